@@ -1,0 +1,1 @@
+"""Factors for 360-degree bundle adjustment on GTSAM."""

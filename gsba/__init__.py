@@ -1,0 +1,1 @@
+"""gsba: pixel-true camera poses for 360-degree video."""

@@ -1,0 +1,98 @@
+"""Closed-form geometry: equirectangular pixels, rotations, poses, Sim(3)."""
+
+import numpy as np
+
+
+def bearings_from_erp(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Unit bearings of equirectangular pixels.
+
+    Args:
+        pixels: (..., 2) float64, (u, v), centre of the top-left pixel at (0.5, 0.5).
+        width, height: image size in pixels, width = 2 height.
+
+    Returns:
+        (..., 3) float64, rig frame (x right, y down, z forward = centre column).
+    """
+    longitude = 2 * np.pi * (pixels[..., 0] / width - 0.5)
+    latitude = np.pi * (0.5 - pixels[..., 1] / height)
+    c = np.cos(latitude)
+    return np.stack([c * np.sin(longitude), -np.sin(latitude), c * np.cos(longitude)], axis=-1)
+
+
+def erp_from_bearings(bearings: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Equirectangular pixels, (..., 2) float64 with u in [0, width], of vectors (..., 3)."""
+    x, y, z = bearings[..., 0], bearings[..., 1], bearings[..., 2]
+    u = width * (np.arctan2(x, z) / (2 * np.pi) + 0.5)
+    v = height * (0.5 + np.arctan2(y, np.hypot(x, z)) / np.pi)
+    return np.stack([u, v], axis=-1)
+
+
+def rotation_from_quaternion(wxyz: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4), wxyz."""
+    w, x, y, z = np.moveaxis(np.asarray(wxyz, dtype=np.float64), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_rotation(rotations: np.ndarray) -> np.ndarray:
+    """Unit quaternions (..., 4), wxyz with w >= 0, of rotation matrices (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    flat = np.asarray(rotations, dtype=np.float64).reshape(-1, 3, 3)
+    xyzw = Rotation.from_matrix(flat).as_quat(canonical=True)
+    return xyzw[:, [3, 0, 1, 2]].reshape((*np.shape(rotations)[:-2], 4))
+
+
+def rotation_angle(rotations: np.ndarray) -> np.ndarray:
+    """Angle (...,) in radians of rotation matrices (..., 3, 3); accurate near 0 and pi."""
+    r = np.asarray(rotations)
+    axis = np.stack(
+        [
+            r[..., 2, 1] - r[..., 1, 2],
+            r[..., 0, 2] - r[..., 2, 0],
+            r[..., 1, 0] - r[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    return np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(r, axis1=-2, axis2=-1) - 1)
+
+
+def pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Homogeneous poses (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
+    out = np.zeros((*np.shape(rotation)[:-2], 4, 4))
+    out[..., :3, :3] = rotation
+    out[..., :3, 3] = translation
+    out[..., 3, 3] = 1
+    return out
+
+
+def inverse(a_T_b: np.ndarray) -> np.ndarray:
+    """b_T_a of rigid poses (..., 4, 4)."""
+    b_R_a = np.swapaxes(a_T_b[..., :3, :3], -1, -2)
+    return pose(b_R_a, -np.einsum("...ij,...j->...i", b_R_a, a_T_b[..., :3, 3]))
+
+
+def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Least-squares Sim(3) with target = scale * rotation @ source + translation.
+
+    Closed form of Umeyama, PAMI 13(4), 1991.
+
+    Args:
+        source, target: (N, 3) float64, N >= 3, not all on one point.
+
+    Returns:
+        scale, rotation (3, 3), translation (3,).
+    """
+    mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
+    s, t = source - mean_s, target - mean_t
+    u, singular, vt = np.linalg.svd(t.T @ s / len(s))
+    sign = np.ones(3)
+    sign[2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    rotation = u @ np.diag(sign) @ vt
+    variance = np.einsum("ij,ij->", s, s) / len(s)
+    scale = float(singular @ sign / variance) if variance > 0 else 1.0
+    return scale, rotation, mean_t - scale * rotation @ mean_s

@@ -1,0 +1,58 @@
+"""The cube rig: six concentric pinhole faces hanging on one frame."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsba.types import FACES
+
+# Rows are the face's axes (right, down, forward) in the rig frame.
+_FACE_R_RIG = np.array(
+    [
+        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],  # front: +z
+        [[0, 0, -1], [0, 1, 0], [1, 0, 0]],  # right: +x
+        [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],  # back: -z
+        [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],  # left: -x
+        [[1, 0, 0], [0, 0, 1], [0, -1, 0]],  # up: -y
+        [[1, 0, 0], [0, 0, -1], [0, 1, 0]],  # down: +y
+    ],
+    dtype=np.float64,
+)
+RIG_R_FACE = np.ascontiguousarray(np.swapaxes(_FACE_R_RIG, 1, 2))  # (6, 3, 3), FACES order
+
+
+@dataclass(frozen=True, slots=True)
+class CubeRig:
+    """Square pinhole faces of `size` pixels seeing `hfov_rad`, one for each name in FACES."""
+
+    size: int  # pixels
+    hfov_rad: float  # field of view of a face, pi / 2 or a little more
+
+    @property
+    def focal(self) -> float:
+        """Focal length in pixels."""
+        return 0.5 * self.size / np.tan(0.5 * self.hfov_rad)
+
+    @property
+    def principal(self) -> float:
+        """Both coordinates of the principal point, pixels, corner origin."""
+        return 0.5 * self.size
+
+    def bearings(self, pixels: np.ndarray, faces: np.ndarray | int) -> np.ndarray:
+        """Unit bearings (..., 3) in the rig frame of face pixels (..., 2), corner origin."""
+        xy = (np.asarray(pixels, dtype=np.float64) - self.principal) / self.focal
+        rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        return np.einsum("...ij,...j->...i", RIG_R_FACE[faces], rays)
+
+    def project(self, bearings_rig: np.ndarray, faces: np.ndarray | int) -> np.ndarray:
+        """Face pixels (..., 2) of rig-frame vectors (..., 3); NaN where behind the face."""
+        local = np.einsum("...ji,...j->...i", RIG_R_FACE[faces], bearings_rig)
+        z = np.where(local[..., 2:] > 1e-9, local[..., 2:], np.nan)
+        return self.focal * local[..., :2] / z + self.principal
+
+
+def owner_faces(bearings_rig: np.ndarray) -> np.ndarray:
+    """Index into FACES of the face that owns each bearing (..., 3): its largest component."""
+    assert len(FACES) == 6
+    return np.argmax(bearings_rig @ RIG_R_FACE[:, :, 2].T, axis=-1).astype(np.uint8)

@@ -1,0 +1,126 @@
+"""Records that stages hand to one another. Arrays inside; one comment per field."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from pathlib import Path
+
+import numpy as np
+
+FACES = ("front", "right", "back", "left", "up", "down")
+
+
+class PoseSource(IntEnum):
+    """Where a frame's coarse pose came from."""
+
+    SLAM = 0  # an entry of the trajectory file
+    INTERPOLATED = 1  # between two entries
+    EXTRAPOLATED = 2  # before the first or after the last entry
+
+
+class PoseStatus(IntEnum):
+    """What became of a frame."""
+
+    REFINED = 0  # images constrain it
+    UNREFINED = 1  # matched nothing: carried by its priors alone
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """What a stage received, what it kept and why the rest was dropped."""
+
+    received: int  # things that came in
+    kept: int  # things that went on
+    unit: str  # what is counted: "frames", "matches", ...
+    dropped: Mapping[str, int] = field(default_factory=dict)  # reason -> how many
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSet:
+    """The captured frames on disk, in time order. No pixels are held."""
+
+    names: tuple[str, ...]  # (F,) unique, without folder or extension
+    paths: tuple[tuple[Path, ...], ...]  # (F,)(1) for "erp", (F,)(len(faces)) for "cube"
+    timestamps: np.ndarray  # (F,) float64, seconds, strictly increasing
+    layout: str  # "erp" (2:1 equirectangular) or "cube" (one 90-degree image per face)
+    faces: tuple[str, ...]  # faces present, in FACES order; () for "erp"
+    width: int  # pixels of one image (ERP or face)
+    height: int  # pixels
+    mask_paths: tuple[Path | None, ...]  # (F,) ERP masks, white = use; None = use all
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Timed rig poses in one world."""
+
+    timestamps: np.ndarray  # (N,) float64, seconds, strictly increasing
+    world_T_rigs: np.ndarray  # (N, 4, 4) float64, map units
+
+
+@dataclass(frozen=True, slots=True)
+class CoarsePoses:
+    """One coarse pose for every frame of a FrameSet."""
+
+    world_T_rigs: np.ndarray  # (F, 4, 4) float64, map units
+    sources: np.ndarray  # (F,) uint8, PoseSource
+    time_offset: float  # seconds added to frame times to reach the trajectory's clock
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """Keypoints of one frame, all faces together."""
+
+    pixels: np.ndarray  # (K, 2) float64, (u, v) on the owning face, corner origin
+    faces: np.ndarray  # (K,) uint8, index into FACES
+    bearings_rig: np.ndarray  # (K, 3) float64, unit, rig frame
+    sigmas_rad: np.ndarray  # (K,) float64, radians, per-axis localisation noise
+    descriptors: np.ndarray  # (K, D) uint8 or float32, unit length up to one common factor
+    colors: np.ndarray  # (K, 3) uint8, RGB at the keypoint
+
+    def __len__(self) -> int:
+        return len(self.faces)
+
+
+@dataclass(frozen=True, slots=True)
+class Matches:
+    """Keypoint correspondences of frame pairs, stored back to back."""
+
+    pairs: np.ndarray  # (P, 2) int32, frame indices (f0 < f1)
+    offsets: np.ndarray  # (P + 1,) int64: pair p owns rows offsets[p]:offsets[p + 1]
+    keypoints: np.ndarray  # (M, 2) int32, keypoint index in f0 and in f1
+
+    def of(self, pair: int) -> np.ndarray:
+        """Rows of one pair, (m, 2) int32."""
+        return self.keypoints[self.offsets[pair] : self.offsets[pair + 1]]
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """Observations of scene points, sorted by point, then by frame."""
+
+    points: np.ndarray  # (O,) int32, point index j, non-decreasing
+    frames: np.ndarray  # (O,) int32, frame index f
+    keypoints: np.ndarray  # (O,) int32, keypoint index k in frame f
+    num_points: int
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, slots=True)
+class Reconstruction:
+    """Refined poses and cloud: what exports and reports are made from."""
+
+    world_T_rigs: np.ndarray  # (F, 4, 4) float64, world of the SLAM trajectory, map units
+    pose_covariances: np.ndarray  # (F, 6, 6) float64, [rotation rad, translation], rig frame; NaN = none
+    pose_statuses: np.ndarray  # (F,) uint8, PoseStatus
+    points_world: np.ndarray  # (J, 3) float64, map units
+    point_colors: np.ndarray  # (J, 3) uint8, RGB
+    point_errors: np.ndarray  # (J,) float64, radians, mean angular residual
+    observation_points: np.ndarray  # (O,) int32, non-decreasing
+    observation_frames: np.ndarray  # (O,) int32
+    observation_bearings: np.ndarray  # (O, 3) float64, unit, rig frame
+    observation_sigmas: np.ndarray  # (O,) float64, radians
