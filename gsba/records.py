@@ -1,0 +1,239 @@
+"""Records on disk: one uncompressed `.npz` per record, typed on the way back, never pickled.
+
+A record is any value built from numpy arrays, numbers, strings, paths, enums, None, tuples, string
+mappings and dataclasses of these. Arrays become members named after their place in the record
+(`points.npy`), everything else a JSON tree in `manifest.json`. Reading is driven by the type that
+the caller expects, so a file can neither name code to run nor smuggle in another type; the zip
+checksums reveal truncated or flipped bytes.
+"""
+
+import errno
+import json
+import os
+import types
+import typing
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+
+import numpy as np
+
+from gsba.log import GsbaError
+
+T = TypeVar("T")
+
+FORMAT = 1  # raised whenever the layout below changes
+_MANIFEST = "manifest.json"
+_TEMPORARY = ".gsba-tmp-"  # prefix of files still being written
+
+
+class RecordError(Exception):
+    """A stored record that is damaged or is not of the expected type."""
+
+
+@contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Turn an OSError of writing to `path` into one line that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise GsbaError(
+                f"no space left while writing {path}: free some and run again; "
+                "finished stages are kept"
+            ) from error
+        raise GsbaError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def atomic_write(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file beside `path` and rename it into place, so that `path` is never half-written.
+
+    Args:
+        path: final file; missing parent folders are made.
+        write: called with a temporary path of the same folder and suffix.
+    Raises:
+        GsbaError: full disk, no permission and the like.
+    """
+    temporary = path.with_name(f"{_TEMPORARY}{os.getpid()}-{path.name}")
+    with disk_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            write(temporary)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Delete what a killed process left half-written under `folder`."""
+    for path in folder.rglob(f"{_TEMPORARY}*"):
+        path.unlink(missing_ok=True)
+
+
+def save_record(path: Path, value: object, info: Mapping[str, Any]) -> None:
+    """Store a record atomically, with a JSON-able `info` (key, timing) beside it.
+
+    Raises:
+        TypeError: `value` holds something that is not record material.
+        GsbaError: the disk refuses.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    manifest = {"format": FORMAT, "info": dict(info), "value": _encode(value, "", arrays)}
+
+    def write(temporary: Path) -> None:
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+            archive.writestr(_MANIFEST, json.dumps(manifest))
+            for name, array in arrays.items():
+                with archive.open(name, "w", force_zip64=True) as member:
+                    np.lib.format.write_array(member, array, allow_pickle=False)
+
+    atomic_write(path, write)
+
+
+def read_info(path: Path) -> dict[str, Any]:
+    """The `info` a record was saved with; RecordError where there is no readable one."""
+    with _reading(path) as archive:
+        return _manifest(archive)["info"]
+
+
+def load_record(path: Path, returns: type[T]) -> T:
+    """Read a record back.
+
+    Args:
+        path: file written by `save_record`.
+        returns: its type, e.g. a dataclass or `tuple[Matches, Counts]`.
+    Raises:
+        RecordError: missing, truncated, corrupt, or of another type.
+    """
+    with _reading(path) as archive:
+        return _decode(_manifest(archive)["value"], returns, archive)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[zipfile.ZipFile]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            yield archive
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise RecordError(f"{path}: {error}") from error
+    except NotImplementedError as error:  # zipfile's word for damaged headers
+        raise RecordError(f"{path}: {error}") from error
+
+
+def _manifest(archive: zipfile.ZipFile) -> dict[str, Any]:
+    manifest = json.loads(archive.read(_MANIFEST))
+    if manifest["format"] != FORMAT:
+        raise RecordError(f"{archive.filename}: format {manifest['format']}, expected {FORMAT}")
+    return manifest
+
+
+def _encode(value: object, place: str, arrays: dict[str, np.ndarray]) -> Any:
+    """JSON tree of `value`; arrays go to `arrays` and leave their member name behind."""
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, np.generic):
+        return value.item()
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, np.ndarray):
+        name = f"{place or 'array'}.npy"
+        arrays[name] = value
+        return name
+    if is_dataclass(value) and not isinstance(value, type):
+        items = {entry.name: getattr(value, entry.name) for entry in fields(value)}
+    elif isinstance(value, Mapping):
+        items = dict(value)
+        if not all(isinstance(name, str) for name in items):
+            raise TypeError(f"record field {place}: only string keys can be stored")
+    elif isinstance(value, tuple | list):
+        return [_encode(item, _join(place, str(i)), arrays) for i, item in enumerate(value)]
+    else:
+        raise TypeError(f"record field {place or '.'}: cannot store a {type(value).__name__}")
+    return {name: _encode(item, _join(place, name), arrays) for name, item in items.items()}
+
+
+def _join(place: str, name: str) -> str:
+    return f"{place}/{name}" if place else name
+
+
+def _decode(tree: Any, hint: Any, archive: zipfile.ZipFile) -> Any:
+    """Value of type `hint` from its JSON tree; RecordError where both disagree."""
+    origin = get_origin(hint)
+    if hint is np.ndarray or origin is np.ndarray:
+        with archive.open(tree) as member:
+            return np.lib.format.read_array(member, allow_pickle=False)
+    if origin in (Union, types.UnionType):
+        return _decode_union(tree, get_args(hint), archive)
+    if origin in (tuple, list):
+        return _decode_sequence(tree, hint, archive)
+    if origin is not None and origin is not Literal and issubclass(origin, Mapping):
+        _require(isinstance(tree, dict), tree, hint)
+        item = get_args(hint)[1]
+        return {name: _decode(value, item, archive) for name, value in tree.items()}
+    if is_dataclass(hint) and isinstance(hint, type):
+        return _decode_dataclass(tree, hint, archive)
+    return _decode_scalar(tree, hint)
+
+
+def _decode_scalar(tree: Any, hint: Any) -> Any:
+    if get_origin(hint) is Literal:
+        _require(tree in get_args(hint), tree, hint)
+        return tree
+    if hint is None or hint is type(None):
+        _require(tree is None, tree, hint)
+        return None
+    if hint is float:
+        _require(isinstance(tree, int | float) and not isinstance(tree, bool), tree, hint)
+        return float(tree)
+    if hint in (bool, int, str):
+        _require(type(tree) is hint, tree, hint)
+        return tree
+    if hint is Path:
+        _require(isinstance(tree, str), tree, hint)
+        return Path(tree)
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return hint(tree)
+    raise TypeError(f"records cannot hold {hint}")
+
+
+def _decode_union(tree: Any, hints: tuple[Any, ...], archive: zipfile.ZipFile) -> Any:
+    if tree is None and type(None) in hints:
+        return None
+    for hint in hints:
+        if hint is not type(None):
+            try:
+                return _decode(tree, hint, archive)
+            except (RecordError, ValueError):
+                continue
+    raise RecordError(f"{tree!r:.60} is none of {hints}")
+
+
+def _decode_sequence(tree: Any, hint: Any, archive: zipfile.ZipFile) -> Any:
+    _require(isinstance(tree, list), tree, hint)
+    items = get_args(hint)
+    if get_origin(hint) is list:
+        return [_decode(value, items[0], archive) for value in tree]
+    if len(items) == 2 and items[1] is Ellipsis:
+        items = (items[0],) * len(tree)
+    _require(len(items) == len(tree), tree, hint)
+    return tuple(_decode(value, item, archive) for value, item in zip(tree, items, strict=True))
+
+
+def _decode_dataclass(tree: Any, cls: type[T], archive: zipfile.ZipFile) -> T:
+    names = {entry.name for entry in fields(cls)}  # type: ignore[arg-type]
+    if not isinstance(tree, dict) or set(tree) != names:
+        raise RecordError(f"{archive.filename}: not a {cls.__name__} of this version")
+    hints = typing.get_type_hints(cls)
+    return cls(**{name: _decode(tree[name], hints[name], archive) for name in names})
+
+
+def _require(condition: bool, tree: Any, hint: Any) -> None:
+    if not condition:
+        raise RecordError(f"{tree!r:.60} is no {hint}")

@@ -1,0 +1,337 @@
+"""The run folder: round trips, resume, damage, ownership."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import BaseModel
+
+import gsba
+from gsba import store as store_module
+from gsba.log import GsbaError
+from gsba.records import RecordError, atomic_write, load_record, save_record
+from gsba.run_folder import claim
+from gsba.store import RunStore, digest, fingerprint, load_stage
+from gsba.types import Counts, Matches, PoseSource, Tracks
+
+
+@dataclass(frozen=True)
+class Everything:
+    array: np.ndarray
+    empty: np.ndarray
+    number: int
+    ratio: float
+    yes: bool
+    name: str
+    nothing: Path | None
+    paths: tuple[tuple[Path, ...], ...]
+    source: PoseSource
+    counts: Counts
+    fixed: tuple[int, str]
+    arrays: Mapping[str, np.ndarray]
+
+
+def _tracks(value: int = 0) -> Tracks:
+    return Tracks(
+        points=np.arange(4, dtype=np.int32),
+        frames=np.zeros(4, np.int32),
+        keypoints=np.full(4, value, np.int32),
+        num_points=4,
+    )
+
+
+class _Calls:
+    """Remembers which stages were computed."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+
+    def tracks(self, name: str, value: int = 0) -> Tracks:
+        self.names.append(name)
+        return _tracks(value)
+
+
+def _run(root: Path, calls: _Calls, first: int = 1, second: int = 1, **kwargs: bool) -> RunStore:
+    """Three stages: b depends on a, c on neither."""
+    with RunStore(root, {"frames": root.parent / "frames"}, **kwargs) as store:
+        for name, settings, after in (("a", first, ()), ("b", second, ("a",)), ("c", 0, ())):
+            value = store.stage(
+                name, settings, lambda name=name: calls.tracks(name), Tracks, after=after
+            )
+            np.testing.assert_array_equal(value.points, np.arange(4))
+    return store
+
+
+def test_record_round_trip(tmp_path: Path) -> None:
+    value = Everything(
+        array=np.arange(12, dtype=np.float32).reshape(3, 4).T,
+        empty=np.zeros((0, 3), np.uint8),
+        number=np.int64(3),  # type: ignore[arg-type]
+        ratio=1 / 3,
+        yes=True,
+        name="a/b é",
+        nothing=None,
+        paths=((Path("/x/y"),), ()),
+        source=PoseSource.INTERPOLATED,
+        counts=Counts(received=5, kept=3, unit="frames", dropped={"too dark": 2}),
+        fixed=(1, "one"),
+        arrays={"left": np.ones(2), "right": np.full((1, 1), np.nan)},
+    )
+    save_record(tmp_path / "r.npz", value, {})
+    back = load_record(tmp_path / "r.npz", Everything)
+    np.testing.assert_array_equal(back.array, value.array)
+    assert back.array.dtype == np.float32
+    assert back.empty.shape == (0, 3) and back.empty.dtype == np.uint8
+    assert np.isnan(back.arrays["right"]).all() and list(back.arrays) == ["left", "right"]
+    for name in ("number", "ratio", "yes", "name", "nothing", "paths", "source", "counts", "fixed"):
+        assert getattr(back, name) == getattr(value, name), name
+    assert type(back.source) is PoseSource and type(back.number) is int
+
+
+def test_record_is_read_as_its_own_type_only(tmp_path: Path) -> None:
+    save_record(tmp_path / "r.npz", _tracks(), {})
+    with pytest.raises(RecordError, match="not a Matches"):
+        load_record(tmp_path / "r.npz", Matches)
+    with pytest.raises(RecordError):
+        load_record(tmp_path / "r.npz", tuple[Tracks, Counts])
+
+
+def test_objects_are_refused_not_pickled(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="cannot store a object"):
+        save_record(tmp_path / "r.npz", (1, object()), {})
+    with pytest.raises(ValueError, match="pickle"):
+        save_record(tmp_path / "r.npz", np.array([{}], dtype=object), {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_second_call_resumes_every_stage(tmp_path: Path) -> None:
+    calls = _Calls()
+    first = _run(tmp_path / "run", calls)
+    again = _run(tmp_path / "run", calls)
+    assert calls.names == ["a", "b", "c"]
+    assert not any(record.resumed for record in first.records.values())
+    assert all(record.resumed for record in again.records.values())
+    assert again.records["a"].seconds == first.records["a"].seconds
+    assert again.records["a"].peak_mb > 0
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [({"first": 2}, ["a", "b"]), ({"second": 2}, ["b"]), ({"fresh": True}, ["a", "b", "c"])],
+)
+def test_a_change_reruns_just_what_depends_on_it(
+    tmp_path: Path, change: dict[str, int], expected: list[str]
+) -> None:
+    _run(tmp_path / "run", _Calls())
+    calls = _Calls()
+    _run(tmp_path / "run", calls, **change)  # type: ignore[arg-type]
+    assert calls.names == expected
+
+
+def test_another_version_computes_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _run(tmp_path / "run", _Calls())
+    monkeypatch.setattr(store_module, "__version__", "999")
+    calls = _Calls()
+    _run(tmp_path / "run", calls)
+    assert calls.names == ["a", "b", "c"]
+
+
+@pytest.mark.parametrize("damage", ["truncate", "flip", "empty", "text", "other"])
+def test_damaged_results_are_computed_again(tmp_path: Path, damage: str) -> None:
+    _run(tmp_path / "run", _Calls())
+    path = tmp_path / "run/stages/a.npz"
+    data = bytearray(path.read_bytes())
+    if damage == "flip":
+        data[data.index(np.arange(4, dtype=np.int32).tobytes())] ^= 1
+    damaged = {
+        "truncate": data[: len(data) // 2],
+        "flip": data,
+        "empty": b"",
+        "text": b"not a zip file",
+        "other": (tmp_path / "run/stages/b.npz").read_bytes(),
+    }
+    path.write_bytes(damaged[damage])
+    calls = _Calls()
+    _run(tmp_path / "run", calls)
+    assert calls.names == ["a"]
+
+
+def _features(root: Path, calls: list[str], **items: int) -> dict[str, int]:
+    def compute(name: str) -> Tracks:
+        calls.append(name)
+        return _tracks(items[name])
+
+    with RunStore(root, {}) as store:
+        frames = store.per_frame("features", "sift", items, compute, Tracks)
+        store.stage("after", None, lambda: calls.append("after"), type(None), after=["features"])
+        return {name: int(frames[name].keypoints[0]) for name in frames}
+
+
+def test_per_frame_results_resume_frame_by_frame(tmp_path: Path) -> None:
+    def interrupted(name: str) -> Tracks:
+        if name == "f2":
+            raise KeyboardInterrupt
+        return _tracks(7)
+
+    items = {"f0": 1, "f1": 2, "f2": 3}
+    with pytest.raises(KeyboardInterrupt), RunStore(tmp_path / "run", {}) as store:
+        store.per_frame("features", "sift", items, interrupted, Tracks)
+
+    calls: list[str] = []
+    assert _features(tmp_path / "run", calls, **items) == {"f0": 7, "f1": 7, "f2": 3}
+    assert calls == ["f2", "after"]
+
+
+def test_per_frame_recomputes_changed_frames_and_what_follows(tmp_path: Path) -> None:
+    root = tmp_path / "run"
+    _features(root, [], f0=1, f1=2, f2=3)
+    calls: list[str] = []
+    assert _features(root, calls, f0=1, f1=5) == {"f0": 1, "f1": 5}
+    assert calls == ["f1", "after"]
+    assert not (root / "stages/features/f2.npz").exists()
+
+
+def test_per_frame_survives_damage_found_late(tmp_path: Path) -> None:
+    with RunStore(tmp_path / "run", {}) as store:
+        frames = store.per_frame("features", 0, {"f0": 0}, lambda _: _tracks(3), Tracks)
+        path = tmp_path / "run/stages/features/f0.npz"
+        data = bytearray(path.read_bytes())
+        data[data.index(np.arange(4, dtype=np.int32).tobytes())] ^= 1  # header stays readable
+        path.write_bytes(data)
+        np.testing.assert_array_equal(frames["f0"].points, np.arange(4))
+
+
+def test_resumes_after_a_kill_in_the_middle(tmp_path: Path) -> None:
+    script = textwrap.dedent("""
+        import os, signal, sys
+        from pathlib import Path
+        from gsba import records
+        from gsba.store import RunStore
+        from test_store import _tracks
+        from gsba.types import Tracks
+
+        with RunStore(Path(sys.argv[1]), {"frames": Path(sys.argv[1]).parent / "frames"}) as store:
+            store.stage("a", 1, _tracks, Tracks)
+            replace = Path.replace
+            Path.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)  # all but renamed
+            store.stage("b", 1, _tracks, Tracks, after=["a"])
+    """)
+    root = tmp_path / "run"
+    folders = (Path(__file__).parent, Path(gsba.__file__).parents[1])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))}
+    done = subprocess.run([sys.executable, "-c", script, root], env=environment)
+    assert done.returncode == -signal.SIGKILL
+    assert len(list((root / "stages").iterdir())) == 2  # a, and half of b
+    calls = _Calls()
+    _run(root, calls)  # the dead process's lock is no obstacle
+    assert calls.names == ["b", "c"]
+    assert sorted(path.name for path in (root / "stages").iterdir()) == ["a.npz", "b.npz", "c.npz"]
+
+
+def test_a_full_disk_is_one_line_and_the_next_call_resumes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with RunStore(tmp_path / "run", {}) as store:
+        store.stage("a", 1, _tracks, Tracks)
+        with monkeypatch.context() as patch:
+            patch.setattr(np.lib.format, "write_array", full)
+            with pytest.raises(GsbaError, match="no space left"):
+                store.stage("b", 1, _tracks, Tracks)
+    assert [path.name for path in (tmp_path / "run/stages").iterdir()] == ["a.npz"]
+    with RunStore(tmp_path / "run", {}) as store:
+        store.stage("a", 1, lambda: pytest.fail("computed again"), Tracks)
+        store.stage("b", 1, _tracks, Tracks)
+
+
+def test_two_processes_do_not_share_a_run(tmp_path: Path) -> None:
+    with RunStore(tmp_path / "run", {}), pytest.raises(GsbaError, match="in use by another"):
+        RunStore(tmp_path / "run", {})
+    with RunStore(tmp_path / "run", {}):
+        pass
+
+
+def test_foreign_folders_are_refused(tmp_path: Path) -> None:
+    _run(tmp_path / "run", _Calls())
+    with pytest.raises(GsbaError, match=r"another run .*frames.*--fresh"):
+        RunStore(tmp_path / "run", {"frames": tmp_path / "elsewhere"})
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/cat.jpg").touch()
+    for fresh in (False, True):
+        with pytest.raises(GsbaError, match="not a gsba run"):
+            RunStore(tmp_path / "photos", {}, fresh=fresh)
+    with pytest.raises(GsbaError, match="is a file"):
+        RunStore(tmp_path / "photos/cat.jpg", {})
+    (tmp_path / "photos/gsba.json").write_text("[]")
+    with pytest.raises(GsbaError, match="not written by gsba"):
+        RunStore(tmp_path / "photos", {})
+
+
+def test_fresh_removes_only_what_gsba_wrote(tmp_path: Path) -> None:
+    root = tmp_path / "run"
+    _run(root, _Calls())
+    for name in ("colmap/sparse/0/images.bin", "trajectory.tum"):
+        atomic_write(root / name, lambda path: path.write_text("ours"))
+    claim(root, root / "colmap")
+    claim(root, root / "trajectory.tum")
+    for name in ("notes.txt", "colmap/notes.txt"):
+        (root / name).write_text("the user's")
+    RunStore(root, {"frames": tmp_path / "elsewhere"}, fresh=True).__exit__()
+    left = sorted(str(path.relative_to(root)) for path in root.rglob("*") if path.is_file())
+    assert left == ["colmap/notes.txt", "gsba.json", "notes.txt"]
+    assert not (root / "colmap/sparse").exists()
+
+
+def test_fresh_stays_inside_the_run(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").touch()
+    _run(tmp_path / "run", _Calls())
+    marker = tmp_path / "run/gsba.json"
+    marker.write_text(marker.read_text().replace('"wrote": []', '"wrote": ["../mine.txt"]'))
+    _run(tmp_path / "run", _Calls(), fresh=True)
+    assert (tmp_path / "mine.txt").exists()
+
+
+def test_load_stage_reads_a_finished_run(tmp_path: Path) -> None:
+    _run(tmp_path / "run", _Calls())
+    assert load_stage(tmp_path / "run", "b", Tracks).num_points == 4
+    with pytest.raises(GsbaError, match="no usable 'z'"):
+        load_stage(tmp_path / "run", "z", Tracks)
+    with pytest.raises(GsbaError, match="not a gsba run"):
+        load_stage(tmp_path, "b", Tracks)
+
+
+def test_atomic_write_keeps_the_old_file_when_the_writer_fails(tmp_path: Path) -> None:
+    path = tmp_path / "points.ply"
+    path.write_text("old")
+
+    def fail(temporary: Path) -> None:
+        temporary.write_text("half")
+        raise ValueError
+
+    with pytest.raises(ValueError):
+        atomic_write(path, fail)
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_keys_see_settings_paths_and_file_changes(tmp_path: Path) -> None:
+    class Settings(BaseModel):
+        sigma: float = 0.5
+
+    assert digest(Settings()) == digest(Settings(sigma=0.5)) != digest(Settings(sigma=0.6))
+    assert digest(Path("a")) == digest("a") and digest(1) != digest("1")
+    with pytest.raises(TypeError, match="cannot be part"):
+        digest(object())
+    path = tmp_path / "frame.jpg"
+    path.write_text("one")
+    before = fingerprint([path, None])
+    path.write_text("longer")
+    assert len(before) == 1 and fingerprint([path, None]) != before
