@@ -1,3 +1,49 @@
-"""gsba: pixel-true camera poses for 360-degree video."""
+"""gsba: pixel-true camera poses for 360-degree video.
+
+The public names below are imported when first used, so that `import gsba` stays light. Exporters
+and trajectory errors are modules of their own: `from gsba.export import export`,
+`from gsba.evaluate import evaluate`.
+"""
+
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gsba.config import RefineSettings
+    from gsba.config_file import load_config
+    from gsba.log import GsbaError
+    from gsba.pipeline import RunResult, load_run, refine
 
 __version__ = "0.1.0"
+__all__ = ["GsbaError", "RefineSettings", "RunResult", "load_config", "load_run", "refine"]
+
+_HOMES = {
+    "GsbaError": "gsba.log",
+    "RefineSettings": "gsba.config",
+    "RunResult": "gsba.pipeline",
+    "load_config": "gsba.config_file",
+    "load_run": "gsba.pipeline",
+    "refine": "gsba.pipeline",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'gsba' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def _require_our_factors() -> None:
+    """ImportError where `factors` is another distribution's package; does not import it."""
+    spec = find_spec("factors")
+    origin = spec.origin if spec else None
+    if origin is None or "LandmarkBlock" not in Path(origin).read_text(encoding="utf-8"):
+        raise ImportError(
+            f"gsba needs its own package 'factors', but Python finds {origin or 'none'}: "
+            "install gsba into a fresh virtual environment, without another 'factors'"
+        )
+
+
+_require_our_factors()

@@ -1,8 +1,13 @@
-"""The one expected failure, and progress of long work."""
+"""The one expected failure, what the terminal shows, and progress of long work."""
 
+import logging
 import sys
 from collections.abc import Iterable, Iterator
-from typing import TypeVar
+from functools import cache
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 T = TypeVar("T")
 
@@ -11,14 +16,41 @@ class GsbaError(Exception):
     """Input or setting that cannot be used: one line saying what, where and what to do."""
 
 
+def show_log(level: int = logging.INFO) -> None:
+    """Send gsba's log to stderr, below the progress bar on a terminal; for the command line.
+
+    Args:
+        level: least level shown, e.g. `logging.WARNING` for a quiet run.
+    """
+    logger = logging.getLogger("gsba")
+    if sys.stderr.isatty():
+        from rich.logging import RichHandler
+
+        handler = RichHandler(console=_console(), show_path=False, rich_tracebacks=False)
+        handler.setFormatter(logging.Formatter("%(message)s"))
+    else:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%X"))
+    logger.handlers[:] = [handler]
+    logger.setLevel(level)
+    logger.propagate = False
+
+
 def track(items: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
     """Yield `items` behind a progress bar on stderr; silent where stderr is no terminal."""
     if not sys.stderr.isatty():
         yield from items
         return
-    from rich.console import Console
     from rich.progress import track as rich_track
 
     yield from rich_track(
-        items, description=description, total=total, console=Console(stderr=True), transient=True
+        items, description=description, total=total, console=_console(), transient=True
     )
+
+
+@cache
+def _console() -> "Console":
+    """The one console on stderr: bars and log lines must share it to stay out of each other."""
+    from rich.console import Console
+
+    return Console(stderr=True)

@@ -1,0 +1,189 @@
+"""Settings from TOML files and `stage.key=value` overrides, and back to TOML.
+
+TOML has no null: the text `"none"` stands for None wherever a setting may be None.
+"""
+
+import json
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from gsba.config import RefineSettings
+from gsba.log import GsbaError
+
+_NONE = "none"
+
+
+def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> RefineSettings:
+    """Settings of a run: defaults, then the file, then the overrides.
+
+    Args:
+        path: TOML file with a table per stage, holding overrides only.
+        overrides: `stage.key=value` each, the value written as in TOML; bare words are texts.
+    Raises:
+        GsbaError: unreadable file, unknown key, or a value out of range; says what is allowed.
+    """
+    tree = _read_toml(path) if path else {}
+    _check_keys(tree, RefineSettings, (), str(path))
+    for override in overrides:
+        keys, value = _parse_override(override)
+        branch: dict[str, Any] = {}
+        _put(branch, keys, value)
+        _check_keys(branch, RefineSettings, (), "--set")
+        _put(tree, keys, value)
+    return _validate(_with_none(tree, RefineSettings))
+
+
+def to_toml(settings: BaseModel) -> str:
+    """TOML text of all settings, each with what is allowed; `load_config` reads it back equal."""
+    return "\n".join(_toml_lines(settings, ())) + "\n"
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise GsbaError(f"cannot read settings {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise GsbaError(f"{path} is not valid TOML: {error}") from error
+
+
+def _parse_override(text: str) -> tuple[tuple[str, ...], Any]:
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip():
+        raise GsbaError(f"--set {text}: write stage.key=value, e.g. features.max_per_face=600")
+    try:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        parsed = value.strip()
+    return tuple(part.strip() for part in name.split(".")), parsed
+
+
+def _put(tree: dict[str, Any], keys: tuple[str, ...], value: Any) -> None:
+    for key in keys[:-1]:
+        tree = tree.setdefault(key, {})
+    tree[keys[-1]] = value
+
+
+def _check_keys(
+    tree: Mapping[str, Any], model: type[BaseModel], place: tuple[str, ...], source: str
+) -> None:
+    """GsbaError for a key the model does not have, or a value where a table belongs."""
+    for key, value in tree.items():
+        name = ".".join((*place, key))
+        if key not in model.model_fields:
+            near = get_close_matches(key, model.model_fields, n=1)
+            hint = f"did you mean {near[0]}?" if near else "known: " + ", ".join(model.model_fields)
+            raise GsbaError(f"{source}: unknown setting {name}; {hint}")
+        nested = _nested_model(model, key)
+        if nested is None:
+            if isinstance(value, Mapping):
+                raise GsbaError(f"{source}: {name} is a value, not a table of settings")
+        elif not isinstance(value, Mapping):
+            known = ", ".join(nested.model_fields)
+            raise GsbaError(f"{source}: {name} is a table of settings ({known}), not a value")
+        else:
+            _check_keys(value, nested, (*place, key), source)
+
+
+def _with_none(tree: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:
+    """The tree with the text "none" as None where the setting may be None."""
+    out: dict[str, Any] = {}
+    for key, value in tree.items():
+        nested = _nested_model(model, key)
+        if nested is not None:
+            out[key] = _with_none(value, nested)
+        elif value == _NONE and {"type": "null"} in _schema(model, key).get("anyOf", []):
+            out[key] = None
+        else:
+            out[key] = value
+    return out
+
+
+def _validate(tree: Mapping[str, Any]) -> RefineSettings:
+    try:
+        return RefineSettings.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+    name, model, value = "", RefineSettings, tree
+    allowed = ""
+    for key in map(str, first["loc"]):
+        if model is None or key not in model.model_fields:
+            break  # inside a value: an item of a list, an arm of a union
+        name, value = f"{name}.{key}".lstrip("."), value[key]
+        allowed = _allowed(_schema(model, key))
+        model = _nested_model(model, key)
+    if model is not None:  # a check across several settings
+        raise GsbaError(f"settings {name}: {first['msg'].removeprefix('Value error, ')}")
+    raise GsbaError(f"setting {name} = {_toml_value(value)} is not allowed: use {allowed}")
+
+
+def _nested_model(model: type[BaseModel], key: str) -> type[BaseModel] | None:
+    annotation: Any = model.model_fields[key].annotation
+    is_model = isinstance(annotation, type) and issubclass(annotation, BaseModel)
+    return annotation if is_model else None
+
+
+def _schema(model: type[BaseModel], key: str) -> dict[str, Any]:
+    """JSON schema of one setting, references to enums resolved."""
+    whole = model.model_json_schema()
+
+    def resolve(node: Any) -> Any:
+        if isinstance(node, list):
+            return [resolve(item) for item in node]
+        if not isinstance(node, dict):
+            return node
+        if "$ref" in node:
+            return resolve(whole["$defs"][node["$ref"].rsplit("/", 1)[1]])
+        return {name: resolve(item) for name, item in node.items()}
+
+    return resolve(whole["properties"][key])
+
+
+def _allowed(schema: Mapping[str, Any]) -> str:
+    """What a setting may be, in words."""
+    if "anyOf" in schema:
+        return " or ".join(_allowed(arm) for arm in schema["anyOf"])
+    if "const" in schema:
+        return json.dumps(schema["const"])
+    if "enum" in schema:
+        return "one of " + ", ".join(json.dumps(choice) for choice in schema["enum"])
+    kind = schema.get("type")
+    if kind == "array":
+        items = [_allowed(item) for item in schema.get("prefixItems", ())]
+        return f"a list [{', '.join(items)}]" if items else f"a list of {_allowed(schema['items'])}"
+    if kind in ("integer", "number"):
+        words = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
+        bounds = [f"{sign} {schema[key]:g}" for key, sign in words.items() if key in schema]
+        noun = "an integer" if kind == "integer" else "a number"
+        return f"{noun} {' and '.join(bounds)}".rstrip()
+    names = {"null": f'"{_NONE}"', "boolean": "true or false", "string": "a text"}
+    return names.get(str(kind), "another value")
+
+
+def _toml_lines(settings: BaseModel, place: tuple[str, ...]) -> Iterator[str]:
+    model = type(settings)
+    tables = [key for key in model.model_fields if _nested_model(model, key) is not None]
+    for key in model.model_fields:
+        if key not in tables:
+            value = _toml_value(getattr(settings, key))
+            yield f"{key} = {value}  # {_allowed(_schema(model, key))}"
+    for key in tables:
+        nested = getattr(settings, key)
+        yield ""
+        yield f"[{'.'.join((*place, key))}]  # {(nested.__doc__ or '').splitlines()[0]}"
+        yield from _toml_lines(nested, (*place, key))
+
+
+def _toml_value(value: Any) -> str:
+    if value is None:
+        return f'"{_NONE}"'
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_toml_value(item) for item in value)}]"
+    if isinstance(value, float):
+        return repr(value)
+    return json.dumps(value, ensure_ascii=False, default=str)
