@@ -1,0 +1,16 @@
+"""What a run starts from: frames, masks and a coarse trajectory on one clock."""
+
+from gsba.read.associate import associate
+from gsba.read.frames import load_erp, load_faces, scan
+from gsba.read.masks import load_mask
+from gsba.read.trajectory import read_trajectory, write_tum
+
+__all__ = [
+    "associate",
+    "load_erp",
+    "load_faces",
+    "load_mask",
+    "read_trajectory",
+    "scan",
+    "write_tum",
+]

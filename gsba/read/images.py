@@ -1,0 +1,119 @@
+"""Image files: size and completeness from the headers alone, and decoding."""
+
+import mmap
+from pathlib import Path
+
+import numpy as np
+
+from gsba.log import GsbaError
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_END = b"IEND\xaeB`\x82"  # chunk type and its constant CRC
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_JPEG_BARE = {0x01, *range(0xD0, 0xD9)}  # markers without a segment: TEM, RST0-7, SOI
+_JPEG_FRAME = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0-15; not DHT, JPG, DAC
+_JPEG_SCAN = 0xDA  # SOS
+
+
+def is_image(path: Path) -> bool:
+    """Whether the name is that of a visible JPEG or PNG file."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of a JPEG or PNG as stored (EXIF orientation ignored), without decoding.
+
+    Raises:
+        GsbaError: unreadable, neither JPEG nor PNG, or its end is missing (truncated).
+    """
+    try:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            if data[:8] == _PNG_SIGNATURE:
+                size, complete = _png_header(data)
+            elif data[:2] == _JPEG_START:
+                size, complete = _jpeg_header(data)
+            else:
+                raise GsbaError(f"{path}: not a JPEG or PNG image; remove or convert it")
+    except OSError as error:
+        raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
+    except (IndexError, ValueError):  # ran past the end; mmap refuses an empty file
+        raise GsbaError(f"{path}: truncated or damaged image; copy or extract it again") from None
+    if not complete:
+        raise GsbaError(f"{path}: truncated image (its end is missing); copy or extract it again")
+    return size
+
+
+def _png_header(data: mmap.mmap) -> tuple[tuple[int, int], bool]:
+    """(width, height), and whether the end chunk is there. PNG 1.2, sections 3 and 4."""
+    if len(data) < 33 or data[12:16] != b"IHDR":
+        raise ValueError
+    size = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    return size, data.rfind(_PNG_END) > 0
+
+
+def _jpeg_header(data: mmap.mmap) -> tuple[tuple[int, int], bool]:
+    """(width, height), and whether the end marker follows the scan. ITU T.81, annex B.
+
+    The end marker cannot occur inside entropy-coded data, but does occur in EXIF thumbnails, so
+    it only counts after the first scan has begun; cameras may append data after it.
+    """
+    position, size = 2, None
+    while True:
+        if data[position] != 0xFF:
+            raise ValueError
+        while data[position] == 0xFF:  # any number of fill bytes
+            position += 1
+        marker = data[position]
+        position += 1
+        if marker in _JPEG_BARE:
+            continue
+        length = int.from_bytes(data[position : position + 2], "big")
+        if marker in _JPEG_FRAME:
+            height, width = (
+                int.from_bytes(data[position + k : position + k + 2], "big") for k in (3, 5)
+            )
+            size = width, height
+        elif marker == _JPEG_SCAN:
+            if size is None:
+                raise ValueError
+            return size, data.rfind(_JPEG_END, position) > 0
+        position += max(length, 2)
+
+
+def decode(path: Path, size: tuple[int, int], gray: bool = False) -> np.ndarray:
+    """Pixels of an image, orientation tags ignored.
+
+    Args:
+        path: JPEG or PNG.
+        size: the width and height it must have.
+        gray: one channel instead of RGB.
+
+    Returns:
+        (H, W, 3) uint8 RGB, or (H, W) uint8.
+
+    Raises:
+        GsbaError: the file is gone, cannot be decoded, or has another size.
+    """
+    import cv2
+
+    try:
+        encoded = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    except OSError as error:
+        raise GsbaError(
+            f"{path}: cannot be read ({error.strerror}); it was there when the run began"
+        ) from None
+    flag = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
+    try:
+        pixels = cv2.imdecode(encoded, flag | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise GsbaError(f"{path}: cannot be decoded; copy or extract it again")
+    found = pixels.shape[1], pixels.shape[0]
+    if found != size:
+        raise GsbaError(
+            f"{path}: is {found[0]}x{found[1]}, was {size[0]}x{size[1]} when the run began"
+        )
+    return pixels if gray else cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB, dst=pixels)
