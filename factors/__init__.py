@@ -1,1 +1,27 @@
-"""Factors for 360-degree bundle adjustment on GTSAM."""
+"""Factors for 360-degree bundle adjustment on GTSAM: reference factors, batched blocks."""
+
+from factors.bearing import BearingFactor, BearingTerm, bearing_residuals, tangent_basis
+from factors.block import Block, PoseSystem
+from factors.landmarks import LandmarkBlock
+from factors.reprojection import (
+    FaceCameras,
+    ReprojectionFactor,
+    ReprojectionTerm,
+    reprojection_residuals,
+)
+from factors.robust import RobustLoss
+
+__all__ = [
+    "BearingFactor",
+    "BearingTerm",
+    "Block",
+    "FaceCameras",
+    "LandmarkBlock",
+    "PoseSystem",
+    "ReprojectionFactor",
+    "ReprojectionTerm",
+    "RobustLoss",
+    "bearing_residuals",
+    "reprojection_residuals",
+    "tangent_basis",
+]

@@ -1,0 +1,120 @@
+"""Bearing family: angle between a measured and a predicted direction, in the tangent plane.
+
+The residual is the log map on the sphere at the measured bearing, a tangent 2-vector whose length
+is the angle (0 to pi, never saturating). It knows no image, so no seam, pole or face.
+"""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors._kernels import BEARING
+from factors._terms import custom_factor, rig_vectors, whitener_rows
+
+_SMALL = 1e-12  # of the sine of the angle: the residual's direction is not defined nearer to pi
+
+
+def tangent_basis(bearings: np.ndarray) -> np.ndarray:
+    """Orthonormal axes of the tangent planes at unit bearings.
+
+    Args:
+        bearings: (..., 3) float64, unit.
+
+    Returns:
+        (..., 2, 3) float64, rows are the axes. Duff et al., "Building an Orthonormal Basis,
+        Revisited", JCGT 6(1), 2017.
+    """
+    x, y, z = np.moveaxis(np.asarray(bearings, dtype=np.float64), -1, 0)
+    sign = np.where(z >= 0, 1.0, -1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    rows = [[1 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def bearing_residuals(
+    world_T_rigs: np.ndarray, points_world: np.ndarray, bearings_rig: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tangent-plane residuals of bearings and their Jacobians.
+
+    Args:
+        world_T_rigs: (N, 4, 4) float64, pose that sees each observation.
+        points_world: (N, 3) float64, world.
+        bearings_rig: (N, 3) float64, unit, measured, rig frame.
+
+    Returns:
+        residuals (N, 2) in radians along `tangent_basis(bearings_rig)`, Jacobians by the pose
+        (N, 2, 6) and by the point (N, 2, 3). Zero Jacobians exactly opposite the measurement;
+        at the rig's centre, where there is no direction, also the residual (pi, 0).
+    """
+    d, d_pose, d_point = rig_vectors(world_T_rigs, points_world)
+    axes = tangent_basis(bearings_rig)
+    xy = np.einsum("nij,nj->ni", axes, d)
+    z = np.einsum("nj,nj->n", bearings_rig, d)
+    s, squared = np.hypot(xy[:, 0], xy[:, 1]), np.einsum("ni,ni->n", d, d)
+    length = np.sqrt(squared)
+    angle = np.arctan2(s, z)
+    centre = length == 0
+    n2 = np.where(centre, 1.0, squared)
+    regular = s > _SMALL * length
+    safe_s = np.where(regular, s, 1.0)
+    ahead = np.where(z > 0, z, np.inf)
+    f = np.where(regular, angle / safe_s, 1.0 / ahead)
+    q = (s / ahead) ** 2
+    series = -(2 / 3 - q * (4 / 5 - q * (6 / 7 - q * (8 / 9 - q * 10 / 11)))) / ahead**3
+    k = np.where((z > 0) & (q < 1e-3), series, (z / n2 - f) / safe_s**2)
+    residuals = f[:, None] * xy
+    d_tangent = f[:, None, None] * np.eye(2) + k[:, None, None] * xy[:, :, None] * xy[:, None, :]
+    by_d = d_tangent @ axes - (xy / n2[:, None])[:, :, None] * bearings_rig[:, None, :]
+    opposite = ~regular & (z <= 0)
+    residuals[opposite] = [np.pi, 0.0]
+    by_d[opposite] = 0.0
+    return residuals, by_d @ d_pose, by_d @ d_point
+
+
+@dataclass(frozen=True, slots=True)
+class BearingTerm:
+    """Bearing observations of the landmarks of a block."""
+
+    frames: np.ndarray  # (O,) int, row of the block's poses
+    points: np.ndarray  # (O,) int, row of the block's landmarks
+    bearings_rig: np.ndarray  # (O, 3) float64, unit, rig frame
+    sigmas_rad: np.ndarray | float = 1.0  # () or (O,) radians, per axis
+    sqrt_infos: np.ndarray | None = None  # (O, 2, 2) 1/rad on tangent_basis; replaces sigmas_rad
+    name: str = "bearing"
+
+    kind = BEARING
+
+    def measurements(self) -> np.ndarray:
+        """(O, 3) rows as the kernels read them."""
+        return np.asarray(self.bearings_rig, dtype=np.float64)
+
+    def whiteners(self) -> np.ndarray:
+        """(O, 3) upper triangles of the square-root information."""
+        return whitener_rows(len(self.frames), self.sigmas_rad, self.sqrt_infos)
+
+    def cameras(self) -> np.ndarray:
+        """No faces here: (0, 12)."""
+        return np.zeros((0, 12))
+
+
+def BearingFactor(
+    pose_key: int,
+    point_key: int,
+    bearing_rig: np.ndarray,
+    noise_model: gtsam.noiseModel.Base,
+) -> gtsam.CustomFactor:
+    """One bearing observation as an ordinary GTSAM factor: the reference for the blocks.
+
+    Args:
+        pose_key, point_key: keys of a Pose3 `world_T_rig` and of a Point3.
+        bearing_rig: (3,) unit, rig frame.
+        noise_model: of dimension 2, radians on `tangent_basis(bearing_rig)`, robust or not.
+    """
+    measured = np.asarray(bearing_rig, dtype=np.float64)[None]
+
+    def residual(world_T_rig: np.ndarray, point: np.ndarray):
+        return bearing_residuals(world_T_rig, point, measured)
+
+    return custom_factor(pose_key, point_key, noise_model, residual)

@@ -1,0 +1,59 @@
+"""What the optimizer asks of a block of like factors."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import gtsam
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class PoseSystem:
+    """Second-order model of a block's cost over its poses: c + g^T x + x^T H x / 2.
+
+    x stacks [rotation, translation] of each pose, right perturbation.
+    """
+
+    diagonal: np.ndarray  # (F, 6, 6) float64, blocks H[f, f]
+    off_diagonal: np.ndarray  # (P, 6, 6) float64, blocks H[f, g] of the block's pairs (f, g), f < g
+    gradient: np.ndarray  # (F, 6) float64
+    costs: Mapping[str, float]  # family -> cost at the linearization point
+
+
+class Block(Protocol):
+    """Like factors held as arrays, on Pose3 variables; inner variables are its own business.
+
+    The optimizer calls, in this order: `refresh` and `linearize` at accepted values, then any
+    number of `propose`, of which the last is followed by `accept` if its values were taken.
+    """
+
+    @property
+    def pose_keys(self) -> Sequence[int]:
+        """(F,) keys of its Pose3 variables."""
+        ...
+
+    @property
+    def pairs(self) -> np.ndarray:
+        """(P, 2) int, rows f < g of pose_keys that share a residual; fixed for a run."""
+        ...
+
+    def refresh(self, values: gtsam.Values) -> None:
+        """Renew what depends on accepted values (renderings, patches); may do nothing."""
+        ...
+
+    def linearize(self, values: gtsam.Values) -> PoseSystem:
+        """Model of the cost at accepted values, inner variables eliminated."""
+        ...
+
+    def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
+        """Cost at tentative values, `steps (F, 6)` away from the linearization point."""
+        ...
+
+    def accept(self) -> None:
+        """Keep the inner variables of the last proposal."""
+        ...
+
+    def costs(self, values: gtsam.Values) -> dict[str, float]:
+        """Cost of each family, inner variables as they are."""
+        ...

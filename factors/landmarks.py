@@ -1,0 +1,299 @@
+"""Batched observations of shared landmarks, eliminated inside: the block and its two doors."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+
+from factors._elimination import eliminate_range, polish_range, residuals_range
+from factors._kernels import Observations
+from factors.bearing import BearingTerm
+from factors.block import PoseSystem
+from factors.reprojection import ReprojectionTerm
+from factors.robust import RobustLoss
+
+Term = BearingTerm | ReprojectionTerm
+
+
+class LandmarkBlock:
+    """All observations of a set of landmarks, by any number of families.
+
+    Implements `factors.block.Block` (the fast door); `factors()` opens the other one. Threads
+    share the work when `num_threads` is above one.
+
+    Attributes:
+        pose_keys: (F,) keys of the Pose3 variables `world_T_rig`.
+        pairs: (P, 2) int64, rows f < g of pose_keys that see a landmark in common.
+        points_world: (J, 3) float64, current landmarks in the order given.
+    """
+
+    def __init__(
+        self,
+        pose_keys: Sequence[int],
+        points_world: np.ndarray,
+        terms: Sequence[Term],
+        loss: RobustLoss | None = None,
+        num_threads: int | None = None,
+        polish_steps: int = 3,
+    ) -> None:
+        """Sort the observations by landmark and frame.
+
+        Args:
+            pose_keys: (F,) keys of Pose3 variables.
+            points_world: (J, 3) start values, world.
+            terms: observations; frames index pose_keys, points index points_world.
+            loss: robust loss on each whitened residual norm; None is plain least squares.
+            num_threads: None takes the cores there are, at most 16.
+            polish_steps: Gauss-Newton steps on the landmarks after each proposed pose step.
+
+        Raises:
+            ValueError: indices out of range, values not finite, arrays of unequal length.
+        """
+        self.pose_keys = [int(key) for key in pose_keys]
+        self.loss = loss or RobustLoss()
+        self.num_threads = max(1, num_threads or min(16, os.cpu_count() or 1))
+        self.polish_steps = polish_steps
+        self.terms = tuple(terms)
+        self.families = tuple(dict.fromkeys(term.name for term in terms))
+        points = np.array(points_world, dtype=np.float64).reshape(-1, 3)
+        for term in terms:
+            _check_term(term, len(self.pose_keys), len(points))
+        if not np.all(np.isfinite(points)):
+            raise ValueError("points_world must be finite")
+        self._sort(points)
+        self._row_starts, self._columns = self._covisibility()
+        rows = np.repeat(np.arange(len(self.pose_keys)), np.diff(self._row_starts))
+        self.pairs = np.column_stack([rows, self._columns]).astype(np.int64)
+        self._trial: tuple[np.ndarray, np.ndarray] | None = None
+        self._poses: np.ndarray | None = None
+        self._point_costs = np.full(len(points), np.inf)
+
+    @property
+    def points_world(self) -> np.ndarray:
+        """(J, 3) float64, current landmarks in the order they were given."""
+        out = np.empty_like(self._points)
+        out[self._point_order] = self._points
+        return out
+
+    def refresh(self, values: gtsam.Values) -> None:
+        """Nothing depends on accepted values here."""
+
+    def linearize(self, values: gtsam.Values) -> PoseSystem:
+        """Reduced pose system at `values`: robust weights, landmarks eliminated."""
+        poses = self._pose_rows(values)
+        num_f, num_p = len(self.pose_keys), len(self._columns)
+        ranges = self._ranges()
+        sums = [
+            (
+                np.zeros((num_f, 6, 6)),
+                np.zeros((num_p, 6, 6)),
+                np.zeros((num_f, 6)),
+                np.zeros(len(self.families)),
+            )
+            for _ in ranges
+        ]
+
+        def work(i: int) -> None:
+            eliminate_range(
+                *ranges[i], self._obs, self._points, poses, self._row_starts, self._columns,
+                *sums[i], self._point_costs,
+            )  # fmt: skip
+
+        self._run(work, len(ranges))
+        total = sums[0]
+        for other in sums[1:]:
+            for target, part in zip(total, other, strict=True):
+                target += part
+        self._poses = poses
+        diagonal, off_diagonal, gradient, costs = total
+        return PoseSystem(diagonal, off_diagonal, gradient, self._named(costs))
+
+    def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
+        """Robust cost at `values`, `steps (F, 6)` from the linearization, landmarks moved along."""
+        if self._poses is None:
+            raise RuntimeError("propose() needs linearize() before it")
+        return self._move(self._pose_rows(values), self._poses, np.ascontiguousarray(steps))
+
+    def accept(self) -> None:
+        """Keep the landmarks of the last proposal."""
+        if self._trial is not None:
+            self._points, self._point_costs = self._trial
+            self._trial = None
+
+    def polish(self, values: gtsam.Values, num_steps: int = 20) -> float:
+        """Move the landmarks to their optimum at fixed poses; returns the robust cost."""
+        cost = self._move(self._pose_rows(values), None, None, num_steps)
+        self.accept()
+        return cost
+
+    def residuals(self, values: gtsam.Values) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Whitened residuals of each term in its own order, at the current landmarks.
+
+        Returns:
+            For each term (O, 2) residuals and (O,) bool, False where the point is behind the face
+            (there the residual is a large constant).
+        """
+        poses = self._pose_rows(values)
+        residuals = np.empty((len(self._order), 2))
+        valid = np.empty(len(self._order), dtype=np.bool_)
+        ranges = self._ranges()
+
+        def work(i: int) -> None:
+            residuals_range(*ranges[i], self._obs, self._points, poses, residuals, valid)
+
+        self._run(work, len(ranges))
+        unsorted, flags = np.empty_like(residuals), np.empty_like(valid)
+        unsorted[self._order], flags[self._order] = residuals, valid
+        splits = np.cumsum([len(term.frames) for term in self.terms])[:-1]
+        return np.split(unsorted, splits), np.split(flags, splits)
+
+    def costs(self, values: gtsam.Values) -> dict[str, float]:
+        """Robust cost of each family at the current landmarks."""
+        out = dict.fromkeys(self.families, 0.0)
+        residuals, _ = self.residuals(values)
+        for term, rows in zip(self.terms, residuals, strict=True):
+            out[term.name] += float(self.loss.rho(np.einsum("ni,ni->n", rows, rows)).sum())
+        return out
+
+    def error(self, values: gtsam.Values) -> float:
+        """Robust cost at the current landmarks."""
+        return sum(self.costs(values).values())
+
+
+    def _move(
+        self,
+        poses: np.ndarray,
+        old_poses: np.ndarray | None,
+        steps: np.ndarray | None,
+        num_steps: int | None = None,
+    ) -> float:
+        points, costs = np.empty_like(self._points), np.empty_like(self._point_costs)
+        ranges = self._ranges()
+        substitute = steps is not None
+        num_steps = self.polish_steps if num_steps is None else num_steps
+
+        def work(i: int) -> None:
+            polish_range(
+                *ranges[i], self._obs, self._points, poses,
+                poses if old_poses is None else old_poses,
+                np.zeros((len(poses), 6)) if steps is None else steps,
+                substitute, num_steps, self._point_costs, points, costs,
+            )  # fmt: skip
+
+        self._run(work, len(ranges))
+        self._trial = points, costs
+        return float(costs.sum())
+
+    def _sort(self, points: np.ndarray) -> None:
+        """Order landmarks by first and last frame, observations by landmark and frame."""
+        terms, num_points = self.terms, len(points)
+        frames = np.concatenate([np.asarray(t.frames) for t in terms] or [[]]).astype(np.int32)
+        owners = np.concatenate([np.asarray(t.points) for t in terms] or [[]]).astype(np.int32)
+        first = np.full(num_points, len(self.pose_keys), dtype=np.int32)
+        last = np.full(num_points, -1, dtype=np.int32)
+        np.minimum.at(first, owners, frames)
+        np.maximum.at(last, owners, frames)
+        self._point_order = np.lexsort((last, first))  # sorted row -> given row
+        rank = np.empty(num_points, dtype=np.int32)
+        rank[self._point_order] = np.arange(num_points, dtype=np.int32)
+        owners = rank[owners]
+        order = np.lexsort((frames, owners))  # sorted row -> given row, terms back to back
+        camera_counts = [len(term.cameras()) for term in terms]
+        measurements = [term.measurements() for term in terms]
+        for rows, term, offset in zip(
+            measurements, terms, np.cumsum([0, *camera_counts]), strict=False
+        ):
+            if len(term.cameras()):
+                rows[:, 2] += offset
+        families = [self.families.index(term.name) for term in terms]
+        lengths = [len(term.frames) for term in terms]
+        cameras = [term.cameras() for term in terms] or [np.zeros((0, 12))]
+        self._order = order.astype(np.int32)
+        self._points = np.ascontiguousarray(points[self._point_order])
+        offsets = np.zeros(num_points + 1, dtype=np.int64)
+        np.cumsum(np.bincount(owners, minlength=num_points), out=offsets[1:])
+        self._obs = Observations(
+            offsets=offsets,
+            frames=frames[order],
+            kinds=np.repeat([t.kind for t in terms], lengths).astype(np.uint8)[order],
+            families=np.repeat(families, lengths).astype(np.uint8)[order],
+            measurements=np.concatenate(measurements or [np.zeros((0, 3))])[order],
+            whiteners=np.concatenate([t.whiteners() for t in terms] or [np.zeros((0, 3))])[order],
+            cameras=np.ascontiguousarray(np.concatenate(cameras)),
+            loss=self.loss.code,
+            loss_scale=float(self.loss.scale),
+        )
+
+    def _covisibility(self) -> tuple[np.ndarray, np.ndarray]:
+        """CSR rows of the frame pairs f < g that see a landmark in common."""
+        from scipy.sparse import csr_matrix
+
+        num_f, obs = len(self.pose_keys), self._obs
+        owners = np.repeat(np.arange(len(self._points)), np.diff(obs.offsets))
+        seen = csr_matrix(
+            (np.ones(len(owners), dtype=np.float32), (obs.frames, owners)),
+            shape=(num_f, len(self._points)),
+        )
+        shared = (seen @ seen.T).tocsr()
+        shared.sort_indices()
+        rows = np.repeat(np.arange(num_f), np.diff(shared.indptr))
+        upper = shared.indices > rows
+        starts = np.zeros(num_f + 1, dtype=np.int64)
+        np.cumsum(np.bincount(rows[upper], minlength=num_f), out=starts[1:])
+        return starts, shared.indices[upper].astype(np.int64)
+
+    def _ranges(self) -> list[tuple[int, int]]:
+        """Runs of landmarks with about the same number of observations, one per thread."""
+        offsets = self._obs.offsets
+        targets = np.linspace(0, offsets[-1], self.num_threads + 1)[1:-1]
+        bounds = np.unique([0, *np.searchsorted(offsets, targets), len(self._points)])
+        if len(bounds) < 2:
+            return [(0, 0)]
+        return [(int(a), int(b)) for a, b in pairwise(bounds)]
+
+    def _run(self, work: Callable[[int], None], num: int) -> None:
+        if num == 1:
+            work(0)
+            return
+        with ThreadPoolExecutor(num) as pool:
+            list(pool.map(work, range(num)))
+
+    def _pose_rows(self, values: gtsam.Values) -> np.ndarray:
+        return pose_rows(values, self.pose_keys)
+
+    def _named(self, costs: np.ndarray) -> dict[str, float]:
+        return {name: float(cost) for name, cost in zip(self.families, costs, strict=True)}
+
+
+def pose_rows(values: gtsam.Values, keys: Sequence[int]) -> np.ndarray:
+    """(F, 12) float64 rows [world_R_rig row-major, rig_in_world] of Pose3 variables."""
+    out = np.empty((len(keys), 12))
+    for row, key in zip(out, keys, strict=True):
+        matrix = values.atPose3(key).matrix()
+        row[:9] = matrix[:3, :3].ravel()
+        row[9:] = matrix[:3, 3]
+    return out
+
+
+def _check_term(term: Term, num_frames: int, num_points: int) -> None:
+    frames, points = np.asarray(term.frames), np.asarray(term.points)
+    rows = term.measurements()
+    if not len(frames) == len(points) == len(rows):
+        raise ValueError(
+            f"term {term.name!r}: {len(frames)} frames, {len(points)} points and {len(rows)} "
+            "measurements must be equally many"
+        )
+    if len(frames) == 0:
+        return
+    if frames.min() < 0 or frames.max() >= num_frames:
+        raise ValueError(f"term {term.name!r}: frame index out of range 0..{num_frames - 1}")
+    if points.min() < 0 or points.max() >= num_points:
+        raise ValueError(f"term {term.name!r}: point index out of range 0..{num_points - 1}")
+    if not np.all(np.isfinite(rows)):
+        raise ValueError(f"term {term.name!r}: measurements must be finite")
+    num_cameras = len(term.cameras())
+    if num_cameras and not (rows[:, 2].min() >= 0 and rows[:, 2].max() < num_cameras):
+        raise ValueError(f"term {term.name!r}: face index out of range 0..{num_cameras - 1}")

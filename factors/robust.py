@@ -1,0 +1,71 @@
+"""Robust losses on the squared, whitened residual, in GTSAM's scaling."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import gtsam
+import numpy as np
+from numba import njit
+
+LossKind = Literal["none", "huber", "cauchy", "geman_mcclure"]
+_CODES: dict[str, int] = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
+
+
+@njit(cache=True, nogil=True)
+def rho_and_weight(code, scale, squared):
+    """Loss rho(s) and weight w = 2 rho'(s) of s = |whitened residual|^2.
+
+    Near zero rho = s / 2, so the sum of rho is the cost GTSAM reports.
+    """
+    c2 = scale * scale
+    if code == 1 and squared > c2:
+        norm = np.sqrt(squared)
+        return scale * (norm - 0.5 * scale), scale / norm
+    if code == 2:
+        return 0.5 * c2 * np.log1p(squared / c2), c2 / (c2 + squared)
+    if code == 3:
+        weight = c2 / (c2 + squared)
+        return 0.5 * squared * weight, weight * weight
+    return 0.5 * squared, 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class RobustLoss:
+    """A loss and the whitened residual norm (sigmas) at which it starts to let go."""
+
+    kind: LossKind = "none"
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in _CODES:
+            raise ValueError(f"robust loss {self.kind!r} is none of {', '.join(_CODES)}")
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise ValueError(f"scale of the robust loss must be positive, not {self.scale}")
+
+    @property
+    def code(self) -> int:
+        """The loss as the kernels know it."""
+        return _CODES[self.kind]
+
+    def noise_model(self, gaussian: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
+        """GTSAM noise model with this loss around a Gaussian one."""
+        estimators = gtsam.noiseModel.mEstimator
+        if self.kind == "none":
+            return gaussian
+        make = {
+            "huber": estimators.Huber,
+            "cauchy": estimators.Cauchy,
+            "geman_mcclure": estimators.GemanMcClure,
+        }[self.kind]
+        return gtsam.noiseModel.Robust.Create(make.Create(self.scale), gaussian)
+
+    def rho(self, squared: np.ndarray) -> np.ndarray:
+        """Loss (N,) of squared whitened residual norms (N,)."""
+        c2, norm = self.scale**2, np.sqrt(squared)
+        if self.kind == "huber":
+            return np.where(squared > c2, self.scale * (norm - 0.5 * self.scale), 0.5 * squared)
+        if self.kind == "cauchy":
+            return 0.5 * c2 * np.log1p(squared / c2)
+        if self.kind == "geman_mcclure":
+            return 0.5 * squared * c2 / (c2 + squared)
+        return 0.5 * squared

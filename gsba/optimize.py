@@ -1,0 +1,150 @@
+"""Levenberg-Marquardt over poses: native factors from a graph, batched blocks beside them."""
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors import Block
+from factors.reduced import ReducedSystem
+from gsba.config import SolverSettings
+from gsba.log import GsbaError
+
+logger = logging.getLogger(__name__)
+
+_MAX_DAMPING = 1e10
+_MIN_DAMPING = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class Iteration:
+    """One attempted step. Iteration 0 is the start."""
+
+    number: int
+    cost: float  # total robust cost of the attempt
+    costs: Mapping[str, float]  # family -> cost; empty where the step was rejected
+    damping: float  # lambda the step was solved with
+    accepted: bool
+    seconds: float  # wall time of this attempt
+
+
+@dataclass(frozen=True, slots=True)
+class OptimizeResult:
+    """Optimized variables and how they came about; landmarks are in their blocks."""
+
+    values: gtsam.Values
+    history: tuple[Iteration, ...]
+    converged: bool
+    reason: str  # why it stopped, one line
+
+    @property
+    def cost(self) -> float:
+        """Total robust cost of `values`."""
+        return next(step.cost for step in reversed(self.history) if step.accepted)
+
+
+def optimize(
+    graph: gtsam.NonlinearFactorGraph,
+    blocks: Sequence[Block],
+    values: gtsam.Values,
+    settings: SolverSettings | None = None,
+    callback: Callable[[Iteration, gtsam.Values], None] | None = None,
+) -> OptimizeResult:
+    """Minimize the cost of a graph and of blocks over all variables they name.
+
+    Args:
+        graph: native or user factors, on variables of any type.
+        blocks: batched factors on Pose3 variables; their landmarks move along.
+        values: start; variables that nothing constrains stay as they are.
+        callback: called with each attempt and the best values so far.
+
+    Returns:
+        The best values met. The blocks hold the landmarks that belong to them.
+
+    Raises:
+        GsbaError: the cost at the start is not finite.
+    """
+    settings = settings or SolverSettings()
+    for block in blocks:
+        block.refresh(values)
+    system = ReducedSystem(graph, blocks, values)
+    history: list[Iteration] = []
+
+    def record(number, cost, costs, damping, accepted, since) -> None:
+        step = Iteration(number, cost, costs, damping, accepted, time.perf_counter() - since)
+        history.append(step)
+        logger.debug("step %d: cost %.6g, lambda %.1e, %s", number, cost, damping, accepted)
+        if callback is not None:
+            callback(step, values)
+
+    since = time.perf_counter()
+    costs = system.linearize(values)
+    cost = sum(costs.values())
+    if not np.isfinite(cost):
+        bad = [name for name, part in costs.items() if not np.isfinite(part)]
+        raise GsbaError(f"the cost of {', '.join(bad)} is not finite at the start: check its input")
+    damping, growth = settings.lambda_initial, 2.0
+    record(0, cost, costs, damping, True, since)
+    for number in range(1, settings.max_iterations + 1):
+        since = time.perf_counter()
+        steps = system.solve(damping)
+        trial_cost = np.inf
+        if steps is not None:
+            trial = system.retract(values, steps)
+            trial_cost = system.propose(trial, steps)
+        predicted = system.predicted_decrease() if steps is not None else 0.0
+        if steps is None or not trial_cost <= cost:  # also where it is not a number
+            record(number, trial_cost, {}, damping, False, since)
+            if 0 <= predicted <= settings.relative_tolerance * cost and steps is not None:
+                return OptimizeResult(values, tuple(history), True, "no step decreases the cost")
+            damping *= growth
+            growth *= 2.0
+            if damping > _MAX_DAMPING:
+                return OptimizeResult(values, tuple(history), False, "no damping gives a good step")
+            continue
+        for block in blocks:
+            block.accept()
+            block.refresh(trial)
+        values, decrease, used = trial, cost - trial_cost, damping
+        ratio = decrease / predicted if predicted > 0 else 1.0
+        damping = max(damping * max(1 / 10, 1 - (2 * ratio - 1) ** 3), _MIN_DAMPING)
+        growth = 2.0
+        converged = decrease <= settings.relative_tolerance * cost
+        costs = system.costs(values) if converged else system.linearize(values)
+        cost = sum(costs.values())
+        record(number, cost, costs, used, True, since)
+        if converged:
+            reason = f"relative decrease below {settings.relative_tolerance:g}"
+            return OptimizeResult(values, tuple(history), True, reason)
+    return OptimizeResult(values, tuple(history), False, "iteration limit")
+
+
+def marginal_covariances(
+    graph: gtsam.NonlinearFactorGraph,
+    blocks: Sequence[Block],
+    values: gtsam.Values,
+    keys: Sequence[int],
+) -> np.ndarray:
+    """Marginal covariances of Pose3 variables from the reduced system at `values`.
+
+    Args:
+        keys: (F,) keys of Pose3 variables of the graph or a block.
+
+    Returns:
+        (F, 6, 6) float64, [rotation rad, translation], rig frame. NaN for a key that nothing
+        constrains, and for all where the system is singular (the gauge is not fixed).
+    """
+    system = ReducedSystem(graph, blocks, values)
+    system.linearize(values)
+    out = np.full((len(keys), 6, 6), np.nan)
+    inverse = system.inverse_diagonal()
+    if inverse is None:
+        return out
+    for covariance, key in zip(out, keys, strict=True):
+        block = system.first_block.get(key)
+        if block is not None:
+            covariance[:] = inverse[block]
+    return out
