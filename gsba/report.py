@@ -1,0 +1,234 @@
+"""What a run did and how good it is: report.json and poses.csv."""
+
+import csv
+import dataclasses
+import json
+import math
+import os
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from enum import Enum
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from gsba import __version__
+from gsba.geometry import inverse, quaternion_from_rotation
+from gsba.store import StageRecord, atomic_write
+from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
+
+_PACKAGES = ("gtsam", "numpy", "numba", "scipy", "opencv-python-headless", "pycolmap")
+_AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # of a pose covariance
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class FrameQuality:
+    """How well the images support each pose."""
+
+    num_observations: np.ndarray  # (F,) int64
+    median_residuals_deg: np.ndarray  # (F,) float64, degrees; NaN without observations
+    std_rotations_deg: np.ndarray  # (F, 3) float64, degrees, rig axes; NaN where unknown
+    std_translations: np.ndarray  # (F, 3) float64, map units, rig axes; NaN where unknown
+
+
+def frame_quality(reconstruction: Reconstruction) -> FrameQuality:
+    """Observations, angular residuals and standard deviations of every frame."""
+    frames = reconstruction.observation_frames
+    num_frames = len(reconstruction.world_T_rigs)
+    residuals = angular_residuals(reconstruction)
+    counts = np.bincount(frames, minlength=num_frames)
+    medians = np.full(num_frames, np.nan)
+    seen = counts > 0
+    ordered = residuals[np.lexsort((residuals, frames))]
+    starts = (np.cumsum(counts) - counts)[seen]
+    middles = ordered[starts + (counts[seen] - 1) // 2] + ordered[starts + counts[seen] // 2]
+    medians[seen] = np.degrees(middles / 2)
+    variances = np.diagonal(reconstruction.pose_covariances, axis1=1, axis2=2)
+    deviations = np.sqrt(np.where(variances >= 0, variances, np.nan))
+    return FrameQuality(counts, medians, np.degrees(deviations[:, :3]), deviations[:, 3:])
+
+
+def angular_residuals(reconstruction: Reconstruction) -> np.ndarray:
+    """Angles (O,) in radians between each observed bearing and the direction to its point."""
+    rig_T_worlds = inverse(reconstruction.world_T_rigs)[reconstruction.observation_frames]
+    points_world = reconstruction.points_world[reconstruction.observation_points]
+    points_rig = np.einsum("oij,oj->oi", rig_T_worlds[:, :3, :3], points_world)
+    points_rig += rig_T_worlds[:, :3, 3]
+    bearings = reconstruction.observation_bearings
+    across = np.linalg.norm(np.cross(bearings, points_rig), axis=1)
+    return np.arctan2(across, np.einsum("oi,oi->o", bearings, points_rig))
+
+
+def build_report(
+    *,
+    settings: BaseModel,
+    frames: FrameSet,
+    coarse: CoarsePoses,
+    reconstruction: Reconstruction,
+    stages: Iterable[StageRecord],
+    counts: Mapping[str, Sequence[Counts]],
+    solver: Sequence[object],
+    gauge: str,
+    notes: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Content of report.json: plain values only.
+
+    Args:
+        settings: as resolved.
+        stages: cost of each stage, in order.
+        counts: stage name -> what it received, kept and dropped.
+        solver: one record for each round, holding its iterations with their cost by family.
+        gauge: a sentence on where the refined map sits.
+        notes: what the user should know: frames without images, unmatched frames, ...
+    """
+    quality = frame_quality(reconstruction)
+    residuals = np.degrees(angular_residuals(reconstruction))
+    lengths = np.bincount(
+        reconstruction.observation_points, minlength=len(reconstruction.points_world)
+    )
+    summary = {
+        "frames": len(frames),
+        "refined": np.count_nonzero(reconstruction.pose_statuses == PoseStatus.REFINED),
+        "points": len(lengths),
+        "observations": len(residuals),
+        "mean_track_length": lengths.mean() if len(lengths) else math.nan,
+        "median_residual_deg": np.median(residuals) if len(residuals) else math.nan,
+    }
+    stage_rows = [
+        {**dataclasses.asdict(stage), "counts": counts.get(stage.name, ())} for stage in stages
+    ]
+    report = {
+        "gsba": __version__,
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        "summary": summary,
+        "gauge": gauge,
+        "notes": notes,
+        "stages": stage_rows,
+        "solver": solver,
+        "frames": _frame_rows(frames, coarse, reconstruction, quality),
+        "settings": settings,
+        "machine": _machine(),
+        "versions": {name: _version(name) for name in _PACKAGES},
+    }
+    return _plain(report)
+
+
+def write_report(path: Path, report: Mapping[str, Any]) -> None:
+    """Write a report as valid JSON, atomically."""
+    text = json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    atomic_write(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def write_poses(
+    path: Path, frames: FrameSet, coarse: CoarsePoses, reconstruction: Reconstruction
+) -> None:
+    """Write poses.csv: world_T_rig, its quality and its covariance for every frame.
+
+    Covariances are of the tangent [rotation (radians), translation (map units)] in the rig frame;
+    the upper triangle is written row by row. Cells of unknown values are empty.
+    """
+    quality = frame_quality(reconstruction)
+    rows, columns = np.triu_indices(6)
+    poses = reconstruction.world_T_rigs
+    wxyz = quaternion_from_rotation(poses[:, :3, :3])
+    numbers = np.hstack(
+        [
+            poses[:, :3, 3],
+            wxyz,
+            quality.std_rotations_deg,
+            quality.std_translations,
+            reconstruction.pose_covariances[:, rows, columns],
+        ]
+    )
+    header = ["frame", "timestamp", "status", "source", "num_observations", "median_residual_deg"]
+    header += ["tx", "ty", "tz", "qw", "qx", "qy", "qz"]
+    header += [f"std_{axis}_deg" for axis in _AXES[:3]] + [f"std_{axis}" for axis in _AXES[3:]]
+    header += [f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in zip(rows, columns, strict=True)]
+
+    def write(temporary: Path) -> None:
+        with temporary.open("w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file)
+            table.writerow(header)
+            for f, name in enumerate(frames.names):
+                status = PoseStatus(reconstruction.pose_statuses[f]).name.lower()
+                source = PoseSource(coarse.sources[f]).name.lower()
+                table.writerow(
+                    [name, repr(float(frames.timestamps[f])), status, source]
+                    + [int(quality.num_observations[f]), _cell(quality.median_residuals_deg[f])]
+                    + [_cell(value) for value in numbers[f]]
+                )
+
+    atomic_write(path, write)
+
+
+def _cell(value: float) -> str:
+    return f"{value:.12g}" if math.isfinite(value) else ""
+
+
+def _frame_rows(
+    frames: FrameSet, coarse: CoarsePoses, reconstruction: Reconstruction, quality: FrameQuality
+) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": name,
+            "status": PoseStatus(reconstruction.pose_statuses[f]).name.lower(),
+            "coarse_pose": PoseSource(coarse.sources[f]).name.lower(),
+            "observations": quality.num_observations[f],
+            "median_residual_deg": quality.median_residuals_deg[f],
+            "std_rotation_deg": np.linalg.norm(quality.std_rotations_deg[f]),
+            "std_translation": np.linalg.norm(quality.std_translations[f]),
+        }
+        for f, name in enumerate(frames.names)
+    ]
+
+
+def _machine() -> dict[str, Any]:
+    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return {
+        "platform": platform.platform(),
+        "processor": _processor(),
+        "cpus": len(os.sched_getaffinity(0)),
+        "memory_mb": round(pages / 2**20),
+        "python": platform.python_version(),
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _plain(value: Any) -> Any:
+    """Values JSON can hold; what is not finite becomes null."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {
+            entry.name: _plain(getattr(value, entry.name)) for entry in dataclasses.fields(value)
+        }
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
