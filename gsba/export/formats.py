@@ -1,0 +1,85 @@
+"""One door to every export format."""
+
+import logging
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+
+from gsba.export.folder import output_folder
+from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
+
+logger = logging.getLogger(__name__)
+
+
+class ExportFormat(StrEnum):
+    """What `export` can write; see the module of each for its layout and conventions."""
+
+    COLMAP = "colmap"  # rig of pinhole faces
+    COLMAP_FLAT = "colmap-flat"  # the same with unique base names, for splat trainers
+    COLMAP_ERP = "colmap-erp"  # one equirectangular camera
+    NERFSTUDIO = "nerfstudio"  # transforms.json: pinhole faces, and panoramas
+    PLY = "ply"  # points3D.ply, the start cloud of splat trainers
+    TUM = "tum"  # trajectory.tum
+
+
+def export(
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    out: Path,
+    to: ExportFormat,
+    face_size: int | None = None,
+) -> None:
+    """Write a reconstruction in another program's format, all frames of it.
+
+    Args:
+        reconstruction: poses and cloud; keeps its world and scale in every format but
+            nerfstudio's, whose `applied_transform` states the turn.
+        frames: the frames it was made from, still on disk.
+        out: folder to write; an earlier export there is replaced, anything else refused.
+        to: the format.
+        face_size: pixels of a cube face; None = see `gsba.export.images.face_size_for`.
+
+    Raises:
+        GsbaError: `out` is in use, the format does not fit the frames, or the disk refuses;
+            nothing is left behind then.
+    """
+    unrefined = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
+    if len(unrefined):
+        names = ", ".join(frames.names[f] for f in unrefined[:5])
+        more = ", ..." if len(unrefined) > 5 else ""
+        logger.warning("%d frames go out with unrefined poses: %s%s", len(unrefined), names, more)
+    with output_folder(out, to.value) as partial:
+        _write(partial, reconstruction, frames, to, face_size)
+    logger.info(
+        "%s: %d frames, %d points, in %s", to, len(frames), len(reconstruction.points_world), out
+    )
+
+
+def _write(
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    to: ExportFormat,
+    face_size: int | None,
+) -> None:
+    from gsba.export import colmap, nerfstudio, ply
+
+    match to:
+        case ExportFormat.COLMAP:
+            colmap.write_colmap(partial, reconstruction, frames, face_size)
+        case ExportFormat.COLMAP_FLAT:
+            colmap.write_colmap_flat(partial, reconstruction, frames, face_size)
+        case ExportFormat.COLMAP_ERP:
+            colmap.write_colmap_erp(partial, reconstruction, frames)
+        case ExportFormat.NERFSTUDIO:
+            nerfstudio.write_nerfstudio(partial, reconstruction, frames, face_size)
+        case ExportFormat.PLY:
+            ply.write_splat_points(
+                partial / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
+            )
+        case ExportFormat.TUM:
+            from gsba.read import write_tum
+
+            trajectory = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
+            write_tum(partial / "trajectory.tum", trajectory)

@@ -1,0 +1,142 @@
+"""Images and masks of an export, one frame in memory at a time.
+
+Faces are cut with bicubic sampling, low-passed first where they are much coarser than the
+panorama. They are written as PNG where the frame is PNG, else as JPEG of quality 95. Images that
+leave unchanged (panoramas; faces that came as faces of the same size) are hard links where the
+file system allows it, else copies, so that an export stays whole when it is moved.
+"""
+
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gsba.log import GsbaError, track
+from gsba.read import load_erp, load_faces, load_mask
+from gsba.rig import CubeRig
+from gsba.types import FACES, FrameSet
+
+JPEG_QUALITY = 95
+MIN_FACE_SIZE = 16  # pixels
+
+
+def face_size_for(frames: FrameSet, face_size: int | None) -> int:
+    """Pixels of an exported face: as asked, else as many around the horizon as the frame has.
+
+    That is a quarter of a panorama's width, rounded to an even number: the mean resolution is
+    kept (a face centre is sampled 1.27 times coarser than the panorama, an edge 1.57 times
+    finer). Frames that come as faces keep their size.
+    """
+    if face_size is None:
+        return frames.width if frames.layout == "cube" else 2 * round(frames.width / 8)
+    if face_size < MIN_FACE_SIZE:
+        raise GsbaError(f"face size {face_size} is too small: use {MIN_FACE_SIZE} pixels or more")
+    return face_size
+
+
+def suffix_of(frames: FrameSet, f: int) -> str:
+    """Suffix of the exported images of a frame: that of the input, JPEG for what is not PNG."""
+    suffix = frames.paths[f][0].suffix
+    return suffix if suffix.lower() in (".jpg", ".jpeg", ".png") else ".jpg"
+
+
+def has_masks(frames: FrameSet) -> bool:
+    """Whether any frame has a mask; then every exported image gets one."""
+    return any(path is not None for path in frames.mask_paths)
+
+
+def write_faces(
+    frames: FrameSet,
+    size: int,
+    image_path: Callable[[int, str], Path],
+    mask_path: Callable[[int, str], Path],
+) -> None:
+    """Write every face of every frame, and its mask where the frames have masks.
+
+    Args:
+        frames: panoramas, or faces of which the missing ones stay missing.
+        size: pixels of a face; its field of view is 90 degrees.
+        image_path: file of the image, by frame index and face name.
+        mask_path: file of the mask (PNG, 0 = ignore, 255 = use).
+    """
+    rig = CubeRig(size, np.pi / 2)
+    for f in track(range(len(frames)), "cutting faces"):
+        faces = frames.faces or FACES
+        paths = [image_path(f, face) for face in faces]
+        if frames.layout == "erp":
+            from gsba.cubemap import cut
+
+            _write_all(paths, cut(load_erp(frames, f), rig))
+        elif size == frames.width and all(
+            source.suffix == path.suffix
+            for source, path in zip(frames.paths[f], paths, strict=True)
+        ):
+            for source, path in zip(frames.paths[f], paths, strict=True):
+                link_or_copy(source, path)
+        else:
+            _write_all(paths, _resized(load_faces(frames, f), size))
+        if has_masks(frames):
+            _write_face_masks(frames, f, rig, [mask_path(f, face) for face in faces], faces)
+
+
+def write_panoramas(
+    frames: FrameSet, image_path: Callable[[int], Path], mask_path: Callable[[int], Path]
+) -> None:
+    """Link or copy every panorama, and write its mask where the frames have masks.
+
+    Args:
+        frames: panoramas.
+        image_path: file of the image, by frame index.
+        mask_path: file of the mask (PNG, 0 = ignore, 255 = use).
+    """
+    for f in track(range(len(frames)), "copying panoramas"):
+        link_or_copy(frames.paths[f][0], image_path(f))
+        if has_masks(frames):
+            mask = load_mask(frames, f)
+            if mask is None:
+                mask = np.ones((frames.height, frames.width), bool)
+            write_image(mask_path(f), mask.astype(np.uint8) * 255)
+
+
+def link_or_copy(source: Path, path: Path) -> None:
+    """Give `path` the content of `source`, without a second copy on disk where that is possible."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source.resolve(), path)
+    except OSError:
+        shutil.copyfile(source, path)
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Encode (H, W, 3) RGB or (H, W) uint8 by the suffix of `path`."""
+    import cv2
+
+    options = [] if path.suffix.lower() == ".png" else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    pixels = image[..., ::-1] if image.ndim == 3 else image
+    encoded = cv2.imencode(path.suffix, np.ascontiguousarray(pixels), options)[1]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(encoded.tobytes())
+
+
+def _write_all(paths: Sequence[Path], images: np.ndarray) -> None:
+    for path, image in zip(paths, images, strict=True):
+        write_image(path, image)
+
+
+def _write_face_masks(
+    frames: FrameSet, f: int, rig: CubeRig, paths: Sequence[Path], faces: Sequence[str]
+) -> None:
+    from gsba.cubemap import cut_mask
+
+    mask = load_mask(frames, f)
+    use = np.ones((len(FACES), rig.size, rig.size), bool) if mask is None else cut_mask(mask, rig)
+    _write_all(paths, use[[FACES.index(face) for face in faces]].astype(np.uint8) * 255)
+
+
+def _resized(faces: np.ndarray, size: int) -> np.ndarray:
+    import cv2
+
+    how = cv2.INTER_AREA if size < faces[0].shape[0] else cv2.INTER_CUBIC
+    return np.stack([cv2.resize(face, (size, size), interpolation=how) for face in faces])

@@ -1,0 +1,150 @@
+"""A small scene with known poses, points and pictures, for the export tests."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gsba.export.images import write_image
+from gsba.geometry import bearings_from_erp, inverse, pose
+from gsba.rig import RIG_R_FACE
+from gsba.types import FACES, FrameSet, PoseStatus, Reconstruction
+
+NUM_FRAMES = 9
+WIDTH, HEIGHT = 512, 256
+BLOB_RAD = 0.025  # spread of a point's picture; a panorama's pixel is 0.012
+
+# One point around each axis, one each behind (on both sides of the seam) and at face edges.
+POINTS = np.array(
+    [
+        [0.3, 0.2, 5.0],
+        [5.0, -0.4, 0.5],
+        [-0.7, 0.5, -5.0],
+        [-5.0, -0.2, 0.6],
+        [0.6, -5.0, 0.4],
+        [-0.5, 5.0, -0.3],
+        [0.1, -1.5, -5.0],
+        [3.6, 1.0, 3.5],
+        [-3.4, -0.8, 3.6],
+    ]
+)
+COLORS = np.array(
+    [[255, 60, 60], [60, 255, 60], [60, 60, 255], [255, 255, 60], [60, 255, 255]] * 2, np.uint8
+)[: len(POINTS)]
+
+
+def poses() -> np.ndarray:
+    """World_T_rig of the frames: a short walk, turning a little; frame 0 is the world itself."""
+    rng = np.random.default_rng(0)
+    rotations = Rotation.from_rotvec(rng.normal(0, 0.08, (NUM_FRAMES, 3))).as_matrix()
+    positions = rng.normal(0, 0.2, (NUM_FRAMES, 3))
+    world_T_rigs = pose(rotations, positions)
+    world_T_rigs[0] = np.eye(4)
+    return world_T_rigs
+
+
+def bearings(world_T_rigs: np.ndarray) -> np.ndarray:
+    """Bearings (F, J, 3) of POINTS in each rig frame."""
+    homogeneous = np.column_stack([POINTS, np.ones(len(POINTS))])
+    local = np.einsum("fij,pj->fpi", inverse(world_T_rigs)[:, :3], homogeneous)
+    return local / np.linalg.norm(local, axis=-1, keepdims=True)
+
+
+def reconstruction() -> Reconstruction:
+    """Every point seen in every frame, without error."""
+    world_T_rigs = poses()
+    seen = np.swapaxes(bearings(world_T_rigs), 0, 1).reshape(-1, 3)  # by point, then frame
+    num_points = len(POINTS)
+    return Reconstruction(
+        world_T_rigs=world_T_rigs,
+        pose_covariances=np.full((NUM_FRAMES, 6, 6), np.nan),
+        pose_statuses=np.full(NUM_FRAMES, PoseStatus.REFINED, np.uint8),
+        points_world=POINTS,
+        point_colors=COLORS,
+        point_errors=np.linspace(0, 0.01, num_points),
+        observation_points=np.repeat(np.arange(num_points, dtype=np.int32), NUM_FRAMES),
+        observation_frames=np.tile(np.arange(NUM_FRAMES, dtype=np.int32), num_points),
+        observation_bearings=seen,
+        observation_sigmas=np.full(len(seen), 1e-3),
+    )
+
+
+def picture(directions: np.ndarray, point_bearings: np.ndarray) -> np.ndarray:
+    """Image (..., 3) uint8 with a soft blob of each point's colour, along directions (..., 3)."""
+    image = np.full((*directions.shape[:-1], 3), 30.0)
+    for bearing, color in zip(point_bearings, COLORS, strict=True):
+        chord = np.linalg.norm(directions - bearing, axis=-1, keepdims=True)
+        weight = np.exp(-0.5 * np.square(chord / BLOB_RAD))
+        image = image * (1 - weight) + color * weight
+    return np.round(image).astype(np.uint8)
+
+
+def _grid(width: int, height: int) -> np.ndarray:
+    return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+
+
+def panoramas(folder: Path, suffix: str = ".png", masked: bool = False) -> FrameSet:
+    """Write the panoramas, and masks that hide the lower fifth of the sphere."""
+    names = tuple(f"frame_{f:04d}" for f in range(NUM_FRAMES))
+    directions = bearings_from_erp(_grid(WIDTH, HEIGHT), WIDTH, HEIGHT)
+    for name, seen in zip(names, bearings(poses()), strict=True):
+        write_image(folder / f"{name}{suffix}", picture(directions, seen))
+    mask_path = None
+    if masked:
+        mask_path = folder.parent / "mask.png"
+        cv2.imwrite(str(mask_path), (directions[..., 1] < 0.6).astype(np.uint8) * 255)
+    return FrameSet(
+        names=names,
+        paths=tuple((folder / f"{name}{suffix}",) for name in names),
+        timestamps=np.arange(NUM_FRAMES) * 0.5,
+        layout="erp",
+        faces=(),
+        width=WIDTH,
+        height=HEIGHT,
+        mask_paths=(mask_path,) * NUM_FRAMES,
+    )
+
+
+def cube_frames(folder: Path, size: int = 128) -> FrameSet:
+    """Write faces without up and down."""
+    faces = ("front", "right", "back", "left")
+    names = tuple(f"frame_{f:04d}" for f in range(NUM_FRAMES))
+    rays = np.concatenate([_grid(size, size) / (size / 2) - 1, np.ones((size, size, 1))], axis=-1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    for name, seen in zip(names, bearings(poses()), strict=True):
+        for face in faces:
+            directions = rays @ RIG_R_FACE[FACES.index(face)].T
+            write_image(folder / face / f"{name}.png", picture(directions, seen))
+    return FrameSet(
+        names=names,
+        paths=tuple(tuple(folder / face / f"{name}.png" for face in faces) for name in names),
+        timestamps=np.arange(NUM_FRAMES) * 0.5,
+        layout="cube",
+        faces=faces,
+        width=size,
+        height=size,
+        mask_paths=(None,) * NUM_FRAMES,
+    )
+
+
+def assert_blob(image: np.ndarray, pixel: np.ndarray, color: np.ndarray) -> bool:
+    """Check that a blob of this RGB colour is centred within 0.5 px of `pixel`, corner origin.
+
+    Returns whether there was anything to check: False where the blob is cut by the border.
+    Half a pixel holds interpolation, rounding to 8 bits and the perspective of a blob's spread.
+    """
+    reach = int(np.ceil(4 * BLOB_RAD * image.shape[0] / 2))
+    column, row = np.floor(pixel).astype(int)
+    if min(row, column) < reach or max(row, column) >= image.shape[0] - reach:
+        return False
+    window = image[row - reach : row + reach + 1, column - reach : column + reach + 1]
+    contrast = np.abs(window.astype(float) - 30).sum(axis=-1)
+    contrast[contrast < 0.2 * contrast.max()] = 0
+    rows, columns = np.mgrid[-reach : reach + 1, -reach : reach + 1] + 0.5
+    centre = [(contrast * columns).sum(), (contrast * rows).sum()] / contrast.sum()
+    assert np.linalg.norm(centre + np.array([column, row]) - pixel) < 0.5
+    tints = np.array([image[row, column], color]) - 30.0
+    tints /= np.linalg.norm(tints, axis=1, keepdims=True)
+    assert tints[0] @ tints[1] > 0.8  # JPEG blurs chroma; 0.6 or less for any other colour
+    return True

@@ -1,0 +1,159 @@
+"""What an export leaves on disk: point clouds, trajectories, and nothing half-written."""
+
+import errno
+import os
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from export_scene import COLORS, NUM_FRAMES, POINTS, panoramas, reconstruction
+from plyfile import PlyData
+
+from gsba.export import ExportFormat, export, write_points
+from gsba.export.images import face_size_for
+from gsba.log import GsbaError
+from gsba.read import read_trajectory
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    return panoramas(tmp_path_factory.mktemp("scene") / "frames", ".jpg")
+
+
+def _entries(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_the_runs_cloud_states_colour_error_and_track_length(tmp_path):
+    scene = reconstruction()
+    write_points(tmp_path / "points.ply", scene)
+    vertex = PlyData.read(tmp_path / "points.ply")["vertex"]
+    assert np.allclose(np.column_stack([vertex["x"], vertex["y"], vertex["z"]]), POINTS, atol=1e-6)
+    assert np.array_equal(np.column_stack([vertex["red"], vertex["green"], vertex["blue"]]), COLORS)
+    assert np.allclose(vertex["error_deg"], np.degrees(scene.point_errors), rtol=1e-6)
+    assert vertex["track_length"].tolist() == [NUM_FRAMES] * len(POINTS)
+    assert _entries(tmp_path) == ["points.ply"]
+
+
+def test_the_start_cloud_is_inrias(tmp_path, frames):
+    export(reconstruction(), frames, tmp_path / "out", ExportFormat.PLY)
+    cloud = PlyData.read(tmp_path / "out" / "points3D.ply")
+    assert not cloud.text and cloud.byte_order == "<"
+    kinds = [(p.name, p.val_dtype) for p in cloud["vertex"].properties]
+    assert kinds == [
+        *((name, "f4") for name in ("x", "y", "z", "nx", "ny", "nz")),
+        *((name, "u1") for name in ("red", "green", "blue")),
+    ]
+    assert not np.any(cloud["vertex"]["nx"])
+
+
+def test_the_trajectory_is_read_back(tmp_path, frames):
+    export(reconstruction(), frames, tmp_path / "out", ExportFormat.TUM)
+    trajectory = read_trajectory(tmp_path / "out" / "trajectory.tum")
+    assert np.array_equal(trajectory.timestamps, frames.timestamps)
+    assert np.allclose(trajectory.world_T_rigs, reconstruction().world_T_rigs, atol=1e-12)
+
+
+def test_jpeg_frames_give_jpeg_faces_and_panoramas_are_not_encoded_again(tmp_path, frames):
+    export(reconstruction(), frames, tmp_path / "faces", ExportFormat.COLMAP)
+    faces = list((tmp_path / "faces" / "images" / "front").iterdir())
+    assert len(faces) == NUM_FRAMES and all(path.suffix == ".jpg" for path in faces)
+    assert cv2.imread(str(faces[0])).shape == (128, 128, 3)
+    assert not (tmp_path / "faces" / "masks").exists()
+
+
+def test_panoramas_are_copied_where_they_cannot_be_linked(tmp_path, frames, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.EXDEV, "other file system")
+
+    monkeypatch.setattr(os, "link", refuse)
+    export(reconstruction(), frames, tmp_path / "out", ExportFormat.COLMAP_ERP)
+    for (path,) in frames.paths:
+        copied = tmp_path / "out" / "images" / path.name
+        assert copied.read_bytes() == path.read_bytes() and not copied.is_symlink()
+
+
+def test_face_size_defaults_to_a_quarter_and_is_even(frames):
+    assert face_size_for(frames, None) == 128
+    assert face_size_for(frames, 77) == 77
+    with pytest.raises(GsbaError, match="face size 8"):
+        face_size_for(frames, 8)
+
+
+@pytest.mark.parametrize("to", ["colmap", "colmap-flat", "nerfstudio"])
+@pytest.mark.parametrize(
+    ("failure", "raised"),
+    [
+        (KeyboardInterrupt(), KeyboardInterrupt),
+        (OSError(errno.ENOSPC, "No space left on device"), GsbaError),
+    ],
+)
+def test_an_interrupted_export_leaves_nothing_and_keeps_the_last(
+    tmp_path, frames, monkeypatch, to, failure, raised
+):
+    from gsba.export import images
+
+    written = []
+
+    def write(path, image):
+        if len(written) == 20:
+            raise failure
+        written.append(path)
+        return whole(path, image)
+
+    whole = images.write_image
+    monkeypatch.setattr(images, "write_image", write)
+    with pytest.raises(raised):
+        export(reconstruction(), frames, tmp_path / "out", ExportFormat(to))
+    assert _entries(tmp_path) == []
+    export(reconstruction(), frames, tmp_path / "out", ExportFormat.PLY)
+    with pytest.raises(raised):
+        export(reconstruction(), frames, tmp_path / "out", ExportFormat(to))
+    assert _entries(tmp_path) == ["out"]
+    assert (tmp_path / "out" / "points3D.ply").exists()
+
+
+def test_an_earlier_export_is_replaced(tmp_path, frames):
+    export(reconstruction(), frames, tmp_path / "out", ExportFormat.TUM)
+    export(reconstruction(), frames, tmp_path / "out", ExportFormat.PLY)
+    assert _entries(tmp_path / "out") == ["export.json", "points3D.ply"]
+    assert _entries(tmp_path) == ["out"]
+
+
+def test_an_empty_folder_is_used(tmp_path, frames):
+    (tmp_path / "out").mkdir()
+    export(reconstruction(), frames, tmp_path / "out", ExportFormat.TUM)
+    assert _entries(tmp_path / "out") == ["export.json", "trajectory.tum"]
+
+
+def test_what_others_wrote_is_refused_and_kept(tmp_path, frames):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "thesis.tex").write_text("years of work")
+    with pytest.raises(GsbaError, match=r"no export but 'thesis.tex'"):
+        export(reconstruction(), frames, folder, ExportFormat.TUM)
+    assert _entries(folder) == ["thesis.tex"]
+    file = tmp_path / "file"
+    file.write_text("x")
+    with pytest.raises(GsbaError, match="is a file"):
+        export(reconstruction(), frames, file, ExportFormat.TUM)
+    assert file.read_text() == "x" and _entries(tmp_path) == ["file", "out"]
+
+
+def test_a_training_beside_an_earlier_export_is_refused_and_kept(tmp_path, frames):
+    export(reconstruction(), frames, tmp_path / "out", ExportFormat.PLY)
+    (tmp_path / "out" / "output").mkdir()
+    with pytest.raises(GsbaError, match="an export and 'output'"):
+        export(reconstruction(), frames, tmp_path / "out", ExportFormat.PLY)
+    assert _entries(tmp_path / "out") == ["export.json", "output", "points3D.ply"]
+
+
+def test_what_a_killed_export_left_is_removed(tmp_path, frames):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    for pid in (gone.pid, os.getppid()):  # the latter is alive: its export may be running
+        (tmp_path / f".out.partial-{pid}").mkdir()
+    export(reconstruction(), frames, tmp_path / "out", ExportFormat.TUM)
+    assert _entries(tmp_path) == [f".out.partial-{os.getppid()}", "out"]
