@@ -52,6 +52,27 @@ def frame_quality(reconstruction: Reconstruction) -> FrameQuality:
     return FrameQuality(counts, medians, np.degrees(deviations[:, :3]), deviations[:, 3:])
 
 
+def median_residual_deg(reconstruction: Reconstruction, world_T_rigs: np.ndarray) -> float:
+    """Median angular residual in degrees that the same observations leave under other poses.
+
+    Each point is placed anew, nearest to the rays of its observations. NaN without observations.
+    """
+    frames, points = reconstruction.observation_frames, reconstruction.observation_points
+    if len(frames) == 0:
+        return math.nan
+    rotations, centres = world_T_rigs[frames, :3, :3], world_T_rigs[frames, :3, 3]
+    rays = np.einsum("oij,oj->oi", rotations, reconstruction.observation_bearings)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # off the ray
+    shape = len(reconstruction.points_world)
+    normal, target = np.zeros((shape, 3, 3)), np.zeros((shape, 3))
+    np.add.at(normal, points, across)
+    np.add.at(target, points, np.einsum("oij,oj->oi", across, centres))
+    normal += 1e-9 * np.eye(3)  # parallel rays leave the depth open
+    placed = np.linalg.solve(normal, target[..., None])[..., 0]
+    moved = dataclasses.replace(reconstruction, world_T_rigs=world_T_rigs, points_world=placed)
+    return float(np.degrees(np.median(angular_residuals(moved))))
+
+
 def angular_residuals(reconstruction: Reconstruction) -> np.ndarray:
     """Angles (O,) in radians between each observed bearing and the direction to its point."""
     rig_T_worlds = inverse(reconstruction.world_T_rigs)[reconstruction.observation_frames]
@@ -97,6 +118,7 @@ def build_report(
         "observations": len(residuals),
         "mean_track_length": lengths.mean() if len(lengths) else math.nan,
         "median_residual_deg": np.median(residuals) if len(residuals) else math.nan,
+        "median_residual_deg_coarse": median_residual_deg(reconstruction, coarse.world_T_rigs),
     }
     stage_rows = [
         {**dataclasses.asdict(stage), "counts": counts.get(stage.name, ())} for stage in stages
