@@ -1,0 +1,140 @@
+"""report.json and poses.csv of a small world whose numbers are known."""
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsba.config import RefineSettings
+from gsba.geometry import inverse, pose, rotation_from_quaternion
+from gsba.report import build_report, frame_quality, median_residual_deg, write_poses, write_report
+from gsba.store import StageRecord
+from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
+
+NUM_FRAMES, NUM_POINTS, ERROR_DEG = 4, 20, 0.25
+
+
+@dataclass(frozen=True)
+class _Iteration:
+    costs: dict[str, float]
+    damping: float
+
+
+def _world() -> tuple[FrameSet, CoarsePoses, Reconstruction]:
+    """Frames 0..2 see all points, each bearing off by ERROR_DEG; frame 3 sees nothing."""
+    rng = np.random.default_rng(1)
+    wxyz = rng.normal(size=(NUM_FRAMES, 4))
+    wxyz /= np.linalg.norm(wxyz, axis=1, keepdims=True)
+    world_T_rigs = pose(rotation_from_quaternion(wxyz), rng.normal(size=(NUM_FRAMES, 3)))
+    points_world = 5 * rng.normal(size=(NUM_POINTS, 3))
+    observation_points = np.repeat(np.arange(NUM_POINTS), 3)
+    observation_frames = np.tile(np.arange(3), NUM_POINTS)
+    rig_T_worlds = inverse(world_T_rigs)[observation_frames]
+    points_rig = np.einsum("oij,oj->oi", rig_T_worlds[:, :3, :3], points_world[observation_points])
+    bearings = points_rig + rig_T_worlds[:, :3, 3]
+    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    sideways = np.cross(bearings, rng.normal(size=bearings.shape))
+    sideways /= np.linalg.norm(sideways, axis=1, keepdims=True)
+    angle = np.radians(ERROR_DEG)
+    covariances = np.tile(np.diag([1e-6, 4e-6, 9e-6, 1.0, 4.0, 9.0]), (NUM_FRAMES, 1, 1))
+    covariances[3] = np.nan
+    reconstruction = Reconstruction(
+        world_T_rigs=world_T_rigs,
+        pose_covariances=covariances,
+        pose_statuses=np.array([0, 0, 0, PoseStatus.UNREFINED], np.uint8),
+        points_world=points_world,
+        point_colors=np.zeros((NUM_POINTS, 3), np.uint8),
+        point_errors=np.full(NUM_POINTS, angle),
+        observation_points=observation_points.astype(np.int32),
+        observation_frames=observation_frames.astype(np.int32),
+        observation_bearings=np.cos(angle) * bearings + np.sin(angle) * sideways,
+        observation_sigmas=np.full(len(bearings), 1e-3),
+    )
+    names = tuple(f"{f:03d}, ä" for f in range(NUM_FRAMES))
+    frames = FrameSet(
+        names=names,
+        paths=tuple((Path(name),) for name in names),
+        timestamps=np.arange(NUM_FRAMES) / 3,
+        layout="erp",
+        faces=(),
+        width=64,
+        height=32,
+        mask_paths=(None,) * NUM_FRAMES,
+    )
+    sources = np.array([0, PoseSource.INTERPOLATED, 0, 0], np.uint8)
+    return frames, CoarsePoses(world_T_rigs, sources, 0.0), reconstruction
+
+
+def test_quality_of_frames() -> None:
+    quality = frame_quality(_world()[2])
+    np.testing.assert_array_equal(quality.num_observations, [NUM_POINTS] * 3 + [0])
+    np.testing.assert_allclose(quality.median_residuals_deg, [ERROR_DEG] * 3 + [np.nan], rtol=1e-9)
+    np.testing.assert_allclose(quality.std_rotations_deg[0], np.degrees([1e-3, 2e-3, 3e-3]))
+    np.testing.assert_allclose(quality.std_translations[0], [1, 2, 3])
+    assert np.isnan(quality.std_translations[3]).all()
+
+
+def test_residual_under_other_poses_places_the_points_anew() -> None:
+    _, coarse, reconstruction = _world()
+    same = median_residual_deg(reconstruction, coarse.world_T_rigs)
+    assert 0 < same < ERROR_DEG  # each point absorbs a part of the errors of its three rays
+    moved = coarse.world_T_rigs.copy()
+    moved[:, :3, 3] = 3 * moved[:, :3, 3] + 1  # a similarity changes nothing
+    assert median_residual_deg(reconstruction, moved) == pytest.approx(same, abs=1e-6)
+    moved[1, :3, 3] += 2.0
+    assert median_residual_deg(reconstruction, moved) > 10 * same
+
+
+def test_report_is_valid_json(tmp_path: Path) -> None:
+    frames, coarse, reconstruction = _world()
+    stage = StageRecord("verify", "key", False, 1.5, 2.5, 300.0)
+    report = build_report(
+        settings=RefineSettings(),
+        frames=frames,
+        coarse=coarse,
+        reconstruction=reconstruction,
+        stages=[stage],
+        counts={"verify": [Counts(10, 7, "pairs", {"too few inliers": 3})]},
+        solver=[(_Iteration({"bearing": np.float64(2.0), "priors": np.nan}, 1e-4),)],
+        gauge="the world and scale of the trajectory",
+    )
+    write_report(tmp_path / "report.json", report)
+    text = (tmp_path / "report.json").read_text(encoding="utf-8")
+    back = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert back["summary"]["refined"] == 3 and back["summary"]["frames"] == 4
+    assert back["summary"]["median_residual_deg"] == pytest.approx(ERROR_DEG)
+    assert back["stages"][0]["seconds"] == 1.5
+    assert back["stages"][0]["counts"][0]["dropped"] == {"too few inliers": 3}
+    assert back["solver"][0][0]["costs"] == {"bearing": 2.0, "priors": None}
+    assert back["frames"][3] == {
+        "name": "003, ä",
+        "status": "unrefined",
+        "coarse_pose": "slam",
+        "observations": 0,
+        "median_residual_deg": None,
+        "std_rotation_deg": None,
+        "std_translation": None,
+    }
+    assert back["settings"]["features"]["extractor"] == "sift"
+
+
+def test_poses_read_back(tmp_path: Path) -> None:
+    frames, coarse, reconstruction = _world()
+    write_poses(tmp_path / "poses.csv", frames, coarse, reconstruction)
+    with (tmp_path / "poses.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["frame"] for row in rows] == list(frames.names)
+    assert [float(row["timestamp"]) for row in rows] == list(frames.timestamps)
+    wxyz = np.array([[float(row[f"q{axis}"]) for axis in "wxyz"] for row in rows])
+    # 12 digits are written
+    np.testing.assert_allclose(
+        rotation_from_quaternion(wxyz), reconstruction.world_T_rigs[:, :3, :3], atol=1e-11
+    )
+    assert rows[1]["source"] == "interpolated" and rows[3]["status"] == "unrefined"
+    assert float(rows[0]["cov_tz_tz"]) == 9.0 and float(rows[0]["cov_rx_ty"]) == 0.0
+    assert float(rows[0]["std_tz"]) == 3.0
+    assert rows[3]["cov_rx_rx"] == "" and rows[3]["median_residual_deg"] == ""
+    assert sum(name.startswith("cov_") for name in rows[0]) == 21
