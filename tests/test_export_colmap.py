@@ -235,6 +235,28 @@ def test_a_rig_without_front_face_hangs_on_its_first(tmp_path):
         assert np.abs(image.project_point(point.xyz) - point2D.xy).max() < 1e-6
 
 
+def test_masks_of_captured_faces_are_cut_from_their_panorama(tmp_path):
+    frames = cube_frames(tmp_path / "frames", 32)
+    mask = np.full((64, 128), 255, np.uint8)
+    mask[:, :32] = mask[:, -32:] = 0  # the half that lies behind
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    frames = replace(frames, mask_paths=(tmp_path / "mask.png",) * NUM_FRAMES)
+    scene = replace(
+        reconstruction(),
+        observation_points=np.empty(0, np.int32),
+        observation_frames=np.empty(0, np.int32),
+        observation_bearings=np.empty((0, 3)),
+    )
+    export(scene, frames, tmp_path / "out", ExportFormat.COLMAP)
+    folder = tmp_path / "out" / "masks"
+    values = {
+        face: cv2.imread(str(folder / face / "frame_0000.png.png"), -1) for face in frames.faces
+    }
+    assert sorted(path.name for path in folder.iterdir()) == sorted(frames.faces)
+    assert values["front"].min() == 255 and values["back"].max() == 0
+    assert (values["right"][:, :15] == 255).all() and (values["right"][:, 17:] == 0).all()
+
+
 def test_cube_frames_have_no_equirectangular_export(tmp_path):
     frames = cube_frames(tmp_path / "frames", 32)
     with pytest.raises(GsbaError, match="use colmap"):

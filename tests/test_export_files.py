@@ -75,6 +75,22 @@ def test_panoramas_are_copied_where_they_cannot_be_linked(tmp_path, frames, monk
         assert copied.read_bytes() == path.read_bytes() and not copied.is_symlink()
 
 
+def test_a_panorama_that_is_gone_is_named(tmp_path):
+    frames = panoramas(tmp_path / "frames")
+    frames.paths[4][0].unlink()
+    with pytest.raises(GsbaError, match=r"frame_0004.png: is gone"):
+        export(reconstruction(), frames, tmp_path / "out", ExportFormat.COLMAP_ERP)
+    assert _entries(tmp_path) == ["frames"]
+
+
+def test_a_link_to_an_earlier_export_stays_a_link(tmp_path, frames):
+    export(reconstruction(), frames, tmp_path / "real", ExportFormat.TUM)
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    export(reconstruction(), frames, tmp_path / "link", ExportFormat.PLY)
+    assert _entries(tmp_path) == ["link", "real"] and (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / "points3D.ply").exists()
+
+
 def test_face_size_defaults_to_a_quarter_and_is_even(frames):
     assert face_size_for(frames, None) == 128
     assert face_size_for(frames, 77) == 77

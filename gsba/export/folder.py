@@ -27,7 +27,7 @@ def output_folder(out: Path, to: str) -> Iterator[Path]:
     Raises:
         GsbaError: `out` is something else than an earlier export, or the disk refuses.
     """
-    out = out.absolute()
+    out = out.resolve()
     with disk_errors(out):
         _require_replaceable(out)
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -101,7 +101,13 @@ def write_panoramas(
 
 
 def link_or_copy(source: Path, path: Path) -> None:
-    """Give `path` the content of `source`, without a second copy on disk where that is possible."""
+    """Give `path` the content of `source`, without a second copy on disk where that is possible.
+
+    Raises:
+        GsbaError: `source` is gone.
+    """
+    if not source.is_file():
+        raise GsbaError(f"{source}: is gone; it was there when the run began")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(source.resolve(), path)
