@@ -113,13 +113,14 @@ def refine(
     fresh: Annotated[bool, typer.Option("--fresh", help="Replace an earlier run.")] = False,
 ) -> None:
     """Refine the pose of every frame; the same call again resumes."""
+    settings = _settings(config, overrides, factors)
     from gsba import pipeline
 
     pipeline.refine(
         frames,
         trajectory,
         out,
-        _settings(config, overrides, factors),
+        settings,
         masks=masks,
         timestamps=timestamps,
         fps=fps,
@@ -149,13 +150,14 @@ def export(
     """Write a finished run as a dataset for another program."""
     from gsba.export import ExportFormat
     from gsba.export import export as write
-    from gsba.pipeline import load_run
     from gsba.run_folder import claim
 
     if to not in list(ExportFormat):
         raise GsbaError(f"--to {to} is not known: use one of {', '.join(ExportFormat)}")
     if face_size is not None and face_size < 1:
         raise GsbaError(f"--face-size {face_size} is out of range: use 1 or more pixels")
+    from gsba.pipeline import load_run
+
     reconstruction, frames, *_ = load_run(run)
     folder = out or run / to
     write(reconstruction, frames, folder, ExportFormat(to), face_size)
@@ -184,6 +186,41 @@ def evaluate(
         text = json.dumps(errors.to_json(), indent=1) + "\n"
         atomic_write(json_file, lambda temporary: temporary.write_text(text))
     typer.echo(format_table({estimate.name: errors}))
+
+
+@_command
+def demo(
+    path: Annotated[str, typer.Option(help="rectangle, oval or open.")] = "rectangle",
+    heading: Annotated[str, typer.Option(help="locked or forward.")] = "locked",
+    out: Annotated[Path, typer.Option(help="Folder for the walk and its run.")] = Path("gsba-demo"),
+    frames: Annotated[int, typer.Option(help="Frames of the walk.")] = 40,
+    width: Annotated[int, typer.Option(help="Pixels across a panorama.")] = 1024,
+    seed: Annotated[int, typer.Option(help="Of the walk's wobble, noise and drift.")] = 0,
+) -> None:
+    """Render a walk with exact truth, spoil its trajectory as SLAM would, refine and compare."""
+    from gsba.config import RefineSettings
+    from gsba.demo import make_walk
+    from gsba.evaluate import evaluate as compare
+    from gsba.evaluate import format_table
+    from gsba.read import read_trajectory
+
+    walk = make_walk(out / "walk", path, heading, frames, width, seed)  # type: ignore[arg-type]
+    run = out / "run"
+    from gsba import pipeline
+
+    pipeline.refine(walk.frames_dir, walk.slam_path, run, RefineSettings(), fresh=True)
+    truth = read_trajectory(walk.truth_path)
+    rows = {
+        "before": compare(read_trajectory(walk.slam_path), truth),
+        "after": compare(read_trajectory(run / "trajectory.tum"), truth),
+    }
+    summary = json.loads((run / "report.json").read_text())["summary"]
+    residuals = (summary["median_residual_deg_coarse"], summary["median_residual_deg"])
+    pixels = [f"{degrees * width / 360:.3f}" for degrees in residuals]
+    typer.echo(format_table(rows, extra={"reproj. px": pixels}))
+    typer.echo(
+        f"Frames, trajectories and truth in {out / 'walk'}, the run with its model in {run}."
+    )
 
 
 @_command

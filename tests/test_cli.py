@@ -1,0 +1,160 @@
+"""The command line: what it answers, how fast it may not think, and how it fails."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+import gsba
+from gsba.cli import app
+from gsba.config import RefineSettings
+from gsba.config_file import load_config
+from gsba.export import ExportFormat
+from gsba.log import GsbaError
+
+
+def _gsba(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def _fails(result: Result, message: str, code: int = 1) -> None:
+    """The command ended with exactly one line on stderr and nothing on stdout."""
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: "), result.stderr
+    assert message in lines[0]
+    assert (result.exit_code, result.stdout) == (code, "")
+
+
+@pytest.fixture
+def pipeline(monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]:
+    """Replace the pipeline by one that raises."""
+
+    def install(error: BaseException) -> None:
+        def fail(*_: object, **__: object) -> None:
+            raise error
+
+        stub = types.ModuleType("gsba.pipeline")
+        stub.refine = stub.load_run = fail  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "gsba.pipeline", stub)
+        monkeypatch.setattr(gsba, "pipeline", stub, raising=False)
+
+    return install
+
+
+def _tum(path: Path, num: int = 5, scale: float = 1.0) -> Path:
+    angles = np.linspace(0, 1, num)
+    rows = [[t, scale * np.sin(t), 0, scale * np.cos(t), 0, 0, 0, 1] for t in angles]
+    np.savetxt(path, rows)
+    return path
+
+
+def test_help_names_every_command_and_format() -> None:
+    out = _gsba("--help").stdout
+    for command in ("refine", "export", "evaluate", "demo", "show-config", "--version"):
+        assert command in out
+    out = _gsba("export", "--help").stdout
+    assert all(to in out for to in ExportFormat)
+
+
+def test_version() -> None:
+    assert _gsba("--version").stdout == f"gsba {gsba.__version__}\n"
+
+
+def test_show_config_prints_what_load_config_reads(tmp_path: Path) -> None:
+    result = _gsba("show-config", "--set", "features.max_per_face=77")
+    assert result.exit_code == 0
+    (tmp_path / "all.toml").write_text(result.stdout)
+    assert load_config(tmp_path / "all.toml").features.max_per_face == 77
+    again = _gsba("show-config", "--config", tmp_path / "all.toml")
+    assert again.stdout == result.stdout
+
+
+def test_wrong_settings_name_the_key() -> None:
+    _fails(_gsba("show-config", "--set", "features.max_per_fce=1"), "did you mean max_per_face?")
+    _fails(_gsba("show-config", "--set", "seed=x"), "use an integer")
+    _fails(_gsba("show-config", "--config", "nowhere.toml"), "cannot read settings nowhere.toml")
+    _fails(_gsba("refine", "a", "b", "--out", "c", "--set", "x=1"), "unknown setting x")
+    assert not Path("c").exists()
+
+
+def test_factors_are_a_setting() -> None:
+    if "factors" not in RefineSettings.model_fields:
+        pytest.skip("no factor families to choose from")
+    out = _gsba("show-config", "--factors", "bearing,reprojection").stdout
+    assert 'factors = ["bearing", "reprojection"]' in out
+    _fails(_gsba("show-config", "--factors", "nonsense"), '"bearing"')
+
+
+@pytest.mark.parametrize(
+    ("error", "message", "code"),
+    [
+        (GsbaError("frames: no such folder"), "error: frames: no such folder", 1),
+        (KeyboardInterrupt(), "error: interrupted; run again to resume", 130),
+        (PermissionError(errno.EACCES, "Permission denied", "out"), "out: Permission denied", 1),
+        (OSError(errno.ENOSPC, "No space left on device"), "No space left on device", 1),
+        (MemoryError(), "out of memory", 1),
+    ],
+)
+def test_expected_failures_are_one_line(
+    pipeline: Callable[[BaseException], None], error: BaseException, message: str, code: int
+) -> None:
+    pipeline(error)
+    _fails(_gsba("refine", "frames", "slam.tum", "--out", "run"), message, code)
+    _fails(_gsba("export", "run", "--to", "colmap"), message, code)
+
+
+def test_unexpected_failures_show_themselves(pipeline: Callable[[BaseException], None]) -> None:
+    pipeline(ZeroDivisionError())
+    result = _gsba("refine", "frames", "slam.tum", "--out", "run")
+    assert isinstance(result.exception, ZeroDivisionError)
+
+
+def test_export_checks_its_options(tmp_path: Path) -> None:
+    _fails(_gsba("export", tmp_path, "--to", "obj"), "use one of colmap, colmap-flat, colmap-erp")
+    _fails(_gsba("export", tmp_path, "--to", "ply", "--face-size", 0), "--face-size 0")
+
+
+def test_evaluate_compares_a_file_or_a_run(tmp_path: Path) -> None:
+    truth = _tum(tmp_path / "truth.tum")
+    (tmp_path / "run").mkdir()
+    _tum(tmp_path / "run/trajectory.tum", scale=3.0)
+    numbers = tmp_path / "numbers.json"
+    result = _gsba("evaluate", tmp_path / "run", "--truth", truth, "--json", numbers)
+    assert result.exit_code == 0 and "5/5" in result.stdout
+    assert json.loads(numbers.read_text())["scale"] == pytest.approx(1 / 3)
+    assert _gsba("evaluate", truth, "--truth", truth).exit_code == 0
+
+
+def test_evaluate_fails_in_one_line(tmp_path: Path) -> None:
+    truth = _tum(tmp_path / "truth.tum")
+    _fails(_gsba("evaluate", tmp_path / "none.tum", "--truth", truth), "none.tum")
+    _fails(_gsba("evaluate", tmp_path, "--truth", truth), "trajectory.tum")
+    (tmp_path / "bad.tum").write_text("0 1 2 nan 0 0 0 1\n")
+    _fails(_gsba("evaluate", truth, "--truth", tmp_path / "bad.tum"), "bad.tum:1")
+
+
+def test_demo_checks_its_options(tmp_path: Path) -> None:
+    _fails(_gsba("demo", "--path", "spiral", "--out", tmp_path), "'spiral'")
+    _fails(_gsba("demo", "--frames", 2, "--out", tmp_path), "2 frames")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_script_ends_quietly_in_a_closed_pipe() -> None:
+    script = "from gsba.cli import main; main()"
+    path = str(Path(gsba.__file__).parents[1])
+    command = [sys.executable, "-c", script, "show-config"]
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        command, stdout=writer, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": path}
+    )
+    os.close(writer)
+    assert done.stderr == b""
