@@ -13,8 +13,12 @@ _log = logging.getLogger(__name__)
 
 _SHARED = 0.5  # part of the frames or of the entries that must lie in the other's span
 _GRID_TOLERANCE = 0.1  # of the shortest interval: how well times must meet to find an offset
-_VELOCITY_S = 0.5  # stretch at an end of the trajectory from which its velocity is taken
-_DAMPING_S = 1.0  # beyond an end the velocity fades with this time constant
+# Beyond an end: the stretch whose velocity is continued, and the time constants with which its two
+# parts fade. Chosen by predicting real SLAM output of walks 0.1 to 4 s ahead: people keep walking
+# but do not keep turning.
+_VELOCITY_S = 0.5
+_TRANSLATION_FADE_S = 10.0
+_ROTATION_FADE_S = 1.0
 
 
 def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) -> CoarsePoses:
@@ -149,15 +153,20 @@ def _poses_at(trajectory: Trajectory, times: np.ndarray) -> np.ndarray:
             continue
         reach = np.abs(entries - entries[end])
         other = int(np.argmin(np.abs(reach - _VELOCITY_S) + (reach == 0) * np.ptp(entries)))
-        lasting = _DAMPING_S * -np.expm1(-np.abs(times[beyond] - entries[end]) / _DAMPING_S)
-        part = lasting / reach[other]
-        first = Rotation.from_matrix(world_T_rigs[other, :3, :3])
+        ahead = np.abs(times[beyond] - entries[end])[:, None]
         last = Rotation.from_matrix(world_T_rigs[end, :3, :3])
-        turn = (first.inv() * last).as_rotvec()
-        rotations[beyond] = last * Rotation.from_rotvec(part[:, None] * turn)
+        turn = (Rotation.from_matrix(world_T_rigs[other, :3, :3]).inv() * last).as_rotvec()
         step = world_T_rigs[end, :3, 3] - world_T_rigs[other, :3, 3]
-        positions[beyond] = world_T_rigs[end, :3, 3] + part[:, None] * step
+        turned = _faded(ahead, _ROTATION_FADE_S) * turn / reach[other]
+        rotations[beyond] = last * Rotation.from_rotvec(turned)
+        moved = _faded(ahead, _TRANSLATION_FADE_S) * step / reach[other]
+        positions[beyond] = world_T_rigs[end, :3, 3] + moved
     return pose(rotations.as_matrix(), positions)
+
+
+def _faded(duration: np.ndarray, time_constant: float) -> np.ndarray:
+    """Seconds at full speed that equal `duration` seconds of exponentially fading speed."""
+    return -time_constant * np.expm1(-duration / time_constant)
 
 
 def _nearest(sorted_values: np.ndarray, queries: np.ndarray) -> np.ndarray:

@@ -53,6 +53,8 @@ def scan(
     table = timestamps
     if table is None and fps is None and (Path(folder) / _TIMES_FILE).is_file():
         table = Path(folder) / _TIMES_FILE
+    if fps is not None:
+        _warn_of_slots(Path(folder), max(path.name for path in found[names[-1]]))
     times = frame_times(names, table, fps)
     order = np.argsort(times, kind="stable")
     names, times = [names[i] for i in order], times[order]
@@ -187,6 +189,18 @@ def _common_size(paths: Sequence[tuple[Path, ...]], layout: str) -> tuple[int, i
             if (w, h) != (width, height):
                 raise GsbaError(f"{path}: is {w}x{h}, but '{first.name}' is {width}x{height}")
     return width, height
+
+
+def _warn_of_slots(folder: Path, last: str) -> None:
+    """stella_vslam gives every file of a folder a time slot, images or not."""
+    early = [p.name for p in _entries(folder) if p.is_file() and not is_image(p) and p.name < last]
+    if early:
+        _log.warning(
+            "--fps counts images only; if stella_vslam read this folder with '%s' in it, its times "
+            "are %d frames later",
+            early[0],
+            len(early),
+        )
 
 
 def _natural(name: str) -> tuple[list[tuple[str, int]], str]:

@@ -81,15 +81,17 @@ def read_times(path: Path) -> list[TimeRow]:
         (number, [p.strip() for p in line.split(",")] if "," in line else line.split())
         for number, line in lines
     ]
-    if rows and not any(_is_seconds(cell) for cell in rows[0][1]):
-        rows = rows[1:]
+    header = rows.pop(0)[1] if rows and not any(map(_is_seconds, rows[0][1])) else None
     if not rows:
         raise GsbaError(f"{path}: holds no times")
     columns = len(rows[0][1])
     if columns > 2:
         raise GsbaError(f"{path}: {columns} columns; want name,timestamp or one timestamp a line")
-    time_first = columns == 2 and not all(_is_seconds(cells[-1]) for _, cells in rows)
-    time_first = time_first and all(_is_seconds(cells[0]) for _, cells in rows)
+    if header:
+        time_first = header[0].lower().startswith("time")
+    else:  # `timestamp name` where only the first column is numbers
+        time_first = all(_is_seconds(cells[0]) for _, cells in rows)
+        time_first &= not all(_is_seconds(cells[-1]) for _, cells in rows)
     table = []
     for number, cells in rows:
         if len(cells) != columns:
@@ -167,13 +169,14 @@ def _stem(name: str) -> str:
 def _times_at_rate(names: Sequence[str], fps: float) -> np.ndarray:
     if not (math.isfinite(fps) and fps > 0):
         raise GsbaError(f"--fps {fps}: must be a positive number of frames per second")
-    matches = [re.search(r"[0-9]+$", name) for name in names]
-    steps = np.diff([int(m[0]) for m in matches if m])
-    skips = np.flatnonzero(steps != steps[0]) if len(steps) == len(names) - 1 else []
-    if len(skips):
+    counters = [int(m[0]) for name in names if (m := re.search(r"[0-9]{1,18}$", name))]
+    steps = np.diff(counters)
+    skips = np.flatnonzero(steps != np.median(steps)) if len(counters) == len(names) else []
+    if 0 < len(skips) <= len(steps) / 2:  # mostly even: counters with holes
+        before, after = names[skips[0]], names[skips[0] + 1]
         raise GsbaError(
-            f"frame numbers skip between '{names[skips[0]]}' and '{names[skips[0] + 1]}', so --fps "
-            "alone does not say when frames were taken; pass --timestamps FILE"
+            f"frame numbers skip between '{before}' and '{after}', so --fps alone does not say "
+            "when frames were taken; pass --timestamps FILE"
         )
     return np.arange(len(names)) / fps
 

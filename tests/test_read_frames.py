@@ -1,0 +1,350 @@
+"""Frames and masks: layouts, order, times, and every input that must be refused."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gsba.log import GsbaError
+from gsba.read import load_erp, load_faces, load_mask, scan
+from gsba.types import FACES
+
+
+def write_image(path: Path, width: int = 64, height: int = 32, level: int = 90) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.full((height, width, 3), level, np.uint8)
+    pixels[: height // 2, :, 2] = 255  # upper half red (OpenCV order is BGR)
+    assert cv2.imwrite(str(path), pixels)
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for i in range(4):
+        write_image(tmp_path / "frames" / f"{i:04d}.jpg", level=20 * i)
+    return tmp_path / "frames"
+
+
+def test_erp_folder_in_order_with_other_files_ignored(folder: Path) -> None:
+    (folder / "README.md").write_text("hello")
+    (folder / ".DS_Store").write_bytes(b"\0")
+    (folder / "._0000.jpg").write_bytes(b"\0")
+    frames = scan(folder, fps=10)
+    assert frames.names == ("0000", "0001", "0002", "0003")
+    assert (frames.layout, frames.faces, frames.width, frames.height) == ("erp", (), 64, 32)
+    np.testing.assert_array_equal(frames.timestamps, [0.0, 0.1, 0.2, 0.3])
+    assert frames.mask_paths == (None,) * 4
+    image = load_erp(frames, 1)
+    assert image.shape == (32, 64, 3) and image.dtype == np.uint8
+    assert image[4, 8, 0] > 200 > 100 > image[4, 8, 2]  # red comes first
+
+
+def test_numbers_without_leading_zeros_are_in_numeric_order(tmp_path: Path, caplog) -> None:
+    for i in (9, 10, 11):
+        write_image(tmp_path / f"f{i}.PNG")
+    assert scan(tmp_path, fps=1).names == ("f9", "f10", "f11")
+    assert "numeric order" in caplog.text
+
+
+def test_fps_warns_of_files_that_stella_counts(folder: Path, caplog) -> None:
+    (folder / ".DS_Store").write_bytes(b"\0")
+    scan(folder, fps=10)
+    assert ".DS_Store" in caplog.text
+
+
+def test_exif_orientation_is_ignored(folder: Path) -> None:
+    tiff = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"  # orientation 6
+    exif = b"Exif\0\0" + tiff
+    plain = (folder / "0000.jpg").read_bytes()
+    tagged = plain[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + plain[2:]
+    (folder / "0000.jpg").write_bytes(tagged)
+    assert cv2.imread(str(folder / "0000.jpg")).shape == (64, 32, 3)  # the tag is really there
+    frames = scan(folder, fps=1)
+    assert load_erp(frames, 0).shape == (32, 64, 3)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_appended_data_is_no_truncation(folder: Path, suffix: str) -> None:
+    path = write_image(folder / f"zz9{suffix}")
+    path.write_bytes(path.read_bytes() + b"trailer" * 1000)
+    assert len(scan(folder, timestamps=_list(folder, 5))) == 5
+
+
+def _list(folder: Path, n: int) -> Path:
+    path = folder.parent / "times.txt"
+    path.write_text("\n".join(str(0.5 * i) for i in range(n)))
+    return path
+
+
+def _cube_folders(root: Path, faces: tuple[str, ...]) -> None:
+    for face in faces:
+        for i in range(3):
+            write_image(root / face / f"{i:03d}.png", 32, 32, level=10 * FACES.index(face))
+
+
+@pytest.mark.parametrize("missing", [(), ("up",), ("down",), ("up", "down")])
+def test_cube_subfolders(tmp_path: Path, missing: tuple[str, ...]) -> None:
+    faces = tuple(face for face in FACES if face not in missing)
+    _cube_folders(tmp_path, faces)
+    frames = scan(tmp_path, fps=2)
+    assert (frames.layout, frames.faces, frames.width, frames.height) == ("cube", faces, 32, 32)
+    assert frames.names == ("000", "001", "002")
+    images = load_faces(frames, 2)
+    assert images.shape == (len(faces), 32, 32, 3)
+    assert [int(level) for level in images[:, -1, 0, 1]] == [10 * FACES.index(f) for f in faces]
+
+
+def test_cube_files_with_suffixes(tmp_path: Path) -> None:
+    for i in range(3):
+        for face in FACES[:5]:
+            write_image(tmp_path / f"n_{i}_{face}.jpg", 32, 32)
+    frames = scan(tmp_path, fps=2)
+    assert frames.names == ("n_0", "n_1", "n_2") and frames.faces == FACES[:5]
+    assert [path.name for path in frames.paths[1]] == [f"n_1_{f}.jpg" for f in FACES[:5]]
+
+
+def test_cube_face_missing_from_one_frame(tmp_path: Path) -> None:
+    _cube_folders(tmp_path, FACES)
+    (tmp_path / "left" / "001.png").unlink()
+    with pytest.raises(GsbaError, match=r"frame '001' has no left face \(1 of 3"):
+        scan(tmp_path, fps=1)
+    shutil.rmtree(tmp_path / "left")
+    with pytest.raises(GsbaError, match=r"no left face"):
+        scan(tmp_path, fps=1)
+
+
+def test_cube_face_not_square(tmp_path: Path) -> None:
+    _cube_folders(tmp_path, FACES)
+    write_image(tmp_path / "back" / "002.png", 32, 16)
+    with pytest.raises(GsbaError, match=r"back/002.png: is 32x16; a cube face is square"):
+        scan(tmp_path, fps=1)
+
+
+def test_stray_image_among_cube_files(tmp_path: Path) -> None:
+    for face in FACES:
+        write_image(tmp_path / f"a_{face}.jpg", 32, 32)
+    write_image(tmp_path / "cover.jpg")
+    with pytest.raises(GsbaError, match=r"'cover.jpg' lies among cube faces"):
+        scan(tmp_path, fps=1)
+
+
+def test_images_beside_face_folders(tmp_path: Path) -> None:
+    _cube_folders(tmp_path, FACES)
+    write_image(tmp_path / "pano.jpg")
+    with pytest.raises(GsbaError, match=r"both images"):
+        scan(tmp_path, fps=1)
+
+
+def test_refused_folders(tmp_path: Path, folder: Path) -> None:
+    with pytest.raises(GsbaError, match=r"no such folder"):
+        scan(tmp_path / "none", fps=1)
+    with pytest.raises(GsbaError, match=r"is a file"):
+        scan(folder / "0000.jpg", fps=1)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(GsbaError, match=r"no JPEG or PNG"):
+        scan(tmp_path / "empty", fps=1)
+    for name in ("0002.jpg", "0003.jpg"):
+        (folder / name).unlink()
+    with pytest.raises(GsbaError, match=r"2 frames; at least 3"):
+        scan(folder, fps=1)
+
+
+def test_refused_frames(folder: Path) -> None:
+    bad = folder / "0002.jpg"
+    whole = bad.read_bytes()
+    thumbnail = b"\xff\xe1\x00\x06\xff\xd8\xff\xd9"  # an end marker before the scan
+    for content, message in [
+        (b"", "truncated"),
+        (b"plain text, not an image at all", "not a JPEG or PNG"),
+        (whole[:-2], "truncated"),
+        (whole[: len(whole) // 3], "truncated"),
+        (whole[:2] + thumbnail + whole[2:-2], "truncated"),
+        (whole[:3], "truncated"),
+    ]:
+        bad.write_bytes(content)
+        with pytest.raises(GsbaError, match=f"0002.jpg: .*{message}"):
+            scan(folder, fps=1)
+    write_image(bad, 66, 32)
+    with pytest.raises(GsbaError, match=r"0002.jpg: is 66x32; an equirectangular frame is 2:1"):
+        scan(folder, fps=1)
+    write_image(bad, 128, 64)
+    with pytest.raises(GsbaError, match=r"0002.jpg: is 128x64, but '0000.jpg' is 64x32"):
+        scan(folder, fps=1)
+    bad.unlink()
+    png = write_image(folder / "0002.png")
+    png.write_bytes(png.read_bytes()[:-12])
+    with pytest.raises(GsbaError, match=r"0002.png: truncated"):
+        scan(folder, fps=1)
+
+
+def test_one_name_twice(folder: Path) -> None:
+    write_image(folder / "0001.png")
+    with pytest.raises(GsbaError, match=r"'0001.jpg' and '0001.png'"):
+        scan(folder, fps=1)
+
+
+def test_frame_that_vanishes_or_breaks_after_the_scan(folder: Path) -> None:
+    frames = scan(folder, fps=1)
+    (folder / "0000.jpg").unlink()
+    with pytest.raises(GsbaError, match=r"0000.jpg: cannot be read"):
+        load_erp(frames, 0)
+    (folder / "0001.jpg").write_bytes(b"\xff\xd8 nothing \xff\xd9")
+    with pytest.raises(GsbaError, match=r"0001.jpg: cannot be decoded"):
+        load_erp(frames, 1)
+    write_image(folder / "0002.jpg", 128, 64)
+    with pytest.raises(GsbaError, match=r"0002.jpg: is 128x64, was 64x32"):
+        load_erp(frames, 2)
+
+
+def test_times_by_name_reorder_frames(folder: Path) -> None:
+    (folder / "timestamps.csv").write_text("name,timestamp\n0000.jpg,3\n0001,2\n0002,0\n0003,1\n")
+    frames = scan(folder)
+    assert frames.names == ("0002", "0003", "0001", "0000")
+    np.testing.assert_array_equal(frames.timestamps, [0, 1, 2, 3])
+    np.testing.assert_array_equal(scan(folder, fps=4).timestamps, np.arange(4) / 4)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "timestamp,name\n0.5,0000\n1.0,0001\n1.5,0002\n2.0,0003\n",
+        "# TUM list\r\n0.5 0000.jpg\r\n1.0 0001.jpg\r\n1.5 0002.jpg\r\n2.0 0003.jpg\r\n",
+        "0000 0.5\n0001 1.0\n0002 1.5\n0003 2.0\n0004 2.5\n",
+        "\n0.5\n1.0\n\n1.5\n2.0\n",
+        "\ufefftimestamp\n0.5\n1\n1.5\n2\n",
+    ],
+)
+def test_tables_of_times(folder: Path, tmp_path: Path, text: str) -> None:
+    (tmp_path / "t.txt").write_text(text, encoding="utf-8")
+    frames = scan(folder, timestamps=tmp_path / "t.txt")
+    np.testing.assert_array_equal(frames.timestamps, [0.5, 1.0, 1.5, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "holds no times"),
+        ("name,timestamp\n", "holds no times"),
+        ("0\n1\n2\n", "3 times for 4 frames"),
+        ("0\n1\nx\n3\n", r"t.txt:3: 'x' is not a time"),
+        ("0\n1\nnan\n3\n", r"t.txt:3: 'nan' is not a time"),
+        ("0000,0\n0001,1\n0002\n", r"t.txt:3: 1 columns"),
+        ("0000,0\n0001,1\n0003,2\n", r"no time for frame '0002' \(1 of 4"),
+        ("0000,0\n0001,1\n0002,2\n0002.jpg,3\n0003,4\n", r"t.txt:4: a second time"),
+        ("0000,0\n0001,1\n0002,1\n0003,2\n", "'0001' and '0002' have the same time"),
+        ("a,b,c\n1,2,3\n", "3 columns"),
+    ],
+)
+def test_refused_tables_of_times(folder: Path, tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "t.txt").write_text(text)
+    with pytest.raises(GsbaError, match=message):
+        scan(folder, timestamps=tmp_path / "t.txt")
+
+
+def test_refused_ways_to_give_times(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(GsbaError, match=r"cannot be read"):
+        scan(folder, timestamps=tmp_path / "none.csv")
+    with pytest.raises(GsbaError, match=r"pass one"):
+        scan(folder, timestamps=_list(folder, 4), fps=1)
+    for fps in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(GsbaError, match=r"positive"):
+            scan(folder, fps=fps)
+    with pytest.raises(GsbaError, match=r"nothing says when .* --fps"):
+        scan(folder)
+
+
+def test_fps_refuses_skipped_numbers_but_not_even_steps(tmp_path: Path) -> None:
+    for i in (0, 8, 16):
+        write_image(tmp_path / f"{i:03d}.jpg")
+    np.testing.assert_array_equal(scan(tmp_path, fps=2).timestamps, [0, 0.5, 1])
+    write_image(tmp_path / "032.jpg")
+    with pytest.raises(GsbaError, match=r"skip between '016' and '032'"):
+        scan(tmp_path, fps=2)
+
+
+@pytest.mark.parametrize(
+    ("names", "times"),
+    [
+        (["1651.25", "1651.5", "1652.0"], [1651.25, 1651.5, 1652.0]),
+        (
+            ["1403636579763555584", "1403636579813555456", "1403636579863555584"],
+            [1403636579.763555584, 1403636579.813555456, 1403636579.863555584],
+        ),
+        (
+            ["cam_1700000000000", "cam_1700000000500", "cam_1700000001000"],
+            [1700000000.0, 1700000000.5, 1700000001.0],
+        ),
+    ],
+)
+def test_names_that_are_times(tmp_path: Path, names: list[str], times: list[float]) -> None:
+    for name in names:
+        write_image(tmp_path / f"{name}.jpg")
+    np.testing.assert_array_equal(scan(tmp_path).timestamps, times)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["1.0001", "1.0002", "1.0003"],  # a version and a number
+        ["20240105123045", "20240105123046", "20240105123047"],  # dates
+        ["R0010210", "R0010211", "R0010212"],
+        ["a1700000000000", "b1700000000500", "c1700000001000"],
+    ],
+)
+def test_names_that_might_be_times_are_not_guessed(tmp_path: Path, names: list[str]) -> None:
+    for name in names:
+        write_image(tmp_path / f"{name}.jpg")
+    with pytest.raises(GsbaError, match=r"pass --timestamps FILE or --fps"):
+        scan(tmp_path)
+
+
+def write_mask(path: Path, width: int = 64, height: int = 32, white: int = 255) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    mask = np.full((height, width), white, np.uint8)
+    mask[height // 2 :] = 0
+    assert cv2.imwrite(str(path), mask)
+    return path
+
+
+def test_one_mask_for_all(folder: Path, tmp_path: Path) -> None:
+    path = write_mask(tmp_path / "mask.png")
+    frames = scan(folder, fps=1, masks=path)
+    mask = load_mask(frames, 3)
+    assert mask is not None and mask.dtype == bool and mask.shape == (32, 64)
+    assert mask[:16].all() and not mask[16:].any()
+    assert load_mask(scan(folder, fps=1), 0) is None
+
+
+@pytest.mark.parametrize("pattern", ["{}.png", "{}.jpg.png"])
+def test_mask_for_each_frame(folder: Path, tmp_path: Path, pattern: str) -> None:
+    for i in range(4):
+        write_mask(tmp_path / "masks" / pattern.format(f"{i:04d}"))
+    frames = scan(folder, fps=1, masks=tmp_path / "masks")
+    assert [p.name for p in frames.mask_paths if p] == [
+        pattern.format(f"{i:04d}") for i in range(4)
+    ]
+    (tmp_path / "masks" / pattern.format("0002")).unlink()
+    with pytest.raises(GsbaError, match=r"no mask for frame '0002' \(1 of 4"):
+        scan(folder, fps=1, masks=tmp_path / "masks")
+
+
+def test_refused_masks(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(GsbaError, match=r"cannot be read"):
+        scan(folder, fps=1, masks=tmp_path / "none.png")
+    small = write_mask(tmp_path / "small.png", 32, 16)
+    with pytest.raises(GsbaError, match=r"small.png: mask is 32x16, but frames are 64x32"):
+        scan(folder, fps=1, masks=small)
+    binary = write_mask(tmp_path / "binary.png", white=1)
+    with pytest.raises(GsbaError, match=r"holds 0 and 1"):
+        load_mask(scan(folder, fps=1, masks=binary), 0)
+
+
+def test_masks_of_cube_frames_are_panoramas_of_any_size(tmp_path: Path) -> None:
+    _cube_folders(tmp_path / "cube", FACES)
+    mask = load_mask(scan(tmp_path / "cube", fps=1, masks=write_mask(tmp_path / "m.png")), 0)
+    assert mask is not None and mask.shape == (32, 64)
+    square = write_mask(tmp_path / "square.png", 32, 32)
+    with pytest.raises(GsbaError, match=r"equirectangular, 2:1"):
+        scan(tmp_path / "cube", fps=1, masks=square)
