@@ -25,7 +25,7 @@ def read_trajectory(path: Path, timestamps: Path | None = None) -> Trajectory:
     TUM: `timestamp tx ty tz qx qy qz qw`, world_T_rig. KITTI: 12 numbers, row-major 3x4
     world_T_rig, times from `timestamps`, one for each row. A map gives its keyframes.
 
-    Where a stella_vslam run closed a loop, give its keyframes: its frame poses stay hung on relative
+    After a loop closure of stella_vslam, give its keyframes: the frame poses still hang on relative
     poses from before the closure, and interpolating the keyframes was three times more accurate.
 
     Raises:
