@@ -165,10 +165,11 @@ def _add_points(
     import pycolmap
 
     points = reconstruction.points_world
-    ends = np.searchsorted(reconstruction.observation_points, np.arange(len(points) + 1)).tolist()
-    elements = list(map(pycolmap.TrackElement, (images + 1).tolist(), rows.tolist()))
+    ends = np.searchsorted(reconstruction.observation_points, np.arange(len(points) + 1))
     for j, (xyz, color) in enumerate(zip(points, reconstruction.point_colors, strict=True)):
-        track = pycolmap.Track(elements[ends[j] : ends[j + 1]])
+        of_point = slice(ends[j], ends[j + 1])
+        image_ids, indices = (images[of_point] + 1).tolist(), rows[of_point].tolist()
+        track = pycolmap.Track(list(map(pycolmap.TrackElement, image_ids, indices)))
         model.add_point3D_with_id(j + 1, pycolmap.Point3D(xyz=xyz, color=color, track=track))
     model.update_point_3d_errors()
 
