@@ -2,6 +2,7 @@
 
 from factors.bearing import BearingFactor, BearingTerm, bearing_residuals, tangent_basis
 from factors.block import Block, PoseSystem
+from factors.check import jacobian_errors
 from factors.landmarks import LandmarkBlock
 from factors.reprojection import (
     FaceCameras,
@@ -22,6 +23,7 @@ __all__ = [
     "ReprojectionTerm",
     "RobustLoss",
     "bearing_residuals",
+    "jacobian_errors",
     "reprojection_residuals",
     "tangent_basis",
 ]

@@ -1,6 +1,6 @@
 """What the observation families share: geometry of a sighting, whitening, the reference factor."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import gtsam
 import numpy as np
@@ -27,6 +27,16 @@ def rig_vectors(
     by_pose[:, 2, 0], by_pose[:, 2, 1] = -d[:, 1], d[:, 0]
     by_pose[:, :, 3:] = -np.eye(3)
     return d, by_pose, rig_R_world
+
+
+def pose_rows(values: gtsam.Values, keys: Sequence[int]) -> np.ndarray:
+    """(F, 12) float64 rows [world_R_rig row-major, rig_in_world] of Pose3 variables."""
+    out = np.empty((len(keys), 12))
+    for row, key in zip(out, keys, strict=True):
+        matrix = values.atPose3(key).matrix()
+        row[:9] = matrix[:3, :3].ravel()
+        row[9:] = matrix[:3, 3]
+    return out
 
 
 def whitener_rows(

@@ -9,7 +9,9 @@ import gtsam
 import numpy as np
 
 from factors._elimination import eliminate_range, polish_range, residuals_range
+from factors._host_factors import host_factors
 from factors._kernels import Observations
+from factors._terms import pose_rows
 from factors.bearing import BearingTerm
 from factors.block import PoseSystem
 from factors.reprojection import ReprojectionTerm
@@ -83,7 +85,7 @@ class LandmarkBlock:
 
     def linearize(self, values: gtsam.Values) -> PoseSystem:
         """Reduced pose system at `values`: robust weights, landmarks eliminated."""
-        poses = self._pose_rows(values)
+        poses = pose_rows(values, self.pose_keys)
         num_f, num_p = len(self.pose_keys), len(self._columns)
         ranges = self._ranges()
         sums = [
@@ -115,7 +117,9 @@ class LandmarkBlock:
         """Robust cost at `values`, `steps (F, 6)` from the linearization, landmarks moved along."""
         if self._poses is None:
             raise RuntimeError("propose() needs linearize() before it")
-        return self._move(self._pose_rows(values), self._poses, np.ascontiguousarray(steps))
+        return self._move(
+            pose_rows(values, self.pose_keys), self._poses, np.ascontiguousarray(steps)
+        )
 
     def accept(self) -> None:
         """Keep the landmarks of the last proposal."""
@@ -125,7 +129,7 @@ class LandmarkBlock:
 
     def polish(self, values: gtsam.Values, num_steps: int = 20) -> float:
         """Move the landmarks to their optimum at fixed poses; returns the robust cost."""
-        cost = self._move(self._pose_rows(values), None, None, num_steps)
+        cost = self._move(pose_rows(values, self.pose_keys), None, None, num_steps)
         self.accept()
         return cost
 
@@ -136,7 +140,7 @@ class LandmarkBlock:
             For each term (O, 2) residuals and (O,) bool, False where the point is behind the face
             (there the residual is a large constant).
         """
-        poses = self._pose_rows(values)
+        poses = pose_rows(values, self.pose_keys)
         residuals = np.empty((len(self._order), 2))
         valid = np.empty(len(self._order), dtype=np.bool_)
         ranges = self._ranges()
@@ -162,6 +166,9 @@ class LandmarkBlock:
         """Robust cost at the current landmarks."""
         return sum(self.costs(values).values())
 
+    def factors(self) -> list[gtsam.CustomFactor]:
+        """The same cost as ordinary GTSAM factors on poses, one per first frame of landmarks."""
+        return host_factors(self)
 
     def _move(
         self,
@@ -261,21 +268,8 @@ class LandmarkBlock:
         with ThreadPoolExecutor(num) as pool:
             list(pool.map(work, range(num)))
 
-    def _pose_rows(self, values: gtsam.Values) -> np.ndarray:
-        return pose_rows(values, self.pose_keys)
-
     def _named(self, costs: np.ndarray) -> dict[str, float]:
         return {name: float(cost) for name, cost in zip(self.families, costs, strict=True)}
-
-
-def pose_rows(values: gtsam.Values, keys: Sequence[int]) -> np.ndarray:
-    """(F, 12) float64 rows [world_R_rig row-major, rig_in_world] of Pose3 variables."""
-    out = np.empty((len(keys), 12))
-    for row, key in zip(out, keys, strict=True):
-        matrix = values.atPose3(key).matrix()
-        row[:9] = matrix[:3, :3].ravel()
-        row[9:] = matrix[:3, 3]
-    return out
 
 
 def _check_term(term: Term, num_frames: int, num_points: int) -> None:

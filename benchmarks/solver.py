@@ -1,0 +1,335 @@
+"""Bundle adjustment of synthetic 360-degree walks: ours beside pycolmap's, same optimum or not.
+
+    python benchmarks/solver.py --size M --peer
+
+Each solver runs in a process of its own; CPU seconds count its solve, peak memory the process. All
+results are judged by one function: the robust angular cost with landmarks at their best for the
+resulting poses. The table says whether the targets hold.
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+SIZES = {"S": (120, 23_700), "M": (500, 98_623), "L": (2_000, 375_000)}  # frames, landmarks
+SIGMA = np.radians(0.05)  # per-axis bearing noise
+LOSS_SCALE = 2.0  # Cauchy, in sigmas
+OUTLIERS = 0.02
+WIDTH, HEIGHT = 4096, 2048  # of the peer's equirectangular images
+COST_TOLERANCE = 1.001
+SOLVERS = {"ours": 1, "pycolmap-erp": 4, "pycolmap-pinholes": 4}
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A closed walk, seen with noise; poses and landmarks start as a drifting SLAM leaves them."""
+
+    truth_world_T_rigs: np.ndarray  # (F, 4, 4)
+    world_T_rigs: np.ndarray  # (F, 4, 4) start
+    points_world: np.ndarray  # (J, 3) start
+    frames: np.ndarray  # (O,) int32
+    points: np.ndarray  # (O,) int32, sorted
+    bearings_rig: np.ndarray  # (O, 3) unit
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What one solver did."""
+
+    solver: str
+    cpu_s: float  # of the solve
+    wall_s: float
+    peak_mb: float  # of the whole process
+    iterations: int
+    converged: bool
+    cost: float = float("nan")  # by the common function
+
+
+def make_problem(num_frames: int, num_points: int, seed: int = 0) -> Problem:
+    """Draw a closed oval walk of 0.3 units a frame, landmarks within 6 units around it."""
+    rng = np.random.default_rng(seed)
+    angle = 2 * np.pi * np.arange(num_frames) / num_frames
+    radius = 0.3 * num_frames / (2 * np.pi)
+    position = radius * np.column_stack([np.cos(angle), 0.02 * np.sin(5 * angle), np.sin(angle)])
+    truth = _poses(_rotations(np.column_stack([0 * angle, -angle, 0 * angle])), position)
+    host = rng.integers(num_frames, size=num_points)
+    offset = rng.normal(size=(num_points, 3))
+    offset *= rng.uniform(1, 6, (num_points, 1)) / np.linalg.norm(offset, axis=1, keepdims=True)
+    points = position[host] + offset
+    length = rng.integers(3, 14, size=num_points)  # 8 observations on average
+    owners = np.repeat(np.arange(num_points), length).astype(np.int32)
+    place = np.arange(len(owners)) - np.repeat(np.cumsum(length) - length, length)
+    frames = ((host[owners] + place - (length // 2)[owners]) % num_frames).astype(np.int32)
+    local = np.einsum("nji,nj->ni", truth[frames, :3, :3], points[owners] - truth[frames, :3, 3])
+    bearings = _noisy(local, SIGMA, rng)
+    wild = rng.random(len(bearings)) < OUTLIERS
+    bearings[wild] = _noisy(bearings[wild], np.radians(3.0), rng)
+    drift = _poses(
+        _rotations(np.radians(0.03) * rng.normal(size=(num_frames, 3))),
+        0.006 * rng.normal(size=(num_frames, 3)),
+    )
+    start = truth.copy()
+    for f in range(1, num_frames):
+        start[f] = start[f - 1] @ np.linalg.inv(truth[f - 1]) @ truth[f] @ drift[f]
+    moved = start @ np.linalg.inv(truth)  # each landmark drifts with its host frame
+    points = np.einsum("nij,nj->ni", moved[host, :3, :3], points) + moved[host, :3, 3]
+    points += 0.01 * np.linalg.norm(offset, axis=1, keepdims=True) * rng.normal(size=points.shape)
+    return Problem(truth, start, points, frames, owners, bearings)
+
+
+def solve_ours(problem: Problem, num_threads: int) -> tuple[Result, np.ndarray, np.ndarray]:
+    """Our loop; the gauge is a prior on the first pose and one distance."""
+    import gtsam
+    from gtsam.symbol_shorthand import X
+
+    from gsba.config import SolverSettings
+    from gsba.optimize import optimize
+
+    _warm_up()
+    wall, cpu = time.perf_counter(), time.process_time()
+    block, values = _block(problem, problem.world_T_rigs, problem.points_world, num_threads)
+    graph = gtsam.NonlinearFactorGraph()
+    first, far = values.atPose3(X(0)), values.atPose3(X(len(problem.world_T_rigs) // 2))
+    graph.add(gtsam.PriorFactorPose3(X(0), first, gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)))
+    distance = float(first.range(far))
+    graph.add(
+        gtsam.RangeFactorPose3(
+            X(0),
+            X(len(problem.world_T_rigs) // 2),
+            distance,
+            gtsam.noiseModel.Isotropic.Sigma(1, 1e-3),
+        )
+    )
+    done = optimize(graph, [block], values, SolverSettings())
+    cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+    poses = np.array([done.values.atPose3(key).matrix() for key in block.pose_keys])
+    steps = len(done.history) - 1
+    return Result("ours", cpu, wall, _peak_mb(), steps, done.converged), poses, block.points_world
+
+
+def _block(problem: Problem, world_T_rigs: np.ndarray, points: np.ndarray, num_threads: int):
+    import gtsam
+    from gtsam.symbol_shorthand import X
+
+    from factors import BearingTerm, LandmarkBlock, RobustLoss
+
+    values = gtsam.Values()
+    for f, world_T_rig in enumerate(world_T_rigs):
+        values.insert(X(f), gtsam.Pose3(world_T_rig))
+    term = BearingTerm(problem.frames, problem.points, problem.bearings_rig, SIGMA)
+    keys = [X(f) for f in range(len(world_T_rigs))]
+    loss = RobustLoss("cauchy", LOSS_SCALE)
+    return LandmarkBlock(keys, points, [term], loss, num_threads=num_threads), values
+
+
+def solve_pycolmap(
+    problem: Problem, num_threads: int, solver: str
+) -> tuple[Result, np.ndarray, np.ndarray]:
+    """The peer: one equirectangular camera a frame, or a rig of six pinhole faces."""
+    import pycolmap
+
+    reconstruction, sigma_px = _reconstruction(problem, pinholes=solver == "pycolmap-pinholes")
+    options = pycolmap.BundleAdjustmentOptions(
+        refine_focal_length=False,
+        refine_principal_point=False,
+        refine_extra_params=False,
+        refine_sensor_from_rig=False,
+        print_summary=False,
+    )
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = LOSS_SCALE * sigma_px
+    options.ceres.solver_options.function_tolerance = 1e-6  # Ceres' default; pycolmap's is never
+    options.ceres.solver_options.num_threads = num_threads
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    wall, cpu = time.perf_counter(), time.process_time()
+    summary = pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+    cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+    poses = np.tile(np.eye(4), (len(problem.world_T_rigs), 1, 1))
+    for f, pose in enumerate(poses):
+        pose[:3] = reconstruction.frame(f + 1).rig_from_world.inverse().matrix()
+    points = np.array([reconstruction.point3D(j + 1).xyz for j in range(len(problem.points_world))])
+    converged = summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE
+    steps = (
+        summary.ceres_summary.num_successful_steps + summary.ceres_summary.num_unsuccessful_steps
+    )
+    return Result(solver, cpu, wall, _peak_mb(), steps, converged), poses, points
+
+
+def _reconstruction(problem: Problem, pinholes: bool):
+    """The problem as a pycolmap reconstruction, and one sigma in its pixels."""
+    import pycolmap
+
+    from gsba.geometry import erp_from_bearings
+    from gsba.rig import RIG_R_FACE, CubeRig, owner_faces
+
+    out = pycolmap.Reconstruction()
+    if pinholes:
+        cube = CubeRig(WIDTH // 4, np.radians(96.0))
+        sigma_px = cube.focal * SIGMA
+        faces = owner_faces(problem.bearings_rig)
+        pixels = cube.project(problem.bearings_rig, faces)
+        rig = pycolmap.Rig(rig_id=1)
+        for c in range(6):
+            params = [cube.focal, cube.focal, cube.principal, cube.principal]
+            camera = pycolmap.Camera(
+                camera_id=c + 1, model="PINHOLE", width=cube.size, height=cube.size, params=params
+            )
+            out.add_camera(camera)
+            if c == 0:
+                rig.add_ref_sensor(camera.sensor_id)
+            else:
+                rotation = pycolmap.Rotation3d(RIG_R_FACE[c].T)
+                rig.add_sensor(camera.sensor_id, pycolmap.Rigid3d(rotation, np.zeros(3)))
+        out.add_rig(rig)
+    else:
+        sigma_px = SIGMA * WIDTH / (2 * np.pi)
+        faces = np.zeros(len(problem.frames), dtype=np.uint8)
+        pixels = erp_from_bearings(problem.bearings_rig, WIDTH, HEIGHT)
+        camera = pycolmap.Camera(
+            camera_id=1, model="EQUIRECTANGULAR", width=WIDTH, height=HEIGHT, params=[WIDTH, HEIGHT]
+        )
+        out.add_camera_with_trivial_rig(camera)
+    num_faces = 6 if pinholes else 1
+    images = problem.frames.astype(np.int64) * num_faces + faces
+    order = np.argsort(images, kind="stable")
+    counts = np.bincount(images, minlength=num_faces * len(problem.world_T_rigs))
+    starts = np.cumsum(counts) - counts
+    places = np.empty(len(order), dtype=np.int64)
+    places[order] = np.arange(len(order)) - starts[images[order]]
+    for f, world_T_rig in enumerate(problem.world_T_rigs):
+        frame = pycolmap.Frame(frame_id=f + 1, rig_id=1)
+        for c in range(num_faces):
+            frame.add_data_id(pycolmap.data_t(out.camera(c + 1).sensor_id, f * num_faces + c + 1))
+        frame.rig_from_world = pycolmap.Rigid3d(world_T_rig[:3]).inverse()
+        out.add_frame(frame)
+        for c in range(num_faces):
+            i = f * num_faces + c
+            rows = order[starts[i] : starts[i] + counts[i]]
+            image = pycolmap.Image(
+                name=f"{c}/{f:06d}.png", keypoints=pixels[rows], camera_id=c + 1, image_id=i + 1
+            )
+            image.frame_id = f + 1
+            out.add_image(image)
+        out.register_frame(f + 1)
+    bounds = np.searchsorted(problem.points, np.arange(len(problem.points_world) + 1))
+    for j, xyz in enumerate(problem.points_world):
+        track = pycolmap.Track()
+        for o in range(bounds[j], bounds[j + 1]):
+            track.add_element(int(images[o]) + 1, int(places[o]))
+        out.add_point3D(xyz, track)
+    return out, sigma_px
+
+
+def common_cost(problem: Problem, world_T_rigs: np.ndarray, points: np.ndarray) -> float:
+    """Robust angular cost of poses, each landmark at its best for them."""
+    block, values = _block(problem, world_T_rigs, points, os.cpu_count() or 1)
+    return block.polish(values, num_steps=50)
+
+
+def _rotations(vectors: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(vectors).as_matrix()
+
+
+def _poses(rotations: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    from gsba.geometry import pose
+
+    return pose(rotations, positions)
+
+
+def _noisy(vectors: np.ndarray, sigma: float, rng: np.random.Generator) -> np.ndarray:
+    """Unit vectors of `vectors`, turned by a tangent noise of `sigma` radians per axis."""
+    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    noise = sigma * rng.normal(size=unit.shape)
+    noise -= np.einsum("ni,ni->n", noise, unit)[:, None] * unit
+    out = unit + noise
+    return out / np.linalg.norm(out, axis=1, keepdims=True)
+
+
+def _warm_up() -> None:
+    """Load or compile the kernels on a toy, so that no run pays for it."""
+    tiny = make_problem(12, 60, seed=1)
+    import gtsam
+
+    from gsba.optimize import optimize
+
+    block, values = _block(tiny, tiny.world_T_rigs, tiny.points_world, 1)
+    graph = gtsam.NonlinearFactorGraph()
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
+    for key in block.pose_keys:
+        graph.add(gtsam.PriorFactorPose3(key, values.atPose3(key), noise))
+    optimize(graph, [block], values)
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _child(solver: str, size: str, out: Path, num_threads: int) -> None:
+    problem = make_problem(*SIZES[size])
+    if solver == "ours":
+        result, poses, points = solve_ours(problem, num_threads)
+    else:
+        result, poses, points = solve_pycolmap(problem, num_threads, solver)
+    np.savez(out, poses=poses, points=points, result=json.dumps(asdict(result)))
+
+
+def run(solver: str, size: str, num_threads: int) -> Result:
+    """Solve in a child process and judge the outcome."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "result.npz"
+        environment = dict(os.environ, OMP_NUM_THREADS=str(num_threads))
+        subprocess.run(
+            [sys.executable, __file__, "--child", solver, "--size", size]
+            + ["--out", str(out), "--threads", str(num_threads)],  # noqa: RUF005
+            check=True,
+            env=environment,
+        )
+        with np.load(out) as stored:
+            result = json.loads(str(stored["result"]))
+            cost = common_cost(make_problem(*SIZES[size]), stored["poses"], stored["points"])
+    return Result(**{**result, "cost": cost})
+
+
+def main() -> None:
+    """Parse, run, print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--size", choices=SIZES, default="S")
+    parser.add_argument("--peer", action="store_true", help="run pycolmap's rigs too")
+    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--child", choices=SOLVERS, help=argparse.SUPPRESS)
+    parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        _child(options.child, options.size, options.out, options.threads)
+        return
+    solvers = list(SOLVERS) if options.peer else ["ours"]
+    results = [run(solver, options.size, options.threads) for solver in solvers]
+    best = min(result.cost for result in results)
+    print(f"{'solver':18} {'CPU s':>8} {'wall s':>8} {'MB':>6} {'steps':>6} {'cost/best':>10}")
+    for r in results:
+        note = "" if r.converged else "  not converged"
+        print(
+            f"{r.solver:18} {r.cpu_s:8.2f} {r.wall_s:8.2f} {r.peak_mb:6.0f} {r.iterations:6d} "
+            f"{r.cost / best:10.5f}{note}"
+        )
+    if options.json:
+        options.json.write_text(json.dumps([asdict(r) for r in results], indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""Reference factors: Jacobians where they are hard, and GTSAM's own factors beside them."""
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import L, X
+
+from factors import (
+    BearingFactor,
+    FaceCameras,
+    ReprojectionFactor,
+    bearing_residuals,
+    jacobian_errors,
+    reprojection_residuals,
+    tangent_basis,
+)
+
+UNIT = gtsam.noiseModel.Unit.Create(2)
+CAMERAS = FaceCameras(
+    rig_R_faces=np.array([np.eye(3), gtsam.Rot3.Ry(np.pi / 2).matrix()]),
+    focals=np.array([300.0, 250.0]),
+    principals=np.array([[256.0, 256.0], [200.0, 210.0]]),
+)
+# Central differences of step 1e-5 on residuals of order one are good to about 1e-9.
+TOLERANCE = 1e-7
+
+
+def values_at(pose: gtsam.Pose3, point: np.ndarray) -> gtsam.Values:
+    values = gtsam.Values()
+    values.insert(X(0), pose)
+    values.insert(L(0), point)
+    return values
+
+
+def random_pose(rng) -> gtsam.Pose3:
+    return gtsam.Pose3.Expmap(rng.normal(size=6))
+
+
+def seen_from(pose: gtsam.Pose3, direction, depth: float) -> np.ndarray:
+    """World point at a direction of the rig frame."""
+    direction = np.asarray(direction, dtype=float)
+    return pose.transformFrom(depth * direction / np.linalg.norm(direction))
+
+
+BEARINGS = {
+    "forward": [0, 0, 1],
+    "seam": [1e-9, 0.1, -1],
+    "other side of the seam": [-1e-9, 0.1, -1],
+    "back": [0, 0, -1],
+    "up": [0, -1, 0],
+    "down": [0, 1, 0],
+    "oblique": [0.3, -0.5, 0.2],
+}
+
+
+@pytest.mark.parametrize("bearing", BEARINGS.values(), ids=BEARINGS)
+@pytest.mark.parametrize("error_rad", [0.0, 1e-6, 1e-3, 0.09, 0.11, 1.0, 2.5, 3.1])
+def test_bearing_jacobians(bearing, error_rad):
+    rng = np.random.default_rng(1)
+    pose = random_pose(rng)
+    bearing = np.asarray(bearing, dtype=float) / np.linalg.norm(bearing)
+    axis = tangent_basis(bearing).T @ [np.cos(0.4), np.sin(0.4)]
+    predicted = np.cos(error_rad) * bearing + np.sin(error_rad) * axis
+    factor = BearingFactor(X(0), L(0), bearing, UNIT)
+    errors = jacobian_errors(factor, values_at(pose, seen_from(pose, predicted, 3.0)))
+    # near the antipode the residual turns on a circle of radius pi: curvature 1 / (pi - error)
+    tolerance = TOLERANCE / max(np.pi - error_rad, 1e-3) ** 2
+    assert max(errors.values()) < tolerance
+
+
+def test_bearing_jacobians_at_random_states_and_depths():
+    rng = np.random.default_rng(2)
+    for depth in (0.05, 1.0, 1e4):  # the last: no parallax
+        for _ in range(20):
+            pose = random_pose(rng)
+            bearing = rng.normal(size=3)
+            bearing /= np.linalg.norm(bearing)
+            point = seen_from(pose, bearing + 0.1 * rng.normal(size=3), depth)
+            factor = BearingFactor(X(0), L(0), bearing, UNIT)
+            # differences are taken over 1e-5 units: at depth 0.05 that is 2e-4 rad of angle
+            assert max(jacobian_errors(factor, values_at(pose, point)).values()) < 1e-6
+
+
+def test_bearing_residual_is_the_angle_all_the_way():
+    bearing = np.array([[0.0, 0.0, 1.0]])
+    for angle in (0.0, 1e-9, 1e-4, 0.0999, 0.1001, 1.0, 3.0, np.pi):
+        point = np.array([[np.sin(angle), 0.0, np.cos(angle)]])
+        residual, by_pose, by_point = bearing_residuals(np.eye(4)[None], point, bearing)
+        assert np.linalg.norm(residual) == pytest.approx(angle, rel=1e-12, abs=1e-15)
+        assert np.isfinite(by_pose).all() and np.isfinite(by_point).all()
+
+
+def test_bearing_at_the_centre_is_finite():
+    results = bearing_residuals(np.eye(4)[None], np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]))
+    assert all(np.isfinite(array).all() for array in results)
+    assert not results[1].any()
+
+
+def test_bearing_agrees_with_gtsam():
+    rng = np.random.default_rng(3)
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, 0.01)
+    for _ in range(50):
+        pose, bearing, point = random_pose(rng), rng.normal(size=3), 3 * rng.normal(size=3)
+        bearing /= np.linalg.norm(bearing)
+        values = values_at(pose, point)
+        ours = BearingFactor(X(0), L(0), bearing, noise).error(values)
+        native = gtsam.BearingFactor3D(X(0), L(0), gtsam.Unit3(bearing), noise).error(values)
+        # GTSAM takes an arc cosine, which near zero keeps half of the digits
+        assert ours == pytest.approx(native, rel=1e-6)
+
+
+def test_reprojection_jacobians():
+    rng = np.random.default_rng(4)
+    for face in (0, 1):
+        for _ in range(20):
+            pose = random_pose(rng)
+            local = np.array([*rng.uniform(-1, 1, 2), 1.0])
+            point = seen_from(pose, CAMERAS.rig_R_faces[face] @ local, rng.uniform(0.5, 20))
+            factor = ReprojectionFactor(X(0), L(0), np.array([10.0, 20]), face, CAMERAS, UNIT)
+            # 1e-5 units at half a unit's depth and 45 degrees: third derivatives of 300 px
+            assert max(jacobian_errors(factor, values_at(pose, point)).values()) < 1e-6
+
+
+def test_reprojection_behind_the_face_pulls_nowhere():
+    pose = gtsam.Pose3()
+    factor = ReprojectionFactor(X(0), L(0), np.array([10.0, 20]), 0, CAMERAS, UNIT)
+    for point in ([0.1, 0.2, -1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]):
+        values = values_at(pose, np.array(point))
+        jacobian, right = factor.linearize(values).jacobian()
+        assert not jacobian.any()
+        assert np.array_equal(right, [-600.0, -600.0])
+    in_front = reprojection_residuals(
+        np.eye(4)[None], np.array([[0.1, 0.2, -1.0]]), np.zeros((1, 2)), np.array([0]), CAMERAS
+    )[3]
+    assert not in_front.any()
+
+
+@pytest.mark.parametrize("face", [0, 1])
+def test_reprojection_agrees_with_gtsam(face):
+    rng = np.random.default_rng(5)
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, 0.7)
+    f, (u, v) = CAMERAS.focals[face], CAMERAS.principals[face]
+    calibration = gtsam.Cal3_S2(f, f, 0, u, v)
+    rig_T_face = gtsam.Pose3(gtsam.Rot3(CAMERAS.rig_R_faces[face]), np.zeros(3))
+    for _ in range(50):
+        values = values_at(random_pose(rng), 3 * rng.normal(size=3))  # behind the face half the time
+        pixel = rng.uniform(0, 512, 2)
+        ours = ReprojectionFactor(X(0), L(0), pixel, face, CAMERAS, noise).error(values)
+        native = gtsam.GenericProjectionFactorCal3_S2(
+            pixel, noise, X(0), L(0), calibration, rig_T_face
+        ).error(values)
+        assert ours == pytest.approx(native, rel=1e-9)
+
+
+def test_tangent_basis_is_orthonormal():
+    bearings = np.random.default_rng(6).normal(size=(100, 3))
+    bearings = np.concatenate([bearings, np.eye(3), -np.eye(3)])
+    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    frame = np.concatenate([tangent_basis(bearings), bearings[:, None]], axis=1)
+    product = np.einsum("nij,nkj->nik", frame, frame)
+    assert np.allclose(product, np.eye(3), atol=1e-12)
+    assert np.allclose(np.linalg.det(frame), 1)
