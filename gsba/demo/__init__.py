@@ -1,0 +1,6 @@
+"""A synthetic walk with exact truth, and the SLAM-like trajectory made from it."""
+
+from gsba.demo.degrade import degrade
+from gsba.demo.walk import DemoWalk, Heading, WalkPath, make_walk
+
+__all__ = ["DemoWalk", "Heading", "WalkPath", "degrade", "make_walk"]

@@ -1,0 +1,114 @@
+"""Equirectangular pictures of a scene, anti-aliased."""
+
+import numpy as np
+
+from gsba.demo.raycast import Scene, coordinates, in_bands, jit, nearest
+from gsba.demo.sampling import albedo_at, light_at
+
+EDGE_SAMPLES = 3  # rays per pixel and axis where faces meet
+EXPOSURE = 1.1  # of the tone curve 1 - exp(-EXPOSURE * radiance)
+
+
+def render_erp(scene: Scene, world_T_rig: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Equirectangular picture of the scene, filtered over each pixel.
+
+    Inside a face the texture filter covers the pixel; where faces meet, EDGE_SAMPLES squared
+    rays, each with its share of the filter, do.
+
+    Args:
+        world_T_rig: (4, 4) float64, rotation and position of the panorama.
+        width, height: pixels, width = 2 height.
+
+    Returns:
+        (height, width, 3) float32, RGB, 0..255, black where nothing is hit.
+    """
+    world_R_rig = np.ascontiguousarray(world_T_rig[:3, :3], dtype=np.float64)
+    rig_in_world = np.ascontiguousarray(world_T_rig[:3, 3], dtype=np.float64)
+    faces = np.empty((height, width), dtype=np.int64)
+    image = np.empty((height, width, 3), dtype=np.float32)
+    in_bands(_find_faces, height, scene, world_R_rig, rig_in_world, faces)
+    in_bands(_shade, height, scene, world_R_rig, rig_in_world, faces, image)
+    return image
+
+
+@jit
+def _find_faces(start, stop, scene, R, o, faces):
+    """Face at each pixel's centre, -1 for none, into rows of faces (H, W)."""
+    height, width = faces.shape
+    step = np.pi / height
+    o = (o[0], o[1], o[2])
+    for row in range(start, stop):
+        latitude, hint = np.pi / 2 - (row + 0.5) * step, -1
+        for column in range(width):
+            x, y, z = _direction((column + 0.5) * step - np.pi, latitude)
+            hint = nearest(scene, o, _rotate(R, x, y, z), np.inf, hint)[1]
+            faces[row, column] = hint
+
+
+@jit
+def _shade(start, stop, scene, R, o, faces, image):
+    """Colours of rows of image (H, W, 3)."""
+    height, width = faces.shape
+    o = (o[0], o[1], o[2])
+    for row in range(start, stop):
+        for column in range(width):
+            samples = 1 if _uniform(faces, row, column) else EDGE_SAMPLES
+            step, hint = np.pi / (height * samples), faces[row, column]
+            red, green, blue = 0.0, 0.0, 0.0
+            for k in range(samples * samples):
+                i, j = column * samples + k % samples, row * samples + k // samples
+                longitude, latitude = (i + 0.5) * step - np.pi, np.pi / 2 - (j + 0.5) * step
+                r, g, b, hint = _color(scene, R, o, longitude, latitude, step, hint)
+                red, green, blue = red + r, green + g, blue + b
+            image[row, column, 0] = red / samples**2
+            image[row, column, 1] = green / samples**2
+            image[row, column, 2] = blue / samples**2
+
+
+@jit
+def _uniform(faces, row, column):
+    """Whether a pixel and its eight neighbours (wrapping around the seam) see one face."""
+    height, width = faces.shape
+    for j in range(max(row - 1, 0), min(row + 2, height)):
+        for i in range(column - 1, column + 2):
+            if faces[j, i % width] != faces[row, column]:
+                return False
+    return True
+
+
+@jit
+def _rotate(R, x, y, z):
+    return (
+        R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
+        R[1, 0] * x + R[1, 1] * y + R[1, 2] * z,
+        R[2, 0] * x + R[2, 1] * y + R[2, 2] * z,
+    )
+
+
+@jit
+def _direction(longitude, latitude):
+    c = np.cos(latitude)
+    return c * np.sin(longitude), -np.sin(latitude), c * np.cos(longitude)
+
+
+@jit
+def _color(scene, R, o, longitude, latitude, step, hint):
+    """Colour (3), 0..255, of the square of angle `step` at this ray, and the face hit or -1."""
+    cy, sy = np.cos(longitude), np.sin(longitude)
+    cp, sp = np.cos(latitude), np.sin(latitude)
+    d = _rotate(R, cp * sy, -sp, cp * cy)
+    t, q = nearest(scene, o, d, np.inf, hint)
+    if q < 0:
+        return 0.0, 0.0, 0.0, q
+    a, b = coordinates(scene, q, o, d, t)
+    du = _rotate(R, step * cp * cy, 0.0, -step * cp * sy)
+    dv = _rotate(R, step * sp * sy, step * cp, step * sp * cy)
+    albedo = albedo_at(scene, q, a, b, d, t, du, dv)
+    light = light_at(scene, scene.light, q, a, b)
+    glow, gain = scene.emissions[q], -EXPOSURE / 255
+    return (
+        255 - 255 * np.exp(gain * (albedo[0] * light[0] + 255 * glow)),
+        255 - 255 * np.exp(gain * (albedo[1] * light[1] + 255 * glow)),
+        255 - 255 * np.exp(gain * (albedo[2] * light[2] + 255 * glow)),
+        q,
+    )

@@ -1,0 +1,217 @@
+"""A walk with a 360-degree camera through the gallery: frames, exact truth, SLAM-like poses."""
+
+import csv
+import logging
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from gsba.demo.degrade import degrade
+from gsba.geometry import bearings_from_erp, pose, quaternion_from_rotation
+from gsba.log import GsbaError, track
+from gsba.types import Trajectory
+
+WalkPath = Literal["rectangle", "oval", "open"]
+Heading = Literal["locked", "forward"]
+
+FRAMES_PER_SECOND = 2.0
+EYE_HEIGHT = 1.5  # units above the floor
+CORNER_RADIUS = 0.45  # units, standard deviation of the smoothing that rounds corners
+WOBBLE_DEG = (1.5, 2.0, 1.5)  # pitch, yaw and roll of the hand, standard deviation
+WOBBLE_UNITS = 0.025  # of the position, per axis, standard deviation
+EXPOSURE_SWING = 0.05  # relative
+NOISE = 2.0  # grey values, standard deviation
+JPEG_QUALITY = 95
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class DemoWalk:
+    """Where a walk lies on disk."""
+
+    frames_dir: Path  # NNNNNN.jpg and timestamps.csv
+    truth_path: Path  # TUM, exact poses, world of the gallery
+    slam_path: Path  # TUM, degraded poses, world of the first frame and a scale of its own
+
+
+def make_walk(
+    out: Path,
+    path: WalkPath = "rectangle",
+    heading: Heading = "locked",
+    num_frames: int = 40,
+    width: int = 1024,
+    seed: int = 0,
+    depth: bool = False,
+) -> DemoWalk:
+    """Render a walk into the folder `out`, replacing a walk that is there.
+
+    Args:
+        path: "rectangle" and "oval" end one step before their start, "open" does not return.
+        heading: "locked" keeps looking one way, "forward" looks along the path.
+        num_frames: at least 3.
+        width: of the equirectangular frames in pixels, an even number of at least 64.
+        seed: of the hand's wobble, the noise and the drift.
+        depth: also write depth/NNNNNN.npz with `range`, (width / 8, width / 4) float32: distance
+            along the ray through each pixel of that size, 0 where nothing is hit.
+
+    Raises:
+        GsbaError: an argument is out of range, or `out` holds something else.
+    """
+    from gsba.demo.gallery import build_gallery
+
+    _check(out, path, heading, num_frames, width)
+    partial = out.with_name(f".{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    (partial / "images").mkdir(parents=True)
+    truth = walk_poses(path, heading, num_frames, seed)
+    scene = build_gallery()
+    logger.info("gallery of %d faces, %d frames of %d px", len(scene.corners), num_frames, width)
+    _write_frames(partial, scene, truth, width, seed)
+    if depth:
+        _write_depth(partial / "depth", scene, truth, width // 4)
+    _write_tum(partial / "groundtruth.tum", truth)
+    _write_tum(partial / "slam.tum", degrade(truth, seed))
+    if out.exists():
+        shutil.rmtree(out)
+    partial.rename(out)
+    return DemoWalk(out / "images", out / "groundtruth.tum", out / "slam.tum")
+
+
+def walk_poses(path: WalkPath, heading: Heading, num_frames: int, seed: int) -> Trajectory:
+    """Exact poses of a walk, evenly spaced along its path, held by hand.
+
+    World: x right, y down, z forward, floor at y = 0, in the gallery's units.
+    """
+    rng = np.random.default_rng(seed)
+    at, tangent = _sample(path, num_frames)
+    wobble = [_wobble(rng, num_frames) for _ in range(6)]
+    yaw = np.arctan2(tangent[:, 0], tangent[:, 1]) if heading == "forward" else 0.0
+    pitch, turn, roll = (np.radians(w) * x for w, x in zip(WOBBLE_DEG, wobble, strict=False))
+    rotations = _rotations(1, yaw + turn) @ _rotations(0, pitch) @ _rotations(2, roll)
+    positions = np.stack([at[:, 0], np.full(num_frames, -EYE_HEIGHT), at[:, 1]], axis=1)
+    positions += WOBBLE_UNITS * np.stack(wobble[3:], axis=1)
+    return Trajectory(np.arange(num_frames) / FRAMES_PER_SECOND, pose(rotations, positions))
+
+
+def _sample(path: WalkPath, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and unit tangents (x, z), each (num_frames, 2), evenly spaced on the path."""
+    closed = path != "open"
+    if path == "oval":
+        angle = np.linspace(0, 2 * np.pi, 73)
+        corners = np.stack([-4.5 * np.cos(angle), -3.0 * np.sin(angle)], axis=1)
+    elif path == "rectangle":
+        corners = np.array(
+            [
+                [-4.4, 0],
+                [-4.4, -2.6],
+                [4.4, -2.6],
+                [4.4, 2.6],
+                [-4.4, 2.6],
+                [-4.4, 0],
+            ]
+        )
+    else:  # through the passage
+        corners = np.array(
+            [
+                [-4.4, 2.6],
+                [-4.4, -2.6],
+                [0, -2.6],
+                [0, 2.8],
+                [4.4, 2.8],
+                [4.4, -2.6],
+            ]
+        )
+    spacing = 0.01
+    length = _arc_length(corners)
+    s = np.arange(0, length[-1], spacing)
+    dense = np.stack([np.interp(s, length, corners[:, k]) for k in range(2)], axis=1)
+    mode = "wrap" if closed else "nearest"
+    dense = gaussian_filter1d(dense, CORNER_RADIUS / spacing, axis=0, mode=mode)
+    if closed:
+        dense = np.concatenate([dense, dense[:1]])
+    length = _arc_length(dense)
+    stops = np.linspace(0, length[-1], num_frames, endpoint=not closed)
+    tangent = np.gradient(dense, axis=0)
+    at, along = (
+        np.stack([np.interp(stops, length, x[:, k]) for k in range(2)], axis=1)
+        for x in (dense, tangent)
+    )
+    return at, along / np.linalg.norm(along, axis=1, keepdims=True)
+
+
+def _arc_length(points: np.ndarray) -> np.ndarray:
+    """Length (N,) of a polyline (N, D) up to each of its points."""
+    return np.r_[0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
+
+
+def _wobble(rng: np.random.Generator, num_frames: int) -> np.ndarray:
+    """Irregular swing (num_frames,) of unit variance, periods of 4 to 14 frames."""
+    phase = rng.uniform(0, 2 * np.pi, (3, 1))
+    frequency = 2 * np.pi / rng.uniform(4, 14, (3, 1))
+    return np.sin(frequency * np.arange(num_frames) + phase).sum(axis=0) * np.sqrt(2 / 3)
+
+
+def _rotations(axis: int, angles: np.ndarray | float) -> np.ndarray:
+    """Rotations (N, 3, 3) about one axis."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(np.atleast_1d(angles)[:, None] * np.eye(3)[axis]).as_matrix()
+
+
+def _write_frames(out: Path, scene, truth: Trajectory, width: int, seed: int) -> None:
+    """JPEGs with exposure and noise, and their times."""
+    import cv2
+
+    from gsba.demo.render import render_erp
+
+    rng = np.random.default_rng([seed, 1])
+    exposures = 1 + EXPOSURE_SWING * np.tanh(_wobble(rng, len(truth.timestamps)))
+    names = [f"{f:06d}.jpg" for f in range(len(exposures))]
+    frames = zip(names, truth.world_T_rigs, exposures, strict=True)
+    for name, world_T_rig, exposure in track(frames, "rendering the walk", total=len(names)):
+        image = exposure * render_erp(scene, world_T_rig, width, width // 2)
+        image += NOISE * rng.standard_normal(image.shape, dtype=np.float32)
+        bgr = np.clip(image[..., ::-1] + 0.5, 0, 255).astype(np.uint8)
+        quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        if not cv2.imwrite(str(out / "images" / name), bgr, quality):
+            raise GsbaError(f"{out / 'images' / name}: cannot be written; is the disk full?")
+    with (out / "images" / "timestamps.csv").open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["name", "timestamp"])
+        rows.writerows((name, f"{t:.6f}") for name, t in zip(names, truth.timestamps, strict=True))
+
+
+def _write_depth(folder: Path, scene, truth: Trajectory, width: int) -> None:
+    from gsba.demo.raycast import ranges
+
+    folder.mkdir()
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
+    bearings = bearings_from_erp(np.stack([u.ravel(), v.ravel()], axis=1), width, width // 2)
+    for f, world_T_rig in enumerate(truth.world_T_rigs):
+        hit = ranges(scene, world_T_rig[:3, 3], bearings @ world_T_rig[:3, :3].T)
+        depth = hit.reshape(u.shape).astype(np.float32)
+        np.savez_compressed(folder / f"{f:06d}.npz", range=depth)
+
+
+def _write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Lines of timestamp, position and quaternion xyzw of world_T_rig."""
+    xyzw = quaternion_from_rotation(trajectory.world_T_rigs[:, :3, :3])[:, [1, 2, 3, 0]]
+    rows = np.column_stack([trajectory.timestamps, trajectory.world_T_rigs[:, :3, 3], xyzw])
+    np.savetxt(path, rows, fmt="%.9f")
+
+
+def _check(out: Path, path: str, heading: str, num_frames: int, width: int) -> None:
+    for value, allowed, what in ((path, WalkPath, "path"), (heading, Heading, "heading")):
+        if value not in get_args(allowed):
+            raise GsbaError(f"{what} {value!r} is none of {', '.join(get_args(allowed))}")
+    if num_frames < 3:
+        raise GsbaError(f"a walk of {num_frames} frames: at least 3 are needed")
+    if width < 64 or width % 2:
+        raise GsbaError(f"frames {width} px wide: an even number of at least 64 is needed")
+    if out.exists() and not (out / "groundtruth.tum").is_file() and any(out.iterdir()):
+        raise GsbaError(f"{out}: holds something else than a walk; name another folder")
