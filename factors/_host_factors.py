@@ -8,13 +8,14 @@ import gtsam
 import numpy as np
 from numba import njit
 
-from factors._elimination import eliminate_range, polish_range
+from factors._kernels import eliminate_range, polish_range
 from factors._terms import pose_rows
 
 if TYPE_CHECKING:
     from factors.landmarks import LandmarkBlock
 
-_POLISH_STEPS = 20  # at each evaluation, so that the error is a function of the poses alone
+_POLISH_TOLERANCE = 1e-12  # of a landmark's cost
+_POLISH_STEPS = 50  # at each evaluation, so that the error is a function of the poses alone
 
 
 def host_factors(block: LandmarkBlock) -> list[gtsam.CustomFactor]:
@@ -58,7 +59,7 @@ def _host_factor(block: LandmarkBlock, first: int, last: int) -> gtsam.CustomFac
         points, costs = np.empty_like(start), np.empty(last - first)
         polish_range(
             0, last - first, local, start, poses, poses, no_steps, False, _POLISH_STEPS,
-            costs, points, costs,
+            _POLISH_TOLERANCE, costs, points, costs,
         )  # fmt: skip
         return points, float(costs.sum())
 
@@ -71,8 +72,8 @@ def _host_factor(block: LandmarkBlock, first: int, last: int) -> gtsam.CustomFac
             diagonal, gradient = np.zeros((num, 6, 6)), np.zeros((num, 6))
             off_diagonal = np.zeros((len(columns), 6, 6))
             eliminate_range(
-                0, last - first, local, points, poses, row_starts, columns, diagonal,
-                off_diagonal, gradient, np.zeros(len(block.families)), np.empty(last - first),
+                0, last - first, local, points, poses, row_starts, columns, diagonal, off_diagonal,
+                gradient, np.zeros(len(block.families)), np.empty(last - first),
             )  # fmt: skip
             H = np.zeros((num, 6, num, 6))
             H[np.arange(num), :, np.arange(num), :] = diagonal

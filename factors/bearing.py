@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from factors._kernels import BEARING
+from factors._observations import BEARING
 from factors._terms import custom_factor, rig_vectors, whitener_rows
 
 _SMALL = 1e-12  # of the sine of the angle: the residual's direction is not defined nearer to pi

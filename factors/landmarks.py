@@ -8,9 +8,9 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 
-from factors._elimination import eliminate_range, polish_range, residuals_range
 from factors._host_factors import host_factors
-from factors._kernels import Observations
+from factors._kernels import eliminate_range, polish_range, residuals_range
+from factors._observations import Observations
 from factors._terms import pose_rows
 from factors.bearing import BearingTerm
 from factors.block import PoseSystem
@@ -18,6 +18,9 @@ from factors.reprojection import ReprojectionTerm
 from factors.robust import RobustLoss
 
 Term = BearingTerm | ReprojectionTerm
+
+_POLISH_TOLERANCE = 1e-12  # of a landmark's cost
+_PROPOSAL_TOLERANCE = 1e-6  # of a landmark's cost: further steps gain less than the poses do
 
 
 class LandmarkBlock:
@@ -117,9 +120,8 @@ class LandmarkBlock:
         """Robust cost at `values`, `steps (F, 6)` from the linearization, landmarks moved along."""
         if self._poses is None:
             raise RuntimeError("propose() needs linearize() before it")
-        return self._move(
-            pose_rows(values, self.pose_keys), self._poses, np.ascontiguousarray(steps)
-        )
+        poses, steps = pose_rows(values, self.pose_keys), np.ascontiguousarray(steps)
+        return self._move(poses, self._poses, steps, self.polish_steps, _PROPOSAL_TOLERANCE)
 
     def accept(self) -> None:
         """Keep the landmarks of the last proposal."""
@@ -127,9 +129,10 @@ class LandmarkBlock:
             self._points, self._point_costs = self._trial
             self._trial = None
 
-    def polish(self, values: gtsam.Values, num_steps: int = 20) -> float:
+    def polish(self, values: gtsam.Values, num_steps: int = 50) -> float:
         """Move the landmarks to their optimum at fixed poses; returns the robust cost."""
-        cost = self._move(pose_rows(values, self.pose_keys), None, None, num_steps)
+        poses = pose_rows(values, self.pose_keys)
+        cost = self._move(poses, None, None, num_steps, _POLISH_TOLERANCE)
         self.accept()
         return cost
 
@@ -175,19 +178,19 @@ class LandmarkBlock:
         poses: np.ndarray,
         old_poses: np.ndarray | None,
         steps: np.ndarray | None,
-        num_steps: int | None = None,
+        num_steps: int,
+        tolerance: float,
     ) -> float:
         points, costs = np.empty_like(self._points), np.empty_like(self._point_costs)
         ranges = self._ranges()
         substitute = steps is not None
-        num_steps = self.polish_steps if num_steps is None else num_steps
 
         def work(i: int) -> None:
             polish_range(
                 *ranges[i], self._obs, self._points, poses,
                 poses if old_poses is None else old_poses,
                 np.zeros((len(poses), 6)) if steps is None else steps,
-                substitute, num_steps, self._point_costs, points, costs,
+                substitute, num_steps, tolerance, self._point_costs, points, costs,
             )  # fmt: skip
 
         self._run(work, len(ranges))

@@ -5,28 +5,9 @@ from typing import Literal
 
 import gtsam
 import numpy as np
-from numba import njit
 
 LossKind = Literal["none", "huber", "cauchy", "geman_mcclure"]
 _CODES: dict[str, int] = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
-
-
-@njit(cache=True, nogil=True)
-def rho_and_weight(code, scale, squared):
-    """Loss rho(s) and weight w = 2 rho'(s) of s = |whitened residual|^2.
-
-    Near zero rho = s / 2, so the sum of rho is the cost GTSAM reports.
-    """
-    c2 = scale * scale
-    if code == 1 and squared > c2:
-        norm = np.sqrt(squared)
-        return scale * (norm - 0.5 * scale), scale / norm
-    if code == 2:
-        return 0.5 * c2 * np.log1p(squared / c2), c2 / (c2 + squared)
-    if code == 3:
-        weight = c2 / (c2 + squared)
-        return 0.5 * squared * weight, weight * weight
-    return 0.5 * squared, 1.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,367 @@
+"""Blocks against reference factors against native ones; the loop against stock optimizers."""
+
+import logging
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import L, X
+
+from factors import (
+    BearingFactor,
+    BearingTerm,
+    FaceCameras,
+    LandmarkBlock,
+    ReprojectionFactor,
+    ReprojectionTerm,
+    RobustLoss,
+)
+from factors.cholesky import BlockCholesky
+from gsba.config import SolverSettings
+from gsba.log import GsbaError
+from gsba.optimize import marginal_covariances, optimize
+
+SIGMA_RAD, SIGMA_PX = 1e-3, 0.5
+LOSS = RobustLoss("cauchy", 2.0)
+CAMERAS = FaceCameras(
+    rig_R_faces=np.array([gtsam.Rot3.Ry(i * np.pi / 2).matrix() for i in range(4)]),
+    focals=np.full(4, 250.0),
+    principals=np.full((4, 2), 256.0),
+)
+PRIOR = gtsam.noiseModel.Isotropic.Sigma(6, 0.02)
+TIGHT = SolverSettings(relative_tolerance=1e-12, max_iterations=200)
+
+
+class World:
+    """Eight frames on a line among forty landmarks; bearings of all, pixels of some."""
+
+    def __init__(self, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        num_frames, num_points = 8, 40
+        self.truth = [
+            gtsam.Pose3(gtsam.Rot3.Ypr(*(0.3 * rng.normal(size=3))), np.array([0.5 * f, 0, 0.1]))
+            for f in range(num_frames)
+        ]
+        points = rng.uniform(-4, 4, (num_points, 3)) + [2.0, 0, 0]
+        f, j = (a.ravel() for a in np.meshgrid(np.arange(num_frames), np.arange(num_points)))
+        keep = rng.random(len(f)) < 0.8
+        self.frames, self.owners = f[keep], j[keep]
+        local = np.array(
+            [self.truth[f].transformTo(points[j]) for f, j in zip(f[keep], j[keep], strict=True)]
+        )
+        self.bearings = local / np.linalg.norm(local, axis=1, keepdims=True)
+        self.bearings += SIGMA_RAD * rng.normal(size=local.shape)
+        self.bearings[::30] += 0.05 * rng.normal(size=self.bearings[::30].shape)  # outliers
+        self.bearings /= np.linalg.norm(self.bearings, axis=1, keepdims=True)
+        faces = np.argmax(local @ CAMERAS.rig_R_faces[:, :, 2].T, axis=1)
+        on_face = np.einsum("nji,nj->ni", CAMERAS.rig_R_faces[faces], local)
+        pixels = 250 * on_face[:, :2] / on_face[:, 2:] + 256
+        pixels += SIGMA_PX * rng.normal(size=pixels.shape)
+        some = (np.abs(on_face[:, 1]) < on_face[:, 2]) & (rng.random(len(faces)) < 0.5)
+        self.pixel_rows, self.pixels, self.faces = np.flatnonzero(some), pixels[some], faces[some]
+        self.start_points = points + 0.05 * rng.normal(size=points.shape)
+        self.values = gtsam.Values()
+        self.graph = gtsam.NonlinearFactorGraph()
+        for f, pose in enumerate(self.truth):
+            self.values.insert(X(f), pose.retract(0.02 * rng.normal(size=6)))
+            self.graph.add(gtsam.PriorFactorPose3(X(f), pose, PRIOR))
+        self.keys = [X(f) for f in range(num_frames)]
+
+    def block(self, **options) -> LandmarkBlock:
+        rows = self.pixel_rows
+        terms = [
+            BearingTerm(self.frames, self.owners, self.bearings, SIGMA_RAD),
+            ReprojectionTerm(
+                self.frames[rows], self.owners[rows], self.pixels, self.faces, CAMERAS, SIGMA_PX
+            ),
+        ]
+        return LandmarkBlock(self.keys, self.start_points, terms, LOSS, **options)
+
+    def reference(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """The same problem in single factors, landmarks as variables."""
+        graph, values = gtsam.NonlinearFactorGraph(self.graph), gtsam.Values(self.values)
+        noise = LOSS.noise_model(gtsam.noiseModel.Isotropic.Sigma(2, SIGMA_RAD))
+        for f, j, bearing in zip(self.frames, self.owners, self.bearings, strict=True):
+            graph.add(BearingFactor(X(f), L(j), bearing, noise))
+        noise = LOSS.noise_model(gtsam.noiseModel.Isotropic.Sigma(2, SIGMA_PX))
+        for row, pixel, face in zip(self.pixel_rows, self.pixels, self.faces, strict=True):
+            f, j = self.frames[row], self.owners[row]
+            graph.add(ReprojectionFactor(X(f), L(j), pixel, int(face), CAMERAS, noise))
+        for j, point in enumerate(self.start_points):
+            values.insert(L(j), point)
+        return graph, values
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return World()
+
+
+@pytest.fixture(scope="module")
+def solved(world):
+    """The fast door's result and its block."""
+    block = world.block()
+    return optimize(world.graph, [block], world.values, TIGHT), block
+
+
+def stock(graph, values) -> gtsam.Values:
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-12)
+    params.setAbsoluteErrorTol(1e-12)
+    params.setMaxIterations(300)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+
+
+def distance(a: gtsam.Values, b: gtsam.Values, keys) -> float:
+    return max(np.abs(a.atPose3(k).localCoordinates(b.atPose3(k))).max() for k in keys)
+
+
+def test_block_costs_what_its_reference_factors_cost(world):
+    graph, values = world.reference()
+    costs = world.block().costs(world.values)
+    assert set(costs) == {"bearing", "reprojection"}
+    expected = graph.error(values) - world.graph.error(values)
+    assert sum(costs.values()) == pytest.approx(expected, rel=1e-10)
+
+
+def test_reduced_system_is_the_schur_complement_of_the_reference_factors(world):
+    graph, values = world.reference()
+    priors = world.graph.size()
+    only = gtsam.NonlinearFactorGraph()
+    for i in range(priors, graph.size()):
+        only.add(graph.at(i))
+    order = gtsam.Ordering()
+    for key in [*world.keys, *(L(j) for j in range(len(world.start_points)))]:
+        order.push_back(key)
+    H, minus_g = only.linearize(values).hessian(order)
+    num = 6 * len(world.keys)
+    eliminate = H[:num, num:] @ np.linalg.inv(H[num:, num:])
+    expected_H = H[:num, :num] - eliminate @ H[num:, :num]
+    expected_g = -(minus_g[:num] - eliminate @ minus_g[num:])
+    block = world.block()
+    system = block.linearize(world.values)
+    dense = np.zeros((len(world.keys), 6, len(world.keys), 6))
+    for f, diagonal in enumerate(system.diagonal):
+        dense[f, :, f, :] = diagonal
+    for (f, g), off in zip(block.pairs, system.off_diagonal, strict=True):
+        dense[f, :, g, :], dense[g, :, f, :] = off, off.T
+    dense = dense.reshape(num, num)
+    # the elimination damps each landmark by 1e-12 of its trace
+    assert np.abs(dense - expected_H).max() < 1e-7 * np.abs(expected_H).max()
+    assert np.abs(system.gradient.ravel() - expected_g).max() < 1e-7 * np.abs(expected_g).max()
+
+
+def test_reference_host_factors_and_fast_door_agree(world, solved):
+    result, block = solved
+    assert result.converged
+    graph, values = world.reference()
+    reference = stock(graph, values)
+    assert result.cost == pytest.approx(graph.error(reference), rel=1e-8)
+    # cost is flat at the optimum: 1e-8 of it is 1e-4 sigmas, and a sigma of a pose about 1e-3
+    assert distance(result.values, reference, world.keys) < 1e-6
+    again = world.block()
+    grouped = gtsam.NonlinearFactorGraph(world.graph)
+    for factor in again.factors():
+        grouped.add(factor)
+    hosted = stock(grouped, world.values)
+    assert grouped.error(hosted) == pytest.approx(result.cost, rel=1e-8)
+    assert distance(result.values, hosted, world.keys) < 1e-5
+
+
+def test_host_factor_errors_add_up_to_the_cost_with_and_without_derivatives(world):
+    block = world.block()
+    cost = block.polish(world.values)
+    factors = block.factors()
+    plain = sum(factor.error(world.values) for factor in factors)
+    assert plain == pytest.approx(cost, rel=1e-6)
+    zero = world.values.zeroVectors()
+    at_linearization = sum(factor.linearize(world.values).error(zero) for factor in factors)
+    assert at_linearization == pytest.approx(cost, rel=1e-6)
+
+
+def test_covariances_agree_with_marginals(world, solved):
+    result, block = solved
+    graph, values = world.reference()
+    for key in world.keys:
+        values.update(key, result.values.atPose3(key))
+    for j, point in enumerate(block.points_world):
+        values.update(L(j), point)
+    marginals = gtsam.Marginals(graph, values)
+    covariances = marginal_covariances(world.graph, [block], result.values, world.keys)
+    for key, covariance in zip(world.keys, covariances, strict=True):
+        expected = marginals.marginalCovariance(key)
+        assert np.abs(covariance - expected).max() < 1e-5 * np.abs(expected).max()
+
+
+def test_result_does_not_depend_on_threads_or_order(world, solved):
+    result, _ = solved
+    block = world.block(num_threads=3)
+    other = optimize(world.graph, [block], world.values, TIGHT)
+    assert distance(result.values, other.values, world.keys) < 1e-6
+    assert other.cost == pytest.approx(result.cost, rel=1e-9)
+
+
+def test_landmarks_keep_their_order(world):
+    block = world.block()
+    assert np.array_equal(block.points_world, world.start_points)
+
+
+def test_residuals_come_back_in_the_terms_order(world):
+    block = world.block()
+    (bearing, pixel), (valid, in_front) = block.residuals(world.values)
+    assert len(bearing) == len(world.frames) and len(pixel) == len(world.pixels)
+    assert valid.all() and in_front.all()
+    row = 17
+    factor = BearingFactor(
+        X(world.frames[row]),
+        L(world.owners[row]),
+        world.bearings[row],
+        gtsam.noiseModel.Isotropic.Sigma(2, SIGMA_RAD),
+    )
+    expected = factor.error(world.reference()[1])
+    assert 0.5 * bearing[row] @ bearing[row] == pytest.approx(expected, rel=1e-9)
+
+
+def test_square_root_information_weighs_directions(world):
+    root = np.array([[2.0, 0.7], [0.0, 0.5]]) / SIGMA_RAD
+    turned = gtsam.Rot2(0.8).matrix() @ root  # another root of the same information
+    args = (world.frames, world.owners, world.bearings)
+    costs = [
+        LandmarkBlock(
+            world.keys,
+            world.start_points,
+            [BearingTerm(*args, sqrt_infos=np.tile(r, (len(world.frames), 1, 1)))],
+        ).error(world.values)
+        for r in (root, turned)
+    ]
+    graph, values = gtsam.NonlinearFactorGraph(), world.reference()[1]
+    noise = gtsam.noiseModel.Gaussian.SqrtInformation(root)
+    for f, j, bearing in zip(*args, strict=True):
+        graph.add(BearingFactor(X(f), L(j), bearing, noise))
+    assert costs == pytest.approx([graph.error(values)] * 2, rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["none", "huber", "cauchy", "geman_mcclure"])
+def test_losses_are_gtsams(kind):
+    loss = RobustLoss(kind, 1.7)
+    model = loss.noise_model(gtsam.noiseModel.Unit.Create(2))
+    for norm in (0.0, 0.5, 1.7, 9.0):
+        whitened = np.array([0.6, 0.8]) * norm
+        prior = gtsam.PriorFactorPoint2(0, np.zeros(2), model)
+        values = gtsam.Values()
+        values.insert(0, whitened)
+        assert loss.rho(np.array([norm**2]))[0] == pytest.approx(prior.error(values), abs=1e-12)
+
+
+def test_degenerate_landmarks_and_idle_frames_stay_finite(world):
+    points = np.array([[1.0, 0, 3], [1, 0, 3], [5, 5, 5], world.truth[0].translation()])
+    frames, owners = np.array([0, 1, 1, 2, 0]), np.array([0, 1, 1, 1, 3])  # one ray; none; centre
+    bearings = np.tile([0.0, 0.0, 1.0], (5, 1))
+    block = LandmarkBlock(world.keys, points, [BearingTerm(frames, owners, bearings, 0.01)])
+    result = optimize(world.graph, [block], world.values)
+    assert np.isfinite(result.cost) and np.isfinite(block.points_world).all()
+    assert np.isfinite(marginal_covariances(world.graph, [block], result.values, world.keys)).all()
+    assert np.array_equal(block.points_world[2], points[2])
+
+
+def test_variables_of_other_types_join(world):
+    """A scalar and a nine-parameter camera beside the poses, moved by native factors."""
+    graph, values = gtsam.NonlinearFactorGraph(world.graph), gtsam.Values(world.values)
+    scalar = gtsam.symbol("s", 0)
+    values.insert(scalar, 2.0)
+    graph.add(gtsam.PriorFactorDouble(scalar, 5.0, gtsam.noiseModel.Isotropic.Sigma(1, 0.1)))
+    camera, wanted = gtsam.symbol("k", 0), gtsam.Cal3DS2(300, 310, 0, 1, 2, 0.1, 0.2, 0.3, 0.4)
+    values.insert(camera, gtsam.Cal3DS2(200, 200, 0, 0, 0, 0, 0, 0, 0))
+    graph.add(gtsam.PriorFactorCal3DS2(camera, wanted, gtsam.noiseModel.Isotropic.Sigma(9, 1.0)))
+
+    def tied(_factor, values, jacobians):
+        pose = values.atPose3(X(0))
+        if jacobians is not None:
+            jacobians[0] = np.array([[-1.0]])
+            row = np.zeros((1, 6))
+            row[:, 3:] = pose.rotation().matrix()[:1]
+            jacobians[1] = row
+        return np.array([pose.x() + 3.0 - values.atDouble(scalar)])
+
+    graph.add(gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, 0.01), [scalar, X(0)], tied))
+    ours = optimize(graph, [world.block()], values, TIGHT)
+    grouped = gtsam.NonlinearFactorGraph(graph)
+    for factor in world.block().factors():
+        grouped.add(factor)
+    theirs = stock(grouped, values)
+    assert ours.values.atDouble(scalar) == pytest.approx(theirs.atDouble(scalar), abs=1e-6)
+    assert np.allclose(ours.values.atCal3DS2(camera).vector(), wanted.vector())
+    assert set(ours.history[-1].costs) == {"bearing", "reprojection", "graph"}
+
+
+def test_bad_steps_are_refused_and_bad_starts_reported(world):
+    """A factor that turns NaN away from the start: the loop stays where the cost is a number."""
+    key = gtsam.symbol("s", 0)
+    values = gtsam.Values(world.values)
+    values.insert(key, 1.0)
+
+    def root(_factor, values, jacobians):
+        x = values.atDouble(key)
+        if jacobians is not None:
+            jacobians[0] = np.array([[1.0]])
+        return np.array([np.log(x) + 5 if x > 0 else np.nan])
+
+    graph = gtsam.NonlinearFactorGraph(world.graph)
+    graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [key], root))
+    result = optimize(graph, [world.block()], values)
+    assert np.isfinite(result.cost) and result.cost <= result.history[0].cost
+    assert not all(step.accepted for step in result.history)
+    values.update(key, -1.0)
+    with pytest.raises(GsbaError, match="graph is not finite"):
+        optimize(graph, [world.block()], values)
+
+
+def test_interrupt_passes_through(world):
+    def stop(_iteration, _values):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        optimize(world.graph, [world.block()], world.values, callback=stop)
+
+
+def test_bad_terms_are_named(world):
+    one = np.array([0])
+    with pytest.raises(ValueError, match="frame index"):
+        LandmarkBlock(
+            world.keys, np.zeros((1, 3)), [BearingTerm(np.array([8]), one, np.eye(3)[:1])]
+        )
+    with pytest.raises(ValueError, match="finite"):
+        LandmarkBlock(
+            world.keys, np.zeros((1, 3)), [BearingTerm(one, one, np.full((1, 3), np.nan))]
+        )
+    with pytest.raises(ValueError, match="positive"):
+        LandmarkBlock(world.keys, np.zeros((1, 3)), [BearingTerm(one, one, np.eye(3)[:1], 0.0)])
+    with pytest.raises(ValueError, match="no value"):
+        optimize(world.graph, [], gtsam.Values())
+
+
+def test_block_cholesky_solves_and_inverts():
+    rng = np.random.default_rng(7)
+    num = 30
+    pairs = np.array([(i, k) for i in range(num) for k in range(i + 1, num) if rng.random() < 0.15])
+    dense = np.zeros((num, 6, num, 6))
+    off = rng.normal(size=(len(pairs), 6, 6))
+    for (i, k), block in zip(pairs, off, strict=True):
+        dense[i, :, k, :], dense[k, :, i, :] = block, block.T
+    dense[np.arange(num), :, np.arange(num), :] += 60 * np.eye(6)  # diagonally dominant
+    matrix = dense.reshape(6 * num, 6 * num)
+    diagonal = np.tile(60 * np.eye(6), (num, 1, 1))
+    cholesky = BlockCholesky(num, pairs)
+    assert cholesky.factorize(diagonal, off)
+    right = rng.normal(size=(num, 6))
+    assert np.allclose(matrix @ cholesky.solve(right).ravel(), right.ravel(), atol=1e-12)
+    inverse = np.linalg.inv(matrix).reshape(num, 6, num, 6)
+    expected = inverse[np.arange(num), :, np.arange(num), :]
+    assert np.allclose(cholesky.inverse_diagonal(), expected, atol=1e-14)
+    assert not cholesky.factorize(-diagonal, off)
+
+
+def test_history_is_logged(world, caplog):
+    with caplog.at_level(logging.DEBUG, logger="gsba.optimize"):
+        optimize(world.graph, [world.block()], world.values)
+    assert "step 0" in caplog.text
