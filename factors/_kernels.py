@@ -173,26 +173,37 @@ def times_symmetric(v, x, y, z):
 
 
 @njit(cache=True, nogil=True)
-def add_point_hessian(normal, pose, a0, a1, a2, b0, b1, b2, w):
-    """Add w (d r / d X)^T (d r / d X) to normal[:6]; d r / d X = (d r / d d) world_R_rig^T."""
-    p0 = a0 * pose[0] + a1 * pose[1] + a2 * pose[2]
-    p1 = a0 * pose[3] + a1 * pose[4] + a2 * pose[5]
-    p2 = a0 * pose[6] + a1 * pose[7] + a2 * pose[8]
-    q0 = b0 * pose[0] + b1 * pose[1] + b2 * pose[2]
-    q1 = b0 * pose[3] + b1 * pose[4] + b2 * pose[5]
-    q2 = b0 * pose[6] + b1 * pose[7] + b2 * pose[8]
+def _point_rows(pose, a0, a1, a2, b0, b1, b2):
+    """Both rows of d r / d X = (d r / d d) world_R_rig^T."""
+    return (
+        a0 * pose[0] + a1 * pose[1] + a2 * pose[2],
+        a0 * pose[3] + a1 * pose[4] + a2 * pose[5],
+        a0 * pose[6] + a1 * pose[7] + a2 * pose[8],
+        b0 * pose[0] + b1 * pose[1] + b2 * pose[2],
+        b0 * pose[3] + b1 * pose[4] + b2 * pose[5],
+        b0 * pose[6] + b1 * pose[7] + b2 * pose[8],
+    )
+
+
+@njit(cache=True, nogil=True)
+def _add_normal(normal, rows, r0, r1, w):
+    """Add an observation to a landmark's Hessian (6, upper) and gradient (3), one array (9,)."""
+    p0, p1, p2, q0, q1, q2 = rows
     normal[0] += w * (p0 * p0 + q0 * q0)
     normal[1] += w * (p0 * p1 + q0 * q1)
     normal[2] += w * (p0 * p2 + q0 * q2)
     normal[3] += w * (p1 * p1 + q1 * q1)
     normal[4] += w * (p1 * p2 + q1 * q2)
     normal[5] += w * (p2 * p2 + q2 * q2)
+    normal[6] += w * (p0 * r0 + q0 * r1)
+    normal[7] += w * (p1 * r0 + q1 * r1)
+    normal[8] += w * (p2 * r0 + q2 * r1)
 
 
 @njit(cache=True, nogil=True)
-def point_normal_equations(obs, j, point, poses, out):
-    """Cost of landmark j at `point`; its Hessian (6) and gradient (3) go into `out (9,)`."""
-    out[:] = 0.0
+def _point_normal(obs, j, point, poses, normal):
+    """Cost of landmark j at `point`; its Hessian and gradient go into `normal (9,)`."""
+    normal[:] = 0.0
     cost = 0.0
     for o in range(obs.offsets[j], obs.offsets[j + 1]):
         pose = poses[obs.frames[o]]
@@ -200,13 +211,8 @@ def point_normal_equations(obs, j, point, poses, out):
         valid, r0, r1, a0, a1, a2, b0, b1, b2 = whitened_residual(obs, o, dx, dy, dz)
         rho, w = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)
         cost += rho
-        if not valid:
-            continue
-        add_point_hessian(out, pose, a0, a1, a2, b0, b1, b2, w)
-        for c in range(3):
-            p = a0 * pose[3 * c] + a1 * pose[3 * c + 1] + a2 * pose[3 * c + 2]
-            q = b0 * pose[3 * c] + b1 * pose[3 * c + 1] + b2 * pose[3 * c + 2]
-            out[6 + c] += w * (p * r0 + q * r1)
+        if valid:
+            _add_normal(normal, _point_rows(pose, a0, a1, a2, b0, b1, b2), r0, r1, w)
     return cost
 
 
@@ -261,19 +267,16 @@ def eliminate_range(
                 continue
             _pose_row(a0, a1, a2, dx, dy, dz, a)
             _pose_row(b0, b1, b2, dx, dy, dz, b)
+            rows = _point_rows(pose, a0, a1, a2, b0, b1, b2)
+            _add_normal(normal, rows, r0, r1, w)
             H, g, Wf = diagonal[f], gradient[f], W[num - 1]
-            for c in range(3):
-                p = a0 * pose[3 * c] + a1 * pose[3 * c + 1] + a2 * pose[3 * c + 2]
-                q = b0 * pose[3 * c] + b1 * pose[3 * c + 1] + b2 * pose[3 * c + 2]
-                normal[6 + c] += w * (p * r0 + q * r1)
-                for i in range(6):
-                    Wf[i, c] += w * (a[i] * p + b[i] * q)
             for i in range(6):
                 ai, bi = w * a[i], w * b[i]
                 g[i] += ai * r0 + bi * r1
+                for c in range(3):
+                    Wf[i, c] += ai * rows[c] + bi * rows[3 + c]
                 for c in range(6):
                     H[i, c] += ai * a[c] + bi * b[c]
-            add_point_hessian(normal, pose, a0, a1, a2, b0, b1, b2, w)
         point_costs[j] = cost
         inverse = invert_symmetric(normal)
         for i in range(num):
@@ -299,7 +302,7 @@ def eliminate_range(
 
 @njit(cache=True, nogil=True)
 def _substituted_step(obs, j, point, poses, steps, normal):
-    """Gauss-Newton step of landmark j that goes with the pose steps (F, 6)."""
+    """Gauss-Newton step of landmark j, negated, that goes with the pose steps (F, 6)."""
     normal[:] = 0.0
     a, b = np.empty(6), np.empty(6)
     for o in range(obs.offsets[j], obs.offsets[j + 1]):
@@ -315,11 +318,7 @@ def _substituted_step(obs, j, point, poses, steps, normal):
         for i in range(6):
             r0 += a[i] * step[i]
             r1 += b[i] * step[i]
-        add_point_hessian(normal, pose, a0, a1, a2, b0, b1, b2, w)
-        for c in range(3):
-            p = a0 * pose[3 * c] + a1 * pose[3 * c + 1] + a2 * pose[3 * c + 2]
-            q = b0 * pose[3 * c] + b1 * pose[3 * c + 1] + b2 * pose[3 * c + 2]
-            normal[6 + c] -= w * (p * r0 + q * r1)
+        _add_normal(normal, _point_rows(pose, a0, a1, a2, b0, b1, b2), r0, r1, w)
     return times_symmetric(invert_symmetric(normal), normal[6], normal[7], normal[8])
 
 
@@ -336,23 +335,21 @@ def polish_range(
     ended where the next would gain less than `tolerance` of it. Writes `trial_points (J, 3)` and
     `trial_costs (J,)`.
     """
-    normal, candidate_normal = np.empty(9), np.empty(9)
+    normal, trial_normal = np.empty(9), np.empty(9)
     here, there = np.empty(3), np.empty(3)
     for j in range(first, last):
-        here[:] = points[j]
+        _copy(points[j], here)
         if substitute:
             x, y, z = _substituted_step(obs, j, here, old_poses, steps, normal)
-            here[0] += x
-            here[1] += y
-            here[2] += z
-        cost = point_normal_equations(obs, j, here, poses, normal)
+            here[0], here[1], here[2] = here[0] - x, here[1] - y, here[2] - z
+        cost = _point_normal(obs, j, here, poses, normal)
         if substitute and not cost <= point_costs[j]:
-            there[:] = points[j]
-            stay = point_normal_equations(obs, j, there, poses, candidate_normal)
+            _copy(points[j], there)
+            stay = _point_normal(obs, j, there, poses, trial_normal)
             if not cost <= stay:
-                here[:] = there
-                normal[:] = candidate_normal
                 cost = stay
+                _copy(there, here)
+                _copy(trial_normal, normal)
         damping = 0.0
         for _ in range(num_steps):
             extra = damping * (normal[0] + normal[3] + normal[5])
@@ -364,16 +361,23 @@ def polish_range(
             if not gain > tolerance * cost:
                 break
             there[0], there[1], there[2] = here[0] - x, here[1] - y, here[2] - z
-            trial = point_normal_equations(obs, j, there, poses, candidate_normal)
+            trial = _point_normal(obs, j, there, poses, trial_normal)
             if trial < cost:
-                here[:] = there
-                normal[:] = candidate_normal
                 cost = trial
+                _copy(there, here)
+                _copy(trial_normal, normal)
                 damping *= 0.1
             else:
                 damping = max(1e-3, 10.0 * damping)
-        trial_points[j] = here
+        _copy(here, trial_points[j])
         trial_costs[j] = cost
+
+
+@njit(cache=True, nogil=True)
+def _copy(source, target):
+    """Copy a vector; an assignment of slices would compile a formatted error message too."""
+    for i in range(len(source)):
+        target[i] = source[i]
 
 
 @njit(cache=True, nogil=True)
