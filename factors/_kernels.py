@@ -14,8 +14,10 @@ from factors._observations import BEARING
 MIN_DEPTH = 1e-9  # of the unit direction: a point nearer to the face's plane counts as behind it
 _EPS = 1e-300  # guards divisions by a squared norm
 
+_kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 
-@njit(cache=True, nogil=True)
+
+@_kernel
 def rho_and_weight(code, scale, squared):
     """Loss rho(s) and weight w = 2 rho'(s) of s = |whitened residual|^2.
 
@@ -33,7 +35,7 @@ def rho_and_weight(code, scale, squared):
     return 0.5 * squared, 1.0
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def tangent_axes(mx, my, mz):
     """Two unit axes spanning the tangent plane at a unit vector.
 
@@ -48,7 +50,7 @@ def tangent_axes(mx, my, mz):
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def _log_map(x, y, z):
     """Tangent vector at +z pointing to (x, y, z), its length the angle, and its Jacobian.
 
@@ -57,8 +59,6 @@ def _log_map(x, y, z):
     """
     s2 = x * x + y * y
     n2 = s2 + z * z
-    if n2 < _EPS:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     if z > 0 and s2 < 0.01 * z * z:
         q = s2 / (z * z)
         f = 1.0 - q * (1 / 3 - q * (1 / 5 - q * (1 / 7 - q * (1 / 9 - q * (1 / 11 - q / 13)))))
@@ -75,7 +75,7 @@ def _log_map(x, y, z):
     return f * x, f * y, f + k * x * x, k * x * y, -x / n2, k * x * y, f + k * y * y, -y / n2
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def whitened_residual(obs, o, dx, dy, dz):
     """Whitened residual and Jacobian of observation o, its point being at d in the rig frame.
 
@@ -90,20 +90,18 @@ def whitened_residual(obs, o, dx, dy, dz):
     if obs.kinds[o] == BEARING:
         mx, my, mz = measurement[0], measurement[1], measurement[2]
         ax, ay, az, bx, by, bz = tangent_axes(mx, my, mz)
-        if dx * dx + dy * dy + dz * dz < _EPS:
-            return False, s00 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        x = ax * dx + ay * dy + az * dz
-        y = bx * dx + by * dy + bz * dz
-        z = mx * dx + my * dy + mz * dz
-        r0, r1, j00, j01, j02, j10, j11, j12 = _log_map(x, y, z)
     else:
         camera = obs.cameras[int(measurement[2])]
-        ax, bx, mx = camera[0], camera[1], camera[2]
-        ay, by, my = camera[3], camera[4], camera[5]
+        ax, bx, mx, ay, by, my = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
         az, bz, mz = camera[6], camera[7], camera[8]
-        x = ax * dx + ay * dy + az * dz
-        y = bx * dx + by * dy + bz * dz
-        z = mx * dx + my * dy + mz * dz
+    x = ax * dx + ay * dy + az * dz
+    y = bx * dx + by * dy + bz * dz
+    z = mx * dx + my * dy + mz * dz
+    if obs.kinds[o] == BEARING:
+        if x * x + y * y + z * z < _EPS:
+            return False, s00 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        r0, r1, j00, j01, j02, j10, j11, j12 = _log_map(x, y, z)
+    else:
         if z * z <= MIN_DEPTH * MIN_DEPTH * (x * x + y * y) or z <= _EPS:
             r0 = r1 = 2.0 * camera[9]
             return False, s00 * r0 + s01 * r1, s11 * r1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -115,19 +113,14 @@ def whitened_residual(obs, o, dx, dy, dz):
     j00, j01, j02 = s00 * j00 + s01 * j10, s00 * j01 + s01 * j11, s00 * j02 + s01 * j12
     j10, j11, j12 = s11 * j10, s11 * j11, s11 * j12
     return (
-        True,
-        s00 * r0 + s01 * r1,
-        s11 * r1,
-        j00 * ax + j01 * bx + j02 * mx,
-        j00 * ay + j01 * by + j02 * my,
-        j00 * az + j01 * bz + j02 * mz,
-        j10 * ax + j11 * bx + j12 * mx,
-        j10 * ay + j11 * by + j12 * my,
-        j10 * az + j11 * bz + j12 * mz,
-    )
+        True, s00 * r0 + s01 * r1, s11 * r1,
+        j00 * ax + j01 * bx + j02 * mx, j00 * ay + j01 * by + j02 * my,
+        j00 * az + j01 * bz + j02 * mz, j10 * ax + j11 * bx + j12 * mx,
+        j10 * ay + j11 * by + j12 * my, j10 * az + j11 * bz + j12 * mz,
+    )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def rig_vector(pose, point):
     """Components of a world point seen from the rig, in the rig frame: world_R_rig^T (X - t)."""
     x, y, z = point[0] - pose[9], point[1] - pose[10], point[2] - pose[11]
@@ -138,7 +131,7 @@ def rig_vector(pose, point):
     )
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def invert_symmetric(v):
     """Inverse (6 values 00 01 02 11 12 22) of a damped symmetric 3x3 given the same way.
 
@@ -162,7 +155,7 @@ def invert_symmetric(v):
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def times_symmetric(v, x, y, z):
     """Product of a symmetric 3x3 (6 values) with a vector."""
     return (
@@ -172,7 +165,7 @@ def times_symmetric(v, x, y, z):
     )
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def _point_rows(pose, a0, a1, a2, b0, b1, b2):
     """Both rows of d r / d X = (d r / d d) world_R_rig^T."""
     return (
@@ -185,7 +178,7 @@ def _point_rows(pose, a0, a1, a2, b0, b1, b2):
     )
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def _add_normal(normal, rows, r0, r1, w):
     """Add an observation to a landmark's Hessian (6, upper) and gradient (3), one array (9,)."""
     p0, p1, p2, q0, q1, q2 = rows
@@ -200,7 +193,7 @@ def _add_normal(normal, rows, r0, r1, w):
     normal[8] += w * (p2 * r0 + q2 * r1)
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def _point_normal(obs, j, point, poses, normal):
     """Cost of landmark j at `point`; its Hessian and gradient go into `normal (9,)`."""
     normal[:] = 0.0
@@ -216,7 +209,7 @@ def _point_normal(obs, j, point, poses, normal):
     return cost
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def _pose_row(j0, j1, j2, dx, dy, dz, out):
     """Row of d r / d pose from a row of d r / d d: d = world_R_rig^T (X - t), right perturbed."""
     out[0] = j1 * dz - j2 * dy
@@ -227,7 +220,7 @@ def _pose_row(j0, j1, j2, dx, dy, dz, out):
     out[5] = -j2
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def eliminate_range(
     first, last, obs, points, poses, row_starts, columns, diagonal, off_diagonal, gradient, costs,
     point_costs,
@@ -243,7 +236,7 @@ def eliminate_range(
     for j in range(first, last):
         longest = max(longest, obs.offsets[j + 1] - obs.offsets[j])
     seen = np.empty(longest, np.int64)
-    W = np.empty((longest, 6, 3))
+    W = np.empty((longest, 3, 6))
     Y = np.empty((longest, 6, 3))
     a, b = np.empty(6), np.empty(6)
     normal = np.empty(9)
@@ -274,7 +267,7 @@ def eliminate_range(
                 ai, bi = w * a[i], w * b[i]
                 g[i] += ai * r0 + bi * r1
                 for c in range(3):
-                    Wf[i, c] += ai * rows[c] + bi * rows[3 + c]
+                    Wf[c, i] += ai * rows[c] + bi * rows[3 + c]
                 for c in range(6):
                     H[i, c] += ai * a[c] + bi * b[c]
         point_costs[j] = cost
@@ -284,11 +277,11 @@ def eliminate_range(
             H, g = diagonal[f], gradient[f]
             Wi, Yi = W[i], Y[i]
             for r in range(6):
-                y0, y1, y2 = times_symmetric(inverse, Wi[r, 0], Wi[r, 1], Wi[r, 2])
+                y0, y1, y2 = times_symmetric(inverse, Wi[0, r], Wi[1, r], Wi[2, r])
                 Yi[r, 0], Yi[r, 1], Yi[r, 2] = y0, y1, y2
                 g[r] -= y0 * normal[6] + y1 * normal[7] + y2 * normal[8]
                 for c in range(6):
-                    H[r, c] -= y0 * Wi[c, 0] + y1 * Wi[c, 1] + y2 * Wi[c, 2]
+                    H[r, c] -= y0 * Wi[0, c] + y1 * Wi[1, c] + y2 * Wi[2, c]
             slot = row_starts[f]
             for k in range(i + 1, num):
                 while columns[slot] != seen[k]:
@@ -297,10 +290,10 @@ def eliminate_range(
                 for r in range(6):
                     y0, y1, y2 = Yi[r, 0], Yi[r, 1], Yi[r, 2]
                     for c in range(6):
-                        B[r, c] -= y0 * Wk[c, 0] + y1 * Wk[c, 1] + y2 * Wk[c, 2]
+                        B[r, c] -= y0 * Wk[0, c] + y1 * Wk[1, c] + y2 * Wk[2, c]
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def _substituted_step(obs, j, point, poses, steps, normal):
     """Gauss-Newton step of landmark j, negated, that goes with the pose steps (F, 6)."""
     normal[:] = 0.0
@@ -322,7 +315,7 @@ def _substituted_step(obs, j, point, poses, steps, normal):
     return times_symmetric(invert_symmetric(normal), normal[6], normal[7], normal[8])
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def polish_range(
     first, last, obs, points, poses, old_poses, steps, substitute, num_steps, tolerance,
     point_costs, trial_points, trial_costs,
@@ -373,14 +366,14 @@ def polish_range(
         trial_costs[j] = cost
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def _copy(source, target):
     """Copy a vector; an assignment of slices would compile a formatted error message too."""
     for i in range(len(source)):
         target[i] = source[i]
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def residuals_range(first, last, obs, points, poses, residuals, valid):
     """Write the whitened residuals (O, 2) and validity (O,) of landmarks first..last."""
     for j in range(first, last):
