@@ -12,76 +12,127 @@ class _Settings(BaseModel):
 class ReadSettings(_Settings):
     """Frames, trajectory and their association in time."""
 
-    max_interpolation_s: float = Field(10.0, gt=0)  # longer gaps are still filled, but reported
-    clock_offset_s: float | None = None  # seconds to add to frame times; None = must not be needed
+    max_interpolation_s: float = Field(
+        default=10.0, gt=0
+    )  # longer gaps are still filled, but reported
+    clock_offset_s: float | None = None  # s to add to frame times; None = clocks agree or one fits
 
 
 class CubemapSettings(_Settings):
     """Faces cut from a panorama for detection."""
 
-    hfov_deg: float = Field(96.0, ge=90, le=120)
-    face_size: int | None = Field(None, ge=64)  # pixels; None = the panorama's own resolution
-    max_face_size: int = Field(1024, ge=64)  # pixels; bound on the automatic size
+    hfov_deg: float = Field(default=96.0, ge=90, le=120)
+    face_size: int | None = Field(
+        default=None, ge=64
+    )  # pixels; None = the panorama's own resolution
+    max_face_size: int = Field(default=1024, ge=64)  # pixels; bound on the automatic size
 
 
 class FeatureSettings(_Settings):
     """Keypoints on faces."""
 
     extractor: Literal["sift"] = "sift"
-    max_per_face: int = Field(900, ge=16)
-    contrast_threshold: float = Field(0.01, gt=0)
-    sigma_px: float = Field(0.16, gt=0)  # per-axis noise of the smallest keypoints, face pixels
-    sigma_per_size: float = Field(0.033, ge=0)  # further noise, as a part of the keypoint's size
+    max_per_face: int = Field(default=900, ge=16)
+    contrast_threshold: float = Field(default=0.01, gt=0)
+    sigma_px: float = Field(
+        default=0.16, gt=0
+    )  # per-axis noise of the smallest keypoints, face pixels
+    sigma_per_size: float = Field(
+        default=0.033, ge=0
+    )  # further noise, as a part of the keypoint's size
 
 
 class MatchingSettings(_Settings):
     """Guided descriptor matching."""
 
-    min_similarity: float = Field(0.8, ge=-1, le=1)  # cosine of both descriptors
-    max_ratio: float = Field(0.85, gt=0, le=1)  # distance to the best over that to the next
+    min_similarity: float = Field(default=0.8, ge=-1, le=1)  # cosine of both descriptors
+    max_ratio: float = Field(default=0.9, gt=0, le=1)  # distance to the best over that to the next
+
+
+class GateSettings(_Settings):
+    """How far a match may stray from what poses predict."""
+
+    rotation_deg: float = Field(gt=0)  # error of the relative rotation
+    direction: float = Field(ge=0)  # tangent of the error of the translation's direction
 
 
 class PairSettings(_Settings):
-    """Which frames are matched."""
+    """Which frames are matched, and how closely predictions are believed."""
 
-    window: int = Field(8, ge=2)  # frames in time
-    max_baseline_depths: float = Field(1.5, gt=0)  # longest baseline in median scene depths
-    max_loop_neighbours: int = Field(8, ge=0)  # nearest frames in space outside the window
+    window: int = Field(default=32, ge=2)  # frames in time
+    max_baseline_depths: float = Field(default=2.0, gt=0)  # longest baseline in median scene depths
+    max_loop_neighbours: int = Field(default=8, ge=0)  # nearest frames in space outside the window
+    max_parallax_deg: float = Field(default=80.0, gt=0, le=180)
+    prior: GateSettings = GateSettings(rotation_deg=4.0, direction=0.4)  # coarse trajectory
+    loop: GateSettings = GateSettings(rotation_deg=2.0, direction=0.15)  # solved chain
+    refined: GateSettings = GateSettings(rotation_deg=0.4, direction=0.005)  # solved map
+    point_deg: float = Field(default=0.8, gt=0)  # around the predicted bearing of a known point
+    drift: float = Field(
+        default=0.003, gt=0
+    )  # of the solved chain, part of the path between two frames
 
 
 class VerifySettings(_Settings):
     """Two-view geometry."""
 
-    max_error_deg: float = Field(0.25, gt=0)  # RANSAC inlier threshold
-    min_inliers: int = Field(25, ge=8)
-    max_rotation_deg: float = Field(6.0, gt=0)  # disagreement with the trajectory
-    max_direction_deg: float = Field(20.0, gt=0)  # disagreement with the trajectory
+    max_error_deg: float = Field(default=0.25, gt=0)  # RANSAC inlier threshold
+    min_inliers: int = Field(default=25, ge=8)
+    max_rotation_deg: float = Field(default=6.0, gt=0)  # disagreement with the trajectory
+    max_direction_deg: float = Field(default=20.0, gt=0)  # disagreement with the trajectory
+    min_parallax_deg: float = Field(default=1.0, gt=0)  # median; below it a direction is not judged
 
 
 class TriangulateSettings(_Settings):
     """Scene points."""
 
-    min_track_length: int = Field(2, ge=2)  # observations of a point
-    min_parallax_deg: float = Field(0.5, gt=0)  # largest angle between two rays of a point
+    min_track_length: int = Field(default=2, ge=2)  # observations of a point
+    min_parallax_deg: float = Field(default=0.5, gt=0)  # largest angle between two rays of a point
+
+
+class RoundSettings(_Settings):
+    """Triangulate, adjust, filter: gates in standard deviations of the observations' noise."""
+
+    chain: tuple[float, ...] = (60.0, 20.0, 8.0)  # from the coarse trajectory
+    loops: tuple[float, ...] = (30.0, 8.0)  # with loops closed
+    refined: tuple[float, ...] = (8.0, 5.0)  # with matches along the solved map
+    map_passes: int = Field(default=2, ge=1)  # times the map is matched anew
+    min_support: float = Field(
+        default=0.99, gt=0, le=1
+    )  # observations a round must go on explaining
+    min_noise: float = Field(default=0.5, gt=0)  # floor of the estimated noise, in feature sigmas
+    min_observations: int = Field(default=12, ge=1)  # of a frame, or it counts as unrefined
 
 
 class PriorSettings(_Settings):
     """What the trajectory is worth in the graph."""
 
-    rotation_deg: float = Field(0.5, gt=0)  # noise of a step's rotation
-    translation: float = Field(0.1, gt=0)  # noise of a step's translation, part of the step
-    absolute_rotation_deg: float = Field(30.0, gt=0)
-    absolute_position: float = Field(0.3, gt=0)  # part of the trajectory's extent
-    loss_sigmas: float = Field(2.0, gt=0)  # Cauchy scale: steps further off let go
+    rotation_deg: float = Field(default=0.5, gt=0)  # noise of a step's rotation
+    translation: float = Field(default=0.1, gt=0)  # noise of a step's translation, part of the step
+    absolute_rotation_deg: float = Field(default=30.0, gt=0)
+    absolute_position: float = Field(default=0.3, gt=0)  # part of the trajectory's extent
+    loss_sigmas: float = Field(default=2.0, gt=0)  # Cauchy scale: steps further off let go
 
 
 class SolverSettings(_Settings):
     """Levenberg-Marquardt."""
 
-    max_iterations: int = Field(50, ge=1)
-    relative_tolerance: float = Field(1e-5, gt=0, lt=1)  # decrease of the cost that ends a run
-    lambda_initial: float = Field(1e-4, gt=0)  # damping, part of the diagonal
-    num_threads: int | None = Field(None, ge=1)  # None = all cores
+    max_iterations: int = Field(default=50, ge=1)
+    relative_tolerance: float = Field(default=1e-5, gt=0, lt=1)  # least decrease of the cost
+    loss: Literal["none", "huber", "cauchy", "geman_mcclure"] = "cauchy"
+    loss_sigmas: float = Field(default=2.0, gt=0)  # scale of the loss, standard deviations
+    lambda_initial: float = Field(default=1e-4, gt=0)  # damping, part of the diagonal
+    num_threads: int | None = Field(default=None, ge=1)  # None = all cores
+
+
+class ExportSettings(_Settings):
+    """Datasets written at the end of a run."""
+
+    formats: tuple[
+        Literal["colmap", "colmap-flat", "colmap-erp", "nerfstudio", "ply", "tum"], ...
+    ] = ("colmap",)
+    face_size: int | None = Field(
+        default=None, ge=16
+    )  # pixels; None = a quarter of the panorama's width
 
 
 class RefineSettings(_Settings):
@@ -95,5 +146,10 @@ class RefineSettings(_Settings):
     verify: VerifySettings = VerifySettings()
     triangulate: TriangulateSettings = TriangulateSettings()
     priors: PriorSettings = PriorSettings()
+    rounds: RoundSettings = RoundSettings()
     solver: SolverSettings = SolverSettings()
+    factors: tuple[Literal["bearing", "reprojection"], ...] = Field(
+        default=("bearing",), min_length=1
+    )
+    export: ExportSettings = ExportSettings()
     seed: int = 0

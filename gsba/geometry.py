@@ -96,3 +96,28 @@ def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarra
     variance = np.einsum("ij,ij->", s, s) / len(s)
     scale = float(singular @ sign / variance) if variance > 0 else 1.0
     return scale, rotation, mean_t - scale * rotation @ mean_s
+
+
+def pose_similarity(
+    source_T_rigs: np.ndarray, target_T_rigs: np.ndarray
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Sim(3) that carries one set of poses onto another of the same rigs.
+
+    The rotation is the chordal mean over orientations, so that a straight path will do; scale and
+    translation are least squares over positions.
+
+    Args:
+        source_T_rigs, target_T_rigs: (N, 4, 4) poses of the same rigs in two worlds.
+
+    Returns:
+        scale, rotation (3, 3), translation (3,): target = scale * rotation @ source + translation.
+    """
+    between = np.einsum("nij,nkj->ik", target_T_rigs[:, :3, :3], source_T_rigs[:, :3, :3])
+    u, _, vt = np.linalg.svd(between)
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    source = source_T_rigs[:, :3, 3] @ rotation.T
+    target = target_T_rigs[:, :3, 3]
+    s, t = source - source.mean(axis=0), target - target.mean(axis=0)
+    spread = float(np.sum(s * s))
+    scale = float(np.sum(s * t)) / spread if spread > 0 else 1.0
+    return scale, rotation, target.mean(axis=0) - scale * source.mean(axis=0)

@@ -15,6 +15,7 @@ import os
 import resource
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -104,6 +105,7 @@ class RunStore:
         compute: Callable[[str], T],
         returns: type[T],
         after: Sequence[str] = (),
+        num_threads: int = 1,
     ) -> "PerFrame[T]":
         """Results of a stage that treats every frame alone, one file each, resumed frame by frame.
 
@@ -112,6 +114,7 @@ class RunStore:
                 `fingerprint(paths)`; only frames whose entry changed are computed again.
             compute: makes the result of the named frame.
             name, settings, returns, after: as for `stage`.
+            num_threads: frames computed at a time.
         """
         base = self._key(name, settings, after)
         keys = {item: digest(base, item, depends) for item, depends in items.items()}
@@ -122,14 +125,23 @@ class RunStore:
         spent = _read_cost(folder / "cost.json", base) if len(missing) < len(keys) else None
         wall, cpu = time.perf_counter(), time.process_time()
         try:
-            for item in track(missing, name):
-                frames[item]
+            with ThreadPoolExecutor(num_threads) as pool:
+                running = [pool.submit(frames.__getitem__, item) for item in missing]
+                try:
+                    for future in track(running, name):
+                        future.result()
+                finally:
+                    pool.shutdown(wait=True, cancel_futures=True)
         finally:
             record = _measured(name, base, wall, cpu, spent)
             text = json.dumps(dataclasses.asdict(record))
             atomic_write(folder / "cost.json", lambda temporary: temporary.write_text(text))
         self._note(replace(record, key=digest(base, keys), resumed=not missing))
         return frames
+
+    def forget(self, name: str) -> None:
+        """Drop the stored result of a stage, so that it is computed again."""
+        _stage_path(self.root, name).unlink(missing_ok=True)
 
     def claim(self, path: Path) -> None:
         """Note a final output (a file, or a folder with all its files) as written by gsba."""

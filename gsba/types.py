@@ -85,6 +85,26 @@ class Features:
 
 
 @dataclass(frozen=True, slots=True)
+class Keypoints:
+    """Keypoints of all frames back to back, without descriptors."""
+
+    starts: np.ndarray  # (F + 1,) int64: frame f owns rows starts[f]:starts[f + 1]
+    pixels: np.ndarray  # (N, 2) float64, (u, v) on the owning face, corner origin
+    faces: np.ndarray  # (N,) uint8, index into FACES
+    bearings_rig: np.ndarray  # (N, 3) float64, unit, rig frame
+    sigmas_rad: np.ndarray  # (N,) float64, radians
+    colors: np.ndarray  # (N, 3) uint8, RGB
+
+    def bearings_of(self, frame: int) -> np.ndarray:
+        """Bearings (K, 3) of one frame."""
+        return self.bearings_rig[self.starts[frame] : self.starts[frame + 1]]
+
+    def rows(self, tracks: "Tracks") -> np.ndarray:
+        """Row (O,) of every observation of the tracks."""
+        return self.starts[tracks.frames] + tracks.keypoints
+
+
+@dataclass(frozen=True, slots=True)
 class Matches:
     """Keypoint correspondences of frame pairs, stored back to back."""
 
@@ -95,6 +115,15 @@ class Matches:
     def of(self, pair: int) -> np.ndarray:
         """Rows of one pair, (m, 2) int32."""
         return self.keypoints[self.offsets[pair] : self.offsets[pair + 1]]
+
+
+@dataclass(frozen=True, slots=True)
+class VerifiedPairs:
+    """Pairs whose matches fit one relative pose that the trajectory does not contradict."""
+
+    matches: Matches  # inliers only
+    f0_T_f1s: np.ndarray  # (P, 4, 4) float64, translation of unit length
+    counts: Counts  # of pairs
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,11 +140,20 @@ class Tracks:
 
 
 @dataclass(frozen=True, slots=True)
+class Landmarks:
+    """Scene points and the observations that agree with them."""
+
+    points_world: np.ndarray  # (J, 3) float64, map units
+    tracks: Tracks  # their observations; point indices are rows of points_world
+    counts: Counts  # of tracks
+
+
+@dataclass(frozen=True, slots=True)
 class Reconstruction:
     """Refined poses and cloud: what exports and reports are made from."""
 
     world_T_rigs: np.ndarray  # (F, 4, 4) float64, world of the SLAM trajectory, map units
-    pose_covariances: np.ndarray  # (F, 6, 6) float64, [rotation rad, translation], rig frame; NaN = none
+    pose_covariances: np.ndarray  # (F, 6, 6) float64, [rotation rad, translation], NaN = none
     pose_statuses: np.ndarray  # (F,) uint8, PoseStatus
     points_world: np.ndarray  # (J, 3) float64, map units
     point_colors: np.ndarray  # (J, 3) uint8, RGB

@@ -1,0 +1,188 @@
+"""Rounds of triangulation, bundle adjustment and filtering over one set of tracks."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors import BearingTerm, FaceCameras, LandmarkBlock, ReprojectionTerm, RobustLoss
+from gsba import graph, triangulate
+from gsba.config import RefineSettings
+from gsba.optimize import Iteration, marginal_covariances, optimize
+from gsba.rig import RIG_R_FACE, CubeRig
+from gsba.types import Counts, Keypoints, Landmarks, Tracks
+
+logger = logging.getLogger(__name__)
+
+_REDUNDANT = 0.1  # least share of residual dimensions left over by the unknowns
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """One bundle adjustment and what was kept of it."""
+
+    gate_sigmas: float  # observations further off were left out
+    noise: float  # estimated noise after the round, in units of the features' own sigmas
+    observations: int  # used
+    points: int  # used
+    support: int  # observations within the last gate of all tracks, under the round's poses
+    accepted: bool  # False: the poses before the round have more support and were kept
+    iterations: tuple[Iteration, ...]  # cost by family
+    reason: str  # why the solver stopped
+
+
+@dataclass(frozen=True, slots=True)
+class Adjustment:
+    """Poses and points after the last good round."""
+
+    world_T_rigs: np.ndarray  # (F, 4, 4) float64
+    landmarks: Landmarks
+    noise: float  # of observations, in units of the features' own sigmas
+    rounds: tuple[Round, ...]
+
+
+def start(world_T_rigs: np.ndarray) -> Adjustment:
+    """Poses (F, 4, 4) as a solution without points."""
+    nothing = np.zeros(0, np.int32)
+    landmarks = Landmarks(
+        np.zeros((0, 3)), Tracks(nothing, nothing, nothing, 0), Counts(0, 0, "tracks")
+    )
+    return Adjustment(world_T_rigs, landmarks, 1.0, ())
+
+
+def run(
+    tracks: Tracks,
+    keypoints: Keypoints,
+    start: Adjustment,
+    priors: gtsam.NonlinearFactorGraph,
+    rig: CubeRig,
+    gates: Sequence[float],
+    settings: RefineSettings,
+    num_threads: int,
+) -> Adjustment:
+    """Solve for all poses in rounds of tightening gates.
+
+    The noise of observations is estimated anew after each round from what the unknowns leave over,
+    so that gates and robust weights fit images of any quality. A round whose poses explain
+    clearly fewer observations than those before it is undone.
+
+    Args:
+        tracks: candidate tracks; every round starts from all of them.
+        keypoints: of all frames.
+        start: poses to start from, and the noise known so far.
+        priors: factors on the poses, gauge included.
+        rig: the faces, for the reprojection family.
+        gates: of each round, in standard deviations of the noise.
+        settings: families, loss, solver.
+        num_threads: of the solver.
+    """
+    world_T_rigs, noise, rounds = start.world_T_rigs, start.noise, []
+    rows = keypoints.rows(tracks)
+    bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
+
+    def place(poses: np.ndarray, gate: float) -> Landmarks:
+        return triangulate.run(tracks, bearings, sigmas, poses, gate, settings.triangulate)
+
+    last_gate = gates[-1] * noise
+    support = len(place(world_T_rigs, last_gate).tracks)
+    for gate in gates:
+        landmarks = place(world_T_rigs, gate * noise)
+        block = landmark_block(landmarks, keypoints, rig, noise, settings, num_threads)
+        result = optimize(priors, [block], _values(world_T_rigs), settings.solver)
+        poses = _poses(result.values, len(world_T_rigs))
+        new_support = len(place(poses, last_gate).tracks)
+        accepted = new_support >= settings.rounds.min_support * support
+        if accepted:
+            world_T_rigs, support = poses, new_support
+            noise = max(_noise(block, result.values, noise), settings.rounds.min_noise)
+        rounds.append(
+            Round(
+                gate,
+                noise,
+                len(landmarks.tracks),
+                landmarks.tracks.num_points,
+                new_support,
+                accepted,
+                result.history,
+                result.reason,
+            )
+        )
+        logger.debug("round: %s", rounds[-1])
+    return Adjustment(world_T_rigs, place(world_T_rigs, gates[-1] * noise), noise, tuple(rounds))
+
+
+def landmark_block(
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    rig: CubeRig,
+    noise: float,
+    settings: RefineSettings,
+    num_threads: int,
+) -> LandmarkBlock:
+    """The factor block of the chosen families; several share each observation's information."""
+    tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
+    share = noise * np.sqrt(len(settings.factors))
+    terms = []
+    if "bearing" in settings.factors:
+        sigmas = share * keypoints.sigmas_rad[rows]
+        terms.append(
+            BearingTerm(tracks.frames, tracks.points, keypoints.bearings_rig[rows], sigmas)
+        )
+    if "reprojection" in settings.factors:
+        bearings, faces = keypoints.bearings_rig[rows], keypoints.faces[rows]
+        cosines = np.einsum("oi,oi->o", bearings, RIG_R_FACE[faces, :, 2])
+        sigmas_px = share * keypoints.sigmas_rad[rows] * rig.focal / cosines**1.5
+        num = len(RIG_R_FACE)
+        cameras = FaceCameras(RIG_R_FACE, np.full(num, rig.focal), np.full((num, 2), rig.principal))
+        pixels = keypoints.pixels[rows]
+        terms.append(
+            ReprojectionTerm(tracks.frames, tracks.points, pixels, faces, cameras, sigmas_px)
+        )
+    return LandmarkBlock(
+        [graph.X(f) for f in range(len(keypoints.starts) - 1)],
+        landmarks.points_world,
+        terms,
+        RobustLoss(settings.solver.loss, settings.solver.loss_sigmas),
+        num_threads,
+    )
+
+
+def pose_covariances(
+    adjustment: Adjustment,
+    priors: gtsam.NonlinearFactorGraph,
+    keypoints: Keypoints,
+    rig: CubeRig,
+    settings: RefineSettings,
+    num_threads: int,
+) -> np.ndarray:
+    """Marginal covariances (F, 6, 6) with the first pose and the extent of the map held fixed."""
+    block = landmark_block(
+        adjustment.landmarks, keypoints, rig, adjustment.noise, settings, num_threads
+    )
+    held = gtsam.NonlinearFactorGraph(priors)
+    held.push_back(graph.fixed_scale(adjustment.world_T_rigs))
+    keys = [graph.X(f) for f in range(len(adjustment.world_T_rigs))]
+    return marginal_covariances(held, [block], _values(adjustment.world_T_rigs), keys)
+
+
+def _noise(block: LandmarkBlock, values: gtsam.Values, noise: float) -> float:
+    """Noise in units of the features' sigmas: robust spread of residuals over its expectation."""
+    residuals = np.concatenate(block.residuals(values)[0]).ravel()
+    if len(residuals) == 0:
+        return noise
+    unknowns = 3 * len(block.points_world) + 6 * len(block.pose_keys)
+    redundancy = max(1 - unknowns / len(residuals), _REDUNDANT)
+    return float(noise * 1.4826 * np.median(np.abs(residuals)) / np.sqrt(redundancy))
+
+
+def _values(world_T_rigs: np.ndarray) -> gtsam.Values:
+    values = gtsam.Values()
+    for f, world_T_rig in enumerate(world_T_rigs):
+        values.insert(graph.X(f), gtsam.Pose3(world_T_rig))
+    return values
+
+
+def _poses(values: gtsam.Values, num_frames: int) -> np.ndarray:
+    return np.array([values.atPose3(graph.X(f)).matrix() for f in range(num_frames)])

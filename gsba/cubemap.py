@@ -1,0 +1,87 @@
+"""Cut the six pinhole faces of a frame out of its panorama."""
+
+import functools
+
+import cv2
+import numpy as np
+
+from gsba.config import CubemapSettings
+from gsba.geometry import erp_from_bearings
+from gsba.rig import CubeRig
+from gsba.types import FACES, FrameSet
+
+_PAD = 4  # pixels of wrap-around: the support of bicubic sampling
+
+
+def rig_for(frames: FrameSet, settings: CubemapSettings) -> CubeRig:
+    """The rig on which features of these frames are found.
+
+    Unless a size is set, a face centre has the pixel density of the panorama's equator, bounded
+    by `max_face_size`. Frames that come as cube faces keep their own size and 90 degrees.
+    """
+    if frames.layout == "cube":
+        return CubeRig(frames.width, np.pi / 2)
+    hfov = np.deg2rad(settings.hfov_deg)
+    native = 2 * frames.width / (2 * np.pi) * np.tan(hfov / 2)
+    size = settings.face_size or min(settings.max_face_size, round(native))
+    return CubeRig(size, hfov)
+
+
+def cut(erp: np.ndarray, rig: CubeRig) -> np.ndarray:
+    """Sample the faces of a panorama, bicubic, continuous over the seam and the poles.
+
+    Args:
+        erp: (H, 2H) or (H, 2H, C) uint8 equirectangular image.
+        rig: faces to cut.
+
+    Returns:
+        (6, size, size[, C]) uint8, in FACES order.
+    """
+    height, width = erp.shape[:2]
+    density = 2 * np.pi * rig.focal  # panorama width at which pixels are as dense as the face's
+    if width > 1.5 * density:  # low-pass first, or detail beyond the faces' resolution aliases
+        width = 2 * round(density / 2)
+        height = width // 2
+        erp = cv2.resize(erp, (width, height), interpolation=cv2.INTER_AREA)
+    padded = _wrap(erp)
+    maps = _face_maps(rig, width, height)
+    return np.stack(
+        [
+            cv2.remap(padded, maps[face, 0], maps[face, 1], cv2.INTER_CUBIC)
+            for face in range(len(FACES))
+        ]
+    )
+
+
+def cut_mask(mask: np.ndarray, rig: CubeRig) -> np.ndarray:
+    """Nearest-neighbour faces (6, size, size) bool of an ERP mask (H, 2H) bool."""
+    height, width = mask.shape
+    padded = _wrap(mask.astype(np.uint8))
+    maps = _face_maps(rig, width, height)
+    return np.stack(
+        [
+            cv2.remap(padded, maps[face, 0], maps[face, 1], cv2.INTER_NEAREST) > 0
+            for face in range(len(FACES))
+        ]
+    )
+
+
+def _wrap(erp: np.ndarray) -> np.ndarray:
+    """Pad by what lies beyond the border on the sphere: the other side of seam and poles."""
+    half = erp.shape[1] // 2
+    above = np.roll(erp[:_PAD][::-1], half, axis=1)
+    below = np.roll(erp[-_PAD:][::-1], half, axis=1)
+    tall = np.concatenate([above, erp, below], axis=0)
+    return np.concatenate([tall[:, -_PAD:], tall, tall[:, :_PAD]], axis=1)
+
+
+@functools.lru_cache(maxsize=2)
+def _face_maps(rig: CubeRig, width: int, height: int) -> np.ndarray:
+    """Sampling positions (6, 2, size, size) float32 in the padded panorama, OpenCV pixels."""
+    centres = np.arange(rig.size) + 0.5
+    grid = np.stack(np.meshgrid(centres, centres), axis=-1)
+    maps = np.empty((len(FACES), 2, rig.size, rig.size), np.float32)
+    for face in range(len(FACES)):
+        erp_pixels = erp_from_bearings(rig.bearings(grid, face), width, height)
+        maps[face] = np.moveaxis(erp_pixels - 0.5 + _PAD, -1, 0)
+    return maps

@@ -1,0 +1,142 @@
+"""From poses to correspondences: neighbours in time, closed loops, and the map itself."""
+
+import numpy as np
+
+from gsba import matching, pairs, verify
+from gsba.adjust import Adjustment
+from gsba.config import RefineSettings
+from gsba.geometry import inverse
+from gsba.matching import Gate, SearchableFrames
+from gsba.types import Keypoints, Matches, VerifiedPairs
+
+
+def match_neighbours(
+    frames: SearchableFrames,
+    keypoints: Keypoints,
+    start: Adjustment,
+    settings: RefineSettings,
+    num_threads: int,
+) -> VerifiedPairs:
+    """Match frames next to one another in time, guided by the trajectory, and verify them.
+
+    Args:
+        frames, keypoints: features of all frames.
+        start: the coarse poses.
+        settings: of matching and verification.
+        num_threads: pairs matched at a time.
+    """
+    world_T_rigs = start.world_T_rigs
+    chosen = pairs.adjacent(len(world_T_rigs))
+    prior = settings.pairs.prior
+    gate = _gate(prior.rotation_deg, prior.direction, settings)
+    found = matching.run(
+        chosen, world_T_rigs, [gate] * len(chosen), frames, settings.matching, num_threads
+    )
+    f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
+    return verify.run(
+        found, keypoints, f0_T_f1s, np.zeros(len(chosen)), settings.verify, settings.seed
+    )
+
+
+def match_loops(
+    frames: SearchableFrames,
+    keypoints: Keypoints,
+    solved: Adjustment,
+    settings: RefineSettings,
+    num_threads: int,
+) -> VerifiedPairs:
+    """Match frames close in space but far in time, as far as drift leaves them predictable.
+
+    Args:
+        frames, keypoints: features of all frames.
+        solved: poses and points that are right between neighbours.
+        settings: of pairs, matching and verification.
+        num_threads: pairs matched at a time.
+    """
+    world_T_rigs, positions = solved.world_T_rigs, solved.world_T_rigs[:, :3, 3]
+    chosen = pairs.covisible(positions, median_depth(solved), settings.pairs)[1]
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    along = np.concatenate([[0], np.cumsum(steps)])
+    drifts = settings.pairs.drift * (along[chosen[:, 1]] - along[chosen[:, 0]])
+    baselines = np.linalg.norm(positions[chosen[:, 0]] - positions[chosen[:, 1]], axis=1)
+    loop = settings.pairs.loop
+    gates = [
+        _gate(
+            loop.rotation_deg, loop.direction + min(1.0, 2 * drift / max(length, 1e-12)), settings
+        )
+        for drift, length in zip(drifts, baselines, strict=True)
+    ]
+    found = matching.run(chosen, world_T_rigs, gates, frames, settings.matching, num_threads)
+    f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
+    return verify.run(found, keypoints, f0_T_f1s, drifts, settings.verify, settings.seed)
+
+
+def match_map(
+    frames: SearchableFrames,
+    keypoints: Keypoints,
+    solved: Adjustment,
+    settings: RefineSettings,
+    num_threads: int,
+) -> tuple[Matches, ...]:
+    """Match again from poses and points that are nearly right; prediction is the verification.
+
+    Neighbours in time are matched along epipolar lines; all other pairs only where a known point
+    must appear. So what merely looks alike elsewhere, a column further on, is not a candidate.
+
+    Args:
+        frames, keypoints: features of all frames.
+        solved: the current solution.
+        settings: of pairs and matching.
+        num_threads: pairs matched at a time.
+
+    Returns:
+        Matches of neighbours and matches of known points, the more trusted first.
+    """
+    world_T_rigs = solved.world_T_rigs
+    neighbours = pairs.adjacent(len(world_T_rigs))
+    near, loops = pairs.covisible(world_T_rigs[:, :3, 3], median_depth(solved), settings.pairs)
+    wide = np.concatenate([near[near[:, 1] - near[:, 0] > 2], loops])
+    refined = settings.pairs.refined
+    band = _gate(refined.rotation_deg, refined.direction, settings)
+    point = Gate(np.pi, 1.0, np.pi, np.deg2rad(settings.pairs.point_deg))
+    known = points_by_keypoint(solved, keypoints)
+    return (
+        matching.run(
+            neighbours,
+            world_T_rigs,
+            [band] * len(neighbours),
+            frames,
+            settings.matching,
+            num_threads,
+        ),
+        matching.run(
+            wide,
+            world_T_rigs,
+            [point] * len(wide),
+            frames,
+            settings.matching,
+            num_threads,
+            known,
+        ),
+    )
+
+
+def median_depth(solved: Adjustment) -> float:
+    """Median distance of points from the frames that see them, map units; 0 without points."""
+    tracks, points = solved.landmarks.tracks, solved.landmarks.points_world
+    offsets = points[tracks.points] - solved.world_T_rigs[tracks.frames, :3, 3]
+    return float(np.median(np.linalg.norm(offsets, axis=1))) if len(offsets) else 0.0
+
+
+def points_by_keypoint(solved: Adjustment, keypoints: Keypoints) -> list[np.ndarray]:
+    """For each frame (K_f, 3): its keypoints' points in its rig frame, NaN where unknown."""
+    tracks = solved.landmarks.tracks
+    known = np.full((len(keypoints.faces), 3), np.nan)
+    world_T_rig = solved.world_T_rigs[tracks.frames]
+    offsets = solved.landmarks.points_world[tracks.points] - world_T_rig[:, :3, 3]
+    known[keypoints.rows(tracks)] = np.einsum("oji,oj->oi", world_T_rig[:, :3, :3], offsets)
+    return np.split(known, keypoints.starts[1:-1])
+
+
+def _gate(rotation_deg: float, direction: float, settings: RefineSettings) -> Gate:
+    return Gate(np.deg2rad(rotation_deg), direction, np.deg2rad(settings.pairs.max_parallax_deg))

@@ -1,0 +1,80 @@
+"""Chain pairwise matches into tracks of one scene point each."""
+
+from collections.abc import Sequence
+
+import numba
+import numpy as np
+
+from gsba.types import Matches, Tracks
+
+
+def run(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
+    """Merge matches into tracks that see a frame at most once.
+
+    Matches are taken in the order given, the most trusted first: one that would give a track two
+    keypoints of the same frame is left out, so that a false match cannot glue two points.
+
+    Args:
+        matches: sets of verified matches, the most trusted set and pair first.
+        num_keypoints: (F,) keypoints in each frame.
+
+    Returns:
+        Tracks of at least two observations.
+    """
+    first_node = np.concatenate([[0], np.cumsum(num_keypoints)]).astype(np.int64)
+    edges = [np.zeros((0, 2), np.int64)]
+    for part in matches:
+        lengths = np.diff(part.offsets)
+        edges.append(first_node[np.repeat(part.pairs, lengths, axis=0)] + part.keypoints)
+    frame_of_node = np.repeat(np.arange(len(num_keypoints), dtype=np.int32), num_keypoints)
+    roots = _merge(np.concatenate(edges), frame_of_node)
+    _, labels, sizes = np.unique(roots, return_inverse=True, return_counts=True)
+    nodes = np.flatnonzero(sizes[labels] > 1)
+    _, points = np.unique(labels[nodes], return_inverse=True)
+    order = np.lexsort((nodes, points))
+    nodes, points = nodes[order], points[order]
+    frames = frame_of_node[nodes]
+    return Tracks(
+        points.astype(np.int32),
+        frames,
+        (nodes - first_node[frames]).astype(np.int32),
+        int(points[-1]) + 1 if len(points) else 0,
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _merge(edges, frame_of_node):
+    """Root node of every node after merging edges that keep frames unique in a component.
+
+    Components are circular linked lists, so that joining two of them swaps two links.
+    """
+    roots = np.arange(len(frame_of_node))
+    following = np.arange(len(frame_of_node))
+    sizes = np.ones(len(frame_of_node), np.int64)
+    for e in range(len(edges)):
+        big, small = roots[edges[e, 0]], roots[edges[e, 1]]
+        if big == small:
+            continue
+        if sizes[big] < sizes[small]:
+            big, small = small, big
+        clash = False
+        node = small
+        for _ in range(sizes[small]):
+            other = big
+            for _ in range(sizes[big]):
+                if frame_of_node[other] == frame_of_node[node]:
+                    clash = True
+                    break
+                other = following[other]
+            if clash:
+                break
+            node = following[node]
+        if clash:
+            continue
+        node = small
+        for _ in range(sizes[small]):
+            roots[node] = big
+            node = following[node]
+        sizes[big] += sizes[small]
+        following[big], following[small] = following[small], following[big]
+    return roots

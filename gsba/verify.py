@@ -1,0 +1,99 @@
+"""Two-view verification on bearings, and agreement with the trajectory."""
+
+import numpy as np
+
+from gsba.config import VerifySettings
+from gsba.geometry import inverse, pose, rotation_angle
+from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
+
+
+def run(
+    matches: Matches,
+    keypoints: Keypoints,
+    prior_f0_T_f1s: np.ndarray,
+    position_sigmas: np.ndarray,
+    settings: VerifySettings,
+    seed: int,
+) -> VerifiedPairs:
+    """Estimate a relative pose per pair by LO-RANSAC and keep pairs that agree with the prior.
+
+    Args:
+        matches: putative matches.
+        keypoints: of all frames.
+        prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory.
+        position_sigmas: (P,) how far the prior's relative position may be off, map units; decides
+            how much its direction is worth.
+        settings: thresholds.
+        seed: of the sampling.
+    """
+    kept, dropped = (
+        [],
+        {"too few matches": 0, "rotation contradicts": 0, "direction contradicts": 0},
+    )
+    for p, (f0, f1) in enumerate(matches.pairs):
+        rows = matches.of(p)
+        bearings0 = keypoints.bearings_of(f0)[rows[:, 0]]
+        bearings1 = keypoints.bearings_of(f1)[rows[:, 1]]
+        estimate = relative_pose(bearings0, bearings1, settings, seed)
+        if estimate is None:
+            dropped["too few matches"] += 1
+            continue
+        f0_T_f1, inliers = estimate
+        prior = prior_f0_T_f1s[p]
+        turn = rotation_angle(prior[:3, :3].T @ f0_T_f1[:3, :3])
+        if turn > np.deg2rad(settings.max_rotation_deg):
+            dropped["rotation contradicts"] += 1
+        elif _parallax(f0_T_f1, bearings0[inliers], bearings1[inliers]) > np.deg2rad(
+            settings.min_parallax_deg
+        ) and not _direction_agrees(prior[:3, 3], f0_T_f1[:3, 3], position_sigmas[p], settings):
+            dropped["direction contradicts"] += 1
+        else:
+            kept.append((p, f0_T_f1, rows[inliers]))
+    index = [p for p, _, _ in kept]
+    inlier_rows = [rows for _, _, rows in kept]
+    verified = Matches(
+        matches.pairs[index],
+        np.cumsum([0, *map(len, inlier_rows)]),
+        np.concatenate([np.zeros((0, 2), np.int32), *inlier_rows]),
+    )
+    poses = np.array([f0_T_f1 for _, f0_T_f1, _ in kept]).reshape(-1, 4, 4)
+    return VerifiedPairs(verified, poses, Counts(len(matches.pairs), len(kept), "pairs", dropped))
+
+
+def relative_pose(
+    bearings0: np.ndarray, bearings1: np.ndarray, settings: VerifySettings, seed: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """f0_T_f1 (4, 4) with unit translation and inlier mask (m,), or None if too few agree."""
+    import pycolmap
+
+    if len(bearings0) < settings.min_inliers:
+        return None
+    options = pycolmap.RANSACOptions()
+    options.max_error = np.deg2rad(settings.max_error_deg)
+    options.min_num_trials, options.max_num_trials = 100, 3000
+    options.random_seed = seed
+    found = pycolmap.estimate_relative_pose(bearings0, bearings1, options)
+    if found is None or found["num_inliers"] < settings.min_inliers:
+        return None
+    f1_T_f0 = found["cam2_from_cam1"].matrix()
+    f0_T_f1 = inverse(pose(f1_T_f0[:, :3], f1_T_f0[:, 3]))
+    f0_T_f1[:3, 3] /= max(np.linalg.norm(f0_T_f1[:3, 3]), 1e-12)
+    return f0_T_f1, np.asarray(found["inlier_mask"], bool)
+
+
+def _parallax(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.ndarray) -> float:
+    """Median angle in radians between both bearings in one orientation."""
+    chords = np.linalg.norm(bearings0 - bearings1 @ f0_T_f1[:3, :3].T, axis=1)
+    return float(2 * np.arcsin(np.median(chords) / 2))
+
+
+def _direction_agrees(
+    prior: np.ndarray, direction: np.ndarray, sigma: float, settings: VerifySettings
+) -> bool:
+    """Whether a unit direction fits a relative position known to `sigma`."""
+    length = np.linalg.norm(prior)
+    if length <= 3 * sigma:  # the prior does not know the direction
+        return True
+    allowed = np.deg2rad(settings.max_direction_deg) + np.arcsin(3 * sigma / length)
+    angle = np.arctan2(np.linalg.norm(np.cross(prior, direction)), prior @ direction)
+    return bool(angle < allowed)
