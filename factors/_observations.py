@@ -1,8 +1,12 @@
-"""The observations of a block as its kernels read them."""
+"""Observations of landmarks: families hand them in as terms, kernels read them sorted."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple, Protocol
 
 import numpy as np
+
+from factors.robust import RobustLoss
 
 BEARING, REPROJECTION = 0, 1  # kinds of measurement
 
@@ -19,3 +23,118 @@ class Observations(NamedTuple):
     cameras: np.ndarray  # (C, 12): [rig_R_face row-major (9), focal, principal u, v in pixels]
     loss: int  # code of the robust loss
     loss_scale: float
+
+
+class Term(Protocol):
+    """Observations of one family, O of them, of the landmarks of a block."""
+
+    @property
+    def name(self) -> str:
+        """Family that the cost is reported under."""
+        ...
+
+    @property
+    def frames(self) -> np.ndarray:
+        """(O,) int, row of the block's poses."""
+        ...
+
+    @property
+    def points(self) -> np.ndarray:
+        """(O,) int, row of the block's landmarks."""
+        ...
+
+    @property
+    def kind(self) -> int:
+        """BEARING or REPROJECTION."""
+        ...
+
+    def measurements(self) -> np.ndarray:
+        """(O, 3) rows as in Observations."""
+        ...
+
+    def whiteners(self) -> np.ndarray:
+        """(O, 3) rows as in Observations."""
+        ...
+
+    def cameras(self) -> np.ndarray:
+        """(C, 12) rows as in Observations, which the measurements count from 0."""
+        ...
+
+
+def sort_observations(
+    terms: Sequence[Term], num_frames: int, num_points: int, loss: RobustLoss
+) -> tuple[Observations, np.ndarray, np.ndarray]:
+    """Order landmarks by first and last frame, observations by landmark and frame.
+
+    Returns:
+        The observations; for each its row among the terms back to back, (O,) int32; for each
+        landmark the row it was given in, (J,).
+    """
+    lengths = [len(term.frames) for term in terms]
+    frames = np.zeros(sum(lengths), dtype=np.int32)
+    owners = np.zeros_like(frames)
+    starts = np.cumsum([0, *lengths])
+    spans = [slice(a, b) for a, b in pairwise(starts)]
+    for term, span in zip(terms, spans, strict=True):
+        frames[span], owners[span] = term.frames, term.points
+    first = np.full(num_points, num_frames, dtype=np.int32)
+    last = np.full(num_points, -1, dtype=np.int32)
+    np.minimum.at(first, owners, frames)
+    np.maximum.at(last, owners, frames)
+    point_order = np.lexsort((last, first))
+    rank = np.empty(num_points, dtype=np.int32)
+    rank[point_order] = np.arange(num_points, dtype=np.int32)
+    owners = rank[owners]
+    order = np.lexsort((frames, owners)).astype(np.int32)
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    offsets = np.zeros(num_points + 1, dtype=np.int64)
+    np.cumsum(np.bincount(owners, minlength=num_points), out=offsets[1:])
+    names = list(dict.fromkeys(term.name for term in terms))
+    obs = Observations(
+        offsets=offsets,
+        frames=frames[order],
+        kinds=np.zeros(len(order), dtype=np.uint8),
+        families=np.zeros(len(order), dtype=np.uint8),
+        measurements=np.empty((len(order), 3)),
+        whiteners=np.empty((len(order), 3)),
+        cameras=np.concatenate([np.zeros((0, 12)), *(term.cameras() for term in terms)]),
+        loss=loss.code,
+        loss_scale=float(loss.scale),
+    )
+    num_cameras = 0
+    for term, span in zip(terms, spans, strict=True):
+        rows = place[span]
+        obs.kinds[rows], obs.families[rows] = term.kind, names.index(term.name)
+        obs.measurements[rows] = term.measurements()
+        obs.whiteners[rows] = term.whiteners()
+        if len(term.cameras()):
+            obs.measurements[rows, 2] += num_cameras
+            num_cameras += len(term.cameras())
+    return obs, order, point_order
+
+
+def check_term(term: Term, num_frames: int, num_points: int) -> None:
+    """Refuse a term that does not fit its block.
+
+    Raises:
+        ValueError: arrays of unequal length, indices out of range, values not finite.
+    """
+    frames, points = np.asarray(term.frames), np.asarray(term.points)
+    rows = term.measurements()
+    if not len(frames) == len(points) == len(rows):
+        raise ValueError(
+            f"term {term.name!r}: {len(frames)} frames, {len(points)} points and {len(rows)} "
+            "measurements must be equally many"
+        )
+    if len(frames) == 0:
+        return
+    if frames.min() < 0 or frames.max() >= num_frames:
+        raise ValueError(f"term {term.name!r}: frame index out of range 0..{num_frames - 1}")
+    if points.min() < 0 or points.max() >= num_points:
+        raise ValueError(f"term {term.name!r}: point index out of range 0..{num_points - 1}")
+    if not np.all(np.isfinite(rows)):
+        raise ValueError(f"term {term.name!r}: measurements must be finite")
+    num_cameras = len(term.cameras())
+    if num_cameras and not (rows[:, 2].min() >= 0 and rows[:, 2].max() < num_cameras):
+        raise ValueError(f"term {term.name!r}: face index out of range 0..{num_cameras - 1}")

@@ -10,14 +10,10 @@ import numpy as np
 
 from factors._host_factors import host_factors
 from factors._kernels import eliminate_range, polish_range, residuals_range
-from factors._observations import Observations
+from factors._observations import Term, check_term, sort_observations
 from factors._terms import pose_rows
-from factors.bearing import BearingTerm
 from factors.block import PoseSystem
-from factors.reprojection import ReprojectionTerm
 from factors.robust import RobustLoss
-
-Term = BearingTerm | ReprojectionTerm
 
 _POLISH_TOLERANCE = 1e-12  # of a landmark's cost
 _PROPOSAL_TOLERANCE = 1e-6  # of a landmark's cost: further steps gain less than the poses do
@@ -65,10 +61,13 @@ class LandmarkBlock:
         self.families = tuple(dict.fromkeys(term.name for term in terms))
         points = np.array(points_world, dtype=np.float64).reshape(-1, 3)
         for term in terms:
-            _check_term(term, len(self.pose_keys), len(points))
+            check_term(term, len(self.pose_keys), len(points))
         if not np.all(np.isfinite(points)):
             raise ValueError("points_world must be finite")
-        self._sort(points)
+        self._obs, self._order, self._point_order = sort_observations(
+            self.terms, len(self.pose_keys), len(points), self.loss
+        )
+        self._points = points[self._point_order]
         self._row_starts, self._columns = self._covisibility()
         rows = np.repeat(np.arange(len(self.pose_keys)), np.diff(self._row_starts))
         self.pairs = np.column_stack([rows, self._columns]).astype(np.int64)
@@ -197,46 +196,6 @@ class LandmarkBlock:
         self._trial = points, costs
         return float(costs.sum())
 
-    def _sort(self, points: np.ndarray) -> None:
-        """Order landmarks by first and last frame, observations by landmark and frame."""
-        terms, num_points = self.terms, len(points)
-        frames = np.concatenate([np.asarray(t.frames) for t in terms] or [[]]).astype(np.int32)
-        owners = np.concatenate([np.asarray(t.points) for t in terms] or [[]]).astype(np.int32)
-        first = np.full(num_points, len(self.pose_keys), dtype=np.int32)
-        last = np.full(num_points, -1, dtype=np.int32)
-        np.minimum.at(first, owners, frames)
-        np.maximum.at(last, owners, frames)
-        self._point_order = np.lexsort((last, first))  # sorted row -> given row
-        rank = np.empty(num_points, dtype=np.int32)
-        rank[self._point_order] = np.arange(num_points, dtype=np.int32)
-        owners = rank[owners]
-        order = np.lexsort((frames, owners))  # sorted row -> given row, terms back to back
-        camera_counts = [len(term.cameras()) for term in terms]
-        measurements = [term.measurements() for term in terms]
-        for rows, term, offset in zip(
-            measurements, terms, np.cumsum([0, *camera_counts]), strict=False
-        ):
-            if len(term.cameras()):
-                rows[:, 2] += offset
-        families = [self.families.index(term.name) for term in terms]
-        lengths = [len(term.frames) for term in terms]
-        cameras = [term.cameras() for term in terms] or [np.zeros((0, 12))]
-        self._order = order.astype(np.int32)
-        self._points = np.ascontiguousarray(points[self._point_order])
-        offsets = np.zeros(num_points + 1, dtype=np.int64)
-        np.cumsum(np.bincount(owners, minlength=num_points), out=offsets[1:])
-        self._obs = Observations(
-            offsets=offsets,
-            frames=frames[order],
-            kinds=np.repeat([t.kind for t in terms], lengths).astype(np.uint8)[order],
-            families=np.repeat(families, lengths).astype(np.uint8)[order],
-            measurements=np.concatenate(measurements or [np.zeros((0, 3))])[order],
-            whiteners=np.concatenate([t.whiteners() for t in terms] or [np.zeros((0, 3))])[order],
-            cameras=np.ascontiguousarray(np.concatenate(cameras)),
-            loss=self.loss.code,
-            loss_scale=float(self.loss.scale),
-        )
-
     def _covisibility(self) -> tuple[np.ndarray, np.ndarray]:
         """CSR rows of the frame pairs f < g that see a landmark in common."""
         from scipy.sparse import csr_matrix
@@ -273,24 +232,3 @@ class LandmarkBlock:
 
     def _named(self, costs: np.ndarray) -> dict[str, float]:
         return {name: float(cost) for name, cost in zip(self.families, costs, strict=True)}
-
-
-def _check_term(term: Term, num_frames: int, num_points: int) -> None:
-    frames, points = np.asarray(term.frames), np.asarray(term.points)
-    rows = term.measurements()
-    if not len(frames) == len(points) == len(rows):
-        raise ValueError(
-            f"term {term.name!r}: {len(frames)} frames, {len(points)} points and {len(rows)} "
-            "measurements must be equally many"
-        )
-    if len(frames) == 0:
-        return
-    if frames.min() < 0 or frames.max() >= num_frames:
-        raise ValueError(f"term {term.name!r}: frame index out of range 0..{num_frames - 1}")
-    if points.min() < 0 or points.max() >= num_points:
-        raise ValueError(f"term {term.name!r}: point index out of range 0..{num_points - 1}")
-    if not np.all(np.isfinite(rows)):
-        raise ValueError(f"term {term.name!r}: measurements must be finite")
-    num_cameras = len(term.cameras())
-    if num_cameras and not (rows[:, 2].min() >= 0 and rows[:, 2].max() < num_cameras):
-        raise ValueError(f"term {term.name!r}: face index out of range 0..{num_cameras - 1}")
