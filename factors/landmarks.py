@@ -142,6 +142,29 @@ class LandmarkBlock:
             For each term (O, 2) residuals and (O,) bool, False where the point is behind the face
             (there the residual is a large constant).
         """
+        residuals, valid = self._residuals(values)
+        unsorted, flags = np.empty_like(residuals), np.empty_like(valid)
+        unsorted[self._order], flags[self._order] = residuals, valid
+        splits = np.cumsum([len(term.frames) for term in self.terms])[:-1]
+        return np.split(unsorted, splits), np.split(flags, splits)
+
+    def costs(self, values: gtsam.Values) -> dict[str, float]:
+        """Robust cost of each family at the current landmarks."""
+        residuals, _ = self._residuals(values)
+        losses = self.loss.rho(np.einsum("ni,ni->n", residuals, residuals))
+        totals = np.bincount(self._obs.families, weights=losses, minlength=len(self.families))
+        return self._named(totals)
+
+    def error(self, values: gtsam.Values) -> float:
+        """Robust cost at the current landmarks."""
+        return sum(self.costs(values).values())
+
+    def factors(self) -> list[gtsam.CustomFactor]:
+        """The same cost as ordinary GTSAM factors on poses, one per first frame of landmarks."""
+        return host_factors(self)
+
+    def _residuals(self, values: gtsam.Values) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened residuals (O, 2) and validity (O,), in the order of the sorted observations."""
         poses = pose_rows(values, self.pose_keys)
         residuals = np.empty((len(self._order), 2))
         valid = np.empty(len(self._order), dtype=np.bool_)
@@ -151,26 +174,7 @@ class LandmarkBlock:
             residuals_range(*ranges[i], self._obs, self._points, poses, residuals, valid)
 
         self._run(work, len(ranges))
-        unsorted, flags = np.empty_like(residuals), np.empty_like(valid)
-        unsorted[self._order], flags[self._order] = residuals, valid
-        splits = np.cumsum([len(term.frames) for term in self.terms])[:-1]
-        return np.split(unsorted, splits), np.split(flags, splits)
-
-    def costs(self, values: gtsam.Values) -> dict[str, float]:
-        """Robust cost of each family at the current landmarks."""
-        out = dict.fromkeys(self.families, 0.0)
-        residuals, _ = self.residuals(values)
-        for term, rows in zip(self.terms, residuals, strict=True):
-            out[term.name] += float(self.loss.rho(np.einsum("ni,ni->n", rows, rows)).sum())
-        return out
-
-    def error(self, values: gtsam.Values) -> float:
-        """Robust cost at the current landmarks."""
-        return sum(self.costs(values).values())
-
-    def factors(self) -> list[gtsam.CustomFactor]:
-        """The same cost as ordinary GTSAM factors on poses, one per first frame of landmarks."""
-        return host_factors(self)
+        return residuals, valid
 
     def _move(
         self,
