@@ -166,22 +166,17 @@ def times_symmetric(v, x, y, z):
 
 
 @_kernel
-def _point_rows(pose, a0, a1, a2, b0, b1, b2):
-    """Both rows of d r / d X = (d r / d d) world_R_rig^T."""
-    return (
-        a0 * pose[0] + a1 * pose[1] + a2 * pose[2],
-        a0 * pose[3] + a1 * pose[4] + a2 * pose[5],
-        a0 * pose[6] + a1 * pose[7] + a2 * pose[8],
-        b0 * pose[0] + b1 * pose[1] + b2 * pose[2],
-        b0 * pose[3] + b1 * pose[4] + b2 * pose[5],
-        b0 * pose[6] + b1 * pose[7] + b2 * pose[8],
-    )
+def _add_normal(normal, pose, a0, a1, a2, b0, b1, b2, r0, r1, w):
+    """Add an observation to a landmark's Hessian (6, upper) and gradient (3), one array (9,).
 
-
-@_kernel
-def _add_normal(normal, rows, r0, r1, w):
-    """Add an observation to a landmark's Hessian (6, upper) and gradient (3), one array (9,)."""
-    p0, p1, p2, q0, q1, q2 = rows
+    Returns both rows of d r / d X = (d r / d d) world_R_rig^T.
+    """
+    p0 = a0 * pose[0] + a1 * pose[1] + a2 * pose[2]
+    p1 = a0 * pose[3] + a1 * pose[4] + a2 * pose[5]
+    p2 = a0 * pose[6] + a1 * pose[7] + a2 * pose[8]
+    q0 = b0 * pose[0] + b1 * pose[1] + b2 * pose[2]
+    q1 = b0 * pose[3] + b1 * pose[4] + b2 * pose[5]
+    q2 = b0 * pose[6] + b1 * pose[7] + b2 * pose[8]
     normal[0] += w * (p0 * p0 + q0 * q0)
     normal[1] += w * (p0 * p1 + q0 * q1)
     normal[2] += w * (p0 * p2 + q0 * q2)
@@ -191,6 +186,7 @@ def _add_normal(normal, rows, r0, r1, w):
     normal[6] += w * (p0 * r0 + q0 * r1)
     normal[7] += w * (p1 * r0 + q1 * r1)
     normal[8] += w * (p2 * r0 + q2 * r1)
+    return p0, p1, p2, q0, q1, q2
 
 
 @_kernel
@@ -205,7 +201,7 @@ def _point_normal(obs, j, point, poses, normal):
         rho, w = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)
         cost += rho
         if valid:
-            _add_normal(normal, _point_rows(pose, a0, a1, a2, b0, b1, b2), r0, r1, w)
+            _add_normal(normal, pose, a0, a1, a2, b0, b1, b2, r0, r1, w)
     return cost
 
 
@@ -218,6 +214,31 @@ def _pose_row(j0, j1, j2, dx, dy, dz, out):
     out[3] = -j0
     out[4] = -j1
     out[5] = -j2
+
+
+@_kernel
+def _reduce(num, seen, W, Y, normal, row_starts, columns, diagonal, off_diagonal, gradient):
+    """Take a landmark's Schur complement from the frames that see it; Y is scratch."""
+    inverse = invert_symmetric(normal)
+    for i in range(num):
+        f = seen[i]
+        H, g = diagonal[f], gradient[f]
+        Wi, Yi = W[i], Y[i]
+        for r in range(6):
+            y0, y1, y2 = times_symmetric(inverse, Wi[0, r], Wi[1, r], Wi[2, r])
+            Yi[r, 0], Yi[r, 1], Yi[r, 2] = y0, y1, y2
+            g[r] -= y0 * normal[6] + y1 * normal[7] + y2 * normal[8]
+            for c in range(6):
+                H[r, c] -= y0 * Wi[0, c] + y1 * Wi[1, c] + y2 * Wi[2, c]
+        slot = row_starts[f]
+        for k in range(i + 1, num):
+            while columns[slot] != seen[k]:
+                slot += 1
+            B, Wk = off_diagonal[slot], W[k]
+            for r in range(6):
+                y0, y1, y2 = Yi[r, 0], Yi[r, 1], Yi[r, 2]
+                for c in range(6):
+                    B[r, c] -= y0 * Wk[0, c] + y1 * Wk[1, c] + y2 * Wk[2, c]
 
 
 @_kernel
@@ -260,8 +281,7 @@ def eliminate_range(
                 continue
             _pose_row(a0, a1, a2, dx, dy, dz, a)
             _pose_row(b0, b1, b2, dx, dy, dz, b)
-            rows = _point_rows(pose, a0, a1, a2, b0, b1, b2)
-            _add_normal(normal, rows, r0, r1, w)
+            rows = _add_normal(normal, pose, a0, a1, a2, b0, b1, b2, r0, r1, w)
             H, g, Wf = diagonal[f], gradient[f], W[num - 1]
             for i in range(6):
                 ai, bi = w * a[i], w * b[i]
@@ -271,26 +291,7 @@ def eliminate_range(
                 for c in range(6):
                     H[i, c] += ai * a[c] + bi * b[c]
         point_costs[j] = cost
-        inverse = invert_symmetric(normal)
-        for i in range(num):
-            f = seen[i]
-            H, g = diagonal[f], gradient[f]
-            Wi, Yi = W[i], Y[i]
-            for r in range(6):
-                y0, y1, y2 = times_symmetric(inverse, Wi[0, r], Wi[1, r], Wi[2, r])
-                Yi[r, 0], Yi[r, 1], Yi[r, 2] = y0, y1, y2
-                g[r] -= y0 * normal[6] + y1 * normal[7] + y2 * normal[8]
-                for c in range(6):
-                    H[r, c] -= y0 * Wi[0, c] + y1 * Wi[1, c] + y2 * Wi[2, c]
-            slot = row_starts[f]
-            for k in range(i + 1, num):
-                while columns[slot] != seen[k]:
-                    slot += 1
-                B, Wk = off_diagonal[slot], W[k]
-                for r in range(6):
-                    y0, y1, y2 = Yi[r, 0], Yi[r, 1], Yi[r, 2]
-                    for c in range(6):
-                        B[r, c] -= y0 * Wk[0, c] + y1 * Wk[1, c] + y2 * Wk[2, c]
+        _reduce(num, seen, W, Y, normal, row_starts, columns, diagonal, off_diagonal, gradient)
 
 
 @_kernel
@@ -311,7 +312,7 @@ def _substituted_step(obs, j, point, poses, steps, normal):
         for i in range(6):
             r0 += a[i] * step[i]
             r1 += b[i] * step[i]
-        _add_normal(normal, _point_rows(pose, a0, a1, a2, b0, b1, b2), r0, r1, w)
+        _add_normal(normal, pose, a0, a1, a2, b0, b1, b2, r0, r1, w)
     return times_symmetric(invert_symmetric(normal), normal[6], normal[7], normal[8])
 
 
@@ -331,18 +332,16 @@ def polish_range(
     normal, trial_normal = np.empty(9), np.empty(9)
     here, there = np.empty(3), np.empty(3)
     for j in range(first, last):
-        _copy(points[j], here)
+        here[0], here[1], here[2] = points[j, 0], points[j, 1], points[j, 2]
         if substitute:
             x, y, z = _substituted_step(obs, j, here, old_poses, steps, normal)
             here[0], here[1], here[2] = here[0] - x, here[1] - y, here[2] - z
         cost = _point_normal(obs, j, here, poses, normal)
         if substitute and not cost <= point_costs[j]:
-            _copy(points[j], there)
+            there[0], there[1], there[2] = points[j, 0], points[j, 1], points[j, 2]
             stay = _point_normal(obs, j, there, poses, trial_normal)
             if not cost <= stay:
-                cost = stay
-                _copy(there, here)
-                _copy(trial_normal, normal)
+                cost, here, there, normal, trial_normal = stay, there, here, trial_normal, normal
         damping = 0.0
         for _ in range(num_steps):
             extra = damping * (normal[0] + normal[3] + normal[5])
@@ -356,21 +355,12 @@ def polish_range(
             there[0], there[1], there[2] = here[0] - x, here[1] - y, here[2] - z
             trial = _point_normal(obs, j, there, poses, trial_normal)
             if trial < cost:
-                cost = trial
-                _copy(there, here)
-                _copy(trial_normal, normal)
+                cost, here, there, normal, trial_normal = trial, there, here, trial_normal, normal
                 damping *= 0.1
             else:
                 damping = max(1e-3, 10.0 * damping)
-        _copy(here, trial_points[j])
+        trial_points[j, 0], trial_points[j, 1], trial_points[j, 2] = here[0], here[1], here[2]
         trial_costs[j] = cost
-
-
-@_kernel
-def _copy(source, target):
-    """Copy a vector; an assignment of slices would compile a formatted error message too."""
-    for i in range(len(source)):
-        target[i] = source[i]
 
 
 @_kernel
@@ -379,7 +369,4 @@ def residuals_range(first, last, obs, points, poses, residuals, valid):
     for j in range(first, last):
         for o in range(obs.offsets[j], obs.offsets[j + 1]):
             dx, dy, dz = rig_vector(poses[obs.frames[o]], points[j])
-            result = whitened_residual(obs, o, dx, dy, dz)
-            valid[o] = result[0]
-            residuals[o, 0] = result[1]
-            residuals[o, 1] = result[2]
+            valid[o], residuals[o, 0], residuals[o, 1] = whitened_residual(obs, o, dx, dy, dz)[:3]
