@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -21,6 +22,8 @@ from gsba.rig import RIG_R_FACE, owner_faces
 from gsba.types import Features, Matches
 
 _CELLS = 8  # cells along a face's side
+_ZERO = np.float32(0)
+_kernel = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +46,17 @@ class Searchable:
     starts: np.ndarray  # (C + 1,) int32, rows of each cell
     centres: np.ndarray  # (C, 3) float32, unit
     radii: np.ndarray  # (C,) float32, largest chord from a centre to a member
+
+
+class _Limits(NamedTuple):
+    """A gate and the thresholds on descriptors as the compiled search takes them."""
+
+    rotation: np.float32  # radians
+    direction: np.float32  # tangent
+    chord: np.float32  # largest distance of both bearings on the unit sphere
+    point: np.float32  # radians
+    similarity: np.float32  # least
+    ratio: np.float32  # largest
 
 
 def searchable(features: Features) -> Searchable:
@@ -116,13 +130,15 @@ def match_pair(
         second.starts,
         second.centres @ rotation.T,
         second.radii,
-        direction,
-        np.float32(gate.rotation_rad),
-        np.float32(gate.direction if length > 1e-12 else 1e3),
-        np.float32(2 * np.sin(min(gate.max_parallax_rad, np.pi) / 2)),
-        np.float32(gate.point_rad),
-        np.float32(settings.min_similarity),
-        np.float32(settings.max_ratio),
+        tuple(direction),
+        _Limits(
+            np.float32(gate.rotation_rad),
+            np.float32(gate.direction if length > 1e-12 else 1e3),
+            np.float32(2 * np.sin(min(gate.max_parallax_rad, np.pi) / 2)),
+            np.float32(gate.point_rad),
+            np.float32(settings.min_similarity),
+            np.float32(settings.max_ratio),
+        ),
     )
     rows = np.flatnonzero(best >= 0)
     pairs = np.column_stack([first.keypoints[rows], second.keypoints[best[rows]]])
@@ -139,7 +155,7 @@ def _one_to_one(pairs: np.ndarray, similarity: np.ndarray) -> np.ndarray:
     return pairs[np.argsort(pairs[:, 0])].astype(np.int32)
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
+@_kernel
 def _search(
     bearings0,
     targets,
@@ -151,103 +167,114 @@ def _search(
     centres,
     radii,
     direction,
-    rotation_tolerance,
-    direction_tolerance,
-    max_chord,
-    point_tolerance,
-    min_similarity,
-    max_ratio,
+    limits,
 ):
     """Best row of frame 1 for every row of frame 0, or -1; all vectors in frame 0's axes."""
     n0, n1, dim = len(bearings0), len(bearings1), descriptors0.shape[1]
-    best0, top0, next0 = (
-        np.full(n0, -1, np.int32),
-        np.full(n0, -1, np.float32),
-        np.full(n0, -1, np.float32),
-    )
-    best1, top1, next1 = (
-        np.full(n1, -1, np.int32),
-        np.full(n1, -1, np.float32),
-        np.full(n1, -1, np.float32),
-    )
-    tx, ty, tz = direction
-    same_place = np.float32(1e-5)  # squared chord, 0.18 degrees: one feature found twice
+    best0, best1 = np.full(n0, -1, np.int32), np.full(n1, -1, np.int32)
+    top0, next0 = np.full(n0, -1, np.float32), np.full(n0, -1, np.float32)
+    top1, next1 = np.full(n1, -1, np.float32), np.full(n1, -1, np.float32)
     for i in range(n0):
         if only_targets and np.isnan(targets[i, 0]):
             continue
-        ax, ay, az = bearings0[i]
-        px, py, pz = targets[i]
-        nx, ny, nz = ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax
-        sine = np.sqrt(nx * nx + ny * ny + nz * nz)
-        if sine > 1e-6:
-            nx, ny, nz = nx / sine, ny / sine, nz / sine
-        cosine = tx * ax + ty * ay + tz * az
-        slack = rotation_tolerance * (sine + rotation_tolerance)
+        bearing = bearings0[i, 0], bearings0[i, 1], bearings0[i, 2]
+        target = targets[i, 0], targets[i, 1], targets[i, 2]
+        normal, cosine, slack = _great_circle(bearing, direction, limits.rotation)
         for cell in range(len(radii)):
             if starts[cell] == starts[cell + 1]:
                 continue
+            ball = centres[cell, 0], centres[cell, 1], centres[cell, 2]
             radius = radii[cell]
-            cx, cy, cz = centres[cell]
-            if only_targets:
-                away = np.sqrt((px - cx) ** 2 + (py - cy) ** 2 + (pz - cz) ** 2)
-                if away > point_tolerance + radius:
-                    continue
-            chord = np.sqrt((ax - cx) ** 2 + (ay - cy) ** 2 + (az - cz) ** 2) + radius
-            if chord - 2 * radius > max_chord + rotation_tolerance:
+            if only_targets and _distance(target, ball) > limits.point + radius:
                 continue
-            off = abs(nx * cx + ny * cy + nz * cz) - radius
-            if off > rotation_tolerance + direction_tolerance * chord:
+            if not _in_band(ball, radius, bearing, normal, direction, cosine + slack, limits):
                 continue
             for j in range(starts[cell], starts[cell + 1]):
-                bx, by, bz = bearings1[j]
-                if only_targets:
-                    away = np.sqrt((px - bx) ** 2 + (py - by) ** 2 + (pz - bz) ** 2)
-                    if away > point_tolerance:
-                        continue
-                chord = np.sqrt((ax - bx) ** 2 + (ay - by) ** 2 + (az - bz) ** 2)
-                if chord > max_chord + rotation_tolerance:
+                ball = bearings1[j, 0], bearings1[j, 1], bearings1[j, 2]
+                if only_targets and _distance(target, ball) > limits.point:
                     continue
-                allowed = rotation_tolerance + direction_tolerance * chord
-                if abs(nx * bx + ny * by + nz * bz) > allowed:
+                if not _in_band(ball, _ZERO, bearing, normal, direction, cosine + slack, limits):
                     continue
-                if tx * bx + ty * by + tz * bz > cosine + slack + direction_tolerance * chord:
-                    continue  # moved towards the direction of motion: behind both frames
-                dot = np.float32(0)
+                dot = _ZERO
                 for d in range(dim):
                     dot += descriptors0[i, d] * descriptors1[j, d]
-                if dot > top0[i]:
-                    previous = best0[i]
-                    if previous < 0 or _apart(bearings1[previous], bearings1[j]) > same_place:
-                        next0[i] = top0[i]
-                    best0[i], top0[i] = j, dot
-                elif dot > next0[i] and _apart(bearings1[best0[i]], bearings1[j]) > same_place:
-                    next0[i] = dot
-                if dot > top1[j]:
-                    previous = best1[j]
-                    if previous < 0 or _apart(bearings0[previous], bearings0[i]) > same_place:
-                        next1[j] = top1[j]
-                    best1[j], top1[j] = i, dot
-                elif dot > next1[j] and _apart(bearings0[best1[j]], bearings0[i]) > same_place:
-                    next1[j] = dot
-    squared_ratio = max_ratio * max_ratio
+                if dot > next0[i]:  # asked here, as calls that pass arrays are dear
+                    _offer(best0, top0, next0, i, j, dot, bearings1)
+                if dot > next1[j]:
+                    _offer(best1, top1, next1, j, i, dot, bearings0)
     for i in range(n0):
         j = best0[i]
-        if j < 0:
-            continue
-        distance = 1 - top0[i]  # half the squared descriptor distance
-        if (
-            best1[j] != i
-            or top0[i] < min_similarity
-            or distance > squared_ratio * (1 - next0[i])
-            or distance > squared_ratio * (1 - next1[j])
+        if j >= 0 and not (
+            best1[j] == i and _distinctive(top0[i], max(next0[i], next1[j]), limits)
         ):
             best0[i] = -1
     return best0, top0
 
 
-@numba.njit(cache=True, nogil=True)
-def _apart(a, b):
-    return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
+@_kernel
+def _great_circle(bearing, direction, rotation_tolerance):
+    """Normal of the plane of a bearing and the motion, cosine between them, and its slack."""
+    (ax, ay, az), (tx, ty, tz) = bearing, direction
+    nx, ny, nz = ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax
+    sine = np.sqrt(nx * nx + ny * ny + nz * nz)
+    if sine > 1e-6:
+        nx, ny, nz = nx / sine, ny / sine, nz / sine
+    slack = rotation_tolerance * (sine + rotation_tolerance)
+    return (nx, ny, nz), tx * ax + ty * ay + tz * az, slack
+
+
+@_kernel
+def _in_band(ball, radius, bearing, normal, direction, max_cosine, limits):
+    """Whether a bearing within `radius` of the centre of a ball can be of the same point.
+
+    It lies on the great circle, no further than parallax goes, and is not displaced towards the
+    direction of motion: that is where points behind both frames are seen.
+    """
+    chord = _distance(bearing, ball)
+    if chord - radius > limits.chord + limits.rotation:
+        return False
+    band = limits.direction * (chord + radius)
+    if abs(_dot(normal, ball)) - radius > limits.rotation + band:
+        return False
+    return _dot(direction, ball) - radius <= max_cosine + band
+
+
+@_kernel
+def _offer(best, top, second, row, candidate, similarity, bearings):
+    """Note a candidate that beats a row's second best, which must lie elsewhere than the best."""
+    elsewhere = best[row] < 0 or not _one_place(bearings, best[row], candidate)
+    if similarity > top[row]:
+        if elsewhere:
+            second[row] = top[row]
+        best[row], top[row] = candidate, similarity
+    elif elsewhere:
+        second[row] = similarity
+
+
+@_kernel
+def _distinctive(similarity, second, limits):
+    """Ratio test on descriptor distances: half their squares are 1 - similarity."""
+    ratio = limits.ratio * limits.ratio
+    return similarity >= limits.similarity and 1 - similarity <= ratio * (1 - second)
+
+
+@_kernel
+def _one_place(bearings, a, b):
+    """Whether two rows are one feature found twice: closer than 0.18 degrees."""
+    x = bearings[a, 0] - bearings[b, 0]
+    y = bearings[a, 1] - bearings[b, 1]
+    z = bearings[a, 2] - bearings[b, 2]
+    return x * x + y * y + z * z <= 1e-5
+
+
+@_kernel
+def _distance(a, b):
+    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
+
+
+@_kernel
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 class SearchableFrames:

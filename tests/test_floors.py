@@ -19,6 +19,7 @@ FLOORS = (
     {"rig", "records", "run_folder", "store", "read"},
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter"},
+    {"adjust", "frontend", "reconstruction"},
     {"export", "evaluate", "report"},
     {"demo", "pipeline"},
     {"cli"},
