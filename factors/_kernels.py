@@ -9,9 +9,8 @@ changes, not when a function it calls from another file does.
 import numpy as np
 from numba import njit
 
-from factors._observations import BEARING
+from factors._observations import BEARING, MIN_DEPTH
 
-MIN_DEPTH = 1e-9  # of the unit direction: a point nearer to the face's plane counts as behind it
 _EPS = 1e-300  # guards divisions by a squared norm
 
 _kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
@@ -19,10 +18,7 @@ _kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"
 
 @_kernel
 def rho_and_weight(code, scale, squared):
-    """Loss rho(s) and weight w = 2 rho'(s) of s = |whitened residual|^2.
-
-    Near zero rho = s / 2, so the sum of rho is the cost GTSAM reports.
-    """
+    """Loss rho(s), near zero s / 2 as in GTSAM, and weight 2 rho'(s) of s = |residual|^2."""
     c2 = scale * scale
     if code == 1 and squared > c2:
         norm = np.sqrt(squared)
@@ -37,17 +33,11 @@ def rho_and_weight(code, scale, squared):
 
 @_kernel
 def tangent_axes(mx, my, mz):
-    """Two unit axes spanning the tangent plane at a unit vector.
-
-    Branch on the sign of z only: Duff et al., Building an Orthonormal Basis, Revisited, 2017.
-    """
+    """Rows of factors.bearing.tangent_basis at a unit vector."""
     sign = 1.0 if mz >= 0 else -1.0
     a = -1.0 / (sign + mz)
     b = mx * my * a
-    return (
-        1.0 + sign * mx * mx * a, sign * b, -sign * mx,
-        b, sign + my * my * a, -my,
-    )  # fmt: skip
+    return 1.0 + sign * mx * mx * a, sign * b, -sign * mx, b, sign + my * my * a, -my
 
 
 @_kernel
@@ -132,13 +122,13 @@ def rig_vector(pose, point):
 
 
 @_kernel
-def invert_symmetric(v):
-    """Inverse (6 values 00 01 02 11 12 22) of a damped symmetric 3x3 given the same way.
+def invert_symmetric(v, damping):
+    """Inverse (6 values 00 01 02 11 12 22) of a symmetric 3x3 given so, damped by its trace.
 
-    A share of 1e-12 of the trace is added, so a direction that no observation constrains (one
-    ray, no parallax) stays finite and moves no pose.
+    At least 1e-12 of the trace is added, so that a direction which no observation constrains
+    (one ray, no parallax) stays finite and moves no pose.
     """
-    eps = 1e-12 * (v[0] + v[3] + v[5]) + 1e-200
+    eps = (1e-12 + damping) * (v[0] + v[3] + v[5]) + 1e-200
     a, b, c, d, e, f = v[0] + eps, v[1], v[2], v[3] + eps, v[4], v[5] + eps
     l00 = np.sqrt(a)
     l10, l20 = b / l00, c / l00
@@ -167,10 +157,7 @@ def times_symmetric(v, x, y, z):
 
 @_kernel
 def _add_normal(normal, pose, a0, a1, a2, b0, b1, b2, r0, r1, w):
-    """Add an observation to a landmark's Hessian (6, upper) and gradient (3), one array (9,).
-
-    Returns both rows of d r / d X = (d r / d d) world_R_rig^T.
-    """
+    """Add to a landmark's Hessian (6) and gradient (3) in `normal`; returns d r / d X by rows."""
     p0 = a0 * pose[0] + a1 * pose[1] + a2 * pose[2]
     p1 = a0 * pose[3] + a1 * pose[4] + a2 * pose[5]
     p2 = a0 * pose[6] + a1 * pose[7] + a2 * pose[8]
@@ -219,7 +206,7 @@ def _pose_row(j0, j1, j2, dx, dy, dz, out):
 @_kernel
 def _reduce(num, seen, W, Y, normal, row_starts, columns, diagonal, off_diagonal, gradient):
     """Take a landmark's Schur complement from the frames that see it; Y is scratch."""
-    inverse = invert_symmetric(normal)
+    inverse = invert_symmetric(normal, 0.0)
     for i in range(num):
         f = seen[i]
         H, g = diagonal[f], gradient[f]
@@ -253,12 +240,8 @@ def eliminate_range(
         diagonal (F, 6, 6), off_diagonal (P, 6, 6), gradient (F, 6), costs (T,): accumulated.
         point_costs (J,): written for the range.
     """
-    longest = 0
-    for j in range(first, last):
-        longest = max(longest, obs.offsets[j + 1] - obs.offsets[j])
-    seen = np.empty(longest, np.int64)
-    W = np.empty((longest, 3, 6))
-    Y = np.empty((longest, 6, 3))
+    seen = np.empty(obs.longest, np.int64)
+    W, Y = np.empty((obs.longest, 3, 6)), np.empty((obs.longest, 6, 3))
     a, b = np.empty(6), np.empty(6)
     normal = np.empty(9)
     for j in range(first, last):
@@ -298,22 +281,20 @@ def eliminate_range(
 def _substituted_step(obs, j, point, poses, steps, normal):
     """Gauss-Newton step of landmark j, negated, that goes with the pose steps (F, 6)."""
     normal[:] = 0.0
-    a, b = np.empty(6), np.empty(6)
     for o in range(obs.offsets[j], obs.offsets[j + 1]):
-        f = obs.frames[o]
-        pose, step = poses[f], steps[f]
+        pose, step = poses[obs.frames[o]], steps[obs.frames[o]]
         dx, dy, dz = rig_vector(pose, point)
         valid, r0, r1, a0, a1, a2, b0, b1, b2 = whitened_residual(obs, o, dx, dy, dz)
         if not valid:
             continue
         w = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)[1]
-        _pose_row(a0, a1, a2, dx, dy, dz, a)
-        _pose_row(b0, b1, b2, dx, dy, dz, b)
-        for i in range(6):
-            r0 += a[i] * step[i]
-            r1 += b[i] * step[i]
+        x = dy * step[2] - dz * step[1] - step[3]  # change of d with the pose step
+        y = dz * step[0] - dx * step[2] - step[4]
+        z = dx * step[1] - dy * step[0] - step[5]
+        r0 += a0 * x + a1 * y + a2 * z
+        r1 += b0 * x + b1 * y + b2 * z
         _add_normal(normal, pose, a0, a1, a2, b0, b1, b2, r0, r1, w)
-    return times_symmetric(invert_symmetric(normal), normal[6], normal[7], normal[8])
+    return times_symmetric(invert_symmetric(normal, 0.0), normal[6], normal[7], normal[8])
 
 
 @_kernel
@@ -344,11 +325,8 @@ def polish_range(
                 cost, here, there, normal, trial_normal = stay, there, here, trial_normal, normal
         damping = 0.0
         for _ in range(num_steps):
-            extra = damping * (normal[0] + normal[3] + normal[5])
-            normal[0] += extra
-            normal[3] += extra
-            normal[5] += extra
-            x, y, z = times_symmetric(invert_symmetric(normal), normal[6], normal[7], normal[8])
+            inverse = invert_symmetric(normal, damping)
+            x, y, z = times_symmetric(inverse, normal[6], normal[7], normal[8])
             gain = 0.5 * (x * normal[6] + y * normal[7] + z * normal[8])
             if not gain > tolerance * cost:
                 break

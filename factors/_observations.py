@@ -9,6 +9,7 @@ import numpy as np
 from factors.robust import RobustLoss
 
 BEARING, REPROJECTION = 0, 1  # kinds of measurement
+MIN_DEPTH = 1e-9  # of a unit direction: a point nearer to the face's plane counts as behind it
 
 
 class Observations(NamedTuple):
@@ -21,6 +22,7 @@ class Observations(NamedTuple):
     measurements: np.ndarray  # (O, 3): unit bearing, rig frame | u, v in pixels, row of cameras
     whiteners: np.ndarray  # (O, 3): [s00, s01, s11] of the upper triangular 2x2 sqrt information
     cameras: np.ndarray  # (C, 12): [rig_R_face row-major (9), focal, principal u, v in pixels]
+    longest: int  # most observations of one landmark
     loss: int  # code of the robust loss
     loss_scale: float
 
@@ -99,6 +101,7 @@ def sort_observations(
         measurements=np.empty((len(order), 3)),
         whiteners=np.empty((len(order), 3)),
         cameras=np.concatenate([np.zeros((0, 12)), *(term.cameras() for term in terms)]),
+        longest=int(np.diff(offsets).max(initial=0)),
         loss=loss.code,
         loss_scale=float(loss.scale),
     )

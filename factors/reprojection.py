@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from factors._kernels import MIN_DEPTH
-from factors._observations import REPROJECTION
+from factors._observations import MIN_DEPTH, REPROJECTION
 from factors._terms import custom_factor, rig_vectors, whitener_rows
 
 
