@@ -70,7 +70,7 @@ def _gather_direct(start, stop, scene, points, normals, lamps, out):
             r2 = d[0] ** 2 + d[1] ** 2 + d[2] ** 2
             here = normals[m, 0] * d[0] + normals[m, 1] * d[1] + normals[m, 2] * d[2]
             there = -(lamps[p, 3] * d[0] + lamps[p, 4] * d[1] + lamps[p, 5] * d[2])
-            if here > 0 and there > 0 and nearest(scene, o, d, 0.999, -1)[1] < 0:
+            if here > 0 and there > 0 and nearest(scene, o, d, 0.999)[1] < 0:
                 light = lamps[p, 6] * here * there / (np.pi * r2 * r2)
                 out[m, 0] += light
                 out[m, 1] += light
@@ -96,7 +96,7 @@ def _gather_bounce(start, stop, scene, points, normals, directions, light, out):
                 u * s[1] + v * t[1] + w * y,
                 u * s[2] + v * t[2] + w * z,
             )
-            distance, q = nearest(scene, o, d, np.inf, -1)
+            distance, q = nearest(scene, o, d, np.inf)
             if q < 0:
                 continue
             ab = coordinates(scene, q, o, d, distance)

@@ -8,7 +8,6 @@ import numpy as np
 from gsba.demo.light import bake
 from gsba.demo.raycast import Scene
 
-LEAF_FACES = 3  # at most, in a leaf of the hierarchy
 LIGHT_SPACING = 0.3  # units between light samples
 Vector = Sequence[float] | np.ndarray
 DOWN = np.array([0.0, 1.0, 0.0])
@@ -190,27 +189,23 @@ def _hierarchy(corners: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, dict
     spanned = np.stack([corners, corners + edges[:, 0], corners + edges[:, 1], far])
     low, high = spanned.min(axis=0) - 1e-7, spanned.max(axis=0) + 1e-7
     order: list[int] = []
-    nodes: list[list] = []  # low, high, skip, first face, number of faces
+    nodes: list[list] = []  # low, high, skip, face
 
     def add(faces: np.ndarray) -> None:
-        node = [low[faces].min(axis=0), high[faces].max(axis=0), 0, len(order), 0]
+        node = [low[faces].min(axis=0), high[faces].max(axis=0), 0, -1]
         nodes.append(node)
-        if len(faces) <= LEAF_FACES:
-            node[4] = len(faces)
-            order.extend(faces.tolist())
+        if len(faces) == 1:
+            node[3] = len(order)
+            order.append(int(faces[0]))
         else:
             for part in _split(faces, low, high):
                 add(part)
         node[2] = len(nodes)
 
     add(np.arange(len(corners)))
-    columns = [np.array(column) for column in zip(*nodes, strict=True)]
-    return np.array(order), {
-        "node_low": columns[0],
-        "node_high": columns[1],
-        "node_skip": columns[2],
-        "node_faces": np.column_stack(columns[3:]),
-    }
+    names = ("node_low", "node_high", "node_skip", "node_face")
+    columns = (np.array(column) for column in zip(*nodes, strict=True))
+    return np.array(order), dict(zip(names, columns, strict=True))
 
 
 def _split(faces: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

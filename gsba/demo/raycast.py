@@ -29,7 +29,7 @@ class Scene(NamedTuple):
     node_low: np.ndarray  # (N, 3) float64, box of a node, depth-first order
     node_high: np.ndarray  # (N, 3) float64
     node_skip: np.ndarray  # (N,) int64, next node when this box is missed
-    node_faces: np.ndarray  # (N, 2) int64, first face and number of faces, 0 for inner nodes
+    node_face: np.ndarray  # (N,) int64, the one face of a leaf, -1 for inner nodes
     texels: np.ndarray  # (T, 3) uint8, RGB albedo, all levels of all textures
     levels: np.ndarray  # (num_textures, num_levels, 3) int64: offset into texels, width, height
     albedos: np.ndarray  # (num_textures, 3) float64, mean of each texture, 0..1
@@ -38,7 +38,7 @@ class Scene(NamedTuple):
 
 
 @jit
-def _face_distance(scene, q, o, d, limit):
+def face_distance(scene, q, o, d, limit):
     """Distance along the ray to face q, or `limit` where it is not hit before."""
     n, c, w = scene.normals, scene.corners, scene.duals
     along = n[q, 0] * d[0] + n[q, 1] * d[1] + n[q, 2] * d[2]
@@ -56,19 +56,14 @@ def _face_distance(scene, q, o, d, limit):
 
 
 @jit
-def nearest(scene, o, d, limit, hint):
+def nearest(scene, o, d, limit):
     """Distance and index of the first face on the ray o + t d; (limit, -1) if there is none.
 
     Args:
         o, d: three numbers each, origin and direction (any length; t is in its units).
         limit: largest distance of interest.
-        hint: face tested first (bounds the search when right), or -1.
     """
     best, found = limit, -1
-    if hint >= 0:
-        t = _face_distance(scene, hint, o, d, best)
-        if t < best:
-            best, found = t, hint
     ix, iy, iz = 1 / d[0], 1 / d[1], 1 / d[2]
     low, high = scene.node_low, scene.node_high
     i = 0
@@ -81,9 +76,9 @@ def nearest(scene, o, d, limit, hint):
         if near > far:
             i = scene.node_skip[i]
             continue
-        first = scene.node_faces[i, 0]
-        for q in range(first, first + scene.node_faces[i, 1]):
-            t = _face_distance(scene, q, o, d, best)
+        q = scene.node_face[i]
+        if q >= 0:
+            t = face_distance(scene, q, o, d, best)
             if t < best:
                 best, found = t, q
         i += 1
@@ -117,7 +112,7 @@ def _trace(start, stop, scene, origin, directions, out):
     o = (origin[0], origin[1], origin[2])
     for i in range(start, stop):
         d = (directions[i, 0], directions[i, 1], directions[i, 2])
-        t, q = nearest(scene, o, d, np.inf, -1)
+        t, q = nearest(scene, o, d, np.inf)
         if q >= 0:
             out[i] = t
 

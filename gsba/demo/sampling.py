@@ -31,21 +31,19 @@ def bilinear(values, offset, width, height, x, y):
 
 
 @jit
-def _texture(scene, texture, s, t, ds, dt, level):
-    """Mean albedo (3), 0..255, along a footprint of centre (s, t), length (ds, dt) and `level`."""
+def _texture(scene, texture, s, t, ds, dt, size, taps):
+    """Mean albedo (3), 0..255, of `taps` spots of `size` texels along (ds, dt) about (s, t)."""
     top = scene.levels.shape[1] - 1
-    level = min(max(level, 0.0), float(top))
+    level = min(max(np.log2(size), 0.0), float(top))
     low = int(level)
-    taps = min(max(int(np.ceil(np.hypot(ds, dt) * 0.5**level)), 1), MAX_TAPS)
     r, g, b = 0.0, 0.0, 0.0
     for k in range(2):
         weight = level - low if k else 1 - (level - low)
         if weight <= 0:
             continue
-        at = min(low + k, top)
+        at = low + k
         offset, width = scene.levels[texture, at, 0], scene.levels[texture, at, 1]
-        height = scene.levels[texture, at, 2]
-        scale = 0.5 ** (low + k)
+        height, scale = scene.levels[texture, at, 2], 1 / (1 << at)
         for tap in range(taps):
             f = (tap + 0.5) / taps - 0.5
             x, y = (s + f * ds) * scale - 0.5, (t + f * dt) * scale - 0.5
@@ -70,14 +68,15 @@ def _slide(scene, q, d, t, e):
 @jit
 def albedo_at(scene, q, a, b, d, t, du, dv):
     """Filtered albedo (3), 0..255, for a ray of distance t whose direction varies by du and dv."""
-    first, second = _slide(scene, q, d, t, du), _slide(scene, q, d, t, dv)
-    longer, shorter = np.hypot(first[0], first[1]), np.hypot(second[0], second[1])
+    u, v = _slide(scene, q, d, t, du), _slide(scene, q, d, t, dv)
+    longer, shorter = np.sqrt(u[0] ** 2 + u[1] ** 2), np.sqrt(v[0] ** 2 + v[1] ** 2)
     if longer < shorter:
-        first, longer, shorter = second, shorter, longer
-    level = np.log2(max(shorter, longer / MAX_TAPS, 1e-6))
+        u, longer, shorter = v, shorter, longer
+    size = max(shorter, longer / MAX_TAPS, 1.0)
+    taps = int(np.ceil(longer / size - 1e-6))
     x = scene.windows[q, 0] + a * scene.windows[q, 2]
     y = scene.windows[q, 1] + b * scene.windows[q, 3]
-    return _texture(scene, scene.textures[q], x, y, first[0], first[1], level)
+    return _texture(scene, scene.textures[q], x, y, u[0], u[1], size, max(taps, 1))
 
 
 @jit
