@@ -104,7 +104,7 @@ def pose_similarity(
     """Sim(3) that carries one set of poses onto another of the same rigs.
 
     The rotation is the chordal mean over orientations, so that a straight path will do; scale and
-    translation are least squares over positions.
+    translation are least squares over positions; a rig that never moves leaves the scale at 1.
 
     Args:
         source_T_rigs, target_T_rigs: (N, 4, 4) poses of the same rigs in two worlds.
@@ -119,5 +119,6 @@ def pose_similarity(
     target = target_T_rigs[:, :3, 3]
     s, t = source - source.mean(axis=0), target - target.mean(axis=0)
     spread = float(np.sum(s * s))
-    scale = float(np.sum(s * t)) / spread if spread > 0 else 1.0
+    at_one_place = spread <= 1e-24 * float(np.sum(source * source))  # but for rounding
+    scale = 1.0 if at_one_place else float(np.sum(s * t)) / spread
     return scale, rotation, target.mean(axis=0) - scale * source.mean(axis=0)
