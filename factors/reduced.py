@@ -119,10 +119,17 @@ class ReducedSystem:
         return costs
 
     def inverse_diagonal(self) -> np.ndarray | None:
-        """Diagonal blocks (N, 6, 6) of H^-1 at the linearization point; None if singular."""
-        if not self._cholesky.factorize(self._diagonal, self._off_diagonal):
+        """Diagonal blocks (N, 6, 6) of H^-1 at the linearization point; None if singular.
+
+        A block that nothing constrains is NaN and does not count.
+        """
+        idle = np.logical_not(np.any(self._diagonal, axis=(1, 2)))
+        diagonal = np.where(idle[:, None, None], np.eye(DIM), self._diagonal)
+        if not self._cholesky.factorize(diagonal, self._off_diagonal):
             return None
-        return self._cholesky.inverse_diagonal()
+        inverse = self._cholesky.inverse_diagonal()
+        inverse[idle] = np.nan
+        return inverse
 
     def _padded_entries(self, counts: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """(block, coordinate) of the entries that belong to no variable."""

@@ -17,6 +17,7 @@ logger = logging.getLogger(__name__)
 
 _MAX_DAMPING = 1e10
 _MIN_DAMPING = 1e-12
+_FREE_DAMPING = 1e-2  # a small step says nothing about convergence where damping made it small
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,46 +81,58 @@ def optimize(
         if callback is not None:
             callback(step, values)
 
+    def result(converged: bool, reason: str) -> OptimizeResult:
+        return OptimizeResult(values, tuple(history), converged, reason)
+
     since = time.perf_counter()
     costs = system.linearize(values)
-    cost = sum(costs.values())
-    if not np.isfinite(cost):
-        bad = [name for name, part in costs.items() if not np.isfinite(part)]
-        raise GsbaError(f"the cost of {', '.join(bad)} is not finite at the start: check its input")
+    cost = _checked_sum(costs)
     damping, growth = settings.lambda_initial, 2.0
     record(0, cost, costs, damping, True, since)
     for number in range(1, settings.max_iterations + 1):
         since = time.perf_counter()
-        steps = system.solve(damping)
-        trial_cost = np.inf
-        if steps is not None:
-            trial = system.retract(values, steps)
-            trial_cost = system.propose(trial, steps)
-        predicted = system.predicted_decrease() if steps is not None else 0.0
-        if steps is None or not trial_cost <= cost:  # also where it is not a number
+        negligible = settings.relative_tolerance * cost
+        trial, trial_cost, predicted = _attempt(system, values, damping)
+        if not trial_cost <= cost:  # also where it is not a number
             record(number, trial_cost, {}, damping, False, since)
-            if 0 <= predicted <= settings.relative_tolerance * cost and steps is not None:
-                return OptimizeResult(values, tuple(history), True, "no step decreases the cost")
-            damping *= growth
-            growth *= 2.0
+            if predicted <= negligible:
+                return result(True, "no step decreases the cost")
+            damping, growth = damping * growth, growth * 2.0
             if damping > _MAX_DAMPING:
-                return OptimizeResult(values, tuple(history), False, "no damping gives a good step")
+                return result(False, "no damping gives a good step")
             continue
         for block in blocks:
             block.accept()
             block.refresh(trial)
         values, decrease, used = trial, cost - trial_cost, damping
         ratio = decrease / predicted if predicted > 0 else 1.0
-        damping = max(damping * max(1 / 10, 1 - (2 * ratio - 1) ** 3), _MIN_DAMPING)
+        damping = max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), _MIN_DAMPING)  # Nielsen 1999
         growth = 2.0
-        converged = decrease <= settings.relative_tolerance * cost
+        converged = decrease <= negligible and used <= _FREE_DAMPING
         costs = system.costs(values) if converged else system.linearize(values)
         cost = sum(costs.values())
         record(number, cost, costs, used, True, since)
         if converged:
-            reason = f"relative decrease below {settings.relative_tolerance:g}"
-            return OptimizeResult(values, tuple(history), True, reason)
-    return OptimizeResult(values, tuple(history), False, "iteration limit")
+            return result(True, f"relative decrease below {settings.relative_tolerance:g}")
+    return result(False, "iteration limit")
+
+
+def _attempt(
+    system: ReducedSystem, values: gtsam.Values, damping: float
+) -> tuple[gtsam.Values, float, float]:
+    """Values after one damped step, their cost and the decrease that the model expected."""
+    steps = system.solve(damping)
+    if steps is None:
+        return values, np.inf, np.inf
+    trial = system.retract(values, steps)
+    return trial, system.propose(trial, steps), system.predicted_decrease()
+
+
+def _checked_sum(costs: Mapping[str, float]) -> float:
+    bad = [name for name, part in costs.items() if not np.isfinite(part)]
+    if bad:
+        raise GsbaError(f"the cost of {', '.join(bad)} is not finite at the start: check its input")
+    return sum(costs.values())
 
 
 def marginal_covariances(
@@ -134,8 +147,8 @@ def marginal_covariances(
         keys: (F,) keys of Pose3 variables of the graph or a block.
 
     Returns:
-        (F, 6, 6) float64, [rotation rad, translation], rig frame. NaN for a key that nothing
-        constrains, and for all where the system is singular (the gauge is not fixed).
+        (F, 6, 6) float64, [rotation rad, translation], rig frame. NaN for a pose that nothing
+        constrains, and for all where the rest is singular (the gauge is not fixed).
     """
     system = ReducedSystem(graph, blocks, values)
     system.linearize(values)

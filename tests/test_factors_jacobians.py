@@ -7,13 +7,18 @@ from gtsam.symbol_shorthand import L, X
 
 from factors import (
     BearingFactor,
+    BearingTerm,
     FaceCameras,
     ReprojectionFactor,
+    ReprojectionTerm,
+    RobustLoss,
     bearing_residuals,
     jacobian_errors,
     reprojection_residuals,
     tangent_basis,
 )
+from factors._kernels import whitened_residual
+from factors._observations import sort_observations
 
 UNIT = gtsam.noiseModel.Unit.Create(2)
 CAMERAS = FaceCameras(
@@ -143,13 +148,49 @@ def test_reprojection_agrees_with_gtsam(face):
     calibration = gtsam.Cal3_S2(f, f, 0, u, v)
     rig_T_face = gtsam.Pose3(gtsam.Rot3(CAMERAS.rig_R_faces[face]), np.zeros(3))
     for _ in range(50):
-        values = values_at(random_pose(rng), 3 * rng.normal(size=3))  # behind the face half the time
+        values = values_at(
+            random_pose(rng), 3 * rng.normal(size=3)
+        )  # behind the face half the time
         pixel = rng.uniform(0, 512, 2)
         ours = ReprojectionFactor(X(0), L(0), pixel, face, CAMERAS, noise).error(values)
         native = gtsam.GenericProjectionFactorCal3_S2(
             pixel, noise, X(0), L(0), calibration, rig_T_face
         ).error(values)
         assert ours == pytest.approx(native, rel=1e-9)
+
+
+def test_kernels_agree_with_the_vectorised_residuals():
+    """Everywhere at once: poles, seam, series and arc tangent, antipode, behind a face."""
+    rng = np.random.default_rng(8)
+    bearings = np.concatenate([rng.normal(size=(60, 3)), list(BEARINGS.values())])
+    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    angles = np.array([0.0, 1e-9, 1e-4, 0.03, 0.0999, 0.1001, 1.0, 2.0, 3.1, np.pi])
+    bearings, angles = np.repeat(bearings, len(angles), axis=0), np.tile(angles, len(bearings))
+    axes = tangent_basis(bearings)[:, 0]
+    points = np.cos(angles)[:, None] * bearings + np.sin(angles)[:, None] * axes
+    points *= rng.uniform(0.5, 20, (len(points), 1))
+    points[0] = 0.0  # the centre
+    num = len(points)
+    pixels, faces = rng.uniform(0, 512, (num, 2)), rng.integers(0, 2, num)
+    zeros, rows = np.zeros(num, dtype=int), np.arange(num)
+    poses = np.tile(np.eye(4), (num, 1, 1))
+    terms = [
+        BearingTerm(zeros, rows, bearings, 0.5),
+        ReprojectionTerm(zeros, rows, pixels, faces, CAMERAS, 2.0),
+    ]
+    obs, order, point_order = sort_observations(terms, 1, num, RobustLoss())
+    wanted = [bearing_residuals(poses, points, bearings)]
+    wanted.append(reprojection_residuals(poses, points, pixels, faces, CAMERAS)[:3])
+    residuals = np.concatenate([2.0 * wanted[0][0], 0.5 * wanted[1][0]])
+    jacobians = np.concatenate([2.0 * wanted[0][2], 0.5 * wanted[1][2]])
+    for o, row in enumerate(order):
+        got = whitened_residual(obs, o, *points[row % num])
+        near_antipode = row < num and angles[row] > np.pi - 1e-9  # direction there is arbitrary
+        if not near_antipode:
+            assert np.allclose(got[1:3], residuals[row], rtol=1e-9, atol=1e-12)
+            assert np.allclose(got[3:], jacobians[row].ravel(), rtol=1e-7, atol=1e-9)
+        assert np.isfinite(got).all()
+    assert np.array_equal(np.sort(point_order), rows)
 
 
 def test_tangent_basis_is_orthonormal():
