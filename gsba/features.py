@@ -74,12 +74,10 @@ def extract(
         rig: geometry of the faces.
         extractor: the detector.
     """
+    usable = [face for face in range(len(FACES)) if masks is None or masks[face].any()]
     parts = []
-    for face in range(len(FACES)):
-        mask = None if masks is None else masks[face]
-        if mask is not None and not mask.any():
-            continue
-        found = extractor(faces_rgb[face], mask)
+    for face in usable or [0]:  # one at least: the extractor knows the shape of nothing
+        found = extractor(faces_rgb[face], None if masks is None else masks[face])
         bearings = rig.bearings(found.pixels, face)
         own = owner_faces(bearings) == face
         parts.append(_record(found, bearings, own, face, faces_rgb[face], rig))
