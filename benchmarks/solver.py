@@ -25,7 +25,7 @@ SIGMA = np.radians(0.05)  # per-axis bearing noise
 LOSS_SCALE = 2.0  # Cauchy, in sigmas
 OUTLIERS = 0.02
 WIDTH, HEIGHT = 4096, 2048  # of the peer's equirectangular images
-SOLVERS = ("ours", "pycolmap-erp", "pycolmap-pinholes")
+OURS, PEER = "ours", "pycolmap-erp"
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ def solve_ours(problem: Problem, num_threads: int) -> tuple[Result, np.ndarray, 
     cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     poses = np.array([done.values.atPose3(key).matrix() for key in block.pose_keys])
     steps = len(done.history) - 1
-    return Result("ours", cpu, wall, _peak_mb(), steps, done.converged), poses, block.points_world
+    return Result(OURS, cpu, wall, _peak_mb(), steps, done.converged), poses, block.points_world
 
 
 def _block(problem: Problem, world_T_rigs: np.ndarray, points: np.ndarray, num_threads: int):
@@ -124,13 +124,12 @@ def _block(problem: Problem, world_T_rigs: np.ndarray, points: np.ndarray, num_t
     return LandmarkBlock(keys, points, [term], loss, num_threads=num_threads), values
 
 
-def solve_pycolmap(
-    problem: Problem, num_threads: int, solver: str
-) -> tuple[Result, np.ndarray, np.ndarray]:
-    """The peer: one equirectangular camera a frame, or a rig of six pinhole faces."""
+def solve_pycolmap(problem: Problem, num_threads: int) -> tuple[Result, np.ndarray, np.ndarray]:
+    """The peer: one equirectangular camera a frame, its loss on the same scale in pixels."""
     import pycolmap
 
-    reconstruction, sigma_px = _reconstruction(problem, pinholes=solver == "pycolmap-pinholes")
+    reconstruction = _reconstruction(problem)
+    sigma_px = SIGMA * WIDTH / (2 * np.pi)
     options = pycolmap.BundleAdjustmentOptions(
         refine_focal_length=False,
         refine_principal_point=False,
@@ -159,72 +158,40 @@ def solve_pycolmap(
     assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
     ceres = summary.ceres_summary
     steps = ceres.num_successful_steps + ceres.num_unsuccessful_steps
-    return Result(solver, cpu, wall, _peak_mb(), steps, converged), poses, points
+    return Result(PEER, cpu, wall, _peak_mb(), steps, converged), poses, points
 
 
-def _reconstruction(problem: Problem, pinholes: bool):
-    """The problem as a pycolmap reconstruction, and one sigma in its pixels."""
+def _reconstruction(problem: Problem):
+    """The problem as a pycolmap reconstruction of equirectangular images."""
     import pycolmap
 
     from gsba.geometry import erp_from_bearings
-    from gsba.rig import RIG_R_FACE, CubeRig, owner_faces
 
     out = pycolmap.Reconstruction()
-    if pinholes:
-        cube = CubeRig(WIDTH // 4, np.radians(96.0))
-        sigma_px = cube.focal * SIGMA
-        faces = owner_faces(problem.bearings_rig)
-        pixels = cube.project(problem.bearings_rig, faces)
-        rig = pycolmap.Rig(rig_id=1)
-        for c in range(6):
-            params = [cube.focal, cube.focal, cube.principal, cube.principal]
-            camera = pycolmap.Camera(
-                camera_id=c + 1, model="PINHOLE", width=cube.size, height=cube.size, params=params
-            )
-            out.add_camera(camera)
-            if c == 0:
-                rig.add_ref_sensor(camera.sensor_id)
-            else:
-                rotation = pycolmap.Rotation3d(RIG_R_FACE[c].T)
-                rig.add_sensor(camera.sensor_id, pycolmap.Rigid3d(rotation, np.zeros(3)))
-        out.add_rig(rig)
-    else:
-        sigma_px = SIGMA * WIDTH / (2 * np.pi)
-        faces = np.zeros(len(problem.frames), dtype=np.uint8)
-        pixels = erp_from_bearings(problem.bearings_rig, WIDTH, HEIGHT)
-        camera = pycolmap.Camera(
-            camera_id=1, model="EQUIRECTANGULAR", width=WIDTH, height=HEIGHT, params=[WIDTH, HEIGHT]
-        )
-        out.add_camera_with_trivial_rig(camera)
-    num_faces = 6 if pinholes else 1
-    images = problem.frames.astype(np.int64) * num_faces + faces
-    order = np.argsort(images, kind="stable")
-    counts = np.bincount(images, minlength=num_faces * len(problem.world_T_rigs))
-    starts = np.cumsum(counts) - counts
-    places = np.empty(len(order), dtype=np.int64)
-    places[order] = np.arange(len(order)) - starts[images[order]]
+    camera = pycolmap.Camera(
+        camera_id=1, model="EQUIRECTANGULAR", width=WIDTH, height=HEIGHT, params=[WIDTH, HEIGHT]
+    )
+    out.add_camera_with_trivial_rig(camera)
+    pixels = erp_from_bearings(problem.bearings_rig, WIDTH, HEIGHT)
+    order = np.argsort(problem.frames, kind="stable")
+    bounds = np.searchsorted(problem.frames[order], np.arange(len(problem.world_T_rigs) + 1))
+    places = np.empty(len(order), dtype=np.int64)  # of each observation in its image
+    places[order] = np.arange(len(order)) - bounds[problem.frames[order]]
     for f, world_T_rig in enumerate(problem.world_T_rigs):
-        frame = pycolmap.Frame(frame_id=f + 1, rig_id=1)
-        for c in range(num_faces):
-            frame.add_data_id(pycolmap.data_t(out.camera(c + 1).sensor_id, f * num_faces + c + 1))
-        frame.rig_from_world = pycolmap.Rigid3d(world_T_rig[:3]).inverse()
-        out.add_frame(frame)
-        for c in range(num_faces):
-            i = f * num_faces + c
-            rows = order[starts[i] : starts[i] + counts[i]]
-            image = pycolmap.Image(
-                name=f"{c}/{f:06d}.png", keypoints=pixels[rows], camera_id=c + 1, image_id=i + 1
-            )
-            image.frame_id = f + 1
-            out.add_image(image)
-        out.register_frame(f + 1)
+        image = pycolmap.Image(
+            name=f"{f:06d}.png",
+            keypoints=pixels[order[bounds[f] : bounds[f + 1]]],
+            camera_id=1,
+            image_id=f + 1,
+        )
+        out.add_image_with_trivial_frame(image, pycolmap.Rigid3d(world_T_rig[:3]).inverse())
     bounds = np.searchsorted(problem.points, np.arange(len(problem.points_world) + 1))
     for j, xyz in enumerate(problem.points_world):
         track = pycolmap.Track()
         for o in range(bounds[j], bounds[j + 1]):
-            track.add_element(int(images[o]) + 1, int(places[o]))
+            track.add_element(int(problem.frames[o]) + 1, int(places[o]))
         out.add_point3D(xyz, track)
-    return out, sigma_px
+    return out
 
 
 def common_cost(problem: Problem, world_T_rigs: np.ndarray, points: np.ndarray) -> float:
@@ -283,10 +250,10 @@ def _peak_mb() -> float:
 def _child(solver: str, folder: Path, num_threads: int) -> None:
     with np.load(folder / "problem.npz") as stored:
         problem = Problem(**{name: stored[name] for name in stored.files})
-    if solver == "ours":
+    if solver == OURS:
         result, poses, points = solve_ours(problem, num_threads)
     else:
-        result, poses, points = solve_pycolmap(problem, num_threads, solver)
+        result, poses, points = solve_pycolmap(problem, num_threads)
     np.savez(folder / "result.npz", poses=poses, points=points, result=json.dumps(asdict(result)))
 
 
@@ -308,7 +275,7 @@ def verdicts(results: dict[str, list[Result]]) -> list[tuple[str, bool]]:
     """What was to be reached, and whether it was, for the sizes and solvers that ran."""
     out = []
     for size, rows in results.items():
-        ours, peers = rows[0], [row for row in rows[1:] if row.solver == "pycolmap-erp"]
+        ours, peers = rows[0], rows[1:]
         out.append((f"{size}: converged", ours.converged))
         for peer in peers:
             optimum = ours.cost / min(row.cost for row in rows)
@@ -332,23 +299,21 @@ def main() -> None:
     """Parse, run, print; exit 1 where a target is missed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--size", choices=SIZES, nargs="+", default=["S"])
-    parser.add_argument("--peer", action="store_true", help="run pycolmap's ERP rig too")
-    parser.add_argument("--pinholes", action="store_true", help="and its rig of six pinholes")
+    parser.add_argument("--peer", action="store_true", help="run pycolmap too")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--child", choices=SOLVERS, help=argparse.SUPPRESS)
+    parser.add_argument("--child", choices=(OURS, PEER), help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
         _child(options.child, options.folder, options.threads)
         return
-    wanted = [True, options.peer, options.pinholes]
     results: dict[str, list[Result]] = {}
     print(f"{'':4} {'solver':18} {'CPU s':>8} {'wall s':>8} {'MB':>6} {'steps':>6} {'cost':>12}")
     for size in options.size:
         problem = make_problem(*SIZES[size])
         rows = results.setdefault(size, [])
-        for solver in (name for name, want in zip(SOLVERS, wanted, strict=True) if want):
+        for solver in (OURS, PEER) if options.peer else (OURS,):
             row = run(problem, solver, options.threads)
             rows.append(row)
             print(
