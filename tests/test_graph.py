@@ -1,0 +1,139 @@
+"""Priors of the factor graph, solved with stock gtsam."""
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic import loop_walk
+
+from gsba import graph
+from gsba.config import PriorSettings
+from gsba.geometry import inverse, rotation_angle
+from gsba.graph import X
+
+SETTINGS = PriorSettings()
+
+
+def _values(world_T_rigs: np.ndarray) -> gtsam.Values:
+    values = gtsam.Values()
+    for f, world_T_rig in enumerate(world_T_rigs):
+        values.insert(X(f), gtsam.Pose3(world_T_rig))
+    return values
+
+
+def _solve(factors: gtsam.NonlinearFactorGraph, start: np.ndarray) -> np.ndarray:
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(1e-12)
+    parameters.setMaxIterations(200)
+    values = gtsam.LevenbergMarquardtOptimizer(factors, _values(start), parameters).optimize()
+    return np.array([values.atPose3(X(f)).matrix() for f in range(len(start))])
+
+
+def _shaken(world_T_rigs: np.ndarray, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    out = world_T_rigs.copy()
+    turns = Rotation.from_rotvec(rng.normal(0, 0.02, (len(out), 3))).as_matrix()
+    out[:, :3, :3] = out[:, :3, :3] @ turns
+    out[:, :3, 3] += rng.normal(0, 0.1, (len(out), 3))
+    return out
+
+
+def test_alone_the_priors_give_the_trajectory_back() -> None:
+    coarse = loop_walk(12)
+    factors = graph.build(coarse, SETTINGS)
+    assert factors.error(_values(coarse)) == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(_solve(factors, _shaken(coarse)), coarse, atol=1e-4)
+
+
+def test_the_first_pose_is_fixed() -> None:
+    """However hard another factor pulls at it."""
+    coarse = loop_walk(6)
+    factors = graph.build(coarse, SETTINGS)
+    pulled = gtsam.Pose3(coarse[0]).compose(gtsam.Pose3.Expmap(np.full(6, 0.3)))
+    factors.add(gtsam.PriorFactorPose3(X(0), pulled, gtsam.noiseModel.Isotropic.Sigma(6, 1e-2)))
+    solved = _solve(factors, coarse)
+    np.testing.assert_allclose(solved[0], coarse[0], atol=1e-4)
+
+
+def test_every_pose_is_constrained() -> None:
+    coarse = loop_walk(8)
+    marginals = gtsam.Marginals(graph.build(coarse, SETTINGS), _values(coarse))
+    for f in range(8):
+        eigenvalues = np.linalg.eigvalsh(marginals.marginalCovariance(X(f)))
+        assert eigenvalues.min() > 0 and np.isfinite(eigenvalues).all()
+
+
+def _with_truth(coarse: np.ndarray, true: np.ndarray, gap: int) -> np.ndarray:
+    """Solve the priors with images replaced by exact steps of the truth, none across `gap`."""
+    factors = graph.build(coarse, SETTINGS)
+    tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)
+    steps = inverse(true[:-1]) @ true[1:]
+    for f, step in enumerate(steps):
+        if f != gap:
+            factors.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), gtsam.Pose3(step), tight))
+    across = inverse(true[0]) @ true[-1]  # a closed loop knows better than the jump
+    factors.add(gtsam.BetweenFactorPose3(X(0), X(len(true) - 1), gtsam.Pose3(across), tight))
+    return _solve(factors, coarse)
+
+
+def test_a_jump_is_let_go() -> None:
+    true = loop_walk(16)
+    coarse = true.copy()
+    jump = gtsam.Pose3.Expmap(np.array([0.0, 0.15, 0.0, 1.5, 0.2, 0.5])).matrix()
+    coarse[8:] = coarse[7] @ jump @ inverse(coarse[7]) @ coarse[8:]
+    solved = _with_truth(coarse, true, gap=7)
+    # The images' 1e-3 a step, in spite of a jump of 17 sigmas in rotation and 10 in position.
+    assert np.linalg.norm(solved[:, :3, 3] - true[:, :3, 3], axis=1).max() < 0.01
+    assert rotation_angle(np.swapaxes(solved[:, :3, :3], 1, 2) @ true[:, :3, :3]).max() < 2e-3
+    clean = _with_truth(true, true, gap=7)
+    np.testing.assert_allclose(clean, true, atol=1e-6)
+
+
+@pytest.mark.parametrize("still", ["all", "some"])
+def test_a_standing_camera_gives_no_nan(still: str) -> None:
+    coarse = loop_walk(10)
+    if still == "all":
+        coarse[:] = coarse[0]
+    else:
+        coarse[3:8] = coarse[3]
+    factors = graph.build(coarse, SETTINGS)
+    error = factors.error(_values(_shaken(coarse)))
+    assert np.isfinite(error) and error > 0
+    np.testing.assert_allclose(_solve(factors, _shaken(coarse)), coarse, atol=1e-4)
+    marginals = gtsam.Marginals(factors, _values(coarse))
+    assert np.isfinite(marginals.marginalCovariance(X(9))).all()
+
+
+def test_images_may_move_a_camera_that_slam_thought_still() -> None:
+    coarse = np.stack([np.eye(4)] * 5)
+    factors = graph.build(coarse, SETTINGS)
+    moved = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 0.1]))
+    tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)
+    for f in range(4):
+        factors.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), moved, tight))
+    solved = _solve(factors, coarse)
+    np.testing.assert_allclose(solved[:, 2, 3], 0.1 * np.arange(5), atol=0.01)
+
+
+def test_step_noise_scales_with_the_map() -> None:
+    """The same walk in other units costs the same."""
+    coarse = loop_walk(10)
+    off = _shaken(coarse)
+    errors = []
+    for scale in (1.0, 50.0):
+        bigger, bigger_off = coarse.copy(), off.copy()
+        bigger[:, :3, 3] *= scale
+        bigger_off[:, :3, 3] *= scale
+        bigger_off[0] = bigger[0]  # the gauge is not at issue
+        errors.append(graph.build(bigger, SETTINGS).error(_values(bigger_off)))
+    assert errors[1] == pytest.approx(errors[0], rel=1e-9)
+
+
+def test_fixed_scale_holds_the_extent() -> None:
+    coarse = loop_walk(10)
+    held = graph.fixed_scale(coarse)
+    bigger = coarse.copy()
+    bigger[:, :3, 3] = coarse[0, :3, 3] + 1.01 * (coarse[:, :3, 3] - coarse[0, :3, 3])
+    assert held.error(_values(coarse)) == pytest.approx(0, abs=1e-9)
+    assert held.error(_values(bigger)) == pytest.approx(0.5 * 1e4**2, rel=1e-6)
+    assert graph.fixed_scale(np.stack([np.eye(4)] * 3)).size() == 0

@@ -1,0 +1,166 @@
+"""Two-view verification: the pose among outliers, and the trajectory's veto."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic import bearings_of, unit, with_noise
+
+from gsba import verify
+from gsba.config import VerifySettings
+from gsba.geometry import pose, rotation_angle
+from gsba.types import Keypoints, Matches, VerifiedPairs
+
+NUM = 200
+SIGMA = 3e-4
+SETTINGS = VerifySettings()
+F0_T_F1 = pose(Rotation.from_rotvec([0.05, 0.4, -0.02]).as_matrix(), np.array([0.4, 0.05, 0.6]))
+
+
+def _see(
+    f0_T_f1: np.ndarray, outliers: float, seed: int = 0, num: int = NUM
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bearings (N, 3) of matches in both frames, and which matches are true."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(2, 8, (num, 1)) * unit(rng.normal(size=(num, 3)))
+    bearings0 = with_noise(unit(points), SIGMA, rng)
+    bearings1 = with_noise(bearings_of(points, f0_T_f1), SIGMA, rng)
+    true = rng.random(num) >= outliers
+    bearings1[~true] = unit(rng.normal(size=((~true).sum(), 3)))
+    return bearings0, bearings1, true
+
+
+def _direction_error(found: np.ndarray, true: np.ndarray) -> float:
+    return np.degrees(np.arccos(np.clip(unit(found[:3, 3]) @ unit(true[:3, 3]), -1, 1)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_pose_is_found_among_outliers(seed: int) -> None:
+    bearings0, bearings1, true = _see(F0_T_F1, 0.4, seed)
+    estimate = verify.relative_pose(bearings0, bearings1, SETTINGS, 0)
+    assert estimate is not None
+    found, inliers = estimate
+    # 120 bearings of 0.017 degrees with some 10 degrees of parallax.
+    assert np.degrees(rotation_angle(found[:3, :3].T @ F0_T_F1[:3, :3])) < 0.05
+    assert _direction_error(found, F0_T_F1) < 0.3
+    assert np.linalg.norm(found[:3, 3]) == pytest.approx(1)
+    assert inliers[true].mean() > 0.98
+    # A random bearing lies within 0.25 degrees of an epipolar line one time in 200.
+    assert inliers[~true].sum() <= 4
+
+
+def test_too_few_matches_make_no_pose() -> None:
+    bearings0, bearings1, _ = _see(F0_T_F1, 0.0)
+    few = SETTINGS.min_inliers - 1
+    assert verify.relative_pose(bearings0[:few], bearings1[:few], SETTINGS, 0) is None
+    noise0, noise1, _ = _see(F0_T_F1, 1.0)
+    assert verify.relative_pose(noise0, noise1, SETTINGS, 0) is None
+
+
+def _run(
+    views: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    priors: list[np.ndarray],
+    sigmas: list[float] | None = None,
+) -> VerifiedPairs:
+    """Each view as a pair of two frames of its own, keypoint k matched with k."""
+    bearings = np.concatenate([np.zeros((0, 3)), *(b for view in views for b in view[:2])])
+    starts = np.cumsum([0] + [len(b) for view in views for b in view[:2]])
+    num = len(bearings)
+    keypoints = Keypoints(
+        starts,
+        np.zeros((num, 2)),
+        np.zeros(num, np.uint8),
+        bearings,
+        np.full(num, SIGMA),
+        np.zeros((num, 3), np.uint8),
+    )
+    rows = [np.repeat(np.arange(len(view[0]), dtype=np.int32)[:, None], 2, 1) for view in views]
+    matches = Matches(
+        np.arange(2 * len(views), dtype=np.int32).reshape(-1, 2),
+        np.cumsum([0, *map(len, rows)]),
+        np.concatenate([np.zeros((0, 2), np.int32), *rows]),
+    )
+    spread = np.zeros(len(views)) if sigmas is None else np.array(sigmas)
+    return verify.run(matches, keypoints, np.array(priors), spread, SETTINGS, 0)
+
+
+def _turned(f0_T_f1: np.ndarray, degrees: float) -> np.ndarray:
+    out = f0_T_f1.copy()
+    out[:3, :3] = Rotation.from_rotvec([0, np.deg2rad(degrees), 0]).as_matrix() @ out[:3, :3]
+    return out
+
+
+def _redirected(f0_T_f1: np.ndarray, degrees: float) -> np.ndarray:
+    out = f0_T_f1.copy()
+    axis = unit(np.cross(out[:3, 3], [1.0, 2.0, 3.0]))
+    out[:3, 3] = Rotation.from_rotvec(np.deg2rad(degrees) * axis).apply(out[:3, 3])
+    return out
+
+
+def test_pairs_that_agree_with_the_prior_are_kept() -> None:
+    views = [_see(F0_T_F1, 0.3), _see(F0_T_F1, 1.0), _see(F0_T_F1, 0.1, seed=1)]
+    found = _run(views, [F0_T_F1] * 3)
+    np.testing.assert_array_equal(found.matches.pairs, [[0, 1], [4, 5]])
+    assert (found.counts.received, found.counts.kept) == (3, 2)
+    assert found.counts.dropped["too few matches"] == 1
+    for row, view in enumerate((views[0], views[2])):
+        kept = found.matches.of(row)
+        assert view[2][kept[:, 0]].mean() > 0.97
+        assert _direction_error(found.f0_T_f1s[row], F0_T_F1) < 0.3
+
+
+def test_rotation_is_vetoed() -> None:
+    limit = SETTINGS.max_rotation_deg
+    views = [_see(F0_T_F1, 0.2)] * 2
+    found = _run(views, [_turned(F0_T_F1, 0.8 * limit), _turned(F0_T_F1, 1.2 * limit)])
+    np.testing.assert_array_equal(found.matches.pairs, [[0, 1]])
+    assert found.counts.dropped["rotation contradicts"] == 1
+
+
+def test_direction_is_vetoed() -> None:
+    limit = SETTINGS.max_direction_deg
+    views = [_see(F0_T_F1, 0.2)] * 3
+    priors = [_redirected(F0_T_F1, angle) for angle in (0.8 * limit, 1.2 * limit, 180)]
+    found = _run(views, priors)
+    np.testing.assert_array_equal(found.matches.pairs, [[0, 1]])
+    assert found.counts.dropped["direction contradicts"] == 2
+
+
+def test_direction_counts_for_as_much_as_the_prior_knows_it() -> None:
+    limit, length = SETTINGS.max_direction_deg, np.linalg.norm(F0_T_F1[:3, 3])
+    prior = _redirected(F0_T_F1, 1.5 * limit)
+    certain, vague, ignorant = 0.0, length * np.sin(np.deg2rad(0.6 * limit)) / 3, length / 2
+    views = [_see(F0_T_F1, 0.2)] * 4
+    found = _run(
+        views,
+        [prior, prior, prior, _redirected(F0_T_F1, 180)],
+        [certain, vague, ignorant, ignorant],
+    )
+    np.testing.assert_array_equal(found.matches.pairs[:, 0] // 2, [1, 2, 3])
+
+
+@pytest.mark.parametrize("baseline", [0.0, 0.01])
+def test_a_standing_camera_has_no_direction_to_veto(baseline: float) -> None:
+    still = F0_T_F1.copy()
+    still[:3, 3] *= baseline
+    found = _run([_see(still, 0.2)], [_redirected(F0_T_F1, 180)])
+    assert found.counts.kept == 1
+    assert np.isfinite(found.f0_T_f1s).all()
+
+
+def test_no_pairs_are_no_error() -> None:
+    view = _see(F0_T_F1, 0.0)
+    for views, priors in (
+        ([], np.zeros((0, 4, 4))),
+        ([(view[0][:5], view[1][:5], None)], [F0_T_F1]),
+    ):
+        found = _run(views, priors)
+        assert found.counts.kept == 0
+        assert found.matches.keypoints.shape == (0, 2) and found.f0_T_f1s.shape == (0, 4, 4)
+        np.testing.assert_array_equal(found.matches.offsets, [0])
+
+
+def test_the_seed_decides() -> None:
+    bearings0, bearings1, _ = _see(F0_T_F1, 0.4)
+    first, again = (verify.relative_pose(bearings0, bearings1, SETTINGS, 7) for _ in range(2))
+    assert first is not None and again is not None
+    np.testing.assert_array_equal(first[0], again[0])
