@@ -172,9 +172,10 @@ def _noise(block: LandmarkBlock, values: gtsam.Values, noise: float) -> float:
     residuals = np.concatenate(block.residuals(values)[0]).ravel()
     if len(residuals) == 0:
         return noise
+    families = len(block.terms)  # each sees every observation, at a part of its information
     unknowns = 3 * len(block.points_world) + 6 * len(block.pose_keys)
-    redundancy = max(1 - unknowns / len(residuals), _REDUNDANT)
-    return float(noise * 1.4826 * np.median(np.abs(residuals)) / np.sqrt(redundancy))
+    redundancy = max(1 - families * unknowns / len(residuals), _REDUNDANT)
+    return float(noise * 1.4826 * np.median(np.abs(residuals)) * np.sqrt(families / redundancy))
 
 
 def _values(world_T_rigs: np.ndarray) -> gtsam.Values:
