@@ -1,0 +1,213 @@
+"""Rounds of adjustment over a synthetic world with a known answer."""
+
+from dataclasses import replace
+from functools import cache
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from synthetic import RIG, World, drifted, make_world
+
+from gsba import adjust, graph
+from gsba.adjust import Adjustment
+from gsba.config import RefineSettings
+from gsba.geometry import inverse, pose_similarity, rotation_angle
+from gsba.optimize import OptimizeResult
+
+SIGMA, CLAIMED = 5e-4, 3e-4  # radians: true noise of bearings, and what keypoints say of it
+GATES = (200.0, 60.0, 20.0, 8.0, 8.0)  # in claimed sigmas: the start is some 5 degrees off
+FAMILIES = {
+    "bearing": ("bearing",),
+    "reprojection": ("reprojection",),
+    "both": ("bearing", "reprojection"),
+}
+
+
+def _settings(families: str = "bearing", **changes: object) -> RefineSettings:
+    return RefineSettings.model_validate({"factors": FAMILIES[families], **changes})
+
+
+def _world(seed: int = 0) -> tuple[World, np.ndarray]:
+    world = make_world(seed, sigma_rad=SIGMA, claimed_sigma_rad=CLAIMED, false_share=0.05)
+    return world, drifted(world.world_T_rigs, np.random.default_rng(seed))
+
+
+def _run(
+    world: World, coarse: np.ndarray, settings: RefineSettings, gates: tuple[float, ...] = GATES
+) -> Adjustment:
+    priors = graph.build(coarse, settings.priors)
+    start = adjust.start(coarse)
+    return adjust.run(world.tracks, world.keypoints, start, priors, RIG, gates, settings, 1)
+
+
+def _covariances(
+    solved: Adjustment, world: World, coarse: np.ndarray, settings: RefineSettings
+) -> np.ndarray:
+    priors = graph.build(coarse, settings.priors)
+    return adjust.pose_covariances(solved, priors, world.keypoints, RIG, settings, 1)
+
+
+@cache
+def _solved(families: str, seed: int = 0) -> tuple[World, np.ndarray, Adjustment, np.ndarray]:
+    """World, start, solution and covariances."""
+    world, coarse = _world(seed)
+    settings = _settings(families)
+    solved = _run(world, coarse, settings)
+    return world, coarse, solved, _covariances(solved, world, coarse, settings)
+
+
+def _position_rmse(world_T_rigs: np.ndarray, true: np.ndarray) -> float:
+    scale, rotation, translation = pose_similarity(world_T_rigs, true)
+    placed = scale * world_T_rigs[:, :3, 3] @ rotation.T + translation
+    return float(np.sqrt(np.mean(np.sum((placed - true[:, :3, 3]) ** 2, axis=1))))
+
+
+def _errors_in_gauge(world_T_rigs: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Tangent errors (F, 6) with the first pose and the distance to the furthest frame equal."""
+    far = np.argmax(np.linalg.norm(world_T_rigs[:, :3, 3] - world_T_rigs[0, :3, 3], axis=1))
+    found, wanted = inverse(world_T_rigs[0]) @ world_T_rigs, inverse(true[0]) @ true
+    found[:, :3, 3] *= np.linalg.norm(wanted[far, :3, 3]) / np.linalg.norm(found[far, :3, 3])
+    return np.array(
+        [
+            gtsam.Pose3.Logmap(gtsam.Pose3(a).between(gtsam.Pose3(b)))
+            for a, b in zip(wanted, found, strict=True)
+        ]
+    )
+
+
+@pytest.mark.parametrize("families", FAMILIES)
+def test_the_world_is_recovered(families: str) -> None:
+    world, coarse, solved, covariances = _solved(families)
+    true = world.world_T_rigs
+    assert _position_rmse(coarse, true) > 0.05
+    # Aligning over all frames leaves less than the covariances of a gauge held at one end say.
+    predicted = np.sqrt(np.trace(covariances[1:, 3:, 3:], axis1=1, axis2=2).mean())
+    assert predicted < 2e-3  # some 180 bearings of 5e-4 a frame, at 2 to 6 units
+    assert _position_rmse(solved.world_T_rigs, true) < predicted
+    steps, true_steps = (inverse(poses[:-1]) @ poses[1:] for poses in (solved.world_T_rigs, true))
+    angles = rotation_angle(np.swapaxes(steps[:, :3, :3], 1, 2) @ true_steps[:, :3, :3])
+    assert np.median(angles) < SIGMA / 3
+
+
+@pytest.mark.parametrize("families", FAMILIES)
+def test_false_observations_are_left_out_and_true_ones_kept(families: str) -> None:
+    world, _, solved, _ = _solved(families)
+    num = len(world.keypoints.bearings_rig)
+    false = np.zeros(num, bool)
+    false[world.keypoints.rows(world.tracks)[world.false]] = True
+    used = np.zeros(num, bool)
+    used[world.keypoints.rows(solved.landmarks.tracks)] = True
+    assert (used & false).sum() < 0.02 * false.sum()
+    assert (used & ~false).sum() > 0.98 * (~false).sum()
+
+
+@pytest.mark.parametrize("families", FAMILIES)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_noise_is_estimated(families: str, seed: int) -> None:
+    """To 15 %: the robust loss takes more than its share from small residuals."""
+    _, _, solved, _ = _solved(families, seed)
+    assert solved.noise * CLAIMED == pytest.approx(SIGMA, rel=0.15)
+
+
+def test_families_agree() -> None:
+    """They weigh the same observations alike, but for the shape of their noise: what separates
+    them is less than the uncertainty of either."""
+    _, _, bearing, covariances = _solved("bearing")
+    predicted = np.sqrt(np.trace(covariances[1:, 3:, 3:], axis1=1, axis2=2).mean())
+    for families in ("reprojection", "both"):
+        _, _, other, theirs = _solved(families)
+        assert _position_rmse(other.world_T_rigs, bearing.world_T_rigs) < 0.5 * predicted
+        assert other.noise == pytest.approx(bearing.noise, rel=0.1)
+        sizes = [np.sqrt(np.trace(c[1:], axis1=1, axis2=2)) for c in (covariances, theirs)]
+        np.testing.assert_allclose(sizes[1], sizes[0], rtol=0.15)
+
+
+def test_covariances_are_of_the_right_size() -> None:
+    """Squared errors of one frame over its covariance, summed over worlds, follow chi-square."""
+    frame, seeds = 5, range(12)
+    total = 0.0
+    for seed in seeds:
+        world, _, solved, covariances = _solved("bearing", seed)
+        error = _errors_in_gauge(solved.world_T_rigs, world.world_T_rigs)[frame]
+        total += error @ np.linalg.solve(covariances[frame], error)
+    low, high = chi2.ppf([1e-3, 1 - 1e-3], 6 * len(seeds))
+    assert low < total < high
+
+
+def test_covariances_hold_the_gauge() -> None:
+    _, _, solved, covariances = _solved("bearing")
+    assert np.isfinite(covariances).all()
+    deviations = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    assert deviations[0].max() < 1e-4 < deviations[1:].max()
+    positions = solved.world_T_rigs[:, :3, 3]
+    far = np.argmax(np.linalg.norm(positions - positions[0], axis=1))
+    toward = solved.world_T_rigs[far, :3, :3].T @ (positions[far] - positions[0])
+    toward /= np.linalg.norm(toward)
+    along = np.sqrt(toward @ covariances[far, 3:, 3:] @ toward)
+    assert along < 0.1 * deviations[far, 3:].max()  # the distance is held
+
+
+def test_a_round_that_explains_less_is_undone(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, coarse = _world()
+    settings = _settings()
+    good = _run(world, coarse, settings)
+    real, calls = adjust.optimize, []
+
+    def sabotage(*arguments: object) -> OptimizeResult:
+        """From the third round on, poses that no image supports."""
+        result = real(*arguments)  # type: ignore[arg-type]
+        calls.append(result)
+        if len(calls) < 3:
+            return result
+        off = drifted(world.world_T_rigs, np.random.default_rng(9), amount=5)
+        return replace(result, values=adjust._values(off))
+
+    monkeypatch.setattr(adjust, "optimize", sabotage)
+    solved = _run(world, coarse, settings)
+    assert [attempt.accepted for attempt in solved.rounds] == [True, True, False, False, False]
+    two = _position_rmse(solved.world_T_rigs, world.world_T_rigs)
+    assert two < 3 * _position_rmse(good.world_T_rigs, world.world_T_rigs)
+    # What is kept fits the second round: its poses, its noise, and points that agree with both.
+    np.testing.assert_array_equal(solved.world_T_rigs, adjust._poses(calls[1].values, 20))
+    assert solved.noise == solved.rounds[1].noise == solved.rounds[-1].noise
+    assert len(solved.landmarks.tracks) > 0.9 * len(good.landmarks.tracks)
+    assert all(r.support < solved.rounds[1].support for r in solved.rounds[2:])
+
+
+def test_rounds_say_what_they_did() -> None:
+    world, _, solved, _ = _solved("bearing")
+    assert [attempt.gate_sigmas for attempt in solved.rounds] == list(GATES)
+    last = solved.rounds[-1]
+    assert last.accepted and last.observations <= len(world.tracks) and last.points > 400
+    costs = [step.costs for step in last.iterations if step.accepted]
+    assert all("bearing" in cost for cost in costs)
+    assert costs[-1]["bearing"] <= costs[0]["bearing"]
+
+
+def test_poses_no_image_sees_keep_their_place_in_the_trajectory() -> None:
+    """A frame without observations hangs on its neighbours' steps."""
+    world, coarse = _world()
+    blind = world.tracks.frames != 7
+    tracks = replace(
+        world.tracks,
+        points=world.tracks.points[blind],
+        frames=world.tracks.frames[blind],
+        keypoints=world.tracks.keypoints[blind],
+    )
+    solved = _run(replace(world, tracks=tracks), coarse, _settings())
+    assert _position_rmse(solved.world_T_rigs, world.world_T_rigs) < 0.02
+    # Its own steps are the drifting ones: 0.3 degrees and 1 % of 1.25 units, half from each side.
+    offset = inverse(world.world_T_rigs[6]) @ world.world_T_rigs[7]
+    found = inverse(solved.world_T_rigs[6]) @ solved.world_T_rigs[7]
+    assert np.linalg.norm(found[:3, 3] - offset[:3, 3]) < 0.05
+    assert np.isfinite(_covariances(solved, world, coarse, _settings())[7]).all()
+
+
+def test_without_tracks_the_trajectory_stays() -> None:
+    world, coarse = _world()
+    nothing = np.zeros(0, np.int32)
+    tracks = replace(world.tracks, points=nothing, frames=nothing, keypoints=nothing, num_points=0)
+    solved = _run(replace(world, tracks=tracks), coarse, _settings())
+    np.testing.assert_allclose(solved.world_T_rigs, coarse, atol=1e-9)
+    assert solved.noise == 1.0 and len(solved.landmarks.tracks) == 0

@@ -1,0 +1,125 @@
+"""The solution carried back into the world and scale of the trajectory."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic import World, make_world
+
+from gsba.adjust import Adjustment
+from gsba.geometry import inverse, pose
+from gsba.reconstruction import assemble
+from gsba.types import CoarsePoses, Counts, Landmarks, PoseSource, PoseStatus, Reconstruction
+
+SCALE = 0.25
+SLAM_R_WORLD = Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix()
+SLAM_SHIFT = np.array([10.0, -3.0, 5.0])
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return make_world(0, num_frames=10, num_points=120, false_share=0)
+
+
+def _in_slam(world_T_rigs: np.ndarray) -> np.ndarray:
+    return pose(SLAM_R_WORLD @ world_T_rigs[:, :3, :3], _points_in_slam(world_T_rigs[:, :3, 3]))
+
+
+def _points_in_slam(points: np.ndarray) -> np.ndarray:
+    return SCALE * points @ SLAM_R_WORLD.T + SLAM_SHIFT
+
+
+def _adjustment(world: World, noise: float = 1.7) -> Adjustment:
+    counts = Counts(world.tracks.num_points, world.tracks.num_points, "tracks")
+    landmarks = Landmarks(world.points_world, world.tracks, counts)
+    return Adjustment(world.world_T_rigs, landmarks, noise, ())
+
+
+def _assemble(
+    world: World,
+    coarse: np.ndarray | None = None,
+    sources: np.ndarray | None = None,
+    covariances: np.ndarray | None = None,
+) -> Reconstruction:
+    num = len(world.world_T_rigs)
+    poses = CoarsePoses(
+        _in_slam(world.world_T_rigs) if coarse is None else coarse,
+        np.full(num, PoseSource.SLAM, np.uint8) if sources is None else sources,
+        0.0,
+    )
+    covariances = np.zeros((num, 6, 6)) if covariances is None else covariances
+    return assemble(_adjustment(world), covariances, world.keypoints, poses, 12)
+
+
+def test_the_result_sits_in_the_slam_world_and_scale(world: World) -> None:
+    found = _assemble(world)
+    np.testing.assert_allclose(found.world_T_rigs, _in_slam(world.world_T_rigs), atol=1e-12)
+    np.testing.assert_allclose(found.points_world, _points_in_slam(world.points_world), atol=1e-12)
+
+
+def test_observations_still_point_at_their_points(world: World) -> None:
+    found = _assemble(world)
+    rig_T_world = inverse(found.world_T_rigs)[found.observation_frames]
+    points = found.points_world[found.observation_points]
+    local = np.einsum("oij,oj->oi", rig_T_world[:, :3, :3], points) + rig_T_world[:, :3, 3]
+    local /= np.linalg.norm(local, axis=1, keepdims=True)
+    angles = np.linalg.norm(np.cross(local, found.observation_bearings), axis=1)
+    assert angles.max() < 5 * 5e-4  # the noise of the world, nothing more
+    errors = np.bincount(found.observation_points, angles) / np.bincount(found.observation_points)
+    np.testing.assert_allclose(found.point_errors, errors, rtol=1e-6)
+    np.testing.assert_allclose(found.observation_sigmas, 1.7 * 5e-4)
+
+
+def test_covariances_scale_with_the_map(world: World) -> None:
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(10, 6, 6))
+    covariances = roots @ np.swapaxes(roots, 1, 2)
+    found = _assemble(world, covariances=covariances).pose_covariances
+    np.testing.assert_allclose(found[:, :3, :3], covariances[:, :3, :3])  # rig axes: no turning
+    np.testing.assert_allclose(found[:, :3, 3:], SCALE * covariances[:, :3, 3:])
+    np.testing.assert_allclose(found[:, 3:, 3:], SCALE**2 * covariances[:, 3:, 3:])
+
+
+def test_interpolated_poses_have_no_say(world: World) -> None:
+    coarse = _in_slam(world.world_T_rigs)
+    coarse[4, :3, 3] += 5
+    sources = np.full(10, PoseSource.SLAM, np.uint8)
+    sources[4] = PoseSource.INTERPOLATED
+    found = _assemble(world, coarse, sources)
+    np.testing.assert_allclose(found.world_T_rigs, _in_slam(world.world_T_rigs), atol=1e-12)
+
+
+def _without_frame(world: World, frame: int, left: int) -> World:
+    """The world with all but `left` observations of a frame gone."""
+    rows = np.flatnonzero(world.tracks.frames == frame)[left:]
+    keep = np.ones(len(world.tracks), bool)
+    keep[rows] = False
+    tracks = replace(
+        world.tracks,
+        points=world.tracks.points[keep],
+        frames=world.tracks.frames[keep],
+        keypoints=world.tracks.keypoints[keep],
+    )
+    return replace(world, tracks=tracks)
+
+
+def test_unrefined_frames_are_told_and_have_no_say(world: World) -> None:
+    fewer = _without_frame(_without_frame(world, 4, 11), 6, 12)
+    coarse = _in_slam(world.world_T_rigs)
+    coarse[4, :3, 3] += 5
+    found = _assemble(fewer, coarse)
+    expected = np.full(10, PoseStatus.REFINED)
+    expected[4] = PoseStatus.UNREFINED
+    np.testing.assert_array_equal(found.pose_statuses, expected)
+    np.testing.assert_allclose(found.world_T_rigs, _in_slam(world.world_T_rigs), atol=1e-12)
+
+
+def test_colours_are_the_means_of_their_observations(world: World) -> None:
+    colors = np.random.default_rng(1).integers(0, 256, world.keypoints.colors.shape, np.uint8)
+    painted = replace(world, keypoints=replace(world.keypoints, colors=colors))
+    found = _assemble(painted)
+    seen = colors[world.keypoints.rows(world.tracks)].astype(float)
+    for j in (0, 50, world.tracks.num_points - 1):
+        mean = seen[world.tracks.points == j].mean(axis=0)
+        np.testing.assert_allclose(found.point_colors[j], mean, atol=0.5)
