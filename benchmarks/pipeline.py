@@ -1,0 +1,309 @@
+"""Whole runs of `gsba refine` beside COLMAP's panorama reconstruction of the same frames.
+
+    python benchmarks/pipeline.py --sequences aisle_loop,demo_rectangle --out WORK
+
+Every row is a process of its own, measured from start to exit, and its trajectory is compared with
+the truth. Rows are kept in WORK and used again while code, options and frames stay the same, so a
+table can be filled in over several calls. The last lines say whether the targets hold.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from common import machine, measure
+from peer import MODES
+from pipeline_table import DEFAULT, to_markdown, verdicts
+
+import factors
+import gsba
+from gsba.config import ReadSettings
+from gsba.evaluate import evaluate
+from gsba.log import GsbaError
+from gsba.read import associate, read_trajectory, scan
+from gsba.records import atomic_write
+from gsba.types import FrameSet, Trajectory
+
+DATA = Path(__file__).resolve().parents[2] / "shared/data"
+RECORDED = {  # coarse trajectories; every row is run from the first, `DEFAULT` from all
+    "aisle_loop": ("slam.tum", "slam_hard.tum"),
+    "gallery_forward": ("slam.tum", "slam_hard.tum"),
+    "aisle_slam": (
+        "frame_trajectory.txt",
+        "keyframe_trajectory.txt",
+        *(
+            f"other_runs/{run}_{kind}.txt"
+            for run in ("rect_default_rt", "loop_more", "loop_loop20")
+            for kind in ("frame", "keyframe")
+        ),
+    ),
+    "apartment": ("coarse.tum",),
+}
+WALKS = {"demo_rectangle": ("rectangle", "locked"), "demo_oval": ("oval", "forward")}
+FACTOR_SETS = ("slam", "bearing", "reprojection", "bearing+reprojection")
+
+
+@dataclass(frozen=True, slots=True)
+class Walk:
+    """Frames with one or more coarse trajectories and what to judge by."""
+
+    name: str
+    folder: Path  # images/ and the trajectories
+    trajectories: tuple[str, ...]
+    reference: Path  # TUM; the truth, or where there is none a peer's result
+    mask: Path | None
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether the reference is exact."""
+        return self.reference.stem == "groundtruth"
+
+
+def find_walk(name: str, data: Path, out: Path) -> Walk:
+    """A recorded sequence of the data folder, or a demo walk rendered into `out`.
+
+    Raises:
+        GsbaError: the sequence is not on this machine.
+    """
+    if name in WALKS:
+        folder = out / name / "walk"
+        if not folder.exists():
+            _make_walk(folder, "{!r}, {!r}".format(*WALKS[name]))
+        return Walk(name, folder, ("slam.tum",), folder / "groundtruth.tum", None)
+    folder = data / name
+    if not folder.is_dir():
+        raise GsbaError(f"{folder} is absent")
+    truth, mask = folder / "groundtruth.tum", folder / "mask.png"
+    reference = truth if truth.exists() else folder / "peer_colmap.tum"
+    return Walk(name, folder, RECORDED[name], reference, mask if mask.exists() else None)
+
+
+class Bench:
+    """Rows of one call: where they are kept and under what conditions they run."""
+
+    def __init__(self, out: Path, timeout_s: float, fresh: bool) -> None:
+        self.out, self.timeout_s, self.fresh = out, timeout_s, fresh
+        homes = [Path(str(package.__file__)).parent for package in (gsba, factors)]
+        self.code = _digest(path for home in homes for path in sorted(home.rglob("*.py")))
+        self.warm = False
+
+    def rows(self, walk: Walk, sets: Sequence[str], peers: Sequence[str]) -> Iterator[dict]:
+        """Rows of one walk, in the order of the table."""
+        frames = scan(walk.folder / "images", masks=walk.mask)
+        for place, name in enumerate(walk.trajectories):
+            for row in sets:
+                if row == "slam":
+                    yield self.slam(walk, frames, name)
+                elif place == 0 or row == DEFAULT:
+                    yield self.refine(walk, frames, name, row)
+        for mode in peers:
+            yield self.peer(walk, frames, mode)
+
+    def slam(self, walk: Walk, frames: FrameSet, trajectory: str) -> dict:
+        """The input, at every frame's time."""
+
+        def finish() -> dict:
+            coarse = associate(frames, read_trajectory(walk.folder / trajectory), ReadSettings())
+            return _errors(walk, Trajectory(frames.timestamps, coarse.world_T_rigs))
+
+        return {**_head(walk, "slam", trajectory), **_outcome(finish)}
+
+    def refine(self, walk: Walk, frames: FrameSet, trajectory: str, factor_set: str) -> dict:
+        """A whole run with one factor set, without a dataset: the peer writes none either."""
+        head = _head(walk, factor_set, trajectory)
+        folder = self.out / walk.name / f"{factor_set}-{Path(trajectory).stem}"
+        inputs = [walk.folder / trajectory, *([walk.mask] if walk.mask else [])]
+        key = [self.code, factor_set, _digest([*_images(frames), *inputs])]
+        command = _refine_command(
+            walk.folder / "images", walk.folder / trajectory, folder / "run", factor_set, walk.mask
+        )
+
+        def finish() -> dict:
+            report = json.loads((folder / "run/report.json").read_text())
+            errors = _errors(walk, read_trajectory(folder / "run/trajectory.tum"))
+            return {**errors, "residual_deg": report["summary"]["median_residual_deg"]}
+
+        return self._measured(head, folder, key, command, finish)
+
+    def peer(self, walk: Walk, frames: FrameSet, mode: str) -> dict:
+        """One of the peer's modes, which take neither trajectory nor mask."""
+        head = _head(walk, mode, None)
+        folder = self.out / walk.name / mode
+        key = [version("pycolmap"), mode, _digest(_images(frames))]
+        links = self.out / walk.name / "images"  # nothing but the frames
+        links.mkdir(parents=True, exist_ok=True)
+        for path in _images(frames):
+            (links / path.name).unlink(missing_ok=True)
+            (links / path.name).symlink_to(path.resolve())
+        script = str(Path(__file__).with_name("peer.py"))
+        command = [sys.executable, script, mode, str(links), str(folder / "model")]
+
+        def finish() -> dict:
+            posed = read_trajectory(folder / "model/trajectory.tum")
+            times = frames.timestamps[posed.timestamps.astype(int)]
+            return _errors(walk, Trajectory(times, posed.world_T_rigs))
+
+        return self._measured(head, folder, key, command, finish)
+
+    def _measured(
+        self, head: dict, folder: Path, key: list, command: list[str], finish: Callable[[], dict]
+    ) -> dict:
+        """The kept row, or the outcome of running the command."""
+        kept = folder / "row.json"
+        if kept.exists() and not self.fresh:
+            row = json.loads(kept.read_text())
+            ended = "errors" in row or (row["timed_out"] and row["wall_s"] >= self.timeout_s)
+            if row["key"] == key and ended:
+                return row
+        if head["trajectory"] and not self.warm:
+            _compile_kernels(self.out / "warm-up")
+            self.warm = True
+        print(f"{head['sequence']}: running {folder.name}", file=sys.stderr, flush=True)
+        row = {**head, "key": key, "machine": machine(), "load": os.getloadavg()[0]}
+        row["date"] = datetime.now(UTC).isoformat(timespec="seconds")
+        cost = measure(command, folder / "log.txt", self.timeout_s)
+        row |= asdict(cost)
+        if cost.timed_out:
+            row["reason"] = f"stopped after {self.timeout_s / 60:g} minutes"
+        elif cost.exit_code != 0:
+            row["reason"] = _last_line(folder / "log.txt")
+        else:
+            row |= _outcome(finish)
+        atomic_write(kept, lambda path: path.write_text(json.dumps(row, indent=1)))
+        return row
+
+
+def _head(walk: Walk, row: str, trajectory: str | None) -> dict[str, Any]:
+    return {"sequence": walk.name, "row": row, "trajectory": trajectory, "truth": walk.has_truth}
+
+
+def _errors(walk: Walk, estimate: Trajectory) -> dict[str, Any]:
+    """Errors against the reference, and the length of its path."""
+    reference = read_trajectory(walk.reference)
+    steps = np.diff(reference.world_T_rigs[:, :3, 3], axis=0)
+    path = float(np.linalg.norm(steps, axis=1).sum())
+    return {"errors": evaluate(estimate, reference).to_json(), "path": path}
+
+
+def _outcome(finish: Callable[[], dict]) -> dict[str, Any]:
+    """What a row is judged to be worth, or why it cannot be judged."""
+    try:
+        return finish()
+    except GsbaError as error:
+        return {"reason": str(error)}
+
+
+def _refine_command(
+    frames: Path, trajectory: Path, run: Path, factor_set: str, mask: Path | None
+) -> list[str]:
+    command = [sys.executable, "-c", "from gsba.cli import main; main()", "refine"]
+    command += [str(frames), str(trajectory), "--out", str(run), "--fresh"]
+    command += ["--factors", factor_set.replace("+", ","), "--set", "export.formats=[]"]
+    return command + (["--masks", str(mask)] if mask else [])
+
+
+def _compile_kernels(out: Path) -> None:
+    """Fill numba's cache by a small run, so that no measured one pays for it."""
+    folder = out / "walk"
+    _make_walk(folder, "'open', num_frames=8, width=512")
+    images, trajectory = folder / "images", folder / "slam.tum"
+    _require(_refine_command(images, trajectory, out / "run", FACTOR_SETS[-1], None), out)
+
+
+def _make_walk(folder: Path, arguments: str) -> None:
+    program = "from pathlib import Path; from gsba.demo import make_walk; "
+    program += f"make_walk(Path({str(folder)!r}), {arguments})"
+    _require([sys.executable, "-c", program], folder.parent)
+
+
+def _require(command: list[str], folder: Path) -> None:
+    """Run a preparation that must not fail."""
+    log = folder / "preparation.txt"
+    if measure(command, log, timeout_s=1200).exit_code != 0:
+        raise GsbaError(f"preparation failed, see {log}: {_last_line(log)}")
+
+
+def _last_line(log: Path) -> str:
+    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    return lines[-1] if lines else "failed without a word"
+
+
+def _images(frames: FrameSet) -> list[Path]:
+    return [path for group in frames.paths for path in group]
+
+
+def _digest(paths: Iterable[Path]) -> str:
+    """Fingerprint of files' contents."""
+    total = hashlib.sha256()
+    for path in paths:
+        total.update(hashlib.sha256(path.read_bytes()).digest())
+    return total.hexdigest()[:16]
+
+
+def _split(text: str) -> list[str]:
+    return [part for part in text.split(",") if part]
+
+
+def main() -> None:
+    """Parse, run, print; exit 1 where a target is missed."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    every = ",".join((*RECORDED, *WALKS))
+    parser.add_argument("--data", type=Path, default=DATA, help="recorded sequences")
+    parser.add_argument("--sequences", type=_split, default=every, help=every)
+    parser.add_argument("--peers", type=_split, default=",".join(MODES), help=",".join(MODES))
+    parser.add_argument("--no-peers", dest="peers", action="store_const", const=[])
+    sets = ",".join(FACTOR_SETS)
+    parser.add_argument("--factors", type=_split, default=sets, help=sets)
+    parser.add_argument("--out", type=Path, default=Path("build/benchmark"), help="kept rows")
+    parser.add_argument("--fresh", action="store_true", help="run these rows again")
+    parser.add_argument("--timeout-min", type=float, default=40.0, help="of a row")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--markdown", type=Path)
+    options = parser.parse_args()
+    known = ((options.sequences, every), (options.peers, ",".join(MODES)), (options.factors, sets))
+    for asked, allowed in known:
+        if unknown := set(asked) - set(allowed.split(",")):
+            parser.error(f"{', '.join(sorted(unknown))}: use some of {allowed}")
+    bench = Bench(options.out, 60 * options.timeout_min, options.fresh)
+    table, text, held = [], [], True
+    for name in options.sequences:
+        try:
+            walk = find_walk(name, options.data, options.out)
+            rows = list(bench.rows(walk, options.factors, options.peers))
+            section, ok = _section(walk, rows)
+        except GsbaError as error:
+            rows, section, ok = [], f"## {name}\n\nSkipped: {error}\n", True
+        print(section, flush=True)
+        table += rows
+        text.append(section)
+        held &= ok
+    if options.json:
+        report = json.dumps(table, indent=1) + "\n"
+        atomic_write(options.json, lambda path: path.write_text(report))
+    if options.markdown:
+        machines = sorted({row["machine"] for row in table if "machine" in row})
+        page = "\n".join(["# gsba refine and its peers\n", f"{'; '.join(machines)}\n", *text])
+        atomic_write(options.markdown, lambda path: path.write_text(page))
+    sys.exit(0 if held else 1)
+
+
+def _section(walk: Walk, rows: list[dict]) -> tuple[str, bool]:
+    """Markdown of one walk, and whether it holds all targets."""
+    judged = list(verdicts(rows))
+    reference = "the exact truth" if walk.has_truth else f"{walk.reference.name}, a peer's result"
+    lines = [f"## {walk.name}", "", f"Against {reference}.", "", to_markdown(rows), ""]
+    lines += [f"- {'ok' if ok else '**missed**'}: {what}" for what, ok in judged]
+    return "\n".join(lines) + "\n", all(ok for _, ok in judged)
+
+
+if __name__ == "__main__":
+    main()
