@@ -122,7 +122,7 @@ class Bench:
         head = _head(walk, factor_set, trajectory)
         folder = self.out / walk.name / f"{factor_set}-{Path(trajectory).stem}"
         inputs = [walk.folder / trajectory, *([walk.mask] if walk.mask else [])]
-        key = [self.code, factor_set, _digest([*_images(frames), *inputs])]
+        key = {"code": self.code, "input": _digest([*_images(frames), *inputs])}
         command = _refine_command(
             walk.folder / "images", walk.folder / trajectory, folder / "run", factor_set, walk.mask
         )
@@ -138,7 +138,7 @@ class Bench:
         """One of the peer's modes, which take neither trajectory nor mask."""
         head = _head(walk, mode, None)
         folder = self.out / walk.name / mode
-        key = [version("pycolmap"), mode, _digest(_images(frames))]
+        key = {"pycolmap": version("pycolmap"), "input": _digest(_images(frames))}
         links = self.out / walk.name / "images"  # nothing but the frames
         links.mkdir(parents=True, exist_ok=True)
         for path in _images(frames):
@@ -155,7 +155,7 @@ class Bench:
         return self._measured(head, folder, key, command, finish)
 
     def _measured(
-        self, head: dict, folder: Path, key: list, command: list[str], finish: Callable[[], dict]
+        self, head: dict, folder: Path, key: dict, command: list[str], finish: Callable[[], dict]
     ) -> dict:
         """The kept row, or the outcome of running the command."""
         kept = folder / "row.json"

@@ -10,7 +10,6 @@ resulting poses. The table says whether the targets hold.
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -19,6 +18,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
+from common import peak_mb
 
 SIZES = {"S": (120, 23_700), "M": (500, 98_623), "L": (2_000, 375_000)}  # frames, landmarks
 SIGMA = np.radians(0.05)  # per-axis bearing noise
@@ -106,7 +106,7 @@ def solve_ours(problem: Problem, num_threads: int) -> tuple[Result, np.ndarray, 
     cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     poses = np.array([done.values.atPose3(key).matrix() for key in block.pose_keys])
     steps = len(done.history) - 1
-    return Result(OURS, cpu, wall, _peak_mb(), steps, done.converged), poses, block.points_world
+    return Result(OURS, cpu, wall, peak_mb(), steps, done.converged), poses, block.points_world
 
 
 def _block(problem: Problem, world_T_rigs: np.ndarray, points: np.ndarray, num_threads: int):
@@ -158,7 +158,7 @@ def solve_pycolmap(problem: Problem, num_threads: int) -> tuple[Result, np.ndarr
     assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
     ceres = summary.ceres_summary
     steps = ceres.num_successful_steps + ceres.num_unsuccessful_steps
-    return Result(PEER, cpu, wall, _peak_mb(), steps, converged), poses, points
+    return Result(PEER, cpu, wall, peak_mb(), steps, converged), poses, points
 
 
 def _reconstruction(problem: Problem):
@@ -241,10 +241,6 @@ def _warm_up(problem: Problem) -> None:
     for key in block.pose_keys:
         graph.add(gtsam.PriorFactorPose3(key, values.atPose3(key), noise))
     optimize(graph, [block], values)
-
-
-def _peak_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def _child(solver: str, folder: Path, num_threads: int) -> None:
