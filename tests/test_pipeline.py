@@ -1,0 +1,201 @@
+"""The whole line on a tiny rendered walk: accuracy, files, odd frames, other inputs."""
+
+import csv
+import json
+import shutil
+from dataclasses import astuple, replace
+from pathlib import Path
+
+import cv2
+import gtsam
+import numpy as np
+import plyfile
+import pycolmap
+import pytest
+from tiny_run import NUM_FRAMES, SETTINGS, WIDTH, Case, computed_stages
+
+from gsba import cubemap, load_run, refine
+from gsba.config_file import load_config
+from gsba.evaluate import evaluate
+from gsba.graph import X
+from gsba.log import GsbaError
+from gsba.read import read_trajectory
+from gsba.rig import CubeRig
+from gsba.store import load_stage
+from gsba.types import FACES, CoarsePoses, Keypoints, PoseStatus, Trajectory
+
+
+def _greyed(case: Case, to: Path, frames: list[int]) -> Path:
+    """The walk's frames, some of them without texture."""
+    shutil.copytree(case.frames, to)
+    for f in frames:
+        cv2.imwrite(str(to / f"{f:06d}.jpg"), np.full((WIDTH // 2, WIDTH, 3), 128, np.uint8))
+    return to
+
+
+def _without(trajectory: Trajectory, frame: int) -> Trajectory:
+    return Trajectory(*(np.delete(x, frame, 0) for x in astuple(trajectory)))
+
+
+def test_poses_become_better_by_far(case: Case) -> None:
+    before = evaluate(read_trajectory(case.slam), case.truth)
+    after = case.errors()
+    assert after.num_matched == NUM_FRAMES
+    # Thirty times better when written; a tenth leaves room for other settings.
+    assert after.ate.rmse < before.ate.rmse / 10
+    assert after.rotation_deg.rmse < before.rotation_deg.rmse / 10
+    assert after.rpe_rotation_deg.median < before.rpe_rotation_deg.median / 5
+    assert (case.result.reconstruction.pose_statuses == PoseStatus.REFINED).all()
+
+
+def test_the_result_sits_in_the_slam_world(case: Case) -> None:
+    coarse = read_trajectory(case.slam).world_T_rigs[:, :3, 3]
+    offsets = case.result.reconstruction.world_T_rigs[:, :3, 3] - coarse
+    assert np.abs(offsets.mean(axis=0)).max() < 1e-9  # least squares over all positions
+    assert np.linalg.norm(offsets, axis=1).max() < 0.05 * np.linalg.norm(np.ptp(coarse, axis=0))
+
+
+def test_every_file_can_be_read(case: Case) -> None:
+    reconstruction, out = case.result.reconstruction, case.out
+    trajectory = read_trajectory(out / "trajectory.tum")
+    np.testing.assert_allclose(trajectory.world_T_rigs, reconstruction.world_T_rigs, atol=1e-7)
+    with (out / "poses.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["frame"] for row in rows] == list(case.result.frames.names)
+    assert all(row["status"] == "refined" and int(row["num_observations"]) > 50 for row in rows)
+    assert all(float(row["cov_tx_tx"]) > 0 for row in rows)
+    vertices = plyfile.PlyData.read(out / "points.ply")["vertex"]
+    assert len(vertices) == len(reconstruction.points_world) > 300
+    np.testing.assert_allclose(vertices["x"], reconstruction.points_world[:, 0], rtol=1e-5)
+    assert load_config(out / "config.toml") == SETTINGS
+    model = pycolmap.Reconstruction(out / "colmap/sparse/0")
+    assert (model.num_frames(), model.num_images()) == (NUM_FRAMES, 6 * NUM_FRAMES)
+    assert model.num_points3D() == len(reconstruction.points_world)
+    assert len(list((out / "colmap/images").rglob("*.jpg"))) == 6 * NUM_FRAMES
+
+
+def test_the_report_tells_what_happened(case: Case) -> None:
+    report = json.loads((case.out / "report.json").read_text())
+    summary = report["summary"]
+    assert (summary["frames"], summary["refined"]) == (NUM_FRAMES, NUM_FRAMES)
+    assert 0 < summary["median_residual_deg"] < summary["median_residual_deg_coarse"]
+    assert report["notes"] == []
+    stages = {stage["name"]: stage for stage in report["stages"]}
+    assert {"features", "neighbours", "chain", "reconstruction", "export-colmap"} <= stages.keys()
+    assert all(stage["seconds"] >= 0 and stage["peak_mb"] > 0 for stage in stages.values())
+    (pairs,) = stages["neighbours"]["counts"]
+    assert pairs["received"] == pairs["kept"] + sum(pairs["dropped"].values())
+    first = report["solver"][0]["rounds"][0]["iterations"]
+    assert first[-1]["cost"] < first[0]["cost"] and "bearing" in first[0]["costs"]
+
+
+def test_a_run_can_be_loaded(case: Case) -> None:
+    reconstruction, frames = load_run(case.out)
+    assert frames.names == case.result.frames.names
+    assert frames.paths == case.result.frames.paths
+    np.testing.assert_array_equal(
+        reconstruction.world_T_rigs, case.result.reconstruction.world_T_rigs
+    )
+
+
+@pytest.fixture(scope="module")
+def blank(case: Case, tmp_path_factory: pytest.TempPathFactory) -> Case:
+    """The walk with frame 3 grey."""
+    folder = tmp_path_factory.mktemp("blank")
+    frames = _greyed(case, folder / "frames", [3])
+    result = refine(frames, case.slam, folder / "run", SETTINGS)
+    return replace(case, frames=frames, out=folder / "run", result=result)
+
+
+def test_a_blank_frame_keeps_a_pose_and_is_reported(blank: Case) -> None:
+    result, statuses = blank.result, blank.result.reconstruction.pose_statuses
+    expected = np.full(NUM_FRAMES, PoseStatus.REFINED)
+    expected[3] = PoseStatus.UNREFINED
+    np.testing.assert_array_equal(statuses, expected)
+    assert result.report["frames"][3]["status"] == "unrefined"
+    assert any("000003" in note for note in result.report["notes"])
+    before, after = (
+        evaluate(_without(read_trajectory(path), 3), _without(blank.truth, 3))
+        for path in (blank.slam, blank.out / "trajectory.tum")
+    )
+    assert after.ate.rmse < before.ate.rmse / 10
+    # The frame itself is where the trajectory's steps from its neighbours put it.
+    before, after = evaluate(read_trajectory(blank.slam), blank.truth), blank.errors()
+    assert after.num_matched == NUM_FRAMES and after.ate.max < before.ate.max
+
+
+def test_frames_that_match_nothing_are_refused(case: Case, tmp_path: Path) -> None:
+    frames = _greyed(case, tmp_path / "frames", list(range(NUM_FRAMES)))
+    out = tmp_path / "run"
+    with pytest.raises(GsbaError, match="no two neighbouring frames match"):
+        refine(frames, case.slam, out, SETTINGS)
+    assert sorted(path.name for path in out.iterdir()) == ["gsba.json", "stages"]
+
+
+@pytest.mark.parametrize("missing", [(), ("up", "down")])
+def test_cube_faces_serve_as_well(case: Case, tmp_path: Path, missing: tuple[str, ...]) -> None:
+    rig = CubeRig(WIDTH // 3, np.pi / 2)  # the panorama's own density
+    frames = tmp_path / "frames"
+    for path in sorted(case.frames.glob("*.jpg")):
+        faces = cubemap.cut(cv2.imread(str(path)), rig)
+        for name, image in zip(FACES, faces, strict=True):
+            if name not in missing:
+                (frames / name).mkdir(parents=True, exist_ok=True)
+                cv2.imwrite(str(frames / name / f"{path.stem}.png"), image)
+    shutil.copy(case.frames / "timestamps.csv", frames)
+    out = tmp_path / "run"
+    result = refine(frames, case.slam, out, SETTINGS)
+    assert (result.reconstruction.pose_statuses == PoseStatus.REFINED).all()
+    keypoints = load_stage(out, "keypoints", Keypoints)
+    assert not {FACES.index(name) for name in missing} & set(keypoints.faces)
+    before = evaluate(read_trajectory(case.slam), case.truth)
+    assert case.errors(out).ate.rmse < before.ate.rmse / 10
+    model = pycolmap.Reconstruction(out / "colmap/sparse/0")
+    assert model.num_images() == (6 - len(missing)) * NUM_FRAMES
+
+
+def test_masks_reach_features_and_exports(case: Case, tmp_path: Path) -> None:
+    mask = np.full((WIDTH // 2, WIDTH), 255, np.uint8)
+    mask[WIDTH // 3 :] = 0  # nothing steeper than 30 degrees down: not even a face's corners
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    out = tmp_path / "run"
+    result = case.refine(out, masks=tmp_path / "mask.png")
+    pixel = 2 * np.pi / WIDTH
+    down = np.sin(np.pi / 6 + 2 * pixel)
+    assert load_stage(out, "keypoints", Keypoints).bearings_rig[:, 1].max() < down
+    assert load_stage(case.out, "keypoints", Keypoints).bearings_rig[:, 1].max() > down
+    assert (result.reconstruction.pose_statuses == PoseStatus.REFINED).all()
+    written = sorted((out / "colmap/masks").rglob("*.png"))
+    assert len(written) == 6 * NUM_FRAMES
+    shares = {path.parent.name: (cv2.imread(str(path), 0) > 127).mean() for path in written}
+    assert shares["down"] == 0 and shares["up"] == 1
+
+
+def test_a_factor_of_ones_own_takes_part(blank: Case, tmp_path: Path) -> None:
+    """A height for the blank frame, of which images say nothing."""
+    lift = 0.1
+
+    def height_factors(coarse: CoarsePoses) -> gtsam.NonlinearFactorGraph:
+        wanted = coarse.world_T_rigs[3, 1, 3] + lift
+
+        def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list | None):
+            world_T_rig = values.atPose3(factor.keys()[0])
+            if jacobians is not None:
+                jacobians[0] = np.append(np.zeros(3), world_T_rig.rotation().matrix()[1])[None]
+            return np.array([world_T_rig.y() - wanted])
+
+        factors = gtsam.NonlinearFactorGraph()
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-4)
+        factors.add(gtsam.CustomFactor(noise, [X(3)], error))
+        return factors
+
+    out = blank.copy(tmp_path / "run")
+    result = blank.refine(out, extra_factors=height_factors)
+    assert "chain" in computed_stages(result) and "features" not in computed_stages(result)
+    heights = result.reconstruction.world_T_rigs[:, 1, 3]
+    # Moving the solution back into the trajectory's world shifts heights by the drift it removed.
+    assert heights[3] == pytest.approx(result.coarse.world_T_rigs[3, 1, 3] + lift, abs=0.02)
+    plain = blank.result.reconstruction.world_T_rigs[:, 1, 3]
+    assert np.abs(np.delete(heights - plain, 3)).max() < 1e-3 < heights[3] - plain[3]
+    again = blank.refine(out, extra_factors=height_factors)
+    assert "chain" in computed_stages(again)  # what a callable does cannot be compared

@@ -1,0 +1,114 @@
+"""Finished stages are taken up: after a second call, a changed setting, a kill, an interrupt."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tiny_run import NUM_FRAMES, SETTINGS, Case, computed_stages
+
+import gsba
+from gsba import frontend
+
+
+def test_a_second_call_takes_everything_up(case: Case, tmp_path: Path) -> None:
+    out = case.copy(tmp_path / "run")
+    (out / "points.ply").unlink()
+    again = case.refine(out)
+    assert computed_stages(again) == []
+    for name in ("trajectory.tum", "poses.csv", "points.ply"):
+        assert (out / name).read_bytes() == (case.out / name).read_bytes()
+
+
+def test_a_changed_setting_renews_what_depends_on_it(case: Case, tmp_path: Path) -> None:
+    out = case.copy(tmp_path / "run")
+    exported = SETTINGS.model_copy(
+        update={"export": SETTINGS.export.model_copy(update={"face_size": 64})}
+    )
+    assert computed_stages(case.refine(out, exported)) == ["export-colmap"]
+    (image, *_) = (out / "colmap/images/front").iterdir()
+    assert cv2.imread(str(image)).shape[:2] == (64, 64)
+    solver = SETTINGS.solver.model_copy(update={"loss_sigmas": 3.0})
+    computed = computed_stages(case.refine(out, exported.model_copy(update={"solver": solver})))
+    assert computed[0] == "chain" and "reconstruction" in computed
+    assert not {"frames", "features", "keypoints", "neighbours"} & set(computed)
+
+
+def test_a_changed_frame_is_extracted_alone(case: Case, tmp_path: Path) -> None:
+    out, frame = case.copy(tmp_path / "run"), case.frames / "000003.jpg"
+    stored = {path: path.stat().st_mtime_ns for path in (out / "stages/features").glob("*.npz")}
+    assert len(stored) == NUM_FRAMES
+    before = frame.stat()
+    os.utime(frame)
+    try:
+        computed = computed_stages(case.refine(out))
+    finally:
+        os.utime(frame, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert {"features", "neighbours", "reconstruction"} <= set(computed)
+    renewed = [path.stem for path, time in stored.items() if path.stat().st_mtime_ns != time]
+    assert renewed == ["000003"]
+
+
+_DEADLY = """
+import itertools, os, signal, sys
+from pathlib import Path
+from gsba import features, frontend, pipeline
+from gsba.config import RefineSettings
+settings, frames, slam, out, module, name, survived = sys.argv[1:]
+real, calls = getattr(globals()[module], name), itertools.count(1)
+def deadly(*arguments, **options):
+    if next(calls) > int(survived):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return real(*arguments, **options)
+setattr(globals()[module], name, deadly)
+settings = RefineSettings.model_validate_json(settings)
+pipeline.refine(Path(frames), Path(slam), Path(out), settings)
+"""
+
+
+def _kill_in(case: Case, out: Path, module: str, name: str, survived: int = 0) -> None:
+    """Run in a process that is killed on a call of a function."""
+    path = str(Path(gsba.__file__).parents[1])
+    words = [SETTINGS.model_dump_json(), case.frames, case.slam, out, module, name, survived]
+    done = subprocess.run(
+        [sys.executable, "-c", _DEADLY, *map(str, words)],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr.decode()
+
+
+def test_a_killed_run_goes_on_where_it_was(case: Case, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    _kill_in(case, out, "features", "extract", survived=5)
+    stored = {path: path.stat().st_mtime_ns for path in (out / "stages/features").glob("0*.npz")}
+    assert 3 <= len(stored) < NUM_FRAMES  # two threads may hold one frame each
+    _kill_in(case, out, "frontend", "match_loops")
+    assert all(path.stat().st_mtime_ns == time for path, time in stored.items())
+    assert not any((out / name).exists() for name in ("trajectory.tum", "colmap", "report.json"))
+    result = case.refine(out)
+    assert computed_stages(result)[0] == "loops"
+    np.testing.assert_allclose(
+        result.reconstruction.world_T_rigs,
+        case.result.reconstruction.world_T_rigs,
+        atol=1e-9,  # nothing is random: the last digits of sums at most
+    )
+    assert not list(out.rglob("*.partial*")) and not list(out.rglob(".*"))
+
+
+def test_an_interrupt_leaves_what_is_finished(
+    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    out = case.copy(tmp_path / "run")
+    (out / "stages/loops.npz").unlink()
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(frontend, "match_loops", interrupt)
+        case.refine(out)
+    assert computed_stages(case.refine(out)) == ["loops"]

@@ -1,0 +1,68 @@
+"""A tiny rendered walk and its run, made once for all tests of the pipeline."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from gsba import refine
+from gsba.config import RefineSettings
+from gsba.demo import make_walk
+from gsba.demo.walk import Heading, WalkPath, walk_poses
+from gsba.evaluate import TrajectoryErrors, evaluate
+from gsba.pipeline import RunResult
+from gsba.read import read_trajectory
+from gsba.types import Trajectory
+
+NUM_FRAMES, WIDTH = 8, 512
+SETTINGS = RefineSettings.model_validate(  # lighter than the defaults
+    {
+        "cubemap": {"oversampling": 1.0},
+        "features": {"max_per_face": 400},
+        "rounds": {"map_passes": 1},
+        "solver": {"num_threads": 2},
+    }
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A walk and its run."""
+
+    frames: Path
+    slam: Path
+    truth: Trajectory
+    out: Path
+    result: RunResult
+
+    def errors(self, out: Path | None = None) -> TrajectoryErrors:
+        return evaluate(read_trajectory((out or self.out) / "trajectory.tum"), self.truth)
+
+    def copy(self, to: Path) -> Path:
+        """The finished run in a folder of its own, to go on from."""
+        return Path(shutil.copytree(self.out, to))
+
+    def refine(self, out: Path, settings: RefineSettings = SETTINGS, **options) -> RunResult:
+        return refine(self.frames, self.slam, out, settings, **options)
+
+
+def make_case(folder: Path) -> Case:
+    """Render the walk into a folder and refine it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gsba.demo.walk.walk_poses", _first_third)
+        walk = make_walk(folder / "walk", "open", "locked", NUM_FRAMES, WIDTH)
+    out = folder / "run"
+    result = refine(walk.frames_dir, walk.slam_path, out, SETTINGS)
+    return Case(walk.frames_dir, walk.slam_path, read_trajectory(walk.truth_path), out, result)
+
+
+def _first_third(path: WalkPath, heading: Heading, num_frames: int, seed: int) -> Trajectory:
+    """Poses a unit apart, as in a walk three times as long."""
+    walk = walk_poses(path, heading, 3 * num_frames, seed)
+    return Trajectory(walk.timestamps[:num_frames], walk.world_T_rigs[:num_frames])
+
+
+def computed_stages(result: RunResult) -> list[str]:
+    """Names of the stages that were not taken from an earlier call."""
+    return [stage["name"] for stage in result.report["stages"] if not stage["resumed"]]
