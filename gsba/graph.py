@@ -18,8 +18,10 @@ def build(coarse_world_T_rigs: np.ndarray, settings: PriorSettings) -> gtsam.Non
     """
     graph = gtsam.NonlinearFactorGraph()
     steps = inverse(coarse_world_T_rigs[:-1]) @ coarse_world_T_rigs[1:]
-    lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
+    positions = coarse_world_T_rigs[:, :3, 3]
+    lengths = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     typical = float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
+    extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), typical)
     loss = gtsam.noiseModel.mEstimator.Cauchy.Create(settings.loss_sigmas)
 
     def robust(rotation: float, translation: float) -> gtsam.noiseModel.Base:
@@ -33,13 +35,10 @@ def build(coarse_world_T_rigs: np.ndarray, settings: PriorSettings) -> gtsam.Non
                 X(f), X(f + 1), gtsam.Pose3(step), robust(np.deg2rad(settings.rotation_deg), sigma)
             )
         )
-    extent = float(np.linalg.norm(np.ptp(coarse_world_T_rigs[:, :3, 3], axis=0)))
     weak = robust(np.deg2rad(settings.absolute_rotation_deg), settings.absolute_position * extent)
     for f, world_T_rig in enumerate(coarse_world_T_rigs):
         graph.add(gtsam.PriorFactorPose3(X(f), gtsam.Pose3(world_T_rig), weak))
-    gauge = gtsam.noiseModel.Diagonal.Sigmas(
-        np.array([1e-6] * 3 + [1e-6 * max(extent, typical)] * 3)
-    )
+    gauge = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-6] * 3 + [1e-6 * extent] * 3))
     graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(coarse_world_T_rigs[0]), gauge))
     return graph
 
