@@ -181,23 +181,38 @@ def test_a_wrong_depth_finds_nothing(scene: Scene) -> None:
     assert not far[found[:, 0]].any() and far.sum() > NUM // 2
 
 
-@pytest.mark.parametrize("side", [0, 1])
-def test_two_orientations_of_one_place_count_once(side: int) -> None:
-    """The second orientation is neither a rival in the ratio test nor a second match."""
+@pytest.mark.parametrize(("sides", "change"), [((0,), 3), ((1,), 3), ((0, 1), 30)])
+def test_two_orientations_of_one_place_count_once(sides: tuple[int, ...], change: int) -> None:
+    """The second orientation is neither a rival in the ratio test, however alike, nor, where both
+    frames have it, a second match."""
     scene = Scene(4)
-    pair = [scene.first(), scene.second()]
-    found = pair[side]
-    twice = np.repeat(np.arange(NUM), 2)
-    descriptors = found.descriptors[twice].astype(int)
-    descriptors[1::2] += scene.rng.integers(-3, 4, (NUM, 64))  # nearly the same: fails any ratio
-    bearings = found.bearings_rig[twice]
-    pair[side] = features_of(bearings, np.clip(descriptors, 0, 255).astype(np.uint8))
-    matches = _match(*pair)
+    views = [scene.first(), scene.second()]
+    for side in sides:
+        twice = np.repeat(np.arange(NUM), 2)
+        descriptors = views[side].descriptors[twice].astype(int)
+        descriptors[1::2, :32] = np.maximum(descriptors[1::2, :32] - change, 0)
+        bearings = views[side].bearings_rig[twice]
+        views[side] = features_of(bearings, descriptors.astype(np.uint8))
+    matches = _match(*views)
     assert len(matches) == NUM
     assert all(len(np.unique(column)) == NUM for column in matches.T)
-    keypoints = matches.copy()
-    keypoints[:, side] //= 2
-    assert scene.correct(keypoints).all()
+    for side in sides:
+        matches[:, side] //= 2
+    assert scene.correct(matches).all()
+    assert all(len(np.unique(column)) == NUM for column in matches.T)
+
+
+@pytest.mark.parametrize(("apart_deg", "expected"), [(0.1, 1), (0.4, 0)])
+def test_rivals_at_one_place_are_none(apart_deg: float, expected: int) -> None:
+    """One feature found twice at two scales, a pixel apart."""
+    angle = np.deg2rad(apart_deg)
+    bearings = np.array([[0.0, 0, 1], [np.sin(angle), 0, np.cos(angle)]])
+    descriptors = np.array([[100, 100, 100, 0], [100, 100, 98, 0]], np.uint8)
+    one = features_of(bearings[:1], np.array([[100, 100, 99, 0]], np.uint8))
+    two = features_of(bearings, descriptors)
+    for first, second in ((one, two), (two, one)):
+        found = _match(first, second, Gate(np.pi, 1.0, np.pi), f0_T_f1=np.eye(4))
+        assert len(found) == expected
 
 
 def test_matches_are_one_to_one_and_mutual() -> None:
@@ -213,24 +228,35 @@ def test_matches_are_one_to_one_and_mutual() -> None:
         np.testing.assert_array_equal(found, [[0, 0]])
 
 
+def test_an_unrequited_match_is_none() -> None:
+    """0 likes 0, but 0 likes 1 and 1 likes 1: only the last is mutual."""
+    bearings = unit(np.array([[0.0, 0, 1], [0.3, 0, 1]]))
+    first = features_of(bearings, _directions(0.0, 0.35))
+    second = features_of(bearings, _directions(0.2, 0.36))
+    loose = MatchingSettings(max_ratio=1.0, min_similarity=0.0)
+    found = _match(first, second, Gate(np.pi, 1.0, np.pi), f0_T_f1=np.eye(4), settings=loose)
+    np.testing.assert_array_equal(found, [[1, 1]])
+
+
+def _directions(*angles: float) -> np.ndarray:
+    """Unit descriptors (N, 3) float32 in a plane."""
+    return np.array([[np.cos(a), np.sin(a), 0] for a in angles], np.float32)
+
+
 @pytest.mark.parametrize("ratio", [0.9, 0.5])
 def test_ratio_and_similarity_are_those_of_the_descriptors(ratio: float) -> None:
     """Against unit descriptors at known angles: distances 2 sin(angle / 2)."""
     bearings = unit(np.array([[0.0, 0, 1], [0.3, 0, 1]]))
     everything = Gate(np.pi, 1.0, np.pi)
-
-    def at(*angles: float) -> np.ndarray:
-        return np.array([[np.cos(a), np.sin(a), 0] for a in angles], np.float32)
-
-    first = features_of(bearings[:1], at(0.0))
+    first = features_of(bearings[:1], _directions(0.0))
     best = 0.2
     for rival, expected in ((ratio * 1.03, 1), (ratio * 0.97, 0)):
         other = 2 * np.arcsin(np.sin(best / 2) / ratio * (rival / ratio))
-        second = features_of(bearings, at(best, -other))
+        second = features_of(bearings, _directions(best, -other))
         settings = MatchingSettings(max_ratio=ratio, min_similarity=0.5)
         found = _match(first, second, everything, f0_T_f1=np.eye(4), settings=settings)
         assert len(found) == expected
-    alone = features_of(bearings[:1], at(best))
+    alone = features_of(bearings[:1], _directions(best))
     for similarity, expected in ((np.cos(best) - 0.01, 1), (np.cos(best) + 0.01, 0)):
         settings = MatchingSettings(min_similarity=similarity)
         found = _match(first, alone, everything, f0_T_f1=np.eye(4), settings=settings)
