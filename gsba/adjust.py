@@ -9,7 +9,7 @@ import numpy as np
 
 from factors import BearingTerm, FaceCameras, LandmarkBlock, ReprojectionTerm, RobustLoss
 from gsba import graph, triangulate
-from gsba.config import RefineSettings
+from gsba.config import RefineSettings, SolverSettings
 from gsba.optimize import Iteration, marginal_covariances, optimize
 from gsba.rig import RIG_R_FACE, CubeRig
 from gsba.types import Counts, Keypoints, Landmarks, Tracks
@@ -87,10 +87,11 @@ def run(
 
     last_gate = gates[-1] * noise
     support = len(place(world_T_rigs, last_gate).tracks)
-    for gate in gates:
+    for number, gate in enumerate(gates, 1):
         landmarks = place(world_T_rigs, gate * noise)
         block = landmark_block(landmarks, keypoints, rig, noise, settings, num_threads)
-        result = optimize(priors, [block], _values(world_T_rigs), settings.solver)
+        solver = _solver(settings, last=number == len(gates))
+        result = optimize(priors, [block], _values(world_T_rigs), solver)
         poses = _poses(result.values, len(world_T_rigs))
         new_support = len(place(poses, last_gate).tracks)
         accepted = new_support >= settings.rounds.min_support * support
@@ -111,6 +112,13 @@ def run(
         )
         logger.debug("round: %s", rounds[-1])
     return Adjustment(world_T_rigs, place(world_T_rigs, gates[-1] * noise), noise, tuple(rounds))
+
+
+def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
+    """Settings of a round: only the last is solved to the end, the others lose observations."""
+    if last or settings.rounds.tolerance < settings.solver.relative_tolerance:
+        return settings.solver
+    return settings.solver.model_copy(update={"relative_tolerance": settings.rounds.tolerance})
 
 
 def landmark_block(

@@ -22,18 +22,18 @@ class CubemapSettings(_Settings):
     """Faces cut from a panorama for detection."""
 
     hfov_deg: float = Field(default=96.0, ge=90, le=120)
-    face_size: int | None = Field(
-        default=None, ge=64
-    )  # pixels; None = the panorama's own resolution
-    max_face_size: int = Field(default=1024, ge=64)  # pixels; bound on the automatic size
+    face_size: int | None = Field(default=None, ge=64)  # pixels; None = by oversampling
+    oversampling: float = Field(default=1.15, ge=0.25, le=4)  # face pixels per panorama pixel
+    min_face_size: int = Field(default=512, ge=64)  # pixels; bounds on the automatic size
+    max_face_size: int = Field(default=1024, ge=64)
 
 
 class FeatureSettings(_Settings):
     """Keypoints on faces."""
 
     extractor: Literal["sift"] = "sift"
-    max_per_face: int = Field(default=900, ge=16)
-    contrast_threshold: float = Field(default=0.01, gt=0)
+    max_per_face: int = Field(default=1000, ge=16)
+    contrast_threshold: float = Field(default=0.015, gt=0)
     sigma_px: float = Field(
         default=0.16, gt=0
     )  # per-axis noise of the smallest keypoints, face pixels
@@ -62,7 +62,9 @@ class PairSettings(_Settings):
     window: int = Field(default=32, ge=2)  # frames in time
     max_baseline_depths: float = Field(default=2.0, gt=0)  # longest baseline in median scene depths
     max_loop_neighbours: int = Field(default=8, ge=0)  # nearest frames in space outside the window
-    max_parallax_deg: float = Field(default=80.0, gt=0, le=180)
+    max_parallax_deg: float = Field(default=60.0, gt=0, le=180)
+    strongest_per_face: int = Field(default=300, ge=16)  # keypoints that find neighbours' geometry
+    scarce_matches: int = Field(default=60, ge=0)  # below, a pair is matched with all keypoints
     prior: GateSettings = GateSettings(rotation_deg=4.0, direction=0.4)  # coarse trajectory
     loop: GateSettings = GateSettings(rotation_deg=2.0, direction=0.15)  # solved chain
     refined: GateSettings = GateSettings(rotation_deg=0.4, direction=0.005)  # solved map
@@ -92,10 +94,11 @@ class TriangulateSettings(_Settings):
 class RoundSettings(_Settings):
     """Triangulate, adjust, filter: gates in standard deviations of the observations' noise."""
 
-    chain: tuple[float, ...] = (60.0, 20.0, 8.0)  # from the coarse trajectory
+    chain: tuple[float, ...] = (60.0, 8.0)  # from the coarse trajectory
     loops: tuple[float, ...] = (30.0, 8.0)  # with loops closed
-    refined: tuple[float, ...] = (8.0, 5.0)  # with matches along the solved map
+    refined: tuple[float, ...] = (8.0, 4.0, 3.0)  # with matches along the solved map
     map_passes: int = Field(default=2, ge=1)  # times the map is matched anew
+    tolerance: float = Field(default=1e-3, gt=0, lt=1)  # solver's, in all rounds but a stage's last
     min_support: float = Field(
         default=0.99, gt=0, le=1
     )  # observations a round must go on explaining

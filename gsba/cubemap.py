@@ -5,6 +5,7 @@ import functools
 import cv2
 import numpy as np
 
+from gsba import read
 from gsba.config import CubemapSettings
 from gsba.geometry import erp_from_bearings
 from gsba.rig import CubeRig
@@ -16,15 +17,32 @@ _PAD = 4  # pixels of wrap-around: the support of bicubic sampling
 def rig_for(frames: FrameSet, settings: CubemapSettings) -> CubeRig:
     """The rig on which features of these frames are found.
 
-    Unless a size is set, a face centre has the pixel density of the panorama's equator, bounded
-    by `max_face_size`. Frames that come as cube faces keep their own size and 90 degrees.
+    Unless a size is set, a face centre has `oversampling` times the pixel density of the
+    panorama's equator (a little more than one loses nothing between both samplings), within
+    `min_face_size` and `max_face_size`. Frames that come as cube faces keep their own size and
+    90 degrees.
     """
     if frames.layout == "cube":
         return CubeRig(frames.width, np.pi / 2)
     hfov = np.deg2rad(settings.hfov_deg)
     native = 2 * frames.width / (2 * np.pi) * np.tan(hfov / 2)
-    size = settings.face_size or min(settings.max_face_size, round(native))
+    wanted = max(round(settings.oversampling * native), settings.min_face_size)
+    size = settings.face_size or min(wanted, settings.max_face_size)
     return CubeRig(size, hfov)
+
+
+def load(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.ndarray | None]:
+    """Faces (6, size, size, 3) uint8 RGB of a frame and where they may be used, bool or None."""
+    mask = read.load_mask(frames, frame)
+    masks = None if mask is None else cut_mask(mask, rig)
+    if frames.layout == "erp":
+        return cut(read.load_erp(frames, frame), rig), masks
+    images = np.zeros((len(FACES), rig.size, rig.size, 3), np.uint8)
+    present = [FACES.index(name) for name in frames.faces]
+    images[present] = read.load_faces(frames, frame)
+    usable = np.zeros((len(FACES), rig.size, rig.size), bool)
+    usable[present] = True
+    return images, usable if masks is None else usable & masks
 
 
 def cut(erp: np.ndarray, rig: CubeRig) -> np.ndarray:

@@ -10,20 +10,18 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
-from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from gsba.config import MatchingSettings
 from gsba.geometry import inverse
 from gsba.log import track
 from gsba.rig import RIG_R_FACE, owner_faces
+from gsba.search import HEAD, Limits, search
 from gsba.types import Features, Matches
 
 _CELLS = 8  # cells along a face's side
-_ZERO = np.float32(0)
-_kernel = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
+_NO_MATCHES = np.zeros((0, 2), np.int32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,27 +39,38 @@ class Searchable:
     """Features of a frame sorted into cells of the sphere."""
 
     bearings: np.ndarray  # (K, 3) float32, rig frame, sorted by cell
-    descriptors: np.ndarray  # (K, D) float32, unit length
+    descriptors: np.ndarray  # (K, D) float32, unit length, in the axes of a basis
+    tails: np.ndarray  # (K,) float32, norm of what lies beyond the first HEAD axes
     keypoints: np.ndarray  # (K,) int32, index of the keypoint standing for each row
     starts: np.ndarray  # (C + 1,) int32, rows of each cell
     centres: np.ndarray  # (C, 3) float32, unit
     radii: np.ndarray  # (C,) float32, largest chord from a centre to a member
 
 
-class _Limits(NamedTuple):
-    """A gate and the thresholds on descriptors as the compiled search takes them."""
-
-    rotation: np.float32  # radians
-    direction: np.float32  # tangent
-    chord: np.float32  # largest distance of both bearings on the unit sphere
-    point: np.float32  # radians
-    similarity: np.float32  # least
-    ratio: np.float32  # largest
+def principal_axes(descriptors: np.ndarray) -> np.ndarray:
+    """Orthonormal axes (D, D) float32 as columns, those that hold most of descriptors first."""
+    rows = descriptors.astype(np.float64)
+    return np.linalg.eigh(rows.T @ rows)[1][:, ::-1].astype(np.float32)
 
 
-def searchable(features: Features) -> Searchable:
-    """Sort features into cells; keypoints at one place (several orientations) become one."""
-    bearings, faces = features.bearings_rig, owner_faces(features.bearings_rig)
+def searchable(
+    features: Features, axes: np.ndarray | None = None, strongest: int | None = None
+) -> Searchable:
+    """Sort features into cells; keypoints at one place (several orientations) become one.
+
+    Args:
+        features: of one frame.
+        axes: (D, D) orthonormal columns, the same for all frames; similarities do not depend on
+            them, but the search is fast if the first columns hold most of the descriptors.
+        strongest: keypoints of a face to search among, None for all.
+    """
+    if strongest is not None:
+        ranks = np.arange(len(features)) - np.searchsorted(features.faces, features.faces)
+        chosen = np.flatnonzero(ranks < strongest)
+    else:
+        chosen = np.arange(len(features))
+    bearings = features.bearings_rig[chosen]
+    faces = owner_faces(bearings)
     local = np.einsum("kji,kj->ki", RIG_R_FACE[faces], bearings)
     angles = np.arctan2(local[:, :2], local[:, 2:]) / (np.pi / 2) + 0.5
     cell_uv = np.clip((angles * _CELLS).astype(int), 0, _CELLS - 1)
@@ -69,7 +78,7 @@ def searchable(features: Features) -> Searchable:
     order = np.argsort(cells, kind="stable")
     starts = np.searchsorted(cells[order], np.arange(6 * _CELLS * _CELLS + 1)).astype(np.int32)
     _, first, inverse = np.unique(
-        np.column_stack([features.faces, features.pixels]),
+        np.column_stack([features.faces, features.pixels])[chosen],
         axis=0,
         return_index=True,
         return_inverse=True,
@@ -79,12 +88,15 @@ def searchable(features: Features) -> Searchable:
     centres = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
     radii = np.zeros(len(centres))
     np.maximum.at(radii, cells, np.linalg.norm(bearings - centres[cells], axis=1))
-    descriptors = features.descriptors[order].astype(np.float32)
+    descriptors = features.descriptors[chosen[order]].astype(np.float32)
     descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-12)
+    if axes is not None:
+        descriptors = descriptors @ axes
     return Searchable(
         bearings[order].astype(np.float32),
         descriptors,
-        first[inverse.ravel()][order].astype(np.int32),
+        np.linalg.norm(descriptors[:, HEAD:], axis=1),
+        chosen[first[inverse.ravel()][order]].astype(np.int32),
         starts,
         centres.astype(np.float32),
         radii.astype(np.float32),
@@ -120,18 +132,20 @@ def match_pair(
     else:
         offsets = points_f0[first.keypoints] - translation
         targets = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
-    best, similarity = _search(
+    best, similarity = search(
         first.bearings,
         targets.astype(np.float32),
         points_f0 is not None,
         first.descriptors,
+        first.tails,
         second.bearings @ rotation.T,
         second.descriptors,
+        second.tails,
         second.starts,
         second.centres @ rotation.T,
         second.radii,
         tuple(direction),
-        _Limits(
+        Limits(
             np.float32(gate.rotation_rad),
             np.float32(gate.direction if length > 1e-12 else 1e3),
             np.float32(2 * np.sin(min(gate.max_parallax_rad, np.pi) / 2)),
@@ -155,133 +169,18 @@ def _one_to_one(pairs: np.ndarray, similarity: np.ndarray) -> np.ndarray:
     return pairs[np.argsort(pairs[:, 0])].astype(np.int32)
 
 
-@_kernel
-def _search(
-    bearings0,
-    targets,
-    only_targets,
-    descriptors0,
-    bearings1,
-    descriptors1,
-    starts,
-    centres,
-    radii,
-    direction,
-    limits,
-):
-    """Best row of frame 1 for every row of frame 0, or -1; all vectors in frame 0's axes."""
-    n0, n1, dim = len(bearings0), len(bearings1), descriptors0.shape[1]
-    best0, best1 = np.full(n0, -1, np.int32), np.full(n1, -1, np.int32)
-    top0, next0 = np.full(n0, -1, np.float32), np.full(n0, -1, np.float32)
-    top1, next1 = np.full(n1, -1, np.float32), np.full(n1, -1, np.float32)
-    for i in range(n0):
-        if only_targets and np.isnan(targets[i, 0]):
-            continue
-        bearing = bearings0[i, 0], bearings0[i, 1], bearings0[i, 2]
-        target = targets[i, 0], targets[i, 1], targets[i, 2]
-        normal, cosine, slack = _great_circle(bearing, direction, limits.rotation)
-        for cell in range(len(radii)):
-            if starts[cell] == starts[cell + 1]:
-                continue
-            ball = centres[cell, 0], centres[cell, 1], centres[cell, 2]
-            radius = radii[cell]
-            if only_targets and _distance(target, ball) > limits.point + radius:
-                continue
-            if not _in_band(ball, radius, bearing, normal, direction, cosine + slack, limits):
-                continue
-            for j in range(starts[cell], starts[cell + 1]):
-                ball = bearings1[j, 0], bearings1[j, 1], bearings1[j, 2]
-                if only_targets and _distance(target, ball) > limits.point:
-                    continue
-                if not _in_band(ball, _ZERO, bearing, normal, direction, cosine + slack, limits):
-                    continue
-                dot = _ZERO
-                for d in range(dim):
-                    dot += descriptors0[i, d] * descriptors1[j, d]
-                if dot > next0[i]:  # asked here, as calls that pass arrays are dear
-                    _offer(best0, top0, next0, i, j, dot, bearings1)
-                if dot > next1[j]:
-                    _offer(best1, top1, next1, j, i, dot, bearings0)
-    for i in range(n0):
-        j = best0[i]
-        if j >= 0 and not (
-            best1[j] == i and _distinctive(top0[i], max(next0[i], next1[j]), limits)
-        ):
-            best0[i] = -1
-    return best0, top0
-
-
-@_kernel
-def _great_circle(bearing, direction, rotation_tolerance):
-    """Normal of the plane of a bearing and the motion, cosine between them, and its slack."""
-    (ax, ay, az), (tx, ty, tz) = bearing, direction
-    nx, ny, nz = ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax
-    sine = np.sqrt(nx * nx + ny * ny + nz * nz)
-    if sine > 1e-6:
-        nx, ny, nz = nx / sine, ny / sine, nz / sine
-    slack = rotation_tolerance * (sine + rotation_tolerance)
-    return (nx, ny, nz), tx * ax + ty * ay + tz * az, slack
-
-
-@_kernel
-def _in_band(ball, radius, bearing, normal, direction, max_cosine, limits):
-    """Whether a bearing within `radius` of the centre of a ball can be of the same point.
-
-    It lies on the great circle, no further than parallax goes, and is not displaced towards the
-    direction of motion: that is where points behind both frames are seen.
-    """
-    chord = _distance(bearing, ball)
-    if chord - radius > limits.chord + limits.rotation:
-        return False
-    band = limits.direction * (chord + radius)
-    if abs(_dot(normal, ball)) - radius > limits.rotation + band:
-        return False
-    return _dot(direction, ball) - radius <= max_cosine + band
-
-
-@_kernel
-def _offer(best, top, second, row, candidate, similarity, bearings):
-    """Note a candidate that beats a row's second best, which must lie elsewhere than the best."""
-    elsewhere = best[row] < 0 or not _one_place(bearings, best[row], candidate)
-    if similarity > top[row]:
-        if elsewhere:
-            second[row] = top[row]
-        best[row], top[row] = candidate, similarity
-    elif elsewhere:
-        second[row] = similarity
-
-
-@_kernel
-def _distinctive(similarity, second, limits):
-    """Ratio test on descriptor distances: half their squares are 1 - similarity."""
-    ratio = limits.ratio * limits.ratio
-    return similarity >= limits.similarity and 1 - similarity <= ratio * (1 - second)
-
-
-@_kernel
-def _one_place(bearings, a, b):
-    """Whether two rows are one feature found twice: closer than 0.18 degrees."""
-    x = bearings[a, 0] - bearings[b, 0]
-    y = bearings[a, 1] - bearings[b, 1]
-    z = bearings[a, 2] - bearings[b, 2]
-    return x * x + y * y + z * z <= 1e-5
-
-
-@_kernel
-def _distance(a, b):
-    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
-
-
-@_kernel
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 class SearchableFrames:
     """Searchable features of frames, read when asked for; the latest used stay in memory."""
 
-    def __init__(self, load: Callable[[int], Features], capacity: int = 48) -> None:
-        self._get = lru_cache(capacity)(lambda frame: searchable(load(frame)))
+    def __init__(
+        self,
+        load: Callable[[int], Features],
+        strongest: int | None = None,
+        capacity: int = 48,
+    ) -> None:
+        first = load(0)
+        axes = principal_axes(first.descriptors) if len(first) else None
+        self._get = lru_cache(capacity)(lambda frame: searchable(load(frame), axes, strongest))
         self._lock = Lock()
 
     def __getitem__(self, frame: int) -> Searchable:
@@ -316,10 +215,14 @@ def run(
         points = None if points_rig is None else points_rig[f0]
         return match_pair(frames[f0], frames[f1], f0_T_f1s[p], gates[p], settings, points)
 
+    order = np.lexsort((pairs[:, 1], pairs[:, 0]))  # pairs that share frames follow one another
+    rows = [_NO_MATCHES] * len(pairs)
     with ThreadPoolExecutor(num_threads) as pool:
-        rows = list(track(pool.map(match, range(len(pairs))), "matching", len(pairs)))
+        found = track(pool.map(match, order), "matching", len(pairs))
+        for p, matched in zip(order, found, strict=True):
+            rows[p] = matched
     return Matches(
         np.asarray(pairs, np.int32).reshape(-1, 2),
         np.cumsum([0, *map(len, rows)]),
-        np.concatenate([np.zeros((0, 2), np.int32), *rows]),
+        np.concatenate([_NO_MATCHES, *rows]),
     )

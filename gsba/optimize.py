@@ -47,6 +47,24 @@ class OptimizeResult:
         return next(step.cost for step in reversed(self.history) if step.accepted)
 
 
+@dataclass(slots=True)
+class _Damping:
+    """Lambda by the rule of Nielsen (IMM-REP-1999-05): lowered by how well the model predicts."""
+
+    value: float
+    growth: float = 2.0
+
+    def raised(self) -> bool:
+        """Raise after a rejected step; False where it cannot go higher."""
+        self.value, self.growth = self.value * self.growth, self.growth * 2.0
+        return self.value <= _MAX_DAMPING
+
+    def lower(self, ratio: float) -> None:
+        """Lower after a step whose decrease was `ratio` of the predicted one."""
+        self.value = max(self.value * max(0.1, 1 - (2 * ratio - 1) ** 3), _MIN_DAMPING)
+        self.growth = 2.0
+
+
 def optimize(
     graph: gtsam.NonlinearFactorGraph,
     blocks: Sequence[Block],
@@ -87,27 +105,25 @@ def optimize(
     since = time.perf_counter()
     costs = system.linearize(values)
     cost = _checked_sum(costs)
-    damping, growth = settings.lambda_initial, 2.0
-    record(0, cost, costs, damping, True, since)
+    damping = _Damping(settings.lambda_initial)
+    record(0, cost, costs, damping.value, True, since)
     for number in range(1, settings.max_iterations + 1):
         since = time.perf_counter()
         negligible = settings.relative_tolerance * cost
-        trial, trial_cost, predicted = _attempt(system, values, damping)
+        used = damping.value
+        trial, trial_cost, predicted = _attempt(system, values, used)
         if not trial_cost <= cost:  # also where it is not a number
-            record(number, trial_cost, {}, damping, False, since)
+            record(number, trial_cost, {}, used, False, since)
             if predicted <= negligible:
                 return result(True, "no step decreases the cost")
-            damping, growth = damping * growth, growth * 2.0
-            if damping > _MAX_DAMPING:
+            if not damping.raised():
                 return result(False, "no damping gives a good step")
             continue
         for block in blocks:
             block.accept()
             block.refresh(trial)
-        values, decrease, used = trial, cost - trial_cost, damping
-        ratio = decrease / predicted if predicted > 0 else 1.0
-        damping = max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), _MIN_DAMPING)  # Nielsen 1999
-        growth = 2.0
+        values, decrease = trial, cost - trial_cost
+        damping.lower(decrease / predicted if predicted > 0 else 1.0)
         converged = decrease <= negligible and used <= _FREE_DAMPING
         costs = system.costs(values) if converged else system.linearize(values)
         cost = sum(costs.values())

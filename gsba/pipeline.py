@@ -20,10 +20,8 @@ from gsba.log import GsbaError
 from gsba.matching import SearchableFrames
 from gsba.reconstruction import assemble
 from gsba.report import build_report, write_poses, write_report
-from gsba.rig import CubeRig
 from gsba.store import PerFrame, RunStore, atomic_write, fingerprint, load_stage
 from gsba.types import (
-    FACES,
     CoarsePoses,
     Counts,
     Features,
@@ -150,15 +148,21 @@ class _Line:
             Keypoints,
             ["frames", "features"],
         )
-        self.searchable = SearchableFrames(lambda frame: found[frames.names[frame]])
+
+        def load(frame: int) -> Features:
+            return found[frames.names[frame]]
+
+        self.searchable = SearchableFrames(load)
+        self.strongest = SearchableFrames(load, settings.pairs.strongest_per_face)
 
     def _extract(self) -> PerFrame[Features]:
         """Features of every frame: image and mask are read, cut and released one at a time."""
         frames, settings = self.frames, self.settings
+        features.keep_freed_memory()
         index = {name: f for f, name in enumerate(frames.names)}
 
         def compute(name: str) -> Features:
-            images, masks = _faces(frames, index[name], self.rig)
+            images, masks = cubemap.load(frames, index[name], self.rig)
             extractor = features.SiftExtractor(settings.features)
             return features.extract(images, masks, self.rig, extractor)
 
@@ -184,7 +188,12 @@ class _Line:
             "neighbours",
             self._matching(),
             lambda: frontend.match_neighbours(
-                self.searchable, self.keypoints, self.start(), self.settings, self.num_threads
+                self.searchable,
+                self.strongest,
+                self.keypoints,
+                self.start(),
+                self.settings,
+                self.num_threads,
             ),
             VerifiedPairs,
         )
@@ -334,17 +343,3 @@ class _Line:
         result = self.store.stage(name, key, compute, returns, [self.latest])
         self.latest = name
         return result
-
-
-def _faces(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.ndarray | None]:
-    """Faces (6, N, N, 3) uint8 of a frame and where they may be used, (6, N, N) bool or None."""
-    mask = read.load_mask(frames, frame)
-    masks = None if mask is None else cubemap.cut_mask(mask, rig)
-    if frames.layout == "erp":
-        return cubemap.cut(read.load_erp(frames, frame), rig), masks
-    images = np.zeros((len(FACES), rig.size, rig.size, 3), np.uint8)
-    present = [FACES.index(name) for name in frames.faces]
-    images[present] = read.load_faces(frames, frame)
-    usable = np.zeros((len(FACES), rig.size, rig.size), bool)
-    usable[present] = True
-    return images, usable if masks is None else usable & masks

@@ -71,7 +71,7 @@ class CoarsePoses:
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """Keypoints of one frame, all faces together."""
+    """Keypoints of one frame, face after face, the strongest of a face first."""
 
     pixels: np.ndarray  # (K, 2) float64, (u, v) on the owning face, corner origin
     faces: np.ndarray  # (K,) uint8, index into FACES

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = (
     {"factors"},
     {"", "types", "geometry", "config", "config_file", "log"},
-    {"rig", "records", "run_folder", "store", "read"},
+    {"rig", "records", "run_folder", "search", "store", "read"},
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter"},
     {"adjust", "frontend", "reconstruction"},

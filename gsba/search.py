@@ -1,0 +1,175 @@
+"""The compiled search behind guided matching: which descriptors are compared, and which win."""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+HEAD = 24  # axes of a descriptor compared before the rest
+_ZERO = np.float32(0)
+_kernel = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
+
+
+class Limits(NamedTuple):
+    """A gate and the thresholds on descriptors as the compiled search takes them."""
+
+    rotation: np.float32  # radians
+    direction: np.float32  # tangent
+    chord: np.float32  # largest distance of both bearings on the unit sphere
+    point: np.float32  # radians
+    similarity: np.float32  # least
+    ratio: np.float32  # largest
+
+
+@_kernel
+def search(
+    bearings0,
+    targets,
+    only_targets,
+    descriptors0,
+    tails0,
+    bearings1,
+    descriptors1,
+    tails1,
+    starts,
+    centres,
+    radii,
+    direction,
+    limits,
+):
+    """Best row of frame 1 for every row of frame 0, or -1; all vectors in frame 0's axes."""
+    n0, n1, dim = len(bearings0), len(bearings1), descriptors0.shape[1]
+    head = min(HEAD, dim)
+    heads0 = np.ascontiguousarray(descriptors0[:, :head])  # stays in the cache
+    heads1 = np.ascontiguousarray(descriptors1[:, :head])
+    # Less alike than this, a candidate neither wins nor stands against the least winner.
+    floor = 1 - (1 - limits.similarity) / (limits.ratio * limits.ratio)
+    axes1 = np.ascontiguousarray(bearings1.T)
+    marks = np.empty(n1, np.bool_)
+    best0, best1 = np.full(n0, -1, np.int32), np.full(n1, -1, np.int32)
+    top0, next0 = np.full(n0, -1, np.float32), np.full(n0, -1, np.float32)
+    top1, next1 = np.full(n1, -1, np.float32), np.full(n1, -1, np.float32)
+    for i in range(n0):
+        if only_targets and np.isnan(targets[i, 0]):
+            continue
+        bearing = bearings0[i, 0], bearings0[i, 1], bearings0[i, 2]
+        target = targets[i, 0], targets[i, 1], targets[i, 2]
+        normal, cosine, slack = _great_circle(bearing, direction, limits.rotation)
+        for cell in range(len(radii)):
+            if starts[cell] == starts[cell + 1]:
+                continue
+            ball = centres[cell, 0], centres[cell, 1], centres[cell, 2]
+            radius = radii[cell]
+            if only_targets:
+                if _distance(target, ball) > limits.point + radius:
+                    continue
+            elif not _in_band(ball, radius, bearing, normal, direction, cosine + slack, limits):
+                continue
+            first = starts[cell]
+            members = axes1[:, first : starts[cell + 1]]
+            if only_targets:
+                _mark_near(members, target, limits.point, marks)
+            else:
+                _mark_in_band(members, bearing, normal, direction, cosine + slack, limits, marks)
+            for j in range(first, starts[cell + 1]):
+                if not marks[j - first]:
+                    continue
+                dot = _ZERO
+                for d in range(head):
+                    dot += heads0[i, d] * heads1[j, d]
+                if dot + tails0[i] * tails1[j] < floor:  # Cauchy-Schwarz on the other axes
+                    continue
+                for d in range(head, dim):
+                    dot += descriptors0[i, d] * descriptors1[j, d]
+                if dot > next0[i]:  # asked here, as calls that pass arrays are dear
+                    _offer(best0, top0, next0, i, j, dot, bearings1)
+                if dot > next1[j]:
+                    _offer(best1, top1, next1, j, i, dot, bearings0)
+    for i in range(n0):
+        j = best0[i]
+        if j >= 0 and not (
+            best1[j] == i and _distinctive(top0[i], max(next0[i], next1[j]), limits)
+        ):
+            best0[i] = -1
+    return best0, top0
+
+
+@_kernel
+def _great_circle(bearing, direction, rotation_tolerance):
+    """Normal of the plane of a bearing and the motion, cosine between them, and its slack."""
+    (ax, ay, az), (tx, ty, tz) = bearing, direction
+    nx, ny, nz = ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax
+    sine = np.sqrt(nx * nx + ny * ny + nz * nz)
+    if sine > 1e-6:
+        nx, ny, nz = nx / sine, ny / sine, nz / sine
+    slack = rotation_tolerance * (sine + rotation_tolerance)
+    return (nx, ny, nz), tx * ax + ty * ay + tz * az, slack
+
+
+@_kernel
+def _in_band(ball, radius, bearing, normal, direction, max_cosine, limits):
+    """Whether a bearing within `radius` of the centre of a ball can be of the same point.
+
+    It lies on the great circle, no further than parallax goes, and is not displaced towards the
+    direction of motion: that is where points behind both frames are seen.
+    """
+    chord = _distance(bearing, ball)
+    band = limits.direction * (chord + radius)
+    return (
+        (chord - radius <= limits.chord + limits.rotation)
+        & (abs(_dot(normal, ball)) - radius <= limits.rotation + band)
+        & (_dot(direction, ball) - radius <= max_cosine + band)
+    )
+
+
+@_kernel
+def _mark_in_band(members, bearing, normal, direction, max_cosine, limits, marks):
+    """Flags of the bearings (3, m) that pass; without branches, so that it runs in vectors."""
+    for m in range(members.shape[1]):
+        ball = members[0, m], members[1, m], members[2, m]
+        marks[m] = _in_band(ball, _ZERO, bearing, normal, direction, max_cosine, limits)
+
+
+@_kernel
+def _mark_near(members, target, radius, marks):
+    """Flags of the bearings (3, m) near a target."""
+    for m in range(members.shape[1]):
+        marks[m] = _distance(target, (members[0, m], members[1, m], members[2, m])) <= radius
+
+
+@_kernel
+def _offer(best, top, second, row, candidate, similarity, bearings):
+    """Note a candidate that beats a row's second best, which must lie elsewhere than the best."""
+    elsewhere = best[row] < 0 or not _one_place(bearings, best[row], candidate)
+    if similarity > top[row]:
+        if elsewhere:
+            second[row] = top[row]
+        best[row], top[row] = candidate, similarity
+    elif elsewhere:
+        second[row] = similarity
+
+
+@_kernel
+def _distinctive(similarity, second, limits):
+    """Ratio test on descriptor distances: half their squares are 1 - similarity."""
+    ratio = limits.ratio * limits.ratio
+    return similarity >= limits.similarity and 1 - similarity <= ratio * (1 - second)
+
+
+@_kernel
+def _one_place(bearings, a, b):
+    """Whether two rows are one feature found twice: closer than 0.18 degrees."""
+    x = bearings[a, 0] - bearings[b, 0]
+    y = bearings[a, 1] - bearings[b, 1]
+    z = bearings[a, 2] - bearings[b, 2]
+    return x * x + y * y + z * z <= 1e-5
+
+
+@_kernel
+def _distance(a, b):
+    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
+
+
+@_kernel
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
