@@ -89,7 +89,8 @@ def run(
     support = len(place(world_T_rigs, last_gate).tracks)
     for number, gate in enumerate(gates, 1):
         landmarks = place(world_T_rigs, gate * noise)
-        block = landmark_block(landmarks, keypoints, rig, noise, settings, num_threads)
+        spread = noise * max(1.0, gate / settings.rounds.gate_scale)
+        block = landmark_block(landmarks, keypoints, rig, spread, settings, num_threads)
         solver = _solver(settings, last=number == len(gates))
         result = optimize(priors, [block], _values(world_T_rigs), solver)
         poses = _poses(result.values, len(world_T_rigs))
@@ -97,7 +98,7 @@ def run(
         accepted = new_support >= settings.rounds.min_support * support
         if accepted:
             world_T_rigs, support = poses, new_support
-            noise = max(_noise(block, result.values, noise), settings.rounds.min_noise)
+            noise = max(_noise(block, result.values, spread), settings.rounds.min_noise)
         rounds.append(
             Round(
                 gate,

@@ -33,7 +33,7 @@ class FeatureSettings(_Settings):
 
     extractor: Literal["sift"] = "sift"
     max_per_face: int = Field(default=1000, ge=16)
-    contrast_threshold: float = Field(default=0.015, gt=0)
+    contrast_threshold: float = Field(default=0.01, gt=0)
     sigma_px: float = Field(
         default=0.16, gt=0
     )  # per-axis noise of the smallest keypoints, face pixels
@@ -66,9 +66,9 @@ class PairSettings(_Settings):
     strongest_per_face: int = Field(default=300, ge=16)  # keypoints that find neighbours' geometry
     scarce_matches: int = Field(default=60, ge=0)  # below, a pair is matched with all keypoints
     prior: GateSettings = GateSettings(rotation_deg=4.0, direction=0.4)  # coarse trajectory
-    loop: GateSettings = GateSettings(rotation_deg=2.0, direction=0.15)  # solved chain
+    loop_deg: float = Field(default=2.0, gt=0)  # around a known point, besides drift
     refined: GateSettings = GateSettings(rotation_deg=0.4, direction=0.005)  # solved map
-    point_deg: float = Field(default=0.8, gt=0)  # around the predicted bearing of a known point
+    point_deg: float = Field(default=0.6, gt=0)  # around the predicted bearing of a known point
     drift: float = Field(
         default=0.003, gt=0
     )  # of the solved chain, part of the path between two frames
@@ -95,9 +95,11 @@ class RoundSettings(_Settings):
     """Triangulate, adjust, filter: gates in standard deviations of the observations' noise."""
 
     chain: tuple[float, ...] = (60.0, 8.0)  # from the coarse trajectory
-    loops: tuple[float, ...] = (30.0, 8.0)  # with loops closed
+    dense: tuple[float, ...] = (8.0, 4.0)  # with matches along the solved chain
+    loops: tuple[float, ...] = (100.0, 20.0, 6.0)  # with loops closed
     refined: tuple[float, ...] = (8.0, 4.0, 3.0)  # with matches along the solved map
-    map_passes: int = Field(default=2, ge=1)  # times the map is matched anew
+    map_passes: int = Field(default=1, ge=1)  # times the closed map is matched anew
+    gate_scale: float = Field(default=10.0, ge=1)  # wider gates loosen the loss in proportion
     tolerance: float = Field(default=1e-3, gt=0, lt=1)  # solver's, in all rounds but a stage's last
     min_support: float = Field(
         default=0.99, gt=0, le=1
@@ -122,7 +124,7 @@ class SolverSettings(_Settings):
     max_iterations: int = Field(default=50, ge=1)
     relative_tolerance: float = Field(default=1e-5, gt=0, lt=1)  # least decrease of the cost
     loss: Literal["none", "huber", "cauchy", "geman_mcclure"] = "cauchy"
-    loss_sigmas: float = Field(default=2.0, gt=0)  # scale of the loss, standard deviations
+    loss_sigmas: float = Field(default=1.4, gt=0)  # scale of the loss, standard deviations
     lambda_initial: float = Field(default=1e-4, gt=0)  # damping, part of the diagonal
     num_threads: int | None = Field(default=None, ge=1)  # None = all cores
 

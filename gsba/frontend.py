@@ -56,6 +56,9 @@ def match_loops(
 ) -> VerifiedPairs:
     """Match frames close in space but far in time, as far as drift leaves them predictable.
 
+    Only known points are looked for, as far around their predicted bearing as drift can have moved
+    them. What repeats at a distance, arches or columns, is further off than that.
+
     Args:
         frames, keypoints: features of all frames.
         solved: poses and points that are right between neighbours.
@@ -63,19 +66,17 @@ def match_loops(
         num_threads: pairs matched at a time.
     """
     world_T_rigs, positions = solved.world_T_rigs, solved.world_T_rigs[:, :3, 3]
-    chosen = pairs.covisible(positions, median_depth(solved), settings.pairs)[1]
+    depth = median_depth(solved)
+    chosen = pairs.covisible(positions, depth, settings.pairs)[1]
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     along = np.concatenate([[0], np.cumsum(steps)])
     drifts = settings.pairs.drift * (along[chosen[:, 1]] - along[chosen[:, 0]])
-    baselines = np.linalg.norm(positions[chosen[:, 0]] - positions[chosen[:, 1]], axis=1)
-    loop = settings.pairs.loop
     gates = [
-        _gate(
-            loop.rotation_deg, loop.direction + min(1.0, 2 * drift / max(length, 1e-12)), settings
-        )
-        for drift, length in zip(drifts, baselines, strict=True)
+        _point_gate(np.deg2rad(settings.pairs.loop_deg) + 2 * drift / max(depth, 1e-12))
+        for drift in drifts
     ]
-    found = matching.run(chosen, world_T_rigs, gates, frames, settings.matching, num_threads)
+    known = points_by_keypoint(solved, keypoints)
+    found = matching.run(chosen, world_T_rigs, gates, frames, settings.matching, num_threads, known)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
     return verify.run(found, keypoints, f0_T_f1s, drifts, settings.verify, settings.seed)
 
@@ -86,6 +87,7 @@ def match_map(
     solved: Adjustment,
     settings: RefineSettings,
     num_threads: int,
+    loops_closed: bool,
 ) -> tuple[Matches, ...]:
     """Match again from poses and points that are nearly right; prediction is the verification.
 
@@ -97,6 +99,7 @@ def match_map(
         solved: the current solution.
         settings: of pairs and matching.
         num_threads: pairs matched at a time.
+        loops_closed: whether frames far apart in time are predictable too.
 
     Returns:
         Matches of neighbours and matches of known points, the more trusted first.
@@ -104,10 +107,12 @@ def match_map(
     world_T_rigs = solved.world_T_rigs
     neighbours = pairs.adjacent(len(world_T_rigs))
     near, loops = pairs.covisible(world_T_rigs[:, :3, 3], median_depth(solved), settings.pairs)
-    wide = np.concatenate([near[near[:, 1] - near[:, 0] > 2], loops])
+    wide = near[near[:, 1] - near[:, 0] > 2]
+    if loops_closed:
+        wide = np.concatenate([wide, loops])
     refined = settings.pairs.refined
     band = _gate(refined.rotation_deg, refined.direction, settings)
-    point = Gate(np.pi, 1.0, np.pi, np.deg2rad(settings.pairs.point_deg))
+    point = _point_gate(np.deg2rad(settings.pairs.point_deg))
     known = points_by_keypoint(solved, keypoints)
     return (
         matching.run(
@@ -153,6 +158,11 @@ def _replaced(matches: Matches, indices: np.ndarray, others: Matches) -> Matches
     for n, p in enumerate(indices):
         rows[p] = others.of(n)
     return Matches(matches.pairs, np.cumsum([0, *map(len, rows)]), np.concatenate(rows))
+
+
+def _point_gate(radius_rad: float) -> Gate:
+    """A gate around predicted points only."""
+    return Gate(np.pi, 1.0, np.pi, min(radius_rad, np.pi))
 
 
 def _gate(rotation_deg: float, direction: float, settings: RefineSettings) -> Gate:

@@ -93,14 +93,15 @@ def refine(
     coarse = read.associate(frame_set, read.read_trajectory(trajectory, timestamps), settings.read)
     with RunStore(out, {"frames": frames, "trajectory": trajectory}, fresh) as store:
         line = _Line(store, frame_set, coarse, settings, extra_factors)
-        neighbours = line.match_neighbours()
-        solved = line.solve("chain", [neighbours.matches], line.start(), settings.rounds.chain)
+        neighbours, rounds = line.match_neighbours(), settings.rounds
+        solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)
+        near = line.match_map("near", solved, loops_closed=False)
+        solved = line.solve("dense", near, solved, rounds.dense)
         loops = line.match_loops(solved)
-        matches = [neighbours.matches, loops.matches]
-        solved = line.solve("closed", matches, solved, settings.rounds.loops)
-        for number in range(1, settings.rounds.map_passes + 1):
-            matches = line.match_map(f"map{number}", solved)
-            solved = line.solve(f"refined{number}", matches, solved, settings.rounds.refined)
+        solved = line.solve("closed", [*near, loops.matches], solved, rounds.loops)
+        for number in range(1, rounds.map_passes + 1):
+            everywhere = line.match_map(f"everywhere{number}", solved, loops_closed=True)
+            solved = line.solve(f"refined{number}", everywhere, solved, rounds.refined)
         reconstruction = line.reconstruct(solved)
         return line.write(reconstruction)
 
@@ -219,13 +220,18 @@ class _Line:
         self.counts["loops"] = [pairs.counts]
         return pairs
 
-    def match_map(self, name: str, solved: Adjustment) -> tuple[Matches, ...]:
+    def match_map(self, name: str, solved: Adjustment, loops_closed: bool) -> tuple[Matches, ...]:
         """Matches predicted by the solved map."""
         return self._stage(
             name,
             self._matching(),
             lambda: frontend.match_map(
-                self.searchable, self.keypoints, solved, self.settings, self.num_threads
+                self.searchable,
+                self.keypoints,
+                solved,
+                self.settings,
+                self.num_threads,
+                loops_closed,
             ),
             tuple[Matches, ...],
         )

@@ -20,7 +20,6 @@ SETTINGS = RefineSettings.model_validate(  # lighter than the defaults
     {
         "cubemap": {"oversampling": 1.0},
         "features": {"max_per_face": 400},
-        "rounds": {"map_passes": 1},
         "solver": {"num_threads": 2},
     }
 )
