@@ -3,7 +3,7 @@
 import logging
 import os
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -37,7 +37,7 @@ from gsba.types import (
 
 logger = logging.getLogger(__name__)
 
-ExtraFactors = Callable[[CoarsePoses], gtsam.NonlinearFactorGraph]
+ExtraFactors = Callable[[CoarsePoses], Iterable[gtsam.NonlinearFactor]]
 T = TypeVar("T")
 _GAUGE = (
     "Sim(3)-aligned to the coarse trajectory over its refined SLAM poses: its world and scale; "
@@ -57,9 +57,9 @@ class RunResult:
 
 
 def refine(
-    frames: Path,
-    trajectory: Path,
-    out: Path,
+    frames: Path | str,
+    trajectory: Path | str,
+    out: Path | str,
     settings: RefineSettings | None = None,
     *,
     masks: Path | None = None,
@@ -88,6 +88,7 @@ def refine(
     Raises:
         GsbaError: an input or setting that cannot be used.
     """
+    frames, trajectory, out = Path(frames), Path(trajectory), Path(out)
     settings = settings or RefineSettings()
     frame_set = read.scan(frames, timestamps, fps, masks)
     coarse = read.associate(frame_set, read.read_trajectory(trajectory, timestamps), settings.read)
@@ -133,7 +134,8 @@ class _Line:
         self.priors = graph.build(coarse.world_T_rigs, settings.priors)
         self.custom = None if extra_factors is None else uuid.uuid4().hex  # resumes nothing
         if extra_factors is not None:
-            self.priors.push_back(extra_factors(coarse))
+            for factor in extra_factors(coarse):
+                self.priors.add(factor)
         self.counts: dict[str, list[Counts]] = {}
         self.solutions: dict[str, Adjustment] = {}
         self.latest = "keypoints"  # the stage that the next one builds on

@@ -175,7 +175,7 @@ def test_a_factor_of_ones_own_takes_part(blank: Case, tmp_path: Path) -> None:
     """A height for the blank frame, of which images say nothing."""
     lift = 0.1
 
-    def height_factors(coarse: CoarsePoses) -> gtsam.NonlinearFactorGraph:
+    def height_factors(coarse: CoarsePoses) -> list[gtsam.CustomFactor]:
         wanted = coarse.world_T_rigs[3, 1, 3] + lift
 
         def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list | None):
@@ -184,10 +184,8 @@ def test_a_factor_of_ones_own_takes_part(blank: Case, tmp_path: Path) -> None:
                 jacobians[0] = np.append(np.zeros(3), world_T_rig.rotation().matrix()[1])[None]
             return np.array([world_T_rig.y() - wanted])
 
-        factors = gtsam.NonlinearFactorGraph()
         noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-4)
-        factors.add(gtsam.CustomFactor(noise, [X(3)], error))
-        return factors
+        return [gtsam.CustomFactor(noise, [X(3)], error)]
 
     out = blank.copy(tmp_path / "run")
     result = blank.refine(out, extra_factors=height_factors)
