@@ -17,7 +17,7 @@ from gsba.config import MatchingSettings
 from gsba.geometry import inverse
 from gsba.log import track
 from gsba.rig import RIG_R_FACE, owner_faces
-from gsba.search import HEAD, Limits, search
+from gsba.search import HEAD, Cells, Limits, Rows, search
 from gsba.types import Features, Matches
 
 _CELLS = 8  # cells along a face's side
@@ -133,17 +133,11 @@ def match_pair(
         offsets = points_f0[first.keypoints] - translation
         targets = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
     best, similarity = search(
-        first.bearings,
+        Rows(first.bearings, first.descriptors, first.tails),
+        Rows(second.bearings @ rotation.T, second.descriptors, second.tails),
+        Cells(second.starts, second.centres @ rotation.T, second.radii),
         targets.astype(np.float32),
         points_f0 is not None,
-        first.descriptors,
-        first.tails,
-        second.bearings @ rotation.T,
-        second.descriptors,
-        second.tails,
-        second.starts,
-        second.centres @ rotation.T,
-        second.radii,
         tuple(direction),
         Limits(
             np.float32(gate.rotation_rad),

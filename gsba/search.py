@@ -21,23 +21,36 @@ class Limits(NamedTuple):
     ratio: np.float32  # largest
 
 
+class Rows(NamedTuple):
+    """What is compared of a frame's features, all float32."""
+
+    bearings: np.ndarray  # (n, 3), frame 0's axes
+    descriptors: np.ndarray  # (n, D) of length one
+    tails: np.ndarray  # (n) length of a descriptor behind its first HEAD axes
+
+
+class Cells(NamedTuple):
+    """Rows that lie together: balls around their bearings, frame 0's axes."""
+
+    starts: np.ndarray  # (C + 1) first row of each cell
+    centres: np.ndarray  # (C, 3) float32
+    radii: np.ndarray  # (C) float32, chords
+
+
 @_kernel
-def search(
-    bearings0,
-    targets,
-    only_targets,
-    descriptors0,
-    tails0,
-    bearings1,
-    descriptors1,
-    tails1,
-    starts,
-    centres,
-    radii,
-    direction,
-    limits,
-):
-    """Best row of frame 1 for every row of frame 0, or -1; all vectors in frame 0's axes."""
+def search(first, second, cells, targets, only_targets, direction, limits):
+    """Best row of the second frame for every row of the first, or -1, and its similarity.
+
+    Args:
+        first, second: Rows of both frames.
+        cells: Cells of the second.
+        targets: (n0, 3) float32 where rows of the first must be found, NaN where unknown.
+        only_targets: look there, and not along epipolar lines.
+        direction, limits: unit vector of the motion, and Limits.
+    """
+    bearings0, descriptors0, tails0 = first
+    bearings1, descriptors1, tails1 = second
+    starts, centres, radii = cells
     n0, n1, dim = len(bearings0), len(bearings1), descriptors0.shape[1]
     head = min(HEAD, dim)
     heads0 = np.ascontiguousarray(descriptors0[:, :head])  # stays in the cache
@@ -46,9 +59,8 @@ def search(
     floor = 1 - (1 - limits.similarity) / (limits.ratio * limits.ratio)
     axes1 = np.ascontiguousarray(bearings1.T)
     marks = np.empty(n1, np.bool_)
-    best0, best1 = np.full(n0, -1, np.int32), np.full(n1, -1, np.int32)
-    top0, next0 = np.full(n0, -1, np.float32), np.full(n0, -1, np.float32)
-    top1, next1 = np.full(n1, -1, np.float32), np.full(n1, -1, np.float32)
+    best0, top0, next0 = _nothing(n0)
+    best1, top1, next1 = _nothing(n1)
     for i in range(n0):
         if only_targets and np.isnan(targets[i, 0]):
             continue
@@ -58,21 +70,20 @@ def search(
         for cell in range(len(radii)):
             if starts[cell] == starts[cell + 1]:
                 continue
-            ball = centres[cell, 0], centres[cell, 1], centres[cell, 2]
-            radius = radii[cell]
+            ball, radius = (centres[cell, 0], centres[cell, 1], centres[cell, 2]), radii[cell]
             if only_targets:
                 if _distance(target, ball) > limits.point + radius:
                     continue
             elif not _in_band(ball, radius, bearing, normal, direction, cosine + slack, limits):
                 continue
-            first = starts[cell]
-            members = axes1[:, first : starts[cell + 1]]
+            begin, end = starts[cell], starts[cell + 1]
+            members = axes1[:, begin:end]
             if only_targets:
                 _mark_near(members, target, limits.point, marks)
             else:
                 _mark_in_band(members, bearing, normal, direction, cosine + slack, limits, marks)
-            for j in range(first, starts[cell + 1]):
-                if not marks[j - first]:
+            for j in range(begin, end):
+                if not marks[j - begin]:
                     continue
                 dot = _ZERO
                 for d in range(head):
@@ -85,13 +96,25 @@ def search(
                     _offer(best0, top0, next0, i, j, dot, bearings1)
                 if dot > next1[j]:
                     _offer(best1, top1, next1, j, i, dot, bearings0)
-    for i in range(n0):
+    _keep_mutual(best0, top0, next0, best1, next1, limits)
+    return best0, top0
+
+
+@_kernel
+def _nothing(n):
+    """Best candidate of n rows, its similarity, and that of the best elsewhere: none yet."""
+    return np.full(n, -1, np.int32), np.full(n, -1, np.float32), np.full(n, -1, np.float32)
+
+
+@_kernel
+def _keep_mutual(best0, top0, next0, best1, next1, limits):
+    """Undo, in place, what is not the best both ways and by a margin."""
+    for i in range(len(best0)):
         j = best0[i]
         if j >= 0 and not (
             best1[j] == i and _distinctive(top0[i], max(next0[i], next1[j]), limits)
         ):
             best0[i] = -1
-    return best0, top0
 
 
 @_kernel
