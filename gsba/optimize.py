@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
@@ -65,6 +65,32 @@ class _Damping:
         self.growth = 2.0
 
 
+@dataclass(slots=True)
+class _History:
+    """Attempts so far; the caller is told of each."""
+
+    callback: Callable[[Iteration, gtsam.Values], None] | None
+    steps: list[Iteration] = field(default_factory=list)
+    since: float = field(default_factory=time.perf_counter)  # start of the next attempt
+
+    def add(
+        self,
+        values: gtsam.Values,
+        cost: float,
+        costs: Mapping[str, float],
+        damping: float,
+        accepted: bool,
+    ) -> None:
+        """Note an attempt that ends now, and the best values after it."""
+        seconds = time.perf_counter() - self.since
+        step = Iteration(len(self.steps), cost, costs, damping, accepted, seconds)
+        self.steps.append(step)
+        logger.debug("step %d: cost %.6g, lambda %.1e, %s", step.number, cost, damping, accepted)
+        if self.callback is not None:
+            self.callback(step, values)
+        self.since = time.perf_counter()
+
+
 def optimize(
     graph: gtsam.NonlinearFactorGraph,
     blocks: Sequence[Block],
@@ -90,30 +116,21 @@ def optimize(
     for block in blocks:
         block.refresh(values)
     system = ReducedSystem(graph, blocks, values)
-    history: list[Iteration] = []
-
-    def record(number, cost, costs, damping, accepted, since) -> None:
-        step = Iteration(number, cost, costs, damping, accepted, time.perf_counter() - since)
-        history.append(step)
-        logger.debug("step %d: cost %.6g, lambda %.1e, %s", number, cost, damping, accepted)
-        if callback is not None:
-            callback(step, values)
+    history = _History(callback)
 
     def result(converged: bool, reason: str) -> OptimizeResult:
-        return OptimizeResult(values, tuple(history), converged, reason)
+        return OptimizeResult(values, tuple(history.steps), converged, reason)
 
-    since = time.perf_counter()
     costs = system.linearize(values)
     cost = _checked_sum(costs)
     damping = _Damping(settings.lambda_initial)
-    record(0, cost, costs, damping.value, True, since)
-    for number in range(1, settings.max_iterations + 1):
-        since = time.perf_counter()
+    history.add(values, cost, costs, damping.value, True)
+    for _ in range(settings.max_iterations):
         negligible = settings.relative_tolerance * cost
         used = damping.value
         trial, trial_cost, predicted = _attempt(system, values, used)
         if not trial_cost <= cost:  # also where it is not a number
-            record(number, trial_cost, {}, used, False, since)
+            history.add(values, trial_cost, {}, used, False)
             if predicted <= negligible:
                 return result(True, "no step decreases the cost")
             if not damping.raised():
@@ -127,7 +144,7 @@ def optimize(
         converged = decrease <= negligible and used <= _FREE_DAMPING
         costs = system.costs(values) if converged else system.linearize(values)
         cost = sum(costs.values())
-        record(number, cost, costs, used, True, since)
+        history.add(values, cost, costs, used, True)
         if converged:
             return result(True, f"relative decrease below {settings.relative_tolerance:g}")
     return result(False, "iteration limit")
