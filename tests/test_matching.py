@@ -312,9 +312,10 @@ def test_frames_are_read_once_while_they_fit(scene: Scene) -> None:
         return scene.first()
 
     frames = SearchableFrames(load, capacity=2)
+    assert reads == [0]  # for the axes of descriptors
     for frame in (0, 1, 0, 1, 2, 1, 0):
         frames[frame]
-    assert reads == [0, 1, 2, 0]
+    assert reads[1:] == [0, 1, 2, 0]
 
 
 def _reader(frames: list[Features]) -> Callable[[int], Features]:
