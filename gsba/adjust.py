@@ -3,9 +3,11 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import gtsam
 import numpy as np
+from scipy.special import gammaincinv
 
 from factors import BearingTerm, FaceCameras, LandmarkBlock, ReprojectionTerm, RobustLoss
 from gsba import graph, triangulate
@@ -81,10 +83,7 @@ def run(
     world_T_rigs, noise, rounds = start.world_T_rigs, start.noise, []
     rows = keypoints.rows(tracks)
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
-
-    def place(poses: np.ndarray, gate: float) -> Landmarks:
-        return triangulate.run(tracks, bearings, sigmas, poses, gate, settings.triangulate)
-
+    place = partial(triangulate.run, tracks, bearings, sigmas, settings=settings.triangulate)
     last_gate = gates[-1] * noise
     support = len(place(world_T_rigs, last_gate).tracks)
     for number, gate in enumerate(gates, 1):
@@ -98,7 +97,9 @@ def run(
         accepted = new_support >= settings.rounds.min_support * support
         if accepted:
             world_T_rigs, support = poses, new_support
-            noise = max(_noise(block, result.values, spread), settings.rounds.min_noise)
+            placed = place(poses, gate * noise)
+            if len(placed.tracks):
+                noise = max(_noise(placed, keypoints, poses), settings.rounds.min_noise)
         rounds.append(
             Round(
                 gate,
@@ -176,15 +177,25 @@ def pose_covariances(
     return marginal_covariances(held, [block], _values(adjustment.world_T_rigs), keys)
 
 
-def _noise(block: LandmarkBlock, values: gtsam.Values, noise: float) -> float:
-    """Noise in units of the features' sigmas: robust spread of residuals over its expectation."""
-    residuals = np.concatenate(block.residuals(values)[0]).ravel()
-    if len(residuals) == 0:
-        return noise
-    families = len(block.terms)  # each sees every observation, at a part of its information
-    unknowns = 3 * len(block.points_world) + 6 * len(block.pose_keys)
-    redundancy = max(1 - families * unknowns / len(residuals), _REDUNDANT)
-    return float(noise * 1.4826 * np.median(np.abs(residuals)) * np.sqrt(families / redundancy))
+def _noise(landmarks: Landmarks, keypoints: Keypoints, world_T_rigs: np.ndarray) -> float:
+    """Noise in units of the features' sigmas: what points leave over, against chi-square.
+
+    A point of n observations, placed by least squares, leaves 2n - 3 degrees of freedom. The
+    median over points of its squared residuals over the median of that distribution lets false
+    observations count little; poses take their share of the freedom from all points alike.
+    """
+    tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
+    offsets = landmarks.points_world[tracks.points] - world_T_rigs[tracks.frames, :3, 3]
+    rays = np.einsum(
+        "oij,oj->oi", world_T_rigs[tracks.frames, :3, :3], keypoints.bearings_rig[rows]
+    )
+    across = np.linalg.norm(np.cross(rays, offsets), axis=1)
+    angles = np.arctan2(across, np.einsum("oi,oi->o", rays, offsets))
+    squares = np.bincount(tracks.points, (angles / keypoints.sigmas_rad[rows]) ** 2)
+    freedom = 2 * np.bincount(tracks.points) - 3
+    expected = 2 * gammaincinv(freedom / 2, 0.5)  # median of chi-square
+    share = 1 - 6 * len(world_T_rigs) / freedom.sum()
+    return float(np.sqrt(np.median(squares / expected) / max(share, _REDUNDANT)))
 
 
 def _values(world_T_rigs: np.ndarray) -> gtsam.Values:

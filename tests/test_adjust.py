@@ -105,9 +105,41 @@ def test_false_observations_are_left_out_and_true_ones_kept(families: str) -> No
 @pytest.mark.parametrize("families", FAMILIES)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_noise_is_estimated(families: str, seed: int) -> None:
-    """To 15 %: the robust loss takes more than its share from small residuals."""
+    """To 20 %: the points follow what the Cauchy loss trusts, so that residuals are 15 % small."""
     _, _, solved, _ = _solved(families, seed)
-    assert solved.noise * CLAIMED == pytest.approx(SIGMA, rel=0.15)
+    assert solved.noise * CLAIMED == pytest.approx(SIGMA, rel=0.2)
+
+
+@pytest.mark.parametrize("families", FAMILIES)
+def test_the_noise_is_estimated_well_without_a_robust_loss(families: str) -> None:
+    """To 6 %: 7000 residuals give 1.5 %, the gates and the uneven redundancy of tracks the rest."""
+    world, coarse = _world()
+    solved = _run(world, coarse, _settings(families, solver={"loss": "none"}))
+    assert solved.noise * CLAIMED == pytest.approx(SIGMA, rel=0.06)
+
+
+def test_a_wide_gate_loosens_the_loss() -> None:
+    """Far from the solution a tight loss takes small steps, and believes what happens to fit."""
+    world, coarse = _world()
+    gate = (500.0,)
+    loose, tight = (
+        _run(world, coarse, _settings(rounds={"gate_scale": scale}), gate) for scale in (10, 1e9)
+    )
+    assert len(loose.rounds[0].iterations) < len(tight.rounds[0].iterations)
+    near = _position_rmse(loose.world_T_rigs, world.world_T_rigs)
+    assert near < 0.05 * _position_rmse(coarse, world.world_T_rigs)
+    # The loss is as wide as the gate, no wider: the noise found is that of the images.
+    assert loose.noise * CLAIMED == pytest.approx(SIGMA, rel=0.2)
+
+
+def test_a_narrow_gate_leaves_the_loss_alone() -> None:
+    world, _ = _world()
+    near = drifted(world.world_T_rigs, np.random.default_rng(0), amount=0.01)
+    once, never = (
+        _run(world, near, _settings(rounds={"gate_scale": scale}), (8.0,)) for scale in (10, 1e9)
+    )
+    np.testing.assert_array_equal(once.world_T_rigs, never.world_T_rigs)
+    assert once.noise == never.noise
 
 
 def test_families_agree() -> None:
