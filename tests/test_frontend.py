@@ -1,0 +1,60 @@
+"""Closing loops: known points where they must appear, not what looks like them elsewhere."""
+
+import numpy as np
+import pytest
+from synthetic import bearings_of, features_of, unit, with_noise
+
+from gsba import features, frontend
+from gsba.adjust import Adjustment
+from gsba.config import PairSettings, RefineSettings
+from gsba.geometry import pose
+from gsba.matching import SearchableFrames
+from gsba.types import Counts, Keypoints, Landmarks, Tracks, VerifiedPairs
+
+NUM = 300
+LAST = 5  # the frame that comes back
+STRIDE = 0.2  # the walk is 0.2 a step along x, the points are 2 to 4 away
+
+
+def _scene(shift: float) -> tuple[SearchableFrames, Keypoints, Adjustment]:
+    """A solved walk along x whose last frame sees, of every point, a copy moved along x."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(2, 4, (NUM, 1)) * unit(rng.normal(size=(NUM, 3)))
+    positions = np.outer(np.arange(LAST + 1), [STRIDE, 0, 0])
+    world_T_rigs = pose(np.tile(np.eye(3), (LAST + 1, 1, 1)), positions)
+    descriptors = (200 * rng.random((NUM, 64)) ** 4).astype(np.uint8)
+    shifts = np.zeros((LAST + 1, 3))
+    shifts[LAST, 0] = shift
+    frames = [
+        features_of(with_noise(bearings_of(points + moved, world_T_rig), 3e-4, rng), descriptors)
+        for moved, world_T_rig in zip(shifts, world_T_rigs, strict=True)
+    ]
+    which, seen_from = (grid.ravel() for grid in np.meshgrid(np.arange(NUM), np.arange(LAST)))
+    order = np.lexsort((seen_from, which))
+    which, seen_from = which[order].astype(np.int32), seen_from[order].astype(np.int32)
+    landmarks = Landmarks(points, Tracks(which, seen_from, which, NUM), Counts(NUM, NUM, "tracks"))
+    solved = Adjustment(world_T_rigs, landmarks, 1.0, ())
+    return SearchableFrames(frames.__getitem__), features.gather(frames), solved
+
+
+def _loops_to_last(shift: float, loop_deg: float = 2.0) -> tuple[VerifiedPairs, np.ndarray]:
+    """All loops, and the rows of those that end in the last frame."""
+    settings = RefineSettings(pairs=PairSettings(window=2, loop_deg=loop_deg))
+    found = frontend.match_loops(*_scene(shift), settings, 1)
+    return found, np.flatnonzero(found.matches.pairs[:, 1] == LAST)
+
+
+def test_loops_are_closed_by_known_points() -> None:
+    found, rows = _loops_to_last(shift=0)
+    assert found.matches.pairs[rows, 0].tolist() == [2, 1, 0]  # beyond the window, nearest first
+    for row in rows:
+        matched = found.matches.of(row)
+        assert len(matched) > 0.9 * NUM and (matched[:, 0] == matched[:, 1]).all()
+
+
+@pytest.mark.parametrize(("loop_deg", "fooled"), [(2.0, False), (180.0, True)])
+def test_look_alikes_at_a_distance_close_no_loop(loop_deg: float, fooled: bool) -> None:
+    """Copies as one would see the points from further along: two views alone cannot tell."""
+    found, rows = _loops_to_last(shift=-1.5, loop_deg=loop_deg)
+    assert (len(rows) > 0) == fooled
+    assert len(found.matches.pairs) - len(rows) == 3  # 0-3, 0-4 and 1-4 are what they seem
