@@ -322,11 +322,7 @@ class _Line:
         lost = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
         if len(lost):
             notes.append(f"matched nothing, held by the trajectory alone: {self._names(lost)}")
-        undone = [
-            name
-            for name, solved in self.solutions.items()
-            if not all(attempt.accepted for attempt in solved.rounds)
-        ]
+        undone = [n for n, s in self.solutions.items() if not all(r.accepted for r in s.rounds)]
         if undone:
             notes.append(f"rounds were undone in {', '.join(undone)}: they explained less")
         for note in notes:
