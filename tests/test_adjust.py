@@ -105,17 +105,15 @@ def test_false_observations_are_left_out_and_true_ones_kept(families: str) -> No
 @pytest.mark.parametrize("families", FAMILIES)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_noise_is_estimated(families: str, seed: int) -> None:
-    """To 20 %: the points follow what the Cauchy loss trusts, so that residuals are 15 % small."""
+    """To 8 %: it comes out some 5 % small on these worlds."""
     _, _, solved, _ = _solved(families, seed)
-    assert solved.noise * CLAIMED == pytest.approx(SIGMA, rel=0.2)
+    assert solved.noise * CLAIMED == pytest.approx(SIGMA, rel=0.08)
 
 
-@pytest.mark.parametrize("families", FAMILIES)
-def test_the_noise_is_estimated_well_without_a_robust_loss(families: str) -> None:
-    """To 6 %: 7000 residuals give 1.5 %, the gates and the uneven redundancy of tracks the rest."""
-    world, coarse = _world()
-    solved = _run(world, coarse, _settings(families, solver={"loss": "none"}))
-    assert solved.noise * CLAIMED == pytest.approx(SIGMA, rel=0.06)
+def test_the_noise_does_not_depend_on_the_loss() -> None:
+    world, coarse, robust, _ = _solved("bearing")
+    plain = _run(world, coarse, _settings(solver={"loss": "none"}))
+    assert robust.noise == pytest.approx(plain.noise, rel=0.03)
 
 
 def test_a_wide_gate_loosens_the_loss() -> None:
