@@ -7,9 +7,15 @@ from functools import partial
 
 import gtsam
 import numpy as np
-from scipy.special import gammaincinv
 
-from factors import BearingTerm, FaceCameras, LandmarkBlock, ReprojectionTerm, RobustLoss
+from factors import (
+    BearingTerm,
+    FaceCameras,
+    LandmarkBlock,
+    ReprojectionTerm,
+    RobustLoss,
+    bearing_residuals,
+)
 from gsba import graph, triangulate
 from gsba.config import RefineSettings, SolverSettings
 from gsba.optimize import Iteration, marginal_covariances, optimize
@@ -178,24 +184,18 @@ def pose_covariances(
 
 
 def _noise(landmarks: Landmarks, keypoints: Keypoints, world_T_rigs: np.ndarray) -> float:
-    """Noise in units of the features' sigmas: what points leave over, against chi-square.
+    """Noise in units of the features' sigmas: robust spread of residuals over its expectation.
 
-    A point of n observations, placed by least squares, leaves 2n - 3 degrees of freedom. The
-    median over points of its squared residuals over the median of that distribution lets false
-    observations count little; poses take their share of the freedom from all points alike.
+    The points are placed by least squares: under the robust loss of the adjustment they would lie
+    closer to most of their observations than the noise allows.
     """
     tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
-    offsets = landmarks.points_world[tracks.points] - world_T_rigs[tracks.frames, :3, 3]
-    rays = np.einsum(
-        "oij,oj->oi", world_T_rigs[tracks.frames, :3, :3], keypoints.bearings_rig[rows]
-    )
-    across = np.linalg.norm(np.cross(rays, offsets), axis=1)
-    angles = np.arctan2(across, np.einsum("oi,oi->o", rays, offsets))
-    squares = np.bincount(tracks.points, (angles / keypoints.sigmas_rad[rows]) ** 2)
-    freedom = 2 * np.bincount(tracks.points) - 3
-    expected = 2 * gammaincinv(freedom / 2, 0.5)  # median of chi-square
-    share = 1 - 6 * len(world_T_rigs) / freedom.sum()
-    return float(np.sqrt(np.median(squares / expected) / max(share, _REDUNDANT)))
+    points, bearings = landmarks.points_world[tracks.points], keypoints.bearings_rig[rows]
+    residuals, _, _ = bearing_residuals(world_T_rigs[tracks.frames], points, bearings)
+    unknowns = 3 * landmarks.tracks.num_points + 6 * len(world_T_rigs)
+    redundancy = max(1 - unknowns / residuals.size, _REDUNDANT)
+    spread = 1.4826 * np.median(np.abs(residuals / keypoints.sigmas_rad[rows, None]))
+    return float(spread / np.sqrt(redundancy))
 
 
 def _values(world_T_rigs: np.ndarray) -> gtsam.Values:

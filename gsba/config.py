@@ -95,9 +95,9 @@ class RoundSettings(_Settings):
     """Triangulate, adjust, filter: gates in standard deviations of the observations' noise."""
 
     chain: tuple[float, ...] = (60.0, 8.0)  # from the coarse trajectory
-    dense: tuple[float, ...] = (8.0, 4.0)  # with matches along the solved chain
-    loops: tuple[float, ...] = (100.0, 20.0, 6.0)  # with loops closed
-    refined: tuple[float, ...] = (8.0, 4.0, 3.0)  # with matches along the solved map
+    dense: tuple[float, ...] = (6.0, 3.0)  # with matches along the solved chain
+    loops: tuple[float, ...] = (100.0, 20.0, 4.0)  # with loops closed
+    refined: tuple[float, ...] = (6.0, 3.0, 2.5)  # with matches along the solved map
     map_passes: int = Field(default=1, ge=1)  # times the closed map is matched anew
     gate_scale: float = Field(default=10.0, ge=1)  # wider gates loosen the loss in proportion
     tolerance: float = Field(default=1e-3, gt=0, lt=1)  # solver's, in all rounds but a stage's last
@@ -124,7 +124,7 @@ class SolverSettings(_Settings):
     max_iterations: int = Field(default=50, ge=1)
     relative_tolerance: float = Field(default=1e-5, gt=0, lt=1)  # least decrease of the cost
     loss: Literal["none", "huber", "cauchy", "geman_mcclure"] = "cauchy"
-    loss_sigmas: float = Field(default=1.4, gt=0)  # scale of the loss, standard deviations
+    loss_sigmas: float = Field(default=1.0, gt=0)  # scale of the loss, standard deviations
     lambda_initial: float = Field(default=1e-4, gt=0)  # damping, part of the diagonal
     num_threads: int | None = Field(default=None, ge=1)  # None = all cores
 
