@@ -81,18 +81,35 @@ def match_loops(
     return verify.run(found, keypoints, f0_T_f1s, drifts, settings.verify, settings.seed)
 
 
-def match_map(
+def match_along_epipolars(
+    frames: SearchableFrames, solved: Adjustment, settings: RefineSettings, num_threads: int
+) -> Matches:
+    """Match neighbours in time again, along the epipolar lines of poses that are nearly right.
+
+    Args:
+        frames: features of all frames.
+        solved: the current solution.
+        settings: of pairs and matching.
+        num_threads: pairs matched at a time.
+    """
+    chosen, refined = pairs.adjacent(len(solved.world_T_rigs)), settings.pairs.refined
+    gates = [_gate(refined.rotation_deg, refined.direction, settings)] * len(chosen)
+    poses = solved.world_T_rigs
+    return matching.run(chosen, poses, gates, frames, settings.matching, num_threads)
+
+
+def match_known_points(
     frames: SearchableFrames,
     keypoints: Keypoints,
     solved: Adjustment,
     settings: RefineSettings,
     num_threads: int,
     loops_closed: bool,
-) -> tuple[Matches, ...]:
-    """Match again from poses and points that are nearly right; prediction is the verification.
+) -> Matches:
+    """Match frames further apart only where a known point must appear.
 
-    Neighbours in time are matched along epipolar lines; all other pairs only where a known point
-    must appear. So what merely looks alike elsewhere, a column further on, is not a candidate.
+    Prediction is the verification: what merely looks alike elsewhere, a column further on, is not
+    a candidate.
 
     Args:
         frames, keypoints: features of all frames.
@@ -100,39 +117,15 @@ def match_map(
         settings: of pairs and matching.
         num_threads: pairs matched at a time.
         loops_closed: whether frames far apart in time are predictable too.
-
-    Returns:
-        Matches of neighbours and matches of known points, the more trusted first.
     """
-    world_T_rigs = solved.world_T_rigs
-    neighbours = pairs.adjacent(len(world_T_rigs))
-    near, loops = pairs.covisible(world_T_rigs[:, :3, 3], median_depth(solved), settings.pairs)
-    wide = near[near[:, 1] - near[:, 0] > 2]
+    poses = solved.world_T_rigs
+    near, loops = pairs.covisible(poses[:, :3, 3], median_depth(solved), settings.pairs)
+    chosen = near[near[:, 1] - near[:, 0] > 2]
     if loops_closed:
-        wide = np.concatenate([wide, loops])
-    refined = settings.pairs.refined
-    band = _gate(refined.rotation_deg, refined.direction, settings)
-    point = _point_gate(np.deg2rad(settings.pairs.point_deg))
+        chosen = np.concatenate([chosen, loops])
+    gates = [_point_gate(np.deg2rad(settings.pairs.point_deg))] * len(chosen)
     known = points_by_keypoint(solved, keypoints)
-    return (
-        matching.run(
-            neighbours,
-            world_T_rigs,
-            [band] * len(neighbours),
-            frames,
-            settings.matching,
-            num_threads,
-        ),
-        matching.run(
-            wide,
-            world_T_rigs,
-            [point] * len(wide),
-            frames,
-            settings.matching,
-            num_threads,
-            known,
-        ),
-    )
+    return matching.run(chosen, poses, gates, frames, settings.matching, num_threads, known)
 
 
 def median_depth(solved: Adjustment) -> float:

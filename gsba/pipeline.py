@@ -1,6 +1,5 @@
 """A run from frames and a coarse trajectory to refined poses, a cloud and datasets."""
 
-import logging
 import os
 import uuid
 from collections.abc import Callable, Iterable, Sequence
@@ -19,7 +18,7 @@ from gsba.export import ExportFormat, export, write_points
 from gsba.log import GsbaError
 from gsba.matching import SearchableFrames
 from gsba.reconstruction import assemble
-from gsba.report import build_report, write_poses, write_report
+from gsba.report import build_report, take_notes, write_poses, write_report
 from gsba.store import PerFrame, RunStore, atomic_write, fingerprint, load_stage
 from gsba.types import (
     CoarsePoses,
@@ -28,14 +27,10 @@ from gsba.types import (
     FrameSet,
     Keypoints,
     Matches,
-    PoseSource,
-    PoseStatus,
     Reconstruction,
     Trajectory,
     VerifiedPairs,
 )
-
-logger = logging.getLogger(__name__)
 
 ExtraFactors = Callable[[CoarsePoses], Iterable[gtsam.NonlinearFactor]]
 T = TypeVar("T")
@@ -96,13 +91,14 @@ def refine(
         line = _Line(store, frame_set, coarse, settings, extra_factors)
         neighbours, rounds = line.match_neighbours(), settings.rounds
         solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)
-        near = line.match_map("near", solved, loops_closed=False)
-        solved = line.solve("dense", near, solved, rounds.dense)
+        adjacent = line.match_along_epipolars(solved)
+        near = line.match_known_points("near", solved, loops_closed=False)
+        solved = line.solve("dense", [adjacent, near], solved, rounds.dense)
         loops = line.match_loops(solved)
-        solved = line.solve("closed", [*near, loops.matches], solved, rounds.loops)
+        solved = line.solve("closed", [adjacent, near, loops.matches], solved, rounds.loops)
         for number in range(1, rounds.map_passes + 1):
-            everywhere = line.match_map(f"everywhere{number}", solved, loops_closed=True)
-            solved = line.solve(f"refined{number}", everywhere, solved, rounds.refined)
+            wide = line.match_known_points(f"everywhere{number}", solved, loops_closed=True)
+            solved = line.solve(f"refined{number}", [adjacent, wide], solved, rounds.refined)
         reconstruction = line.reconstruct(solved)
         return line.write(reconstruction)
 
@@ -222,12 +218,23 @@ class _Line:
         self.counts["loops"] = [pairs.counts]
         return pairs
 
-    def match_map(self, name: str, solved: Adjustment, loops_closed: bool) -> tuple[Matches, ...]:
-        """Matches predicted by the solved map."""
+    def match_along_epipolars(self, solved: Adjustment) -> Matches:
+        """Matches of neighbours in time along their solved epipolar lines."""
+        return self._stage(
+            "adjacent",
+            self._matching(),
+            lambda: frontend.match_along_epipolars(
+                self.searchable, solved, self.settings, self.num_threads
+            ),
+            Matches,
+        )
+
+    def match_known_points(self, name: str, solved: Adjustment, loops_closed: bool) -> Matches:
+        """Matches of solved points in frames further apart."""
         return self._stage(
             name,
             self._matching(),
-            lambda: frontend.match_map(
+            lambda: frontend.match_known_points(
                 self.searchable,
                 self.keypoints,
                 solved,
@@ -235,7 +242,7 @@ class _Line:
                 self.num_threads,
                 loops_closed,
             ),
-            tuple[Matches, ...],
+            Matches,
         )
 
     def solve(
@@ -283,6 +290,8 @@ class _Line:
         atomic_write(out / "config.toml", lambda path: path.write_text(to_toml(settings)))
         for name in settings.export.formats:
             self._export(ExportFormat(name), reconstruction)
+        undone = [n for n, s in self.solutions.items() if not all(r.accepted for r in s.rounds)]
+        notes = take_notes(self.frames, self.coarse, reconstruction, undone)
         report = build_report(
             settings=settings,
             frames=self.frames,
@@ -292,7 +301,7 @@ class _Line:
             counts=self.counts,
             solver=[{"stage": name, "rounds": s.rounds} for name, s in self.solutions.items()],
             gauge=_GAUGE,
-            notes=self._notes(reconstruction),
+            notes=notes,
         )
         write_report(out / "report.json", report)
         for name in ("trajectory.tum", "poses.csv", "points.ply", "config.toml", "report.json"):
@@ -310,28 +319,6 @@ class _Line:
 
         self.store.stage(name, self.settings.export.face_size, compute, Counts, [self.latest])
         self.store.claim(folder)
-
-    def _notes(self, reconstruction: Reconstruction) -> list[str]:
-        """What the user should know, also logged."""
-        notes = []
-        if self.coarse.time_offset:
-            notes.append(f"frame times were shifted by {self.coarse.time_offset:.6f} s")
-        filled = np.flatnonzero(self.coarse.sources != PoseSource.SLAM)
-        if len(filled):
-            notes.append(f"no SLAM pose, started from neighbours: {self._names(filled)}")
-        lost = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
-        if len(lost):
-            notes.append(f"matched nothing, held by the trajectory alone: {self._names(lost)}")
-        undone = [n for n, s in self.solutions.items() if not all(r.accepted for r in s.rounds)]
-        if undone:
-            notes.append(f"rounds were undone in {', '.join(undone)}: they explained less")
-        for note in notes:
-            logger.warning(note)
-        return notes
-
-    def _names(self, frames: np.ndarray) -> str:
-        names = ", ".join(self.frames.names[f] for f in frames[:20])
-        return names if len(frames) <= 20 else f"{names} and {len(frames) - 20} more"
 
     def _matching(self) -> list[object]:
         settings = self.settings

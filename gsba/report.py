@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import logging
 import math
 import os
 import platform
@@ -20,6 +21,8 @@ from gsba import __version__
 from gsba.geometry import inverse, quaternion_from_rotation
 from gsba.store import StageRecord, atomic_write
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
+
+logger = logging.getLogger(__name__)
 
 _PACKAGES = ("gtsam", "numpy", "numba", "scipy", "opencv-python-headless", "pycolmap")
 _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # of a pose covariance
@@ -82,6 +85,39 @@ def angular_residuals(reconstruction: Reconstruction) -> np.ndarray:
     bearings = reconstruction.observation_bearings
     across = np.linalg.norm(np.cross(bearings, points_rig), axis=1)
     return np.arctan2(across, np.einsum("oi,oi->o", bearings, points_rig))
+
+
+def take_notes(
+    frames: FrameSet,
+    coarse: CoarsePoses,
+    reconstruction: Reconstruction,
+    undone: Sequence[str],
+) -> list[str]:
+    """What the user should know about a run, also logged as warnings.
+
+    Args:
+        undone: stages in which a round of bundle adjustment was undone.
+    """
+    filled = np.flatnonzero(coarse.sources != PoseSource.SLAM)
+    lost = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
+    notes = []
+    if coarse.time_offset:
+        notes.append(f"frame times were shifted by {coarse.time_offset:.6f} s")
+    if len(filled):
+        notes.append(f"no SLAM pose, started from neighbours: {_names(frames, filled)}")
+    if len(lost):
+        notes.append(f"matched nothing, held by the trajectory alone: {_names(frames, lost)}")
+    if undone:
+        notes.append(f"rounds were undone in {', '.join(undone)}: they explained less")
+    for note in notes:
+        logger.warning(note)
+    return notes
+
+
+def _names(frames: FrameSet, chosen: np.ndarray) -> str:
+    """The first twenty names, and how many more."""
+    names = ", ".join(frames.names[f] for f in chosen[:20])
+    return names if len(chosen) <= 20 else f"{names} and {len(chosen) - 20} more"
 
 
 def build_report(
