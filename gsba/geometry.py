@@ -76,6 +76,22 @@ def inverse(a_T_b: np.ndarray) -> np.ndarray:
     return pose(b_R_a, -np.einsum("...ij,...j->...i", b_R_a, a_T_b[..., :3, 3]))
 
 
+def angular_errors(
+    world_T_rigs: np.ndarray, points_world: np.ndarray, bearings_rig: np.ndarray
+) -> np.ndarray:
+    """Angles (O,) in radians between observed bearings and the directions to their points.
+
+    Args:
+        world_T_rigs: (O, 4, 4) pose of each observation's frame.
+        points_world: (O, 3) point of each observation.
+        bearings_rig: (O, 3) unit, rig frame.
+    """
+    rays = np.einsum("oij,oj->oi", world_T_rigs[:, :3, :3], bearings_rig)
+    offsets = points_world - world_T_rigs[:, :3, 3]
+    across = np.linalg.norm(np.cross(rays, offsets), axis=1)
+    return np.arctan2(across, np.einsum("oi,oi->o", rays, offsets))
+
+
 def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Least-squares Sim(3) with target = scale * rotation @ source + translation.
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from gsba.adjust import Adjustment
-from gsba.geometry import pose, pose_similarity
+from gsba.geometry import angular_errors, pose, pose_similarity
 from gsba.types import CoarsePoses, Keypoints, PoseSource, PoseStatus, Reconstruction
 
 
@@ -38,7 +38,8 @@ def assemble(
     points = landmarks.tracks.points
     lengths = np.bincount(points, minlength=len(landmarks.points_world))
     bearings = keypoints.bearings_rig[rows]
-    errors = _angles(adjustment, bearings)
+    poses = world_T_rigs[landmarks.tracks.frames]
+    errors = angular_errors(poses, landmarks.points_world[points], bearings)
     colors = np.column_stack(
         [
             np.bincount(points, keypoints.colors[rows, channel], len(lengths)) / lengths
@@ -57,13 +58,3 @@ def assemble(
         bearings,
         adjustment.noise * keypoints.sigmas_rad[rows],
     )
-
-
-def _angles(adjustment: Adjustment, bearings_rig: np.ndarray) -> np.ndarray:
-    """Angles (O,) in radians between observed bearings and the directions to their points."""
-    tracks = adjustment.landmarks.tracks
-    world_T_rig = adjustment.world_T_rigs[tracks.frames]
-    rays = np.einsum("oij,oj->oi", world_T_rig[:, :3, :3], bearings_rig)
-    offsets = adjustment.landmarks.points_world[tracks.points] - world_T_rig[:, :3, 3]
-    across = np.linalg.norm(np.cross(rays, offsets), axis=1)
-    return np.arctan2(across, np.einsum("oi,oi->o", rays, offsets))

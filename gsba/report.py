@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from gsba import __version__
-from gsba.geometry import inverse, quaternion_from_rotation
+from gsba.geometry import angular_errors, quaternion_from_rotation
 from gsba.store import StageRecord, atomic_write
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
 
@@ -78,13 +78,11 @@ def median_residual_deg(reconstruction: Reconstruction, world_T_rigs: np.ndarray
 
 def angular_residuals(reconstruction: Reconstruction) -> np.ndarray:
     """Angles (O,) in radians between each observed bearing and the direction to its point."""
-    rig_T_worlds = inverse(reconstruction.world_T_rigs)[reconstruction.observation_frames]
-    points_world = reconstruction.points_world[reconstruction.observation_points]
-    points_rig = np.einsum("oij,oj->oi", rig_T_worlds[:, :3, :3], points_world)
-    points_rig += rig_T_worlds[:, :3, 3]
-    bearings = reconstruction.observation_bearings
-    across = np.linalg.norm(np.cross(bearings, points_rig), axis=1)
-    return np.arctan2(across, np.einsum("oi,oi->o", bearings, points_rig))
+    return angular_errors(
+        reconstruction.world_T_rigs[reconstruction.observation_frames],
+        reconstruction.points_world[reconstruction.observation_points],
+        reconstruction.observation_bearings,
+    )
 
 
 def take_notes(

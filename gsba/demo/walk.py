@@ -11,8 +11,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from gsba.demo.degrade import degrade
-from gsba.geometry import bearings_from_erp, pose, quaternion_from_rotation
+from gsba.geometry import bearings_from_erp, pose
 from gsba.log import GsbaError, track
+from gsba.read import write_tum
 from gsba.types import Trajectory
 
 WalkPath = Literal["rectangle", "oval", "open"]
@@ -74,8 +75,8 @@ def make_walk(
     _write_frames(partial, scene, truth, width, seed)
     if depth:
         _write_depth(partial / "depth", scene, truth, width // 4)
-    _write_tum(partial / "groundtruth.tum", truth)
-    _write_tum(partial / "slam.tum", degrade(truth, seed))
+    write_tum(partial / "groundtruth.tum", truth)
+    write_tum(partial / "slam.tum", degrade(truth, seed))
     if out.exists():
         shutil.rmtree(out)
     partial.rename(out)
@@ -196,13 +197,6 @@ def _write_depth(folder: Path, scene, truth: Trajectory, width: int) -> None:
         hit = ranges(scene, world_T_rig[:3, 3], bearings @ world_T_rig[:3, :3].T)
         depth = hit.reshape(u.shape).astype(np.float32)
         np.savez_compressed(folder / f"{f:06d}.npz", range=depth)
-
-
-def _write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Lines of timestamp, position and quaternion xyzw of world_T_rig."""
-    xyzw = quaternion_from_rotation(trajectory.world_T_rigs[:, :3, :3])[:, [1, 2, 3, 0]]
-    rows = np.column_stack([trajectory.timestamps, trajectory.world_T_rigs[:, :3, 3], xyzw])
-    np.savetxt(path, rows, fmt="%.9f")
 
 
 def _check(out: Path, path: str, heading: str, num_frames: int, width: int) -> None:
