@@ -21,7 +21,7 @@ FLOORS = (
     | {"graph", "optimize", "filter"},
     {"adjust", "frontend", "reconstruction"},
     {"export", "evaluate", "report"},
-    {"demo", "pipeline"},
+    {"demo", "line", "pipeline"},
     {"cli"},
     {"benchmarks"},
 )

@@ -1,0 +1,11 @@
+"""The command line. Commands parse, call and print; heavy imports stay in their bodies."""
+
+from gsba.cli import refining, results
+from gsba.cli.app import app
+
+__all__ = ["app", "main", "refining", "results"]
+
+
+def main() -> None:
+    """Entry point of the `gsba` script."""
+    app()

@@ -1,0 +1,65 @@
+"""Commands on finished runs: `export`, `evaluate`."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gsba.cli.app import command
+from gsba.log import GsbaError
+
+
+@command
+def export(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
+    to: Annotated[
+        str,
+        typer.Option(
+            help="colmap, colmap-flat, colmap-erp, nerfstudio, ply or tum.", metavar="FORMAT"
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write; RUN/FORMAT by default.")
+    ] = None,
+    face_size: Annotated[int | None, typer.Option(help="Pixels of a cube face.")] = None,
+) -> None:
+    """Write a finished run as a dataset for another program."""
+    from gsba.export import ExportFormat
+    from gsba.export import export as write
+    from gsba.run_folder import claim
+
+    if to not in list(ExportFormat):
+        raise GsbaError(f"--to {to} is not known: use one of {', '.join(ExportFormat)}")
+    if face_size is not None and face_size < 1:
+        raise GsbaError(f"--face-size {face_size} is out of range: use 1 or more pixels")
+    from gsba.pipeline import load_run
+
+    reconstruction, frames, *_ = load_run(run)
+    folder = out or run / to
+    write(reconstruction, frames, folder, ExportFormat(to), face_size)
+    if folder.resolve().is_relative_to(run.resolve()):
+        claim(run.resolve(), folder.resolve())
+    typer.echo(f"{to}: {folder}")
+
+
+@command
+def evaluate(
+    estimate: Annotated[Path, typer.Argument(help="A run, or a trajectory file.", metavar="RUN")],
+    truth: Annotated[Path, typer.Option(help="True trajectory (TUM).")],
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the numbers here too.", metavar="FILE")
+    ] = None,
+) -> None:
+    """Compare a run or a trajectory with the truth."""
+    from gsba.evaluate import evaluate as compare
+    from gsba.evaluate import format_table
+    from gsba.read import read_trajectory
+    from gsba.records import atomic_write
+
+    path = estimate / "trajectory.tum" if estimate.is_dir() else estimate
+    errors = compare(read_trajectory(path), read_trajectory(truth))
+    if json_file is not None:
+        text = json.dumps(errors.to_json(), indent=1) + "\n"
+        atomic_write(json_file, lambda temporary: temporary.write_text(text))
+    typer.echo(format_table({estimate.name: errors}))
