@@ -1,0 +1,162 @@
+"""Compiled elimination of patches' planes from the models of their observations."""
+
+import numpy as np
+from numba import njit
+
+_kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+
+
+@_kernel
+def _to_poses(host, target, by_host, by_target):
+    """Rows (6, 6) that carry right steps of both poses into the tangent (phi, tau).
+
+    phi = A w_host - w_target and tau = A v_host - v_target + c x w_target.
+    """
+    by_host[:] = 0.0
+    by_target[:] = 0.0
+    x, y, z = host[9] - target[9], host[10] - target[10], host[11] - target[11]
+    cx = target[0] * x + target[3] * y + target[6] * z
+    cy = target[1] * x + target[4] * y + target[7] * z
+    cz = target[2] * x + target[5] * y + target[8] * z
+    for i in range(3):
+        by_target[i, i] = -1.0
+        by_target[3 + i, 3 + i] = -1.0
+        for k in range(3):
+            a = target[i] * host[k] + target[3 + i] * host[3 + k] + target[6 + i] * host[6 + k]
+            by_host[i, k] = a
+            by_host[3 + i, 3 + k] = a
+    by_target[3, 1], by_target[3, 2] = -cz, cy
+    by_target[4, 0], by_target[4, 2] = cz, -cx
+    by_target[5, 0], by_target[5, 1] = -cy, cx
+
+
+@_kernel
+def _invert(V, out):
+    """Inverse of a symmetric positive definite 3x3, damped by 1e-12 of its trace."""
+    eps = 1e-12 * (V[0, 0] + V[1, 1] + V[2, 2]) + 1e-200
+    a, b, c = V[0, 0] + eps, V[0, 1], V[0, 2]
+    d, e, f = V[1, 1] + eps, V[1, 2], V[2, 2] + eps
+    l00 = np.sqrt(a)
+    l10, l20 = b / l00, c / l00
+    l11 = np.sqrt(max(d - l10 * l10, eps))
+    l21 = (e - l10 * l20) / l11
+    l22 = np.sqrt(max(f - l20 * l20 - l21 * l21, eps))
+    i00, i11, i22 = 1 / l00, 1 / l11, 1 / l22
+    i10, i21 = -l10 * i00 * i11, -l21 * i11 * i22
+    i20 = -(l20 * i00 + l21 * i10) * i22
+    out[0, 0] = i00 * i00 + i10 * i10 + i20 * i20
+    out[0, 1] = out[1, 0] = i10 * i11 + i20 * i21
+    out[0, 2] = out[2, 0] = i20 * i22
+    out[1, 1] = i11 * i11 + i21 * i21
+    out[1, 2] = out[2, 1] = i21 * i22
+    out[2, 2] = i22 * i22
+
+
+@_kernel
+def _add_product(P, G, Q, out):
+    """out += P^T G Q for 6x6 P, Q and the pose part of a (9, 9) Hessian."""
+    GQ = np.zeros((6, 6))
+    for i in range(6):
+        for k in range(6):
+            factor = G[3 + i, 3 + k]
+            for j in range(6):
+                GQ[i, j] += factor * Q[k, j]
+    for k in range(6):
+        for i in range(6):
+            factor = P[k, i]
+            for j in range(6):
+                out[i, j] += factor * GQ[k, j]
+
+
+@_kernel
+def _add_coupling(P, G, g, W, gradient):
+    """W (3, 6) += plane-by-pose part of G through P; the pose's gradient (6) likewise."""
+    for k in range(6):
+        for j in range(6):
+            gradient[j] += P[k, j] * g[3 + k]
+            for i in range(3):
+                W[i, j] += G[i, 3 + k] * P[k, j]
+
+
+@_kernel
+def _add_pair(f, g, block, row_starts, columns, off_diagonal):
+    """Add H[f, g] to the pairs, which hold the upper half."""
+    low, high = min(f, g), max(f, g)
+    first, last = row_starts[low], row_starts[low + 1]
+    while last - first > 1:  # columns of a row ascend
+        middle = (first + last) // 2
+        if columns[middle] <= high:
+            first = middle
+        else:
+            last = middle
+    out = off_diagonal[first]
+    for i in range(6):
+        for j in range(6):
+            out[i, j] += block[i, j] if f < g else block[j, i]
+
+
+@_kernel
+def eliminate_range(
+    first, last, hosts, offsets, targets, poses, hessians, gradients, priors, row_starts, columns,
+    diagonal, off_diagonal, gradient, couplings, inverses, plane_gradients,
+):  # fmt: skip
+    """Add patches first..last, their planes eliminated, to a reduced pose system.
+
+    Args:
+        hessians (O, 9, 9), gradients (O, 9): models of the observations in their own tangents.
+        priors (P, 6): weights (3) on the plane, then its gradient (3).
+        row_starts (F + 1,), columns (Q,): frame pairs i < k as sorted CSR rows.
+        diagonal (F, 6, 6), off_diagonal (Q, 6, 6), gradient (F, 6): accumulated.
+        couplings (P + O, 3, 6): written, rows offsets[p] + p of the host, then of the targets.
+        inverses (P, 3, 3), plane_gradients (P, 3): written; with the couplings they give the
+            step of a plane, -inverse (gradient + sum of coupling @ pose step).
+    """
+    by_host, by_target = np.empty((6, 6)), np.empty((6, 6))
+    V, block, Y = np.empty((3, 3)), np.empty((6, 6)), np.empty((6, 3))
+    for p in range(first, last):
+        host, row = hosts[p], offsets[p] + p
+        num = offsets[p + 1] - offsets[p]
+        W = couplings[row : row + num + 1]
+        W[:] = 0.0
+        V[:] = 0.0
+        down = plane_gradients[p]
+        for k in range(3):
+            V[k, k] = priors[p, k]
+            down[k] = priors[p, 3 + k]
+        for i in range(num):
+            o = offsets[p] + i
+            target, G, g = targets[o], hessians[o], gradients[o]
+            _to_poses(poses[host], poses[target], by_host, by_target)
+            _add_product(by_host, G, by_host, diagonal[host])
+            _add_product(by_target, G, by_target, diagonal[target])
+            block[:] = 0.0
+            _add_product(by_host, G, by_target, block)
+            _add_pair(host, target, block, row_starts, columns, off_diagonal)
+            _add_coupling(by_host, G, g, W[0], gradient[host])
+            _add_coupling(by_target, G, g, W[i + 1], gradient[target])
+            for k in range(3):
+                down[k] += g[k]
+                for j in range(3):
+                    V[k, j] += G[k, j]
+        inverse = inverses[p]
+        _invert(V, inverse)
+        for i in range(num + 1):
+            f = host if i == 0 else targets[offsets[p] + i - 1]
+            for r in range(6):
+                for k in range(3):
+                    Y[r, k] = (
+                        W[i, 0, r] * inverse[0, k] + W[i, 1, r] * inverse[1, k]
+                        + W[i, 2, r] * inverse[2, k]
+                    )  # fmt: skip
+                gradient[f, r] -= Y[r, 0] * down[0] + Y[r, 1] * down[1] + Y[r, 2] * down[2]
+            for k in range(i, num + 1):
+                for r in range(6):
+                    for c in range(6):
+                        block[r, c] = -(
+                            Y[r, 0] * W[k, 0, c] + Y[r, 1] * W[k, 1, c] + Y[r, 2] * W[k, 2, c]
+                        )
+                if k == i:
+                    diagonal[f] += block
+                else:
+                    other = targets[offsets[p] + k - 1]
+                    _add_pair(f, other, block, row_starts, columns, off_diagonal)

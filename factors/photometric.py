@@ -1,0 +1,354 @@
+"""Photometric family: patches of one frame seen in others, their planes eliminated, two doors."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from dataclasses import replace
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+
+from factors._photometric_host import host_factors
+from factors._photometric_kernels import DIMS, PatchData, observe_range
+from factors._photometric_schur import eliminate_range
+from factors._terms import pose_rows
+from factors.block import PoseSystem
+from factors.patches import PatchPixels, patch_axes, patch_spans
+from factors.robust import RobustLoss
+
+FAMILY = "photometric"
+_LEAST_SHARE = 0.2  # of its inverse depth is what one step leaves a patch at least
+_LEAST_COSINE = 0.15  # of the angle between a patch's normal and the ray that sees it
+_MOST_ZOOM = 2.0  # change of a patch's size between host and target, either way
+
+
+class PhotometricBlock:
+    """Patches of any number of frames, each with an inverse-depth plane of its own.
+
+    Implements `factors.block.Block`; `factors()` opens the other door. Which observations count
+    is settled by `refresh`, at accepted values only: those that see a patch from behind or at a
+    grazing angle, far larger or smaller, or beyond their window are left out and counted. A plane
+    never leaves the front of its host: no step takes more than 80% of an inverse depth.
+
+    Attributes:
+        pose_keys: (F,) keys of the Pose3 variables `world_T_rig`.
+        pairs: (Q, 2) int64, rows f < g of pose_keys that share a patch.
+        planes: (P, 3) float64, current inverse-depth planes.
+        dropped: reason -> observations left out by the last `refresh`.
+    """
+
+    def __init__(
+        self,
+        pose_keys: Sequence[int],
+        pixels: PatchPixels,
+        sigmas: np.ndarray | float,
+        loss: RobustLoss | None = None,
+        weights: np.ndarray | None = None,
+        num_threads: int | None = None,
+        polish_steps: int = 0,
+        floor: float = 0.25,
+    ) -> None:
+        """Normalise the templates.
+
+        Args:
+            pose_keys: (F,) keys of Pose3 variables.
+            pixels: templates and windows, of all frames that the table names.
+            sigmas: (P,) or one, grey values of a pixel in the host: noise of a residual.
+            loss: robust loss on the root mean square of a patch's whitened residuals, times the
+                number of its pixels; None is plain least squares.
+            weights: (O,) of the observations' costs, 0 leaves one out; None is 1.
+            num_threads: None takes the cores there are, at most 16.
+            polish_steps: Gauss-Newton steps on the planes after each proposed pose step.
+            floor: grey values added to every contrast in quadrature.
+
+        Raises:
+            ValueError: frames that are no poses, sigmas or weights that are none.
+        """
+        table = pixels.table
+        self.pose_keys = [int(key) for key in pose_keys]
+        table.check(len(self.pose_keys))
+        self.table, self.planes = table, table.planes.copy()
+        self.loss, self.polish_steps = loss or RobustLoss(), polish_steps
+        self.num_threads = max(1, num_threads or min(16, os.cpu_count() or 1))
+        self.dropped: dict[str, int] = {}
+        sigmas = np.broadcast_to(np.asarray(sigmas, dtype=np.float64), (len(table),))
+        if not np.all(np.isfinite(sigmas) & (sigmas > 0)):
+            raise ValueError("sigmas must be positive and finite")
+        base = np.ones(len(table.targets)) if weights is None else np.asarray(weights, float)
+        if base.shape != (len(table.targets),) or not np.all(np.isfinite(base) & (base >= 0)):
+            raise ValueError(f"weights must be ({len(table.targets)},), finite, not negative")
+        self._weights = base
+        values = pixels.templates.astype(np.float64)
+        values -= values.mean(axis=1, keepdims=True)
+        norms = np.sqrt(np.einsum("pn,pn->p", values, values) + values.shape[1] * floor**2)
+        self._data = PatchData(
+            table.hosts.astype(np.int32), patch_axes(table.bearings_rig),
+            (values / norms[:, None]).astype(np.float32), norms / sigmas,
+            table.offsets.astype(np.int64), table.targets.astype(np.int32), base.copy(),
+            pixels.pixels(), pixels.starts, pixels.windows, table.grid, pixels.width, floor,
+            self.loss.code, float(self.loss.scale),
+        )  # fmt: skip
+        self._prior_weights = 1.0 / table.plane_sigmas**2
+        self._set_pairs()
+
+    def refresh(self, values: gtsam.Values) -> None:
+        """Settle which observations count."""
+        self._data.weights[:] = self._weights
+        _, errors = self._observe(pose_rows(values, self.pose_keys), self.planes, 0)
+        flags = self._blemishes(values, errors)
+        left = self._weights > 0
+        self.dropped = {}
+        for reason, flag in flags.items():
+            self.dropped[reason] = int(np.count_nonzero(flag & left))
+            left &= ~flag
+        self._data.weights[~left] = 0.0
+
+    def linearize(self, values: gtsam.Values) -> PoseSystem:
+        """Reduced pose system at `values`: robust weights, planes eliminated."""
+        poses, data = pose_rows(values, self.pose_keys), self._data
+        (hessians, gradients), errors = self._observe(poses, self.planes, DIMS)
+        self._costs = self._patch_costs(self.planes, errors)
+        num_f, num_p = len(self.pose_keys), len(self.table)
+        off = self.planes - self.table.planes
+        priors = np.hstack([self._prior_weights, self._prior_weights * off])
+        couplings = np.empty((num_p + len(self.table.targets), 3, 6))
+        inverses, downs = np.empty((num_p, 3, 3)), np.empty((num_p, 3))
+        diagonal, gradient = np.zeros((num_f, 6, 6)), np.zeros((num_f, 6))
+        off_diagonal = np.zeros((len(self._columns), 6, 6))
+        eliminate_range(
+            0, num_p, data.hosts, data.offsets, data.targets, poses, hessians, gradients, priors,
+            self._row_starts, self._columns, diagonal, off_diagonal, gradient, couplings, inverses,
+            downs,
+        )  # fmt: skip
+        self._schur = couplings, inverses, downs
+        return PoseSystem(diagonal, off_diagonal, gradient, {FAMILY: float(self._costs.sum())})
+
+    def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
+        """Robust cost at `values`, `steps (F, 6)` from the linearization, planes moved along."""
+        if self._schur is None:
+            raise RuntimeError("propose() needs linearize() before it")
+        couplings, inverses, downs = self._schur
+        rows = self.table.offsets[:-1] + np.arange(len(self.table))
+        frames = np.insert(self.table.targets, self.table.offsets[:-1], self.table.hosts)
+        pulls = np.einsum("oki,oi->ok", couplings, steps[frames])
+        downs = downs + (np.add.reduceat(pulls, rows) if len(rows) else np.zeros((0, 3)))
+        moved = self._stepped(self.planes, -np.einsum("pij,pj->pi", inverses, downs))
+        poses = pose_rows(values, self.pose_keys)
+        self._trial = self._better(poses, moved, self.planes, self._costs)
+        if self.polish_steps:
+            self._trial = self._descend(poses, *self._trial, self.polish_steps)
+        return float(self._trial[1].sum())
+
+    def accept(self) -> None:
+        """Keep the planes of the last proposal."""
+        if self._trial is not None:
+            self.planes, self._costs = self._trial
+            self._trial = None
+
+    def polish(self, values: gtsam.Values, num_steps: int = 30) -> float:
+        """Move the planes to their optimum at fixed poses; returns the robust cost."""
+        poses = pose_rows(values, self.pose_keys)
+        _, errors = self._observe(poses, self.planes, 0)
+        costs = self._patch_costs(self.planes, errors)
+        self.planes, self._costs = self._descend(poses, self.planes, costs, num_steps)
+        return float(self._costs.sum())
+
+    def costs(self, values: gtsam.Values) -> dict[str, float]:
+        """Robust cost at the current planes, priors on these included."""
+        errors = self.errors(values)
+        return {FAMILY: float(self._patch_costs(self.planes, errors).sum())}
+
+    def errors(self, values: gtsam.Values) -> np.ndarray:
+        """Mean square (O,) of each observation's whitened residuals, whether it counts or not."""
+        return self._observe(pose_rows(values, self.pose_keys), self.planes, 0)[1]
+
+    def correlations(self, values: gtsam.Values) -> np.ndarray:
+        """Normalised correlation (O,) of each observation with its template, 1 at best."""
+        scales = self._data.scales[self.table.owners]
+        return 1 - 0.5 * self.errors(values) * len(self.table.grid) / scales**2
+
+    @property
+    def counted(self) -> np.ndarray:
+        """(O,) bool, observations that the last `refresh` let count."""
+        return self._data.weights > 0
+
+    def subset(self, rows: np.ndarray) -> "PhotometricBlock":
+        """A block of some patches (their rows, ascending) and only the frames they touch.
+
+        It has the planes and the observations' standing of this moment, and shares the pixels.
+        """
+        counts = np.diff(self.table.offsets)[rows]
+        offsets = np.concatenate([[0], np.cumsum(counts)])
+        shift = self.table.offsets[rows] - offsets[:-1]
+        observations = np.arange(offsets[-1]) + np.repeat(shift, counts)
+        hosts, targets = self.table.hosts[rows], self.table.targets[observations]
+        frames = np.unique(np.concatenate([hosts, targets]))
+        part, data = copy(self), self._data
+        part.table = replace(
+            self.table,
+            hosts=np.searchsorted(frames, hosts),
+            bearings_rig=self.table.bearings_rig[rows],
+            planes=self.table.planes[rows],
+            plane_sigmas=self.table.plane_sigmas[rows],
+            offsets=offsets,
+            targets=np.searchsorted(frames, targets),
+        )
+        part.pose_keys = [self.pose_keys[f] for f in frames]
+        part.planes, part._prior_weights = self.planes[rows], self._prior_weights[rows]
+        part._weights, part.num_threads = self._weights[observations], 1
+        part._data = data._replace(
+            hosts=part.table.hosts.astype(np.int32),
+            axes=data.axes[rows],
+            templates=data.templates[rows],
+            scales=data.scales[rows],
+            offsets=offsets,
+            targets=part.table.targets.astype(np.int32),
+            weights=data.weights[observations],
+            starts=data.starts[observations],
+            windows=data.windows[observations],
+        )
+        part._set_pairs()
+        return part
+
+    def factors(self) -> list[gtsam.CustomFactor]:
+        """The same cost as ordinary GTSAM factors on poses, one per host frame."""
+        return host_factors(self)
+
+    def _blemishes(self, values: gtsam.Values, errors: np.ndarray) -> dict[str, np.ndarray]:
+        """Reason -> observations (O,) bool that cannot count, at the current planes."""
+        table, owners = self.table, self.table.owners
+        hosts = table.hosts[owners]
+        world_T_rigs = np.array([values.atPose3(key).matrix() for key in self.pose_keys])
+        inverse_depths = np.column_stack([np.ones(len(table.grid)), table.grid]) @ self.planes.T
+        behind = ~np.all(inverse_depths > 0, axis=0)[owners]
+        spans = patch_spans(table, world_T_rigs, self.planes, np.arange(len(owners)))
+        middle, across, down = spans[:, 0], spans[:, 1], spans[:, 2]
+        length = np.maximum(np.linalg.norm(middle, axis=1), 1e-12)
+        # area of the patch on the target's sphere per area on the host's
+        area = np.einsum("oi,oi->o", np.cross(across, down), middle) / length**3
+        normals = np.einsum("pk,pki->pi", self.planes, self._data.axes)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = np.einsum("oij,oj->oi", world_T_rigs[hosts, :3, :3], normals[owners])
+        rays = np.einsum("oij,oj->oi", world_T_rigs[table.targets, :3, :3], middle)
+        cosine = np.einsum("oi,oi->o", normals, rays) / length
+        lost = 2 * self._data.scales[owners] ** 2 / len(table.grid)
+        return {
+            "behind": behind,
+            "grazing": ~(cosine > _LEAST_COSINE),
+            "zoom": ~((area < _MOST_ZOOM**2) & (area > _MOST_ZOOM**-2)),
+            "outside its window": errors == lost,
+            "no contrast": self._data.scales[owners] <= 0,
+        }
+
+    def _observe(self, poses: np.ndarray, planes: np.ndarray, dims: int):
+        """Models (hessians, gradients) of the observations, and their mean squares (O,)."""
+        num_o = len(self.table.targets)
+        size = num_o if dims else 0
+        hessians, gradients = np.empty((size, DIMS, DIMS)), np.empty((size, DIMS))
+        errors = np.empty(num_o)
+        ranges = self._ranges()
+
+        def work(i: int) -> None:
+            observe_range(
+                *ranges[i], self._data, planes, poses, dims, hessians, gradients, errors
+            )
+
+        self._run(work, len(ranges))
+        return (hessians, gradients), errors
+
+    def _patch_costs(self, planes: np.ndarray, errors: np.ndarray) -> np.ndarray:
+        """Robust cost (P,) of each patch, the prior on its plane included."""
+        num = len(self.table.grid)
+        losses = num * self._data.weights * self.loss.rho(errors)
+        off = planes - self.table.planes
+        priors = 0.5 * np.einsum("pk,pk->p", self._prior_weights, off * off)
+        return priors + np.bincount(self.table.owners, losses, len(self.table))
+
+    def _better(
+        self, poses: np.ndarray, new: np.ndarray, old: np.ndarray, least: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """For each patch the better of two planes; the old are only tried where above `least`."""
+        costs = self._patch_costs(new, self._observe(poses, new, 0)[1])
+        worse = ~(costs <= least)
+        if np.any(worse):
+            stay = self._patch_costs(old, self._observe(poses, old, 0)[1])
+            worse &= ~(costs <= stay)
+            new, costs = np.where(worse[:, None], old, new), np.where(worse, stay, costs)
+        return new, costs
+
+    def _descend(
+        self, poses: np.ndarray, planes: np.ndarray, costs: np.ndarray, num_steps: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Up to `num_steps` damped Gauss-Newton steps on the planes that never raise a cost."""
+        damping = np.full(len(planes), 1e-6)
+        for _ in range(num_steps):
+            (hessians, gradients), _ = self._observe(poses, planes, 3)
+            V, down = np.zeros((len(planes), 3, 3)), self._prior_weights * (
+                planes - self.table.planes
+            )
+            np.add.at(V, self.table.owners, hessians[:, :3, :3])
+            np.add.at(down, self.table.owners, gradients[:, :3])
+            V[:, range(3), range(3)] += self._prior_weights
+            spread = np.einsum("pkk->pk", V)
+            V[:, range(3), range(3)] += damping[:, None] * spread + 1e-200 + 1e-12 * spread.sum(
+                axis=1, keepdims=True
+            )
+            step = -np.linalg.solve(V, down[..., None])[..., 0]
+            if not np.any(-np.einsum("pk,pk->p", step, down) > 1e-12 * costs):
+                break
+            trial = self._stepped(planes, step)
+            trial_costs = self._patch_costs(trial, self._observe(poses, trial, 0)[1])
+            good = trial_costs < costs
+            planes = np.where(good[:, None], trial, planes)
+            costs = np.where(good, trial_costs, costs)
+            damping = np.where(good, 0.1 * damping, np.maximum(1e-3, 10 * damping))
+        return planes, costs
+
+    def _stepped(self, planes: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        """Planes after steps that are shortened where they would lead behind the host."""
+        room = (1 - _LEAST_SHARE) * planes[:, 0]
+        share = np.minimum(1.0, room / np.maximum(-steps[:, 0], 1e-300))
+        return planes + share[:, None] * np.where(np.isfinite(steps), steps, 0.0)
+
+    def _set_pairs(self) -> None:
+        """Frame pairs that share a patch, and a state without a linearization."""
+        self._row_starts, self._columns = self._covisibility()
+        rows = np.repeat(np.arange(len(self.pose_keys)), np.diff(self._row_starts))
+        self.pairs = np.column_stack([rows, self._columns]).astype(np.int64)
+        self._costs = np.full(len(self.table), np.inf)
+        self._trial: tuple[np.ndarray, np.ndarray] | None = None
+        self._schur: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    def _covisibility(self) -> tuple[np.ndarray, np.ndarray]:
+        """CSR rows of the frame pairs f < g that share a patch."""
+        num, table = len(self.pose_keys), self.table
+        counts = np.diff(table.offsets)
+        codes = [np.zeros(0, dtype=np.int64)]
+        for count in np.unique(counts[counts > 0]):
+            rows = np.flatnonzero(counts == count)
+            seen = table.targets[table.offsets[rows][:, None] + np.arange(count)]
+            frames = np.sort(np.column_stack([table.hosts[rows], seen]), axis=1).astype(np.int64)
+            i, k = np.triu_indices(count + 1, 1)
+            codes.append(np.unique(frames[:, i] * num + frames[:, k]))
+        first, second = np.divmod(np.unique(np.concatenate(codes)), num)
+        starts = np.zeros(num + 1, dtype=np.int64)
+        np.cumsum(np.bincount(first, minlength=num), out=starts[1:])
+        return starts, second
+
+    def _ranges(self) -> list[tuple[int, int]]:
+        """Runs of patches with about the same number of observations, one per thread."""
+        offsets = self.table.offsets
+        targets = np.linspace(0, offsets[-1], self.num_threads + 1)[1:-1]
+        bounds = np.unique([0, *np.searchsorted(offsets, targets), len(self.table)])
+        if len(bounds) < 2:
+            return [(0, 0)]
+        return [(int(a), int(b)) for a, b in pairwise(bounds)]
+
+    def _run(self, work: Callable[[int], None], num: int) -> None:
+        if num == 1:
+            work(0)
+            return
+        with ThreadPoolExecutor(num) as pool:
+            list(pool.map(work, range(num)))
