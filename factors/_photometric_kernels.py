@@ -246,7 +246,7 @@ def observe_range(first, last, data, planes, poses, dims, hessians, gradients, e
         hessians (O, 9, 9), gradients (O, 9): written in their first `dims`, robust weights and
             those of the observations included; zero for what is left out or lost.
         errors (O,): mean square of whitened residuals; 2 scale^2 / N, that of an image which has
-            nothing to do with the template, where a window ends.
+            nothing to do with the template, where a window ends or an observation is left out.
     """
     num = len(data.grid)
     A, c, Z = np.empty((3, 3)), np.empty(3), np.empty((10, num))
@@ -257,12 +257,14 @@ def observe_range(first, last, data, planes, poses, dims, hessians, gradients, e
             if dims:
                 hessians[o, :dims, :dims] = 0.0
                 gradients[o, :dims] = 0.0
+            if data.weights[o] <= 0:
+                continue
             _relative(poses[data.hosts[p]], poses[data.targets[o]], A, c)
             if not _look(data, p, o, planes[p], A, c, dims, Z):
                 continue
             norm = _normalise(Z, 9, data.floor)
             errors[o] = _squared_error(Z, template, scale) / num
-            if dims and data.weights[o] > 0:
+            if dims:
                 weight = rho_and_weight(data.loss, data.loss_scale, errors[o])[1]
                 _gauss_newton(
                     Z, template, scale, norm, dims, data.weights[o] * weight, hessians[o],

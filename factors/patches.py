@@ -149,6 +149,11 @@ class PatchPixels:
         self._chunks: list[np.ndarray] = []
         self._length = 0
 
+    @property
+    def num_frames(self) -> int:
+        """Number of poses given."""
+        return len(self._world_T_rigs)
+
     def take(self, frame: int, image: SphereImage) -> None:
         """Cut what frame `frame` hosts and shows out of its image."""
         if image.width != self.width:

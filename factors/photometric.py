@@ -93,6 +93,12 @@ class PhotometricBlock:
         self._prior_weights = 1.0 / table.plane_sigmas**2
         self._set_pairs()
 
+    def weigh(self, frame_weights: np.ndarray) -> None:
+        """Multiply the weights of observations by those (F,) of their host and target."""
+        table = self.table
+        hosts = table.hosts[table.owners]
+        self._weights = self._weights * frame_weights[hosts] * frame_weights[table.targets]
+
     def refresh(self, values: gtsam.Values) -> None:
         """Settle which observations count."""
         self._data.weights[:] = self._weights
@@ -161,11 +167,11 @@ class PhotometricBlock:
         return {FAMILY: float(self._patch_costs(self.planes, errors).sum())}
 
     def errors(self, values: gtsam.Values) -> np.ndarray:
-        """Mean square (O,) of each observation's whitened residuals, whether it counts or not."""
+        """Mean square (O,) of each observation's whitened residuals; large where left out."""
         return self._observe(pose_rows(values, self.pose_keys), self.planes, 0)[1]
 
     def correlations(self, values: gtsam.Values) -> np.ndarray:
-        """Normalised correlation (O,) of each observation with its template, 1 at best."""
+        """Normalised correlation (O,) of each observation with its template, 0 where left out."""
         scales = self._data.scales[self.table.owners]
         return 1 - 0.5 * self.errors(values) * len(self.table.grid) / scales**2
 

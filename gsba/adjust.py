@@ -97,8 +97,8 @@ def run(
         spread = noise * max(1.0, gate / settings.rounds.gate_scale)
         block = landmark_block(landmarks, keypoints, rig, spread, settings, num_threads)
         solver = _solver(settings, last=number == len(gates))
-        result = optimize(priors, [block], _values(world_T_rigs), solver)
-        poses = _poses(result.values, len(world_T_rigs))
+        result = optimize(priors, [block], values_of(world_T_rigs), solver)
+        poses = poses_of(result.values, len(world_T_rigs))
         new_support = len(place(poses, last_gate).tracks)
         accepted = new_support >= settings.rounds.min_support * support
         if accepted:
@@ -139,7 +139,7 @@ def landmark_block(
 ) -> LandmarkBlock:
     """The factor block of the chosen families; several share each observation's information."""
     tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
-    share = noise * np.sqrt(len(settings.factors))
+    share = noise * np.sqrt(len({"bearing", "reprojection"} & set(settings.factors)))
     terms = []
     if "bearing" in settings.factors:
         sigmas = share * keypoints.sigmas_rad[rows]
@@ -180,7 +180,7 @@ def pose_covariances(
     held = gtsam.NonlinearFactorGraph(priors)
     held.push_back(graph.fixed_scale(adjustment.world_T_rigs))
     keys = [graph.X(f) for f in range(len(adjustment.world_T_rigs))]
-    return marginal_covariances(held, [block], _values(adjustment.world_T_rigs), keys)
+    return marginal_covariances(held, [block], values_of(adjustment.world_T_rigs), keys)
 
 
 def _noise(landmarks: Landmarks, keypoints: Keypoints, world_T_rigs: np.ndarray) -> float:
@@ -198,12 +198,14 @@ def _noise(landmarks: Landmarks, keypoints: Keypoints, world_T_rigs: np.ndarray)
     return float(spread / np.sqrt(redundancy))
 
 
-def _values(world_T_rigs: np.ndarray) -> gtsam.Values:
+def values_of(world_T_rigs: np.ndarray) -> gtsam.Values:
+    """Poses (F, 4, 4) under their keys."""
     values = gtsam.Values()
     for f, world_T_rig in enumerate(world_T_rigs):
         values.insert(graph.X(f), gtsam.Pose3(world_T_rig))
     return values
 
 
-def _poses(values: gtsam.Values, num_frames: int) -> np.ndarray:
+def poses_of(values: gtsam.Values, num_frames: int) -> np.ndarray:
+    """Poses (F, 4, 4) of the first keys."""
     return np.array([values.atPose3(graph.X(f)).matrix() for f in range(num_frames)])

@@ -129,6 +129,30 @@ class SolverSettings(_Settings):
     num_threads: int | None = Field(default=None, ge=1)  # None = all cores
 
 
+class PhotometricSettings(_Settings):
+    """Direct alignment of patches, joint with the other families."""
+
+    levels: tuple[int, ...] = Field(default=(0,), min_length=1)  # halvings of the panorama, in order
+    max_width: int = Field(default=4096, ge=128)  # pixels of level 0; larger panoramas are halved
+    size: int = Field(default=9, ge=3, le=33)  # pixels across a patch
+    spacing_deg: float = Field(default=7.0, gt=0, le=60)  # between patches of a frame
+    targets: int = Field(default=8, ge=1)  # frames that a patch is looked for in, nearest in space
+    min_gradient: float = Field(default=2.0, gt=0)  # grey values per pixel, least of a patch
+    min_correlation: float = Field(default=0.8, ge=-1, le=1)  # with the template, at the start
+    depth_reach_deg: float = Field(default=6.0, gt=0, le=60)  # to map points that give the depth
+    depth_tolerance: float = Field(default=0.03, gt=0)  # relative, of map points on one plane
+    depth_sigma: float = Field(default=0.2, gt=0)  # relative, of a patch's depth
+    slope_sigma: float = Field(default=0.7, gt=0)  # of its tilt, as a tangent
+    noise_grey: float = Field(default=2.0, gt=0)  # grey values of a pixel
+    noise_contrast: float = Field(default=0.1, ge=0)  # further noise, part of the contrast
+    inflation: float = Field(default=3.0, gt=0)  # of sigmas: pixels of a patch err together
+    loss_sigmas: float = Field(default=2.0, gt=0)  # Cauchy scale, of a patch's mean residual
+    max_frame_ratio: float = Field(
+        default=2.0, gt=1
+    )  # residual of a frame over the median of all; above, it is weighted down
+    polish_steps: int = Field(default=0, ge=0)  # of planes, after each step of the poses
+
+
 class ExportSettings(_Settings):
     """Datasets written at the end of a run."""
 
@@ -153,8 +177,9 @@ class RefineSettings(_Settings):
     priors: PriorSettings = PriorSettings()
     rounds: RoundSettings = RoundSettings()
     solver: SolverSettings = SolverSettings()
-    factors: tuple[Literal["bearing", "reprojection"], ...] = Field(
+    factors: tuple[Literal["bearing", "reprojection", "photometric"], ...] = Field(
         default=("bearing",), min_length=1
     )
+    photometric: PhotometricSettings = PhotometricSettings()
     export: ExportSettings = ExportSettings()
     seed: int = 0
