@@ -20,6 +20,7 @@ from factors.robust import RobustLoss
 
 FAMILY = "photometric"
 _LEAST_SHARE = 0.2  # of its inverse depth is what one step leaves a patch at least
+_LEAST_CONTRAST = 1.0  # grey values, standard deviation over a template
 _LEAST_COSINE = 0.15  # of the angle between a patch's normal and the ray that sees it
 _MOST_ZOOM = 2.0  # change of a patch's size between host and target, either way
 
@@ -82,6 +83,7 @@ class PhotometricBlock:
         self._weights = base
         values = pixels.templates.astype(np.float64)
         values -= values.mean(axis=1, keepdims=True)
+        self._flat = values.std(axis=1) < _LEAST_CONTRAST
         norms = np.sqrt(np.einsum("pn,pn->p", values, values) + values.shape[1] * floor**2)
         self._data = PatchData(
             table.hosts.astype(np.int32), patch_axes(table.bearings_rig),
@@ -203,6 +205,7 @@ class PhotometricBlock:
         )
         part.pose_keys = [self.pose_keys[f] for f in frames]
         part.planes, part._prior_weights = self.planes[rows], self._prior_weights[rows]
+        part._flat = self._flat[rows]
         part._weights, part.num_threads = self._weights[observations], 1
         part._data = data._replace(
             hosts=part.table.hosts.astype(np.int32),
@@ -245,7 +248,7 @@ class PhotometricBlock:
             "grazing": ~(cosine > _LEAST_COSINE),
             "zoom": ~((area < _MOST_ZOOM**2) & (area > _MOST_ZOOM**-2)),
             "outside its window": errors == lost,
-            "no contrast": self._data.scales[owners] <= 0,
+            "no contrast": self._flat[owners],
         }
 
     def _observe(self, poses: np.ndarray, planes: np.ndarray, dims: int):

@@ -8,7 +8,7 @@ and kernel are those of Unser, "Splines: A Perfect Fit", IEEE Signal Processing 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import convolve1d, spline_filter1d
+from scipy.ndimage import correlate1d, spline_filter1d
 
 from factors._photometric_kernels import CODE_SCALE, CODE_ZERO, sample_many
 
@@ -74,8 +74,8 @@ def halved(grey: np.ndarray) -> np.ndarray:
     if len(image) % 4:
         raise ValueError(f"an image of {len(image)} rows has no half: the rows must be fours")
     taps = np.array([1, 3, 3, 1], dtype=np.float32) / 8
-    tall = convolve1d(_over_poles(image, PAD), taps, axis=0, origin=-1)[PAD:-PAD][::2]
-    return convolve1d(tall, taps, axis=1, mode="wrap", origin=-1)[:, ::2]
+    tall = correlate1d(_over_poles(image, PAD), taps, axis=0, origin=-1)[PAD:-PAD][::2]
+    return correlate1d(tall, taps, axis=1, mode="wrap", origin=-1)[:, ::2]
 
 
 def pixels_of(bearings: np.ndarray, width: int) -> np.ndarray:

@@ -1,0 +1,126 @@
+"""Frames inside a textured ball: every grey value, depth and normal in closed form."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from synthetic import unit
+
+from factors.patches import PatchPixels, PatchTable, pixel_grid, planes_from
+from factors.sphere_image import SphereImage
+from gsba.geometry import bearings_from_erp
+
+RADIUS = 4.0
+
+
+class Texture:
+    """Sum of plane waves over the ball: smooth, with detail down to a few pixels."""
+
+    def __init__(self, rng: np.random.Generator, finest: float = 40.0) -> None:
+        self.waves = unit(rng.normal(size=(60, 3))) * rng.uniform(5, finest, (60, 1))
+        self.phases = rng.uniform(0, 6, 60)
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Grey values (...,) at points (..., 3) of the ball."""
+        return 127 + 8 * np.sin(points / RADIUS @ self.waves.T + self.phases).sum(axis=-1)
+
+
+@dataclass
+class BallWorld:
+    """Frames, their images and patches that are exact in depth and nearly flat."""
+
+    world_T_rigs: np.ndarray
+    images: list[SphereImage]
+    pixels: PatchPixels
+    grey: list[np.ndarray]
+
+    def values(self, world_T_rigs: np.ndarray | None = None) -> gtsam.Values:
+        values = gtsam.Values()
+        for f, pose in enumerate(self.world_T_rigs if world_T_rigs is None else world_T_rigs):
+            values.insert(f, gtsam.Pose3(pose))
+        return values
+
+
+def distances_to_ball(world_T_rig: np.ndarray, bearings: np.ndarray) -> np.ndarray:
+    """Distances (...,) along bearings (..., 3) of a rig inside the ball."""
+    rays, centre = bearings @ world_T_rig[:3, :3].T, world_T_rig[:3, 3]
+    along = rays @ centre
+    return -along + np.sqrt(along**2 + RADIUS**2 - centre @ centre)
+
+
+def render(world_T_rig: np.ndarray, texture: Texture, width: int) -> np.ndarray:
+    """Grey panorama (width / 2, width) of the ball from inside."""
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
+    bearings = bearings_from_erp(np.stack([u, v], axis=-1), width, width // 2)
+    points = distances_to_ball(world_T_rig, bearings)[..., None] * bearings
+    return texture(points @ world_T_rig[:3, :3].T + world_T_rig[:3, 3])
+
+
+def poses(rng: np.random.Generator, num: int, spread: float = 0.3) -> np.ndarray:
+    """Random poses (num, 4, 4) near the centre of the ball."""
+    return np.array(
+        [
+            gtsam.Pose3(
+                gtsam.Rot3.Ypr(*(0.2 * rng.normal(size=3))), spread * rng.normal(size=3)
+            ).matrix()
+            for _ in range(num)
+        ]
+    )
+
+
+def make_ball_world(
+    seed: int = 0,
+    num_frames: int = 4,
+    num_patches: int = 120,
+    width: int = 512,
+    size: int = 9,
+    gains: np.ndarray | None = None,
+    offsets: np.ndarray | None = None,
+    spread: float = 0.3,
+) -> BallWorld:
+    """Patches at random bearings of all frames, each seen in all others.
+
+    Args:
+        gains, offsets: (F,) of each frame's grey values.
+        spread: of the frames' positions, units.
+    """
+    rng = np.random.default_rng(seed)
+    world_T_rigs, texture = poses(rng, num_frames, spread), Texture(rng, 40.0 * width / 512)
+    gains = np.ones(num_frames) if gains is None else gains
+    offsets = np.zeros(num_frames) if offsets is None else offsets
+    grey = [
+        gain * render(pose, texture, width) + offset
+        for pose, gain, offset in zip(world_T_rigs, gains, offsets, strict=True)
+    ]
+    images = [SphereImage.of(image) for image in grey]
+    hosts = np.sort(rng.integers(0, num_frames, num_patches))
+    bearings = unit(rng.normal(size=(num_patches, 3)))
+    table = table_of(world_T_rigs, hosts, bearings, width, size)
+    pixels = PatchPixels(table, world_T_rigs, width)
+    for f, image in enumerate(images):
+        pixels.take(f, image)
+    return BallWorld(world_T_rigs, images, pixels, grey)
+
+
+def table_of(
+    world_T_rigs: np.ndarray, hosts: np.ndarray, bearings: np.ndarray, width: int, size: int
+) -> PatchTable:
+    """Patches with exact planes, seen in all other frames."""
+    num_frames = len(world_T_rigs)
+    distances = np.array(
+        [distances_to_ball(world_T_rigs[h], b) for h, b in zip(hosts, bearings, strict=True)]
+    )
+    rotations = world_T_rigs[hosts, :3, :3]
+    points = np.einsum("pij,pj->pi", rotations, distances[:, None] * bearings)
+    normals = np.einsum("pji,pj->pi", rotations, points + world_T_rigs[hosts, :3, 3])
+    planes = planes_from(bearings, distances, normals)
+    targets = [[f for f in range(num_frames) if f != host] for host in hosts]
+    return PatchTable(
+        hosts,
+        bearings,
+        planes,
+        planes[:, :1] * [[0.5, 0.5, 0.5]],
+        np.arange(len(hosts) + 1) * (num_frames - 1),
+        np.array(targets, dtype=np.int64).ravel(),
+        pixel_grid(size, 2 * np.pi / width),
+    )
