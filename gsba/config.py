@@ -139,6 +139,7 @@ class PhotometricSettings(_Settings):
     targets: int = Field(default=8, ge=1)  # frames that a patch is looked for in, nearest in space
     min_gradient: float = Field(default=2.0, gt=0)  # grey values per pixel, least of a patch
     min_correlation: float = Field(default=0.8, ge=-1, le=1)  # with the template, at the start
+    depth_levels: int = Field(default=2, ge=0)  # coarser ones on which depths are found first
     depth_reach_deg: float = Field(default=6.0, gt=0, le=60)  # to map points that give the depth
     depth_tolerance: float = Field(default=0.03, gt=0)  # relative, of map points on one plane
     depth_sigma: float = Field(default=0.2, gt=0)  # relative, of a patch's depth

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from factors.patches import PatchTable, patch_axes, pixel_grid
+from factors.sphere_image import halved
 from gsba import read
 from gsba.config import PhotometricSettings
 from gsba.geometry import bearings_from_erp, erp_from_bearings
@@ -18,31 +19,40 @@ _EDGE_SHARE = 0.05  # of an edge's strength, beside that of a corner
 _MAX_LATITUDE = np.deg2rad(80.0)  # beyond, pixels of a panorama are mostly invented
 
 
-def grey_levels(frames: FrameSet, frame: int, settings: PhotometricSettings, level: int):
-    """A frame's grey image (H, 2 H) float32 at a pyramid level and where it may be used.
+def pyramid(
+    frames: FrameSet, frame: int, settings: PhotometricSettings, top: int
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Grey images of a frame, level 0 to `top`, and where level 0 may be used.
+
+    Level 0 is the largest within `settings.max_width`; each further one has half the width, down
+    to 64 pixels, where the levels end.
 
     Returns:
-        The image, level 0 being the largest within `settings.max_width`, and (H, 2 H) bool.
-    """
-    from factors.sphere_image import halved
+        (H, 2 H) float32 of each level, and (H, 2 H) bool: not masked, neither black nor saturated.
 
+    Raises:
+        GsbaError: the frames are no panoramas.
+    """
     if frames.layout != "erp":
         raise GsbaError(
             "the photometric family reads panoramas: leave it out of --factors for cube faces"
         )
-    rgb = read.load_erp(frames, frame)
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    grey = cv2.cvtColor(read.load_erp(frames, frame), cv2.COLOR_RGB2GRAY).astype(np.float32)
     usable = (grey > _DARK) & (grey < _BRIGHT)
     mask = read.load_mask(frames, frame)
     if mask is not None:
         usable &= mask
-    halvings = level + max(0, int(np.ceil(np.log2(grey.shape[1] / settings.max_width))))
-    for _ in range(halvings):
-        if len(grey) % 4 or len(grey) < 64:
-            break
+    while grey.shape[1] > settings.max_width and _divides(grey):
         grey = halved(grey)
         usable = usable.reshape(len(grey), 2, -1, 2).all(axis=(1, 3))
-    return grey, usable
+    levels = [grey]
+    while len(levels) <= top and _divides(levels[-1]):
+        levels.append(halved(levels[-1]))
+    return levels, usable
+
+
+def _divides(image: np.ndarray) -> bool:
+    return len(image) % 4 == 0 and len(image) >= 64
 
 
 def candidates(grey: np.ndarray, usable: np.ndarray, settings: PhotometricSettings) -> np.ndarray:

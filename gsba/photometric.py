@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 
 from factors import LandmarkBlock, RobustLoss
-from factors.patches import PatchPixels, patch_spans
+from factors.patches import PatchPixels, PatchTable, patch_spans
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
 from gsba import adjust, graph, patches
@@ -21,6 +21,7 @@ from gsba.types import Counts, FrameSet, Keypoints
 logger = logging.getLogger(__name__)
 
 _LEAST_WEIGHT = 1e-3  # of a frame
+_DEPTH_STEPS = 5  # Gauss-Newton steps on the planes at each level
 _LEAST_PATCHES = 10  # observations of a frame that is judged
 
 
@@ -80,29 +81,28 @@ def _patches(
 ) -> tuple[PhotometricBlock, list[Counts]]:
     """The block of one level, its noise estimated, and what was kept for it."""
     chosen = settings.photometric
-
-    def image(frame: int) -> tuple[np.ndarray, np.ndarray]:
-        return patches.grey_levels(frames, frame, chosen, level)
-
+    top = level + chosen.depth_levels
     bearings, width = [], 0
     for f in track(range(len(frames)), "choosing patches"):
-        grey, usable = image(f)
-        width = grey.shape[1]
-        bearings.append(patches.candidates(grey, usable, chosen))
+        greys, usable = patches.pyramid(frames, f, chosen, level)
+        width = greys[-1].shape[1]
+        bearings.append(patches.candidates(greys[-1], usable, chosen))
     table, counts = patches.table_of(
         bearings, solved.world_T_rigs, solved.landmarks, width, chosen
     )
-    pixels = PatchPixels(table, solved.world_T_rigs, width)
-    visible = np.ones(len(table.targets))
-    owners = table.owners
-    for f in track(range(len(frames)), "sampling patches"):
-        grey, usable = image(f)
-        pixels.take(f, SphereImage.of(grey))
-        rows = np.flatnonzero(table.targets == f)
-        spans = patch_spans(table, solved.world_T_rigs, table.planes, rows)
-        visible[rows] = patches.usable_at(usable, spans[:, 0])
-    block = make_block(pixels, visible, settings, num_threads)
+    gathered, visible = _gather(frames, table, solved.world_T_rigs, level, top, chosen)
     values = adjust.values_of(solved.world_T_rigs)
+    planes = table.planes
+    for pixels in gathered[:0:-1]:  # coarse to fine
+        block = make_block(pixels, visible, settings, num_threads)
+        block.planes = planes
+        block.refresh(values)
+        block.polish(values, _DEPTH_STEPS)
+        planes = block.planes
+    block = make_block(gathered[0], visible, settings, num_threads)
+    block.planes = planes
+    block.refresh(values)
+    block.polish(values, _DEPTH_STEPS)
     block.refresh(values)
     correlated = block.correlations(values) >= chosen.min_correlation
     kept = block.counted & correlated
@@ -111,9 +111,38 @@ def _patches(
         **block.dropped,
         "does not correlate": int(np.count_nonzero(block.counted & ~correlated)),
     }
-    seen = Counts(len(owners), int(np.count_nonzero(kept)), "patch observations", dropped)
-    scale = _noise(block, values, kept) * chosen.inflation
-    return make_block(pixels, kept.astype(float), settings, num_threads, scale), [counts, seen]
+    seen = Counts(
+        len(table.targets), int(np.count_nonzero(kept)), "patch observations", dropped
+    )
+    noise = _noise(block, values, kept) * chosen.inflation
+    final = make_block(gathered[0], kept.astype(float), settings, num_threads, noise)
+    final.planes = block.planes
+    final.refresh(values)
+    return final, [counts, seen]
+
+
+def _gather(
+    frames: FrameSet,
+    table: PatchTable,
+    world_T_rigs: np.ndarray,
+    level: int,
+    top: int,
+    settings: PhotometricSettings,
+) -> tuple[list[PatchPixels], np.ndarray]:
+    """Pixels of the patches at the levels from `level` to `top`, and visibility (O,) 0 or 1."""
+    gathered: list[PatchPixels] = []
+    visible = np.ones(len(table.targets))
+    for f in track(range(len(frames)), "sampling patches"):
+        greys, usable = patches.pyramid(frames, f, settings, top)
+        for k, grey in enumerate(greys[level:]):
+            if k == len(gathered):
+                scaled = replace(table, grid=2.0**k * table.grid)
+                gathered.append(PatchPixels(scaled, world_T_rigs, grey.shape[1]))
+            gathered[k].take(f, SphereImage.of(grey))
+        rows = np.flatnonzero(table.targets == f)
+        spans = patch_spans(table, world_T_rigs, table.planes, rows)
+        visible[rows] = patches.usable_at(usable, spans[:, 0])
+    return gathered, visible
 
 
 def make_block(
