@@ -76,7 +76,7 @@ def measure(block: PhotometricBlock, values: gtsam.Values) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--patches", type=int, default=9000)
     parser.add_argument("--targets", type=int, default=8)
     parser.add_argument("--size", type=int, default=9)

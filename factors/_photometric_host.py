@@ -21,7 +21,9 @@ def host_factors(block: PhotometricBlock) -> list[gtsam.CustomFactor]:
     `refresh` left them.
     """
     hosts = block.table.hosts
-    return [_host_factor(block, np.flatnonzero(hosts == host)) for host in np.unique(hosts)]
+    observed = np.diff(block.table.offsets) > 0  # the others say nothing
+    groups = [np.flatnonzero(observed & (hosts == host)) for host in np.unique(hosts)]
+    return [_host_factor(block, rows) for rows in groups if len(rows)]
 
 
 def _host_factor(block: PhotometricBlock, rows: np.ndarray) -> gtsam.CustomFactor:

@@ -96,6 +96,34 @@ def _add_pair(f, g, block, row_starts, columns, off_diagonal):
 
 
 @_kernel
+def _reduce(
+    host, targets, W, inverse, down, row_starts, columns, diagonal, off_diagonal, gradient
+):  # fmt: skip
+    """Take a patch's Schur complement from the host and the targets that see it."""
+    block, Y = np.empty((6, 6)), np.empty((6, 3))
+    for i in range(len(targets) + 1):
+        f = host if i == 0 else targets[i - 1]
+        for r in range(6):
+            for k in range(3):
+                Y[r, k] = (
+                    W[i, 0, r] * inverse[0, k]
+                    + W[i, 1, r] * inverse[1, k]
+                    + W[i, 2, r] * inverse[2, k]
+                )
+            gradient[f, r] -= Y[r, 0] * down[0] + Y[r, 1] * down[1] + Y[r, 2] * down[2]
+        for k in range(i, len(targets) + 1):
+            for r in range(6):
+                for c in range(6):
+                    block[r, c] = -(
+                        Y[r, 0] * W[k, 0, c] + Y[r, 1] * W[k, 1, c] + Y[r, 2] * W[k, 2, c]
+                    )
+            if k == i:
+                diagonal[f] += block
+            else:
+                _add_pair(f, targets[k - 1], block, row_starts, columns, off_diagonal)
+
+
+@_kernel
 def eliminate_range(
     first, last, hosts, offsets, targets, poses, hessians, gradients, priors, row_starts, columns,
     diagonal, off_diagonal, gradient, couplings, inverses, plane_gradients,
@@ -112,7 +140,7 @@ def eliminate_range(
             step of a plane, -inverse (gradient + sum of coupling @ pose step).
     """
     by_host, by_target = np.empty((6, 6)), np.empty((6, 6))
-    V, block, Y = np.empty((3, 3)), np.empty((6, 6)), np.empty((6, 3))
+    V, block = np.empty((3, 3)), np.empty((6, 6))
     for p in range(first, last):
         host, row = hosts[p], offsets[p] + p
         num = offsets[p + 1] - offsets[p]
@@ -140,23 +168,7 @@ def eliminate_range(
                     V[k, j] += G[k, j]
         inverse = inverses[p]
         _invert(V, inverse)
-        for i in range(num + 1):
-            f = host if i == 0 else targets[offsets[p] + i - 1]
-            for r in range(6):
-                for k in range(3):
-                    Y[r, k] = (
-                        W[i, 0, r] * inverse[0, k] + W[i, 1, r] * inverse[1, k]
-                        + W[i, 2, r] * inverse[2, k]
-                    )  # fmt: skip
-                gradient[f, r] -= Y[r, 0] * down[0] + Y[r, 1] * down[1] + Y[r, 2] * down[2]
-            for k in range(i, num + 1):
-                for r in range(6):
-                    for c in range(6):
-                        block[r, c] = -(
-                            Y[r, 0] * W[k, 0, c] + Y[r, 1] * W[k, 1, c] + Y[r, 2] * W[k, 2, c]
-                        )
-                if k == i:
-                    diagonal[f] += block
-                else:
-                    other = targets[offsets[p] + k - 1]
-                    _add_pair(f, other, block, row_starts, columns, off_diagonal)
+        _reduce(
+            host, targets[offsets[p] : offsets[p + 1]], W, inverse, down, row_starts, columns,
+            diagonal, off_diagonal, gradient,
+        )  # fmt: skip

@@ -4,7 +4,7 @@ Frames are taken one at a time: of each, the templates of the patches that it ho
 window around every patch that it shows. Memory grows with observations, never with the images.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,24 @@ class PatchTable:
     def owners(self) -> np.ndarray:
         """(O,) patch of every observation."""
         return np.repeat(np.arange(len(self)), np.diff(self.offsets))
+
+    def select(self, observations: np.ndarray) -> "tuple[PatchTable, np.ndarray]":
+        """The table of some observations (O,) bool, and the patches (p,) that have any.
+
+        Frames keep their numbers.
+        """
+        counts = np.bincount(self.owners[observations], minlength=len(self))
+        rows = np.flatnonzero(counts)
+        part = replace(
+            self,
+            hosts=self.hosts[rows],
+            bearings_rig=self.bearings_rig[rows],
+            planes=self.planes[rows],
+            plane_sigmas=self.plane_sigmas[rows],
+            offsets=np.concatenate([[0], np.cumsum(counts[rows])]),
+            targets=self.targets[observations],
+        )
+        return part, rows
 
     def check(self, num_frames: int) -> None:
         """Refuse arrays that do not fit one another.
@@ -102,6 +120,22 @@ def planes_from(
         along = np.einsum("pki,pi->pk", patch_axes(bearings_rig), normals_rig)
         planes[:, 1:] = inverse[:, None] * along[:, 1:] / along[:, :1]
     return planes
+
+
+def covisible_frames(table: PatchTable, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Frame pairs f < g that share a patch, as sorted CSR rows: starts (F + 1,), columns (Q,)."""
+    counts = np.diff(table.offsets)
+    codes = [np.zeros(0, dtype=np.int64)]
+    for count in np.unique(counts[counts > 0]):
+        rows = np.flatnonzero(counts == count)
+        seen = table.targets[table.offsets[rows][:, None] + np.arange(count)]
+        frames = np.sort(np.column_stack([table.hosts[rows], seen]), axis=1).astype(np.int64)
+        i, k = np.triu_indices(count + 1, 1)
+        codes.append(np.unique(frames[:, i] * num_frames + frames[:, k]))
+    first, second = np.divmod(np.unique(np.concatenate(codes)), num_frames)
+    starts = np.zeros(num_frames + 1, dtype=np.int64)
+    np.cumsum(np.bincount(first, minlength=num_frames), out=starts[1:])
+    return starts, second
 
 
 def patch_spans(

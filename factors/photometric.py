@@ -15,7 +15,7 @@ from factors._photometric_kernels import DIMS, PatchData, observe_range
 from factors._photometric_schur import eliminate_range
 from factors._terms import pose_rows
 from factors.block import PoseSystem
-from factors.patches import PatchPixels, patch_axes, patch_spans
+from factors.patches import PatchPixels, covisible_frames, patch_axes, patch_spans
 from factors.robust import RobustLoss
 
 FAMILY = "photometric"
@@ -101,6 +101,10 @@ class PhotometricBlock:
         hosts = table.hosts[table.owners]
         self._weights = self._weights * frame_weights[hosts] * frame_weights[table.targets]
 
+    def weigh_observations(self, weights: np.ndarray) -> None:
+        """Multiply the weights of observations by these (O,), 0 leaves one out."""
+        self._weights = self._weights * weights
+
     def refresh(self, values: gtsam.Values) -> None:
         """Settle which observations count."""
         self._data.weights[:] = self._weights
@@ -183,25 +187,20 @@ class PhotometricBlock:
         return self._data.weights > 0
 
     def subset(self, rows: np.ndarray) -> "PhotometricBlock":
-        """A block of some patches (their rows, ascending) and only the frames they touch.
+        """A block of some patches (rows, ascending, all observed) on the frames they touch.
 
         It has the planes and the observations' standing of this moment, and shares the pixels.
         """
-        counts = np.diff(self.table.offsets)[rows]
-        offsets = np.concatenate([[0], np.cumsum(counts)])
-        shift = self.table.offsets[rows] - offsets[:-1]
-        observations = np.arange(offsets[-1]) + np.repeat(shift, counts)
-        hosts, targets = self.table.hosts[rows], self.table.targets[observations]
-        frames = np.unique(np.concatenate([hosts, targets]))
+        chosen = np.zeros(len(self.table), bool)
+        chosen[rows] = True
+        observations = chosen[self.table.owners]
+        table, _ = self.table.select(observations)
+        frames = np.unique(np.concatenate([table.hosts, table.targets]))
         part, data = copy(self), self._data
         part.table = replace(
-            self.table,
-            hosts=np.searchsorted(frames, hosts),
-            bearings_rig=self.table.bearings_rig[rows],
-            planes=self.table.planes[rows],
-            plane_sigmas=self.table.plane_sigmas[rows],
-            offsets=offsets,
-            targets=np.searchsorted(frames, targets),
+            table,
+            hosts=np.searchsorted(frames, table.hosts),
+            targets=np.searchsorted(frames, table.targets),
         )
         part.pose_keys = [self.pose_keys[f] for f in frames]
         part.planes, part._prior_weights = self.planes[rows], self._prior_weights[rows]
@@ -212,7 +211,7 @@ class PhotometricBlock:
             axes=data.axes[rows],
             templates=data.templates[rows],
             scales=data.scales[rows],
-            offsets=offsets,
+            offsets=part.table.offsets,
             targets=part.table.targets.astype(np.int32),
             weights=data.weights[observations],
             starts=data.starts[observations],
@@ -260,9 +259,7 @@ class PhotometricBlock:
         ranges = self._ranges()
 
         def work(i: int) -> None:
-            observe_range(
-                *ranges[i], self._data, planes, poses, dims, hessians, gradients, errors
-            )
+            observe_range(*ranges[i], self._data, planes, poses, dims, hessians, gradients, errors)
 
         self._run(work, len(ranges))
         return (hessians, gradients), errors
@@ -294,15 +291,16 @@ class PhotometricBlock:
         damping = np.full(len(planes), 1e-6)
         for _ in range(num_steps):
             (hessians, gradients), _ = self._observe(poses, planes, 3)
-            V, down = np.zeros((len(planes), 3, 3)), self._prior_weights * (
-                planes - self.table.planes
+            V, down = (
+                np.zeros((len(planes), 3, 3)),
+                self._prior_weights * (planes - self.table.planes),
             )
             np.add.at(V, self.table.owners, hessians[:, :3, :3])
             np.add.at(down, self.table.owners, gradients[:, :3])
             V[:, range(3), range(3)] += self._prior_weights
             spread = np.einsum("pkk->pk", V)
-            V[:, range(3), range(3)] += damping[:, None] * spread + 1e-200 + 1e-12 * spread.sum(
-                axis=1, keepdims=True
+            V[:, range(3), range(3)] += (
+                damping[:, None] * spread + 1e-200 + 1e-12 * spread.sum(axis=1, keepdims=True)
             )
             step = -np.linalg.solve(V, down[..., None])[..., 0]
             if not np.any(-np.einsum("pk,pk->p", step, down) > 1e-12 * costs):
@@ -323,28 +321,12 @@ class PhotometricBlock:
 
     def _set_pairs(self) -> None:
         """Frame pairs that share a patch, and a state without a linearization."""
-        self._row_starts, self._columns = self._covisibility()
+        self._row_starts, self._columns = covisible_frames(self.table, len(self.pose_keys))
         rows = np.repeat(np.arange(len(self.pose_keys)), np.diff(self._row_starts))
         self.pairs = np.column_stack([rows, self._columns]).astype(np.int64)
         self._costs = np.full(len(self.table), np.inf)
         self._trial: tuple[np.ndarray, np.ndarray] | None = None
         self._schur: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-
-    def _covisibility(self) -> tuple[np.ndarray, np.ndarray]:
-        """CSR rows of the frame pairs f < g that share a patch."""
-        num, table = len(self.pose_keys), self.table
-        counts = np.diff(table.offsets)
-        codes = [np.zeros(0, dtype=np.int64)]
-        for count in np.unique(counts[counts > 0]):
-            rows = np.flatnonzero(counts == count)
-            seen = table.targets[table.offsets[rows][:, None] + np.arange(count)]
-            frames = np.sort(np.column_stack([table.hosts[rows], seen]), axis=1).astype(np.int64)
-            i, k = np.triu_indices(count + 1, 1)
-            codes.append(np.unique(frames[:, i] * num + frames[:, k]))
-        first, second = np.divmod(np.unique(np.concatenate(codes)), num)
-        starts = np.zeros(num + 1, dtype=np.int64)
-        np.cumsum(np.bincount(first, minlength=num), out=starts[1:])
-        return starts, second
 
     def _ranges(self) -> list[tuple[int, int]]:
         """Runs of patches with about the same number of observations, one per thread."""

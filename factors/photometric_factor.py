@@ -91,9 +91,7 @@ def PhotometricFactor(
     shape = None if slopes is None else np.concatenate([[1.0], slopes])
 
     def error(_factor, values: gtsam.Values, jacobians) -> np.ndarray:
-        plane = (
-            values.atPoint3(plane_key) if shape is None else values.atDouble(plane_key) * shape
-        )
+        plane = values.atPoint3(plane_key) if shape is None else values.atDouble(plane_key) * shape
         residuals, by_host, by_target, by_plane = photometric_residuals(
             values.atPose3(host_key).matrix(), values.atPose3(target_key).matrix(), plane, axes,
             grid, template, image, floor,

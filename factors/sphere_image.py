@@ -35,8 +35,9 @@ class SphereImage:
         height, width = image.shape
         reach = min(_REACH, height)
         tall = _over_poles(image, reach)
-        tall = spline_filter1d(tall, axis=1, output=np.float32, mode="grid-wrap")
-        tall = spline_filter1d(tall, axis=0, output=np.float32, mode="mirror")
+        filtered = np.empty_like(tall)
+        spline_filter1d(tall, axis=1, output=filtered, mode="grid-wrap")  # type: ignore[arg-type]
+        spline_filter1d(filtered, axis=0, output=tall, mode="mirror")  # type: ignore[arg-type]
         rows = tall[reach - PAD : reach + height + PAD]
         wide = np.concatenate([rows[:, -PAD:], rows, rows[:, :PAD]], axis=1)
         steps = np.rint((wide - CODE_ZERO) * CODE_SCALE)

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class _Settings(BaseModel):
@@ -132,7 +132,9 @@ class SolverSettings(_Settings):
 class PhotometricSettings(_Settings):
     """Direct alignment of patches, joint with the other families."""
 
-    levels: tuple[int, ...] = Field(default=(0,), min_length=1)  # halvings of the panorama, in order
+    levels: tuple[int, ...] = Field(
+        default=(0,), min_length=1
+    )  # halvings of the panorama, in order
     max_width: int = Field(default=4096, ge=128)  # pixels of level 0; larger panoramas are halved
     size: int = Field(default=9, ge=3, le=33)  # pixels across a patch
     spacing_deg: float = Field(default=7.0, gt=0, le=60)  # between patches of a frame
@@ -151,6 +153,11 @@ class PhotometricSettings(_Settings):
     max_frame_ratio: float = Field(
         default=2.0, gt=1
     )  # residual of a frame over the median of all; above, it is weighted down
+    max_frame_growth: float = Field(
+        default=1.2, gt=1
+    )  # of a frame's geometric residual under the joint solve; above, it is weighted down
+    max_growth: float = Field(default=1.05, gt=0)  # of all geometric cost, or the solve is undone
+    tolerance: float = Field(default=2e-4, gt=0, lt=1)  # of the joint solve
     polish_steps: int = Field(default=0, ge=0)  # of planes, after each step of the poses
 
 
@@ -184,3 +191,9 @@ class RefineSettings(_Settings):
     photometric: PhotometricSettings = PhotometricSettings()
     export: ExportSettings = ExportSettings()
     seed: int = 0
+
+    @model_validator(mode="after")
+    def _geometry_first(self) -> "RefineSettings":
+        if set(self.factors) == {"photometric"}:
+            raise ValueError("factors: photometric starts from bearing or reprojection; add one")
+        return self

@@ -8,11 +8,12 @@ from typing import TypeVar
 import gtsam
 import numpy as np
 
-from gsba import adjust, cubemap, features, frontend, graph, tracks
+from gsba import adjust, cubemap, features, frontend, graph, photometric, tracks
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
 from gsba.matching import SearchableFrames
+from gsba.photometric import PhotometricResult
 from gsba.reconstruction import assemble
 from gsba.store import PerFrame, RunStore, fingerprint
 from gsba.types import (
@@ -51,6 +52,7 @@ class Line:
                 self.priors.add(factor)
         self.counts: dict[str, list[Counts]] = {}
         self.solutions: dict[str, Adjustment] = {}
+        self.frame_weights = np.ones(len(frames))  # of each frame's pixels
         self.latest = "keypoints"  # the stage that the next one builds on
         paths = [path for group in frames.paths for path in group]
         inputs = [fingerprint(paths), fingerprint(frames.mask_paths), frames.timestamps.tolist()]
@@ -185,6 +187,27 @@ class Line:
         self.solutions[name] = solved
         return solved
 
+    def align_patches(self, solved: Adjustment) -> Adjustment:
+        """Joint refinement by the grey values of patches."""
+        result = self._stage(
+            "photometric",
+            [self._solving(), self.settings.photometric],
+            lambda: photometric.run(
+                self.frames,
+                self.keypoints,
+                solved,
+                self.priors,
+                self.rig,
+                self.settings,
+                self.num_threads,
+            ),
+            PhotometricResult,
+        )
+        self.counts["photometric"] = list(result.counts)
+        self.solutions["photometric"] = result.adjustment
+        self.frame_weights = result.frame_weights
+        return result.adjustment
+
     def reconstruct(self, solved: Adjustment) -> Reconstruction:
         """Covariances, and everything back in the trajectory's world."""
 
@@ -204,7 +227,8 @@ class Line:
     def _solving(self) -> list[object]:
         settings = self.settings
         relevant = [settings.triangulate, settings.rounds, settings.priors, settings.solver]
-        return [*relevant, settings.factors, self.custom]
+        geometric = [family for family in settings.factors if family != "photometric"]
+        return [*relevant, geometric, self.custom]
 
     def _stage(self, name: str, key: object, compute: Callable[[], T], returns: type[T]) -> T:
         """A stage that builds on the one before it."""

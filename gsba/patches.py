@@ -44,11 +44,18 @@ def pyramid(
         usable &= mask
     while grey.shape[1] > settings.max_width and _divides(grey):
         grey = halved(grey)
-        usable = usable.reshape(len(grey), 2, -1, 2).all(axis=(1, 3))
+        usable = coarser(usable, 2)
     levels = [grey]
     while len(levels) <= top and _divides(levels[-1]):
         levels.append(halved(levels[-1]))
     return levels, usable
+
+
+def coarser(usable: np.ndarray, step: int) -> np.ndarray:
+    """(H / step, W / step) bool, whether all of step x step pixels (H, W) bool may be used."""
+    height, width = usable.shape
+    blocks = usable.reshape(height // step, step, width // step, step)
+    return np.logical_and.reduce(blocks, axis=(1, 3))
 
 
 def _divides(image: np.ndarray) -> bool:
@@ -119,14 +126,14 @@ def lay_planes(
     Returns:
         planes (K, 3), 1 / map units, and (K,) bool, whether the points around agree on one.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     planes, clear = np.zeros((len(bearings), 3)), np.zeros(len(bearings), bool)
     ranges = np.linalg.norm(points_rig, axis=1)
     if len(points_rig) < _NEIGHBOURS or len(bearings) == 0:
         return planes, clear
     reach = 2 * np.sin(np.deg2rad(settings.depth_reach_deg) / 2)
-    chords, rows = cKDTree(points_rig / ranges[:, None]).query(bearings, k=_NEIGHBOURS)
+    chords, rows = KDTree(points_rig / ranges[:, None]).query(bearings, k=_NEIGHBOURS)
     local = np.einsum("pki,pni->pnk", patch_axes(bearings), points_rig[rows])
     ahead = (local[..., 0] > 0) & (chords < reach)
     depth = np.where(ahead, local[..., 0], 1.0)
@@ -181,7 +188,7 @@ def table_of(
         hosts.append(np.full(np.count_nonzero(clear), f))
         centres.append(found[clear])
         planes.append(laid[clear])
-        targets.append(np.tile(near, (np.count_nonzero(clear), 1)))
+        targets.append(np.broadcast_to(near, (int(np.count_nonzero(clear)), len(near))))
     plane = np.concatenate(planes)
     sigmas = [settings.depth_sigma, settings.slope_sigma, settings.slope_sigma]
     table = PatchTable(

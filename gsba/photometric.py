@@ -22,7 +22,8 @@ logger = logging.getLogger(__name__)
 
 _LEAST_WEIGHT = 1e-3  # of a frame
 _DEPTH_STEPS = 5  # Gauss-Newton steps on the planes at each level
-_LEAST_PATCHES = 10  # observations of a frame that is judged
+_LEAST_JUDGED = 10  # observations of a frame that is judged
+_CHUNK = 150_000  # observations whose depths are found at a time: bounds the windows held
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,67 +59,80 @@ def run(
     solved, counts = start, []
     weights, residuals = np.ones(len(frames)), np.full(len(frames), np.nan)
     for level in settings.photometric.levels:
-        block, found = _patches(frames, solved, level, settings, num_threads)
+        pixels, found = _patches(frames, solved, level, settings, num_threads)
         counts += found
-        if not block.counted.any():
+        if pixels is None:
             logger.warning("no patch is seen twice at level %d: left as it was", level)
             continue
-        landmarks = adjust.landmark_block(
-            solved.landmarks, keypoints, rig, solved.noise, settings, num_threads
+        solved, weights, residuals = _solve(
+            pixels, keypoints, solved, priors, rig, settings, num_threads
         )
-        values = adjust.values_of(solved.world_T_rigs)
-        result = optimize(priors, [landmarks, block], values, settings.solver)
-        weights, residuals = _frame_weights(block, result.values, settings.photometric)
-        if np.any(weights < 1):
-            block.weigh(weights)
-            result = optimize(priors, [landmarks, block], result.values, settings.solver)
-        solved = _adjusted(solved, landmarks, result)
     return PhotometricResult(solved, tuple(counts), weights, residuals)
 
 
 def _patches(
     frames: FrameSet, solved: Adjustment, level: int, settings: RefineSettings, num_threads: int
-) -> tuple[PhotometricBlock, list[Counts]]:
-    """The block of one level, its noise estimated, and what was kept for it."""
-    chosen = settings.photometric
-    top = level + chosen.depth_levels
+) -> tuple[PatchPixels | None, list[Counts]]:
+    """Pixels of the patches and observations that are good enough, if any, and the counts."""
+    chosen, world_T_rigs = settings.photometric, solved.world_T_rigs
     bearings, width = [], 0
     for f in track(range(len(frames)), "choosing patches"):
         greys, usable = patches.pyramid(frames, f, chosen, level)
-        width = greys[-1].shape[1]
-        bearings.append(patches.candidates(greys[-1], usable, chosen))
-    table, counts = patches.table_of(
-        bearings, solved.world_T_rigs, solved.landmarks, width, chosen
+        grey = greys[-1]
+        usable = patches.coarser(usable, len(usable) // len(grey))
+        bearings.append(patches.candidates(grey, usable, chosen))
+        width = grey.shape[1]
+    table, counts = patches.table_of(bearings, world_T_rigs, solved.landmarks, width, chosen)
+    rows = np.cumsum(np.diff(table.offsets)) // _CHUNK
+    kept, dropped = np.zeros(len(table.targets), bool), {}
+    for chunk in np.unique(rows):
+        observations = (rows == chunk)[table.owners]
+        part, own = table.select(observations)
+        block = _with_depths(frames, part, world_T_rigs, level, settings, num_threads, dropped)
+        table.planes[own] = block.planes
+        kept[observations] = block.counted
+    seen = Counts(len(kept), int(np.count_nonzero(kept)), "patch observations", dropped)
+    table, _ = table.select(kept)
+    gathered, _ = _gather(frames, table, world_T_rigs, level, level, chosen)
+    return next(iter(gathered), None), [counts, seen]
+
+
+def _with_depths(
+    frames: FrameSet,
+    table: PatchTable,
+    world_T_rigs: np.ndarray,
+    level: int,
+    settings: RefineSettings,
+    num_threads: int,
+    dropped: dict[str, int],
+) -> PhotometricBlock:
+    """Patches with planes found at fixed poses, coarse to fine; only what correlates counts.
+
+    What does not is added to `dropped`.
+    """
+    chosen, values = settings.photometric, adjust.values_of(world_T_rigs)
+    gathered, visible = _gather(
+        frames, table, world_T_rigs, level, level + chosen.depth_levels, chosen
     )
-    gathered, visible = _gather(frames, table, solved.world_T_rigs, level, top, chosen)
-    values = adjust.values_of(solved.world_T_rigs)
     planes = table.planes
-    for pixels in gathered[:0:-1]:  # coarse to fine
+    for pixels in reversed(gathered):
         block = make_block(pixels, visible, settings, num_threads)
         block.planes = planes
         block.refresh(values)
         block.polish(values, _DEPTH_STEPS)
         planes = block.planes
-    block = make_block(gathered[0], visible, settings, num_threads)
-    block.planes = planes
-    block.refresh(values)
-    block.polish(values, _DEPTH_STEPS)
     block.refresh(values)
     correlated = block.correlations(values) >= chosen.min_correlation
-    kept = block.counted & correlated
-    dropped = {
-        "masked or saturated": int(np.count_nonzero(visible == 0)),
+    reasons = {
+        "masked or saturated": np.count_nonzero(visible == 0),
         **block.dropped,
-        "does not correlate": int(np.count_nonzero(block.counted & ~correlated)),
+        "does not correlate": np.count_nonzero(block.counted & ~correlated),
     }
-    seen = Counts(
-        len(table.targets), int(np.count_nonzero(kept)), "patch observations", dropped
-    )
-    noise = _noise(block, values, kept) * chosen.inflation
-    final = make_block(gathered[0], kept.astype(float), settings, num_threads, noise)
-    final.planes = block.planes
-    final.refresh(values)
-    return final, [counts, seen]
+    for reason, number in reasons.items():
+        dropped[reason] = dropped.get(reason, 0) + int(number)
+    block.weigh_observations(correlated)
+    block.refresh(values)
+    return block
 
 
 def _gather(
@@ -132,7 +146,8 @@ def _gather(
     """Pixels of the patches at the levels from `level` to `top`, and visibility (O,) 0 or 1."""
     gathered: list[PatchPixels] = []
     visible = np.ones(len(table.targets))
-    for f in track(range(len(frames)), "sampling patches"):
+    needed = np.union1d(table.hosts, table.targets)
+    for f in track(needed.tolist(), "sampling patches"):
         greys, usable = patches.pyramid(frames, f, settings, top)
         for k, grey in enumerate(greys[level:]):
             if k == len(gathered):
@@ -143,6 +158,42 @@ def _gather(
         spans = patch_spans(table, world_T_rigs, table.planes, rows)
         visible[rows] = patches.usable_at(usable, spans[:, 0])
     return gathered, visible
+
+
+def _solve(
+    pixels: PatchPixels,
+    keypoints: Keypoints,
+    solved: Adjustment,
+    priors: gtsam.NonlinearFactorGraph,
+    rig: CubeRig,
+    settings: RefineSettings,
+    num_threads: int,
+) -> tuple[Adjustment, np.ndarray, np.ndarray]:
+    """The joint solve, repeated once where frames are doubted: their weights, their residuals.
+
+    It is undone where it explains the map's own observations worse than before.
+    """
+    chosen, values = settings.photometric, adjust.values_of(solved.world_T_rigs)
+    solver = settings.solver.model_copy(update={"relative_tolerance": chosen.tolerance})
+    start = make_block(pixels, np.ones(len(pixels.table.targets)), settings, num_threads)
+    noise = _noise(start, values) * chosen.inflation
+    weights = np.ones(pixels.num_frames)
+    for _ in range(2):
+        block = make_block(pixels, start.counted * 1.0, settings, num_threads, noise)
+        block.weigh(weights)
+        landmarks = adjust.landmark_block(
+            solved.landmarks, keypoints, rig, solved.noise, settings, num_threads
+        )
+        landmarks.polish(values)
+        before, fits = landmarks.error(values), _geometric_fits(landmarks, values)
+        result = optimize(priors, [landmarks, block], values, solver)
+        growth = _geometric_fits(landmarks, result.values) / fits
+        doubts, residuals = _frame_weights(block, result.values, growth, chosen)
+        if np.all(doubts >= 1) or np.any(weights < 1):
+            break
+        weights = doubts
+    accepted = landmarks.error(result.values) <= chosen.max_growth * before
+    return _adjusted(solved, landmarks, result, accepted), weights, residuals
 
 
 def make_block(
@@ -167,43 +218,66 @@ def make_block(
     )
 
 
-def _noise(block: PhotometricBlock, values: gtsam.Values, kept: np.ndarray) -> float:
+def _noise(block: PhotometricBlock, values: gtsam.Values) -> float:
     """Typical residual of a pixel at the start, in units of the settings' sigma."""
-    if not kept.any():
+    block.refresh(values)
+    if not block.counted.any():
         return 1.0
-    return float(np.sqrt(np.median(block.errors(values)[kept])))
+    return float(np.sqrt(np.median(block.errors(values)[block.counted])))
+
+
+def _geometric_fits(landmarks: LandmarkBlock, values: gtsam.Values) -> np.ndarray:
+    """Median residual (F,) of each frame's geometric observations, sigmas; 1 without any."""
+    residuals, _ = landmarks.residuals(values)
+    norms = np.linalg.norm(np.concatenate(residuals), axis=1)
+    frames = np.concatenate([term.frames for term in landmarks.terms])
+    fits = np.ones(len(landmarks.pose_keys))
+    for f in range(len(fits)):
+        rows = frames == f
+        if np.count_nonzero(rows) >= _LEAST_JUDGED:
+            fits[f] = max(float(np.median(norms[rows])), 1e-9)
+    return fits
 
 
 def _frame_weights(
-    block: PhotometricBlock, values: gtsam.Values, settings: PhotometricSettings
+    block: PhotometricBlock,
+    values: gtsam.Values,
+    growth: np.ndarray,
+    settings: PhotometricSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weight (F,) of each frame's pixels, and the median (F,) of its residuals in sigmas.
 
-    Blur, a passer-by or a wrong pose make a frame's patches fit worse than those of the others:
-    beyond `max_frame_ratio` its weight falls with the square of the ratio.
+    Blur, a passer-by or a wrong pose make a frame's patches fit worse than those of the others;
+    or its pixels pull it off its geometric observations, whose residuals grow by `growth (F,)`.
+    Beyond what is allowed a weight falls with the square of the ratio.
     """
     kept = block.counted
     errors = np.sqrt(block.errors(values)[kept])
-    frames = [block.table.targets[kept], block.table.hosts[block.table.owners][kept]]
+    targets, hosts = block.table.targets[kept], block.table.hosts[block.table.owners][kept]
     residuals = np.full(len(block.pose_keys), np.nan)
     for f in range(len(residuals)):
-        rows = (frames[0] == f) | (frames[1] == f)
-        if np.count_nonzero(rows) >= _LEAST_PATCHES:
+        rows = (targets == f) | (hosts == f)
+        if np.count_nonzero(rows) >= _LEAST_JUDGED:
             residuals[f] = np.median(errors[rows])
     typical = np.nanmedian(residuals) if np.isfinite(residuals).any() else 1.0
-    ratios = np.nan_to_num(residuals / typical, nan=1.0)
-    weights = np.where(
-        ratios > settings.max_frame_ratio, (settings.max_frame_ratio / ratios) ** 2, 1.0
-    )
-    return np.maximum(weights, _LEAST_WEIGHT), residuals
+    ratios = np.nan_to_num(residuals / typical, nan=1.0) / settings.max_frame_ratio
+    worst = np.maximum(1.0, np.maximum(ratios, growth / settings.max_frame_growth))
+    return np.maximum(worst**-2.0, _LEAST_WEIGHT), residuals
 
 
-def _adjusted(solved: Adjustment, landmarks: LandmarkBlock, result: OptimizeResult) -> Adjustment:
-    world_T_rigs = adjust.poses_of(result.values, len(solved.world_T_rigs))
-    placed = replace(solved.landmarks, points_world=landmarks.points_world)
-    num = len(placed.tracks)
+def _adjusted(
+    solved: Adjustment, landmarks: LandmarkBlock, result: OptimizeResult, accepted: bool
+) -> Adjustment:
+    """The solution with the joint solve's poses and points, or as it was if not accepted."""
+    tracks = solved.landmarks.tracks
     gate = solved.rounds[-1].gate_sigmas if solved.rounds else np.inf
     note = Round(
-        gate, solved.noise, num, placed.tracks.num_points, num, True, result.history, result.reason
-    )
-    return Adjustment(world_T_rigs, placed, solved.noise, (*solved.rounds, note))
+        gate, solved.noise, len(tracks), tracks.num_points, len(tracks), accepted,
+        result.history, result.reason,
+    )  # fmt: skip
+    rounds = (*solved.rounds, note)
+    if not accepted:
+        return replace(solved, rounds=rounds)
+    placed = replace(solved.landmarks, points_world=landmarks.points_world)
+    world_T_rigs = adjust.poses_of(result.values, len(solved.world_T_rigs))
+    return Adjustment(world_T_rigs, placed, solved.noise, rounds)

@@ -90,11 +90,13 @@ def take_notes(
     coarse: CoarsePoses,
     reconstruction: Reconstruction,
     undone: Sequence[str],
+    frame_weights: np.ndarray,
 ) -> list[str]:
     """What the user should know about a run, also logged as warnings.
 
     Args:
         undone: stages in which a round of bundle adjustment was undone.
+        frame_weights: (F,) of each frame's pixels, below 1 where they contradict the others.
     """
     filled = np.flatnonzero(coarse.sources != PoseSource.SLAM)
     lost = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
@@ -107,6 +109,8 @@ def take_notes(
         notes.append(f"matched nothing, held by the trajectory alone: {_names(frames, lost)}")
     if undone:
         notes.append(f"rounds were undone in {', '.join(undone)}: they explained less")
+    if len(doubted := np.flatnonzero(frame_weights < 1)):
+        notes.append(f"pixels fit badly and were weighted down: {_names(frames, doubted)}")
     for note in notes:
         logger.warning(note)
     return notes

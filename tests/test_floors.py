@@ -18,8 +18,8 @@ FLOORS = (
     {"", "types", "geometry", "config", "config_file", "log"},
     {"rig", "records", "run_folder", "search", "store", "read"},
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
-    | {"graph", "optimize", "filter"},
-    {"adjust", "frontend", "reconstruction"},
+    | {"graph", "optimize", "filter", "patches"},
+    {"adjust", "frontend", "photometric", "reconstruction"},
     {"export", "evaluate", "report"},
     {"demo", "line", "pipeline"},
     {"cli"},

@@ -18,7 +18,7 @@ Overrides = Annotated[
 ]
 Factors = Annotated[
     str | None,
-    typer.Option(help="Factor families: bearing, reprojection, or both with a comma between."),
+    typer.Option(help="Factor families, commas between: bearing, reprojection, photometric."),
 ]
 
 

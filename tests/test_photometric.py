@@ -1,0 +1,181 @@
+"""Patches on the sphere, their depths from the map, and the stage in a run."""
+
+import gtsam
+import numpy as np
+import pytest
+from photometric_world import Texture, render
+from synthetic import unit
+from tiny_run import SETTINGS, Case, computed_stages
+
+from gsba import patches, photometric
+from gsba.config import PhotometricSettings, RefineSettings
+from gsba.config_file import load_config
+from gsba.geometry import erp_from_bearings
+from gsba.log import GsbaError
+from gsba.types import FrameSet
+
+WIDTH = 512
+GREY = render(np.eye(4), Texture(np.random.default_rng(0)), WIDTH).astype(np.float32)
+ALL = np.ones(GREY.shape, bool)
+JOINT = RefineSettings.model_validate(
+    {**SETTINGS.model_dump(), "factors": ("bearing", "photometric")}
+)
+
+
+def test_patches_are_spread_over_the_sphere() -> None:
+    settings = PhotometricSettings(spacing_deg=10)
+    bearings = patches.candidates(GREY, ALL, settings)
+    assert np.allclose(np.linalg.norm(bearings, axis=1), 1)
+    # 4 pi / (10 deg)^2 cells, those beyond 80 degrees of latitude left empty
+    assert 370 < len(bearings) < 430
+    octants = np.bincount((bearings > 0) @ [1, 2, 4], minlength=8)
+    assert octants.min() > 0.8 * octants.max()
+
+
+def test_masked_flat_and_saturated_places_have_no_patch() -> None:
+    settings = PhotometricSettings()
+    usable = ALL.copy()
+    usable[:, :200] = False
+    bearings = patches.candidates(GREY, usable, settings)
+    u = erp_from_bearings(bearings, WIDTH, WIDTH // 2)[:, 0]
+    reach = settings.size // 2
+    assert len(bearings) and (u > 200 + reach).all() and (u < WIDTH - reach).all()
+    assert len(patches.candidates(np.full_like(GREY, 90), ALL, settings)) == 0
+    assert len(patches.candidates(GREY, ~ALL, settings)) == 0
+
+
+def test_coarser_masks_want_all_pixels() -> None:
+    usable = np.ones((4, 8), bool)
+    usable[3, 5] = False
+    assert np.array_equal(patches.coarser(usable, 2), [[1, 1, 1, 1], [1, 1, 0, 1]])
+
+
+def test_planes_pass_through_the_map() -> None:
+    rng = np.random.default_rng(1)
+    normal, offset = unit(np.array([0.3, -0.2, 1.0])), 3.0
+    rays = unit(np.array([0, 0, 1.0]) + 0.25 * rng.normal(size=(400, 3)))
+    points = rays * (offset / (rays @ normal))[:, None]
+    points[::15] *= 1.5  # of another surface
+    bearings = unit(np.array([0, 0, 1.0]) + 0.05 * rng.normal(size=(50, 3)))
+    settings = PhotometricSettings(slope_sigma=10.0)
+    planes, clear = patches.lay_planes(bearings, points, settings)
+    assert np.count_nonzero(clear) > 40
+    expected = bearings @ normal / offset
+    assert np.abs(planes[clear, 0] / expected[clear] - 1).max() < 0.01
+
+
+def test_a_map_without_points_near_gives_no_depth() -> None:
+    rng = np.random.default_rng(2)
+    bearings = unit(np.array([0, 0, -1.0]) + 0.05 * rng.normal(size=(5, 3)))
+    points = 3 * unit(np.array([0, 0, 1.0]) + 0.05 * rng.normal(size=(100, 3)))
+    assert not patches.lay_planes(bearings, points, PhotometricSettings())[1].any()
+    assert not patches.lay_planes(bearings, points[:3], PhotometricSettings())[1].any()
+    scattered = unit(rng.normal(size=(200, 3))) * rng.uniform(1, 30, (200, 1))
+    clear = patches.lay_planes(unit(rng.normal(size=(50, 3))), scattered, PhotometricSettings())[1]
+    assert np.count_nonzero(clear) < 10
+
+
+@pytest.fixture(scope="module")
+def joint(case: Case, tmp_path_factory: pytest.TempPathFactory):
+    """The case's run, taken further by the photometric family."""
+    out = case.copy(tmp_path_factory.mktemp("photometric") / "run")
+    return case.refine(out, JOINT), out
+
+
+def test_a_finished_run_goes_on(case: Case, joint) -> None:
+    result, out = joint
+    assert computed_stages(result)[0] == "photometric"
+    before, after = case.errors(), case.errors(out)
+    # a walk of eight 512 px frames; at full size the gain is about twofold
+    assert after.rpe_rotation_deg.rmse < 0.9 * before.rpe_rotation_deg.rmse
+    assert after.rpe_translation.rmse < before.rpe_translation.rmse
+
+
+def test_the_report_tells_of_patches(joint) -> None:
+    result, _ = joint
+    stage = next(s for s in result.report["stages"] if s["name"] == "photometric")
+    taken, seen = stage["counts"]
+    assert taken["unit"] == "patches" and seen["unit"] == "patch observations"
+    for counts in (taken, seen):
+        assert counts["received"] == counts["kept"] + sum(counts["dropped"].values())
+        assert counts["kept"] > 100
+    last = result.report["solver"][-1]
+    costs = last["rounds"][-1]["iterations"][0]["costs"]
+    assert last["stage"] == "photometric" and {"bearing", "photometric", "graph"} == set(costs)
+
+
+def _start(case: Case, settings: RefineSettings):
+    from gsba import cubemap, graph
+    from gsba.adjust import Adjustment
+    from gsba.store import load_stage
+    from gsba.types import Keypoints
+
+    frames = load_stage(case.out, "frames", FrameSet)
+    solved = load_stage(case.out, "refined1", Adjustment)
+    keypoints = load_stage(case.out, "keypoints", Keypoints)
+    priors = graph.build(case.result.coarse.world_T_rigs, settings.priors)
+    return frames, keypoints, solved, priors, cubemap.rig_for(frames, settings.cubemap)
+
+
+def test_nothing_to_see_changes_nothing(case: Case) -> None:
+    settings = JOINT.model_copy(
+        update={"photometric": PhotometricSettings(min_gradient=1e3, depth_levels=0)}
+    )
+    frames, keypoints, solved, priors, rig = _start(case, settings)
+    result = photometric.run(frames, keypoints, solved, priors, rig, settings, 1)
+    assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
+    assert all(counts.kept == 0 for counts in result.counts)
+
+
+def test_a_solve_against_the_map_is_undone(case: Case) -> None:
+    settings = JOINT.model_copy(
+        update={"photometric": PhotometricSettings(max_growth=1e-3, depth_levels=0, spacing_deg=20)}
+    )
+    frames, keypoints, solved, priors, rig = _start(case, settings)
+    result = photometric.run(frames, keypoints, solved, priors, rig, settings, 1)
+    assert not result.adjustment.rounds[-1].accepted
+    assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
+
+
+def test_cube_faces_are_refused_in_one_line(case: Case) -> None:
+    frames, *_ = _start(case, JOINT)
+    cube = FrameSet(
+        frames.names, frames.paths, frames.timestamps, "cube", ("front",), 64, 64, frames.mask_paths
+    )
+    with pytest.raises(GsbaError, match="reads panoramas"):
+        patches.pyramid(cube, 0, PhotometricSettings(), 0)
+
+
+def test_the_family_needs_another() -> None:
+    with pytest.raises(GsbaError, match="photometric starts from bearing or reprojection"):
+        load_config(None, ['factors=["photometric"]'])
+
+
+def test_wide_panoramas_are_halved(case: Case) -> None:
+    frames, *_ = _start(case, JOINT)
+    levels, usable = patches.pyramid(frames, 0, PhotometricSettings(max_width=256), 2)
+    assert [level.shape for level in levels] == [(128, 256), (64, 128), (32, 64)]
+    assert usable.shape == (128, 256)
+
+
+def test_a_doubted_frame_loses_weight() -> None:
+    class Block:
+        """What the rule looks at."""
+
+        pose_keys = range(3)
+        counted = np.ones(60, bool)
+
+        class table:
+            targets = np.repeat([0, 1, 2], 20)
+            hosts = np.array([0, 1, 2])
+            owners = np.repeat([0, 1, 2], 20)
+
+        def errors(self, _values: gtsam.Values) -> np.ndarray:
+            return np.repeat([1.0, 1.0, 36.0], 20)
+
+    settings, values = PhotometricSettings(), gtsam.Values()
+    rule = photometric._frame_weights
+    weights, residuals = rule(Block(), values, np.ones(3), settings)  # type: ignore[arg-type]
+    assert np.allclose(residuals, [1, 1, 6]) and np.allclose(weights, [1, 1, 1 / 9])
+    pulled = rule(Block(), values, np.array([2.4, 1.0, 1.0]), settings)[0]  # type: ignore[arg-type]
+    assert np.allclose(pulled, [1 / 4, 1, 1 / 9])
