@@ -12,6 +12,9 @@ from factors._photometric_kernels import sample_many
 from factors.bearing import tangent_basis
 from factors.sphere_image import PAD, SphereImage, pixels_of
 
+_LEAST_COSINE = 0.15  # of the angle between a patch's normal and the ray that sees it
+_MOST_ZOOM = 2.0  # change of a patch's size between host and target, either way
+
 
 @dataclass(frozen=True, slots=True)
 class PatchTable:
@@ -151,6 +154,33 @@ def patch_spans(
     c = np.einsum("rji,rj->ri", target[:, :3, :3], host[:, :3, 3] - target[:, :3, 3])
     spans = np.einsum("rij,rkj->rki", target_R_host, patch_axes(table.bearings_rig)[owners])
     return spans + planes[owners][:, :, None] * c[:, None, :]
+
+
+def poor_views(
+    table: PatchTable, world_T_rigs: np.ndarray, planes: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Reason -> observations (O,) bool that show their patch too badly to count.
+
+    "behind": a pixel of the patch has no positive depth; "grazing": the target sees it from behind
+    or along its surface; "zoom": far larger or smaller than the host does.
+    """
+    owners = table.owners
+    inverse_depths = np.column_stack([np.ones(len(table.grid)), table.grid]) @ planes.T
+    spans = patch_spans(table, world_T_rigs, planes, np.arange(len(owners)))
+    middle = spans[:, 0]
+    length = np.maximum(np.linalg.norm(middle, axis=1), 1e-12)
+    # area of the patch on the target's sphere per area on the host's
+    area = np.einsum("oi,oi->o", np.cross(spans[:, 1], spans[:, 2]), middle) / length**3
+    normals = np.einsum("pk,pki->pi", planes, patch_axes(table.bearings_rig))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.einsum("oij,oj->oi", world_T_rigs[table.hosts[owners], :3, :3], normals[owners])
+    rays = np.einsum("oij,oj->oi", world_T_rigs[table.targets, :3, :3], middle)
+    cosine = np.einsum("oi,oi->o", normals, rays) / length
+    return {
+        "behind": ~np.all(inverse_depths > 0, axis=0)[owners],
+        "grazing": ~(cosine > _LEAST_COSINE),
+        "zoom": ~((area < _MOST_ZOOM**2) & (area > _MOST_ZOOM**-2)),
+    }
 
 
 class PatchPixels:

@@ -15,14 +15,12 @@ from factors._photometric_kernels import DIMS, PatchData, observe_range
 from factors._photometric_schur import eliminate_range
 from factors._terms import pose_rows
 from factors.block import PoseSystem
-from factors.patches import PatchPixels, covisible_frames, patch_axes, patch_spans
+from factors.patches import PatchPixels, covisible_frames, patch_axes, poor_views
 from factors.robust import RobustLoss
 
 FAMILY = "photometric"
 _LEAST_SHARE = 0.2  # of its inverse depth is what one step leaves a patch at least
 _LEAST_CONTRAST = 1.0  # grey values, standard deviation over a template
-_LEAST_COSINE = 0.15  # of the angle between a patch's normal and the ray that sees it
-_MOST_ZOOM = 2.0  # change of a patch's size between host and target, either way
 
 
 class PhotometricBlock:
@@ -226,26 +224,11 @@ class PhotometricBlock:
 
     def _blemishes(self, values: gtsam.Values, errors: np.ndarray) -> dict[str, np.ndarray]:
         """Reason -> observations (O,) bool that cannot count, at the current planes."""
-        table, owners = self.table, self.table.owners
-        hosts = table.hosts[owners]
         world_T_rigs = np.array([values.atPose3(key).matrix() for key in self.pose_keys])
-        inverse_depths = np.column_stack([np.ones(len(table.grid)), table.grid]) @ self.planes.T
-        behind = ~np.all(inverse_depths > 0, axis=0)[owners]
-        spans = patch_spans(table, world_T_rigs, self.planes, np.arange(len(owners)))
-        middle, across, down = spans[:, 0], spans[:, 1], spans[:, 2]
-        length = np.maximum(np.linalg.norm(middle, axis=1), 1e-12)
-        # area of the patch on the target's sphere per area on the host's
-        area = np.einsum("oi,oi->o", np.cross(across, down), middle) / length**3
-        normals = np.einsum("pk,pki->pi", self.planes, self._data.axes)
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = np.einsum("oij,oj->oi", world_T_rigs[hosts, :3, :3], normals[owners])
-        rays = np.einsum("oij,oj->oi", world_T_rigs[table.targets, :3, :3], middle)
-        cosine = np.einsum("oi,oi->o", normals, rays) / length
-        lost = 2 * self._data.scales[owners] ** 2 / len(table.grid)
+        owners = self.table.owners
+        lost = 2 * self._data.scales[owners] ** 2 / len(self.table.grid)
         return {
-            "behind": behind,
-            "grazing": ~(cosine > _LEAST_COSINE),
-            "zoom": ~((area < _MOST_ZOOM**2) & (area > _MOST_ZOOM**-2)),
+            **poor_views(self.table, world_T_rigs, self.planes),
             "outside its window": errors == lost,
             "no contrast": self._flat[owners],
         }

@@ -148,7 +148,7 @@ class PhotometricSettings(_Settings):
     slope_sigma: float = Field(default=0.7, gt=0)  # of its tilt, as a tangent
     noise_grey: float = Field(default=2.0, gt=0)  # grey values of a pixel
     noise_contrast: float = Field(default=0.1, ge=0)  # further noise, part of the contrast
-    inflation: float = Field(default=3.0, gt=0)  # of sigmas: pixels of a patch err together
+    inflation: float = Field(default=2.0, gt=0)  # of sigmas: pixels of a patch err together
     loss_sigmas: float = Field(default=2.0, gt=0)  # Cauchy scale, of a patch's mean residual
     max_frame_ratio: float = Field(
         default=2.0, gt=1
@@ -157,7 +157,7 @@ class PhotometricSettings(_Settings):
         default=1.2, gt=1
     )  # of a frame's geometric residual under the joint solve; above, it is weighted down
     max_growth: float = Field(default=1.05, gt=0)  # of all geometric cost, or the solve is undone
-    tolerance: float = Field(default=2e-4, gt=0, lt=1)  # of the joint solve
+    tolerance: float = Field(default=1e-3, gt=0, lt=1)  # of the joint solve
     polish_steps: int = Field(default=0, ge=0)  # of planes, after each step of the poses
 
 

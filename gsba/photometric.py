@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 
 from factors import LandmarkBlock, RobustLoss
-from factors.patches import PatchPixels, PatchTable, patch_spans
+from factors.patches import PatchPixels, PatchTable, patch_spans, poor_views
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
 from gsba import adjust, graph, patches
@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 _LEAST_WEIGHT = 1e-3  # of a frame
 _DEPTH_STEPS = 5  # Gauss-Newton steps on the planes at each level
 _LEAST_JUDGED = 10  # observations of a frame that is judged
-_CHUNK = 150_000  # observations whose depths are found at a time: bounds the windows held
+_CHUNK = 80_000  # observations whose depths are found at a time: bounds the windows held
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,15 +83,21 @@ def _patches(
         bearings.append(patches.candidates(grey, usable, chosen))
         width = grey.shape[1]
     table, counts = patches.table_of(bearings, world_T_rigs, solved.landmarks, width, chosen)
+    num, dropped = len(table.targets), {}
+    left = np.ones(num, bool)
+    for reason, flag in poor_views(table, world_T_rigs, table.planes).items():
+        dropped[reason] = int(np.count_nonzero(flag & left))
+        left &= ~flag
+    table, _ = table.select(left)
+    kept = np.zeros(len(table.targets), bool)
     rows = np.cumsum(np.diff(table.offsets)) // _CHUNK
-    kept, dropped = np.zeros(len(table.targets), bool), {}
     for chunk in np.unique(rows):
         observations = (rows == chunk)[table.owners]
         part, own = table.select(observations)
         block = _with_depths(frames, part, world_T_rigs, level, settings, num_threads, dropped)
         table.planes[own] = block.planes
         kept[observations] = block.counted
-    seen = Counts(len(kept), int(np.count_nonzero(kept)), "patch observations", dropped)
+    seen = Counts(num, int(np.count_nonzero(kept)), "patch observations", dropped)
     table, _ = table.select(kept)
     gathered, _ = _gather(frames, table, world_T_rigs, level, level, chosen)
     return next(iter(gathered), None), [counts, seen]
