@@ -8,7 +8,7 @@ from typing import TypeVar
 import gtsam
 import numpy as np
 
-from gsba import adjust, cubemap, features, frontend, graph, photometric, tracks
+from gsba import adjust, cubemap, features, frontend, graph, patches, photometric, tracks
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
@@ -44,6 +44,8 @@ class Line:
     ) -> None:
         self.store, self.frames, self.coarse, self.settings = store, frames, coarse, settings
         self.num_threads = settings.solver.num_threads or os.cpu_count() or 1
+        if "photometric" in settings.factors:
+            patches.check(frames)
         self.rig = cubemap.rig_for(frames, settings.cubemap)
         self.priors = graph.build(coarse.world_T_rigs, settings.priors)
         self.custom = None if extra_factors is None else uuid.uuid4().hex  # resumes nothing

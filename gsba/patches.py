@@ -19,6 +19,20 @@ _EDGE_SHARE = 0.05  # of an edge's strength, beside that of a corner
 _MAX_LATITUDE = np.deg2rad(80.0)  # beyond, pixels of a panorama are mostly invented
 
 
+def check(frames: FrameSet) -> None:
+    """Refuse frames that patches cannot be sampled from.
+
+    Raises:
+        GsbaError: cube faces, or panoramas of an odd height.
+    """
+    if frames.layout != "erp" or frames.height % 2:
+        what = "cube faces" if frames.layout != "erp" else f"{frames.height} rows"
+        raise GsbaError(
+            f"the photometric family reads panoramas of even height, not {what}: leave it out of "
+            "--factors"
+        )
+
+
 def pyramid(
     frames: FrameSet, frame: int, settings: PhotometricSettings, top: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
@@ -29,14 +43,7 @@ def pyramid(
 
     Returns:
         (H, 2 H) float32 of each level, and (H, 2 H) bool: not masked, neither black nor saturated.
-
-    Raises:
-        GsbaError: the frames are no panoramas.
     """
-    if frames.layout != "erp":
-        raise GsbaError(
-            "the photometric family reads panoramas: leave it out of --factors for cube faces"
-        )
     grey = cv2.cvtColor(read.load_erp(frames, frame), cv2.COLOR_RGB2GRAY).astype(np.float32)
     usable = (grey > _DARK) & (grey < _BRIGHT)
     mask = read.load_mask(frames, frame)

@@ -81,7 +81,7 @@ def _patches(
         grey = greys[-1]
         usable = patches.coarser(usable, len(usable) // len(grey))
         bearings.append(patches.candidates(grey, usable, chosen))
-        width = grey.shape[1]
+        width, level = grey.shape[1], len(greys) - 1  # a small panorama has fewer
     table, counts = patches.table_of(bearings, world_T_rigs, solved.landmarks, width, chosen)
     num, dropped = len(table.targets), {}
     left = np.ones(num, bool)

@@ -1,5 +1,7 @@
 """Patches on the sphere, their depths from the map, and the stage in a run."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from gsba import patches, photometric
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.config_file import load_config
 from gsba.geometry import erp_from_bearings
+from gsba.line import Line
 from gsba.log import GsbaError
 from gsba.types import FrameSet
 
@@ -137,13 +140,27 @@ def test_a_solve_against_the_map_is_undone(case: Case) -> None:
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
 
 
-def test_cube_faces_are_refused_in_one_line(case: Case) -> None:
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"layout": "cube", "faces": ("front",)}, "not cube faces"),
+        ({"width": 510, "height": 255}, "not 255 rows"),
+    ],
+)
+def test_other_frames_are_refused_before_any_work(case: Case, change: dict, message: str) -> None:
     frames, *_ = _start(case, JOINT)
-    cube = FrameSet(
-        frames.names, frames.paths, frames.timestamps, "cube", ("front",), 64, 64, frames.mask_paths
+    patches.check(frames)
+    with pytest.raises(GsbaError, match=message):
+        Line(None, replace(frames, **change), None, JOINT, None)  # type: ignore[arg-type]
+
+
+def test_a_small_panorama_has_fewer_levels(case: Case) -> None:
+    settings = JOINT.model_copy(
+        update={"photometric": PhotometricSettings(levels=(9,), spacing_deg=20, size=5)}
     )
-    with pytest.raises(GsbaError, match="reads panoramas"):
-        patches.pyramid(cube, 0, PhotometricSettings(), 0)
+    frames, keypoints, solved, priors, rig = _start(case, settings)
+    result = photometric.run(frames, keypoints, solved, priors, rig, settings, 1)
+    assert np.isfinite(result.adjustment.world_T_rigs).all() and len(result.counts) == 2
 
 
 def test_the_family_needs_another() -> None:
