@@ -191,7 +191,7 @@ def test_a_round_that_explains_less_is_undone(monkeypatch: pytest.MonkeyPatch) -
         if len(calls) < 3:
             return result
         off = drifted(world.world_T_rigs, np.random.default_rng(9), amount=5)
-        return replace(result, values=adjust._values(off))
+        return replace(result, values=adjust.values_of(off))
 
     monkeypatch.setattr(adjust, "optimize", sabotage)
     solved = _run(world, coarse, settings)
@@ -199,7 +199,7 @@ def test_a_round_that_explains_less_is_undone(monkeypatch: pytest.MonkeyPatch) -
     two = _position_rmse(solved.world_T_rigs, world.world_T_rigs)
     assert two < 3 * _position_rmse(good.world_T_rigs, world.world_T_rigs)
     # What is kept fits the second round: its poses, its noise, and points that agree with both.
-    np.testing.assert_array_equal(solved.world_T_rigs, adjust._poses(calls[1].values, 20))
+    np.testing.assert_array_equal(solved.world_T_rigs, adjust.poses_of(calls[1].values, 20))
     assert solved.noise == solved.rounds[1].noise == solved.rounds[-1].noise
     assert len(solved.landmarks.tracks) > 0.9 * len(good.landmarks.tracks)
     assert all(r.support < solved.rounds[1].support for r in solved.rounds[2:])
