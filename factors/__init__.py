@@ -4,6 +4,9 @@ from factors.bearing import BearingFactor, BearingTerm, bearing_residuals, tange
 from factors.block import Block, PoseSystem
 from factors.check import jacobian_errors
 from factors.landmarks import LandmarkBlock
+from factors.patches import PatchPixels, PatchTable
+from factors.photometric import PhotometricBlock
+from factors.photometric_factor import PhotometricFactor, photometric_residuals
 from factors.reprojection import (
     FaceCameras,
     ReprojectionFactor,
@@ -11,6 +14,7 @@ from factors.reprojection import (
     reprojection_residuals,
 )
 from factors.robust import RobustLoss
+from factors.sphere_image import SphereImage
 
 __all__ = [
     "BearingFactor",
@@ -18,12 +22,18 @@ __all__ = [
     "Block",
     "FaceCameras",
     "LandmarkBlock",
+    "PatchPixels",
+    "PatchTable",
+    "PhotometricBlock",
+    "PhotometricFactor",
     "PoseSystem",
     "ReprojectionFactor",
     "ReprojectionTerm",
     "RobustLoss",
+    "SphereImage",
     "bearing_residuals",
     "jacobian_errors",
+    "photometric_residuals",
     "reprojection_residuals",
     "tangent_basis",
 ]
