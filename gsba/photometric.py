@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 _LEAST_WEIGHT = 1e-3  # of a frame
 _DEPTH_STEPS = 5  # Gauss-Newton steps on the planes at each level
 _LEAST_JUDGED = 10  # observations of a frame that is judged
-_CHUNK = 80_000  # observations whose depths are found at a time: bounds the windows held
+_CHUNK = 40_000  # observations whose depths are found at a time: bounds the windows held
 
 
 @dataclass(frozen=True, slots=True)
