@@ -14,7 +14,7 @@ from factors import (
     LandmarkBlock,
     ReprojectionTerm,
     RobustLoss,
-    bearing_residuals,
+    tangent_basis,
 )
 from gsba import graph, triangulate
 from gsba.config import RefineSettings, SolverSettings
@@ -69,6 +69,7 @@ def run(
     gates: Sequence[float],
     settings: RefineSettings,
     num_threads: int,
+    final: bool = True,
 ) -> Adjustment:
     """Solve for all poses in rounds of tightening gates.
 
@@ -85,18 +86,20 @@ def run(
         gates: of each round, in standard deviations of the noise.
         settings: families, loss, solver.
         num_threads: of the solver.
+        final: whether the last round is solved to the end; others lose observations anyway.
     """
     world_T_rigs, noise, rounds = start.world_T_rigs, start.noise, []
     rows = keypoints.rows(tracks)
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
-    place = partial(triangulate.run, tracks, bearings, sigmas, settings=settings.triangulate)
+    shared = {"settings": settings.triangulate, "num_threads": num_threads}
+    place = partial(triangulate.run, tracks, bearings, sigmas, **shared)
     last_gate = gates[-1] * noise
     support = len(place(world_T_rigs, last_gate).tracks)
     for number, gate in enumerate(gates, 1):
         landmarks = place(world_T_rigs, gate * noise)
         spread = noise * max(1.0, gate / settings.rounds.gate_scale)
         block = landmark_block(landmarks, keypoints, rig, spread, settings, num_threads)
-        solver = _solver(settings, last=number == len(gates))
+        solver = _solver(settings, last=final and number == len(gates))
         result = optimize(priors, [block], _values(world_T_rigs), solver)
         poses = _poses(result.values, len(world_T_rigs))
         new_support = len(place(poses, last_gate).tracks)
@@ -106,24 +109,15 @@ def run(
             placed = place(poses, gate * noise)
             if len(placed.tracks):
                 noise = max(_noise(placed, keypoints, poses), settings.rounds.min_noise)
-        rounds.append(
-            Round(
-                gate,
-                noise,
-                len(landmarks.tracks),
-                landmarks.tracks.num_points,
-                new_support,
-                accepted,
-                result.history,
-                result.reason,
-            )
-        )
+        used = len(landmarks.tracks), landmarks.tracks.num_points
+        outcome = accepted, result.history, result.reason
+        rounds.append(Round(gate, noise, *used, new_support, *outcome))
         logger.debug("round: %s", rounds[-1])
     return Adjustment(world_T_rigs, place(world_T_rigs, gates[-1] * noise), noise, tuple(rounds))
 
 
 def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
-    """Settings of a round: only the last is solved to the end, the others lose observations."""
+    """Settings of a round: only the last of a run is solved to the end."""
     if last or settings.rounds.tolerance < settings.solver.relative_tolerance:
         return settings.solver
     return settings.solver.model_copy(update={"relative_tolerance": settings.rounds.tolerance})
@@ -191,7 +185,10 @@ def _noise(landmarks: Landmarks, keypoints: Keypoints, world_T_rigs: np.ndarray)
     """
     tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
     points, bearings = landmarks.points_world[tracks.points], keypoints.bearings_rig[rows]
-    residuals, _, _ = bearing_residuals(world_T_rigs[tracks.frames], points, bearings)
+    world_T_rig = world_T_rigs[tracks.frames]
+    offsets = np.einsum("oji,oj->oi", world_T_rig[:, :3, :3], points - world_T_rig[:, :3, 3])
+    residuals = np.einsum("oij,oj->oi", tangent_basis(bearings), offsets)
+    residuals /= np.linalg.norm(offsets, axis=1, keepdims=True)  # sines: the angles are small
     unknowns = 3 * landmarks.tracks.num_points + 6 * len(world_T_rigs)
     redundancy = max(1 - unknowns / residuals.size, _REDUNDANT)
     spread = 1.4826 * np.median(np.abs(residuals / keypoints.sigmas_rad[rows, None]))

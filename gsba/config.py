@@ -100,7 +100,7 @@ class RoundSettings(_Settings):
     refined: tuple[float, ...] = (6.0, 3.0, 2.5)  # with matches along the solved map
     map_passes: int = Field(default=1, ge=1)  # times the closed map is matched anew
     gate_scale: float = Field(default=10.0, ge=1)  # wider gates loosen the loss in proportion
-    tolerance: float = Field(default=1e-3, gt=0, lt=1)  # solver's, in all rounds but a stage's last
+    tolerance: float = Field(default=3e-4, gt=0, lt=1)  # solver's, in all rounds but a run's last
     min_support: float = Field(
         default=0.99, gt=0, le=1
     )  # observations a round must go on explaining

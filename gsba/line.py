@@ -163,7 +163,12 @@ class Line:
         )
 
     def solve(
-        self, name: str, matches: Sequence[Matches], start: Adjustment, gates: Sequence[float]
+        self,
+        name: str,
+        matches: Sequence[Matches],
+        start: Adjustment,
+        gates: Sequence[float],
+        final: bool = False,
     ) -> Adjustment:
         """Bundle adjustment in rounds over the tracks that matches make."""
 
@@ -178,9 +183,10 @@ class Line:
                 gates,
                 self.settings,
                 self.num_threads,
+                final,
             )
 
-        solved = self._stage(name, [self._solving(), gates], compute, Adjustment)
+        solved = self._stage(name, [self._solving(), gates, final], compute, Adjustment)
         self.counts[name] = [solved.landmarks.counts]
         self.solutions[name] = solved
         return solved

@@ -77,7 +77,8 @@ def refine(
         solved = line.solve("closed", [adjacent, near, loops.matches], solved, rounds.loops)
         for number in range(1, rounds.map_passes + 1):
             wide = line.match_known_points(f"everywhere{number}", solved, loops_closed=True)
-            solved = line.solve(f"refined{number}", [adjacent, wide], solved, rounds.refined)
+            final = number == rounds.map_passes
+            solved = line.solve(f"refined{number}", [adjacent, wide], solved, rounds.refined, final)
         reconstruction = line.reconstruct(solved)
         return _write(line, reconstruction)
 

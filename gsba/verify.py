@@ -1,5 +1,7 @@
 """Two-view verification on bearings, and agreement with the trajectory."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
 from gsba.config import VerifySettings
@@ -14,6 +16,7 @@ def run(
     position_sigmas: np.ndarray,
     settings: VerifySettings,
     seed: int,
+    num_threads: int = 1,
 ) -> VerifiedPairs:
     """Estimate a relative pose per pair by LO-RANSAC and keep pairs that agree with the prior.
 
@@ -25,30 +28,36 @@ def run(
             how much its direction is worth.
         settings: thresholds.
         seed: of the sampling.
+        num_threads: pairs verified at a time.
     """
-    kept, dropped = (
-        [],
-        {"too few matches": 0, "rotation contradicts": 0, "direction contradicts": 0},
-    )
-    for p, (f0, f1) in enumerate(matches.pairs):
-        rows = matches.of(p)
-        bearings0 = keypoints.bearings_of(f0)[rows[:, 0]]
-        bearings1 = keypoints.bearings_of(f1)[rows[:, 1]]
-        estimate = relative_pose(bearings0, bearings1, settings, seed)
-        if estimate is None:
+
+    def bearings_of(p: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        f0, f1 = matches.pairs[p]
+        return keypoints.bearings_of(f0)[rows[:, 0]], keypoints.bearings_of(f1)[rows[:, 1]]
+
+    def estimate(p: int) -> tuple[np.ndarray, np.ndarray] | None:
+        return relative_pose(*bearings_of(p, matches.of(p)), settings, seed)
+
+    with ThreadPoolExecutor(num_threads) as pool:
+        estimates = list(pool.map(estimate, range(len(matches.pairs))))
+    kept = []
+    dropped = {"too few matches": 0, "rotation contradicts": 0, "direction contradicts": 0}
+    for p, found in enumerate(estimates):
+        if found is None:
             dropped["too few matches"] += 1
             continue
-        f0_T_f1, inliers = estimate
+        f0_T_f1, inliers = found
+        rows = matches.of(p)[inliers]
         prior = prior_f0_T_f1s[p]
         turn = rotation_angle(prior[:3, :3].T @ f0_T_f1[:3, :3])
         if turn > np.deg2rad(settings.max_rotation_deg):
             dropped["rotation contradicts"] += 1
-        elif _parallax(f0_T_f1, bearings0[inliers], bearings1[inliers]) > np.deg2rad(
+        elif _parallax(f0_T_f1, *bearings_of(p, rows)) > np.deg2rad(
             settings.min_parallax_deg
         ) and not _direction_agrees(prior[:3, 3], f0_T_f1[:3, 3], position_sigmas[p], settings):
             dropped["direction contradicts"] += 1
         else:
-            kept.append((p, f0_T_f1, rows[inliers]))
+            kept.append((p, f0_T_f1, rows))
     index = [p for p, _, _ in kept]
     inlier_rows = [rows for _, _, rows in kept]
     verified = Matches(
