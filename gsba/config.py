@@ -23,8 +23,8 @@ class CubemapSettings(_Settings):
 
     hfov_deg: float = Field(default=96.0, ge=90, le=120)
     face_size: int | None = Field(default=None, ge=64)  # pixels; None = by oversampling
-    oversampling: float = Field(default=1.15, ge=0.25, le=4)  # face pixels per panorama pixel
-    min_face_size: int = Field(default=512, ge=64)  # pixels; bounds on the automatic size
+    oversampling: float = Field(default=0.6, ge=0.25, le=4)  # face pixels per panorama pixel
+    min_face_size: int = Field(default=320, ge=64)  # pixels; bounds on the automatic size
     max_face_size: int = Field(default=1024, ge=64)
 
 
@@ -32,8 +32,8 @@ class FeatureSettings(_Settings):
     """Keypoints on faces."""
 
     extractor: Literal["sift"] = "sift"
-    max_per_face: int = Field(default=1000, ge=16)
-    contrast_threshold: float = Field(default=0.01, gt=0)
+    max_per_face: int = Field(default=700, ge=16)
+    contrast_threshold: float = Field(default=0.015, gt=0)
     sigma_px: float = Field(
         default=0.16, gt=0
     )  # per-axis noise of the smallest keypoints, face pixels
@@ -63,7 +63,7 @@ class PairSettings(_Settings):
     max_baseline_depths: float = Field(default=2.0, gt=0)  # longest baseline in median scene depths
     max_loop_neighbours: int = Field(default=8, ge=0)  # nearest frames in space outside the window
     max_parallax_deg: float = Field(default=60.0, gt=0, le=180)
-    strongest_per_face: int = Field(default=300, ge=16)  # keypoints that find neighbours' geometry
+    strongest_per_face: int = Field(default=200, ge=16)  # keypoints that find neighbours' geometry
     scarce_matches: int = Field(default=60, ge=0)  # below, a pair is matched with all keypoints
     prior: GateSettings = GateSettings(rotation_deg=4.0, direction=0.4)  # coarse trajectory
     loop_deg: float = Field(default=2.0, gt=0)  # around a known point, besides drift
