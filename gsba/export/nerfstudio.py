@@ -2,8 +2,9 @@
 
 nerfstudio's cameras have OpenGL axes (y up, z backward) and its world has z up, so the world
 is turned by NERFSTUDIO_R_WORLD, which `applied_transform` states and the cloud shares. Base names
-are unique, because nerfstudio looks for down-scaled images by base name. Splat trainers need the
-faces; the panoramas are for models that take equirectangular rays:
+are unique, because nerfstudio looks for down-scaled images by base name. Every eighth panorama is
+held out with all its faces: a face left in for training would give its siblings away. Splat
+trainers need the faces; the panoramas are for models that take equirectangular rays:
 `ns-train nerfacto --data OUT/transforms_erp.json`.
 """
 
@@ -27,6 +28,7 @@ from gsba.types import FACES, FrameSet, Reconstruction
 NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 _CV_R_GL = np.diag([1.0, -1, -1])  # OpenGL camera axes in our camera axes
 _CLOUD = "points3D.ply"
+_HOLD_OUT_EVERY = 8  # panoramas, as in the benchmarks of splat trainers
 
 
 def write_nerfstudio(
@@ -53,14 +55,16 @@ def _write_face_dataset(
     # OPENCV without distortion is a pinhole, under the one name that all readers know.
     camera = {"camera_model": "OPENCV", "fl_x": half, "fl_y": half, "cx": half, "cy": half}
     camera |= {"w": size, "h": size, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
-    entries = []
+    entries: list[dict[str, Any]] = []
+    held_out: list[bool] = []
     for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
         for face in frames.faces or FACES:
+            held_out.append(f % _HOLD_OUT_EVERY == 0)
             entry = _entry(image(f, face), world_T_rig, RIG_R_FACE[FACES.index(face)])
             if has_masks(frames):
                 entry["mask_path"] = mask(f, face)
             entries.append(entry)
-    _write_transforms(partial / "transforms.json", camera, entries)
+    _write_transforms(partial / "transforms.json", camera, entries, held_out)
     write_faces(
         frames,
         size,
@@ -85,7 +89,8 @@ def _write_erp_dataset(partial: Path, reconstruction: Reconstruction, frames: Fr
         if has_masks(frames):
             entry["mask_path"] = mask(f)
         entries.append(entry)
-    _write_transforms(partial / "transforms_erp.json", camera, entries)
+    held_out = [f % _HOLD_OUT_EVERY == 0 for f in range(len(entries))]
+    _write_transforms(partial / "transforms_erp.json", camera, entries, held_out)
     write_panoramas(frames, lambda f: partial / image(f), lambda f: partial / mask(f))
 
 
@@ -97,12 +102,19 @@ def _entry(file_path: str, world_T_rig: np.ndarray, rig_R_camera: np.ndarray) ->
     return {"file_path": file_path, "transform_matrix": matrix.tolist()}
 
 
-def _write_transforms(path: Path, camera: dict[str, Any], entries: list[dict[str, Any]]) -> None:
+def _write_transforms(
+    path: Path, camera: dict[str, Any], entries: list[dict[str, Any]], held_out: list[bool]
+) -> None:
+    names = [str(entry["file_path"]) for entry in entries]
+    evaluated = [name for name, out in zip(names, held_out, strict=True) if out]
     applied = np.column_stack([NERFSTUDIO_R_WORLD, np.zeros(3)])
     document = {
         **camera,
         "applied_transform": applied.tolist(),
         "ply_file_path": _CLOUD,
+        "train_filenames": [name for name, out in zip(names, held_out, strict=True) if not out],
+        "val_filenames": evaluated,
+        "test_filenames": evaluated,
         "frames": entries,
     }
     path.write_text(json.dumps(document, indent=1) + "\n")
