@@ -142,10 +142,10 @@ def landmark_block(
     share = noise * np.sqrt(len(settings.factors))
     terms = []
     if "bearing" in settings.factors:
-        sigmas = share * keypoints.sigmas_rad[rows]
-        terms.append(
-            BearingTerm(tracks.frames, tracks.points, keypoints.bearings_rig[rows], sigmas)
-        )
+        sigmas, infos = share * keypoints.sigmas_rad[rows], keypoints.sqrt_infos
+        roots = None if infos is None else infos[rows] / share
+        bearings = keypoints.bearings_rig[rows]
+        terms.append(BearingTerm(tracks.frames, tracks.points, bearings, sigmas, roots))
     if "reprojection" in settings.factors:
         bearings, faces = keypoints.bearings_rig[rows], keypoints.faces[rows]
         cosines = np.einsum("oi,oi->o", bearings, RIG_R_FACE[faces, :, 2])
@@ -194,8 +194,15 @@ def _noise(landmarks: Landmarks, keypoints: Keypoints, world_T_rigs: np.ndarray)
     residuals, _, _ = bearing_residuals(world_T_rigs[tracks.frames], points, bearings)
     unknowns = 3 * landmarks.tracks.num_points + 6 * len(world_T_rigs)
     redundancy = max(1 - unknowns / residuals.size, _REDUNDANT)
-    spread = 1.4826 * np.median(np.abs(residuals / keypoints.sigmas_rad[rows, None]))
+    spread = 1.4826 * np.median(np.abs(_whitened(residuals, keypoints, rows)))
     return float(spread / np.sqrt(redundancy))
+
+
+def _whitened(residuals: np.ndarray, keypoints: Keypoints, rows: np.ndarray) -> np.ndarray:
+    """Residuals (O, 2) in radians in units of their standard deviations."""
+    if keypoints.sqrt_infos is None:
+        return residuals / keypoints.sigmas_rad[rows, None]
+    return np.einsum("oij,oj->oi", keypoints.sqrt_infos[rows], residuals)
 
 
 def _values(world_T_rigs: np.ndarray) -> gtsam.Values:

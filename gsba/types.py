@@ -94,6 +94,8 @@ class Keypoints:
     bearings_rig: np.ndarray  # (N, 3) float64, unit, rig frame
     sigmas_rad: np.ndarray  # (N,) float64, radians
     colors: np.ndarray  # (N, 3) uint8, RGB
+    sqrt_infos: np.ndarray | None = None  # (N, 2, 2) 1/rad on the bearings' tangent_basis: the
+    # square-root information where noise depends on the direction; None = 1 / sigmas_rad
 
     def bearings_of(self, frame: int) -> np.ndarray:
         """Bearings (K, 3) of one frame."""
