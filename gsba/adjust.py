@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import gtsam
@@ -20,10 +20,11 @@ from gsba import graph, triangulate
 from gsba.config import RefineSettings, SolverSettings
 from gsba.optimize import Iteration, marginal_covariances, optimize
 from gsba.rig import RIG_R_FACE, CubeRig
-from gsba.types import Counts, Keypoints, Landmarks, Tracks
+from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
 
 logger = logging.getLogger(__name__)
 
+_WIDE = 20.0  # gate in sigmas for observations whose noise is not known yet
 _REDUNDANT = 0.1  # least share of residual dimensions left over by the unknowns
 
 
@@ -58,6 +59,22 @@ def start(world_T_rigs: np.ndarray) -> Adjustment:
         np.zeros((0, 3)), Tracks(nothing, nothing, nothing, 0), Counts(0, 0, "tracks")
     )
     return Adjustment(world_T_rigs, landmarks, 1.0, ())
+
+
+def with_noise_of(before: Adjustment, sighted: Sighted, settings: RefineSettings) -> Adjustment:
+    """A solution with the noise that other observations show under its poses.
+
+    It is too high by what the poses are off, and falls with the rounds that start from it.
+    """
+    rows = sighted.keypoints.rows(sighted.tracks)
+    bearings, sigmas = sighted.keypoints.bearings_rig[rows], sighted.keypoints.sigmas_rad[rows]
+    placed = triangulate.run(
+        sighted.tracks, bearings, sigmas, before.world_T_rigs, _WIDE, settings.triangulate
+    )
+    noise = before.noise
+    if len(placed.tracks):
+        noise = _noise(placed, sighted.keypoints, before.world_T_rigs)
+    return replace(before, noise=max(noise, settings.rounds.min_noise))
 
 
 def run(

@@ -1,177 +1,264 @@
 """Sub-pixel observations: the patch around each point, aligned to every frame that shows it."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeAlias
 
-import cv2
-import numba
 import numpy as np
 
 from factors import tangent_basis
-from factors._image_kernels import ALIGNED, FAR, FLAT, MASKED, UNSTEADY, align_patches, make_templates
+from factors.patches import ALIGNED, REASONS, PatchSet, Sightings, expect, found_at
 from factors.sphere_image import SphereImage
-from gsba import read
-from gsba.geometry import erp_from_bearings
+from gsba import panorama
+from gsba.config import AlignSettings
 from gsba.log import track
 from gsba.rig import CubeRig, owner_faces
-from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Tracks
+from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Sighted, Tracks
+from gsba.views import references, views
 
-@dataclass
-class S:
-    patch:int=11
-    max_views:int=12
-    near:int=24
-    max_angle:float=40.
-    max_ratio:float=1.8
-    sigma_affine:float=0.15
-    sigma_grey:float=3.0
-    least_contrast:float=2.0
-    max_shift:float=1.5
-    min_zncc:float=0.85
-    steps:int=12
-    tol:float=0.02
-    window:float=0.6  # of half
-    spacing:float=1.0
-    mix:bool=False
-    max_sigma:float=0.5
+_WINDOW = 0.6  # standard deviation of the patch's window, part of half a patch
+_SEARCH = 3.0  # shifts followed while aligning, in largest accepted ones
+_STEPS = 12
+_TOLERANCE = 0.02  # of the last step, pixels
+_LEAST_SIGMA = 1e-3  # pixels: no patch is better than this
 
-class Views: pass
+_Mask: TypeAlias = np.ndarray | None  # (H, 2H) bool, True = use
 
-def plan(landmarks, poses, kp, s):
-    t=landmarks.tracks; X=landmarks.points_world
-    starts=np.searchsorted(t.points,np.arange(t.num_points+1))
-    C=poses[:,:3,3].copy()
-    ref=np.empty(t.num_points,np.int64)
-    _references(starts,t.frames.astype(np.int64),C,X,ref)
-    D=np.linalg.norm(C[:,None]-C[None],axis=2)
-    near=np.argsort(D,axis=1,kind='stable')[:,1:s.near+1]
-    # include observed frames always
-    pts,fr=_views(starts,t.frames.astype(np.int64),C,X,ref,near,np.cos(np.deg2rad(s.max_angle)),s.max_ratio,s.max_views)
-    return t.frames[ref].astype(np.int64), ref, pts, fr
 
-@numba.njit(cache=True,nogil=True)
-def _references(starts,frames,C,X,ref):
-    for j in range(len(X)):
-        best=np.inf
-        for a in range(starts[j],starts[j+1]):
-            cost=0.
-            va=X[j]-C[frames[a]]; da=np.sqrt((va**2).sum())
-            for b in range(starts[j],starts[j+1]):
-                vb=X[j]-C[frames[b]]; db=np.sqrt((vb**2).sum())
-                c=(va*vb).sum()/(da*db)
-                cost+=2*(1-c)+0.25*np.log(da/db)**2
-            if cost<best:
-                best=cost; ref[j]=a
+@dataclass(frozen=True, slots=True)
+class _Observed:
+    """Observations of points, in any order."""
 
-@numba.njit(cache=True,nogil=True)
-def _views(starts,frames,C,X,ref,near,min_cos,max_ratio,max_views):
-    J=len(X)
-    pts=np.empty(J*(max_views+1)+len(frames),np.int64); fr=np.empty_like(pts); n=0
-    costs=np.empty(near.shape[1]); 
-    seen=np.full(len(C),-1)
-    for j in range(J):
-        r=frames[ref[j]]
-        vr=X[j]-C[r]; dr=np.sqrt((vr**2).sum())
-        seen[r]=j; m=0
-        for a in range(starts[j],starts[j+1]):
-            f=frames[a]
-            if seen[f]!=j:
-                seen[f]=j; pts[n]=j; fr[n]=f; n+=1; m+=1
-        for k in range(near.shape[1]):
-            f=near[r,k]
-            costs[k]=np.inf
-            if seen[f]==j: continue
-            v=X[j]-C[f]; d=np.sqrt((v**2).sum())
-            c=(v*vr).sum()/(d*dr); q=d/dr
-            if c<min_cos or q>max_ratio or q*max_ratio<1: continue
-            costs[k]=2*(1-c)+0.25*np.log(q)**2
-        order=np.argsort(costs)
-        for k in order:
-            if m>=max_views or costs[k]==np.inf: break
-            pts[n]=j; fr[n]=near[r,k]; n+=1; m+=1
-    return pts[:n],fr[:n]
+    points: np.ndarray  # (N,) int64
+    frames: np.ndarray  # (N,) int64
+    bearings_rig: np.ndarray  # (N, 3) float64, unit
+    covariances: np.ndarray  # (N, 2, 2) float64, radians squared, on tangent_basis
 
-def window(s):
-    n=s.patch; r=n//2
-    g=np.exp(-0.5*(np.arange(-r,r+1)/(s.window*(r+.5)))**2)
-    w=np.outer(g,g).ravel()
-    return (w/w.max())
 
-def align(frames, poses, landmarks, kp, s, num_threads=2):
-    ref_frame, ref_obs, pts, fr = plan(landmarks,poses,kp,s)
-    X=landmarks.points_world
-    h=s.spacing*2*np.pi/frames.width
-    Y=np.einsum('jba,jb->ja',poses[ref_frame,:3,:3],X-poses[ref_frame,:3,3])
-    d=np.linalg.norm(Y,axis=1); b=Y/d[:,None]
-    B=h*np.swapaxes(tangent_basis(b),1,2)  # J,3,2
-    worldB=np.einsum('jab,jbc->jac',poses[ref_frame,:3,:3],B)
-    O_=np.einsum('oba,ob->oa',poses[fr,:3,:3],X[pts]-poses[fr,:3,3])/d[pts,None]
-    S_=np.einsum('oba,obc->oac',poses[fr,:3,:3],worldB[pts])
-    n2=s.patch**2; J=len(X)
-    grey,bx,by=(np.zeros((J,n2),np.float32) for _ in range(3))
-    inv=np.zeros((J,8,8),np.float32); tst=np.full(J,FLAT,np.uint8)
-    w=window(s); prior=(s.sigma_grey/s.sigma_affine)**2
-    nomask=np.zeros((0,0),np.bool_)
-    warps=np.zeros((len(pts),6)); zn=np.zeros(len(pts)); var=np.zeros(len(pts)); st=np.full(len(pts),UNSTEADY,np.uint8)
-    order=np.argsort(ref_frame,kind='stable'); cuts=np.searchsorted(ref_frame[order],np.arange(len(frames)+1))
-    def load(f):
-        m=read.load_mask(frames,f)
-        im=cv2.cvtColor(read.load_erp(frames,f),cv2.COLOR_RGB2GRAY)
-        return SphereImage.of(im).coefficients, nomask if m is None else m
-    def p1(f):
-        c,m=load(f)
-        make_templates(c,m,order[cuts[f]:cuts[f+1]],b,B,w,prior,s.least_contrast,grey,bx,by,inv,tst)
-    use=np.flatnonzero
-    with ThreadPoolExecutor(num_threads) as pool: list(pool.map(p1,range(len(frames))))
-    good=np.flatnonzero(tst[pts]==ALIGNED)
-    order2=good[np.argsort(fr[good],kind='stable')]; cuts2=np.searchsorted(fr[order2],np.arange(len(frames)+1))
-    def p2(f):
-        c,m=load(f)
-        align_patches(c,m,order2[cuts2[f]:cuts2[f+1]],pts,O_,S_,w,prior,3*s.max_shift,s.steps,s.tol,grey,bx,by,inv,warps,zn,var,st)
-    with ThreadPoolExecutor(num_threads) as pool: list(pool.map(p2,range(len(frames))))
-    # post
-    out=Views()
-    out.__dict__.update(locals())
-    return out
+def run(
+    landmarks: Landmarks,
+    world_T_rigs: np.ndarray,
+    keypoints: Keypoints,
+    noise: float,
+    frames: FrameSet,
+    rig: CubeRig,
+    name: str,
+    first: bool,
+    settings: AlignSettings,
+    num_threads: int,
+) -> Sighted:
+    """Observe every point anew, in the frames that should show it.
 
-def collect(v,s):
-    """Aligned obs -> keypoints, tracks."""
-    frames,poses,kp,landmarks=v.frames,v.poses,v.kp,v.landmarks
-    pred=v.O_/np.linalg.norm(v.O_,axis=1)[:,None]
-    ray=v.O_+np.einsum('oij,oj->oi',v.S_,v.warps[:,:2])
-    ln=np.linalg.norm(ray,axis=1); bear=ray/ln[:,None]
-    shift_px=np.linalg.norm(np.cross(pred,bear),axis=1)/(2*np.pi/frames.width)
-    spread=np.empty_like(v.S_)
-    wq=v.warps
-    M=np.stack([np.stack([1+wq[:,2],wq[:,4]],-1),np.stack([wq[:,3],1+wq[:,5]],-1)],-2)
-    Jt=np.einsum('oij,ojk,okl->oil',tangent_basis(bear),v.S_,M)/ln[:,None,None]
-    Cq=v.inv[v.pts][:,:2,:2].astype(float)*v.var[:,None,None]
-    C=np.einsum('oij,ojk,olk->oil',Jt,Cq,Jt)
-    px=2*np.pi/frames.width
-    major=np.sqrt(np.maximum(np.linalg.eigvalsh(C)[:,1],0))/px
-    ok=(v.st==ALIGNED)&(v.zn>s.min_zncc)&(shift_px<s.max_shift)&(major<s.max_sigma)
-    # reference
-    J=len(v.b)
-    num=np.bincount(v.pts[ok],minlength=J)
-    # mean variance per template
-    vmean=np.bincount(v.pts[ok],v.var[ok],J)/np.maximum(num,1)
-    Jr=np.einsum('jik,jkl->jil',tangent_basis(v.b),v.B)
-    Cr=np.einsum('oij,ojk,olk->oil',Jr,v.inv[:,:2,:2].astype(float)*vmean[:,None,None],Jr)
-    keep=num>0
-    P=np.concatenate([np.flatnonzero(keep),v.pts[ok]]); F=np.concatenate([v.ref_frame[keep],v.fr[ok]])
-    BE=np.concatenate([v.b[keep],bear[ok]]); CC=np.concatenate([Cr[keep],C[ok]])
-    return P,F,BE,CC,dict(total=len(v.pts),st=np.bincount(v.st,minlength=5).tolist(),tst=np.bincount(v.tst,minlength=5).tolist(),ok=int(ok.sum()),templates=int(keep.sum()),zn=int(((v.st==ALIGNED)&(v.zn<=s.min_zncc)).sum()),shift=int(((v.st==ALIGNED)&(v.zn>s.min_zncc)&(shift_px>=s.max_shift)).sum())), ok
+    The patch around a point is cut from the frame in the middle of its observations, as a plane
+    that faces it; poses and depth carry it into others, where a shift, a small affine change,
+    gain and offset are found. Images are read twice, one per thread at a time.
 
-def pack(P,F,BE,CC,num_frames,rig,colors):
-    order=np.lexsort((P,F)); 
-    P,F,BE,CC=P[order],F[order],BE[order],CC[order]
-    starts=np.searchsorted(F,np.arange(num_frames+1))
-    faces=owner_faces(BE)
-    info=np.linalg.inv(CC)
-    L=np.linalg.cholesky(info); roots=np.swapaxes(L,1,2)
-    sig=np.linalg.det(CC)**0.25
-    kp=Keypoints(starts,rig.project(BE,faces),faces,BE,sig,colors[P],np.ascontiguousarray(roots))
-    o=np.lexsort((F,P)); _,pt=np.unique(P[o],return_inverse=True)
-    tr=Tracks(pt.astype(np.int32),F[o].astype(np.int32),(o-starts[F[o]]).astype(np.int32),int(pt.max())+1)
-    return kp,tr
+    Args:
+        landmarks: points and their observations so far.
+        world_T_rigs: (F, 4, 4) poses they were solved with.
+        keypoints: of those observations.
+        noise: of those, in units of their sigmas.
+        rig: faces that pixels are given on.
+        name: beside the progress bar.
+        first: whether no patch has confirmed the points yet.
+        settings: limits and sizes.
+        num_threads: frames worked on at a time.
+
+    Returns:
+        Tracks of aligned observations; frames with few of them keep their former ones as well.
+    """
+    rows = references(landmarks, world_T_rigs)
+    hosts = landmarks.tracks.frames[rows].astype(np.int64)
+    least = settings.min_track_length if first else 2
+    points, seeing = views(landmarks, world_T_rigs, rows, least, settings)
+    width = panorama.width_for(frames, settings.max_width)
+    origins, spreads, depths = _patches(landmarks.points_world, world_T_rigs[hosts], width)
+    plane = world_T_rigs[hosts, :3, :3] @ spreads * depths[:, None, None]
+    sightings = expect(
+        points, *_carried(landmarks.points_world[points], plane[points], world_T_rigs[seeing])
+    )
+    reach = _SEARCH * settings.max_shift_px
+    sigmas = settings.affine_sigma, settings.grey_sigma
+    patches = PatchSet(len(hosts), settings.patch_size, _WINDOW, *sigmas)
+
+    def cut(image: SphereImage, mask: _Mask, chosen: np.ndarray) -> None:
+        patches.cut(image, mask, chosen, origins, spreads, settings.min_contrast)
+
+    def align(image: SphereImage, mask: _Mask, chosen: np.ndarray) -> None:
+        patches.align(image, mask, chosen, sightings, reach, _STEPS, _TOLERANCE)
+
+    _stream(cut, frames, width, hosts, f"{name}: templates", num_threads)
+    _stream(align, frames, width, seeing, name, num_threads)
+    kept, found, dropped = _accepted(patches, sightings, seeing, 2 * np.pi / width, settings)
+    at_hosts = _at_hosts(patches, sightings, kept, hosts, origins, spreads)
+    former = _former(landmarks, keypoints, noise, [found, at_hosts], len(frames), settings)
+    colors = keypoints.colors[keypoints.rows(landmarks.tracks)[rows]]
+    counts = Counts(len(points), len(found.points), "observations", dropped)
+    return _pack([found, at_hosts, former], colors, len(frames), rig, counts)
+
+
+def _patches(
+    points_world: np.ndarray, world_T_hosts: np.ndarray, width: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Plane patches that face their hosts, one panorama pixel to a step.
+
+    Returns:
+        origins (J, 3), the points' unit bearings; spreads (J, 3, 2) across them; depths (J,).
+    """
+    offsets = points_world - world_T_hosts[:, :3, 3]
+    local = np.einsum("jba,jb->ja", world_T_hosts[:, :3, :3], offsets)
+    depths = np.linalg.norm(local, axis=1)
+    origins = local / np.maximum(depths, 1e-300)[:, None]
+    spreads = 2 * np.pi / width * np.swapaxes(tangent_basis(origins), 1, 2)
+    return origins, np.ascontiguousarray(spreads), depths
+
+
+def _carried(
+    points_world: np.ndarray, planes_world: np.ndarray, world_T_rigs: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Plane patches (points (O, 3) and axes (O, 3, 2)) in their rigs' frames, at unit distance."""
+    rotations = world_T_rigs[:, :3, :3]
+    origins = np.einsum("oba,ob->oa", rotations, points_world - world_T_rigs[:, :3, 3])
+    spreads = np.einsum("oba,obc->oac", rotations, planes_world)
+    distances = np.maximum(np.linalg.norm(origins, axis=1), 1e-300)
+    return origins / distances[:, None], spreads / distances[:, None, None]
+
+
+def _stream(
+    work: Callable[[SphereImage, _Mask, np.ndarray], None],
+    frames: FrameSet,
+    width: int,
+    frame_of: np.ndarray,
+    title: str,
+    num_threads: int,
+) -> None:
+    """Do `work(image, mask, rows of a frame)` for every frame that has rows, `frame_of (R,)`."""
+    order = np.argsort(frame_of, kind="stable")
+    bounds = np.searchsorted(frame_of[order], np.arange(len(frames) + 1))
+
+    def one(frame: int) -> None:
+        grey, mask = panorama.load_grey(frames, frame, width)
+        work(SphereImage.of(grey, smooth=True), mask, order[bounds[frame] : bounds[frame + 1]])
+
+    with ThreadPoolExecutor(num_threads) as pool:
+        running = [pool.submit(one, int(frame)) for frame in np.flatnonzero(np.diff(bounds))]
+        try:
+            for future in track(running, title):
+                future.result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _accepted(
+    patches: PatchSet,
+    sightings: Sightings,
+    seeing: np.ndarray,
+    pixel: float,
+    settings: AlignSettings,
+) -> tuple[np.ndarray, _Observed, dict[str, int]]:
+    """Rows (N,) of the sightings to believe, as observations, and why others fell."""
+    bearings, by_shift = found_at(sightings)
+    axes = tangent_basis(bearings) @ by_shift
+    of_shifts = patches.shift_covariances(sightings.templates, sightings.variances)
+    covariances = axes @ of_shifts @ np.swapaxes(axes, 1, 2)
+    covariances += (_LEAST_SIGMA * pixel) ** 2 * np.eye(2)
+    worst = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, 1], 0))
+    shifts = np.linalg.norm(np.cross(sightings.origins, bearings), axis=1)
+    tests = {reason: sightings.states != state for state, reason in REASONS.items()}
+    aligned = sightings.states == ALIGNED
+    tests["look different"] &= ~aligned | (sightings.scores > settings.min_zncc)
+    tests["found too far off"] &= ~aligned | (shifts < settings.max_shift_px * pixel)
+    tests["position too uncertain"] = ~aligned | (worst < settings.max_sigma_px * pixel)
+    left, dropped = np.ones(len(seeing), bool), {}
+    for reason, passed in tests.items():
+        dropped[reason] = int(np.count_nonzero(left & ~passed))
+        left &= passed
+    kept = np.flatnonzero(left)
+    found = _Observed(sightings.templates[kept], seeing[kept], bearings[kept], covariances[kept])
+    return kept, found, dropped
+
+
+def _at_hosts(
+    patches: PatchSet,
+    sightings: Sightings,
+    kept: np.ndarray,
+    hosts: np.ndarray,
+    origins: np.ndarray,
+    spreads: np.ndarray,
+) -> _Observed:
+    """Observations of the templates found again, in the frames they are from.
+
+    A template's place is exact by definition; its noise, which all its alignments share, is
+    counted here, with the mean residual of those alignments.
+    """
+    templates = sightings.templates[kept]
+    times = np.bincount(templates, minlength=len(hosts))
+    sums = np.bincount(templates, sightings.variances[kept], len(hosts))
+    used = np.flatnonzero(times)
+    of_shifts = patches.shift_covariances(used, sums[used] / times[used])
+    axes = tangent_basis(origins[used]) @ spreads[used]
+    covariances = axes @ of_shifts @ np.swapaxes(axes, 1, 2)
+    covariances += _LEAST_SIGMA**2 * np.einsum("oij,okj->oik", axes, axes)
+    return _Observed(used, hosts[used], origins[used], covariances)
+
+
+def _former(
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    noise: float,
+    found: list[_Observed],
+    num_frames: int,
+    settings: AlignSettings,
+) -> _Observed:
+    """What frames with few aligned observations saw before, and others of the same points."""
+    tracks = landmarks.tracks
+    counts = sum(np.bincount(part.frames, minlength=num_frames) for part in found)
+    weak = np.asarray(counts) < settings.min_observations
+    wanted = np.zeros(tracks.num_points, bool)
+    wanted[tracks.points[weak[tracks.frames]]] = True
+    known = np.concatenate([part.points * num_frames + part.frames for part in found])
+    cells = tracks.points.astype(np.int64) * num_frames + tracks.frames
+    chosen = np.flatnonzero(wanted[tracks.points] & ~np.isin(cells, known))
+    rows = keypoints.rows(tracks)[chosen]
+    covariances = keypoints.sigmas_rad[rows, None, None] ** 2 * np.eye(2)
+    if keypoints.sqrt_infos is not None:
+        roots = keypoints.sqrt_infos[rows]
+        covariances = np.linalg.inv(np.swapaxes(roots, 1, 2) @ roots)
+    points, frames = tracks.points[chosen].astype(np.int64), tracks.frames[chosen].astype(np.int64)
+    return _Observed(points, frames, keypoints.bearings_rig[rows], noise**2 * covariances)
+
+
+def _pack(
+    parts: list[_Observed], colors: np.ndarray, num_frames: int, rig: CubeRig, counts: Counts
+) -> Sighted:
+    """Observations as keypoints, frame by frame, and the tracks of points seen at least twice."""
+    points, frames, bearings, covariances = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("points", "frames", "bearings_rig", "covariances")
+    )
+    seen = np.bincount(points, minlength=len(colors))
+    order = np.lexsort((points, frames))
+    order = order[seen[points[order]] > 1]
+    points, frames, bearings = points[order], frames[order], bearings[order]
+    starts = np.searchsorted(frames, np.arange(num_frames + 1))
+    faces = owner_faces(bearings)
+    lower = np.linalg.cholesky(np.linalg.inv(covariances[order]))
+    keypoints = Keypoints(
+        starts,
+        rig.project(bearings, faces),
+        faces,
+        bearings,
+        np.linalg.det(covariances[order]) ** 0.25,
+        colors[points],
+        np.ascontiguousarray(np.swapaxes(lower, 1, 2)),
+    )
+    by_point = np.lexsort((frames, points))
+    _, compact = np.unique(points[by_point], return_inverse=True)
+    tracks = Tracks(
+        compact.astype(np.int32),
+        frames[by_point].astype(np.int32),
+        (by_point - starts[frames[by_point]]).astype(np.int32),
+        int(compact[-1]) + 1 if len(compact) else 0,
+    )
+    return Sighted(keypoints, tracks, counts)

@@ -151,6 +151,15 @@ class Landmarks:
 
 
 @dataclass(frozen=True, slots=True)
+class Sighted:
+    """Observations made anew, by aligning patches: keypoints and the tracks they form."""
+
+    keypoints: Keypoints  # one for each observation
+    tracks: Tracks
+    counts: Counts  # of observations
+
+
+@dataclass(frozen=True, slots=True)
 class Reconstruction:
     """Refined poses and cloud: what exports and reports are made from."""
 
