@@ -178,9 +178,7 @@ def _normal_matrix(templates, t, reach, normal):
     trace = normal[0, 0] + normal[1, 1]
     determinant = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
     for r in range(8):
-        normal[r, r] *= 1 + 1e-6
-        if 2 <= r < 6:
-            normal[r, r] += templates.prior
+        normal[r, r] += 1e-6 * normal[r, r] + (templates.prior if 2 <= r < 6 else 0.0)
     return determinant > _LEAST_CORNER * trace * trace
 
 
