@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import gtsam
@@ -20,10 +20,11 @@ from gsba import graph, triangulate
 from gsba.config import RefineSettings, SolverSettings
 from gsba.optimize import Iteration, marginal_covariances, optimize
 from gsba.rig import RIG_R_FACE, CubeRig
-from gsba.types import Counts, Keypoints, Landmarks, Tracks
+from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
 
 logger = logging.getLogger(__name__)
 
+_WIDE = 20.0  # gate in sigmas for observations whose noise is not known yet
 _REDUNDANT = 0.1  # least share of residual dimensions left over by the unknowns
 
 
@@ -58,6 +59,22 @@ def start(world_T_rigs: np.ndarray) -> Adjustment:
         np.zeros((0, 3)), Tracks(nothing, nothing, nothing, 0), Counts(0, 0, "tracks")
     )
     return Adjustment(world_T_rigs, landmarks, 1.0, ())
+
+
+def with_noise_of(before: Adjustment, sighted: Sighted, settings: RefineSettings) -> Adjustment:
+    """A solution with the noise that other observations show under its poses.
+
+    It is too high by what the poses are off, and falls with the rounds that start from it.
+    """
+    rows = sighted.keypoints.rows(sighted.tracks)
+    bearings, sigmas = sighted.keypoints.bearings_rig[rows], sighted.keypoints.sigmas_rad[rows]
+    placed = triangulate.run(
+        sighted.tracks, bearings, sigmas, before.world_T_rigs, _WIDE, settings.triangulate
+    )
+    noise = before.noise
+    if len(placed.tracks):
+        noise = _noise(placed, sighted.keypoints, before.world_T_rigs)
+    return replace(before, noise=max(noise, settings.rounds.min_noise))
 
 
 def run(
@@ -136,10 +153,10 @@ def landmark_block(
     share = noise * np.sqrt(len(settings.factors))
     terms = []
     if "bearing" in settings.factors:
-        sigmas = share * keypoints.sigmas_rad[rows]
-        terms.append(
-            BearingTerm(tracks.frames, tracks.points, keypoints.bearings_rig[rows], sigmas)
-        )
+        sigmas, infos = share * keypoints.sigmas_rad[rows], keypoints.sqrt_infos
+        roots = None if infos is None else infos[rows] / share
+        bearings = keypoints.bearings_rig[rows]
+        terms.append(BearingTerm(tracks.frames, tracks.points, bearings, sigmas, roots))
     if "reprojection" in settings.factors:
         bearings, faces = keypoints.bearings_rig[rows], keypoints.faces[rows]
         cosines = np.einsum("oi,oi->o", bearings, RIG_R_FACE[faces, :, 2])
@@ -191,8 +208,15 @@ def _noise(landmarks: Landmarks, keypoints: Keypoints, world_T_rigs: np.ndarray)
     residuals /= np.linalg.norm(offsets, axis=1, keepdims=True)  # sines: the angles are small
     unknowns = 3 * landmarks.tracks.num_points + 6 * len(world_T_rigs)
     redundancy = max(1 - unknowns / residuals.size, _REDUNDANT)
-    spread = 1.4826 * np.median(np.abs(residuals / keypoints.sigmas_rad[rows, None]))
+    spread = 1.4826 * np.median(np.abs(_whitened(residuals, keypoints, rows)))
     return float(spread / np.sqrt(redundancy))
+
+
+def _whitened(residuals: np.ndarray, keypoints: Keypoints, rows: np.ndarray) -> np.ndarray:
+    """Residuals (O, 2) in radians in units of their standard deviations."""
+    if keypoints.sqrt_infos is None:
+        return residuals / keypoints.sigmas_rad[rows, None]
+    return np.einsum("oij,oj->oi", keypoints.sqrt_infos[rows], residuals)
 
 
 def _values(world_T_rigs: np.ndarray) -> gtsam.Values:

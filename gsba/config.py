@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 
 class _Settings(BaseModel):
@@ -98,6 +98,7 @@ class RoundSettings(_Settings):
     dense: tuple[float, ...] = (6.0, 3.0)  # with matches along the solved chain
     loops: tuple[float, ...] = (100.0, 20.0, 4.0)  # with loops closed
     refined: tuple[float, ...] = (6.0, 3.0, 2.5)  # with matches along the solved map
+    aligned: tuple[float, ...] = (6.0, 3.0)  # with aligned patches
     map_passes: int = Field(default=1, ge=1)  # times the closed map is matched anew
     gate_scale: float = Field(default=10.0, ge=1)  # wider gates loosen the loss in proportion
     tolerance: float = Field(default=3e-4, gt=0, lt=1)  # solver's, in all rounds but a run's last
@@ -106,6 +107,37 @@ class RoundSettings(_Settings):
     )  # observations a round must go on explaining
     min_noise: float = Field(default=0.5, gt=0)  # floor of the estimated noise, in feature sigmas
     min_observations: int = Field(default=12, ge=1)  # of a frame, or it counts as unrefined
+
+
+class AlignSettings(_Settings):
+    """Patches around the map's points, aligned to every frame that shows them."""
+
+    rounds: int = Field(default=2, ge=0)  # of alignment and bundle adjustment; 0 = none
+    patch_size: int = Field(default=15, ge=5, le=41)  # pixels across, odd
+    max_width: int = Field(default=4096, ge=64)  # of a panorama; wider ones are halved till under
+    max_views: int = Field(default=16, ge=1)  # frames that a point is looked for in
+    near_frames: int = Field(default=40, ge=0)  # nearest in space, among which views are found
+    min_track_length: int = Field(
+        default=3, ge=2
+    )  # observations a point needs, in the first round, to be looked for in further frames
+    max_angle_deg: float = Field(default=45.0, gt=0, lt=90)  # between views of a point
+    max_ratio: float = Field(default=1.8, gt=1)  # of a point's distances
+    affine_sigma: float = Field(default=0.15, gt=0)  # deviation from a surface facing the viewer
+    grey_sigma: float = Field(default=3.0, gt=0)  # noise it is weighed against, grey values
+    min_contrast: float = Field(default=2.0, gt=0)  # grey values, standard deviation in a patch
+    min_zncc: float = Field(default=0.75, gt=0, lt=1)  # correlation of the aligned patches
+    max_shift_px: float = Field(default=1.5, gt=0)  # from the predicted place, panorama pixels
+    max_sigma_px: float = Field(default=0.5, gt=0)  # along the worst direction
+    min_observations: int = Field(
+        default=60, ge=0
+    )  # of a frame; below, it keeps its features' observations too
+
+    @field_validator("patch_size")
+    @classmethod
+    def _odd(cls, size: int) -> int:
+        if size % 2 == 0:
+            raise ValueError("must be odd: a patch has a pixel in its middle")
+        return size
 
 
 class PriorSettings(_Settings):
@@ -152,6 +184,7 @@ class RefineSettings(_Settings):
     triangulate: TriangulateSettings = TriangulateSettings()
     priors: PriorSettings = PriorSettings()
     rounds: RoundSettings = RoundSettings()
+    align: AlignSettings = AlignSettings()
     solver: SolverSettings = SolverSettings()
     factors: tuple[Literal["bearing", "reprojection"], ...] = Field(
         default=("bearing",), min_length=1

@@ -8,7 +8,7 @@ from typing import TypeVar
 import gtsam
 import numpy as np
 
-from gsba import adjust, cubemap, features, frontend, graph, tracks
+from gsba import adjust, align, cubemap, features, frontend, graph, tracks
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
@@ -23,6 +23,7 @@ from gsba.types import (
     Keypoints,
     Matches,
     Reconstruction,
+    Sighted,
     VerifiedPairs,
 )
 
@@ -51,6 +52,7 @@ class Line:
                 self.priors.add(factor)
         self.counts: dict[str, list[Counts]] = {}
         self.solutions: dict[str, Adjustment] = {}
+        self.undone: list[str] = []  # solutions that were not taken
         self.latest = "keypoints"  # the stage that the next one builds on
         paths = [path for group in frames.paths for path in group]
         inputs = [fingerprint(paths), fingerprint(frames.mask_paths), frames.timestamps.tolist()]
@@ -64,6 +66,7 @@ class Line:
             Keypoints,
             ["frames", "features"],
         )
+        self.observed = self.keypoints  # those that the latest solution is made of
 
         def load(frame: int) -> Features:
             return found[frames.names[frame]]
@@ -191,15 +194,74 @@ class Line:
         self.solutions[name] = solved
         return solved
 
+    def align(self, number: int, solved: Adjustment) -> Sighted:
+        """Points observed anew by aligning patches."""
+        name = f"align{number}"
+
+        def compute() -> Sighted:
+            return align.run(
+                solved.landmarks,
+                solved.world_T_rigs,
+                self.observed,
+                solved.noise,
+                self.frames,
+                self.rig,
+                name,
+                number == 1,
+                self.settings.align,
+                self.num_threads,
+            )
+
+        key = self.settings.align.model_dump(exclude={"rounds"})
+        sighted = self._stage(name, key, compute, Sighted)
+        self.counts[name] = [sighted.counts]
+        return sighted
+
+    def solve_aligned(self, number: int, sighted: Sighted, before: Adjustment) -> Adjustment:
+        """Bundle adjustment of aligned observations; undone where that explains less."""
+        name, gates = f"aligned{number}", self.settings.rounds.aligned
+        final = number == self.settings.align.rounds
+
+        def compute() -> Adjustment:
+            return adjust.run(
+                sighted.tracks,
+                sighted.keypoints,
+                adjust.with_noise_of(before, sighted, self.settings),
+                self.priors,
+                self.rig,
+                gates,
+                self.settings,
+                self.num_threads,
+                final,
+            )
+
+        solved = self._stage(name, [self._solving(), gates, final], compute, Adjustment)
+        self.counts[name] = [solved.landmarks.counts]
+        self.solutions[name] = solved
+        if not self._explains(solved, before):
+            self.undone.append(name)
+            return before
+        self.observed = sighted.keypoints
+        return solved
+
+    def _explains(self, solved: Adjustment, before: Adjustment) -> bool:
+        """Whether a solution carries all frames that another did."""
+        least = self.settings.rounds.min_observations
+        carried = [
+            np.bincount(one.landmarks.tracks.frames, minlength=len(self.frames)) >= least
+            for one in (solved, before)
+        ]
+        return bool(np.all(carried[0] | ~carried[1]))
+
     def reconstruct(self, solved: Adjustment) -> Reconstruction:
         """Covariances, and everything back in the trajectory's world."""
 
         def compute() -> Reconstruction:
             covariances = adjust.pose_covariances(
-                solved, self.priors, self.keypoints, self.rig, self.settings, self.num_threads
+                solved, self.priors, self.observed, self.rig, self.settings, self.num_threads
             )
             least = self.settings.rounds.min_observations
-            return assemble(solved, covariances, self.keypoints, self.coarse, least)
+            return assemble(solved, covariances, self.observed, self.coarse, least)
 
         return self._stage("reconstruction", self._solving(), compute, Reconstruction)
 

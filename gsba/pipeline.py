@@ -77,8 +77,10 @@ def refine(
         solved = line.solve("closed", [adjacent, near, loops.matches], solved, rounds.loops)
         for number in range(1, rounds.map_passes + 1):
             wide = line.match_known_points(f"everywhere{number}", solved, loops_closed=True)
-            final = number == rounds.map_passes
+            final = number == rounds.map_passes and settings.align.rounds == 0
             solved = line.solve(f"refined{number}", [adjacent, wide], solved, rounds.refined, final)
+        for number in range(1, settings.align.rounds + 1):
+            solved = line.solve_aligned(number, line.align(number, solved), solved)
         reconstruction = line.reconstruct(solved)
         return _write(line, reconstruction)
 
@@ -105,6 +107,7 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
     for name in settings.export.formats:
         _export(line, ExportFormat(name), reconstruction)
     undone = [n for n, s in line.solutions.items() if not all(r.accepted for r in s.rounds)]
+    undone += [name for name in line.undone if name not in undone]
     notes = take_notes(frames, coarse, reconstruction, undone)
     report = build_report(
         settings=settings,

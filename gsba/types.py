@@ -94,6 +94,8 @@ class Keypoints:
     bearings_rig: np.ndarray  # (N, 3) float64, unit, rig frame
     sigmas_rad: np.ndarray  # (N,) float64, radians
     colors: np.ndarray  # (N, 3) uint8, RGB
+    sqrt_infos: np.ndarray | None = None  # (N, 2, 2) 1/rad on the bearings' tangent_basis: the
+    # square-root information where noise depends on the direction; None = 1 / sigmas_rad
 
     def bearings_of(self, frame: int) -> np.ndarray:
         """Bearings (K, 3) of one frame."""
@@ -146,6 +148,15 @@ class Landmarks:
     points_world: np.ndarray  # (J, 3) float64, map units
     tracks: Tracks  # their observations; point indices are rows of points_world
     counts: Counts  # of tracks
+
+
+@dataclass(frozen=True, slots=True)
+class Sighted:
+    """Observations made anew, by aligning patches: keypoints and the tracks they form."""
+
+    keypoints: Keypoints  # one for each observation
+    tracks: Tracks
+    counts: Counts  # of observations
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,11 +16,11 @@ ROOT = Path(__file__).parents[1]
 FLOORS = (
     {"factors"},
     {"", "types", "geometry", "config", "config_file", "log"},
-    {"rig", "records", "run_folder", "search", "store", "read"},
+    {"rig", "records", "run_folder", "search", "store", "read", "panorama", "views"},
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
-    | {"graph", "optimize", "filter"},
+    | {"graph", "optimize", "filter", "align"},
     {"adjust", "frontend", "reconstruction"},
-    {"export", "evaluate", "report"},
+    {"export", "evaluate", "induced", "report"},
     {"demo", "line", "pipeline"},
     {"cli"},
     {"benchmarks"},

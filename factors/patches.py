@@ -1,0 +1,156 @@
+"""Patches of panoramas, aligned to other panoramas: sub-pixel sightings with their covariance."""
+
+import numpy as np
+
+from factors._patch_kernels import align_templates, cut_templates
+from factors._patch_records import (
+    ALIGNED,
+    FAR,
+    FLAT,
+    MASKED,
+    UNLIKE,
+    UNSTEADY,
+    Sightings,
+    Templates,
+)
+from factors.sphere_image import SphereImage
+
+REASONS = {
+    FLAT: "no texture",
+    MASKED: "masked",
+    UNLIKE: "look different",
+    FAR: "found too far off",
+    UNSTEADY: "no convergence",
+}  # state of a sighting -> why it is none
+_NO_MASK = np.zeros((0, 0), dtype=np.bool_)
+
+
+class PatchSet:
+    """Templates around scene points, cut from one panorama each and aligned to others.
+
+    A patch is a plane: the rays `origin + spread @ (x, y)` of an n x n grid of unit spacing. One
+    image is needed at a time; images may be worked on in threads, each with rows of its own.
+
+    Attributes:
+        templates: what was cut; `states` says which are usable.
+    """
+
+    def __init__(
+        self, num: int, size: int, window: float, affine_sigma: float, grey_sigma: float
+    ) -> None:
+        """Room for templates.
+
+        Args:
+            num: of templates, T.
+            size: pixels across a patch, n, odd.
+            window: standard deviation of the Gaussian window, part of half a patch.
+            affine_sigma: standard deviation of the affine part's deviation from the prediction.
+            grey_sigma: noise in grey values that it is weighed against.
+
+        Raises:
+            ValueError: an even size.
+        """
+        if size % 2 == 0 or size < 3:
+            raise ValueError(f"a patch is an odd number of pixels across, not {size}")
+        offsets = (np.arange(size) - size // 2) / (window * size / 2)
+        bell = np.exp(-0.5 * offsets**2)
+        grey, by_x, by_y = (np.zeros((num, size * size), np.float32) for _ in range(3))
+        self.templates = Templates(
+            np.outer(bell, bell).ravel(),
+            (grey_sigma / affine_sigma) ** 2,
+            grey,
+            by_x,
+            by_y,
+            np.zeros((num, 8, 8), np.float32),
+            np.full(num, FLAT, np.uint8),
+        )
+
+    def cut(
+        self,
+        image: SphereImage,
+        mask: np.ndarray | None,
+        rows: np.ndarray,
+        origins: np.ndarray,
+        spreads: np.ndarray,
+        least_contrast: float,
+    ) -> None:
+        """Cut the templates `rows (R,)` from their panorama.
+
+        Args:
+            mask: (H, 2H) bool, True = use.
+            origins (T, 3), spreads (T, 3, 2): plane patches, rig frame of the panorama.
+            least_contrast: least standard deviation in grey values.
+        """
+        usable = _NO_MASK if mask is None else mask
+        coefficients = image.coefficients
+        cut_templates(coefficients, usable, rows, origins, spreads, least_contrast, self.templates)
+
+    def align(
+        self,
+        image: SphereImage,
+        mask: np.ndarray | None,
+        rows: np.ndarray,
+        sightings: Sightings,
+        max_shift: float,
+        max_steps: int,
+        tolerance: float,
+    ) -> None:
+        """Align to a panorama the sightings `rows (R,)` in it; fills in what became of them.
+
+        Args:
+            mask: (H, 2H) bool, True = use.
+            max_shift, tolerance: of the shift and of its last step, template pixels.
+            max_steps: of Gauss-Newton.
+        """
+        usable = _NO_MASK if mask is None else mask
+        states = self.templates.states[sightings.templates[rows]]
+        sightings.states[rows] = states
+        rows = rows[states == ALIGNED]
+        align_templates(
+            image.coefficients, usable, rows, sightings, max_shift, max_steps, tolerance,
+            self.templates,
+        )  # fmt: skip
+
+    def shift_covariances(self, rows: np.ndarray, variances: np.ndarray) -> np.ndarray:
+        """Covariances (N, 2, 2) of shifts, template pixels squared.
+
+        Args:
+            rows: (N,) of templates.
+            variances: (N,) of the residual, in the template's grey values.
+        """
+        return self.templates.inverses[rows][:, :2, :2] * np.asarray(variances)[:, None, None]
+
+
+def expect(templates: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> Sightings:
+    """Sightings (O,) of templates where poses and depths put them, yet to be aligned.
+
+    Args:
+        templates: (O,) row of each one's template.
+        origins (O, 3), spreads (O, 3, 2): the template's plane patch, rig frame of the seeing.
+    """
+    num = len(templates)
+    return Sightings(
+        np.asarray(templates, np.int64),
+        np.ascontiguousarray(origins, np.float64),
+        np.ascontiguousarray(spreads, np.float64),
+        np.zeros((num, 6)),
+        np.zeros(num),
+        np.zeros(num),
+        np.full(num, UNSTEADY, np.uint8),
+    )
+
+
+def found_at(sightings: Sightings) -> tuple[np.ndarray, np.ndarray]:
+    """Where the templates' centres were found.
+
+    Returns:
+        bearings (O, 3), unit, rig frame; their derivatives (O, 3, 2) by the shift in the
+        template's axes, radians per template pixel.
+    """
+    shift, affine = sightings.warps[:, :2], sightings.warps[:, 2:].reshape(-1, 2, 2)
+    rays = sightings.origins + np.einsum("oij,oj->oi", sightings.spreads, shift)
+    lengths = np.linalg.norm(rays, axis=1)
+    bearings = rays / lengths[:, None]
+    warped = sightings.spreads @ (np.eye(2) + np.swapaxes(affine, 1, 2)) / lengths[:, None, None]
+    along = np.einsum("oi,oij->oj", bearings, warped)
+    return bearings, warped - bearings[:, :, None] * along[:, None, :]
