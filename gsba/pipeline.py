@@ -4,11 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsba import read
+from gsba import read, video
 from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.export import ExportFormat, export, write_points
 from gsba.line import ExtraFactors, Line
+from gsba.log import GsbaError
 from gsba.report import build_report, take_notes, write_poses, write_report
 from gsba.store import RunStore, atomic_write, load_stage
 from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
@@ -48,13 +49,14 @@ def refine(
     depends on it.
 
     Args:
-        frames: folder of 2:1 panoramas or of cube faces.
+        frames: folder of 2:1 panoramas or of cube faces, or a video, whose frames go to
+            `out`/frames first.
         trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig.
         out: folder of the run.
         settings: see `gsba.config`.
         masks: one ERP mask for all frames, or a folder of one for each; white = use.
         timestamps: times of the frames (and of a KITTI trajectory's rows).
-        fps: frames per second, where no file gives times.
+        fps: frames per second, where no file gives times; of a video: frames kept per second.
         fresh: forget an earlier run in `out`.
         extra_factors: makes factors of your own on the keys graph.X(frame); they join every
             bundle adjustment (and those are then never resumed).
@@ -63,10 +65,15 @@ def refine(
         GsbaError: an input or setting that cannot be used.
     """
     frames, trajectory, out = Path(frames), Path(trajectory), Path(out)
-    settings = settings or RefineSettings()
-    frame_set = read.scan(frames, timestamps, fps, masks)
+    settings, origin = settings or RefineSettings(), {"frames": frames, "trajectory": trajectory}
+    if video.is_video(frames):
+        read.read_trajectory(trajectory, timestamps)  # fails before hours of decoding, not after
+        frame_set = _extracted(frames, out, origin, settings, fps, masks, fresh)
+        fresh = False
+    else:
+        frame_set = read.scan(frames, timestamps, fps, masks)
     coarse = read.associate(frame_set, read.read_trajectory(trajectory, timestamps), settings.read)
-    with RunStore(out, {"frames": frames, "trajectory": trajectory}, fresh) as store:
+    with RunStore(out, origin, fresh) as store:
         line = Line(store, frame_set, coarse, settings, extra_factors)
         neighbours, rounds = line.match_neighbours(), settings.rounds
         solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)
@@ -90,6 +97,27 @@ def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:
     """
     reconstruction = load_stage(out, "reconstruction", Reconstruction)
     return reconstruction, load_stage(out, "frames", FrameSet)
+
+
+def _extracted(
+    film: Path,
+    out: Path,
+    origin: dict[str, Path],
+    settings: RefineSettings,
+    fps: float | None,
+    masks: Path | None,
+    fresh: bool,
+) -> FrameSet:
+    """Frames of a video, in `out`/frames."""
+    if fps is not None and not fps > 0:
+        raise GsbaError(f"--fps {fps}: must be a positive number of frames per second")
+    chosen = settings.video
+    if fps is not None:
+        chosen = chosen.model_copy(update={"fps": fps, "every": None, "at": None})
+    with RunStore(out, origin, fresh) as store:
+        video.extract(film, out / "frames", chosen, replace=True)
+        store.claim(out / "frames")
+    return read.scan(out / "frames", masks=masks)
 
 
 def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
