@@ -11,12 +11,21 @@ from gsba.export import ExportFormat, export, write_points
 from gsba.line import ExtraFactors, Line
 from gsba.log import GsbaError
 from gsba.report import build_report, take_notes, write_poses, write_report
+from gsba.report_html import write_html
 from gsba.store import RunStore, atomic_write, load_stage
 from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
 
 _GAUGE = (
     "Sim(3)-aligned to the coarse trajectory over its refined SLAM poses: its world and scale; "
     "covariances hold the first pose and the distance to the frame furthest from it"
+)
+_OUTPUTS = (
+    "trajectory.tum",
+    "poses.csv",
+    "points.ply",
+    "config.toml",
+    "report.json",
+    "report.html",
 )
 
 
@@ -145,7 +154,8 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
         notes=notes,
     )
     write_report(out / "report.json", report)
-    for name in ("trajectory.tum", "poses.csv", "points.ply", "config.toml", "report.json"):
+    write_html(out / "report.html", frames, coarse, reconstruction, report)
+    for name in _OUTPUTS:
         store.claim(out / name)
     return RunResult(out, frames, coarse, reconstruction, report)
 

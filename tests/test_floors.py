@@ -20,7 +20,7 @@ FLOORS = (
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter"},
     {"adjust", "frontend", "reconstruction"},
-    {"export", "evaluate", "report", "video"},
+    {"export", "evaluate", "report", "report_html", "video"},
     {"demo", "line", "pipeline"},
     {"cli"},
     {"benchmarks"},
