@@ -18,7 +18,7 @@ function worldMap(canvas, across, up) {
     view.place = p => [X(p), Y(p)];
     if (layers.points) {
       g.globalAlpha = +css("--cloud");
-      points.forEach((p, i) => { g.fillStyle = `rgb(${colors[i]})`; g.fillRect(X(p) - .8, Y(p) - .8, 1.6, 1.6); });
+      points.forEach((p, i) => { g.fillStyle = `rgb(${colors[i]})`; g.fillRect(X(p) - 1, Y(p) - 1, 2, 2); });
       g.globalAlpha = 1;
     }
     const line = (path, colour, size) => {
@@ -43,7 +43,7 @@ function worldMap(canvas, across, up) {
     const unit = ticks(0, 120 / view.scale, 1).pop() || 1, length = unit * view.scale;
     g.strokeStyle = g.fillStyle = css("--quiet"); g.lineWidth = 1.5; g.textAlign = "right";
     g.beginPath(); g.moveTo(width - 12 - length, height - 12); g.lineTo(width - 12, height - 12); g.stroke();
-    g.fillText(`${num(unit)} map units`, width - 12, height - 18);
+    g.fillText(`${num(unit)} map unit${unit === 1 ? "" : "s"}`, width - 12, height - 18);
   });
   let held = null;
   canvas.addEventListener("pointerdown", e => { held = [e.offsetX, e.offsetY]; canvas.setPointerCapture(e.pointerId); });
@@ -111,9 +111,10 @@ function series(parent, title, unit, values, colour) {
   });
 }
 
-function matrix(canvas) {
+function matrix(canvas, scale) {
   const { cells, frames_per_cell: step } = D.matches, n = cells.length;
-  const most = Math.log1p(Math.max(1, ...cells.map(row => Math.max(...row))));
+  const highest = Math.max(1, ...cells.map(row => Math.max(...row))), most = Math.log1p(highest);
+  scale.append("1", make("i"), `${num(highest)} points`);
   surface(canvas, (g, width) => {
     const size = width / n, colour = ramp(css("--low"), css("--high"));
     g.fillStyle = css("--card"); g.fillRect(0, 0, width, width);
@@ -138,7 +139,8 @@ function sphere(canvas, scale) {
   const { rows, columns, median_deg: median, east_deg: east, south_deg: south, count } = D.sphere;
   const known = median.flat().filter(v => v !== null).sort((a, b) => a - b);
   const high = known.length ? known[Math.floor(.98 * (known.length - 1))] : 1;
-  const biases = east.flatMap((row, i) => row.map((e, j) => e === null ? 0 : Math.hypot(e, south[i][j]))).sort((a, b) => a - b);
+  const solid = (i, j) => count[i][j] >= 20 && east[i][j] !== null;
+  const biases = east.flatMap((row, i) => row.flatMap((e, j) => solid(i, j) ? [Math.hypot(e, south[i][j])] : [])).sort((a, b) => a - b);
   const stretch = biases[Math.floor(.98 * (biases.length - 1))] || 1;
   surface(canvas, (g, width, height) => {
     const w = width / columns, h = height / rows, colour = ramp(css("--low"), css("--high"));
@@ -147,10 +149,12 @@ function sphere(canvas, scale) {
       g.fillStyle = colour(median[i][j] / high); g.fillRect(j * w, i * h, w + .6, h + .6);
     }
     g.strokeStyle = css("--before"); g.lineWidth = 1.2;
-    for (let i = 0; i < rows; i += 2) for (let j = 0; j < columns; j += 2) if (east[i][j] !== null) {
+    for (let i = 0; i < rows; i += 2) for (let j = 0; j < columns; j += 2) if (solid(i, j)) {
       const x = (j + .5) * w, y = (i + .5) * h, k = 1.8 * w / stretch;
       g.beginPath(); g.moveTo(x, y); g.lineTo(x + k * east[i][j], y + k * south[i][j]); g.stroke();
     }
+    g.fillStyle = css("--quiet"); g.textAlign = "center"; g.textBaseline = "bottom";
+    ["left", "front", "right"].forEach((text, i) => g.fillText(text, width * (i + 1) / 4, height - 4));
   });
   scale.append("0", make("i"), `${num(high)}° (${num(high * pxPerDeg)} px)`);
   hover(canvas, (x, y) => {

@@ -30,7 +30,7 @@ function mapLegend() {
 function worst() {
   const lengths = D.worst.flatMap(w => w.vectors.map(v => Math.hypot(v[2], v[3]))).sort((a, b) => a - b);
   const median = lengths[lengths.length >> 1] || 1;
-  const times = Math.max(1, Math.round(3 / median));  // a median residual becomes three degrees long
+  const times = Math.max(1, +(3 / median).toPrecision(1));  // a median residual becomes three degrees long
   el("worst-lead").textContent = D.worst.length
     ? `The frames with the largest median residual. Lines run from where a point was seen to where the map has it, ${num(times)} times as long.`
     : "No frame has observations.";
@@ -141,7 +141,7 @@ series(el("series"), "Residual", "px", F.residual_deg.map(v => v === null ? null
 series(el("series"), "Observations", "", F.observations, "--c");
 series(el("series"), "σ of position", "units", F.std, "--d");
 series(el("series"), "σ of rotation", "°", F.std_deg, "--d");
-matrix(el("matrix"));
+matrix(el("matrix"), el("matrix-scale"));
 sphere(el("sphere"), el("sphere-scale"));
 worst();
 cost();
