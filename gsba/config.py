@@ -18,6 +18,21 @@ class ReadSettings(_Settings):
     clock_offset_s: float | None = None  # s to add to frame times; None = clocks agree or one fits
 
 
+class VideoSettings(_Settings):
+    """Frames taken from a video, where one is given in their place."""
+
+    fps: float = Field(default=1.0, gt=0)  # frames kept per second
+    every: int | None = Field(default=None, ge=1)  # keep one of so many frames instead
+    at: str | None = None  # trajectory file: keep the frames at its times instead
+    sharpest: bool = False  # of the frames that one is kept of; else the first
+    from_s: float | None = Field(default=None, ge=0)  # seconds after the first frame
+    to_s: float | None = Field(default=None, gt=0)
+    width: int | None = Field(default=None, ge=64, multiple_of=2)  # pixels; None = as the video
+    standing_deg: float = Field(
+        default=0.1, ge=0
+    )  # less apparent motion since the last frame: the camera stands, leave out; 0 = keep all
+
+
 class CubemapSettings(_Settings):
     """Faces cut from a panorama for detection."""
 
@@ -175,6 +190,7 @@ class ExportSettings(_Settings):
 class RefineSettings(_Settings):
     """Everything a run depends on."""
 
+    video: VideoSettings = VideoSettings()
     read: ReadSettings = ReadSettings()
     cubemap: CubemapSettings = CubemapSettings()
     features: FeatureSettings = FeatureSettings()

@@ -4,18 +4,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsba import read
+from gsba import read, video
 from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.export import ExportFormat, export, write_points
 from gsba.line import ExtraFactors, Line
+from gsba.log import GsbaError
 from gsba.report import build_report, take_notes, write_poses, write_report
+from gsba.report_html import write_html
 from gsba.store import RunStore, atomic_write, load_stage
 from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
 
 _GAUGE = (
     "Sim(3)-aligned to the coarse trajectory over its refined SLAM poses: its world and scale; "
     "covariances hold the first pose and the distance to the frame furthest from it"
+)
+_OUTPUTS = (
+    "trajectory.tum",
+    "poses.csv",
+    "points.ply",
+    "config.toml",
+    "report.json",
+    "report.html",
 )
 
 
@@ -48,13 +58,14 @@ def refine(
     depends on it.
 
     Args:
-        frames: folder of 2:1 panoramas or of cube faces.
+        frames: folder of 2:1 panoramas or of cube faces, or a video, whose frames go to
+            `out`/frames first.
         trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig.
         out: folder of the run.
         settings: see `gsba.config`.
         masks: one ERP mask for all frames, or a folder of one for each; white = use.
         timestamps: times of the frames (and of a KITTI trajectory's rows).
-        fps: frames per second, where no file gives times.
+        fps: frames per second, where no file gives times; of a video: frames kept per second.
         fresh: forget an earlier run in `out`.
         extra_factors: makes factors of your own on the keys graph.X(frame); they join every
             bundle adjustment (and those are then never resumed).
@@ -63,10 +74,15 @@ def refine(
         GsbaError: an input or setting that cannot be used.
     """
     frames, trajectory, out = Path(frames), Path(trajectory), Path(out)
-    settings = settings or RefineSettings()
-    frame_set = read.scan(frames, timestamps, fps, masks)
+    settings, origin = settings or RefineSettings(), {"frames": frames, "trajectory": trajectory}
+    if video.is_video(frames):
+        read.read_trajectory(trajectory, timestamps)  # fails before hours of decoding, not after
+        frame_set = _extracted(frames, out, origin, settings, fps, masks, fresh)
+        fresh = False
+    else:
+        frame_set = read.scan(frames, timestamps, fps, masks)
     coarse = read.associate(frame_set, read.read_trajectory(trajectory, timestamps), settings.read)
-    with RunStore(out, {"frames": frames, "trajectory": trajectory}, fresh) as store:
+    with RunStore(out, origin, fresh) as store:
         line = Line(store, frame_set, coarse, settings, extra_factors)
         neighbours, rounds = line.match_neighbours(), settings.rounds
         solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)
@@ -95,6 +111,27 @@ def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:
     return reconstruction, load_stage(out, "frames", FrameSet)
 
 
+def _extracted(
+    film: Path,
+    out: Path,
+    origin: dict[str, Path],
+    settings: RefineSettings,
+    fps: float | None,
+    masks: Path | None,
+    fresh: bool,
+) -> FrameSet:
+    """Frames of a video, in `out`/frames."""
+    if fps is not None and not fps > 0:
+        raise GsbaError(f"--fps {fps}: must be a positive number of frames per second")
+    chosen = settings.video
+    if fps is not None:
+        chosen = chosen.model_copy(update={"fps": fps, "every": None, "at": None})
+    with RunStore(out, origin, fresh) as store:
+        video.extract(film, out / "frames", chosen, replace=True)
+        store.claim(out / "frames")
+    return read.scan(out / "frames", masks=masks)
+
+
 def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
     """Poses, cloud, report and datasets."""
     store, settings, frames, coarse = line.store, line.settings, line.frames, line.coarse
@@ -121,7 +158,8 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
         notes=notes,
     )
     write_report(out / "report.json", report)
-    for name in ("trajectory.tum", "poses.csv", "points.ply", "config.toml", "report.json"):
+    write_html(out / "report.html", frames, coarse, reconstruction, report)
+    for name in _OUTPUTS:
         store.claim(out / name)
     return RunResult(out, frames, coarse, reconstruction, report)
 

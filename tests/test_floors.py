@@ -20,14 +20,14 @@ FLOORS = (
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter", "align"},
     {"adjust", "frontend", "reconstruction"},
-    {"export", "evaluate", "induced", "report"},
+    {"export", "evaluate", "induced", "report", "report_html", "video"},
     {"demo", "line", "pipeline"},
     {"cli"},
     {"benchmarks"},
 )
 STAGES = 3  # the floor whose modules must not import one another
 FACTORS_MAY_USE = {"factors", "gtsam", "numba", "numpy", "scipy"}
-HEAVY = {"cv2", "gtsam", "kornia", "numba", "open3d", "pycolmap", "scipy", "torch", "trimesh"}
+HEAVY = {"av", "cv2", "gtsam", "kornia", "numba", "open3d", "pycolmap", "scipy", "torch", "trimesh"}
 
 FILES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path

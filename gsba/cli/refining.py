@@ -24,7 +24,9 @@ Factors = Annotated[
 
 @command
 def refine(
-    frames: Annotated[Path, typer.Argument(help="Folder of 2:1 panoramas or of cube faces.")],
+    frames: Annotated[
+        Path, typer.Argument(help="Folder of 2:1 panoramas or of cube faces, or a 2:1 video.")
+    ],
     trajectory: Annotated[Path, typer.Argument(help="TUM, KITTI or stella_vslam map.msg.")],
     out: Annotated[Path, typer.Option(help="Folder of the run.", metavar="RUN")],
     config: Config = None,
@@ -36,7 +38,10 @@ def refine(
     timestamps: Annotated[
         Path | None, typer.Option(help="Times of the frames.", metavar="FILE")
     ] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames per second, from time 0.")] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(help="Frames per second, from time 0; of a video: frames kept per second."),
+    ] = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="Replace an earlier run.")] = False,
 ) -> None:
     """Refine the pose of every frame; the same call again resumes."""
