@@ -18,7 +18,7 @@ FLOORS = (
     {"", "types", "geometry", "config", "config_file", "log"},
     {"rig", "records", "run_folder", "search", "store", "read"},
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
-    | {"graph", "optimize", "filter"},
+    | {"graph", "optimize", "filter", "splat"},
     {"adjust", "frontend", "reconstruction"},
     {"export", "evaluate", "report"},
     {"demo", "line", "pipeline"},
