@@ -19,8 +19,8 @@ FLOORS = (
     {"rig", "records", "run_folder", "search", "store", "read"},
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter", "splat"},
-    {"adjust", "frontend", "reconstruction"},
-    {"export", "evaluate", "report"},
+    {"adjust", "frontend", "reconstruction", "splatting"},
+    {"export", "evaluate", "evaluate_splat", "report"},
     {"demo", "line", "pipeline"},
     {"cli"},
     {"benchmarks"},

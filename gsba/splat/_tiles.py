@@ -63,10 +63,10 @@ def _power_of_two(typing_context, value):
 def _exp(x):
     """Exponential of a float32 <= 0, to a relative 1.2e-7 (2 - x); e^-80 for anything less."""
     t = max(min(x, _ZERO), _LEAST_POWER) * _LOG2E
-    n = _nearest_whole(t)
+    n = _nearest_whole(t)  # type: ignore[call-arg]
     f = t - n
     series = _ONE + f * (_E1 + f * (_E2 + f * (_E3 + f * (_E4 + f * (_E5 + f * _E6)))))
-    return series * _power_of_two(n)
+    return series * _power_of_two(n)  # type: ignore[call-arg]
 
 
 @_kernel

@@ -96,7 +96,7 @@ def from_cloud(
     return Gaussians(
         points.astype(np.float32),
         np.repeat(np.log(widths)[:, None], 3, axis=1).astype(np.float32),
-        np.tile(np.float32([1, 0, 0, 0]), (len(points), 1)),
+        np.tile(np.array([1, 0, 0, 0], np.float32), (len(points), 1)),
         np.full(len(points), np.log(opacity / (1 - opacity)), np.float32),
         sh,
     )
