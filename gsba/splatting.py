@@ -1,14 +1,15 @@
 """From a run to splats: posed faces, start clouds, training, and metrics of held-out frames."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from gsba import cubemap, triangulate
 from gsba.config import SplatSettings, TriangulateSettings
+from gsba.geometry import bearings_from_erp
 from gsba.log import GsbaError, track
-from gsba.rig import CubeRig
+from gsba.rig import CubeRig, owner_faces
 from gsba.splat.backend import Backend
 from gsba.splat.camera import face_camera
 from gsba.splat.gaussians import Gaussians, from_cloud
@@ -17,6 +18,7 @@ from gsba.splat.train import Views, extent_of
 from gsba.types import FACES, FrameSet, PoseStatus, Reconstruction, Tracks
 
 _GATE = np.deg2rad(3.0)  # of an observation under poses that may have drifted
+_PANORAMA_HFOV_DEG = 94.0  # of the faces a panorama is sampled from
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +100,7 @@ def make_views(images: np.ndarray, use: np.ndarray, world_T_rigs: np.ndarray) ->
     """
     rig = CubeRig(images.shape[1], np.pi / 2)
     seen = np.flatnonzero(use.any(axis=(1, 2)))
-    cameras = [face_camera(world_T_rigs[v // 6], v % 6, rig) for v in seen]
+    cameras = [face_camera(world_T_rigs[v // 6], int(v % 6), rig) for v in seen]
     if len(seen) < len(images):
         images, use = images[seen], use[seen]
     return Views(cameras, images, None if use.all() else use)
@@ -190,22 +192,38 @@ def mean_score(scores: Sequence[Score]) -> Score:
     return Score(*(float(np.mean(column)) for column in zip(*columns, strict=True)))
 
 
-def near_of(views: Views, settings: SplatSettings) -> float:
-    """Least z of a Gaussian that is seen, map units."""
-    return settings.near * extent_of(views.cameras)
+def near_of(world_T_rigs: np.ndarray, settings: SplatSettings) -> float:
+    """Least z, map units, of a Gaussian that is seen by rigs (N, 4, 4)."""
+    return settings.near * extent_of(world_T_rigs[:, :3, 3])
 
 
 def render_faces(
-    gaussians: Gaussians, world_T_rig: np.ndarray, size: int, near: float, backend: Backend
-) -> Mapping[str, np.ndarray]:
-    """The six faces of a rig, name -> (size, size, 3) uint8 RGB, 90 degrees wide."""
-    rig = CubeRig(size, np.pi / 2)
-    return {
-        name: to_uint8(
-            backend.render(gaussians, face_camera(world_T_rig, face, rig), None, near).color
-        )
-        for face, name in enumerate(FACES)
-    }
+    gaussians: Gaussians, world_T_rig: np.ndarray, rig: CubeRig, near: float, backend: Backend
+) -> np.ndarray:
+    """The six faces (6, size, size, 3) uint8 RGB of a rig, in FACES order."""
+    cameras = (face_camera(world_T_rig, face, rig) for face in range(len(FACES)))
+    return np.stack([to_uint8(backend.render(gaussians, c, None, near).color) for c in cameras])
+
+
+def render_panorama(
+    gaussians: Gaussians, world_T_rig: np.ndarray, width: int, near: float, backend: Backend
+) -> np.ndarray:
+    """An equirectangular image (width / 2, width, 3) uint8 RGB, sampled from wider faces."""
+    import cv2
+
+    hfov = np.deg2rad(_PANORAMA_HFOV_DEG)
+    rig = CubeRig(round(width / np.pi * np.tan(hfov / 2)), hfov)  # as dense as the equator
+    faces = render_faces(gaussians, world_T_rig, rig, near, backend)
+    height = width // 2
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    bearings = bearings_from_erp(np.stack([u, v], axis=-1), width, height)
+    owners = owner_faces(bearings)
+    at = (rig.project(bearings, owners) - 0.5).astype(np.float32)
+    image = np.empty((height, width, 3), np.uint8)
+    for face in range(len(FACES)):
+        sampled = cv2.remap(faces[face], at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        image[owners == face] = sampled[owners == face]
+    return image
 
 
 def to_uint8(color: np.ndarray) -> np.ndarray:

@@ -82,7 +82,7 @@ def from_cloud(
         raise GsbaError("the cloud has no points to start a splat from: refine the run first")
     if not np.isfinite(points).all():
         raise GsbaError("the cloud has points that are not finite: refine the run again")
-    from scipy.spatial import cKDTree
+    from scipy.spatial import cKDTree  # type: ignore[attr-defined]
 
     spread = np.linalg.norm(points.std(axis=0))
     if len(points) > 1:

@@ -1,9 +1,10 @@
 """Train a splat on posed faces: 3D Gaussian Splatting as published (Kerbl et al., 2023).
 
 One view a step, in an order drawn anew for every round through the views; Adam; clone, split and
-prune; opacity resets. The published times are for 30,000 steps and shrink with the number asked
-for, down to sensible floors. Every random draw depends on the seed and the step alone, so that a
-run that was interrupted goes on to the same result.
+prune; opacity resets. Published times and rates are for 30,000 steps. With fewer, times shrink in
+proportion, down to sensible floors, and the rates of shape and colour grow as the square root, up
+to four times. Every random draw depends on the seed and the step alone, so that a run that was
+interrupted goes on to the same result.
 """
 
 import logging
@@ -27,6 +28,7 @@ from gsba.splat.metrics import training_loss
 logger = logging.getLogger(__name__)
 
 _PUBLISHED = 30_000  # steps that the published times are for
+_MAX_PACE = 4.0
 _CHECK_EVERY = 20  # steps between looks for values that are not finite
 
 
@@ -72,9 +74,13 @@ def times_for(iterations: int) -> Times:
     )
 
 
-def extent_of(cameras: Sequence[FaceCamera]) -> float:
-    """Radius of the region the cameras are in, times 1.1, map units; 1 for a single place."""
-    places = np.array([camera.face_in_world for camera in cameras])
+def pace_for(iterations: int) -> float:
+    """Factor on the published rates of shape and colour for a number of steps."""
+    return min(max((_PUBLISHED / iterations) ** 0.5, 1.0), _MAX_PACE)
+
+
+def extent_of(places: np.ndarray) -> float:
+    """Radius of the region that cameras at (N, 3) are in, times 1.1; 1 for a single place."""
     radius = float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
     return 1.1 * radius if radius > 0 else 1.0
 
@@ -154,7 +160,8 @@ class _Trainer:
     def __init__(self, views: Views, settings: SplatSettings, backend: Backend) -> None:
         self.views, self.settings, self.backend = views, settings, backend
         self.times = times_for(settings.iterations)
-        self.extent = extent_of(views.cameras)
+        self.extent = extent_of(np.array([camera.face_in_world for camera in views.cameras]))
+        self.pace = pace_for(settings.iterations)
         self.near = settings.near * self.extent
         self.capped = False
 
@@ -195,11 +202,11 @@ class _Trainer:
         means = settings.rate_means ** (1 - done) * settings.rate_means_end**done
         return adam.Rates(
             means=means * self.extent,
-            log_scales=settings.rate_scales,
-            quaternions=settings.rate_rotations,
+            log_scales=settings.rate_scales * self.pace,
+            quaternions=settings.rate_rotations * self.pace,
             opacity_logits=settings.rate_opacities,
-            sh=settings.rate_colors,
-            sh_rest=settings.rate_colors / 20,
+            sh=settings.rate_colors * self.pace,
+            sh_rest=settings.rate_colors * self.pace / 20,
         )
 
     def _densify(self, state: State, step: int) -> tuple[Gaussians, adam.Moments]:
