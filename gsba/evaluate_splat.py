@@ -199,8 +199,8 @@ def format_table(results: Mapping[str, SourceResult]) -> str:
     return "\n".join(
         [
             *lines,
-            f"Means over {num} held-out panoramas at each source's own poses. exp.: after the gain of",
-            "each channel that fits best. vs. first: PSNR less that of the first source.",
+            f"Means over {num} held-out panoramas at each source's own poses. exp.: after the gain",
+            "of each channel that fits best. vs. first: PSNR less that of the first source.",
             f"LPIPS {LPIPS}.",
         ]
     )
