@@ -39,6 +39,7 @@ from gsba.types import FrameSet, Reconstruction, Trajectory
 logger = logging.getLogger(__name__)
 
 LPIPS = "not computed: no weights"
+_COLORS = ((200, 60, 40), (30, 110, 200), (40, 150, 60), (150, 60, 160), (220, 140, 20))  # RGB
 _CURVE_POINTS = 10  # measurements during a training
 
 
@@ -80,8 +81,8 @@ def compare(
 ) -> dict[str, SourceResult]:
     """Train and measure a splat for each source of poses; resumes what is done.
 
-    Writes `out`/SOURCE/point_cloud.ply and checkpoint.npz, results.json, table.txt, and
-    pictures/FRAME.jpg: the front face as captured, then as each source renders it.
+    Writes `out`/SOURCE/point_cloud.ply and checkpoint.npz, results.json, table.txt,
+    curves.png, and pictures/FRAME.jpg: the six faces as captured, then as each source has them.
 
     Args:
         reconstruction, frames: of a finished run; its tracks make the start clouds.
@@ -124,6 +125,7 @@ def compare(
     content = {"lpips": LPIPS, "settings": settings.model_dump(), "sources": to_json(results)}
     atomic_write(out / "table.txt", lambda path: path.write_text(lines + "\n"))
     atomic_write(out / "results.json", lambda path: path.write_text(json.dumps(content, indent=1)))
+    _write_curves(out / "curves.png", results)
     _write_pictures(
         out / "pictures", frames, split, faces[1][0], sources, splats, settings, backend
     )
@@ -230,6 +232,42 @@ def _write_pictures(
                 )
             )
         write_image(folder / f"{frames.names[f]}.jpg", np.concatenate(rows))
+
+
+def _write_curves(path: Path, results: Mapping[str, SourceResult]) -> None:
+    """PSNR of held-out frames over steps, a line for each source."""
+    import cv2
+
+    left, top, wide, tall = 60, 20, 520, 300
+    lines = {
+        name: np.array([(step, score.psnr) for step, score in sorted(result.curve.items())])
+        for name, result in results.items()
+        if len(result.curve) > 1
+    }
+    if not lines:
+        return
+    every = np.concatenate(list(lines.values()))
+    low, high = np.floor(every[:, 1].min()), np.ceil(every[:, 1].max())
+    canvas = np.full((top + tall + 40, left + wide + 140, 3), 255, np.uint8)
+
+    def write(text: str, x: float, y: float, color: tuple[int, int, int] = (0, 0, 0)) -> None:
+        at = (int(x), int(y))
+        cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
+
+    for share in np.linspace(0, 1, 6):
+        y = int(top + (1 - share) * tall)
+        cv2.line(canvas, (left, y), (left + wide, y), (220, 220, 220), 1)
+        write(f"{low + share * (high - low):.1f}", 8, y + 4)
+        write(f"{share * every[:, 0].max():.0f}", left + share * wide - 12, top + tall + 16)
+    write("PSNR of held-out frames, dB, over steps", left, top + tall + 34)
+    for i, (name, line) in enumerate(lines.items()):
+        x = left + wide * line[:, 0] / every[:, 0].max()
+        y = top + tall * (high - line[:, 1]) / max(high - low, 1.0)
+        color = _COLORS[i % len(_COLORS)]
+        at = np.rint(np.column_stack([x, y])).astype(np.int32)
+        cv2.polylines(canvas, [at[:, None]], False, color, 2, cv2.LINE_AA)
+        write(name, left + wide + 8, y[-1] + 4, color)
+    write_image(path, canvas)
 
 
 def write_image(path: Path, image: np.ndarray) -> None:

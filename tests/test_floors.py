@@ -19,7 +19,7 @@ FLOORS = (
     {"rig", "records", "run_folder", "search", "store", "read"},
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter", "splat"},
-    {"adjust", "frontend", "reconstruction", "splatting"},
+    {"adjust", "frontend", "reconstruction", "splat_align", "splatting"},
     {"export", "evaluate", "evaluate_splat", "report"},
     {"demo", "line", "pipeline"},
     {"cli"},
