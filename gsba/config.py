@@ -187,6 +187,32 @@ class ExportSettings(_Settings):
     )  # pixels; None = a quarter of the panorama's width
 
 
+class SplatSettings(_Settings):
+    """Training of a Gaussian splat: the rates of Kerbl et al., 2023, times scaled to the length."""
+
+    iterations: int = Field(default=7000, ge=1)  # views shown, one at a time
+    face_size: int = Field(default=256, ge=16)  # pixels
+    backend: Literal["auto", "gsplat", "cpu"] = "auto"
+    held_out_every: int = Field(default=8, ge=2)  # whole panoramas kept for evaluation
+    sh_degree: int = Field(default=3, ge=0, le=3)
+    max_gaussians: int = Field(default=1_000_000, ge=1)
+    ssim_weight: float = Field(default=0.2, ge=0, le=1)
+    near: float = Field(default=0.01, gt=0)  # Gaussians nearer are not seen, part of the extent
+    rate_means: float = Field(default=1.6e-4, gt=0)  # at the start, part of the extent
+    rate_means_end: float = Field(default=1.6e-6, gt=0)
+    rate_scales: float = Field(default=5e-3, gt=0)
+    rate_rotations: float = Field(default=1e-3, gt=0)
+    rate_opacities: float = Field(default=0.05, gt=0)
+    rate_colors: float = Field(default=2.5e-3, gt=0)  # a twentieth of it for what varies by view
+    densify: bool = True
+    densify_pull: float = Field(default=2e-4, gt=0)  # gradient of a centre, image half-widths
+    densify_scale: float = Field(default=0.01, gt=0)  # smaller: cloned, larger: split; of extent
+    min_opacity: float = Field(default=5e-3, gt=0, lt=1)
+    max_scale: float = Field(default=0.1, gt=0)  # of extent
+    checkpoint_every_s: float = Field(default=60.0, gt=0)
+    seed: int = 0
+
+
 class RefineSettings(_Settings):
     """Everything a run depends on."""
 

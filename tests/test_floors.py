@@ -18,9 +18,9 @@ FLOORS = (
     {"", "types", "geometry", "config", "config_file", "log"},
     {"rig", "records", "run_folder", "search", "store", "read", "panorama", "views"},
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
-    | {"graph", "optimize", "filter", "align"},
-    {"adjust", "frontend", "reconstruction"},
-    {"export", "evaluate", "induced", "report", "report_html", "video"},
+    | {"graph", "optimize", "filter", "align", "splat"},
+    {"adjust", "frontend", "reconstruction", "splat_align", "splatting"},
+    {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"},
     {"demo", "line", "pipeline"},
     {"cli"},
     {"benchmarks"},

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from gsba.cli.app import command
+from gsba.cli.splat import BackendName, FaceSize, Iterations, evaluate_splat, splat_settings
 from gsba.log import GsbaError
 
 
@@ -46,12 +47,27 @@ def export(
 @command
 def evaluate(
     estimate: Annotated[Path, typer.Argument(help="A run, or a trajectory file.", metavar="RUN")],
-    truth: Annotated[Path, typer.Option(help="True trajectory (TUM).")],
+    truth: Annotated[Path | None, typer.Option(help="True trajectory (TUM).")] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the numbers here too.", metavar="FILE")
     ] = None,
+    splat: Annotated[
+        bool, typer.Option("--splat", help="Train splats on poses, and measure held-out frames.")
+    ] = False,
+    against: Annotated[
+        list[Path] | None, typer.Option(help="With --splat: other poses; repeatable.")
+    ] = None,
+    iterations: Iterations = None,
+    face_size: FaceSize = None,
+    backend: BackendName = "auto",
 ) -> None:
-    """Compare a run or a trajectory with the truth."""
+    """Compare a run or a trajectory with the truth, or what its poses are worth to a splat."""
+    if splat:
+        evaluate_splat(estimate, against or [], splat_settings(iterations, face_size, backend))
+    if truth is None:
+        if not splat:
+            raise GsbaError("nothing to compare with: give --truth FILE, or --splat")
+        return
     from gsba.evaluate import evaluate as compare
     from gsba.evaluate import format_table
     from gsba.read import read_trajectory
