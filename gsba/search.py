@@ -67,7 +67,7 @@ def search(first, second, cells, targets, only_targets, direction, limits):
             continue
         bearing = bearings0[i, 0], bearings0[i, 1], bearings0[i, 2]
         target = targets[i, 0], targets[i, 1], targets[i, 2]
-        normal, cosine, slack, spread = _great_circle(bearing, direction, limits)
+        circle = _great_circle(bearing, direction, limits)
         for cell in range(len(radii)):
             if starts[cell] == starts[cell + 1]:
                 continue
@@ -75,18 +75,14 @@ def search(first, second, cells, targets, only_targets, direction, limits):
             if only_targets:
                 if _distance(target, ball) > limits.point + radius:
                     continue
-            elif not _in_band(
-                ball, radius, bearing, normal, direction, cosine + slack, spread, limits
-            ):
+            elif not _in_band(ball, radius, bearing, direction, circle, limits):
                 continue
             begin, end = starts[cell], starts[cell + 1]
             members = axes1[:, begin:end]
             if only_targets:
                 _mark_near(members, target, limits.point, marks)
             else:
-                _mark_in_band(
-                    members, bearing, normal, direction, cosine + slack, spread, limits, marks
-                )
+                _mark_in_band(members, bearing, direction, circle, limits, marks)
             for j in range(begin, end):
                 if not marks[j - begin]:
                     continue
@@ -124,8 +120,9 @@ def _keep_mutual(best0, top0, next0, best1, next1, limits):
 
 @_kernel
 def _great_circle(bearing, direction, limits):
-    """Normal of the plane of a bearing and the motion, cosine between them, its slack, and how far
-    off the plane an error of the direction takes a point for each unit of its parallax."""
+    """Normal of the plane of a bearing and the motion, largest cosine to the motion of a bearing
+    that is not displaced towards it, and how far off the plane an error of the motion's direction
+    takes a point for each unit of its parallax."""
     (ax, ay, az), (tx, ty, tz) = bearing, direction
     nx, ny, nz = ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax
     sine = np.sqrt(nx * nx + ny * ny + nz * nz)
@@ -133,16 +130,17 @@ def _great_circle(bearing, direction, limits):
         nx, ny, nz = nx / sine, ny / sine, nz / sine
     slack = limits.rotation * (sine + limits.rotation)
     spread = limits.direction / max(sine, _LEAST_SINE)
-    return (nx, ny, nz), tx * ax + ty * ay + tz * az, slack, spread
+    return (nx, ny, nz), tx * ax + ty * ay + tz * az + slack, spread
 
 
 @_kernel
-def _in_band(ball, radius, bearing, normal, direction, max_cosine, spread, limits):
+def _in_band(ball, radius, bearing, direction, circle, limits):
     """Whether a bearing within `radius` of the centre of a ball can be of the same point.
 
     It lies on the great circle, no further than parallax goes, and is not displaced towards the
     direction of motion: that is where points behind both frames are seen.
     """
+    normal, max_cosine, spread = circle
     chord = _distance(bearing, ball)
     band = spread * (chord + radius)
     return (
@@ -153,11 +151,11 @@ def _in_band(ball, radius, bearing, normal, direction, max_cosine, spread, limit
 
 
 @_kernel
-def _mark_in_band(members, bearing, normal, direction, max_cosine, spread, limits, marks):
+def _mark_in_band(members, bearing, direction, circle, limits, marks):
     """Flags of the bearings (3, m) that pass; without branches, so that it runs in vectors."""
     for m in range(members.shape[1]):
         ball = members[0, m], members[1, m], members[2, m]
-        marks[m] = _in_band(ball, _ZERO, bearing, normal, direction, max_cosine, spread, limits)
+        marks[m] = _in_band(ball, _ZERO, bearing, direction, circle, limits)
 
 
 @_kernel
