@@ -104,7 +104,7 @@ def _run(
     frames, world_T_rigs = walk
     landmarks, keypoints = _start(world_T_rigs, sigma_px)
     return align.run(
-        landmarks, world_T_rigs, keypoints, 1.0, frames, RIG, "align", True, settings, 2
+        landmarks, world_T_rigs, keypoints, 1.0, frames, RIG, "align", None, settings, 2
     )
 
 
@@ -119,7 +119,7 @@ def _errors_px(sighted: Sighted, world_T_rigs: np.ndarray) -> np.ndarray:
         rows = np.flatnonzero(tracks.frames == f)
         true = bearings_of(landmarks.points_world, world_T_rigs[f])
         errors[rows] = np.arccos(np.clip(found[rows] @ true.T, -1, 1)).min(axis=1)
-    return errors / PIXEL
+    return errors[sighted.aligned[keypoints.rows(tracks)]] / PIXEL
 
 
 def test_observations_are_sub_pixel(walk) -> None:
@@ -164,13 +164,17 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
     before = adjust.run(landmarks.tracks, keypoints, start, *common)
     sighted = align.run(
         before.landmarks, before.world_T_rigs, keypoints, before.noise, frames, RIG, "align",
-        True, SETTINGS, 2,
+        None, SETTINGS, 2,
     )  # fmt: skip
-    noise = adjust.with_noise_of(before, sighted, settings)
-    after = adjust.run(sighted.tracks, sighted.keypoints, noise, *common)
+    after, known = adjust.run_sighted(sighted, before, *common)
     assert np.median(rotation_errors(after)) < 0.5 * np.median(rotation_errors(before))
-    assert 0.5 <= after.noise < 2  # covariances are about right as they are
-    assert all(step.accepted for step in after.rounds)
+    assert 0.5 <= after.noise < 2 and all(step.accepted for step in after.rounds)
+    aligned = sighted.aligned
+    factor = known.sigmas_rad[aligned] / sighted.keypoints.sigmas_rad[aligned]
+    np.testing.assert_allclose(factor, factor[0])  # one for all, found from their residuals
+    errors = np.median(_errors_px(replace(sighted, keypoints=known), world_T_rigs))
+    median_sigma = np.median(known.sigmas_rad[aligned]) / PIXEL
+    assert 0.5 < errors / (1.18 * median_sigma) < 1.5  # 1.18: median of a Rayleigh variable
 
 
 @pytest.mark.parametrize("grey", [0, 255])
@@ -183,6 +187,7 @@ def test_a_frame_without_texture_keeps_what_it_had(walk, tmp_path: Path, grey: i
     assert sighted.counts.dropped["no texture"] > 50
     seen = np.bincount(sighted.tracks.frames, minlength=NUM)
     assert seen.min() > 100
+    assert not sighted.aligned[slice(*sighted.keypoints.starts[2:4])].any()
     assert np.isfinite(sighted.keypoints.sqrt_infos).all()
 
 
@@ -194,7 +199,7 @@ def test_all_masked_leaves_the_former_observations(walk, tmp_path: Path) -> None
     landmarks, keypoints = _start(world_T_rigs)
     assert sighted.counts.kept == 0
     assert sighted.counts.dropped["masked"] == sighted.counts.received
-    assert len(sighted.tracks) == len(landmarks.tracks)
+    assert len(sighted.tracks) == len(landmarks.tracks) and not sighted.aligned.any()
     np.testing.assert_allclose(sighted.keypoints.sigmas_rad, keypoints.sigmas_rad)
 
 
@@ -207,17 +212,31 @@ def test_points_at_a_centre_and_behind_walls_do_no_harm(walk) -> None:
     points[100] = world_T_rigs[landmarks.tracks.frames[300], :3, 3]
     moved = replace(landmarks, points_world=points)
     sighted = align.run(
-        moved, world_T_rigs, keypoints, 1.0, frames, RIG, "align", True, SETTINGS, 2
+        moved, world_T_rigs, keypoints, 1.0, frames, RIG, "align", None, SETTINGS, 2
     )
     assert np.isfinite(sighted.keypoints.bearings_rig).all()
     assert np.isfinite(sighted.keypoints.sqrt_infos).all()
+
+
+def test_confirmed_points_are_looked_for_elsewhere(walk) -> None:
+    frames, world_T_rigs = walk
+    landmarks, keypoints = _start(world_T_rigs)
+    settings = AlignSettings(patch_size=11, min_track_length=4)  # longer than any here
+    short, confirmed = (
+        align.run(
+            landmarks, world_T_rigs, keypoints, 1.0, frames, RIG, "align", aligned, settings, 2
+        )
+        for aligned in (None, np.ones(len(keypoints.faces), bool))
+    )
+    assert short.counts.received == 2 * 400  # all observations but the references
+    assert confirmed.counts.received > 3 * 400
 
 
 def test_no_points_are_no_observations(walk) -> None:
     frames, world_T_rigs = walk
     none = adjust.start(world_T_rigs).landmarks
     _, keypoints = _start(world_T_rigs)
-    sighted = align.run(none, world_T_rigs, keypoints, 1.0, frames, RIG, "align", True, SETTINGS, 2)
+    sighted = align.run(none, world_T_rigs, keypoints, 1.0, frames, RIG, "align", None, SETTINGS, 2)
     assert len(sighted.tracks) == 0 and sighted.counts.received == 0
 
 
@@ -243,6 +262,7 @@ def test_cube_faces_are_aligned_like_panoramas(walk, tmp_path: Path) -> None:
     sighted = _run((cube, world_T_rigs))
     errors = _errors_px(sighted, world_T_rigs)
     rows = sighted.keypoints.rows(sighted.tracks)
+    rows = rows[sighted.aligned[rows]]
     pixels = sighted.keypoints.pixels[rows] / RIG.size
     edge = np.abs(pixels - 0.5).max(axis=1) > 0.47
     assert len(errors) > 900 and np.median(errors) < 0.08
