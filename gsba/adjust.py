@@ -24,6 +24,7 @@ from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
 
 logger = logging.getLogger(__name__)
 
+_LEAST = 1e-3  # times its claimed sigma: no observation is better than that
 _WIDE = 20.0  # gate in sigmas for observations whose noise is not known yet
 _REDUNDANT = 0.1  # least share of residual dimensions left over by the unknowns
 
@@ -61,20 +62,54 @@ def start(world_T_rigs: np.ndarray) -> Adjustment:
     return Adjustment(world_T_rigs, landmarks, 1.0, ())
 
 
-def with_noise_of(before: Adjustment, sighted: Sighted, settings: RefineSettings) -> Adjustment:
-    """A solution with the noise that other observations show under its poses.
+def run_sighted(
+    sighted: Sighted,
+    before: Adjustment,
+    priors: gtsam.NonlinearFactorGraph,
+    rig: CubeRig,
+    gates: Sequence[float],
+    settings: RefineSettings,
+    num_threads: int,
+) -> tuple[Adjustment, Keypoints]:
+    """As `run`, of aligned and former observations, the noise of either estimated on its own.
 
-    It is too high by what the poses are off, and falls with the rounds that start from it.
+    Returns:
+        The solution, and its keypoints with the noise that they turned out to have.
     """
-    rows = sighted.keypoints.rows(sighted.tracks)
-    bearings, sigmas = sighted.keypoints.bearings_rig[rows], sighted.keypoints.sigmas_rad[rows]
-    placed = triangulate.run(
-        sighted.tracks, bearings, sigmas, before.world_T_rigs, _WIDE, settings.triangulate
+    solved, rounds = before, []
+    for number, gate in enumerate(gates, 1):
+        sighted = calibrate(sighted, solved, settings)
+        tracks, keypoints, start = sighted.tracks, sighted.keypoints, replace(solved, noise=1.0)
+        solver = _solver(settings, last=number == len(gates))
+        so_far = settings.model_copy(update={"solver": solver})
+        solved = run(tracks, keypoints, start, priors, rig, (gate,), so_far, num_threads)
+        rounds += solved.rounds
+    return replace(solved, rounds=tuple(rounds)), sighted.keypoints
+
+
+def calibrate(sighted: Sighted, before: Adjustment, settings: RefineSettings) -> Sighted:
+    """Scale new and former observations' noise to what a solution shows of each.
+
+    A patch's covariance knows the image's noise and texture, not how far a surface or a lens is
+    from the model; residuals do. They also hold what the poses are off: too much noise, until
+    poses are adjusted.
+    """
+    tracks, keypoints = sighted.tracks, sighted.keypoints
+    rows, poses = keypoints.rows(tracks), before.world_T_rigs
+    bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
+    placed = triangulate.run(tracks, bearings, sigmas, poses, _WIDE, settings.triangulate)
+    factors = np.ones(len(keypoints.faces))
+    for group in (sighted.aligned, ~sighted.aligned):
+        chosen = group[keypoints.rows(placed.tracks)]
+        if np.count_nonzero(chosen) >= settings.rounds.min_observations:
+            factors[group] = max(_noise(placed, keypoints, poses, chosen), _LEAST)
+    infos = keypoints.sqrt_infos
+    scaled = replace(
+        keypoints,
+        sigmas_rad=keypoints.sigmas_rad * factors,
+        sqrt_infos=None if infos is None else infos / factors[:, None, None],
     )
-    noise = before.noise
-    if len(placed.tracks):
-        noise = _noise(placed, sighted.keypoints, before.world_T_rigs)
-    return replace(before, noise=max(noise, settings.rounds.min_noise))
+    return replace(sighted, keypoints=scaled)
 
 
 def run(
@@ -194,11 +229,19 @@ def pose_covariances(
     return marginal_covariances(held, [block], _values(adjustment.world_T_rigs), keys)
 
 
-def _noise(landmarks: Landmarks, keypoints: Keypoints, world_T_rigs: np.ndarray) -> float:
+def _noise(
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    world_T_rigs: np.ndarray,
+    chosen: np.ndarray | slice = slice(None),
+) -> float:
     """Noise in units of the features' sigmas: robust spread of residuals over its expectation.
 
     The points are placed by least squares: under the robust loss of the adjustment they would lie
     closer to most of their observations than the noise allows.
+
+    Args:
+        chosen: (O,) bool, observations whose spread is asked for; all share one redundancy.
     """
     tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
     points, bearings = landmarks.points_world[tracks.points], keypoints.bearings_rig[rows]
@@ -208,7 +251,7 @@ def _noise(landmarks: Landmarks, keypoints: Keypoints, world_T_rigs: np.ndarray)
     residuals /= np.linalg.norm(offsets, axis=1, keepdims=True)  # sines: the angles are small
     unknowns = 3 * landmarks.tracks.num_points + 6 * len(world_T_rigs)
     redundancy = max(1 - unknowns / residuals.size, _REDUNDANT)
-    spread = 1.4826 * np.median(np.abs(_whitened(residuals, keypoints, rows)))
+    spread = 1.4826 * np.median(np.abs(_whitened(residuals, keypoints, rows)[chosen]))
     return float(spread / np.sqrt(redundancy))
 
 

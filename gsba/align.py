@@ -21,7 +21,7 @@ _WINDOW = 0.6  # standard deviation of the patch's window, part of half a patch
 _SEARCH = 3.0  # shifts followed while aligning, in largest accepted ones
 _STEPS = 12
 _TOLERANCE = 0.02  # of the last step, pixels
-_LEAST_SIGMA = 1e-3  # pixels: no patch is better than this
+_LEAST_SIGMA = 0.03  # pixels: what sampling and a plane for the surface cost the best of patches
 
 _Mask: TypeAlias = np.ndarray | None  # (H, 2H) bool, True = use
 
@@ -44,7 +44,7 @@ def run(
     frames: FrameSet,
     rig: CubeRig,
     name: str,
-    first: bool,
+    aligned: np.ndarray | None,
     settings: AlignSettings,
     num_threads: int,
 ) -> Sighted:
@@ -61,17 +61,17 @@ def run(
         noise: of those, in units of their sigmas.
         rig: faces that pixels are given on.
         name: beside the progress bar.
-        first: whether no patch has confirmed the points yet.
+        aligned: (N,) bool, which of the keypoints patches have confirmed; None = none.
         settings: limits and sizes.
         num_threads: frames worked on at a time.
 
     Returns:
-        Tracks of aligned observations; frames with few of them keep their former ones as well.
+        Tracks of aligned observations, and of former ones where a point was not aligned.
     """
     rows = references(landmarks, world_T_rigs)
     hosts = landmarks.tracks.frames[rows].astype(np.int64)
-    least = settings.min_track_length if first else 2
-    points, seeing = views(landmarks, world_T_rigs, rows, least, settings)
+    extended = _extended(landmarks, keypoints, aligned, settings.min_track_length)
+    points, seeing = views(landmarks, world_T_rigs, rows, extended, settings)
     width = panorama.width_for(frames, settings.max_width)
     origins, spreads, depths = _patches(landmarks.points_world, world_T_rigs[hosts], width)
     plane = world_T_rigs[hosts, :3, :3] @ spreads * depths[:, None, None]
@@ -92,7 +92,7 @@ def run(
     _stream(align, frames, width, seeing, name, num_threads)
     kept, found, dropped = _accepted(patches, sightings, seeing, 2 * np.pi / width, settings)
     at_hosts = _at_hosts(patches, sightings, kept, hosts, origins, spreads)
-    former = _former(landmarks, keypoints, noise, [found, at_hosts], len(frames), settings)
+    former = _former(landmarks, keypoints, noise, [found, at_hosts], len(frames))
     colors = keypoints.colors[keypoints.rows(landmarks.tracks)[rows]]
     counts = Counts(len(points), len(found.points), "observations", dropped)
     return _pack([found, at_hosts, former], colors, len(frames), rig, counts)
@@ -203,23 +203,29 @@ def _at_hosts(
     return _Observed(used, hosts[used], origins[used], covariances)
 
 
+def _extended(
+    landmarks: Landmarks, keypoints: Keypoints, aligned: np.ndarray | None, min_length: int
+) -> np.ndarray:
+    """Points (J,) that many observations or a patch confirm: worth looking for elsewhere."""
+    tracks = landmarks.tracks
+    out = np.bincount(tracks.points, minlength=tracks.num_points) >= min_length
+    if aligned is not None:
+        out[tracks.points[aligned[keypoints.rows(tracks)]]] = True
+    return out
+
+
 def _former(
     landmarks: Landmarks,
     keypoints: Keypoints,
     noise: float,
     found: list[_Observed],
     num_frames: int,
-    settings: AlignSettings,
 ) -> _Observed:
-    """What frames with few aligned observations saw before, and others of the same points."""
+    """The observations so far, where there are none now."""
     tracks = landmarks.tracks
-    counts = sum(np.bincount(part.frames, minlength=num_frames) for part in found)
-    weak = np.asarray(counts) < settings.min_observations
-    wanted = np.zeros(tracks.num_points, bool)
-    wanted[tracks.points[weak[tracks.frames]]] = True
     known = np.concatenate([part.points * num_frames + part.frames for part in found])
     cells = tracks.points.astype(np.int64) * num_frames + tracks.frames
-    chosen = np.flatnonzero(wanted[tracks.points] & ~np.isin(cells, known))
+    chosen = np.flatnonzero(~np.isin(cells, known))
     rows = keypoints.rows(tracks)[chosen]
     covariances = keypoints.sigmas_rad[rows, None, None] ** 2 * np.eye(2)
     if keypoints.sqrt_infos is not None:
@@ -232,7 +238,10 @@ def _former(
 def _pack(
     parts: list[_Observed], colors: np.ndarray, num_frames: int, rig: CubeRig, counts: Counts
 ) -> Sighted:
-    """Observations as keypoints, frame by frame, and the tracks of points seen at least twice."""
+    """Observations, the last part being former ones, as keypoints frame by frame and as tracks.
+
+    Points seen once are left out.
+    """
     points, frames, bearings, covariances = (
         np.concatenate([getattr(part, name) for part in parts])
         for name in ("points", "frames", "bearings_rig", "covariances")
@@ -240,6 +249,7 @@ def _pack(
     seen = np.bincount(points, minlength=len(colors))
     order = np.lexsort((points, frames))
     order = order[seen[points[order]] > 1]
+    is_new = order < len(points) - len(parts[-1].points)
     points, frames, bearings = points[order], frames[order], bearings[order]
     starts = np.searchsorted(frames, np.arange(num_frames + 1))
     faces = owner_faces(bearings)
@@ -261,4 +271,4 @@ def _pack(
         (by_point - starts[frames[by_point]]).astype(np.int32),
         int(compact[-1]) + 1 if len(compact) else 0,
     )
-    return Sighted(keypoints, tracks, counts)
+    return Sighted(keypoints, is_new, tracks, counts)

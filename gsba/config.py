@@ -134,7 +134,7 @@ class AlignSettings(_Settings):
     near_frames: int = Field(default=40, ge=0)  # nearest in space, among which views are found
     min_track_length: int = Field(
         default=3, ge=2
-    )  # observations a point needs, in the first round, to be looked for in further frames
+    )  # observations a point needs, unless aligned before, to be looked for in further frames
     max_angle_deg: float = Field(default=45.0, gt=0, lt=90)  # between views of a point
     max_ratio: float = Field(default=1.8, gt=1)  # of a point's distances
     affine_sigma: float = Field(default=0.15, gt=0)  # deviation from a surface facing the viewer
@@ -143,9 +143,6 @@ class AlignSettings(_Settings):
     min_zncc: float = Field(default=0.75, gt=0, lt=1)  # correlation of the aligned patches
     max_shift_px: float = Field(default=1.5, gt=0)  # from the predicted place, panorama pixels
     max_sigma_px: float = Field(default=0.5, gt=0)  # along the worst direction
-    min_observations: int = Field(
-        default=60, ge=0
-    )  # of a frame; below, it keeps its features' observations too
 
     @field_validator("patch_size")
     @classmethod

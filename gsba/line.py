@@ -67,6 +67,7 @@ class Line:
             ["frames", "features"],
         )
         self.observed = self.keypoints  # those that the latest solution is made of
+        self.aligned: np.ndarray | None = None  # which of them patches have confirmed
 
         def load(frame: int) -> Features:
             return found[frames.names[frame]]
@@ -207,7 +208,7 @@ class Line:
                 self.frames,
                 self.rig,
                 name,
-                number == 1,
+                self.aligned,
                 self.settings.align,
                 self.num_threads,
             )
@@ -220,28 +221,20 @@ class Line:
     def solve_aligned(self, number: int, sighted: Sighted, before: Adjustment) -> Adjustment:
         """Bundle adjustment of aligned observations; undone where that explains less."""
         name, gates = f"aligned{number}", self.settings.rounds.aligned
-        final = number == self.settings.align.rounds
 
-        def compute() -> Adjustment:
-            return adjust.run(
-                sighted.tracks,
-                sighted.keypoints,
-                adjust.with_noise_of(before, sighted, self.settings),
-                self.priors,
-                self.rig,
-                gates,
-                self.settings,
-                self.num_threads,
-                final,
+        def compute() -> tuple[Adjustment, Keypoints]:
+            return adjust.run_sighted(
+                sighted, before, self.priors, self.rig, gates, self.settings, self.num_threads
             )
 
-        solved = self._stage(name, [self._solving(), gates, final], compute, Adjustment)
+        key = [self._solving(), gates]
+        solved, keypoints = self._stage(name, key, compute, tuple[Adjustment, Keypoints])
         self.counts[name] = [solved.landmarks.counts]
         self.solutions[name] = solved
         if not self._explains(solved, before):
             self.undone.append(name)
             return before
-        self.observed = sighted.keypoints
+        self.observed, self.aligned = keypoints, sighted.aligned
         return solved
 
     def _explains(self, solved: Adjustment, before: Adjustment) -> bool:

@@ -152,9 +152,10 @@ class Landmarks:
 
 @dataclass(frozen=True, slots=True)
 class Sighted:
-    """Observations made anew, by aligning patches: keypoints and the tracks they form."""
+    """Observations made anew by aligning patches, former ones where that failed, their tracks."""
 
     keypoints: Keypoints  # one for each observation
+    aligned: np.ndarray  # (N,) bool, which of them are new
     tracks: Tracks
     counts: Counts  # of observations
 

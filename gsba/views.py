@@ -25,19 +25,19 @@ def views(
     landmarks: Landmarks,
     world_T_rigs: np.ndarray,
     rows: np.ndarray,
-    min_length: int,
+    extended: np.ndarray,
     settings: AlignSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Frames in which each point is looked for, its reference left out.
 
-    They are the frames of its observations, and those near its reference in space, whatever their
-    time, that see it from a similar direction and distance: the most similar first.
+    They are the frames of its observations, and where asked for those near its reference in space,
+    whatever their time, that see it from a like direction and distance: the most similar first.
 
     Args:
         landmarks: the points.
         world_T_rigs: (F, 4, 4) current poses.
         rows: (J,) observation each point is taken from.
-        min_length: observations of a point that is looked for where it has none.
+        extended: (J,) bool, points that are looked for where they have no observation.
 
     Returns:
         points (O,) and frames (O,), int64, by point.
@@ -55,7 +55,7 @@ def views(
     limits = np.cos(np.deg2rad(settings.max_angle_deg)), settings.max_ratio
     num = _views(
         _starts(landmarks), frames, centres, points, rows, near, *limits, settings.max_views,
-        min_length, out,
+        extended, out,
     )  # fmt: skip
     return out[0, :num].copy(), out[1, :num].copy()
 
@@ -92,7 +92,7 @@ def _references(starts, frames, centres, points, out):
 
 @numba.njit(cache=True, nogil=True)
 def _views(
-    starts, frames, centres, points, rows, near, min_cosine, max_ratio, max_views, min_length, out
+    starts, frames, centres, points, rows, near, min_cosine, max_ratio, max_views, extended, out
 ):
     listed = np.full(len(centres), -1)  # point that last listed each frame
     costs = np.empty(near.shape[1])
@@ -108,7 +108,7 @@ def _views(
                 out[0, num], out[1, num] = j, frames[a]
                 num += 1
                 room -= 1
-        if starts[j + 1] - starts[j] < min_length:
+        if not extended[j]:
             continue
         for k in range(near.shape[1]):
             costs[k] = np.inf
