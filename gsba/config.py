@@ -155,6 +155,16 @@ class ExportSettings(_Settings):
     )  # pixels; None = a quarter of the panorama's width
 
 
+class PlacementSettings(_Settings):
+    """Where the exported world is: upright, to scale, on the earth; the run itself stays put."""
+
+    up: Literal["auto", "none"] = "none"  # auto: gravity from rigs and vertical edges
+    length: float | None = Field(default=None, gt=0)  # metres between the two of `between`
+    between: tuple[str, str] | None = None  # frames by name, or points "x,y,z" of the run's world
+    gps: str | None = None  # file of positions: metres, east-north-up
+    align: str | None = None  # TUM file of true poses: its world and unit
+
+
 class RefineSettings(_Settings):
     """Everything a run depends on."""
 
@@ -173,4 +183,5 @@ class RefineSettings(_Settings):
         default=("bearing",), min_length=1
     )
     export: ExportSettings = ExportSettings()
+    placement: PlacementSettings = PlacementSettings()
     seed: int = 0

@@ -20,7 +20,8 @@ FLOORS = (
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter"},
     {"adjust", "frontend", "reconstruction"},
-    {"export", "evaluate", "report", "report_html", "video"},
+    {"export", "evaluate", "report", "report_html", "video"}
+    | {"alignment", "gravity", "placement"},
     {"demo", "line", "pipeline"},
     {"cli"},
     {"benchmarks"},
