@@ -210,6 +210,16 @@ class SplatSettings(_Settings):
     seed: int = 0
 
 
+class PlacementSettings(_Settings):
+    """Where the exported world is: upright, to scale, on the earth; the run itself stays put."""
+
+    up: Literal["auto", "none"] = "none"  # auto: gravity from rigs and vertical edges
+    length: float | None = Field(default=None, gt=0)  # metres between the two of `between`
+    between: tuple[str, str] | None = None  # frames by name, or points "x,y,z" of the run's world
+    gps: str | None = None  # file of positions: metres, east-north-up
+    align: str | None = None  # TUM file of true poses: its world and unit
+
+
 class RefineSettings(_Settings):
     """Everything a run depends on."""
 
@@ -229,4 +239,5 @@ class RefineSettings(_Settings):
         default=("bearing",), min_length=1
     )
     export: ExportSettings = ExportSettings()
+    placement: PlacementSettings = PlacementSettings()
     seed: int = 0

@@ -10,6 +10,7 @@ from gsba.config_file import to_toml
 from gsba.export import ExportFormat, export, write_points
 from gsba.line import ExtraFactors, Line
 from gsba.log import GsbaError
+from gsba.placement import Placement, check, place
 from gsba.report import build_report, take_notes, write_poses, write_report
 from gsba.report_html import write_html
 from gsba.store import RunStore, atomic_write, load_stage
@@ -75,6 +76,7 @@ def refine(
     """
     frames, trajectory, out = Path(frames), Path(trajectory), Path(out)
     settings, origin = settings or RefineSettings(), {"frames": frames, "trajectory": trajectory}
+    check(settings.placement)
     if video.is_video(frames):
         read.read_trajectory(trajectory, timestamps)  # fails before hours of decoding, not after
         frame_set = _extracted(frames, out, origin, settings, fps, masks, fresh)
@@ -141,8 +143,9 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
     write_poses(out / "poses.csv", frames, coarse, reconstruction)
     write_points(out / "points.ply", reconstruction)
     atomic_write(out / "config.toml", lambda path: path.write_text(to_toml(settings)))
+    placement = place(reconstruction, frames, settings.placement)
     for name in settings.export.formats:
-        _export(line, ExportFormat(name), reconstruction)
+        _export(line, ExportFormat(name), reconstruction, placement)
     undone = [n for n, s in line.solutions.items() if not all(r.accepted for r in s.rounds)]
     undone += [name for name in line.undone if name not in undone]
     notes = take_notes(frames, coarse, reconstruction, undone)
@@ -164,14 +167,18 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
     return RunResult(out, frames, coarse, reconstruction, report)
 
 
-def _export(line: Line, to: ExportFormat, reconstruction: Reconstruction) -> None:
+def _export(
+    line: Line, to: ExportFormat, reconstruction: Reconstruction, placement: Placement
+) -> None:
     folder, name = line.store.root / to.value, f"export-{to.value}"
     if not folder.exists():
         line.store.forget(name)
 
     def compute() -> Counts:
-        export(reconstruction, line.frames, folder, to, line.settings.export.face_size)
+        size = line.settings.export.face_size
+        export(reconstruction, line.frames, folder, to, size, placement)
         return Counts(len(line.frames), len(line.frames), "frames")
 
-    line.store.stage(name, line.settings.export.face_size, compute, Counts, [line.latest])
+    key = [line.settings.export.face_size, placement.to_json()]
+    line.store.stage(name, key, compute, Counts, [line.latest])
     line.store.claim(folder)

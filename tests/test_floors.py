@@ -20,7 +20,8 @@ FLOORS = (
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter", "align", "splat"},
     {"adjust", "frontend", "reconstruction", "splat_align", "splatting"},
-    {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"},
+    {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"}
+    | {"alignment", "gravity", "placement"},
     {"demo", "line", "pipeline"},
     {"cli"},
     {"benchmarks"},

@@ -24,8 +24,23 @@ def export(
         Path | None, typer.Option(help="Folder to write; RUN/FORMAT by default.")
     ] = None,
     face_size: Annotated[int | None, typer.Option(help="Pixels of a cube face.")] = None,
+    up: Annotated[str, typer.Option(help="auto: turn the world upright; none: leave it.")] = "none",
+    scale: Annotated[
+        float | None, typer.Option(help="Metres between the two of --between.", metavar="LENGTH")
+    ] = None,
+    between: Annotated[
+        tuple[str, str] | None,
+        typer.Option(help="Two frames, or points x,y,z of the run's world.", metavar="A B"),
+    ] = None,
+    gps: Annotated[
+        Path | None, typer.Option(help="CSV or GPX: metres east, north, up.", metavar="FILE")
+    ] = None,
+    align: Annotated[
+        Path | None, typer.Option(help="True poses: their world and unit.", metavar="TRUTH.tum")
+    ] = None,
 ) -> None:
-    """Write a finished run as a dataset for another program."""
+    """Write a finished run as a dataset for another program, placed where you want it."""
+    from gsba.config_file import validated
     from gsba.export import ExportFormat
     from gsba.export import export as write
     from gsba.run_folder import claim
@@ -34,11 +49,16 @@ def export(
         raise GsbaError(f"--to {to} is not known: use one of {', '.join(ExportFormat)}")
     if face_size is not None and face_size < 1:
         raise GsbaError(f"--face-size {face_size} is out of range: use 1 or more pixels")
+    asked = {"up": up, "length": scale, "between": between}
+    asked |= {key: str(path) for key, path in (("gps", gps), ("align", align)) if path is not None}
+    settings = validated({"placement": asked}).placement
     from gsba.pipeline import load_run
+    from gsba.placement import place
 
     reconstruction, frames, *_ = load_run(run)
     folder = out or run / to
-    write(reconstruction, frames, folder, ExportFormat(to), face_size)
+    placement = place(reconstruction, frames, settings)
+    write(reconstruction, frames, folder, ExportFormat(to), face_size, placement)
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
     typer.echo(f"{to}: {folder}")

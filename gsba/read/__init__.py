@@ -2,14 +2,18 @@
 
 from gsba.read.associate import associate
 from gsba.read.frames import load_erp, load_faces, scan
+from gsba.read.gps import GpsFixes, local_from_geodetic, read_gps
 from gsba.read.masks import load_mask
 from gsba.read.trajectory import read_trajectory, write_tum
 
 __all__ = [
+    "GpsFixes",
     "associate",
     "load_erp",
     "load_faces",
     "load_mask",
+    "local_from_geodetic",
+    "read_gps",
     "read_trajectory",
     "scan",
     "write_tum",
