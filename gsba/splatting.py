@@ -1,6 +1,6 @@
 """From a run to splats: posed faces, start clouds, training, and metrics of held-out frames."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -103,7 +103,7 @@ def make_views(images: np.ndarray, use: np.ndarray, world_T_rigs: np.ndarray) ->
     cameras = [face_camera(world_T_rigs[v // 6], int(v % 6), rig) for v in seen]
     if len(seen) < len(images):
         images, use = images[seen], use[seen]
-    return Views(cameras, images, None if use.all() else use)
+    return Views(cameras, images, None if use.all() else use, seen // 6)
 
 
 def place_points(
@@ -159,26 +159,33 @@ def start_cloud(
 
 def measure(
     gaussians: Gaussians, views: Views, settings: SplatSettings, near: float, backend: Backend
-) -> list[Score]:
-    """Scores of panoramas, in the order of the views' first faces.
+) -> dict[int, Score]:
+    """Scores of panoramas, by their number in the views.
 
     Args:
         gaussians: the splat.
-        views: held-out faces.
+        views: held-out faces; a panorama that is masked altogether has none, and no score.
         settings: degree of the harmonics.
         near: least z of a Gaussian, map units.
         backend: the renderer.
+
+    Raises:
+        GsbaError: no panorama has a pixel to measure.
     """
-    groups: dict[bytes, list[int]] = {}
-    for v, camera in enumerate(views.cameras):
-        groups.setdefault(camera.face_in_world.tobytes(), []).append(v)
-    return [_score(gaussians, views, rows, settings, near, backend) for rows in groups.values()]
+    if len(views.cameras) == 0:
+        raise GsbaError("no pixel to measure a splat on: all held-out frames are masked")
+    return {
+        int(i): _score(
+            gaussians, views, np.flatnonzero(views.panoramas == i), settings, near, backend
+        )
+        for i in np.unique(views.panoramas)
+    }
 
 
 def _score(
     gaussians: Gaussians,
     views: Views,
-    rows: Sequence[int],
+    rows: np.ndarray,
     settings: SplatSettings,
     near: float,
     backend: Backend,
@@ -197,7 +204,7 @@ def _score(
     return Score(psnr(image, real), float(np.nanmean(similarities)), exposed)
 
 
-def mean_score(scores: Sequence[Score]) -> Score:
+def mean_score(scores: Iterable[Score]) -> Score:
     """Mean of each metric over panoramas."""
     columns = ((s.psnr, s.ssim, s.psnr_exposed) for s in scores)
     return Score(*(float(np.mean(column)) for column in zip(*columns, strict=True)))

@@ -39,6 +39,7 @@ class Views:
     cameras: Sequence[FaceCamera]  # (V,) all of one size
     images: np.ndarray  # (V, H, W, 3) uint8, RGB
     use: np.ndarray | None  # (V, H, W) bool, pixels that count; None = all
+    panoramas: np.ndarray  # (V,) int, which panorama each is a face of
 
 
 @dataclass(frozen=True, slots=True)
