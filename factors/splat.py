@@ -76,7 +76,8 @@ class SplatBlock:
             cameras: of the faces.
             render: the splat from a pose; called by `refresh`.
             loss: robust loss on each whitened residual; None is Cauchy at one sigma.
-            correlation: pixels that err together and count as one.
+            correlation: pixels that err together and count as one; 25 made the errors of aligned
+                poses about as large as their covariance says, at faces of 48 to 192 pixels.
 
         Raises:
             ValueError: as many images and masks as keys are needed.

@@ -150,7 +150,7 @@ def _one(
 
     def watch(step: int, gaussians: Gaussians) -> None:
         if step % max(settings.iterations // _CURVE_POINTS, 1) == 0:
-            curve[step] = mean_score(measure(gaussians, held_out, settings, near, backend))
+            curve[step] = mean_score(measure(gaussians, held_out, settings, near, backend).values())
             content = {"key": key, "curve": {s: asdict(score) for s, score in curve.items()}}
             atomic_write(out / "curve.json", lambda path: path.write_text(json.dumps(content)))
 
@@ -158,9 +158,8 @@ def _one(
     splat = train(start, training, settings, backend, out / "checkpoint.npz", key, watch)
     write_ply(out / "point_cloud.ply", splat)
     scores = measure(splat, held_out, settings, near, backend)
-    names = [frames.names[f] for f in split.held_out]
-    by_frame = dict(zip(names, scores, strict=True))
-    return splat, SourceResult(by_frame, mean_score(scores), curve, len(splat))
+    by_frame = {frames.names[split.held_out[i]]: score for i, score in scores.items()}
+    return splat, SourceResult(by_frame, mean_score(scores.values()), curve, len(splat))
 
 
 def _read_curve(path: Path, key: str) -> dict[int, Score]:

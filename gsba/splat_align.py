@@ -1,21 +1,85 @@
 """Frames against a splat: the block that aligns rig poses to what the splat renders."""
 
+from collections.abc import Sequence
+
+import gtsam
 import numpy as np
 
-from factors import FaceCameras, RobustLoss
+from factors import BearingTerm, FaceCameras, LandmarkBlock, RobustLoss
 from factors.splat import RenderedView, SplatBlock
 from gsba import cubemap, graph
+from gsba.config import SolverSettings
 from gsba.log import track
+from gsba.optimize import optimize
 from gsba.rig import RIG_R_FACE, CubeRig
 from gsba.splat.backend import Backend
 from gsba.splat.camera import face_camera
 from gsba.splat.gaussians import Gaussians
-from gsba.types import FACES, FrameSet
+from gsba.splatting import place_points
+from gsba.types import FACES, FrameSet, Reconstruction
 
 MIN_ALPHA = 0.95  # of a rendered pixel that is believed
 MAX_STEP = 0.1  # of the depth, between neighbouring pixels: more is an edge
+MAX_STEPS = 12  # of the solver at each size
+_GATE = np.deg2rad(1.0)  # of observations that join the splat
 _LUMA = np.array([0.299, 0.587, 0.114])
 _MARGIN_HFOV_DEG = 100.0  # of captured faces, so that samples beyond an edge find pixels
+
+
+def align(
+    gaussians: Gaussians,
+    frames: FrameSet,
+    world_T_rigs: np.ndarray,
+    near: float,
+    backend: Backend,
+    sizes: Sequence[int] = (48, 96, 192),
+    reconstruction: Reconstruction | None = None,
+) -> np.ndarray:
+    """Align the poses of all frames to a splat that stays as it is, from coarse to fine.
+
+    The splat holds the gauge. The coarsest faces have the widest basin and work alone; bearings,
+    where given, join from the second size on.
+
+    Args:
+        gaussians: the splat.
+        frames: captured frames.
+        world_T_rigs: (F, 4, 4) start, in the splat's world.
+        near: least z of a Gaussian, map units.
+        backend: the renderer.
+        sizes: pixels of a face at each level.
+        reconstruction: whose observations join as bearing factors; None = the splat alone.
+
+    Returns:
+        (F, 4, 4) float64.
+    """
+    which = np.arange(len(frames))
+    settings = SolverSettings(max_iterations=MAX_STEPS, relative_tolerance=1e-5)
+    poses = world_T_rigs
+    for level, size in enumerate(sizes):
+        blocks: list = [splat_block(gaussians, frames, which, size, near, backend)]
+        if reconstruction is not None and level > 0:
+            blocks.append(bearing_block(reconstruction, poses))
+        values = gtsam.Values()
+        for f in which:
+            values.insert(graph.X(int(f)), gtsam.Pose3(poses[f]))
+        found = optimize(gtsam.NonlinearFactorGraph(), blocks, values, settings).values
+        poses = np.stack([found.atPose3(graph.X(int(f))).matrix() for f in which])
+    return poses
+
+
+def bearing_block(reconstruction: Reconstruction, world_T_rigs: np.ndarray) -> LandmarkBlock:
+    """A run's observations as bearing factors, points placed under given poses (F, 4, 4)."""
+    which = np.arange(len(world_T_rigs))
+    landmarks, _ = place_points(reconstruction, world_T_rigs, which, float(_GATE))
+    tracks = landmarks.tracks
+    term = BearingTerm(
+        tracks.frames,
+        tracks.points,
+        reconstruction.observation_bearings[tracks.keypoints],
+        reconstruction.observation_sigmas[tracks.keypoints],
+    )
+    keys = [graph.X(int(f)) for f in which]
+    return LandmarkBlock(keys, landmarks.points_world, [term], RobustLoss("cauchy", 1.0))
 
 
 def splat_block(

@@ -1,7 +1,7 @@
 """From a run to splats: posed faces, start clouds, training, and metrics of held-out frames."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from gsba.splat.camera import face_camera
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.metrics import psnr, ssim
 from gsba.splat.train import Views, extent_of
-from gsba.types import FACES, FrameSet, PoseStatus, Reconstruction, Tracks
+from gsba.types import FACES, FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
 
 _GATE = np.deg2rad(3.0)  # of an observation under poses that may have drifted
 _PANORAMA_HFOV_DEG = 94.0  # of the faces a panorama is sampled from
@@ -103,71 +103,89 @@ def make_views(images: np.ndarray, use: np.ndarray, world_T_rigs: np.ndarray) ->
     cameras = [face_camera(world_T_rigs[v // 6], int(v % 6), rig) for v in seen]
     if len(seen) < len(images):
         images, use = images[seen], use[seen]
-    return Views(cameras, images, None if use.all() else use)
+    return Views(cameras, images, None if use.all() else use, seen // 6)
 
 
-def start_cloud(
-    reconstruction: Reconstruction, world_T_rigs: np.ndarray, frames: np.ndarray, sh_degree: int
-) -> Gaussians:
+def place_points(
+    reconstruction: Reconstruction, world_T_rigs: np.ndarray, frames: np.ndarray, gate_rad: float
+) -> tuple[Landmarks, np.ndarray]:
     """The run's points, triangulated anew from some frames under given poses.
-
-    That places a start cloud in the world of any poses, by one recipe.
 
     Args:
         reconstruction: whose observations are used.
         world_T_rigs: (F, 4, 4) poses, in a world of their own; only those of `frames` are used.
         frames: frame indices.
-        sh_degree: of the Gaussians.
+        gate_rad: observations further from their point are left out.
+
+    Returns:
+        Points with their observations, whose keypoints are rows of the reconstruction's
+        observations; and the reconstruction's index (J,) of each point.
     """
     rows = np.flatnonzero(np.isin(reconstruction.observation_frames, frames))
     points = reconstruction.observation_points[rows]
-    tracks = Tracks(
-        points,
+    known, renumbered = np.unique(points, return_inverse=True)
+    candidates = Tracks(
+        renumbered.astype(np.int32),
         reconstruction.observation_frames[rows],
         np.arange(len(rows), dtype=np.int32),
-        len(reconstruction.points_world),
+        len(known),
     )
-    known, renumbered = np.unique(points, return_inverse=True)
-    tracks = Tracks(renumbered.astype(np.int32), tracks.frames, tracks.keypoints, len(known))
-    landmarks = triangulate.run(
-        tracks,
+    placed = triangulate.run(
+        candidates,
         reconstruction.observation_bearings[rows],
         np.ones(len(rows)),
         world_T_rigs,
-        float(_GATE),
+        gate_rad,
         TriangulateSettings(),
     )
-    kept = np.zeros(0, int)
-    if len(landmarks.tracks):
-        rows_of_points = np.searchsorted(
-            landmarks.tracks.points, np.arange(len(landmarks.points_world))
-        )
-        kept = points[landmarks.tracks.keypoints[rows_of_points]]
-    return from_cloud(landmarks.points_world, reconstruction.point_colors[kept], sh_degree)
+    kept = np.empty(len(placed.points_world), np.int64)
+    kept[placed.tracks.points] = points[placed.tracks.keypoints]
+    tracks = replace(placed.tracks, keypoints=rows[placed.tracks.keypoints])
+    return replace(placed, tracks=tracks), kept
+
+
+def start_cloud(
+    reconstruction: Reconstruction, world_T_rigs: np.ndarray, frames: np.ndarray, sh_degree: int
+) -> Gaussians:
+    """Gaussians at the run's points, placed in the world of any poses by one recipe.
+
+    Args:
+        reconstruction, world_T_rigs, frames: see `place_points`.
+        sh_degree: of the Gaussians.
+    """
+    landmarks, known = place_points(reconstruction, world_T_rigs, frames, float(_GATE))
+    return from_cloud(landmarks.points_world, reconstruction.point_colors[known], sh_degree)
 
 
 def measure(
     gaussians: Gaussians, views: Views, settings: SplatSettings, near: float, backend: Backend
-) -> list[Score]:
-    """Scores of panoramas, in the order of the views' first faces.
+) -> dict[int, Score]:
+    """Scores of panoramas, by their number in the views.
 
     Args:
         gaussians: the splat.
-        views: held-out faces.
+        views: held-out faces; a panorama that is masked altogether has none, and no score.
         settings: degree of the harmonics.
         near: least z of a Gaussian, map units.
         backend: the renderer.
+
+    Raises:
+        GsbaError: no panorama has a pixel to measure.
     """
-    groups: dict[bytes, list[int]] = {}
-    for v, camera in enumerate(views.cameras):
-        groups.setdefault(camera.face_in_world.tobytes(), []).append(v)
-    return [_score(gaussians, views, rows, settings, near, backend) for rows in groups.values()]
+    if len(views.cameras) == 0:
+        raise GsbaError("no pixel to measure a splat on: all held-out frames are masked")
+    return {
+        int(i): _score(
+            gaussians, views, np.flatnonzero(views.panoramas == i), settings, near, backend
+        )
+        for i in np.unique(views.panoramas)
+    }
 
 
 def _score(
     gaussians: Gaussians,
     views: Views,
-    rows: Sequence[int],
+    rows: np.ndarray,
     settings: SplatSettings,
     near: float,
     backend: Backend,
@@ -186,7 +204,7 @@ def _score(
     return Score(psnr(image, real), float(np.nanmean(similarities)), exposed)
 
 
-def mean_score(scores: Sequence[Score]) -> Score:
+def mean_score(scores: Iterable[Score]) -> Score:
     """Mean of each metric over panoramas."""
     columns = ((s.psnr, s.ssim, s.psnr_exposed) for s in scores)
     return Score(*(float(np.mean(column)) for column in zip(*columns, strict=True)))

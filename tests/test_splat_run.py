@@ -18,7 +18,7 @@ from gsba.log import GsbaError
 from gsba.pipeline import load_run
 from gsba.read import read_trajectory, write_tum
 from gsba.rig import CubeRig
-from gsba.splat import read_ply
+from gsba.splat import from_cloud, read_ply
 from gsba.splat.backend import CpuBackend
 from gsba.types import Trajectory
 
@@ -139,6 +139,20 @@ def test_a_masked_face_is_left_out(case: Case) -> None:
     use[5] = False
     views = splatting.make_views(images, use, np.eye(4)[None])
     assert len(views.cameras) == 5 and views.use is None
+    nothing = splatting.make_views(images, np.zeros_like(use), np.eye(4)[None])
+    gaussians = from_cloud(np.ones((2, 3)), np.zeros((2, 3), np.uint8))
+    with pytest.raises(GsbaError, match="held-out frames are masked"):
+        splatting.measure(gaussians, nothing, SplatSettings(), 0.01, CpuBackend(1))
+
+
+def test_panoramas_at_one_place_are_scored_apart() -> None:
+    images = np.zeros((12, 16, 16, 3), np.uint8)
+    images[6:] = 128
+    views = splatting.make_views(images, np.ones((12, 16, 16), bool), np.eye(4)[None].repeat(2, 0))
+    gaussians = from_cloud(np.full((2, 3), 99.0), np.zeros((2, 3), np.uint8))
+    scores = splatting.measure(gaussians, views, SplatSettings(), 0.01, CpuBackend(1))
+    assert list(scores) == [0, 1] and scores[0].psnr > scores[1].psnr
+    assert scores[1].psnr == pytest.approx(-20 * np.log10(128 / 255), abs=1e-3)
 
 
 def test_too_few_common_frames_are_refused(case: Case, tmp_path: Path) -> None:

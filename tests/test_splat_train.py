@@ -35,7 +35,9 @@ def scene() -> tuple[Gaussians, Views]:
     places = np.column_stack([np.linspace(-0.5, 0.5, 6), np.zeros(6), np.linspace(0, 0.3, 6)])
     cameras = [face_camera(pose(np.eye(3), place), 0, RIG) for place in places]
     images = [render(truth, camera)[0].color for camera in cameras]
-    return truth, Views(cameras, (np.clip(images, 0, 1) * 255 + 0.5).astype(np.uint8), None)
+    return truth, Views(
+        cameras, (np.clip(images, 0, 1) * 255 + 0.5).astype(np.uint8), None, np.arange(6)
+    )
 
 
 def start(truth: Gaussians) -> Gaussians:

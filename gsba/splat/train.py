@@ -39,6 +39,7 @@ class Views:
     cameras: Sequence[FaceCamera]  # (V,) all of one size
     images: np.ndarray  # (V, H, W, 3) uint8, RGB
     use: np.ndarray | None  # (V, H, W) bool, pixels that count; None = all
+    panoramas: np.ndarray  # (V,) int, which panorama each is a face of
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +70,7 @@ def times_for(iterations: int) -> Times:
         densify_from=max(round(500 * scale), 100),
         densify_until=iterations // 2,
         densify_every=min(max(round(100 * scale), 50), 100),
-        reset_every=max(round(3000 * scale), 500),
+        reset_every=max(round(3000 * scale), 3000),  # short trainings cannot recover from one
         degree_every=max(round(1000 * scale), 1),
     )
 
