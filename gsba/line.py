@@ -8,12 +8,14 @@ from typing import TypeVar
 import gtsam
 import numpy as np
 
-from gsba import adjust, cubemap, features, frontend, graph, tracks
+from gsba import adjust, cubemap, features, frontend, graph, recovery, tracks
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
 from gsba.matching import SearchableFrames
+from gsba.motion import Trust
 from gsba.reconstruction import assemble
+from gsba.recovery import Recovered
 from gsba.store import PerFrame, RunStore, fingerprint
 from gsba.types import (
     CoarsePoses,
@@ -44,11 +46,10 @@ class Line:
         self.store, self.frames, self.coarse, self.settings = store, frames, coarse, settings
         self.num_threads = settings.solver.num_threads or os.cpu_count() or 1
         self.rig = cubemap.rig_for(frames, settings.cubemap)
-        self.priors = graph.build(coarse.world_T_rigs, settings.priors)
         self.custom = None if extra_factors is None else uuid.uuid4().hex  # resumes nothing
-        if extra_factors is not None:
-            for factor in extra_factors(coarse):
-                self.priors.add(factor)
+        self.extra = list(extra_factors(coarse)) if extra_factors is not None else []
+        self.trust: Trust | None = None
+        self._set_priors()
         self.counts: dict[str, list[Counts]] = {}
         self.solutions: dict[str, Adjustment] = {}
         self.latest = "keypoints"  # the stage that the next one builds on
@@ -70,6 +71,18 @@ class Line:
 
         self.searchable = SearchableFrames(load)
         self.strongest = SearchableFrames(load, settings.pairs.strongest_per_face)
+
+    def _set_priors(self) -> None:
+        """What the trajectory says, as far as it is trusted, and the caller's own factors."""
+        self.priors = graph.build(
+            self.coarse.world_T_rigs,
+            self.settings.priors,
+            None if self.trust is None else self.trust.false_steps,
+            None if self.trust is None else self.trust.false_frames,
+            None if self.trust is None else self.trust.world_T_rigs[0],
+        )
+        for factor in self.extra:
+            self.priors.add(factor)
 
     def _extract(self) -> PerFrame[Features]:
         """Features of every frame: image and mask are read, cut and released one at a time."""
@@ -95,8 +108,9 @@ class Line:
         )
 
     def start(self) -> Adjustment:
-        """The coarse trajectory as a solution without points."""
-        return adjust.start(self.coarse.world_T_rigs)
+        """The coarse trajectory, chained past its false steps, as a solution without points."""
+        trusted = self.coarse if self.trust is None else self.trust
+        return adjust.start(trusted.world_T_rigs)
 
     def match_neighbours(self) -> VerifiedPairs:
         """Verified matches of frames next to one another in time."""
@@ -114,12 +128,34 @@ class Line:
             VerifiedPairs,
         )
         self.counts["neighbours"] = [pairs.counts]
-        if pairs.counts.kept == 0:
-            reasons = ", ".join(f"{n} {why}" for why, n in pairs.counts.dropped.items() if n)
+        return pairs
+
+    def judge(self, guided: VerifiedPairs) -> VerifiedPairs:
+        """Neighbours once more where the trajectory misled, which then loses those priors."""
+        recovered = self._stage(
+            "steps",
+            [self._matching(), self.settings.priors],
+            lambda: recovery.run(
+                self.searchable,
+                self.strongest,
+                self.keypoints,
+                guided,
+                self.coarse,
+                self.settings,
+                self.num_threads,
+            ),
+            Recovered,
+        )
+        pairs = recovered.neighbours
+        self.counts["steps"] = [pairs.counts]
+        if len(pairs.matches.pairs) == 0:
+            reasons = ", ".join(f"{n} {why}" for why, n in guided.counts.dropped.items() if n)
             raise GsbaError(
-                f"no two neighbouring frames match ({pairs.counts.received} pairs: {reasons}): "
+                f"no two neighbouring frames match ({guided.counts.received} pairs: {reasons}): "
                 "check that frames and trajectory are of the same recording and on one clock"
             )
+        self.trust = recovered.trust
+        self._set_priors()
         return pairs
 
     def match_loops(self, solved: Adjustment) -> VerifiedPairs:

@@ -68,7 +68,7 @@ def refine(
     coarse = read.associate(frame_set, read.read_trajectory(trajectory, timestamps), settings.read)
     with RunStore(out, {"frames": frames, "trajectory": trajectory}, fresh) as store:
         line = Line(store, frame_set, coarse, settings, extra_factors)
-        neighbours, rounds = line.match_neighbours(), settings.rounds
+        neighbours, rounds = line.judge(line.match_neighbours()), settings.rounds
         solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)
         adjacent = line.match_along_epipolars(solved)
         near = line.match_known_points("near", solved, loops_closed=False)
