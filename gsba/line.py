@@ -229,7 +229,8 @@ class Line:
                 solved, self.priors, self.keypoints, self.rig, self.settings, self.num_threads
             )
             least = self.settings.rounds.min_observations
-            return assemble(solved, covariances, self.keypoints, self.coarse, least)
+            false = None if self.trust is None else self.trust.false_frames
+            return assemble(solved, covariances, self.keypoints, self.coarse, least, false)
 
         return self._stage("reconstruction", self._solving(), compute, Reconstruction)
 

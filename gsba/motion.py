@@ -6,13 +6,17 @@ from its neighbours': a point that two steps see must be equally far in both. St
 trajectory that this contradicts lose their prior, and the start is chained past them.
 """
 
+import logging
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from gsba.config import PriorSettings, VerifySettings
 from gsba.geometry import inverse, pose, rotation_angle
-from gsba.types import CoarsePoses, Keypoints, PoseSource, VerifiedPairs
+from gsba.types import CoarsePoses, FrameSet, Keypoints, PoseSource, VerifiedPairs
+
+logger = logging.getLogger(__name__)
 
 _MIN_COMMON = 8  # points that two steps must share to compare their lengths
 _MIN_POINT_PARALLAX = np.deg2rad(1.0)  # of a point, or its depth is not worth comparing
@@ -207,6 +211,30 @@ def judge(
     else:
         start = coarse.world_T_rigs
     return Trust(start, wrong, _named(wrong, slam, chosen, own, verify), unseen, lengths)
+
+
+def describe(trust: Trust, frames: FrameSet) -> tuple[dict[str, list[Any]], list[str]]:
+    """The judgement by the names of frames, for the report, and what to note of it."""
+    names = np.array(frames.names)
+
+    def between(chosen: np.ndarray) -> list[Any]:
+        return [[names[f], names[f + 1]] for f in np.flatnonzero(chosen).tolist()]
+
+    false = names[trust.false_frames].tolist()
+    judgement = {
+        "false_frames": false,
+        "false_steps": between(trust.false_steps),
+        "unseen_steps": between(trust.unseen_steps),
+    }
+    notes = []
+    if false:
+        notes.append(f"the images contradict the trajectory at {', '.join(false)}: not believed")
+    if trust.unseen_steps.any():
+        steps = ", ".join(f"{a} to {b}" for a, b in judgement["unseen_steps"])
+        notes.append(f"no images in common, held by the trajectory alone: {steps}")
+    for note in notes:
+        logger.warning(note)
+    return judgement, notes
 
 
 def _disagreement(slam: np.ndarray, found: Steps) -> tuple[np.ndarray, np.ndarray]:

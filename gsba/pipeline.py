@@ -9,6 +9,7 @@ from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.export import ExportFormat, export, write_points
 from gsba.line import ExtraFactors, Line
+from gsba.motion import describe
 from gsba.report import build_report, take_notes, write_poses, write_report
 from gsba.store import RunStore, atomic_write, load_stage
 from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
@@ -104,7 +105,8 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
     for name in settings.export.formats:
         _export(line, ExportFormat(name), reconstruction)
     undone = [n for n, s in line.solutions.items() if not all(r.accepted for r in s.rounds)]
-    notes = take_notes(frames, coarse, reconstruction, undone)
+    judgement, findings = describe(line.trust, frames) if line.trust else ({}, [])
+    notes = findings + take_notes(frames, coarse, reconstruction, undone)
     report = build_report(
         settings=settings,
         frames=frames,
@@ -115,6 +117,7 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
         solver=[{"stage": name, "rounds": s.rounds} for name, s in line.solutions.items()],
         gauge=_GAUGE,
         notes=notes,
+        trajectory=judgement,
     )
     write_report(out / "report.json", report)
     for name in ("trajectory.tum", "poses.csv", "points.ply", "config.toml", "report.json"):

@@ -45,7 +45,9 @@ def run(
     """
     chosen = pairs.adjacent(len(coarse.sources))
     lost = _missing(chosen[chosen[:, 1] - chosen[:, 0] == 1], guided)
-    alone = _join([guided, match_anywhere(strongest, frames, keypoints, lost, settings, num_threads)])
+    alone = _join(
+        [guided, match_anywhere(strongest, frames, keypoints, lost, settings, num_threads)]
+    )
     trust = _judge(alone, keypoints, coarse, settings)
     if trust.sound:
         return Recovered(guided, trust)

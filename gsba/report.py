@@ -129,6 +129,7 @@ def build_report(
     solver: Sequence[object],
     gauge: str,
     notes: Sequence[str] = (),
+    trajectory: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Content of report.json: plain values only.
 
@@ -139,6 +140,7 @@ def build_report(
         solver: one record for each round, holding its iterations with their cost by family.
         gauge: a sentence on where the refined map sits.
         notes: what the user should know: frames without images, unmatched frames, ...
+        trajectory: the images' judgement of it, see `gsba.motion.describe`.
     """
     quality = frame_quality(reconstruction)
     residuals = np.degrees(angular_residuals(reconstruction))
@@ -163,6 +165,7 @@ def build_report(
         "summary": summary,
         "gauge": gauge,
         "notes": notes,
+        "trajectory": trajectory,
         "stages": stage_rows,
         "solver": solver,
         "frames": _frame_rows(frames, coarse, reconstruction, quality),
