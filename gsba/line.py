@@ -3,6 +3,7 @@
 import os
 import uuid
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import gtsam
@@ -24,6 +25,7 @@ from gsba.types import (
     FrameSet,
     Keypoints,
     Matches,
+    PoseSource,
     Reconstruction,
     VerifiedPairs,
 )
@@ -74,13 +76,14 @@ class Line:
 
     def _set_priors(self) -> None:
         """What the trajectory says, as far as it is trusted, and the caller's own factors."""
-        self.priors = graph.build(
-            self.coarse.world_T_rigs,
-            self.settings.priors,
-            None if self.trust is None else self.trust.false_steps,
-            None if self.trust is None else self.trust.false_frames,
-            None if self.trust is None else self.trust.world_T_rigs[0],
-        )
+        coarse, priors, trust = self.coarse.world_T_rigs, self.settings.priors, self.trust
+        if trust is None:
+            self.priors = graph.build(coarse, priors)
+        else:
+            start = trust.world_T_rigs
+            believed = start if trust.false_steps.all() else coarse
+            false = trust.false_steps, trust.false_frames
+            self.priors = graph.build(believed, priors, *false, start[0])
         for factor in self.extra:
             self.priors.add(factor)
 
@@ -114,6 +117,8 @@ class Line:
 
     def match_neighbours(self) -> VerifiedPairs:
         """Verified matches of frames next to one another in time."""
+        if (self.coarse.sources == PoseSource.NONE).all():
+            return recovery.nothing_verified()
         pairs = self._stage(
             "neighbours",
             self._matching(),
@@ -149,12 +154,13 @@ class Line:
         pairs = recovered.neighbours
         self.counts["steps"] = [pairs.counts]
         if len(pairs.matches.pairs) == 0:
-            reasons = ", ".join(f"{n} {why}" for why, n in guided.counts.dropped.items() if n)
             raise GsbaError(
-                f"no two neighbouring frames match ({guided.counts.received} pairs: {reasons}): "
-                "check that frames and trajectory are of the same recording and on one clock"
+                f"no two neighbouring frames match ({pairs.counts.received} pairs, with and "
+                "without the trajectory): frames must follow one another closely and show texture"
             )
         self.trust = recovered.trust
+        if (self.coarse.sources == PoseSource.NONE).all():
+            self.coarse = replace(self.coarse, world_T_rigs=self.trust.world_T_rigs)
         self._set_priors()
         return pairs
 

@@ -44,6 +44,7 @@ class Trust:
     false_frames: np.ndarray  # (F,) bool, both steps at a frame are false, but not around it
     unseen_steps: np.ndarray  # (F - 1,) bool, the images say nothing: the trajectory alone
     lengths: np.ndarray  # (F - 1,) float64, map units, of the steps
+    turning_only: bool  # no two frames have parallax: only rotations can be had
 
     @property
     def sound(self) -> bool:
@@ -188,11 +189,13 @@ def judge(
     slam_lengths = np.linalg.norm(slam[:, :3, 3], axis=1)
     own = coarse.sources == PoseSource.SLAM
     turned, off = _disagreement(slam, found)
+    if not own.any() or (found.verified.any() and not found.directed.any()):
+        return _from_images_alone(coarse, slam, found, logs, sigmas)
     wrong = found.verified & (turned > np.deg2rad(verify.max_rotation_deg))
     wrong |= found.directed & (off > np.deg2rad(verify.max_direction_deg))
     known = own[:-1] & own[1:]
-    noise = np.where(known, priors.translation, 3 * priors.translation)
-    lengths = step_lengths(slam_lengths, np.where(wrong, 10 * noise, noise), logs, sigmas)
+    noise = np.where(known, np.where(wrong, 10 * priors.translation, priors.translation), np.inf)
+    lengths = step_lengths(slam_lengths, noise, logs, sigmas)
     strain = np.abs(np.log(np.maximum(slam_lengths, 1e-12) / lengths))
     linked = np.zeros(len(strain), bool)
     linked[:-1] |= np.isfinite(sigmas)
@@ -210,7 +213,28 @@ def judge(
         start = _chain(coarse.world_T_rigs, chosen, own)
     else:
         start = coarse.world_T_rigs
-    return Trust(start, wrong, _named(wrong, slam, chosen, own, verify), unseen, lengths)
+    named = _named(wrong, slam, chosen, own, verify)
+    return Trust(start, wrong, named, unseen, lengths, False)
+
+
+def _from_images_alone(
+    coarse: CoarsePoses, slam: np.ndarray, found: Steps, logs: np.ndarray, sigmas: np.ndarray
+) -> Trust:
+    """A start from the steps of the images wherever there are any; no step keeps its prior."""
+    slam_lengths = np.linalg.norm(slam[:, :3, 3], axis=1)
+    lengths = slam_lengths
+    if found.directed.any():
+        unknown = np.full(len(slam), np.inf)
+        lengths = step_lengths(slam_lengths, unknown, logs, sigmas)
+    chosen = slam.copy()
+    chosen[found.verified, :3, :3] = found.f_T_nexts[found.verified, :3, :3]
+    moved = found.directed
+    chosen[moved, :3, 3] = lengths[moved, None] * found.f_T_nexts[moved, :3, 3]
+    own = coarse.sources == PoseSource.SLAM
+    start = _chain(coarse.world_T_rigs, chosen, own)
+    every, nobody = np.ones(len(slam), bool), np.zeros(len(slam) + 1, bool)
+    turning_only = bool(found.verified.any() and not moved.any())
+    return Trust(start, every, nobody, ~found.verified, lengths, turning_only)
 
 
 def describe(trust: Trust, frames: FrameSet) -> tuple[dict[str, list[Any]], list[str]]:
@@ -229,6 +253,8 @@ def describe(trust: Trust, frames: FrameSet) -> tuple[dict[str, list[Any]], list
     notes = []
     if false:
         notes.append(f"the images contradict the trajectory at {', '.join(false)}: not believed")
+    if trust.turning_only:
+        notes.append("no frame has parallax to the next: no depth can be had, rotations only")
     if trust.unseen_steps.any():
         steps = ", ".join(f"{a} to {b}" for a, b in judgement["unseen_steps"])
         notes.append(f"no images in common, held by the trajectory alone: {steps}")

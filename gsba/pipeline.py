@@ -9,13 +9,18 @@ from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.export import ExportFormat, export, write_points
 from gsba.line import ExtraFactors, Line
+from gsba.misfit import refuse_useless
 from gsba.motion import describe
 from gsba.report import build_report, take_notes, write_poses, write_report
 from gsba.store import RunStore, atomic_write, load_stage
-from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
+from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, Reconstruction, Trajectory
 
 _GAUGE = (
     "Sim(3)-aligned to the coarse trajectory over its refined SLAM poses: its world and scale; "
+    "covariances hold the first pose and the distance to the frame furthest from it"
+)
+_OWN_GAUGE = (
+    "no trajectory: the first frame's axes, and the median step of the start as the unit; "
     "covariances hold the first pose and the distance to the frame furthest from it"
 )
 
@@ -33,7 +38,7 @@ class RunResult:
 
 def refine(
     frames: Path | str,
-    trajectory: Path | str,
+    trajectory: Path | str | None,
     out: Path | str,
     settings: RefineSettings | None = None,
     *,
@@ -50,7 +55,8 @@ def refine(
 
     Args:
         frames: folder of 2:1 panoramas or of cube faces.
-        trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig.
+        trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig. None = start from the images
+            alone: the first step's length is the unit and the first frame the world.
         out: folder of the run.
         settings: see `gsba.config`.
         masks: one ERP mask for all frames, or a folder of one for each; white = use.
@@ -63,11 +69,18 @@ def refine(
     Raises:
         GsbaError: an input or setting that cannot be used.
     """
-    frames, trajectory, out = Path(frames), Path(trajectory), Path(out)
+    frames, out = Path(frames), Path(out)
     settings = settings or RefineSettings()
     frame_set = read.scan(frames, timestamps, fps, masks)
-    coarse = read.associate(frame_set, read.read_trajectory(trajectory, timestamps), settings.read)
-    with RunStore(out, {"frames": frames, "trajectory": trajectory}, fresh) as store:
+    origin = {"frames": frames}
+    if trajectory is None:
+        coarse = read.without_trajectory(frame_set)
+    else:
+        origin["trajectory"] = Path(trajectory)
+        given = read.read_trajectory(Path(trajectory), timestamps)
+        coarse = read.associate(frame_set, given, settings.read)
+        refuse_useless(coarse)
+    with RunStore(out, origin, fresh) as store:
         line = Line(store, frame_set, coarse, settings, extra_factors)
         neighbours, rounds = line.judge(line.match_neighbours()), settings.rounds
         solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)
@@ -115,7 +128,7 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
         stages=store.records.values(),
         counts=line.counts,
         solver=[{"stage": name, "rounds": s.rounds} for name, s in line.solutions.items()],
-        gauge=_GAUGE,
+        gauge=_GAUGE if (coarse.sources != PoseSource.NONE).any() else _OWN_GAUGE,
         notes=notes,
         trajectory=judgement,
     )

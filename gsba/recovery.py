@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba import matching, motion, pairs, verify
+from gsba import matching, misfit, motion, pairs, verify
 from gsba.config import RefineSettings
 from gsba.geometry import inverse
 from gsba.matching import Gate, SearchableFrames
@@ -42,12 +42,16 @@ def run(
         coarse: the trajectory.
         settings: of pairs, matching, verification and priors.
         num_threads: pairs matched at a time.
+
+    Raises:
+        GsbaError: the images contradict most of the trajectory.
     """
     chosen = pairs.adjacent(len(coarse.sources))
     lost = _missing(chosen[chosen[:, 1] - chosen[:, 0] == 1], guided)
     alone = _join(
         [guided, match_anywhere(strongest, frames, keypoints, lost, settings, num_threads)]
     )
+    misfit.refuse_misfit(coarse, motion.steps(alone, keypoints, settings.verify), settings.verify)
     trust = _judge(alone, keypoints, coarse, settings)
     if trust.sound:
         return Recovered(guided, trust)
@@ -74,6 +78,13 @@ def run(
         {"no common geometry": len(chosen) - len(neighbours.matches.pairs)},
     )
     return Recovered(VerifiedPairs(neighbours.matches, neighbours.f0_T_f1s, counts), trust)
+
+
+def nothing_verified() -> VerifiedPairs:
+    """No pairs: what guidance finds where there is no trajectory."""
+    none = np.zeros((0, 2), np.int32)
+    matches = Matches(none, np.zeros(1, np.int64), none)
+    return VerifiedPairs(matches, np.zeros((0, 4, 4)), Counts(0, 0, "pairs"))
 
 
 def match_anywhere(

@@ -96,9 +96,12 @@ def take_notes(
     Args:
         undone: stages in which a round of bundle adjustment was undone.
     """
-    filled = np.flatnonzero(coarse.sources != PoseSource.SLAM)
+    absent = coarse.sources == PoseSource.NONE
+    filled = np.flatnonzero((coarse.sources != PoseSource.SLAM) & ~absent)
     lost = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
     notes = []
+    if absent.all():
+        notes.append("no trajectory: started from the images alone, in units of their own")
     if coarse.time_offset:
         notes.append(f"frame times were shifted by {coarse.time_offset:.6f} s")
     if len(filled):

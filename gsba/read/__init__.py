@@ -1,6 +1,6 @@
 """What a run starts from: frames, masks and a coarse trajectory on one clock."""
 
-from gsba.read.associate import associate
+from gsba.read.associate import associate, without_trajectory
 from gsba.read.frames import load_erp, load_faces, scan
 from gsba.read.masks import load_mask
 from gsba.read.trajectory import read_trajectory, write_tum
@@ -12,5 +12,6 @@ __all__ = [
     "load_mask",
     "read_trajectory",
     "scan",
+    "without_trajectory",
     "write_tum",
 ]
