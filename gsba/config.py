@@ -72,6 +72,9 @@ class PairSettings(_Settings):
     drift: float = Field(
         default=0.003, gt=0
     )  # of the solved chain, part of the path between two frames
+    far_drift: float = Field(
+        default=0.05, ge=0, le=1
+    )  # the same at its worst: no loop may ask for more
 
 
 class VerifySettings(_Settings):

@@ -9,12 +9,13 @@ from typing import TypeVar
 import gtsam
 import numpy as np
 
-from gsba import adjust, cubemap, features, frontend, graph, recovery, tracks
+from gsba import adjust, cubemap, features, frontend, graph, places, recovery, tracks
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
 from gsba.matching import SearchableFrames
 from gsba.motion import Trust
+from gsba.places import Closed, connected
 from gsba.reconstruction import assemble
 from gsba.recovery import Recovered
 from gsba.store import PerFrame, RunStore, fingerprint
@@ -164,18 +165,39 @@ class Line:
         self._set_priors()
         return pairs
 
-    def match_loops(self, solved: Adjustment) -> VerifiedPairs:
+    def match_loops(self, solved: Adjustment, name: str = "loops") -> VerifiedPairs:
         """Verified matches of frames that met the same place again."""
         pairs = self._stage(
-            "loops",
+            name,
             self._matching(),
             lambda: frontend.match_loops(
                 self.searchable, self.keypoints, solved, self.settings, self.num_threads
             ),
             VerifiedPairs,
         )
-        self.counts["loops"] = [pairs.counts]
+        self.counts[name] = [pairs.counts]
         return pairs
+
+    def close_far_loops(self, solved: Adjustment, loops: VerifiedPairs) -> Adjustment:
+        """The map bent so that places met again meet, where guided search could not reach them."""
+        unseen = self.trust.unseen_steps if self.trust else np.zeros(len(self.frames) - 1, bool)
+        if connected(unseen, loops.matches.pairs) and len(loops.matches.pairs):
+            return solved
+        closed = self._stage(
+            "places",
+            self._matching(),
+            lambda: places.run(
+                self.strongest,
+                self.keypoints,
+                solved,
+                unseen,
+                self.settings,
+                self.num_threads,
+            ),
+            Closed,
+        )
+        self.counts["places"] = [closed.counts]
+        return closed.solved
 
     def match_along_epipolars(self, solved: Adjustment) -> Matches:
         """Matches of neighbours in time along their solved epipolar lines."""
