@@ -178,7 +178,13 @@ class Line:
         self.counts[name] = [pairs.counts]
         return pairs
 
-    def close_far_loops(self, solved: Adjustment, loops: VerifiedPairs) -> Adjustment:
+    def close_loops(self, solved: Adjustment) -> tuple[VerifiedPairs, Adjustment]:
+        """Matches of places met again, and the map, bent first where drift had hidden them."""
+        loops = self.match_loops(solved)
+        bent = self._meet_places(solved, loops)
+        return (loops, solved) if bent is solved else (self.match_loops(bent, "loops2"), bent)
+
+    def _meet_places(self, solved: Adjustment, loops: VerifiedPairs) -> Adjustment:
         """The map bent so that places met again meet, where guided search could not reach them."""
         unseen = self.trust.unseen_steps if self.trust else np.zeros(len(self.frames) - 1, bool)
         if connected(unseen, loops.matches.pairs) and len(loops.matches.pairs):
@@ -197,6 +203,12 @@ class Line:
             Closed,
         )
         self.counts["places"] = [closed.counts]
+        if len(closed.pairs) == 0:
+            return solved
+        if self.trust is not None:  # places met again know better than a step no image shows
+            false = self.trust.false_steps | unseen
+            self.trust = replace(self.trust, false_steps=false)
+            self._set_priors()
         return closed.solved
 
     def match_along_epipolars(self, solved: Adjustment) -> Matches:

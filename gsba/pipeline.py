@@ -87,10 +87,7 @@ def refine(
         adjacent = line.match_along_epipolars(solved)
         near = line.match_known_points("near", solved, loops_closed=False)
         solved = line.solve("dense", [adjacent, near], solved, rounds.dense)
-        loops = line.match_loops(solved)
-        bent = line.close_far_loops(solved, loops)
-        if bent is not solved:
-            solved, loops = bent, line.match_loops(bent, "loops2")
+        loops, solved = line.close_loops(solved)
         solved = line.solve("closed", [adjacent, near, loops.matches], solved, rounds.loops)
         for number in range(1, rounds.map_passes + 1):
             wide = line.match_known_points(f"everywhere{number}", solved, loops_closed=True)

@@ -29,6 +29,7 @@ _POINT_DEG = 1.0  # a point of one frame's map seen in the other
 _MIN_POINTS = 15
 _MIN_GROUP = 3  # loops that must agree
 _RIVAL = 1.5  # by how much a group must outweigh one that contradicts it
+_TURN_DEG, _UNSEEN_TURN_DEG = 10.0, 45.0  # of the map between two frames, and per unseen step
 _AGREE_DEG, _AGREE = 2.0, 0.1  # of two loops; part of the median depth
 
 
@@ -237,7 +238,9 @@ def _within_drift(
     slack = _drift(loop.f0, loop.f1, poses[:, :3, 3], unseen, settings)
     expected = poses[loop.f0] @ loop.f0_T_f1
     moved = np.linalg.norm(expected[:3, 3] - poses[loop.f1, :3, 3])
-    return bool(moved < slack + _AGREE * median_depth(solved))
+    turned = np.degrees(rotation_angle(expected[:3, :3].T @ poses[loop.f1, :3, :3]))
+    allowed = _TURN_DEG + _UNSEEN_TURN_DEG * np.count_nonzero(unseen[loop.f0 : loop.f1])
+    return bool(moved < slack + _AGREE * median_depth(solved) and turned < allowed)
 
 
 def consistent(loops: list[Loop], solved: Adjustment, window: int) -> list[Loop]:
