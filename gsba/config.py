@@ -87,6 +87,9 @@ class PairSettings(_Settings):
     drift: float = Field(
         default=0.003, gt=0
     )  # of the solved chain, part of the path between two frames
+    far_drift: float = Field(
+        default=0.05, ge=0, le=1
+    )  # the same at its worst: no loop may ask for more
 
 
 class VerifySettings(_Settings):
@@ -94,9 +97,11 @@ class VerifySettings(_Settings):
 
     max_error_deg: float = Field(default=0.25, gt=0)  # RANSAC inlier threshold
     min_inliers: int = Field(default=25, ge=8)
+    min_share: float = Field(default=0.3, ge=0, le=1)  # inliers, where no trajectory guided
     max_rotation_deg: float = Field(default=6.0, gt=0)  # disagreement with the trajectory
     max_direction_deg: float = Field(default=20.0, gt=0)  # disagreement with the trajectory
     min_parallax_deg: float = Field(default=1.0, gt=0)  # median; below it a direction is not judged
+    max_length_ratio: float = Field(default=1.5, gt=1)  # disagreement with the trajectory
 
 
 class TriangulateSettings(_Settings):

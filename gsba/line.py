@@ -3,17 +3,21 @@
 import os
 import uuid
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import gtsam
 import numpy as np
 
-from gsba import adjust, align, cubemap, features, frontend, graph, tracks
+from gsba import adjust, align, cubemap, features, frontend, graph, places, recovery, tracks
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
 from gsba.matching import SearchableFrames
+from gsba.motion import Trust
+from gsba.places import Closed, connected
 from gsba.reconstruction import assemble
+from gsba.recovery import Recovered
 from gsba.store import PerFrame, RunStore, fingerprint
 from gsba.types import (
     CoarsePoses,
@@ -22,6 +26,7 @@ from gsba.types import (
     FrameSet,
     Keypoints,
     Matches,
+    PoseSource,
     Reconstruction,
     Sighted,
     VerifiedPairs,
@@ -45,11 +50,10 @@ class Line:
         self.store, self.frames, self.coarse, self.settings = store, frames, coarse, settings
         self.num_threads = settings.solver.num_threads or os.cpu_count() or 1
         self.rig = cubemap.rig_for(frames, settings.cubemap)
-        self.priors = graph.build(coarse.world_T_rigs, settings.priors)
         self.custom = None if extra_factors is None else uuid.uuid4().hex  # resumes nothing
-        if extra_factors is not None:
-            for factor in extra_factors(coarse):
-                self.priors.add(factor)
+        self.extra = list(extra_factors(coarse)) if extra_factors is not None else []
+        self.trust: Trust | None = None
+        self._set_priors()
         self.counts: dict[str, list[Counts]] = {}
         self.solutions: dict[str, Adjustment] = {}
         self.undone: list[str] = []  # solutions that were not taken
@@ -75,6 +79,19 @@ class Line:
         self.searchable = SearchableFrames(load)
         self.strongest = SearchableFrames(load, settings.pairs.strongest_per_face)
 
+    def _set_priors(self) -> None:
+        """What the trajectory says, as far as it is trusted, and the caller's own factors."""
+        coarse, priors, trust = self.coarse.world_T_rigs, self.settings.priors, self.trust
+        if trust is None:
+            self.priors = graph.build(coarse, priors)
+        else:
+            start = trust.world_T_rigs
+            believed = start if trust.false_steps.all() else coarse
+            false = trust.false_steps, trust.false_frames
+            self.priors = graph.build(believed, priors, *false, start[0])
+        for factor in self.extra:
+            self.priors.add(factor)
+
     def _extract(self) -> PerFrame[Features]:
         """Features of every frame: image and mask are read, cut and released one at a time."""
         frames, settings = self.frames, self.settings
@@ -99,11 +116,14 @@ class Line:
         )
 
     def start(self) -> Adjustment:
-        """The coarse trajectory as a solution without points."""
-        return adjust.start(self.coarse.world_T_rigs)
+        """The coarse trajectory, chained past its false steps, as a solution without points."""
+        trusted = self.coarse if self.trust is None else self.trust
+        return adjust.start(trusted.world_T_rigs)
 
     def match_neighbours(self) -> VerifiedPairs:
         """Verified matches of frames next to one another in time."""
+        if (self.coarse.sources == PoseSource.NONE).all():
+            return recovery.nothing_verified()
         pairs = self._stage(
             "neighbours",
             self._matching(),
@@ -118,26 +138,82 @@ class Line:
             VerifiedPairs,
         )
         self.counts["neighbours"] = [pairs.counts]
-        if pairs.counts.kept == 0:
-            reasons = ", ".join(f"{n} {why}" for why, n in pairs.counts.dropped.items() if n)
-            raise GsbaError(
-                f"no two neighbouring frames match ({pairs.counts.received} pairs: {reasons}): "
-                "check that frames and trajectory are of the same recording and on one clock"
-            )
         return pairs
 
-    def match_loops(self, solved: Adjustment) -> VerifiedPairs:
+    def judge(self, guided: VerifiedPairs) -> VerifiedPairs:
+        """Neighbours once more where the trajectory misled, which then loses those priors."""
+        recovered = self._stage(
+            "steps",
+            [self._matching(), self.settings.priors],
+            lambda: recovery.run(
+                self.searchable,
+                self.strongest,
+                self.keypoints,
+                guided,
+                self.coarse,
+                self.settings,
+                self.num_threads,
+            ),
+            Recovered,
+        )
+        pairs = recovered.neighbours
+        self.counts["steps"] = [pairs.counts]
+        if len(pairs.matches.pairs) == 0:
+            raise GsbaError(
+                f"no two neighbouring frames match ({pairs.counts.received} pairs, with and "
+                "without the trajectory): frames must follow one another closely and show texture"
+            )
+        self.trust = recovered.trust
+        if (self.coarse.sources == PoseSource.NONE).all():
+            self.coarse = replace(self.coarse, world_T_rigs=self.trust.world_T_rigs)
+        self._set_priors()
+        return pairs
+
+    def match_loops(self, solved: Adjustment, name: str = "loops") -> VerifiedPairs:
         """Verified matches of frames that met the same place again."""
         pairs = self._stage(
-            "loops",
+            name,
             self._matching(),
             lambda: frontend.match_loops(
                 self.searchable, self.keypoints, solved, self.settings, self.num_threads
             ),
             VerifiedPairs,
         )
-        self.counts["loops"] = [pairs.counts]
+        self.counts[name] = [pairs.counts]
         return pairs
+
+    def close_loops(self, solved: Adjustment) -> tuple[VerifiedPairs, Adjustment]:
+        """Matches of places met again, and the map, bent first where drift had hidden them."""
+        loops = self.match_loops(solved)
+        bent = self._meet_places(solved, loops)
+        return (loops, solved) if bent is solved else (self.match_loops(bent, "loops2"), bent)
+
+    def _meet_places(self, solved: Adjustment, loops: VerifiedPairs) -> Adjustment:
+        """The map bent so that places met again meet, where guided search could not reach them."""
+        unseen = self.trust.unseen_steps if self.trust else np.zeros(len(self.frames) - 1, bool)
+        if connected(unseen, loops.matches.pairs) and len(loops.matches.pairs):
+            return solved
+        closed = self._stage(
+            "places",
+            self._matching(),
+            lambda: places.run(
+                self.strongest,
+                self.keypoints,
+                solved,
+                unseen,
+                self.settings,
+                self.num_threads,
+            ),
+            Closed,
+        )
+        self.counts["places"] = [closed.counts]
+        if len(closed.pairs) == 0:
+            return solved
+        if self.trust is not None:  # places met again know better than a step no image shows
+            false = self.trust.false_steps | unseen
+            self.trust = replace(self.trust, false_steps=false)
+            self._set_priors()
+        return closed.solved
 
     def match_along_epipolars(self, solved: Adjustment) -> Matches:
         """Matches of neighbours in time along their solved epipolar lines."""
@@ -254,7 +330,8 @@ class Line:
                 solved, self.priors, self.observed, self.rig, self.settings, self.num_threads
             )
             least = self.settings.rounds.min_observations
-            return assemble(solved, covariances, self.observed, self.coarse, least)
+            false = None if self.trust is None else self.trust.false_frames
+            return assemble(solved, covariances, self.observed, self.coarse, least, false)
 
         return self._stage("reconstruction", self._solving(), compute, Reconstruction)
 

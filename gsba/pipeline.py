@@ -10,11 +10,13 @@ from gsba.config_file import to_toml
 from gsba.export import ExportFormat, export, write_points
 from gsba.line import ExtraFactors, Line
 from gsba.log import GsbaError
+from gsba.misfit import refuse_useless
+from gsba.motion import describe
 from gsba.placement import Placement, check, place
 from gsba.report import build_report, take_notes, write_poses, write_report
 from gsba.report_html import write_html
 from gsba.store import RunStore, atomic_write, load_stage
-from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
+from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, Reconstruction, Trajectory
 
 _GAUGE = (
     "Sim(3)-aligned to the coarse trajectory over its refined SLAM poses: its world and scale; "
@@ -27,6 +29,10 @@ _OUTPUTS = (
     "config.toml",
     "report.json",
     "report.html",
+)
+_OWN_GAUGE = (
+    "no trajectory: the first frame's axes, and the median step of the start as the unit; "
+    "covariances hold the first pose and the distance to the frame furthest from it"
 )
 
 
@@ -43,7 +49,7 @@ class RunResult:
 
 def refine(
     frames: Path | str,
-    trajectory: Path | str,
+    trajectory: Path | str | None,
     out: Path | str,
     settings: RefineSettings | None = None,
     *,
@@ -61,7 +67,8 @@ def refine(
     Args:
         frames: folder of 2:1 panoramas or of cube faces, or a video, whose frames go to
             `out`/frames first.
-        trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig.
+        trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig. None = start from the images
+            alone: the first step's length is the unit and the first frame the world.
         out: folder of the run.
         settings: see `gsba.config`.
         masks: one ERP mask for all frames, or a folder of one for each; white = use.
@@ -74,24 +81,31 @@ def refine(
     Raises:
         GsbaError: an input or setting that cannot be used.
     """
-    frames, trajectory, out = Path(frames), Path(trajectory), Path(out)
-    settings, origin = settings or RefineSettings(), {"frames": frames, "trajectory": trajectory}
+    frames, out = Path(frames), Path(out)
+    settings, origin = settings or RefineSettings(), {"frames": frames}
     check(settings.placement)
+    given = None
+    if trajectory is not None:  # fails before hours of decoding, not after
+        origin["trajectory"] = Path(trajectory)
+        given = read.read_trajectory(Path(trajectory), timestamps)
     if video.is_video(frames):
-        read.read_trajectory(trajectory, timestamps)  # fails before hours of decoding, not after
         frame_set = _extracted(frames, out, origin, settings, fps, masks, fresh)
         fresh = False
     else:
         frame_set = read.scan(frames, timestamps, fps, masks)
-    coarse = read.associate(frame_set, read.read_trajectory(trajectory, timestamps), settings.read)
+    if given is None:
+        coarse = read.without_trajectory(frame_set)
+    else:
+        coarse = read.associate(frame_set, given, settings.read)
+        refuse_useless(coarse)
     with RunStore(out, origin, fresh) as store:
         line = Line(store, frame_set, coarse, settings, extra_factors)
-        neighbours, rounds = line.match_neighbours(), settings.rounds
+        neighbours, rounds = line.judge(line.match_neighbours()), settings.rounds
         solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)
         adjacent = line.match_along_epipolars(solved)
         near = line.match_known_points("near", solved, loops_closed=False)
         solved = line.solve("dense", [adjacent, near], solved, rounds.dense)
-        loops = line.match_loops(solved)
+        loops, solved = line.close_loops(solved)
         solved = line.solve("closed", [adjacent, near, loops.matches], solved, rounds.loops)
         for number in range(1, rounds.map_passes + 1):
             wide = line.match_known_points(f"everywhere{number}", solved, loops_closed=True)
@@ -148,7 +162,8 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
         _export(line, ExportFormat(name), reconstruction, placement)
     undone = [n for n, s in line.solutions.items() if not all(r.accepted for r in s.rounds)]
     undone += [name for name in line.undone if name not in undone]
-    notes = take_notes(frames, coarse, reconstruction, undone)
+    judgement, findings = describe(line.trust, frames) if line.trust else ({}, [])
+    notes = findings + take_notes(frames, coarse, reconstruction, undone)
     report = build_report(
         settings=settings,
         frames=frames,
@@ -157,8 +172,9 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
         stages=store.records.values(),
         counts=line.counts,
         solver=[{"stage": name, "rounds": s.rounds} for name, s in line.solutions.items()],
-        gauge=_GAUGE,
+        gauge=_GAUGE if (coarse.sources != PoseSource.NONE).any() else _OWN_GAUGE,
         notes=notes,
+        trajectory=judgement,
     )
     write_report(out / "report.json", report)
     write_html(out / "report.html", frames, coarse, reconstruction, report)

@@ -96,9 +96,12 @@ def take_notes(
     Args:
         undone: stages in which a round of bundle adjustment was undone.
     """
-    filled = np.flatnonzero(coarse.sources != PoseSource.SLAM)
+    absent = coarse.sources == PoseSource.NONE
+    filled = np.flatnonzero((coarse.sources != PoseSource.SLAM) & ~absent)
     lost = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
     notes = []
+    if absent.all():
+        notes.append("no trajectory: started from the images alone, in units of their own")
     if coarse.time_offset:
         notes.append(f"frame times were shifted by {coarse.time_offset:.6f} s")
     if len(filled):
@@ -129,6 +132,7 @@ def build_report(
     solver: Sequence[object],
     gauge: str,
     notes: Sequence[str] = (),
+    trajectory: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Content of report.json: plain values only.
 
@@ -139,6 +143,7 @@ def build_report(
         solver: one record for each round, holding its iterations with their cost by family.
         gauge: a sentence on where the refined map sits.
         notes: what the user should know: frames without images, unmatched frames, ...
+        trajectory: the images' judgement of it, see `gsba.motion.describe`.
     """
     quality = frame_quality(reconstruction)
     residuals = np.degrees(angular_residuals(reconstruction))
@@ -163,6 +168,7 @@ def build_report(
         "summary": summary,
         "gauge": gauge,
         "notes": notes,
+        "trajectory": trajectory,
         "stages": stage_rows,
         "solver": solver,
         "frames": _frame_rows(frames, coarse, reconstruction, quality),

@@ -16,6 +16,7 @@ class PoseSource(IntEnum):
     SLAM = 0  # an entry of the trajectory file
     INTERPOLATED = 1  # between two entries
     EXTRAPOLATED = 2  # before the first or after the last entry
+    NONE = 3  # there is no trajectory: a placeholder
 
 
 class PoseStatus(IntEnum):

@@ -12,8 +12,8 @@ from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
 def run(
     matches: Matches,
     keypoints: Keypoints,
-    prior_f0_T_f1s: np.ndarray,
-    position_sigmas: np.ndarray,
+    prior_f0_T_f1s: np.ndarray | None,
+    position_sigmas: np.ndarray | None,
     settings: VerifySettings,
     seed: int,
     num_threads: int = 1,
@@ -23,7 +23,8 @@ def run(
     Args:
         matches: putative matches.
         keypoints: of all frames.
-        prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory.
+        prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = none is believed, and
+            a pair needs `min_share` of its matches instead.
         position_sigmas: (P,) how far the prior's relative position may be off, map units; decides
             how much its direction is worth.
         settings: thresholds.
@@ -48,6 +49,12 @@ def run(
             continue
         f0_T_f1, inliers = found
         rows = matches.of(p)[inliers]
+        if prior_f0_T_f1s is None or position_sigmas is None:
+            if inliers.mean() < settings.min_share:
+                dropped["too few matches"] += 1
+            else:
+                kept.append((p, f0_T_f1, rows))
+            continue
         prior = prior_f0_T_f1s[p]
         turn = rotation_angle(prior[:3, :3].T @ f0_T_f1[:3, :3])
         if turn > np.deg2rad(settings.max_rotation_deg):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gsba.cli.app import command
+from gsba.log import GsbaError
 
 if TYPE_CHECKING:
     from gsba.config import RefineSettings
@@ -27,8 +28,13 @@ def refine(
     frames: Annotated[
         Path, typer.Argument(help="Folder of 2:1 panoramas or of cube faces, or a 2:1 video.")
     ],
-    trajectory: Annotated[Path, typer.Argument(help="TUM, KITTI or stella_vslam map.msg.")],
     out: Annotated[Path, typer.Option(help="Folder of the run.", metavar="RUN")],
+    trajectory: Annotated[
+        Path | None, typer.Argument(help="TUM, KITTI or stella_vslam map.msg.")
+    ] = None,
+    no_trajectory: Annotated[
+        bool, typer.Option("--no-trajectory", help="Start from the images alone.")
+    ] = False,
     config: Config = None,
     overrides: Overrides = None,
     masks: Annotated[
@@ -45,6 +51,8 @@ def refine(
     fresh: Annotated[bool, typer.Option("--fresh", help="Replace an earlier run.")] = False,
 ) -> None:
     """Refine the pose of every frame; the same call again resumes."""
+    if (trajectory is None) != no_trajectory:
+        raise GsbaError("give either a TRAJECTORY or --no-trajectory")
     settings = _settings(config, overrides, factors)
     from gsba import pipeline
 

@@ -1,6 +1,6 @@
 """What a run starts from: frames, masks and a coarse trajectory on one clock."""
 
-from gsba.read.associate import associate
+from gsba.read.associate import associate, without_trajectory
 from gsba.read.frames import load_erp, load_faces, scan
 from gsba.read.gps import GpsFixes, local_from_geodetic, read_gps
 from gsba.read.masks import load_mask
@@ -16,5 +16,6 @@ __all__ = [
     "read_gps",
     "read_trajectory",
     "scan",
+    "without_trajectory",
     "write_tum",
 ]
