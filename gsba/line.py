@@ -9,7 +9,18 @@ from typing import TypeVar
 import gtsam
 import numpy as np
 
-from gsba import adjust, align, cubemap, features, frontend, graph, places, recovery, tracks
+from gsba import (
+    adjust,
+    align,
+    cubemap,
+    extraction,
+    features,
+    frontend,
+    graph,
+    places,
+    recovery,
+    tracks,
+)
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
@@ -18,7 +29,7 @@ from gsba.motion import Trust
 from gsba.places import Closed, connected
 from gsba.reconstruction import assemble
 from gsba.recovery import Recovered
-from gsba.store import PerFrame, RunStore, fingerprint
+from gsba.store import RunStore, fingerprint
 from gsba.types import (
     CoarsePoses,
     Counts,
@@ -62,7 +73,7 @@ class Line:
         inputs = [fingerprint(paths), fingerprint(frames.mask_paths), frames.timestamps.tolist()]
         start = [coarse.world_T_rigs.tolist(), settings.read]
         store.stage("frames", [inputs, start], lambda: frames, FrameSet)
-        found = self._extract()
+        found = extraction.run(store, frames, self.rig, settings, self.num_threads)
         self.keypoints = store.stage(
             "keypoints",
             None,
@@ -91,29 +102,6 @@ class Line:
             self.priors = graph.build(believed, priors, *false, start[0])
         for factor in self.extra:
             self.priors.add(factor)
-
-    def _extract(self) -> PerFrame[Features]:
-        """Features of every frame: image and mask are read, cut and released one at a time."""
-        frames, settings = self.frames, self.settings
-        features.keep_freed_memory()
-        index = {name: f for f, name in enumerate(frames.names)}
-
-        def compute(name: str) -> Features:
-            images, masks = cubemap.load(frames, index[name], self.rig)
-            extractor = features.SiftExtractor(settings.features)
-            return features.extract(images, masks, self.rig, extractor)
-
-        return self.store.per_frame(
-            "features",
-            [settings.cubemap, settings.features],
-            {
-                name: fingerprint([*frames.paths[f], frames.mask_paths[f]])
-                for name, f in index.items()
-            },
-            compute,
-            Features,
-            num_threads=self.num_threads,
-        )
 
     def start(self) -> Adjustment:
         """The coarse trajectory, chained past its false steps, as a solution without points."""

@@ -93,11 +93,7 @@ def refine(
         fresh = False
     else:
         frame_set = read.scan(frames, timestamps, fps, masks)
-    if given is None:
-        coarse = read.without_trajectory(frame_set)
-    else:
-        coarse = read.associate(frame_set, given, settings.read)
-        refuse_useless(coarse)
+    coarse = _coarse(frame_set, given, settings)
     with RunStore(out, origin, fresh) as store:
         line = Line(store, frame_set, coarse, settings, extra_factors)
         neighbours, rounds = line.judge(line.match_neighbours()), settings.rounds
@@ -115,6 +111,15 @@ def refine(
             solved = line.solve_aligned(number, line.align(number, solved), solved)
         reconstruction = line.reconstruct(solved)
         return _write(line, reconstruction)
+
+
+def _coarse(frames: FrameSet, given: Trajectory | None, settings: RefineSettings) -> CoarsePoses:
+    """Start poses of frames, refused where no video could have them."""
+    if given is None:
+        return read.without_trajectory(frames)
+    coarse = read.associate(frames, given, settings.read)
+    refuse_useless(coarse)
+    return coarse
 
 
 def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:

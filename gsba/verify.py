@@ -32,15 +32,7 @@ def run(
         num_threads: pairs verified at a time.
     """
 
-    def bearings_of(p: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        f0, f1 = matches.pairs[p]
-        return keypoints.bearings_of(f0)[rows[:, 0]], keypoints.bearings_of(f1)[rows[:, 1]]
-
-    def estimate(p: int) -> tuple[np.ndarray, np.ndarray] | None:
-        return relative_pose(*bearings_of(p, matches.of(p)), settings, seed)
-
-    with ThreadPoolExecutor(num_threads) as pool:
-        estimates = list(pool.map(estimate, range(len(matches.pairs))))
+    estimates = _estimates(matches, keypoints, settings, seed, num_threads)
     kept = []
     dropped = {"too few matches": 0, "rotation contradicts": 0, "direction contradicts": 0}
     for p, found in enumerate(estimates):
@@ -59,7 +51,7 @@ def run(
         turn = rotation_angle(prior[:3, :3].T @ f0_T_f1[:3, :3])
         if turn > np.deg2rad(settings.max_rotation_deg):
             dropped["rotation contradicts"] += 1
-        elif _parallax(f0_T_f1, *bearings_of(p, rows)) > np.deg2rad(
+        elif _parallax(f0_T_f1, *_bearings(matches, keypoints, p, rows)) > np.deg2rad(
             settings.min_parallax_deg
         ) and not _direction_agrees(prior[:3, 3], f0_T_f1[:3, 3], position_sigmas[p], settings):
             dropped["direction contradicts"] += 1
@@ -74,6 +66,27 @@ def run(
     )
     poses = np.array([f0_T_f1 for _, f0_T_f1, _ in kept]).reshape(-1, 4, 4)
     return VerifiedPairs(verified, poses, Counts(len(matches.pairs), len(kept), "pairs", dropped))
+
+
+def _estimates(
+    matches: Matches, keypoints: Keypoints, settings: VerifySettings, seed: int, num_threads: int
+) -> list[tuple[np.ndarray, np.ndarray] | None]:
+    """`relative_pose` of every pair."""
+
+    def estimate(p: int) -> tuple[np.ndarray, np.ndarray] | None:
+        bearings0, bearings1 = _bearings(matches, keypoints, p, matches.of(p))
+        return relative_pose(bearings0, bearings1, settings, seed)
+
+    with ThreadPoolExecutor(num_threads) as pool:
+        return list(pool.map(estimate, range(len(matches.pairs))))
+
+
+def _bearings(
+    matches: Matches, keypoints: Keypoints, p: int, rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bearings (m, 3) of matched keypoints (m, 2) of pair p in either frame."""
+    f0, f1 = matches.pairs[p]
+    return keypoints.bearings_of(f0)[rows[:, 0]], keypoints.bearings_of(f1)[rows[:, 1]]
 
 
 def relative_pose(

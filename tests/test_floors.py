@@ -23,7 +23,7 @@ FLOORS = (
     | {"splat_align", "splatting"},
     {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"}
     | {"alignment", "gravity", "placement"},
-    {"demo", "line", "pipeline"},
+    {"demo", "extraction", "line", "pipeline"},
     {"cli"},
     {"benchmarks"},
 )

@@ -1,0 +1,26 @@
+"""Features of every frame of a run, stored frame by frame."""
+
+from gsba import cubemap, features
+from gsba.config import RefineSettings
+from gsba.rig import CubeRig
+from gsba.store import PerFrame, RunStore, fingerprint
+from gsba.types import Features, FrameSet
+
+
+def run(
+    store: RunStore, frames: FrameSet, rig: CubeRig, settings: RefineSettings, num_threads: int
+) -> PerFrame[Features]:
+    """Features by frame name; image and mask are read, cut and released one at a time."""
+    features.keep_freed_memory()
+    index = {name: f for f, name in enumerate(frames.names)}
+
+    def compute(name: str) -> Features:
+        images, masks = cubemap.load(frames, index[name], rig)
+        extractor = features.SiftExtractor(settings.features)
+        return features.extract(images, masks, rig, extractor)
+
+    inputs = {
+        name: fingerprint([*frames.paths[f], frames.mask_paths[f]]) for name, f in index.items()
+    }
+    key = [settings.cubemap, settings.features]
+    return store.per_frame("features", key, inputs, compute, Features, num_threads=num_threads)
