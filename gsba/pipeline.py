@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from gsba import read, video
+from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.export import ExportFormat, export, write_points
@@ -96,21 +97,25 @@ def refine(
     coarse = _coarse(frame_set, given, settings)
     with RunStore(out, origin, fresh) as store:
         line = Line(store, frame_set, coarse, settings, extra_factors)
-        neighbours, rounds = line.judge(line.match_neighbours()), settings.rounds
-        solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)
-        adjacent = line.match_along_epipolars(solved)
-        near = line.match_known_points("near", solved, loops_closed=False)
-        solved = line.solve("dense", [adjacent, near], solved, rounds.dense)
-        loops, solved = line.close_loops(solved)
-        solved = line.solve("closed", [adjacent, near, loops.matches], solved, rounds.loops)
-        for number in range(1, rounds.map_passes + 1):
-            wide = line.match_known_points(f"everywhere{number}", solved, loops_closed=True)
-            final = number == rounds.map_passes and settings.align.rounds == 0
-            solved = line.solve(f"refined{number}", [adjacent, wide], solved, rounds.refined, final)
-        for number in range(1, settings.align.rounds + 1):
-            solved = line.solve_aligned(number, line.align(number, solved), solved)
-        reconstruction = line.reconstruct(solved)
-        return _write(line, reconstruction)
+        return _write(line, line.reconstruct(_solve(line, settings)))
+
+
+def _solve(line: Line, settings: RefineSettings) -> Adjustment:
+    """All stages from the coarse trajectory to the last solution."""
+    neighbours, rounds = line.judge(line.match_neighbours()), settings.rounds
+    solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)
+    adjacent = line.match_along_epipolars(solved)
+    near = line.match_known_points("near", solved, loops_closed=False)
+    solved = line.solve("dense", [adjacent, near], solved, rounds.dense)
+    loops, solved = line.close_loops(solved)
+    solved = line.solve("closed", [adjacent, near, loops.matches], solved, rounds.loops)
+    for number in range(1, rounds.map_passes + 1):
+        wide = line.match_known_points(f"everywhere{number}", solved, loops_closed=True)
+        final = number == rounds.map_passes and settings.align.rounds == 0
+        solved = line.solve(f"refined{number}", [adjacent, wide], solved, rounds.refined, final)
+    for number in range(1, settings.align.rounds + 1):
+        solved = line.solve_aligned(number, line.align(number, solved), solved)
+    return solved
 
 
 def _coarse(frames: FrameSet, given: Trajectory | None, settings: RefineSettings) -> CoarsePoses:
