@@ -172,9 +172,6 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
     aligned = sighted.aligned
     factor = known.sigmas_rad[aligned] / sighted.keypoints.sigmas_rad[aligned]
     np.testing.assert_allclose(factor, factor[0])  # one for all, found from their residuals
-    errors = np.median(_errors_px(replace(sighted, keypoints=known), world_T_rigs))
-    median_sigma = np.median(known.sigmas_rad[aligned]) / PIXEL
-    assert 0.5 < errors / (1.18 * median_sigma) < 1.5  # 1.18: median of a Rayleigh variable
 
 
 @pytest.mark.parametrize("grey", [0, 255])
