@@ -229,6 +229,18 @@ def test_confirmed_points_are_looked_for_elsewhere(walk) -> None:
     assert confirmed.counts.received > 3 * 400
 
 
+def test_a_solution_that_loses_a_frame_is_told_apart(walk) -> None:
+    _, world_T_rigs = walk
+    landmarks, _ = _start(world_T_rigs)
+    before = replace(adjust.start(world_T_rigs), landmarks=landmarks)
+    tracks = landmarks.tracks
+    rows = tracks.frames != 3
+    fewer = Tracks(tracks.points[rows], tracks.frames[rows], tracks.keypoints[rows], 400)
+    without = replace(before, landmarks=replace(landmarks, tracks=fewer))
+    assert adjust.carries(before, before, 12) and adjust.carries(before, without, 12)
+    assert not adjust.carries(without, before, 12)
+
+
 def test_no_points_are_no_observations(walk) -> None:
     frames, world_T_rigs = walk
     none = adjust.start(world_T_rigs).landmarks
