@@ -168,6 +168,13 @@ def run(
     return Adjustment(world_T_rigs, place(world_T_rigs, gates[-1] * noise), noise, tuple(rounds))
 
 
+def carries(solved: Adjustment, before: Adjustment, least: int) -> bool:
+    """Whether every frame with `least` observations in one solution has as many in the other."""
+    num = len(before.world_T_rigs)
+    seen = [np.bincount(one.landmarks.tracks.frames, minlength=num) for one in (solved, before)]
+    return bool(np.all((seen[0] >= least) | (seen[1] < least)))
+
+
 def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
     """Settings of a round: only the last of a run is solved to the end."""
     if last or settings.rounds.tolerance < settings.solver.relative_tolerance:

@@ -38,8 +38,8 @@ class CubemapSettings(_Settings):
 
     hfov_deg: float = Field(default=96.0, ge=90, le=120)
     face_size: int | None = Field(default=None, ge=64)  # pixels; None = by oversampling
-    oversampling: float = Field(default=0.6, ge=0.25, le=4)  # face pixels per panorama pixel
-    min_face_size: int = Field(default=320, ge=64)  # pixels; bounds on the automatic size
+    oversampling: float = Field(default=0.5, ge=0.25, le=4)  # face pixels per panorama pixel
+    min_face_size: int = Field(default=256, ge=64)  # pixels; bounds on the automatic size
     max_face_size: int = Field(default=1024, ge=64)
 
 
@@ -47,8 +47,8 @@ class FeatureSettings(_Settings):
     """Keypoints on faces."""
 
     extractor: Literal["sift"] = "sift"
-    max_per_face: int = Field(default=700, ge=16)
-    contrast_threshold: float = Field(default=0.015, gt=0)
+    max_per_face: int = Field(default=600, ge=16)
+    contrast_threshold: float = Field(default=0.02, gt=0)
     sigma_px: float = Field(
         default=0.16, gt=0
     )  # per-axis noise of the smallest keypoints, face pixels
@@ -115,9 +115,9 @@ class RoundSettings(_Settings):
     """Triangulate, adjust, filter: gates in standard deviations of the observations' noise."""
 
     chain: tuple[float, ...] = (60.0, 8.0)  # from the coarse trajectory
-    dense: tuple[float, ...] = (6.0, 3.0)  # with matches along the solved chain
-    loops: tuple[float, ...] = (100.0, 20.0, 4.0)  # with loops closed
-    refined: tuple[float, ...] = (6.0, 3.0, 2.5)  # with matches along the solved map
+    dense: tuple[float, ...] = (4.0,)  # with matches along the solved chain
+    loops: tuple[float, ...] = (100.0, 6.0)  # with loops closed
+    refined: tuple[float, ...] = (4.0, 2.5)  # with matches along the solved map
     aligned: tuple[float, ...] = (6.0, 3.0)  # with aligned patches
     map_passes: int = Field(default=1, ge=1)  # times the closed map is matched anew
     gate_scale: float = Field(default=10.0, ge=1)  # wider gates loosen the loss in proportion

@@ -295,20 +295,11 @@ class Line:
         solved, keypoints = self._stage(name, key, compute, tuple[Adjustment, Keypoints])
         self.counts[name] = [solved.landmarks.counts]
         self.solutions[name] = solved
-        if not self._explains(solved, before):
+        if not adjust.carries(solved, before, self.settings.rounds.min_observations):
             self.undone.append(name)
             return before
         self.observed, self.aligned = keypoints, sighted.aligned
         return solved
-
-    def _explains(self, solved: Adjustment, before: Adjustment) -> bool:
-        """Whether a solution carries all frames that another did."""
-        least = self.settings.rounds.min_observations
-        carried = [
-            np.bincount(one.landmarks.tracks.frames, minlength=len(self.frames)) >= least
-            for one in (solved, before)
-        ]
-        return bool(np.all(carried[0] | ~carried[1]))
 
     def reconstruct(self, solved: Adjustment) -> Reconstruction:
         """Covariances, and everything back in the trajectory's world."""

@@ -172,9 +172,6 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
     aligned = sighted.aligned
     factor = known.sigmas_rad[aligned] / sighted.keypoints.sigmas_rad[aligned]
     np.testing.assert_allclose(factor, factor[0])  # one for all, found from their residuals
-    errors = np.median(_errors_px(replace(sighted, keypoints=known), world_T_rigs))
-    median_sigma = np.median(known.sigmas_rad[aligned]) / PIXEL
-    assert 0.5 < errors / (1.18 * median_sigma) < 1.5  # 1.18: median of a Rayleigh variable
 
 
 @pytest.mark.parametrize("grey", [0, 255])
@@ -230,6 +227,18 @@ def test_confirmed_points_are_looked_for_elsewhere(walk) -> None:
     )
     assert short.counts.received == 2 * 400  # all observations but the references
     assert confirmed.counts.received > 3 * 400
+
+
+def test_a_solution_that_loses_a_frame_is_told_apart(walk) -> None:
+    _, world_T_rigs = walk
+    landmarks, _ = _start(world_T_rigs)
+    before = replace(adjust.start(world_T_rigs), landmarks=landmarks)
+    tracks = landmarks.tracks
+    rows = tracks.frames != 3
+    fewer = Tracks(tracks.points[rows], tracks.frames[rows], tracks.keypoints[rows], 400)
+    without = replace(before, landmarks=replace(landmarks, tracks=fewer))
+    assert adjust.carries(before, before, 12) and adjust.carries(before, without, 12)
+    assert not adjust.carries(without, before, 12)
 
 
 def test_no_points_are_no_observations(walk) -> None:

@@ -1,6 +1,7 @@
 """Commands on finished runs: `export`, `evaluate`."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -68,6 +69,10 @@ def export(
 def evaluate(
     estimate: Annotated[Path, typer.Argument(help="A run, or a trajectory file.", metavar="RUN")],
     truth: Annotated[Path | None, typer.Option(help="True trajectory (TUM).")] = None,
+    depth: Annotated[
+        Path | None,
+        typer.Option(help="True depth maps: also say how far pixels are moved.", metavar="DIR"),
+    ] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the numbers here too.", metavar="FILE")
     ] = None,
@@ -90,12 +95,23 @@ def evaluate(
         return
     from gsba.evaluate import evaluate as compare
     from gsba.evaluate import format_table
+    from gsba.induced import depth_maps, induced_errors
     from gsba.read import read_trajectory
     from gsba.records import atomic_write
 
     path = estimate / "trajectory.tum" if estimate.is_dir() else estimate
-    errors = compare(read_trajectory(path), read_trajectory(truth))
+    found, true = read_trajectory(path), read_trajectory(truth)
+    errors, induced = compare(found, true), None
+    if depth is not None:
+        ranges = depth_maps(depth)
+        induced = induced_errors(found, true, ranges, 4 * ranges(0).shape[1])
     if json_file is not None:
-        text = json.dumps(errors.to_json(), indent=1) + "\n"
+        content = errors.to_json() | ({"induced": asdict(induced)} if induced else {})
+        text = json.dumps(content, indent=1) + "\n"
         atomic_write(json_file, lambda temporary: temporary.write_text(text))
     typer.echo(format_table({estimate.name: errors}))
+    if induced is not None:
+        typer.echo(
+            f"induced error, in pixels of a panorama four times as wide as the depth maps: median "
+            f"{induced.median_px:.4f}, 95th percentile {induced.percentile95_px:.4f}"
+        )
