@@ -21,7 +21,7 @@ FLOORS = (
     | {"graph", "optimize", "filter"},
     {"adjust", "frontend", "reconstruction"},
     {"export", "evaluate", "report", "report_html", "video"}
-    | {"alignment", "gravity", "placement"},
+    | {"alignment", "carrier", "gravity", "placement"},
     {"demo", "line", "pipeline"},
     {"cli"},
     {"benchmarks"},

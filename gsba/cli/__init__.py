@@ -1,9 +1,9 @@
 """The command line. Commands parse, call and print; heavy imports stay in their bodies."""
 
-from gsba.cli import refining, results, videos
+from gsba.cli import preparing, refining, results
 from gsba.cli.app import app
 
-__all__ = ["app", "main", "refining", "results", "videos"]
+__all__ = ["app", "main", "preparing", "refining", "results"]
 
 
 def main() -> None:

@@ -32,7 +32,10 @@ def refine(
     config: Config = None,
     overrides: Overrides = None,
     masks: Annotated[
-        Path | None, typer.Option(help="One mask for all frames, or a folder; white = use.")
+        Path | None,
+        typer.Option(
+            help="One mask for all frames, or a folder; white = use. auto: find the carrier."
+        ),
     ] = None,
     factors: Factors = None,
     timestamps: Annotated[
