@@ -61,8 +61,7 @@ def refine(
     depends on it.
 
     Args:
-        frames: folder of 2:1 panoramas or of cube faces, or a video, whose frames go to
-            `out`/frames first.
+        frames: folder of 2:1 panoramas or of cube faces; or a video, for `out`/frames.
         trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig.
         out: folder of the run.
         settings: see `gsba.config`.
@@ -79,8 +78,7 @@ def refine(
     frames, trajectory, out = Path(frames), Path(trajectory), Path(out)
     settings, origin = settings or RefineSettings(), {"frames": frames, "trajectory": trajectory}
     check(settings.placement)
-    is_auto = str(masks) == AUTO and not Path(AUTO).exists()
-    given = None if masks is None or is_auto else Path(masks)
+    given = None if masks is None or masks == AUTO else Path(masks)
     if video.is_video(frames):
         read.read_trajectory(trajectory, timestamps)  # fails before hours of decoding, not after
         _extract(out, origin, settings, fps, fresh)
@@ -89,7 +87,7 @@ def refine(
         frame_set = read.scan(frames, timestamps, fps, given)
     coarse = read.associate(frame_set, read.read_trajectory(trajectory, timestamps), settings.read)
     with RunStore(out, origin, fresh) as store:
-        if is_auto:
+        if masks == AUTO:
             frame_set = _without_carrier(store, frame_set)
         line = Line(store, frame_set, coarse, settings, extra_factors)
         neighbours, rounds = line.match_neighbours(), settings.rounds

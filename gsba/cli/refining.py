@@ -56,7 +56,7 @@ def refine(
         trajectory,
         out,
         settings,
-        masks=masks,
+        masks="auto" if str(masks) == "auto" else masks,
         timestamps=timestamps,
         fps=fps,
         fresh=fresh,
