@@ -3,6 +3,8 @@
 import os
 import uuid
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
 from typing import TypeVar
 
 import gtsam
@@ -77,14 +79,23 @@ class Line:
         features.keep_freed_memory()
         index = {name: f for f, name in enumerate(frames.names)}
 
+        chosen, weights = settings.features, settings.features.weights
+        if chosen.extractor == "sift":
+            make_extractor, inputs = partial(features.SiftExtractor, chosen), None
+        else:
+            from gsba.learned import LearnedExtractor, check_weights
+
+            check_weights(chosen)
+            make_extractor = partial(LearnedExtractor, chosen)
+            inputs = fingerprint([Path(weights or "")])
+
         def compute(name: str) -> Features:
             images, masks = cubemap.load(frames, index[name], self.rig)
-            extractor = features.SiftExtractor(settings.features)
-            return features.extract(images, masks, self.rig, extractor)
+            return features.extract(images, masks, self.rig, make_extractor())
 
         return self.store.per_frame(
             "features",
-            [settings.cubemap, settings.features],
+            [settings.cubemap, settings.features, inputs],
             {
                 name: fingerprint([*frames.paths[f], frames.mask_paths[f]])
                 for name, f in index.items()

@@ -19,7 +19,7 @@ FLOORS = (
     {"rig", "records", "run_folder", "search", "store", "read"},
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter"},
-    {"adjust", "frontend", "reconstruction"},
+    {"adjust", "frontend", "learned", "reconstruction"},
     {"export", "evaluate", "report", "report_html", "video"}
     | {"alignment", "carrier", "gravity", "placement"},
     {"demo", "line", "pipeline"},
