@@ -46,7 +46,8 @@ class CubemapSettings(_Settings):
 class FeatureSettings(_Settings):
     """Keypoints on faces."""
 
-    extractor: Literal["sift"] = "sift"
+    extractor: Literal["sift", "aliked", "disk"] = "sift"
+    weights: str | None = None  # file of a learned extractor's weights
     max_per_face: int = Field(default=600, ge=16)
     contrast_threshold: float = Field(default=0.02, gt=0)
     sigma_px: float = Field(

@@ -1,11 +1,12 @@
 """A run from frames and a coarse trajectory to refined poses, a cloud and datasets."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from gsba import read, video
 from gsba.adjust import Adjustment
+from gsba.carrier import Carrier, find_carrier, write_carrier
 from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.export import ExportFormat, export, write_points
@@ -16,13 +17,14 @@ from gsba.motion import describe
 from gsba.placement import Placement, check, place
 from gsba.report import build_report, take_notes, write_poses, write_report
 from gsba.report_html import write_html
-from gsba.store import RunStore, atomic_write, load_stage
+from gsba.store import RunStore, atomic_write, fingerprint, load_stage
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, Reconstruction, Trajectory
 
 _GAUGE = (
     "Sim(3)-aligned to the coarse trajectory over its refined SLAM poses: its world and scale; "
     "covariances hold the first pose and the distance to the frame furthest from it"
 )
+AUTO = "auto"  # in place of masks: find the carrier
 _OUTPUTS = (
     "trajectory.tum",
     "poses.csv",
@@ -54,7 +56,7 @@ def refine(
     out: Path | str,
     settings: RefineSettings | None = None,
     *,
-    masks: Path | None = None,
+    masks: Path | str | None = None,
     timestamps: Path | None = None,
     fps: float | None = None,
     fresh: bool = False,
@@ -66,13 +68,12 @@ def refine(
     depends on it.
 
     Args:
-        frames: folder of 2:1 panoramas or of cube faces, or a video, whose frames go to
-            `out`/frames first.
+        frames: folder of 2:1 panoramas or of cube faces, or a video, for `out`/frames.
         trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig. None = start from the images
             alone: the first step's length is the unit and the first frame the world.
         out: folder of the run.
         settings: see `gsba.config`.
-        masks: one ERP mask for all frames, or a folder of one for each; white = use.
+        masks: one ERP mask for all frames, or a folder of one for each; white = use; or "auto".
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         fresh: forget an earlier run in `out`.
@@ -85,17 +86,20 @@ def refine(
     frames, out = Path(frames), Path(out)
     settings, origin = settings or RefineSettings(), {"frames": frames}
     check(settings.placement)
+    mask_files = None if masks is None or masks == AUTO else Path(masks)
     given = None
     if trajectory is not None:  # fails before hours of decoding, not after
         origin["trajectory"] = Path(trajectory)
         given = read.read_trajectory(Path(trajectory), timestamps)
     if video.is_video(frames):
-        frame_set = _extracted(frames, out, origin, settings, fps, masks, fresh)
-        fresh = False
+        _extract(out, origin, settings, fps, fresh)
+        frame_set, fresh = read.scan(out / "frames", masks=mask_files), False
     else:
-        frame_set = read.scan(frames, timestamps, fps, masks)
+        frame_set = read.scan(frames, timestamps, fps, mask_files)
     coarse = _coarse(frame_set, given, settings)
     with RunStore(out, origin, fresh) as store:
+        if masks == AUTO:
+            frame_set = _without_carrier(store, frame_set)
         line = Line(store, frame_set, coarse, settings, extra_factors)
         return _write(line, line.reconstruct(_solve(line, settings)))
 
@@ -137,25 +141,32 @@ def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:
     return reconstruction, load_stage(out, "frames", FrameSet)
 
 
-def _extracted(
-    film: Path,
-    out: Path,
-    origin: dict[str, Path],
-    settings: RefineSettings,
-    fps: float | None,
-    masks: Path | None,
-    fresh: bool,
-) -> FrameSet:
-    """Frames of a video, in `out`/frames."""
-    if fps is not None and not fps > 0:
-        raise GsbaError(f"--fps {fps}: must be a positive number of frames per second")
+def _extract(
+    out: Path, origin: dict[str, Path], settings: RefineSettings, fps: float | None, fresh: bool
+) -> None:
+    """Write the frames of the video that a run is about to `out`/frames."""
     chosen = settings.video
     if fps is not None:
+        if not fps > 0:
+            raise GsbaError(f"--fps {fps}: must be a positive number of frames per second")
         chosen = chosen.model_copy(update={"fps": fps, "every": None, "at": None})
     with RunStore(out, origin, fresh) as store:
-        video.extract(film, out / "frames", chosen, replace=True)
+        video.extract(origin["frames"], out / "frames", chosen, replace=True)
         store.claim(out / "frames")
-    return read.scan(out / "frames", masks=masks)
+
+
+def _without_carrier(store: RunStore, frames: FrameSet) -> FrameSet:
+    """Frames whose mask leaves out the carrier, if there is one."""
+    inputs = fingerprint(path for group in frames.paths for path in group)
+    found = store.stage("carrier", inputs, lambda: find_carrier(frames), Carrier)
+    path = store.root / "carrier.png"
+    if not (path.exists() and store.records["carrier"].resumed):  # a new file would undo all stages
+        write_carrier(found, frames, store.root)
+    for name in ("carrier.png", "carrier_check.jpg"):
+        store.claim(store.root / name)
+    if not found.share:
+        return frames
+    return replace(frames, mask_paths=(path,) * len(frames))
 
 
 def _write(line: Line, reconstruction: Reconstruction) -> RunResult:

@@ -19,10 +19,10 @@ FLOORS = (
     {"rig", "records", "run_folder", "search", "store", "read", "panorama", "views"},
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter", "align", "splat"},
-    {"adjust", "frontend", "misfit", "motion", "places", "reconstruction", "recovery"}
+    {"adjust", "frontend", "learned", "misfit", "motion", "places", "reconstruction", "recovery"}
     | {"splat_align", "splatting"},
     {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"}
-    | {"alignment", "gravity", "placement"},
+    | {"alignment", "carrier", "gravity", "placement"},
     {"demo", "extraction", "line", "pipeline"},
     {"cli"},
     {"benchmarks"},

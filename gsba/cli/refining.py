@@ -38,7 +38,10 @@ def refine(
     config: Config = None,
     overrides: Overrides = None,
     masks: Annotated[
-        Path | None, typer.Option(help="One mask for all frames, or a folder; white = use.")
+        Path | None,
+        typer.Option(
+            help="One mask for all frames, or a folder; white = use. auto: find the carrier."
+        ),
     ] = None,
     factors: Factors = None,
     timestamps: Annotated[
@@ -61,7 +64,7 @@ def refine(
         trajectory,
         out,
         settings,
-        masks=masks,
+        masks="auto" if str(masks) == "auto" else masks,
         timestamps=timestamps,
         fps=fps,
         fresh=fresh,

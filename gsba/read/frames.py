@@ -77,6 +77,30 @@ def scan(
     )
 
 
+def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
+    """Panoramas of a folder in name order; nothing is asked of their times, which are 0, 1, ...
+
+    Raises:
+        GsbaError: no panoramas, or a mask that does not fit.
+    """
+    layout, _, found = _find_frames(Path(folder))
+    if layout != "erp":
+        raise GsbaError(f"{folder}: holds cube faces; panoramas are wanted here")
+    names = sorted(found, key=_natural)
+    paths = tuple(found[name] for name in names)
+    width, height = _common_size(paths, layout)
+    return FrameSet(
+        names=tuple(names),
+        paths=paths,
+        timestamps=np.arange(len(names), dtype=np.float64),
+        layout=layout,
+        faces=(),
+        width=width,
+        height=height,
+        mask_paths=find_masks(masks, names, (width, height)),
+    )
+
+
 def load_erp(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
     """Equirectangular image of frame f, (height, width, 3) uint8 RGB, or (height, width) grey."""
     if frames.layout != "erp":

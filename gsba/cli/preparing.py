@@ -1,4 +1,4 @@
-"""Commands on videos: `extract`."""
+"""Commands that prepare frames: `extract`, `mask`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -44,3 +44,22 @@ def extract(
     counts = write(video, out, validated({"video": chosen}).video, fresh)
     why = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
     typer.echo(f"{counts.kept} of {counts.received} frames kept{f' ({why})' if why else ''}: {out}")
+
+
+@command
+def mask(
+    frames: Annotated[Path, typer.Argument(help="Folder of 2:1 panoramas.")],
+    out: Annotated[Path, typer.Option(help="Folder of the masks.", metavar="DIR")],
+    masks: Annotated[
+        Path | None, typer.Option(help="Masks of your own, merged with what is found.")
+    ] = None,
+) -> None:
+    """Find what carries the camera and write it as a mask to look at and to use."""
+    from gsba.carrier import find_carrier, write_carrier
+    from gsba.read.frames import find_panoramas
+
+    found_frames = find_panoramas(frames, masks)
+    carrier = find_carrier(found_frames)
+    written = write_carrier(carrier, found_frames, out)
+    what = carrier.reason or f"the carrier is {100 * carrier.share:.1f}% of the picture"
+    typer.echo(f"{what}: {written[0]}" + (f", {out / 'merged'}" if masks is not None else ""))
