@@ -22,7 +22,9 @@ BACKEND = CpuBackend(2)
 @pytest.fixture(scope="module")
 def splat(case: Case) -> Gaussians:
     """A splat of all frames, trained just long enough to show the larger things."""
-    settings = SplatSettings(iterations=150, face_size=48, sh_degree=0)
+    settings = SplatSettings(
+        iterations=300, face_size=48, sh_degree=0, rate_scales=0.02, rate_colors=0.01
+    )
     poses = case.result.reconstruction.world_T_rigs
     every = np.arange(len(poses))
     views = make_views(*load_faces(case.result.frames, every, 48), poses)

@@ -1,10 +1,9 @@
 """Train a splat on posed faces: 3D Gaussian Splatting as published (Kerbl et al., 2023).
 
 One view a step, in an order drawn anew for every round through the views; Adam; clone, split and
-prune; opacity resets. Published times and rates are for 30,000 steps. With fewer, times shrink in
-proportion, down to sensible floors, and the rates of shape and colour grow as the square root, up
-to four times. Every random draw depends on the seed and the step alone, so that a run that was
-interrupted goes on to the same result.
+prune; opacity resets. The published times are for 30,000 steps and shrink with the number asked
+for, down to sensible floors. Every random draw depends on the seed and the step alone, so that a
+run that was interrupted goes on to the same result.
 """
 
 import logging
@@ -28,7 +27,6 @@ from gsba.splat.metrics import training_loss
 logger = logging.getLogger(__name__)
 
 _PUBLISHED = 30_000  # steps that the published times are for
-_MAX_PACE = 4.0
 _CHECK_EVERY = 20  # steps between looks for values that are not finite
 
 
@@ -73,11 +71,6 @@ def times_for(iterations: int) -> Times:
         reset_every=max(round(3000 * scale), 3000),  # short trainings cannot recover from one
         degree_every=max(round(1000 * scale), 1),
     )
-
-
-def pace_for(iterations: int) -> float:
-    """Factor on the published rates of shape and colour for a number of steps."""
-    return min(max((_PUBLISHED / iterations) ** 0.5, 1.0), _MAX_PACE)
 
 
 def extent_of(places: np.ndarray) -> float:
@@ -162,7 +155,6 @@ class _Trainer:
         self.views, self.settings, self.backend = views, settings, backend
         self.times = times_for(settings.iterations)
         self.extent = extent_of(np.array([camera.face_in_world for camera in views.cameras]))
-        self.pace = pace_for(settings.iterations)
         self.near = settings.near * self.extent
         self.capped = False
 
@@ -203,11 +195,11 @@ class _Trainer:
         means = settings.rate_means ** (1 - done) * settings.rate_means_end**done
         return adam.Rates(
             means=means * self.extent,
-            log_scales=settings.rate_scales * self.pace,
-            quaternions=settings.rate_rotations * self.pace,
+            log_scales=settings.rate_scales,
+            quaternions=settings.rate_rotations,
             opacity_logits=settings.rate_opacities,
-            sh=settings.rate_colors * self.pace,
-            sh_rest=settings.rate_colors * self.pace / 20,
+            sh=settings.rate_colors,
+            sh_rest=settings.rate_colors / 20,
         )
 
     def _densify(self, state: State, step: int) -> tuple[Gaussians, adam.Moments]:
