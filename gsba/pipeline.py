@@ -1,5 +1,6 @@
 """A run from frames and a coarse trajectory to refined poses, a cloud and datasets."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,7 @@ def refine(
     out: Path | str,
     settings: RefineSettings | None = None,
     *,
+    keyframes: Path | None = None,
     masks: Path | None = None,
     timestamps: Path | None = None,
     fps: float | None = None,
@@ -59,6 +61,7 @@ def refine(
             alone: the first step's length is the unit and the first frame the world.
         out: folder of the run.
         settings: see `gsba.config`.
+        keyframes: second trajectory file of the same run, with its keyframes: they lead.
         masks: one ERP mask for all frames, or a folder of one for each; white = use.
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times.
@@ -72,15 +75,10 @@ def refine(
     frames, out = Path(frames), Path(out)
     settings = settings or RefineSettings()
     frame_set = read.scan(frames, timestamps, fps, masks)
-    origin = {"frames": frames}
-    if trajectory is None:
-        coarse = read.without_trajectory(frame_set)
-    else:
-        origin["trajectory"] = Path(trajectory)
-        given = read.read_trajectory(Path(trajectory), timestamps)
-        coarse = read.associate(frame_set, given, settings.read)
-        refuse_useless(coarse)
-    with RunStore(out, origin, fresh) as store:
+    given = {"trajectory": trajectory, "keyframes": keyframes}
+    origin = {name: Path(path) for name, path in given.items() if path is not None}
+    coarse = _coarse(frame_set, origin, timestamps, settings)
+    with RunStore(out, {"frames": frames, **origin}, fresh) as store:
         line = Line(store, frame_set, coarse, settings, extra_factors)
         neighbours, rounds = line.judge(line.match_neighbours()), settings.rounds
         solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)
@@ -94,6 +92,21 @@ def refine(
             solved = line.solve(f"refined{number}", [adjacent, wide], solved, rounds.refined)
         reconstruction = line.reconstruct(solved)
         return _write(line, reconstruction)
+
+
+def _coarse(
+    frames: FrameSet, given: Mapping[str, Path], timestamps: Path | None, settings: RefineSettings
+) -> CoarsePoses:
+    """Pose of every frame from the trajectory files given, if any."""
+    if "trajectory" not in given:
+        return read.without_trajectory(frames)
+    trajectory = read.read_trajectory(given["trajectory"], timestamps)
+    if "keyframes" in given:
+        keyframes = read.read_trajectory(given["keyframes"], timestamps)
+        trajectory = read.follow_keyframes(trajectory, keyframes)
+    coarse = read.associate(frames, trajectory, settings.read)
+    refuse_useless(coarse)
+    return coarse
 
 
 def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:

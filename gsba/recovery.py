@@ -94,6 +94,7 @@ def match_anywhere(
     chosen: np.ndarray,
     settings: RefineSettings,
     num_threads: int,
+    min_share: float | None = None,
 ) -> VerifiedPairs:
     """Match whole panoramas without any prediction, and verify their geometry alone.
 
@@ -104,7 +105,12 @@ def match_anywhere(
         chosen: (P, 2) frame indices.
         settings: of matching and verification.
         num_threads: pairs matched at a time.
+        min_share: part of the matches that must be of one geometry; None = as for neighbours.
     """
+    if min_share is not None:
+        settings = settings.model_copy(
+            update={"verify": settings.verify.model_copy(update={"min_share": min_share})}
+        )
     nowhere = np.tile(np.eye(4), (len(keypoints.starts) - 1, 1, 1))
 
     def verified(among: SearchableFrames, some: np.ndarray) -> VerifiedPairs:

@@ -75,7 +75,7 @@ def test_plain_drift_is_not_accused(seed: int) -> None:
     np.testing.assert_array_equal(trust.world_T_rigs, slam)
 
 
-@pytest.mark.parametrize("frames", [(7,), (1,), (4, 15, 20), (9, 10)])
+@pytest.mark.parametrize("frames", [(7,), (1,), (4, 15, 20), (9, 10), (9, 11), (3, 4, 6)])
 def test_displaced_frames_are_named_and_chained_past(frames: tuple[int, ...]) -> None:
     slam = _slam()
     rng = np.random.default_rng(3)
@@ -83,9 +83,7 @@ def test_displaced_frames_are_named_and_chained_past(frames: tuple[int, ...]) ->
         turn = Rotation.from_rotvec(np.deg2rad(12) * unit(rng.normal(size=3))).as_matrix()
         slam[f] = slam[f] @ pose(turn, 1.5 * unit(rng.normal(size=3)))
     trust = _judge(slam)
-    named = np.flatnonzero(trust.false_frames)
-    assert set(frames) <= set(named)
-    assert len(named) <= len(frames) + (frames == (9, 10))  # of two in a row, the way back too
+    assert tuple(np.flatnonzero(trust.false_frames)) == frames
     steps = inverse(trust.world_T_rigs[:-1]) @ trust.world_T_rigs[1:]
     true = inverse(TRUTH[:-1]) @ TRUTH[1:]
     between = np.swapaxes(steps[:, :3, :3], 1, 2) @ true[:, :3, :3]
