@@ -147,6 +147,7 @@ class Line:
                 self.keypoints,
                 guided,
                 self.coarse,
+                self.frames.timestamps,
                 self.settings,
                 self.num_threads,
             ),

@@ -259,7 +259,12 @@ def describe(trust: Trust, frames: FrameSet) -> tuple[dict[str, list[Any]], list
         notes.append("no frame has parallax to the next: no depth can be had, rotations only")
     if trust.unseen_steps.any():
         steps = ", ".join(f"{a} to {b}" for a, b in judgement["unseen_steps"])
-        notes.append(f"no images in common, held by the trajectory alone: {steps}")
+        held = (
+            "what follows is placed by guess"
+            if trust.false_steps.all()
+            else ("held by the trajectory alone")
+        )
+        notes.append(f"no images in common, {held}: {steps}")
     for note in notes:
         logger.warning(note)
     return judgement, notes

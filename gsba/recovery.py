@@ -11,6 +11,7 @@ from gsba.matching import Gate, SearchableFrames
 from gsba.motion import Trust
 from gsba.types import CoarsePoses, Counts, Keypoints, Matches, VerifiedPairs
 
+_PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
 _ANYWHERE = Gate(np.pi, 1e3, np.pi)
 
 
@@ -28,18 +29,21 @@ def run(
     keypoints: Keypoints,
     guided: VerifiedPairs,
     coarse: CoarsePoses,
+    timestamps: np.ndarray,
     settings: RefineSettings,
     num_threads: int,
 ) -> Recovered:
     """Match the neighbours that guidance lost, judge the trajectory, and guide anew from that.
 
     Frames next to one another are compared as a whole: they share so much that repeated structure
-    does not mislead. Frames two apart, where it does, are only matched along the steps found.
+    does not mislead. Frames two apart, or with a pause between them, where it does, are only
+    matched along the steps found or the trajectory.
 
     Args:
         frames, strongest, keypoints: features of all frames.
         guided: neighbours verified under the trajectory's guidance; all of them where it is right.
         coarse: the trajectory.
+        timestamps: (F,) seconds.
         settings: of pairs, matching, verification and priors.
         num_threads: pairs matched at a time.
 
@@ -47,7 +51,9 @@ def run(
         GsbaError: the images contradict most of the trajectory.
     """
     chosen = pairs.adjacent(len(coarse.sources))
-    lost = _missing(chosen[chosen[:, 1] - chosen[:, 0] == 1], guided)
+    intervals = np.diff(timestamps)
+    close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
+    lost = _missing(np.column_stack([close, close + 1]), guided)
     alone = _join(
         [guided, match_anywhere(strongest, frames, keypoints, lost, settings, num_threads)]
     )
