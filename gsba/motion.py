@@ -20,6 +20,7 @@ logger = logging.getLogger(__name__)
 
 _MIN_COMMON = 8  # points that two steps must share to compare their lengths
 _MIN_POINT_PARALLAX = np.deg2rad(1.0)  # of a point, or its depth is not worth comparing
+_STILL = np.deg2rad(0.1)  # median: what a mere turn leaves over of bearings
 _RATIO_SIGMA = 0.02  # least noise of the logarithm of a ratio of lengths
 _SMOOTH_SIGMA = 0.5  # of the same where nothing is measured: walkers keep their pace
 _LENGTH_ROUNDS = 20  # of reweighting
@@ -70,11 +71,21 @@ def steps(pairs: VerifiedPairs, keypoints: Keypoints, settings: VerifySettings) 
             continue
         rows, f0_T_f1 = pairs.matches.of(p), pairs.f0_T_f1s[p]
         rays0 = keypoints.bearings_of(f0)[rows[:, 0]]
-        rays1 = keypoints.bearings_of(f1)[rows[:, 1]] @ f0_T_f1[:3, :3].T
+        bearings1 = keypoints.bearings_of(f1)[rows[:, 1]]
+        rays1 = bearings1 @ f0_T_f1[:3, :3].T
         chord = np.median(np.linalg.norm(rays0 - rays1, axis=1))
         f_T_nexts[f0], verified[f0] = f0_T_f1, True
+        turn = _turn(rays0, bearings1)
+        if np.median(np.linalg.norm(rays0 - bearings1 @ turn.T, axis=1)) < _STILL:
+            f_T_nexts[f0, :3, :3] = turn  # an essential matrix knows it less well
         directed[f0] = 2 * np.arcsin(chord / 2) > np.deg2rad(settings.min_parallax_deg)
     return Steps(f_T_nexts, verified, directed)
+
+
+def _turn(rays0: np.ndarray, rays1: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) that carries rays (m, 3) onto others in least squares (Kabsch, 1976)."""
+    u, _, vt = np.linalg.svd(rays0.T @ rays1)
+    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
 
 
 def length_ratios(
@@ -233,9 +244,11 @@ def _from_images_alone(
     moved = found.directed
     chosen[moved, :3, 3] = lengths[moved, None] * found.f_T_nexts[moved, :3, 3]
     own = coarse.sources == PoseSource.SLAM
+    turning_only = bool(found.verified.any() and not moved.any())
+    if turning_only and not own.any():
+        chosen[:, :3, 3] = 0
     start = _chain(coarse.world_T_rigs, chosen, own)
     every, nobody = np.ones(len(slam), bool), np.zeros(len(slam) + 1, bool)
-    turning_only = bool(found.verified.any() and not moved.any())
     return Trust(start, every, nobody, ~found.verified, lengths, turning_only)
 
 

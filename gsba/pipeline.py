@@ -1,9 +1,12 @@
 """A run from frames and a coarse trajectory to refined poses, a cloud and datasets."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from gsba import read
 from gsba.config import RefineSettings
@@ -15,6 +18,8 @@ from gsba.motion import describe
 from gsba.report import build_report, take_notes, write_poses, write_report
 from gsba.store import RunStore, atomic_write, load_stage
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, Reconstruction, Trajectory
+
+logger = logging.getLogger(__name__)
 
 _GAUGE = (
     "Sim(3)-aligned to the coarse trajectory over its refined SLAM poses: its world and scale; "
@@ -106,6 +111,9 @@ def _coarse(
         trajectory = read.follow_keyframes(trajectory, keyframes)
     coarse = read.associate(frames, trajectory, settings.read)
     refuse_useless(coarse)
+    if np.ptp(coarse.world_T_rigs[:, :3, 3], axis=0).max() == 0:
+        logger.warning("the trajectory only turns: positions come from the images alone")
+        return read.without_trajectory(frames)
     return coarse
 
 
