@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from gsba.blame import chained, false_frames
 from gsba.config import PriorSettings, VerifySettings
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.types import CoarsePoses, FrameSet, Keypoints, PoseSource, VerifiedPairs
@@ -24,8 +25,6 @@ _STILL = np.deg2rad(0.1)  # median: what a mere turn leaves over of bearings
 _RATIO_SIGMA = 0.02  # least noise of the logarithm of a ratio of lengths
 _SMOOTH_SIGMA = 0.5  # of the same where nothing is measured: walkers keep their pace
 _LENGTH_ROUNDS = 20  # of reweighting
-_MAX_RUN = 12  # false frames in a row that are told from a jump
-_BREAK = 1.5  # price of a jump in frames named
 _ROUGH = 3.0  # standard deviations of the prior: a step further off starts from the images
 
 
@@ -226,7 +225,7 @@ def judge(
         start = _chain(coarse.world_T_rigs, chosen, own)
     else:
         start = coarse.world_T_rigs
-    named = _named(wrong, slam, chosen, own, verify)
+    named = false_frames(wrong, slam, chosen, own, verify)
     return Trust(start, wrong, named, unseen, lengths, False)
 
 
@@ -293,7 +292,7 @@ def _disagreement(slam: np.ndarray, found: Steps) -> tuple[np.ndarray, np.ndarra
 
 def _chain(world_T_rigs: np.ndarray, chosen: np.ndarray, own: np.ndarray) -> np.ndarray:
     """Poses (F, 4, 4) that follow the chosen steps, laid over the trajectory's own frames."""
-    poses = _chained(chosen)
+    poses = chained(chosen)
     own = own if own.any() else np.ones(len(own), bool)
     u, _, vt = np.linalg.svd(
         np.einsum("fij,fkj->ik", world_T_rigs[own, :3, :3], poses[own, :3, :3])
@@ -302,57 +301,3 @@ def _chain(world_T_rigs: np.ndarray, chosen: np.ndarray, own: np.ndarray) -> np.
     positions = poses[:, :3, 3] @ rotation.T
     shift = np.median(world_T_rigs[own, :3, 3] - positions[own], axis=0)
     return pose(rotation @ poses[:, :3, :3], positions + shift)
-
-
-def _named(
-    wrong: np.ndarray,
-    slam: np.ndarray,
-    chosen: np.ndarray,
-    own: np.ndarray,
-    settings: VerifySettings,
-) -> np.ndarray:
-    """Frames (F,) whose own pose is false: the fewest whose absence explains the false steps.
-
-    The longest chain of frames is kept whose relative poses in the trajectory agree with the
-    images, from each to the next in the chain; a jump for good breaks it, at a price, and names the
-    frame behind. Filled-in poses take no part: they were guesses.
-    """
-    named = np.zeros(len(own), bool)
-    if not wrong.any():
-        return named
-    ours = np.flatnonzero(own)
-    theirs, images = _chained(slam), _chained(chosen)
-    score, back = np.ones(len(ours)), np.full(len(ours), -1)
-    broken = np.zeros(len(ours), bool)
-    for n in range(1, len(ours)):
-        for m in range(n - 1, max(n - 1 - _MAX_RUN, -1), -1):
-            a, b = int(ours[m]), int(ours[n])
-            agree = not wrong[a] if b == a + 1 else _agree(theirs, images, a, b, settings)
-            gain = score[m] + 1 - (0 if agree else _BREAK)
-            if gain > score[n]:
-                score[n], back[n], broken[n] = gain, m, not agree
-    named[ours] = True
-    n = int(np.argmax(score))
-    while n >= 0:
-        named[ours[n]] = broken[n]
-        n = int(back[n])
-    return named
-
-
-def _agree(
-    theirs: np.ndarray, images: np.ndarray, a: int, b: int, settings: VerifySettings
-) -> bool:
-    """Whether a trajectory's relative pose of two frames fits the steps of the images."""
-    one, other = inverse(theirs[a]) @ theirs[b], inverse(images[a]) @ images[b]
-    turned = rotation_angle(one[:3, :3].T @ other[:3, :3])
-    off, length = np.linalg.norm(one[:3, 3] - other[:3, 3]), np.linalg.norm(other[:3, 3])
-    allowed = np.sin(np.deg2rad(settings.max_direction_deg)) * length
-    return bool(turned < np.deg2rad(settings.max_rotation_deg) and off < allowed)
-
-
-def _chained(steps: np.ndarray) -> np.ndarray:
-    """Poses (F, 4, 4) that follow steps (F - 1, 4, 4), the first the identity."""
-    poses = [np.eye(4)]
-    for step in steps:
-        poses.append(poses[-1] @ step)
-    return np.array(poses)

@@ -63,15 +63,7 @@ def run(
         return Recovered(guided, trust)
     again = _missing(chosen, alone)
     again = again[again[:, 1] - again[:, 0] == 2]
-    prior = settings.pairs.prior
-    limit = np.deg2rad(settings.pairs.max_parallax_deg)
-    gates = [Gate(np.deg2rad(prior.rotation_deg), prior.direction, limit)] * len(again)
-    poses = trust.world_T_rigs
-    found = matching.run(again, poses, gates, frames, settings.matching, num_threads)
-    f0_T_f1s = inverse(poses[again[:, 0]]) @ poses[again[:, 1]]
-    over = verify.run(
-        found, keypoints, f0_T_f1s, np.zeros(len(again)), settings.verify, settings.seed
-    )
+    over = _match_along(trust.world_T_rigs, again, frames, keypoints, settings, num_threads)
     neighbours = _join([alone, over])
     doubtful = [p for p in _index(lost) if not _supported(p, neighbours, keypoints, settings)]
     if doubtful:
@@ -84,6 +76,23 @@ def run(
         {"no common geometry": len(chosen) - len(neighbours.matches.pairs)},
     )
     return Recovered(VerifiedPairs(neighbours.matches, neighbours.f0_T_f1s, counts), trust)
+
+
+def _match_along(
+    world_T_rigs: np.ndarray,
+    chosen: np.ndarray,
+    frames: SearchableFrames,
+    keypoints: Keypoints,
+    settings: RefineSettings,
+    num_threads: int,
+) -> VerifiedPairs:
+    """Match pairs (P, 2) guided by the start, and verify that they agree with it."""
+    prior, limit = settings.pairs.prior, np.deg2rad(settings.pairs.max_parallax_deg)
+    gates = [Gate(np.deg2rad(prior.rotation_deg), prior.direction, limit)] * len(chosen)
+    found = matching.run(chosen, world_T_rigs, gates, frames, settings.matching, num_threads)
+    f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
+    sigmas = np.zeros(len(chosen))
+    return verify.run(found, keypoints, f0_T_f1s, sigmas, settings.verify, settings.seed)
 
 
 def nothing_verified() -> VerifiedPairs:

@@ -19,7 +19,7 @@ FLOORS = (
     {"rig", "records", "run_folder", "search", "store", "read"},
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter"},
-    {"adjust", "frontend", "misfit", "motion", "places", "reconstruction", "recovery"},
+    {"adjust", "blame", "frontend", "misfit", "motion", "places", "reconstruction", "recovery"},
     {"export", "evaluate", "report"},
     {"demo", "line", "pipeline"},
     {"cli"},
