@@ -98,7 +98,9 @@ class VerifySettings(_Settings):
 
     max_error_deg: float = Field(default=0.25, gt=0)  # RANSAC inlier threshold
     min_inliers: int = Field(default=25, ge=8)
-    min_share: float = Field(default=0.3, ge=0, le=1)  # inliers, where no trajectory guided
+    min_share: float = Field(
+        default=0.45, ge=0, le=1
+    )  # inliers among the matches of neighbours that no trajectory guided: look-alikes have 0.4
     max_rotation_deg: float = Field(default=6.0, gt=0)  # disagreement with the trajectory
     max_direction_deg: float = Field(default=20.0, gt=0)  # disagreement with the trajectory
     min_parallax_deg: float = Field(default=1.0, gt=0)  # median; below it a direction is not judged

@@ -139,6 +139,7 @@ class Line:
                 self.keypoints,
                 guided,
                 self.coarse,
+                self.frames.timestamps,
                 self.settings,
                 self.num_threads,
             ),

@@ -9,7 +9,8 @@ from gsba.motion import Steps
 from gsba.types import CoarsePoses, PoseSource
 
 _MIN_STEPS = 5  # fewer say nothing about a whole trajectory
-_FITS = 0.3  # part of the steps that must agree
+_FITS = 0.5  # part of the steps that must roughly agree: of random ones, a third does
+_LOOSE = {"max_rotation_deg": 20.0, "max_direction_deg": 60.0}  # roughly
 _DOUBTFUL = 0.6  # part below which another reading that explains the rest is the right one
 _EXPLAINS = 0.7  # part of the steps that a reading must explain to be named
 _WITHOUT = "or refine without it (--no-trajectory)"
@@ -50,7 +51,11 @@ def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -
     }
     best = max(shares, key=lambda reading: shares[reading])
     explained = best and shares[best] >= _EXPLAINS and shares[""] < _DOUBTFUL
-    if shares[""] >= _FITS and not explained:
+    loose = settings.model_copy(update=_LOOSE)
+    if (
+        not explained
+        and _agreeing(_readings(coarse.world_T_rigs)[""], found, judged, loose) > _FITS
+    ):
         return
     text = f"the images contradict {round((1 - shares['']) * total)} of {total} steps"
     if explained:

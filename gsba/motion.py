@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from gsba.blame import chained, false_frames
 from gsba.config import PriorSettings, VerifySettings
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.types import CoarsePoses, FrameSet, Keypoints, PoseSource, VerifiedPairs
@@ -20,6 +21,7 @@ logger = logging.getLogger(__name__)
 
 _MIN_COMMON = 8  # points that two steps must share to compare their lengths
 _MIN_POINT_PARALLAX = np.deg2rad(1.0)  # of a point, or its depth is not worth comparing
+_STILL = np.deg2rad(0.1)  # median: what a mere turn leaves over of bearings
 _RATIO_SIGMA = 0.02  # least noise of the logarithm of a ratio of lengths
 _SMOOTH_SIGMA = 0.5  # of the same where nothing is measured: walkers keep their pace
 _LENGTH_ROUNDS = 20  # of reweighting
@@ -68,11 +70,21 @@ def steps(pairs: VerifiedPairs, keypoints: Keypoints, settings: VerifySettings) 
             continue
         rows, f0_T_f1 = pairs.matches.of(p), pairs.f0_T_f1s[p]
         rays0 = keypoints.bearings_of(f0)[rows[:, 0]]
-        rays1 = keypoints.bearings_of(f1)[rows[:, 1]] @ f0_T_f1[:3, :3].T
+        bearings1 = keypoints.bearings_of(f1)[rows[:, 1]]
+        rays1 = bearings1 @ f0_T_f1[:3, :3].T
         chord = np.median(np.linalg.norm(rays0 - rays1, axis=1))
         f_T_nexts[f0], verified[f0] = f0_T_f1, True
+        turn = _turn(rays0, bearings1)
+        if np.median(np.linalg.norm(rays0 - bearings1 @ turn.T, axis=1)) < _STILL:
+            f_T_nexts[f0, :3, :3] = turn  # an essential matrix knows it less well
         directed[f0] = 2 * np.arcsin(chord / 2) > np.deg2rad(settings.min_parallax_deg)
     return Steps(f_T_nexts, verified, directed)
+
+
+def _turn(rays0: np.ndarray, rays1: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) that carries rays (m, 3) onto others in least squares (Kabsch, 1976)."""
+    u, _, vt = np.linalg.svd(rays0.T @ rays1)
+    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
 
 
 def length_ratios(
@@ -213,7 +225,7 @@ def judge(
         start = _chain(coarse.world_T_rigs, chosen, own)
     else:
         start = coarse.world_T_rigs
-    named = _named(wrong, slam, chosen, own, verify)
+    named = false_frames(wrong, slam, chosen, own, verify)
     return Trust(start, wrong, named, unseen, lengths, False)
 
 
@@ -231,9 +243,11 @@ def _from_images_alone(
     moved = found.directed
     chosen[moved, :3, 3] = lengths[moved, None] * found.f_T_nexts[moved, :3, 3]
     own = coarse.sources == PoseSource.SLAM
+    turning_only = bool(found.verified.any() and not moved.any())
+    if turning_only and not own.any():
+        chosen[:, :3, 3] = 0
     start = _chain(coarse.world_T_rigs, chosen, own)
     every, nobody = np.ones(len(slam), bool), np.zeros(len(slam) + 1, bool)
-    turning_only = bool(found.verified.any() and not moved.any())
     return Trust(start, every, nobody, ~found.verified, lengths, turning_only)
 
 
@@ -257,7 +271,12 @@ def describe(trust: Trust, frames: FrameSet) -> tuple[dict[str, list[Any]], list
         notes.append("no frame has parallax to the next: no depth can be had, rotations only")
     if trust.unseen_steps.any():
         steps = ", ".join(f"{a} to {b}" for a, b in judgement["unseen_steps"])
-        notes.append(f"no images in common, held by the trajectory alone: {steps}")
+        held = (
+            "what follows is placed by guess"
+            if trust.false_steps.all()
+            else ("held by the trajectory alone")
+        )
+        notes.append(f"no images in common, {held}: {steps}")
     for note in notes:
         logger.warning(note)
     return judgement, notes
@@ -273,10 +292,7 @@ def _disagreement(slam: np.ndarray, found: Steps) -> tuple[np.ndarray, np.ndarra
 
 def _chain(world_T_rigs: np.ndarray, chosen: np.ndarray, own: np.ndarray) -> np.ndarray:
     """Poses (F, 4, 4) that follow the chosen steps, laid over the trajectory's own frames."""
-    chained = [np.eye(4)]
-    for step in chosen:
-        chained.append(chained[-1] @ step)
-    poses = np.array(chained)
+    poses = chained(chosen)
     own = own if own.any() else np.ones(len(own), bool)
     u, _, vt = np.linalg.svd(
         np.einsum("fij,fkj->ik", world_T_rigs[own, :3, :3], poses[own, :3, :3])
@@ -285,32 +301,3 @@ def _chain(world_T_rigs: np.ndarray, chosen: np.ndarray, own: np.ndarray) -> np.
     positions = poses[:, :3, 3] @ rotation.T
     shift = np.median(world_T_rigs[own, :3, 3] - positions[own], axis=0)
     return pose(rotation @ poses[:, :3, :3], positions + shift)
-
-
-def _named(
-    wrong: np.ndarray,
-    slam: np.ndarray,
-    chosen: np.ndarray,
-    own: np.ndarray,
-    settings: VerifySettings,
-) -> np.ndarray:
-    """Frames (F,) whose own pose is false: a false step on each side, the one over both right.
-
-    A false step that no such frame explains is a jump for good, and the frame after it is named.
-    Where a step ends in a filled-in pose, nobody is: that pose was a guess.
-    """
-    num = len(wrong) + 1
-    named, explained = np.zeros(num, bool), ~(own[:-1] & own[1:])
-    for f in range(1, num - 1):
-        if not (wrong[f - 1] and wrong[f] and own[f]):
-            continue
-        over_slam, over = slam[f - 1] @ slam[f], chosen[f - 1] @ chosen[f]
-        turned = rotation_angle(over_slam[:3, :3].T @ over[:3, :3])
-        off = np.linalg.norm(over_slam[:3, 3] - over[:3, 3])
-        length = np.linalg.norm(over[:3, 3])
-        allowed = np.sin(np.deg2rad(settings.max_direction_deg)) * length
-        if turned < np.deg2rad(settings.max_rotation_deg) and off < allowed:
-            named[f] = explained[f - 1] = explained[f] = True
-    for f in np.flatnonzero(wrong & ~explained):
-        named[f + 1] = True
-    return named

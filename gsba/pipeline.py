@@ -1,8 +1,12 @@
 """A run from frames and a coarse trajectory to refined poses, a cloud and datasets."""
 
+import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from gsba import read, video
 from gsba.adjust import Adjustment
@@ -19,6 +23,8 @@ from gsba.report import build_report, take_notes, write_poses, write_report
 from gsba.report_html import write_html
 from gsba.store import RunStore, atomic_write, fingerprint, load_stage
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, Reconstruction, Trajectory
+
+logger = logging.getLogger(__name__)
 
 _GAUGE = (
     "Sim(3)-aligned to the coarse trajectory over its refined SLAM poses: its world and scale; "
@@ -56,6 +62,7 @@ def refine(
     out: Path | str,
     settings: RefineSettings | None = None,
     *,
+    keyframes: Path | None = None,
     masks: Path | str | None = None,
     timestamps: Path | None = None,
     fps: float | None = None,
@@ -73,6 +80,7 @@ def refine(
             alone: the first step's length is the unit and the first frame the world.
         out: folder of the run.
         settings: see `gsba.config`.
+        keyframes: second trajectory file of the same run, with its keyframes: they lead.
         masks: one ERP mask for all frames, or a folder of one for each; white = use; or "auto".
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
@@ -87,10 +95,9 @@ def refine(
     settings, origin = settings or RefineSettings(), {"frames": frames}
     check(settings.placement)
     mask_files = None if masks is None or masks == AUTO else Path(masks)
-    given = None
-    if trajectory is not None:  # fails before hours of decoding, not after
-        origin["trajectory"] = Path(trajectory)
-        given = read.read_trajectory(Path(trajectory), timestamps)
+    paths = {"trajectory": trajectory, "keyframes": keyframes}
+    origin |= {name: Path(path) for name, path in paths.items() if path is not None}
+    given = _given(origin, timestamps)  # fails before hours of decoding, not after
     if video.is_video(frames):
         _extract(out, origin, settings, fps, fresh)
         frame_set, fresh = read.scan(out / "frames", masks=mask_files), False
@@ -122,12 +129,26 @@ def _solve(line: Line, settings: RefineSettings) -> Adjustment:
     return solved
 
 
+def _given(origin: Mapping[str, Path], timestamps: Path | None) -> Trajectory | None:
+    """The trajectory of the files of a run, if any."""
+    if "trajectory" not in origin:
+        return None
+    trajectory = read.read_trajectory(origin["trajectory"], timestamps)
+    if "keyframes" in origin:
+        keyframes = read.read_trajectory(origin["keyframes"], timestamps)
+        trajectory = read.follow_keyframes(trajectory, keyframes)
+    return trajectory
+
+
 def _coarse(frames: FrameSet, given: Trajectory | None, settings: RefineSettings) -> CoarsePoses:
     """Start poses of frames, refused where no video could have them."""
     if given is None:
         return read.without_trajectory(frames)
     coarse = read.associate(frames, given, settings.read)
     refuse_useless(coarse)
+    if np.ptp(coarse.world_T_rigs[:, :3, 3], axis=0).max() == 0:
+        logger.warning("the trajectory only turns: positions come from the images alone")
+        return read.without_trajectory(frames)
     return coarse
 
 

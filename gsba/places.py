@@ -27,6 +27,7 @@ _LOOKS = 3  # places compared for each frame
 _TRIALS = 200  # of three points each
 _POINT_DEG = 1.0  # a point of one frame's map seen in the other
 _MIN_POINTS = 15
+_MIN_SHARE = 0.25  # of the matches, to measure a loop at all: consistency decides
 _MIN_GROUP = 3  # loops that must agree
 _RIVAL = 1.5  # by how much a group must outweigh one that contradicts it
 _TURN_DEG, _UNSEEN_TURN_DEG = 10.0, 45.0  # of the map between two frames, and per unseen step
@@ -73,7 +74,7 @@ def run(
     looks = describe(strongest, len(solved.world_T_rigs), settings.seed)
     chosen = candidates(looks, solved, unseen, settings)
     verified = recovery.match_anywhere(
-        strongest, strongest, keypoints, chosen, settings, num_threads
+        strongest, strongest, keypoints, chosen, settings, num_threads, _MIN_SHARE
     )
     loops = _measure(verified, keypoints, solved, settings.seed)
     within = [loop for loop in loops if _within_drift(loop, solved, unseen, settings)]

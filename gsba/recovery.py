@@ -11,6 +11,7 @@ from gsba.matching import Gate, SearchableFrames
 from gsba.motion import Trust
 from gsba.types import CoarsePoses, Counts, Keypoints, Matches, VerifiedPairs
 
+_PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
 _ANYWHERE = Gate(np.pi, 1e3, np.pi)
 
 
@@ -28,18 +29,21 @@ def run(
     keypoints: Keypoints,
     guided: VerifiedPairs,
     coarse: CoarsePoses,
+    timestamps: np.ndarray,
     settings: RefineSettings,
     num_threads: int,
 ) -> Recovered:
     """Match the neighbours that guidance lost, judge the trajectory, and guide anew from that.
 
     Frames next to one another are compared as a whole: they share so much that repeated structure
-    does not mislead. Frames two apart, where it does, are only matched along the steps found.
+    does not mislead. Frames two apart, or with a pause between them, where it does, are only
+    matched along the steps found or the trajectory.
 
     Args:
         frames, strongest, keypoints: features of all frames.
         guided: neighbours verified under the trajectory's guidance; all of them where it is right.
         coarse: the trajectory.
+        timestamps: (F,) seconds.
         settings: of pairs, matching, verification and priors.
         num_threads: pairs matched at a time.
 
@@ -47,7 +51,9 @@ def run(
         GsbaError: the images contradict most of the trajectory.
     """
     chosen = pairs.adjacent(len(coarse.sources))
-    lost = _missing(chosen[chosen[:, 1] - chosen[:, 0] == 1], guided)
+    intervals = np.diff(timestamps)
+    close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
+    lost = _missing(np.column_stack([close, close + 1]), guided)
     alone = _join(
         [guided, match_anywhere(strongest, frames, keypoints, lost, settings, num_threads)]
     )
@@ -57,15 +63,7 @@ def run(
         return Recovered(guided, trust)
     again = _missing(chosen, alone)
     again = again[again[:, 1] - again[:, 0] == 2]
-    prior = settings.pairs.prior
-    limit = np.deg2rad(settings.pairs.max_parallax_deg)
-    gates = [Gate(np.deg2rad(prior.rotation_deg), prior.direction, limit)] * len(again)
-    poses = trust.world_T_rigs
-    found = matching.run(again, poses, gates, frames, settings.matching, num_threads)
-    f0_T_f1s = inverse(poses[again[:, 0]]) @ poses[again[:, 1]]
-    over = verify.run(
-        found, keypoints, f0_T_f1s, np.zeros(len(again)), settings.verify, settings.seed
-    )
+    over = _match_along(trust.world_T_rigs, again, frames, keypoints, settings, num_threads)
     neighbours = _join([alone, over])
     doubtful = [p for p in _index(lost) if not _supported(p, neighbours, keypoints, settings)]
     if doubtful:
@@ -78,6 +76,23 @@ def run(
         {"no common geometry": len(chosen) - len(neighbours.matches.pairs)},
     )
     return Recovered(VerifiedPairs(neighbours.matches, neighbours.f0_T_f1s, counts), trust)
+
+
+def _match_along(
+    world_T_rigs: np.ndarray,
+    chosen: np.ndarray,
+    frames: SearchableFrames,
+    keypoints: Keypoints,
+    settings: RefineSettings,
+    num_threads: int,
+) -> VerifiedPairs:
+    """Match pairs (P, 2) guided by the start, and verify that they agree with it."""
+    prior, limit = settings.pairs.prior, np.deg2rad(settings.pairs.max_parallax_deg)
+    gates = [Gate(np.deg2rad(prior.rotation_deg), prior.direction, limit)] * len(chosen)
+    found = matching.run(chosen, world_T_rigs, gates, frames, settings.matching, num_threads)
+    f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
+    sigmas = np.zeros(len(chosen))
+    return verify.run(found, keypoints, f0_T_f1s, sigmas, settings.verify, settings.seed)
 
 
 def nothing_verified() -> VerifiedPairs:
@@ -94,6 +109,7 @@ def match_anywhere(
     chosen: np.ndarray,
     settings: RefineSettings,
     num_threads: int,
+    min_share: float | None = None,
 ) -> VerifiedPairs:
     """Match whole panoramas without any prediction, and verify their geometry alone.
 
@@ -104,7 +120,12 @@ def match_anywhere(
         chosen: (P, 2) frame indices.
         settings: of matching and verification.
         num_threads: pairs matched at a time.
+        min_share: part of the matches that must be of one geometry; None = as for neighbours.
     """
+    if min_share is not None:
+        settings = settings.model_copy(
+            update={"verify": settings.verify.model_copy(update={"min_share": min_share})}
+        )
     nowhere = np.tile(np.eye(4), (len(keypoints.starts) - 1, 1, 1))
 
     def verified(among: SearchableFrames, some: np.ndarray) -> VerifiedPairs:

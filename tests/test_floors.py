@@ -19,8 +19,8 @@ FLOORS = (
     {"rig", "records", "run_folder", "search", "store", "read", "panorama", "views"},
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter", "align", "splat"},
-    {"adjust", "frontend", "learned", "misfit", "motion", "places", "reconstruction", "recovery"}
-    | {"splat_align", "splatting"},
+    {"adjust", "blame", "frontend", "learned", "misfit", "motion", "places", "reconstruction"}
+    | {"recovery", "splat_align", "splatting"},
     {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"}
     | {"alignment", "carrier", "gravity", "placement"},
     {"demo", "extraction", "line", "pipeline"},

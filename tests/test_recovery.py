@@ -18,6 +18,7 @@ TRUTH = pose(
     np.tile(np.eye(3), (NUM_FRAMES, 1, 1)), np.outer(np.arange(NUM_FRAMES), [0.3, 0.0, 0.05])
 )
 SETTINGS = RefineSettings()
+TIMES = np.arange(NUM_FRAMES, dtype=float)
 
 
 def _scene(cut: int | None = None) -> tuple[SearchableFrames, Keypoints]:
@@ -34,12 +35,12 @@ def _scene(cut: int | None = None) -> tuple[SearchableFrames, Keypoints]:
     return SearchableFrames(frames.__getitem__), features.gather(frames)
 
 
-def _run(slam: np.ndarray, cut: int | None = None) -> Recovered:
+def _run(slam: np.ndarray, cut: int | None = None, times: np.ndarray = TIMES) -> Recovered:
     frames, keypoints = _scene(cut)
     start = adjust.start(slam)
     guided = frontend.match_neighbours(frames, frames, keypoints, start, SETTINGS, 1)
     coarse = CoarsePoses(slam, np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8), 0.0)
-    return recovery.run(frames, frames, keypoints, guided, coarse, SETTINGS, 1)
+    return recovery.run(frames, frames, keypoints, guided, coarse, times, SETTINGS, 1)
 
 
 def test_a_right_trajectory_is_left_alone() -> None:
@@ -64,6 +65,15 @@ def test_neighbours_of_a_false_pose_are_matched_without_it() -> None:
         true = inverse(TRUTH[f0]) @ TRUTH[f1]
         assert np.degrees(rotation_angle(found.f0_T_f1s[p, :3, :3])) < 0.1
         assert found.f0_T_f1s[p, :3, 3] @ unit(true[:3, 3]) > np.cos(np.deg2rad(1))
+
+
+def test_frames_with_a_pause_between_them_are_no_neighbours() -> None:
+    slam = TRUTH.copy()
+    slam[4:, :3, 3] += [0, 2.0, 0]
+    times = np.arange(NUM_FRAMES) + 5.0 * (np.arange(NUM_FRAMES) >= 4)
+    assert np.flatnonzero(_run(slam).trust.false_steps).tolist() == [3]
+    paused = _run(slam, times=times).trust
+    assert np.flatnonzero(paused.unseen_steps).tolist() == [3] and not paused.false_steps.any()
 
 
 def test_two_places_stay_two() -> None:

@@ -32,6 +32,9 @@ def refine(
     trajectory: Annotated[
         Path | None, typer.Argument(help="TUM, KITTI or stella_vslam map.msg.")
     ] = None,
+    keyframes: Annotated[
+        Path | None, typer.Option(help="Keyframe trajectory of the same run.", metavar="FILE")
+    ] = None,
     no_trajectory: Annotated[
         bool, typer.Option("--no-trajectory", help="Start from the images alone.")
     ] = False,
@@ -56,6 +59,8 @@ def refine(
     """Refine the pose of every frame; the same call again resumes."""
     if (trajectory is None) != no_trajectory:
         raise GsbaError("give either a TRAJECTORY or --no-trajectory")
+    if keyframes is not None and no_trajectory:
+        raise GsbaError("--keyframes go with the TRAJECTORY of the same run")
     settings = _settings(config, overrides, factors)
     from gsba import pipeline
 
@@ -64,6 +69,7 @@ def refine(
         trajectory,
         out,
         settings,
+        keyframes=keyframes,
         masks="auto" if str(masks) == "auto" else masks,
         timestamps=timestamps,
         fps=fps,

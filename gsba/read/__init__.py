@@ -3,12 +3,14 @@
 from gsba.read.associate import associate, without_trajectory
 from gsba.read.frames import load_erp, load_faces, scan
 from gsba.read.gps import GpsFixes, local_from_geodetic, read_gps
+from gsba.read.keyframes import follow_keyframes
 from gsba.read.masks import load_mask
 from gsba.read.trajectory import read_trajectory, write_tum
 
 __all__ = [
     "GpsFixes",
     "associate",
+    "follow_keyframes",
     "load_erp",
     "load_faces",
     "load_mask",
