@@ -19,8 +19,8 @@ def rig_for(frames: FrameSet, settings: CubemapSettings) -> CubeRig:
 
     Unless a size is set, a face centre has `oversampling` times the pixel density of the
     panorama's equator (half is enough where patches refine what features find, a little more than
-    one loses nothing), within `min_face_size` and `max_face_size`. Frames that come as cube faces keep their own size and
-    90 degrees.
+    one loses nothing), within `min_face_size` and `max_face_size`. Frames that come as cube faces
+    keep their own size and 90 degrees.
     """
     if frames.layout == "cube":
         return CubeRig(frames.width, np.pi / 2)
