@@ -4,6 +4,7 @@ from factors.bearing import BearingFactor, BearingTerm, bearing_residuals, tange
 from factors.block import Block, PoseSystem
 from factors.check import jacobian_errors
 from factors.landmarks import LandmarkBlock
+from factors.patches import PatchSet
 from factors.reprojection import (
     FaceCameras,
     ReprojectionFactor,
@@ -11,6 +12,7 @@ from factors.reprojection import (
     reprojection_residuals,
 )
 from factors.robust import RobustLoss
+from factors.sphere_image import SphereImage
 
 __all__ = [
     "BearingFactor",
@@ -18,10 +20,12 @@ __all__ = [
     "Block",
     "FaceCameras",
     "LandmarkBlock",
+    "PatchSet",
     "PoseSystem",
     "ReprojectionFactor",
     "ReprojectionTerm",
     "RobustLoss",
+    "SphereImage",
     "bearing_residuals",
     "jacobian_errors",
     "reprojection_residuals",
