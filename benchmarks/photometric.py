@@ -15,9 +15,10 @@ import numpy as np
 
 from benchmarks.common import machine, peak_mb
 from factors import RobustLoss
-from factors.patches import PatchPixels, PatchTable, pixel_grid, planes_from
+from factors.patch_windows import PatchPixels, PatchTable, pixel_grid, planes_from
 from factors.photometric import PhotometricBlock
-from factors.sphere_image import SphereImage, halved
+from factors.sphere_image import SphereImage
+from gsba.patch_grid import halved
 
 RADIUS = 4.0  # of the ball, units
 

@@ -14,10 +14,10 @@ import gtsam
 import numpy as np
 
 from factors import RobustLoss
-from factors.patches import PatchPixels, PatchTable, patch_spans, pixel_grid, pixels_of
+from factors.patch_windows import PatchPixels, PatchTable, patch_spans, pixel_grid, pixels_of
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
-from gsba import patches, read
+from gsba import patch_grid, read
 from gsba.config import PhotometricSettings, SolverSettings
 from gsba.demo import make_walk
 from gsba.geometry import bearings_from_erp
@@ -37,8 +37,8 @@ def exact_table(folder: Path, truth: np.ndarray, pyramids: list, settings: Photo
         u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         rays = bearings_from_erp(np.stack([u, v], axis=-1), width, height)
         hit = depth > 0
-        found = patches.candidates(greys[0], usable, settings)
-        laid, clear = patches.lay_planes(found, rays[hit] * depth[hit][:, None], settings)
+        found = patch_grid.candidates(greys[0], usable, settings)
+        laid, clear = patch_grid.lay_planes(found, rays[hit] * depth[hit][:, None], settings)
         hosts.append(np.full(np.count_nonzero(clear), f))
         bearings.append(found[clear])
         planes.append(laid[clear])
@@ -118,7 +118,7 @@ def main() -> None:
     frames = read.scan(options.folder / "images", None, None, None)
     truth = read.read_trajectory(options.folder / "groundtruth.tum").world_T_rigs[:NUM_FRAMES]
     settings = PhotometricSettings(spacing_deg=10, depth_reach_deg=4)
-    pyramids = [patches.pyramid(frames, f, settings, 2) for f in range(NUM_FRAMES)]
+    pyramids = [patch_grid.pyramid(frames, f, settings, 2) for f in range(NUM_FRAMES)]
     table = exact_table(options.folder, truth, pyramids, settings)
     print(f"{len(table)} patches, {len(table.targets)} observations, {frames.width} px wide")
     print("start px | " + " | ".join(f"{name}: converged, median px" for name in STRATEGIES))

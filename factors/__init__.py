@@ -4,7 +4,8 @@ from factors.bearing import BearingFactor, BearingTerm, bearing_residuals, tange
 from factors.block import Block, PoseSystem
 from factors.check import jacobian_errors
 from factors.landmarks import LandmarkBlock
-from factors.patches import PatchPixels, PatchTable
+from factors.patch_windows import PatchPixels, PatchTable
+from factors.patches import PatchSet
 from factors.photometric import PhotometricBlock
 from factors.photometric_factor import PhotometricFactor, photometric_residuals
 from factors.reprojection import (
@@ -23,6 +24,7 @@ __all__ = [
     "FaceCameras",
     "LandmarkBlock",
     "PatchPixels",
+    "PatchSet",
     "PatchTable",
     "PhotometricBlock",
     "PhotometricFactor",

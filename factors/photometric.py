@@ -15,7 +15,7 @@ from factors._photometric_kernels import DIMS, PatchData, observe_range
 from factors._photometric_schur import eliminate_range
 from factors._terms import pose_rows
 from factors.block import PoseSystem
-from factors.patches import PatchPixels, covisible_frames, patch_axes, poor_views
+from factors.patch_windows import PatchPixels, covisible_frames, patch_axes, poor_views
 from factors.robust import RobustLoss
 
 FAMILY = "photometric"

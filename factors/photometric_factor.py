@@ -4,10 +4,18 @@ A patch of one frame, its grey values less their mean over their contrast, is co
 same patch of another frame, normalised alike: gain and offset between both drop out.
 """
 
+from typing import Protocol
+
 import gtsam
 import numpy as np
 
-from factors.sphere_image import SphereImage
+
+class Sampled(Protocol):
+    """An image on the sphere: a `SphereImage`, or what is sampled like one."""
+
+    def sample(self, vectors_rig: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values (...) and gradients (..., 3) along vectors (..., 3)."""
+        ...
 
 
 def normalised(values: np.ndarray, floor: float) -> tuple[np.ndarray, float]:
@@ -28,15 +36,15 @@ def photometric_residuals(
     axes: np.ndarray,
     grid: np.ndarray,
     template: np.ndarray,
-    image: SphereImage,
+    image: Sampled,
     floor: float = 0.25,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Residual of each pixel of a patch in one target, in grey values of the host's patch.
 
     Args:
         world_T_host, world_T_target: (4, 4) float64.
-        plane: (3,) inverse depth and slopes, see `factors.patches.planes_from`.
-        axes: (3, 3) bearing and tangent axes, see `factors.patches.patch_axes`.
+        plane: (3,) inverse depth and slopes, see `factors.patch_windows.planes_from`.
+        axes: (3, 3) bearing and tangent axes, see `factors.patch_windows.patch_axes`.
         grid: (N, 2) tangents of the pixels.
         template: (N,) grey values in the host.
         image: the target's.
@@ -73,7 +81,7 @@ def PhotometricFactor(
     axes: np.ndarray,
     grid: np.ndarray,
     template: np.ndarray,
-    image: SphereImage,
+    image: Sampled,
     noise_model: gtsam.noiseModel.Base,
     slopes: np.ndarray | None = None,
     floor: float = 0.25,

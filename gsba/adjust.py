@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import gtsam
@@ -14,16 +14,18 @@ from factors import (
     LandmarkBlock,
     ReprojectionTerm,
     RobustLoss,
-    bearing_residuals,
+    tangent_basis,
 )
 from gsba import graph, triangulate
 from gsba.config import RefineSettings, SolverSettings
 from gsba.optimize import Iteration, marginal_covariances, optimize
 from gsba.rig import RIG_R_FACE, CubeRig
-from gsba.types import Counts, Keypoints, Landmarks, Tracks
+from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
 
 logger = logging.getLogger(__name__)
 
+_LEAST = 1e-3  # times its claimed sigma: no observation is better than that
+_WIDE = 20.0  # gate in sigmas for observations whose noise is not known yet
 _REDUNDANT = 0.1  # least share of residual dimensions left over by the unknowns
 
 
@@ -60,6 +62,56 @@ def start(world_T_rigs: np.ndarray) -> Adjustment:
     return Adjustment(world_T_rigs, landmarks, 1.0, ())
 
 
+def run_sighted(
+    sighted: Sighted,
+    before: Adjustment,
+    priors: gtsam.NonlinearFactorGraph,
+    rig: CubeRig,
+    gates: Sequence[float],
+    settings: RefineSettings,
+    num_threads: int,
+) -> tuple[Adjustment, Keypoints]:
+    """As `run`, of aligned and former observations, the noise of either estimated on its own.
+
+    Returns:
+        The solution, and its keypoints with the noise that they turned out to have.
+    """
+    solved, rounds = before, []
+    for number, gate in enumerate(gates, 1):
+        sighted = calibrate(sighted, solved, settings)
+        tracks, keypoints, start = sighted.tracks, sighted.keypoints, replace(solved, noise=1.0)
+        solver = _solver(settings, last=number == len(gates))
+        so_far = settings.model_copy(update={"solver": solver})
+        solved = run(tracks, keypoints, start, priors, rig, (gate,), so_far, num_threads)
+        rounds += solved.rounds
+    return replace(solved, rounds=tuple(rounds)), sighted.keypoints
+
+
+def calibrate(sighted: Sighted, before: Adjustment, settings: RefineSettings) -> Sighted:
+    """Scale new and former observations' noise to what a solution shows of each.
+
+    A patch's covariance knows the image's noise and texture, not how far a surface or a lens is
+    from the model; residuals do. They also hold what the poses are off: too much noise, until
+    poses are adjusted.
+    """
+    tracks, keypoints = sighted.tracks, sighted.keypoints
+    rows, poses = keypoints.rows(tracks), before.world_T_rigs
+    bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
+    placed = triangulate.run(tracks, bearings, sigmas, poses, _WIDE, settings.triangulate)
+    factors = np.ones(len(keypoints.faces))
+    for group in (sighted.aligned, ~sighted.aligned):
+        chosen = group[keypoints.rows(placed.tracks)]
+        if np.count_nonzero(chosen) >= settings.rounds.min_observations:
+            factors[group] = max(_noise(placed, keypoints, poses, chosen), _LEAST)
+    infos = keypoints.sqrt_infos
+    scaled = replace(
+        keypoints,
+        sigmas_rad=keypoints.sigmas_rad * factors,
+        sqrt_infos=None if infos is None else infos / factors[:, None, None],
+    )
+    return replace(sighted, keypoints=scaled)
+
+
 def run(
     tracks: Tracks,
     keypoints: Keypoints,
@@ -69,6 +121,7 @@ def run(
     gates: Sequence[float],
     settings: RefineSettings,
     num_threads: int,
+    final: bool = True,
 ) -> Adjustment:
     """Solve for all poses in rounds of tightening gates.
 
@@ -85,18 +138,20 @@ def run(
         gates: of each round, in standard deviations of the noise.
         settings: families, loss, solver.
         num_threads: of the solver.
+        final: whether the last round is solved to the end; others lose observations anyway.
     """
     world_T_rigs, noise, rounds = start.world_T_rigs, start.noise, []
     rows = keypoints.rows(tracks)
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
-    place = partial(triangulate.run, tracks, bearings, sigmas, settings=settings.triangulate)
+    shared = {"settings": settings.triangulate, "num_threads": num_threads}
+    place = partial(triangulate.run, tracks, bearings, sigmas, **shared)
     last_gate = gates[-1] * noise
     support = len(place(world_T_rigs, last_gate).tracks)
     for number, gate in enumerate(gates, 1):
         landmarks = place(world_T_rigs, gate * noise)
         spread = noise * max(1.0, gate / settings.rounds.gate_scale)
         block = landmark_block(landmarks, keypoints, rig, spread, settings, num_threads)
-        solver = _solver(settings, last=number == len(gates))
+        solver = _solver(settings, last=final and number == len(gates))
         result = optimize(priors, [block], values_of(world_T_rigs), solver)
         poses = poses_of(result.values, len(world_T_rigs))
         new_support = len(place(poses, last_gate).tracks)
@@ -106,24 +161,22 @@ def run(
             placed = place(poses, gate * noise)
             if len(placed.tracks):
                 noise = max(_noise(placed, keypoints, poses), settings.rounds.min_noise)
-        rounds.append(
-            Round(
-                gate,
-                noise,
-                len(landmarks.tracks),
-                landmarks.tracks.num_points,
-                new_support,
-                accepted,
-                result.history,
-                result.reason,
-            )
-        )
+        used = len(landmarks.tracks), landmarks.tracks.num_points
+        outcome = accepted, result.history, result.reason
+        rounds.append(Round(gate, noise, *used, new_support, *outcome))
         logger.debug("round: %s", rounds[-1])
     return Adjustment(world_T_rigs, place(world_T_rigs, gates[-1] * noise), noise, tuple(rounds))
 
 
+def carries(solved: Adjustment, before: Adjustment, least: int) -> bool:
+    """Whether every frame with `least` observations in one solution has as many in the other."""
+    num = len(before.world_T_rigs)
+    seen = [np.bincount(one.landmarks.tracks.frames, minlength=num) for one in (solved, before)]
+    return bool(np.all((seen[0] >= least) | (seen[1] < least)))
+
+
 def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
-    """Settings of a round: only the last is solved to the end, the others lose observations."""
+    """Settings of a round: only the last of a run is solved to the end."""
     if last or settings.rounds.tolerance < settings.solver.relative_tolerance:
         return settings.solver
     return settings.solver.model_copy(update={"relative_tolerance": settings.rounds.tolerance})
@@ -142,10 +195,10 @@ def landmark_block(
     share = noise * np.sqrt(len({"bearing", "reprojection"} & set(settings.factors)))
     terms = []
     if "bearing" in settings.factors:
-        sigmas = share * keypoints.sigmas_rad[rows]
-        terms.append(
-            BearingTerm(tracks.frames, tracks.points, keypoints.bearings_rig[rows], sigmas)
-        )
+        sigmas, infos = share * keypoints.sigmas_rad[rows], keypoints.sqrt_infos
+        roots = None if infos is None else infos[rows] / share
+        bearings = keypoints.bearings_rig[rows]
+        terms.append(BearingTerm(tracks.frames, tracks.points, bearings, sigmas, roots))
     if "reprojection" in settings.factors:
         bearings, faces = keypoints.bearings_rig[rows], keypoints.faces[rows]
         cosines = np.einsum("oi,oi->o", bearings, RIG_R_FACE[faces, :, 2])
@@ -183,19 +236,37 @@ def pose_covariances(
     return marginal_covariances(held, [block], values_of(adjustment.world_T_rigs), keys)
 
 
-def _noise(landmarks: Landmarks, keypoints: Keypoints, world_T_rigs: np.ndarray) -> float:
+def _noise(
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    world_T_rigs: np.ndarray,
+    chosen: np.ndarray | slice = slice(None),
+) -> float:
     """Noise in units of the features' sigmas: robust spread of residuals over its expectation.
 
     The points are placed by least squares: under the robust loss of the adjustment they would lie
     closer to most of their observations than the noise allows.
+
+    Args:
+        chosen: (O,) bool, observations whose spread is asked for; all share one redundancy.
     """
     tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
     points, bearings = landmarks.points_world[tracks.points], keypoints.bearings_rig[rows]
-    residuals, _, _ = bearing_residuals(world_T_rigs[tracks.frames], points, bearings)
+    world_T_rig = world_T_rigs[tracks.frames]
+    offsets = np.einsum("oji,oj->oi", world_T_rig[:, :3, :3], points - world_T_rig[:, :3, 3])
+    residuals = np.einsum("oij,oj->oi", tangent_basis(bearings), offsets)
+    residuals /= np.linalg.norm(offsets, axis=1, keepdims=True)  # sines: the angles are small
     unknowns = 3 * landmarks.tracks.num_points + 6 * len(world_T_rigs)
     redundancy = max(1 - unknowns / residuals.size, _REDUNDANT)
-    spread = 1.4826 * np.median(np.abs(residuals / keypoints.sigmas_rad[rows, None]))
+    spread = 1.4826 * np.median(np.abs(_whitened(residuals, keypoints, rows)[chosen]))
     return float(spread / np.sqrt(redundancy))
+
+
+def _whitened(residuals: np.ndarray, keypoints: Keypoints, rows: np.ndarray) -> np.ndarray:
+    """Residuals (O, 2) in radians in units of their standard deviations."""
+    if keypoints.sqrt_infos is None:
+        return residuals / keypoints.sigmas_rad[rows, None]
+    return np.einsum("oij,oj->oi", keypoints.sqrt_infos[rows], residuals)
 
 
 def values_of(world_T_rigs: np.ndarray) -> gtsam.Values:

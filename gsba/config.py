@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 
 class _Settings(BaseModel):
@@ -18,22 +18,38 @@ class ReadSettings(_Settings):
     clock_offset_s: float | None = None  # s to add to frame times; None = clocks agree or one fits
 
 
+class VideoSettings(_Settings):
+    """Frames taken from a video, where one is given in their place."""
+
+    fps: float = Field(default=1.0, gt=0)  # frames kept per second
+    every: int | None = Field(default=None, ge=1)  # keep one of so many frames instead
+    at: str | None = None  # trajectory file: keep the frames at its times instead
+    sharpest: bool = False  # of the frames that one is kept of; else the first
+    from_s: float | None = Field(default=None, ge=0)  # seconds after the first frame
+    to_s: float | None = Field(default=None, gt=0)
+    width: int | None = Field(default=None, ge=64, multiple_of=2)  # pixels; None = as the video
+    standing_deg: float = Field(
+        default=0.1, ge=0
+    )  # less apparent motion since the last frame: the camera stands, leave out; 0 = keep all
+
+
 class CubemapSettings(_Settings):
     """Faces cut from a panorama for detection."""
 
     hfov_deg: float = Field(default=96.0, ge=90, le=120)
     face_size: int | None = Field(default=None, ge=64)  # pixels; None = by oversampling
-    oversampling: float = Field(default=1.15, ge=0.25, le=4)  # face pixels per panorama pixel
-    min_face_size: int = Field(default=512, ge=64)  # pixels; bounds on the automatic size
+    oversampling: float = Field(default=0.5, ge=0.25, le=4)  # face pixels per panorama pixel
+    min_face_size: int = Field(default=256, ge=64)  # pixels; bounds on the automatic size
     max_face_size: int = Field(default=1024, ge=64)
 
 
 class FeatureSettings(_Settings):
     """Keypoints on faces."""
 
-    extractor: Literal["sift"] = "sift"
-    max_per_face: int = Field(default=1000, ge=16)
-    contrast_threshold: float = Field(default=0.01, gt=0)
+    extractor: Literal["sift", "aliked", "disk"] = "sift"
+    weights: str | None = None  # file of a learned extractor's weights
+    max_per_face: int = Field(default=600, ge=16)
+    contrast_threshold: float = Field(default=0.02, gt=0)
     sigma_px: float = Field(
         default=0.16, gt=0
     )  # per-axis noise of the smallest keypoints, face pixels
@@ -63,7 +79,7 @@ class PairSettings(_Settings):
     max_baseline_depths: float = Field(default=2.0, gt=0)  # longest baseline in median scene depths
     max_loop_neighbours: int = Field(default=8, ge=0)  # nearest frames in space outside the window
     max_parallax_deg: float = Field(default=60.0, gt=0, le=180)
-    strongest_per_face: int = Field(default=300, ge=16)  # keypoints that find neighbours' geometry
+    strongest_per_face: int = Field(default=200, ge=16)  # keypoints that find neighbours' geometry
     scarce_matches: int = Field(default=60, ge=0)  # below, a pair is matched with all keypoints
     prior: GateSettings = GateSettings(rotation_deg=4.0, direction=0.4)  # coarse trajectory
     loop_deg: float = Field(default=2.0, gt=0)  # around a known point, besides drift
@@ -72,6 +88,9 @@ class PairSettings(_Settings):
     drift: float = Field(
         default=0.003, gt=0
     )  # of the solved chain, part of the path between two frames
+    far_drift: float = Field(
+        default=0.05, ge=0, le=1
+    )  # the same at its worst: no loop may ask for more
 
 
 class VerifySettings(_Settings):
@@ -79,9 +98,13 @@ class VerifySettings(_Settings):
 
     max_error_deg: float = Field(default=0.25, gt=0)  # RANSAC inlier threshold
     min_inliers: int = Field(default=25, ge=8)
+    min_share: float = Field(
+        default=0.45, ge=0, le=1
+    )  # inliers among the matches of neighbours that no trajectory guided: look-alikes have 0.4
     max_rotation_deg: float = Field(default=6.0, gt=0)  # disagreement with the trajectory
     max_direction_deg: float = Field(default=20.0, gt=0)  # disagreement with the trajectory
     min_parallax_deg: float = Field(default=1.0, gt=0)  # median; below it a direction is not judged
+    max_length_ratio: float = Field(default=1.5, gt=1)  # disagreement with the trajectory
 
 
 class TriangulateSettings(_Settings):
@@ -95,17 +118,46 @@ class RoundSettings(_Settings):
     """Triangulate, adjust, filter: gates in standard deviations of the observations' noise."""
 
     chain: tuple[float, ...] = (60.0, 8.0)  # from the coarse trajectory
-    dense: tuple[float, ...] = (6.0, 3.0)  # with matches along the solved chain
-    loops: tuple[float, ...] = (100.0, 20.0, 4.0)  # with loops closed
-    refined: tuple[float, ...] = (6.0, 3.0, 2.5)  # with matches along the solved map
+    dense: tuple[float, ...] = (4.0,)  # with matches along the solved chain
+    loops: tuple[float, ...] = (100.0, 6.0)  # with loops closed
+    refined: tuple[float, ...] = (4.0, 2.5)  # with matches along the solved map
+    aligned: tuple[float, ...] = (6.0, 3.0)  # with aligned patches
     map_passes: int = Field(default=1, ge=1)  # times the closed map is matched anew
     gate_scale: float = Field(default=10.0, ge=1)  # wider gates loosen the loss in proportion
-    tolerance: float = Field(default=1e-3, gt=0, lt=1)  # solver's, in all rounds but a stage's last
+    tolerance: float = Field(default=3e-4, gt=0, lt=1)  # solver's, in all rounds but a run's last
     min_support: float = Field(
         default=0.99, gt=0, le=1
     )  # observations a round must go on explaining
     min_noise: float = Field(default=0.5, gt=0)  # floor of the estimated noise, in feature sigmas
     min_observations: int = Field(default=12, ge=1)  # of a frame, or it counts as unrefined
+
+
+class AlignSettings(_Settings):
+    """Patches around the map's points, aligned to every frame that shows them."""
+
+    rounds: int = Field(default=2, ge=0)  # of alignment and bundle adjustment; 0 = none
+    patch_size: int = Field(default=15, ge=5, le=41)  # pixels across, odd
+    max_width: int = Field(default=4096, ge=64)  # of a panorama; wider ones are halved till under
+    max_views: int = Field(default=16, ge=1)  # frames that a point is looked for in
+    near_frames: int = Field(default=40, ge=0)  # nearest in space, among which views are found
+    min_track_length: int = Field(
+        default=3, ge=2
+    )  # observations a point needs, unless aligned before, to be looked for in further frames
+    max_angle_deg: float = Field(default=45.0, gt=0, lt=90)  # between views of a point
+    max_ratio: float = Field(default=1.8, gt=1)  # of a point's distances
+    affine_sigma: float = Field(default=0.15, gt=0)  # deviation from a surface facing the viewer
+    grey_sigma: float = Field(default=3.0, gt=0)  # noise it is weighed against, grey values
+    min_contrast: float = Field(default=2.0, gt=0)  # grey values, standard deviation in a patch
+    min_zncc: float = Field(default=0.75, gt=0, lt=1)  # correlation of the aligned patches
+    max_shift_px: float = Field(default=1.5, gt=0)  # from the predicted place, panorama pixels
+    max_sigma_px: float = Field(default=0.5, gt=0)  # along the worst direction
+
+    @field_validator("patch_size")
+    @classmethod
+    def _odd(cls, size: int) -> int:
+        if size % 2 == 0:
+            raise ValueError("must be odd: a patch has a pixel in its middle")
+        return size
 
 
 class PriorSettings(_Settings):
@@ -172,9 +224,46 @@ class ExportSettings(_Settings):
     )  # pixels; None = a quarter of the panorama's width
 
 
+class SplatSettings(_Settings):
+    """Training of a Gaussian splat: the rates of Kerbl et al., 2023, times scaled to the length."""
+
+    iterations: int = Field(default=7000, ge=1)  # views shown, one at a time
+    face_size: int = Field(default=256, ge=16)  # pixels
+    backend: Literal["auto", "gsplat", "cpu"] = "auto"
+    held_out_every: int = Field(default=8, ge=2)  # whole panoramas kept for evaluation
+    sh_degree: int = Field(default=3, ge=0, le=3)
+    max_gaussians: int = Field(default=1_000_000, ge=1)
+    ssim_weight: float = Field(default=0.2, ge=0, le=1)
+    near: float = Field(default=0.01, gt=0)  # Gaussians nearer are not seen, part of the extent
+    rate_means: float = Field(default=1.6e-4, gt=0)  # at the start, part of the extent
+    rate_means_end: float = Field(default=1.6e-6, gt=0)
+    rate_scales: float = Field(default=5e-3, gt=0)
+    rate_rotations: float = Field(default=1e-3, gt=0)
+    rate_opacities: float = Field(default=0.05, gt=0)
+    rate_colors: float = Field(default=2.5e-3, gt=0)  # a twentieth of it for what varies by view
+    densify: bool = True
+    densify_pull: float = Field(default=2e-4, gt=0)  # gradient of a centre, image half-widths
+    densify_scale: float = Field(default=0.01, gt=0)  # smaller: cloned, larger: split; of extent
+    min_opacity: float = Field(default=5e-3, gt=0, lt=1)
+    max_scale: float = Field(default=0.1, gt=0)  # of extent
+    checkpoint_every_s: float = Field(default=60.0, gt=0)
+    seed: int = 0
+
+
+class PlacementSettings(_Settings):
+    """Where the exported world is: upright, to scale, on the earth; the run itself stays put."""
+
+    up: Literal["auto", "none"] = "none"  # auto: gravity from rigs and vertical edges
+    length: float | None = Field(default=None, gt=0)  # metres between the two of `between`
+    between: tuple[str, str] | None = None  # frames by name, or points "x,y,z" of the run's world
+    gps: str | None = None  # file of positions: metres, east-north-up
+    align: str | None = None  # TUM file of true poses: its world and unit
+
+
 class RefineSettings(_Settings):
     """Everything a run depends on."""
 
+    video: VideoSettings = VideoSettings()
     read: ReadSettings = ReadSettings()
     cubemap: CubemapSettings = CubemapSettings()
     features: FeatureSettings = FeatureSettings()
@@ -184,12 +273,14 @@ class RefineSettings(_Settings):
     triangulate: TriangulateSettings = TriangulateSettings()
     priors: PriorSettings = PriorSettings()
     rounds: RoundSettings = RoundSettings()
+    align: AlignSettings = AlignSettings()
     solver: SolverSettings = SolverSettings()
     factors: tuple[Literal["bearing", "reprojection", "photometric"], ...] = Field(
         default=("bearing",), min_length=1
     )
     photometric: PhotometricSettings = PhotometricSettings()
     export: ExportSettings = ExportSettings()
+    placement: PlacementSettings = PlacementSettings()
     seed: int = 0
 
     @model_validator(mode="after")

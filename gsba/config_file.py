@@ -35,7 +35,7 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Refi
         _put(branch, keys, value)
         _check_keys(branch, RefineSettings, (), "--set")
         _put(tree, keys, value)
-    return _validate(_with_none(tree, RefineSettings))
+    return validated(_with_none(tree, RefineSettings))
 
 
 def to_toml(settings: BaseModel) -> str:
@@ -104,7 +104,8 @@ def _with_none(tree: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any
     return out
 
 
-def _validate(tree: Mapping[str, Any]) -> RefineSettings:
+def validated(tree: Mapping[str, Any]) -> RefineSettings:
+    """Settings from a tree of values with known keys; GsbaError says which is out of range."""
     try:
         return RefineSettings.model_validate(tree)
     except ValidationError as error:

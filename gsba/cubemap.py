@@ -18,8 +18,8 @@ def rig_for(frames: FrameSet, settings: CubemapSettings) -> CubeRig:
     """The rig on which features of these frames are found.
 
     Unless a size is set, a face centre has `oversampling` times the pixel density of the
-    panorama's equator (a little more than one loses nothing between both samplings), within
-    `min_face_size` and `max_face_size`. Frames that come as cube faces keep their own size and
+    panorama's equator, within `min_face_size` and `max_face_size`: half is enough where patches
+    refine what features find. Frames that come as cube faces keep their own size and
     90 degrees.
     """
     if frames.layout == "cube":

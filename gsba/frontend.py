@@ -42,8 +42,9 @@ def match_neighbours(
     if len(scarce):
         found = _replaced(found, scarce, match(frames, chosen[scarce]))
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
+    exact = np.zeros(len(chosen))
     return verify.run(
-        found, keypoints, f0_T_f1s, np.zeros(len(chosen)), settings.verify, settings.seed
+        found, keypoints, f0_T_f1s, exact, settings.verify, settings.seed, num_threads
     )
 
 
@@ -78,7 +79,9 @@ def match_loops(
     known = points_by_keypoint(solved, keypoints)
     found = matching.run(chosen, world_T_rigs, gates, frames, settings.matching, num_threads, known)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
-    return verify.run(found, keypoints, f0_T_f1s, drifts, settings.verify, settings.seed)
+    return verify.run(
+        found, keypoints, f0_T_f1s, drifts, settings.verify, settings.seed, num_threads
+    )
 
 
 def match_along_epipolars(

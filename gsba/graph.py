@@ -9,12 +9,21 @@ from gsba.geometry import inverse
 X = gtsam.symbol_shorthand.X
 
 
-def build(coarse_world_T_rigs: np.ndarray, settings: PriorSettings) -> gtsam.NonlinearFactorGraph:
+def build(
+    coarse_world_T_rigs: np.ndarray,
+    settings: PriorSettings,
+    false_steps: np.ndarray | None = None,
+    false_frames: np.ndarray | None = None,
+    first: np.ndarray | None = None,
+) -> gtsam.NonlinearFactorGraph:
     """Relative priors between neighbours, a weak absolute one, and a fixed first pose.
 
     Args:
         coarse_world_T_rigs: (F, 4, 4) trajectory, in the frame and scale that the result keeps.
         settings: noise of the trajectory's steps, loss, strength of the absolute prior.
+        false_steps: (F - 1,) bool, steps that get no prior; None = all do.
+        false_frames: (F,) bool, frames that get no absolute prior; None = all do.
+        first: (4, 4) where to fix the first pose; None = where the trajectory has it.
     """
     graph = gtsam.NonlinearFactorGraph()
     steps = inverse(coarse_world_T_rigs[:-1]) @ coarse_world_T_rigs[1:]
@@ -29,6 +38,8 @@ def build(coarse_world_T_rigs: np.ndarray, settings: PriorSettings) -> gtsam.Non
         return gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
     for f, step in enumerate(steps):
+        if false_steps is not None and false_steps[f]:
+            continue
         sigma = settings.translation * max(float(lengths[f]), typical)
         graph.add(
             gtsam.BetweenFactorPose3(
@@ -37,9 +48,12 @@ def build(coarse_world_T_rigs: np.ndarray, settings: PriorSettings) -> gtsam.Non
         )
     weak = robust(np.deg2rad(settings.absolute_rotation_deg), settings.absolute_position * extent)
     for f, world_T_rig in enumerate(coarse_world_T_rigs):
+        if false_frames is not None and false_frames[f]:
+            continue
         graph.add(gtsam.PriorFactorPose3(X(f), gtsam.Pose3(world_T_rig), weak))
     gauge = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-6] * 3 + [1e-6 * extent] * 3))
-    graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(coarse_world_T_rigs[0]), gauge))
+    fixed = gtsam.Pose3(coarse_world_T_rigs[0] if first is None else first)
+    graph.add(gtsam.PriorFactorPose3(X(0), fixed, gauge))
     return graph
 
 

@@ -3,19 +3,35 @@
 import os
 import uuid
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import gtsam
 import numpy as np
 
-from gsba import adjust, cubemap, features, frontend, graph, patches, photometric, tracks
+from gsba import (
+    adjust,
+    align,
+    cubemap,
+    extraction,
+    features,
+    frontend,
+    graph,
+    photometric,
+    places,
+    recovery,
+    tracks,
+)
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
 from gsba.matching import SearchableFrames
+from gsba.motion import Trust
 from gsba.photometric import PhotometricResult
+from gsba.places import Closed, connected
 from gsba.reconstruction import assemble
-from gsba.store import PerFrame, RunStore, fingerprint
+from gsba.recovery import Recovered
+from gsba.store import RunStore, fingerprint
 from gsba.types import (
     CoarsePoses,
     Counts,
@@ -23,7 +39,9 @@ from gsba.types import (
     FrameSet,
     Keypoints,
     Matches,
+    PoseSource,
     Reconstruction,
+    Sighted,
     VerifiedPairs,
 )
 
@@ -44,23 +62,22 @@ class Line:
     ) -> None:
         self.store, self.frames, self.coarse, self.settings = store, frames, coarse, settings
         self.num_threads = settings.solver.num_threads or os.cpu_count() or 1
-        if "photometric" in settings.factors:
-            patches.check(frames)
+        photometric.check(frames, settings)
         self.rig = cubemap.rig_for(frames, settings.cubemap)
-        self.priors = graph.build(coarse.world_T_rigs, settings.priors)
         self.custom = None if extra_factors is None else uuid.uuid4().hex  # resumes nothing
-        if extra_factors is not None:
-            for factor in extra_factors(coarse):
-                self.priors.add(factor)
+        self.extra = list(extra_factors(coarse)) if extra_factors is not None else []
+        self.trust: Trust | None = None
+        self._set_priors()
         self.counts: dict[str, list[Counts]] = {}
         self.solutions: dict[str, Adjustment] = {}
+        self.undone: list[str] = []  # solutions that were not taken
         self.frame_weights = np.ones(len(frames))  # of each frame's pixels
         self.latest = "keypoints"  # the stage that the next one builds on
         paths = [path for group in frames.paths for path in group]
         inputs = [fingerprint(paths), fingerprint(frames.mask_paths), frames.timestamps.tolist()]
         start = [coarse.world_T_rigs.tolist(), settings.read]
         store.stage("frames", [inputs, start], lambda: frames, FrameSet)
-        found = self._extract()
+        found = extraction.run(store, frames, self.rig, settings, self.num_threads)
         self.keypoints = store.stage(
             "keypoints",
             None,
@@ -68,6 +85,8 @@ class Line:
             Keypoints,
             ["frames", "features"],
         )
+        self.observed = self.keypoints  # those that the latest solution is made of
+        self.aligned: np.ndarray | None = None  # which of them patches have confirmed
 
         def load(frame: int) -> Features:
             return found[frames.names[frame]]
@@ -75,35 +94,28 @@ class Line:
         self.searchable = SearchableFrames(load)
         self.strongest = SearchableFrames(load, settings.pairs.strongest_per_face)
 
-    def _extract(self) -> PerFrame[Features]:
-        """Features of every frame: image and mask are read, cut and released one at a time."""
-        frames, settings = self.frames, self.settings
-        features.keep_freed_memory()
-        index = {name: f for f, name in enumerate(frames.names)}
-
-        def compute(name: str) -> Features:
-            images, masks = cubemap.load(frames, index[name], self.rig)
-            extractor = features.SiftExtractor(settings.features)
-            return features.extract(images, masks, self.rig, extractor)
-
-        return self.store.per_frame(
-            "features",
-            [settings.cubemap, settings.features],
-            {
-                name: fingerprint([*frames.paths[f], frames.mask_paths[f]])
-                for name, f in index.items()
-            },
-            compute,
-            Features,
-            num_threads=self.num_threads,
-        )
+    def _set_priors(self) -> None:
+        """What the trajectory says, as far as it is trusted, and the caller's own factors."""
+        coarse, priors, trust = self.coarse.world_T_rigs, self.settings.priors, self.trust
+        if trust is None:
+            self.priors = graph.build(coarse, priors)
+        else:
+            start = trust.world_T_rigs
+            believed = start if trust.false_steps.all() else coarse
+            false = trust.false_steps, trust.false_frames
+            self.priors = graph.build(believed, priors, *false, start[0])
+        for factor in self.extra:
+            self.priors.add(factor)
 
     def start(self) -> Adjustment:
-        """The coarse trajectory as a solution without points."""
-        return adjust.start(self.coarse.world_T_rigs)
+        """The coarse trajectory, chained past its false steps, as a solution without points."""
+        trusted = self.coarse if self.trust is None else self.trust
+        return adjust.start(trusted.world_T_rigs)
 
     def match_neighbours(self) -> VerifiedPairs:
         """Verified matches of frames next to one another in time."""
+        if (self.coarse.sources == PoseSource.NONE).all():
+            return recovery.nothing_verified()
         pairs = self._stage(
             "neighbours",
             self._matching(),
@@ -118,26 +130,83 @@ class Line:
             VerifiedPairs,
         )
         self.counts["neighbours"] = [pairs.counts]
-        if pairs.counts.kept == 0:
-            reasons = ", ".join(f"{n} {why}" for why, n in pairs.counts.dropped.items() if n)
-            raise GsbaError(
-                f"no two neighbouring frames match ({pairs.counts.received} pairs: {reasons}): "
-                "check that frames and trajectory are of the same recording and on one clock"
-            )
         return pairs
 
-    def match_loops(self, solved: Adjustment) -> VerifiedPairs:
+    def judge(self, guided: VerifiedPairs) -> VerifiedPairs:
+        """Neighbours once more where the trajectory misled, which then loses those priors."""
+        recovered = self._stage(
+            "steps",
+            [self._matching(), self.settings.priors],
+            lambda: recovery.run(
+                self.searchable,
+                self.strongest,
+                self.keypoints,
+                guided,
+                self.coarse,
+                self.frames.timestamps,
+                self.settings,
+                self.num_threads,
+            ),
+            Recovered,
+        )
+        pairs = recovered.neighbours
+        self.counts["steps"] = [pairs.counts]
+        if len(pairs.matches.pairs) == 0:
+            raise GsbaError(
+                f"no two neighbouring frames match ({pairs.counts.received} pairs, with and "
+                "without the trajectory): frames must follow one another closely and show texture"
+            )
+        self.trust = recovered.trust
+        if (self.coarse.sources == PoseSource.NONE).all():
+            self.coarse = replace(self.coarse, world_T_rigs=self.trust.world_T_rigs)
+        self._set_priors()
+        return pairs
+
+    def match_loops(self, solved: Adjustment, name: str = "loops") -> VerifiedPairs:
         """Verified matches of frames that met the same place again."""
         pairs = self._stage(
-            "loops",
+            name,
             self._matching(),
             lambda: frontend.match_loops(
                 self.searchable, self.keypoints, solved, self.settings, self.num_threads
             ),
             VerifiedPairs,
         )
-        self.counts["loops"] = [pairs.counts]
+        self.counts[name] = [pairs.counts]
         return pairs
+
+    def close_loops(self, solved: Adjustment) -> tuple[VerifiedPairs, Adjustment]:
+        """Matches of places met again, and the map, bent first where drift had hidden them."""
+        loops = self.match_loops(solved)
+        bent = self._meet_places(solved, loops)
+        return (loops, solved) if bent is solved else (self.match_loops(bent, "loops2"), bent)
+
+    def _meet_places(self, solved: Adjustment, loops: VerifiedPairs) -> Adjustment:
+        """The map bent so that places met again meet, where guided search could not reach them."""
+        unseen = self.trust.unseen_steps if self.trust else np.zeros(len(self.frames) - 1, bool)
+        if connected(unseen, loops.matches.pairs) and len(loops.matches.pairs):
+            return solved
+        closed = self._stage(
+            "places",
+            self._matching(),
+            lambda: places.run(
+                self.strongest,
+                self.keypoints,
+                solved,
+                unseen,
+                self.settings,
+                self.num_threads,
+            ),
+            Closed,
+        )
+        self.counts["places"] = [closed.counts]
+        if len(closed.pairs) == 0:
+            return solved
+        if self.trust is not None:  # places met again know better than a step no image shows
+            false = self.trust.false_steps | unseen
+            self.trust = replace(self.trust, false_steps=false)
+            self._set_priors()
+        return closed.solved
 
     def match_along_epipolars(self, solved: Adjustment) -> Matches:
         """Matches of neighbours in time along their solved epipolar lines."""
@@ -167,7 +236,12 @@ class Line:
         )
 
     def solve(
-        self, name: str, matches: Sequence[Matches], start: Adjustment, gates: Sequence[float]
+        self,
+        name: str,
+        matches: Sequence[Matches],
+        start: Adjustment,
+        gates: Sequence[float],
+        final: bool = False,
     ) -> Adjustment:
         """Bundle adjustment in rounds over the tracks that matches make."""
 
@@ -182,31 +256,67 @@ class Line:
                 gates,
                 self.settings,
                 self.num_threads,
+                final,
             )
 
-        solved = self._stage(name, [self._solving(), gates], compute, Adjustment)
+        solved = self._stage(name, [self._solving(), gates, final], compute, Adjustment)
         self.counts[name] = [solved.landmarks.counts]
         self.solutions[name] = solved
         return solved
 
-    def align_patches(self, solved: Adjustment) -> Adjustment:
-        """Joint refinement by the grey values of patches."""
-        result = self._stage(
-            "photometric",
-            [self._solving(), self.settings.photometric],
-            lambda: photometric.run(
+    def align(self, number: int, solved: Adjustment) -> Sighted:
+        """Points observed anew by aligning patches."""
+        name = f"align{number}"
+
+        def compute() -> Sighted:
+            return align.run(
+                solved.landmarks,
+                solved.world_T_rigs,
+                self.observed,
+                solved.noise,
                 self.frames,
-                self.keypoints,
-                solved,
-                self.priors,
                 self.rig,
-                self.settings,
+                name,
+                self.aligned,
+                self.settings.align,
                 self.num_threads,
-            ),
-            PhotometricResult,
-        )
-        self.counts["photometric"] = list(result.counts)
-        self.solutions["photometric"] = result.adjustment
+            )
+
+        key = self.settings.align.model_dump(exclude={"rounds"})
+        sighted = self._stage(name, key, compute, Sighted)
+        self.counts[name] = [sighted.counts]
+        return sighted
+
+    def solve_aligned(self, number: int, sighted: Sighted, before: Adjustment) -> Adjustment:
+        """Bundle adjustment of aligned observations; undone where that explains less."""
+        name, gates = f"aligned{number}", self.settings.rounds.aligned
+
+        def compute() -> tuple[Adjustment, Keypoints]:
+            return adjust.run_sighted(
+                sighted, before, self.priors, self.rig, gates, self.settings, self.num_threads
+            )
+
+        key = [self._solving(), gates]
+        solved, keypoints = self._stage(name, key, compute, tuple[Adjustment, Keypoints])
+        self.counts[name] = [solved.landmarks.counts]
+        self.solutions[name] = solved
+        if not adjust.carries(solved, before, self.settings.rounds.min_observations):
+            self.undone.append(name)
+            return before
+        self.observed, self.aligned = keypoints, sighted.aligned
+        return solved
+
+    def solve_photometric(self, solved: Adjustment) -> Adjustment:
+        """Joint refinement by the observations so far and the grey values of patches."""
+        name, settings = "photometric", self.settings
+
+        def compute() -> PhotometricResult:
+            given = self.frames, self.observed, solved, self.priors, self.rig
+            return photometric.run(*given, settings, self.num_threads)
+
+        key = [self._solving(), settings.photometric]
+        result = self._stage(name, key, compute, PhotometricResult)
+        self.counts[name], self.solutions[name] = list(result.counts), result.adjustment
         self.frame_weights = result.frame_weights
         return result.adjustment
 
@@ -215,10 +325,11 @@ class Line:
 
         def compute() -> Reconstruction:
             covariances = adjust.pose_covariances(
-                solved, self.priors, self.keypoints, self.rig, self.settings, self.num_threads
+                solved, self.priors, self.observed, self.rig, self.settings, self.num_threads
             )
             least = self.settings.rounds.min_observations
-            return assemble(solved, covariances, self.keypoints, self.coarse, least)
+            false = None if self.trust is None else self.trust.false_frames
+            return assemble(solved, covariances, self.observed, self.coarse, least, false)
 
         return self._stage("reconstruction", self._solving(), compute, Reconstruction)
 
@@ -229,8 +340,7 @@ class Line:
     def _solving(self) -> list[object]:
         settings = self.settings
         relevant = [settings.triangulate, settings.rounds, settings.priors, settings.solver]
-        geometric = [family for family in settings.factors if family != "photometric"]
-        return [*relevant, geometric, self.custom]
+        return [*relevant, [f for f in settings.factors if f != "photometric"], self.custom]
 
     def _stage(self, name: str, key: object, compute: Callable[[], T], returns: type[T]) -> T:
         """A stage that builds on the one before it."""

@@ -77,12 +77,9 @@ def searchable(
     cells = (faces.astype(int) * _CELLS + cell_uv[:, 1]) * _CELLS + cell_uv[:, 0]
     order = np.argsort(cells, kind="stable")
     starts = np.searchsorted(cells[order], np.arange(6 * _CELLS * _CELLS + 1)).astype(np.int32)
-    _, first, inverse = np.unique(
-        np.column_stack([features.faces, features.pixels])[chosen],
-        axis=0,
-        return_index=True,
-        return_inverse=True,
-    )
+    places = features.pixels[chosen, 0] + 1j * features.pixels[chosen, 1]  # one number sorts fast
+    places += 1e6 * features.faces[chosen]
+    _, first, inverse = np.unique(places, return_index=True, return_inverse=True)
     sums = np.zeros((len(starts) - 1, 3))
     np.add.at(sums, cells, bearings)
     centres = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
@@ -96,7 +93,7 @@ def searchable(
         bearings[order].astype(np.float32),
         descriptors,
         np.linalg.norm(descriptors[:, HEAD:], axis=1),
-        chosen[first[inverse.ravel()][order]].astype(np.int32),
+        chosen[first[inverse][order]].astype(np.int32),
         starts,
         centres.astype(np.float32),
         radii.astype(np.float32),
@@ -170,7 +167,7 @@ class SearchableFrames:
         self,
         load: Callable[[int], Features],
         strongest: int | None = None,
-        capacity: int = 48,
+        capacity: int = 96,
     ) -> None:
         first = load(0)
         axes = principal_axes(first.descriptors) if len(first) else None

@@ -7,13 +7,13 @@ import gtsam
 import numpy as np
 
 from factors import LandmarkBlock, RobustLoss
-from factors.patches import PatchPixels, PatchTable, patch_spans, poor_views
+from factors.patch_windows import PatchPixels, PatchTable, patch_spans, poor_views
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
-from gsba import adjust, graph, patches
+from gsba import adjust, graph, patch_grid
 from gsba.adjust import Adjustment, Round
 from gsba.config import PhotometricSettings, RefineSettings
-from gsba.log import track
+from gsba.log import GsbaError, track
 from gsba.optimize import OptimizeResult, optimize
 from gsba.rig import CubeRig
 from gsba.types import Counts, FrameSet, Keypoints
@@ -34,6 +34,22 @@ class PhotometricResult:
     counts: tuple[Counts, ...]  # of patches, then of observations, for each level
     frame_weights: np.ndarray  # (F,) float64, 1 = full trust in a frame's pixels
     residuals: np.ndarray  # (F,) float64, median over a frame of patches' residuals, sigmas
+
+
+def check(frames: FrameSet, settings: RefineSettings) -> None:
+    """Where the family is asked for, refuse frames that patches cannot be sampled from.
+
+    Raises:
+        GsbaError: cube faces, or panoramas of an odd height.
+    """
+    if "photometric" not in settings.factors:
+        return
+    if frames.layout != "erp" or frames.height % 2:
+        what = "cube faces" if frames.layout != "erp" else f"{frames.height} rows"
+        raise GsbaError(
+            f"the photometric family reads panoramas of even height, not {what}: leave it out of "
+            "--factors"
+        )
 
 
 def run(
@@ -77,12 +93,12 @@ def _patches(
     chosen, world_T_rigs = settings.photometric, solved.world_T_rigs
     bearings, width = [], 0
     for f in track(range(len(frames)), "choosing patches"):
-        greys, usable = patches.pyramid(frames, f, chosen, level)
+        greys, usable = patch_grid.pyramid(frames, f, chosen, level)
         grey = greys[-1]
-        usable = patches.coarser(usable, len(usable) // len(grey))
-        bearings.append(patches.candidates(grey, usable, chosen))
+        usable = patch_grid.coarser(usable, len(usable) // len(grey))
+        bearings.append(patch_grid.candidates(grey, usable, chosen))
         width, level = grey.shape[1], len(greys) - 1  # a small panorama has fewer
-    table, counts = patches.table_of(bearings, world_T_rigs, solved.landmarks, width, chosen)
+    table, counts = patch_grid.table_of(bearings, world_T_rigs, solved.landmarks, width, chosen)
     num, dropped = len(table.targets), {}
     left = np.ones(num, bool)
     for reason, flag in poor_views(table, world_T_rigs, table.planes).items():
@@ -154,7 +170,7 @@ def _gather(
     visible = np.ones(len(table.targets))
     needed = np.union1d(table.hosts, table.targets)
     for f in track(needed.tolist(), "sampling patches"):
-        greys, usable = patches.pyramid(frames, f, settings, top)
+        greys, usable = patch_grid.pyramid(frames, f, settings, top)
         for k, grey in enumerate(greys[level:]):
             if k == len(gathered):
                 scaled = replace(table, grid=2.0**k * table.grid)
@@ -162,7 +178,7 @@ def _gather(
             gathered[k].take(f, SphereImage.of(grey))
         rows = np.flatnonzero(table.targets == f)
         spans = patch_spans(table, world_T_rigs, table.planes, rows)
-        visible[rows] = patches.usable_at(usable, spans[:, 0])
+        visible[rows] = patch_grid.usable_at(usable, spans[:, 0])
     return gathered, visible
 
 

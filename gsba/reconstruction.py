@@ -13,6 +13,7 @@ def assemble(
     keypoints: Keypoints,
     coarse: CoarsePoses,
     min_observations: int,
+    false_frames: np.ndarray | None = None,
 ) -> Reconstruction:
     """Carry the solution back to the trajectory's world and gather what exports need.
 
@@ -22,11 +23,14 @@ def assemble(
         keypoints: of all frames.
         coarse: poses that define the world; interpolated ones have no say in it.
         min_observations: frames with fewer count as unrefined.
+        false_frames: (F,) bool, frames whose coarse pose has no say either.
     """
     world_T_rigs, landmarks = adjustment.world_T_rigs, adjustment.landmarks
     seen = np.bincount(landmarks.tracks.frames, minlength=len(world_T_rigs))
     refined = seen >= min_observations
     known = refined & (coarse.sources == PoseSource.SLAM)
+    if false_frames is not None:
+        known &= ~false_frames
     known = known if np.count_nonzero(known) > 1 else np.ones(len(known), bool)
     scale, rotation, translation = pose_similarity(world_T_rigs[known], coarse.world_T_rigs[known])
     placed = pose(

@@ -98,9 +98,12 @@ def take_notes(
         undone: stages in which a round of bundle adjustment was undone.
         frame_weights: (F,) of each frame's pixels, below 1 where they contradict the others.
     """
-    filled = np.flatnonzero(coarse.sources != PoseSource.SLAM)
+    absent = coarse.sources == PoseSource.NONE
+    filled = np.flatnonzero((coarse.sources != PoseSource.SLAM) & ~absent)
     lost = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
     notes = []
+    if absent.all():
+        notes.append("no trajectory: started from the images alone, in units of their own")
     if coarse.time_offset:
         notes.append(f"frame times were shifted by {coarse.time_offset:.6f} s")
     if len(filled):
@@ -133,6 +136,7 @@ def build_report(
     solver: Sequence[object],
     gauge: str,
     notes: Sequence[str] = (),
+    trajectory: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Content of report.json: plain values only.
 
@@ -143,6 +147,7 @@ def build_report(
         solver: one record for each round, holding its iterations with their cost by family.
         gauge: a sentence on where the refined map sits.
         notes: what the user should know: frames without images, unmatched frames, ...
+        trajectory: the images' judgement of it, see `gsba.motion.describe`.
     """
     quality = frame_quality(reconstruction)
     residuals = np.degrees(angular_residuals(reconstruction))
@@ -167,6 +172,7 @@ def build_report(
         "summary": summary,
         "gauge": gauge,
         "notes": notes,
+        "trajectory": trajectory,
         "stages": stage_rows,
         "solver": solver,
         "frames": _frame_rows(frames, coarse, reconstruction, quality),

@@ -7,6 +7,7 @@ import numpy as np
 
 HEAD = 24  # axes of a descriptor compared before the rest
 _ZERO = np.float32(0)
+_LEAST_SINE = np.float32(0.05)  # of the angle to the motion; nearer to it, planes mean nothing
 _kernel = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 
@@ -66,7 +67,7 @@ def search(first, second, cells, targets, only_targets, direction, limits):
             continue
         bearing = bearings0[i, 0], bearings0[i, 1], bearings0[i, 2]
         target = targets[i, 0], targets[i, 1], targets[i, 2]
-        normal, cosine, slack = _great_circle(bearing, direction, limits.rotation)
+        circle = _great_circle(bearing, direction, limits)
         for cell in range(len(radii)):
             if starts[cell] == starts[cell + 1]:
                 continue
@@ -74,14 +75,14 @@ def search(first, second, cells, targets, only_targets, direction, limits):
             if only_targets:
                 if _distance(target, ball) > limits.point + radius:
                     continue
-            elif not _in_band(ball, radius, bearing, normal, direction, cosine + slack, limits):
+            elif not _in_band(ball, radius, bearing, direction, circle, limits):
                 continue
             begin, end = starts[cell], starts[cell + 1]
             members = axes1[:, begin:end]
             if only_targets:
                 _mark_near(members, target, limits.point, marks)
             else:
-                _mark_in_band(members, bearing, normal, direction, cosine + slack, limits, marks)
+                _mark_in_band(members, bearing, direction, circle, limits, marks)
             for j in range(begin, end):
                 if not marks[j - begin]:
                     continue
@@ -118,26 +119,30 @@ def _keep_mutual(best0, top0, next0, best1, next1, limits):
 
 
 @_kernel
-def _great_circle(bearing, direction, rotation_tolerance):
-    """Normal of the plane of a bearing and the motion, cosine between them, and its slack."""
+def _great_circle(bearing, direction, limits):
+    """Normal of the plane of a bearing and the motion, largest cosine to the motion of a bearing
+    that is not displaced towards it, and how far off the plane an error of the motion's direction
+    takes a point for each unit of its parallax."""
     (ax, ay, az), (tx, ty, tz) = bearing, direction
     nx, ny, nz = ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax
     sine = np.sqrt(nx * nx + ny * ny + nz * nz)
     if sine > 1e-6:
         nx, ny, nz = nx / sine, ny / sine, nz / sine
-    slack = rotation_tolerance * (sine + rotation_tolerance)
-    return (nx, ny, nz), tx * ax + ty * ay + tz * az, slack
+    slack = limits.rotation * (sine + limits.rotation)
+    spread = limits.direction / max(sine, _LEAST_SINE)
+    return (nx, ny, nz), tx * ax + ty * ay + tz * az + slack, spread
 
 
 @_kernel
-def _in_band(ball, radius, bearing, normal, direction, max_cosine, limits):
+def _in_band(ball, radius, bearing, direction, circle, limits):
     """Whether a bearing within `radius` of the centre of a ball can be of the same point.
 
     It lies on the great circle, no further than parallax goes, and is not displaced towards the
     direction of motion: that is where points behind both frames are seen.
     """
+    normal, max_cosine, spread = circle
     chord = _distance(bearing, ball)
-    band = limits.direction * (chord + radius)
+    band = spread * (chord + radius)
     return (
         (chord - radius <= limits.chord + limits.rotation)
         & (abs(_dot(normal, ball)) - radius <= limits.rotation + band)
@@ -146,11 +151,11 @@ def _in_band(ball, radius, bearing, normal, direction, max_cosine, limits):
 
 
 @_kernel
-def _mark_in_band(members, bearing, normal, direction, max_cosine, limits, marks):
+def _mark_in_band(members, bearing, direction, circle, limits, marks):
     """Flags of the bearings (3, m) that pass; without branches, so that it runs in vectors."""
     for m in range(members.shape[1]):
         ball = members[0, m], members[1, m], members[2, m]
-        marks[m] = _in_band(ball, _ZERO, bearing, normal, direction, max_cosine, limits)
+        marks[m] = _in_band(ball, _ZERO, bearing, direction, circle, limits)
 
 
 @_kernel

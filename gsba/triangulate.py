@@ -1,5 +1,7 @@
 """Scene points from bearings and poses, robust to false observations in a track."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numba
 import numpy as np
 
@@ -16,6 +18,7 @@ def run(
     world_T_rigs: np.ndarray,
     max_error_sigmas: float,
     settings: TriangulateSettings,
+    num_threads: int = 1,
 ) -> Landmarks:
     """Triangulate every track and drop what does not fit.
 
@@ -30,6 +33,7 @@ def run(
         world_T_rigs: (F, 4, 4) current poses.
         max_error_sigmas: gate on the angle between observation and point, in sigmas.
         settings: limits on parallax and track length.
+        num_threads: that share the tracks.
     """
     starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
     rays = np.einsum("oij,oj->oi", world_T_rigs[tracks.frames, :3, :3], bearings_rig)
@@ -37,7 +41,16 @@ def run(
     points = np.zeros((tracks.num_points, 3))
     inliers = np.zeros(len(rays), np.int64)
     parallaxes = np.zeros(tracks.num_points)
-    _triangulate(starts, rays, centres, sigmas_rad, max_error_sigmas, points, inliers, parallaxes)
+    bounds = np.linspace(0, tracks.num_points, num_threads + 1).astype(np.int64)
+
+    def triangulate(first: int, last: int) -> None:
+        gate = float(max_error_sigmas)
+        _triangulate(
+            starts, first, last, rays, centres, sigmas_rad, gate, points, inliers, parallaxes
+        )
+
+    with ThreadPoolExecutor(num_threads) as pool:
+        list(pool.map(triangulate, bounds[:-1], bounds[1:]))
     lengths = np.add.reduceat(inliers, starts[:-1]) if len(rays) else np.zeros(0, int)
     short = lengths < settings.min_track_length
     flat = ~short & (parallaxes < np.deg2rad(settings.min_parallax_deg))
@@ -60,84 +73,132 @@ def run(
 
 
 @numba.njit(cache=True, nogil=True)
-def _triangulate(starts, rays, centres, sigmas, gate, points, inliers, parallaxes):
-    """Point, inlier flags and largest parallax (radians) of each track; rays in the world frame."""
-    for j in range(len(starts) - 1):
+def _triangulate(starts, first, last, rays, centres, sigmas, gate, points, inliers, parallaxes):
+    """Points, inlier flags and largest parallax (radians) of tracks first to last - 1.
+
+    Rays are in the world frame. A hypothesis that all observations support ends the search.
+    """
+    best = np.zeros(3)
+    for j in range(first, last):
         lo, hi = starts[j], starts[j + 1]
         best_count, best_cost = 0, np.inf
-        best = np.zeros(3)
         tried = 0
         for step in range(hi - lo - 1, 0, -1):  # wide pairs of the track first
             for a in range(lo, hi - step):
-                if tried == _MAX_HYPOTHESES:
+                if tried == _MAX_HYPOTHESES or best_count == hi - lo:
                     break
                 tried += 1
-                point, ok = _midpoint(rays, centres, a, a + step)
+                x, y, z, ok = _midpoint(rays, centres, a, a + step)
                 if not ok:
                     continue
                 count, cost = 0, 0.0
                 for o in range(lo, hi):
-                    error = _angle(rays[o], point - centres[o]) / sigmas[o]
-                    if error < gate:
+                    error = _squared_error(rays, centres, o, x, y, z) / sigmas[o] ** 2
+                    if error < gate * gate:
                         count += 1
-                        cost += error * error
+                        cost += error
                 if count > best_count or (count == best_count and cost < best_cost):
-                    best_count, best_cost, best = count, cost, point
+                    best_count, best_cost = count, cost
+                    best[0], best[1], best[2] = x, y, z
         if best_count < 2:
             continue
         for _ in range(3):
-            best = _gauss_newton_step(rays, centres, sigmas, lo, hi, best, gate)
+            _gauss_newton_step(rays, centres, sigmas, lo, hi, best, gate)
+        x, y, z = best
+        cosine = 1.0
         for o in range(lo, hi):
-            if _angle(rays[o], best - centres[o]) / sigmas[o] < gate:
+            if _squared_error(rays, centres, o, x, y, z) < (gate * sigmas[o]) ** 2:
                 inliers[o] = 1
                 for p in range(lo, o):
                     if inliers[p]:
-                        parallax = _angle(best - centres[o], best - centres[p])
-                        parallaxes[j] = max(parallaxes[j], parallax)
+                        cosine = min(cosine, _cosine(centres, o, p, x, y, z))
         points[j] = best
+        parallaxes[j] = np.arccos(max(cosine, -1.0))
 
 
 @numba.njit(cache=True, nogil=True)
-def _angle(a, b):
-    """Angle between two vectors, accurate when small."""
-    x = a[1] * b[2] - a[2] * b[1]
-    y = a[2] * b[0] - a[0] * b[2]
-    z = a[0] * b[1] - a[1] * b[0]
-    return np.arctan2(np.sqrt(x * x + y * y + z * z), a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+def _squared_error(rays, centres, o, x, y, z):
+    """Squared tangent of the angle between ray o and the way to a point; inf behind."""
+    x, y, z = x - centres[o, 0], y - centres[o, 1], z - centres[o, 2]
+    u, v, w = rays[o, 0], rays[o, 1], rays[o, 2]
+    along = u * x + v * y + w * z
+    if along <= 0:
+        return np.inf
+    a, b, c = v * z - w * y, w * x - u * z, u * y - v * x
+    return (a * a + b * b + c * c) / (along * along)
+
+
+@numba.njit(cache=True, nogil=True)
+def _cosine(centres, o, p, x, y, z):
+    """Cosine of the angle at a point between the ways to two centres."""
+    a, b, c = x - centres[o, 0], y - centres[o, 1], z - centres[o, 2]
+    d, e, f = x - centres[p, 0], y - centres[p, 1], z - centres[p, 2]
+    squares = (a * a + b * b + c * c) * (d * d + e * e + f * f)
+    return (a * d + b * e + c * f) / np.sqrt(max(squares, 1e-300))
 
 
 @numba.njit(cache=True, nogil=True)
 def _midpoint(rays, centres, a, b):
     """Point halfway between two rays where they come closest; False if parallel or behind."""
-    u, v = rays[a], rays[b]
-    w = centres[b] - centres[a]
-    c = u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+    ux, uy, uz = rays[a, 0], rays[a, 1], rays[a, 2]
+    vx, vy, vz = rays[b, 0], rays[b, 1], rays[b, 2]
+    ax, ay, az = centres[a, 0], centres[a, 1], centres[a, 2]
+    wx, wy, wz = centres[b, 0] - ax, centres[b, 1] - ay, centres[b, 2] - az
+    c = ux * vx + uy * vy + uz * vz
     denominator = 1 - c * c
     if denominator < 1e-10:
-        return centres[a], False
-    uw = u[0] * w[0] + u[1] * w[1] + u[2] * w[2]
-    vw = v[0] * w[0] + v[1] * w[1] + v[2] * w[2]
+        return ax, ay, az, False
+    uw, vw = ux * wx + uy * wy + uz * wz, vx * wx + vy * wy + vz * wz
     s, t = (uw - c * vw) / denominator, (c * uw - vw) / denominator
-    return 0.5 * (centres[a] + s * u + centres[b] + t * v), s > 0 and t > 0
+    x = ax + 0.5 * (s * ux + wx + t * vx)
+    y = ay + 0.5 * (s * uy + wy + t * vy)
+    z = az + 0.5 * (s * uz + wz + t * vz)
+    return x, y, z, s > 0 and t > 0
 
 
 @numba.njit(cache=True, nogil=True)
 def _gauss_newton_step(rays, centres, sigmas, lo, hi, point, gate):
-    """One step on the sines of the angles of the observations within the gate."""
-    hessian, gradient = np.zeros((3, 3)), np.zeros(3)
+    """Move a point by one step on the sines of the angles of the observations within the gate."""
+    xx = xy = xz = yy = yz = zz = gx = gy = gz = 0.0
     for o in range(lo, hi):
-        offset = point - centres[o]
-        distance = np.sqrt(offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2)
-        if distance < 1e-12 or _angle(rays[o], offset) / sigmas[o] >= gate:
+        if (
+            _squared_error(rays, centres, o, point[0], point[1], point[2])
+            >= (gate * sigmas[o]) ** 2
+        ):
             continue
-        weight = 1 / (sigmas[o] * distance) ** 2
-        along = rays[o][0] * offset[0] + rays[o][1] * offset[1] + rays[o][2] * offset[2]
-        for r in range(3):
-            gradient[r] += weight * (offset[r] - along * rays[o][r])
-            for c in range(3):
-                hessian[r, c] += weight * ((1.0 if r == c else 0.0) - rays[o][r] * rays[o][c])
-    for r in range(3):
-        hessian[r, r] *= 1 + 1e-9
-    if abs(np.linalg.det(hessian)) < 1e-300:
-        return point
-    return point - np.linalg.solve(hessian, gradient)
+        dx, dy, dz = point[0] - centres[o, 0], point[1] - centres[o, 1], point[2] - centres[o, 2]
+        u, v, w = rays[o, 0], rays[o, 1], rays[o, 2]
+        weight = 1 / (sigmas[o] ** 2 * max(dx * dx + dy * dy + dz * dz, 1e-24))
+        along = u * dx + v * dy + w * dz
+        gx += weight * (dx - along * u)
+        gy += weight * (dy - along * v)
+        gz += weight * (dz - along * w)
+        xx += weight * (1 - u * u)
+        yy += weight * (1 - v * v)
+        zz += weight * (1 - w * w)
+        xy -= weight * u * v
+        xz -= weight * u * w
+        yz -= weight * v * w
+    # Cholesky factor of the Hessian, its diagonal raised a little
+    a = np.sqrt(xx * (1 + 1e-9))
+    if not a > 0:
+        return
+    b, c = xy / a, xz / a
+    d = yy * (1 + 1e-9) - b * b
+    if not d > 0:
+        return
+    d = np.sqrt(d)
+    e = (yz - b * c) / d
+    f = zz * (1 + 1e-9) - c * c - e * e
+    if not f > 0:
+        return
+    f = np.sqrt(f)
+    p = gx / a
+    q = (gy - b * p) / d
+    r = (gz - c * p - e * q) / f
+    z = r / f
+    y = (q - e * z) / d
+    x = (p - b * y - c * z) / a
+    point[0] -= x
+    point[1] -= y
+    point[2] -= z

@@ -16,6 +16,7 @@ class PoseSource(IntEnum):
     SLAM = 0  # an entry of the trajectory file
     INTERPOLATED = 1  # between two entries
     EXTRAPOLATED = 2  # before the first or after the last entry
+    NONE = 3  # there is no trajectory: a placeholder
 
 
 class PoseStatus(IntEnum):
@@ -94,6 +95,8 @@ class Keypoints:
     bearings_rig: np.ndarray  # (N, 3) float64, unit, rig frame
     sigmas_rad: np.ndarray  # (N,) float64, radians
     colors: np.ndarray  # (N, 3) uint8, RGB
+    sqrt_infos: np.ndarray | None = None  # (N, 2, 2) 1/rad on the bearings' tangent_basis: the
+    # square-root information where noise depends on the direction; None = 1 / sigmas_rad
 
     def bearings_of(self, frame: int) -> np.ndarray:
         """Bearings (K, 3) of one frame."""
@@ -146,6 +149,16 @@ class Landmarks:
     points_world: np.ndarray  # (J, 3) float64, map units
     tracks: Tracks  # their observations; point indices are rows of points_world
     counts: Counts  # of tracks
+
+
+@dataclass(frozen=True, slots=True)
+class Sighted:
+    """Observations made anew by aligning patches, former ones where that failed, their tracks."""
+
+    keypoints: Keypoints  # one for each observation
+    aligned: np.ndarray  # (N,) bool, which of them are new
+    tracks: Tracks
+    counts: Counts  # of observations
 
 
 @dataclass(frozen=True, slots=True)

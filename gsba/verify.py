@@ -1,5 +1,7 @@
 """Two-view verification on bearings, and agreement with the trajectory."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
 from gsba.config import VerifySettings
@@ -10,45 +12,51 @@ from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
 def run(
     matches: Matches,
     keypoints: Keypoints,
-    prior_f0_T_f1s: np.ndarray,
-    position_sigmas: np.ndarray,
+    prior_f0_T_f1s: np.ndarray | None,
+    position_sigmas: np.ndarray | None,
     settings: VerifySettings,
     seed: int,
+    num_threads: int = 1,
 ) -> VerifiedPairs:
     """Estimate a relative pose per pair by LO-RANSAC and keep pairs that agree with the prior.
 
     Args:
         matches: putative matches.
         keypoints: of all frames.
-        prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory.
+        prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = none is believed, and
+            a pair needs `min_share` of its matches instead.
         position_sigmas: (P,) how far the prior's relative position may be off, map units; decides
             how much its direction is worth.
         settings: thresholds.
         seed: of the sampling.
+        num_threads: pairs verified at a time.
     """
-    kept, dropped = (
-        [],
-        {"too few matches": 0, "rotation contradicts": 0, "direction contradicts": 0},
-    )
-    for p, (f0, f1) in enumerate(matches.pairs):
-        rows = matches.of(p)
-        bearings0 = keypoints.bearings_of(f0)[rows[:, 0]]
-        bearings1 = keypoints.bearings_of(f1)[rows[:, 1]]
-        estimate = relative_pose(bearings0, bearings1, settings, seed)
-        if estimate is None:
+
+    estimates = _estimates(matches, keypoints, settings, seed, num_threads)
+    kept = []
+    dropped = {"too few matches": 0, "rotation contradicts": 0, "direction contradicts": 0}
+    for p, found in enumerate(estimates):
+        if found is None:
             dropped["too few matches"] += 1
             continue
-        f0_T_f1, inliers = estimate
+        f0_T_f1, inliers = found
+        rows = matches.of(p)[inliers]
+        if prior_f0_T_f1s is None or position_sigmas is None:
+            if inliers.mean() < settings.min_share:
+                dropped["too few matches"] += 1
+            else:
+                kept.append((p, f0_T_f1, rows))
+            continue
         prior = prior_f0_T_f1s[p]
         turn = rotation_angle(prior[:3, :3].T @ f0_T_f1[:3, :3])
         if turn > np.deg2rad(settings.max_rotation_deg):
             dropped["rotation contradicts"] += 1
-        elif _parallax(f0_T_f1, bearings0[inliers], bearings1[inliers]) > np.deg2rad(
+        elif _parallax(f0_T_f1, *_bearings(matches, keypoints, p, rows)) > np.deg2rad(
             settings.min_parallax_deg
         ) and not _direction_agrees(prior[:3, 3], f0_T_f1[:3, 3], position_sigmas[p], settings):
             dropped["direction contradicts"] += 1
         else:
-            kept.append((p, f0_T_f1, rows[inliers]))
+            kept.append((p, f0_T_f1, rows))
     index = [p for p, _, _ in kept]
     inlier_rows = [rows for _, _, rows in kept]
     verified = Matches(
@@ -58,6 +66,27 @@ def run(
     )
     poses = np.array([f0_T_f1 for _, f0_T_f1, _ in kept]).reshape(-1, 4, 4)
     return VerifiedPairs(verified, poses, Counts(len(matches.pairs), len(kept), "pairs", dropped))
+
+
+def _estimates(
+    matches: Matches, keypoints: Keypoints, settings: VerifySettings, seed: int, num_threads: int
+) -> list[tuple[np.ndarray, np.ndarray] | None]:
+    """`relative_pose` of every pair."""
+
+    def estimate(p: int) -> tuple[np.ndarray, np.ndarray] | None:
+        bearings0, bearings1 = _bearings(matches, keypoints, p, matches.of(p))
+        return relative_pose(bearings0, bearings1, settings, seed)
+
+    with ThreadPoolExecutor(num_threads) as pool:
+        return list(pool.map(estimate, range(len(matches.pairs))))
+
+
+def _bearings(
+    matches: Matches, keypoints: Keypoints, p: int, rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bearings (m, 3) of matched keypoints (m, 2) of pair p in either frame."""
+    f0, f1 = matches.pairs[p]
+    return keypoints.bearings_of(f0)[rows[:, 0]], keypoints.bearings_of(f1)[rows[:, 1]]
 
 
 def relative_pose(

@@ -6,7 +6,8 @@ import gtsam
 import numpy as np
 from synthetic import unit
 
-from factors.patches import PatchPixels, PatchTable, pixel_grid, planes_from
+from factors._photometric_kernels import sample_many
+from factors.patch_windows import PAD, PatchPixels, PatchTable, coded, pixel_grid, planes_from
 from factors.sphere_image import SphereImage
 from gsba.geometry import bearings_from_erp
 
@@ -23,6 +24,22 @@ class Texture:
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Grey values (...,) at points (..., 3) of the ball."""
         return 127 + 8 * np.sin(points / RADIUS @ self.waves.T + self.phases).sum(axis=-1)
+
+
+class CodedImage:
+    """A whole sphere image as windows hold it, in double precision: what the block samples."""
+
+    def __init__(self, image: SphereImage) -> None:
+        codes = coded(image)
+        self.codes, self.width = codes.ravel(), image.coefficients.shape[1]
+        self.window = np.array([-PAD, -PAD, codes.shape[1], codes.shape[0]], dtype=np.int32)
+
+    def sample(self, vectors_rig: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values (...) and gradients (..., 3) along vectors (..., 3); NaN where there is none."""
+        flat = np.ascontiguousarray(vectors_rig, dtype=np.float64).reshape(-1, 3)
+        values, gradients = np.empty(len(flat)), np.empty((len(flat), 3))
+        sample_many(self.codes, self.window, self.width, flat, values, gradients)
+        return values.reshape(vectors_rig.shape[:-1]), gradients.reshape(vectors_rig.shape)
 
 
 @dataclass

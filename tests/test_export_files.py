@@ -134,14 +134,14 @@ def test_an_interrupted_export_leaves_nothing_and_keeps_the_last(
 def test_an_earlier_export_is_replaced(tmp_path, frames):
     export(reconstruction(), frames, tmp_path / "out", ExportFormat.TUM)
     export(reconstruction(), frames, tmp_path / "out", ExportFormat.PLY)
-    assert _entries(tmp_path / "out") == ["export.json", "points3D.ply"]
+    assert _entries(tmp_path / "out") == ["export.json", "points3D.ply", "transform.json"]
     assert _entries(tmp_path) == ["out"]
 
 
 def test_an_empty_folder_is_used(tmp_path, frames):
     (tmp_path / "out").mkdir()
     export(reconstruction(), frames, tmp_path / "out", ExportFormat.TUM)
-    assert _entries(tmp_path / "out") == ["export.json", "trajectory.tum"]
+    assert _entries(tmp_path / "out") == ["export.json", "trajectory.tum", "transform.json"]
 
 
 def test_what_others_wrote_is_refused_and_kept(tmp_path, frames):
@@ -163,7 +163,7 @@ def test_a_training_beside_an_earlier_export_is_refused_and_kept(tmp_path, frame
     (tmp_path / "out" / "output").mkdir()
     with pytest.raises(GsbaError, match="an export and 'output'"):
         export(reconstruction(), frames, tmp_path / "out", ExportFormat.PLY)
-    assert _entries(tmp_path / "out") == ["export.json", "output", "points3D.ply"]
+    assert _entries(tmp_path / "out") == ["export.json", "output", "points3D.ply", "transform.json"]
 
 
 def test_what_a_killed_export_left_is_removed(tmp_path, frames):

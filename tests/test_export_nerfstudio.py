@@ -137,6 +137,16 @@ def test_base_names_are_unique_and_every_frame_has_a_mask(dataset):
             assert mask.shape == image.shape[:2] and set(np.unique(mask)) <= {0, 255}
 
 
+@pytest.mark.parametrize("name", ["transforms.json", "transforms_erp.json"])
+def test_whole_panoramas_are_held_out(dataset, name):
+    meta = _meta(dataset, name)
+    everything = [frame["file_path"] for frame in meta["frames"]]
+    assert sorted(meta["train_filenames"] + meta["val_filenames"]) == sorted(everything)
+    whole = len(everything) // NUM_FRAMES
+    assert meta["val_filenames"] == meta["test_filenames"]
+    assert meta["val_filenames"] == everything[:whole] + everything[8 * whole : 9 * whole]
+
+
 def test_frames_without_masks_get_white_ones_where_others_have_some(tmp_path):
     frames = panoramas(tmp_path / "frames", masked=True)
     frames = replace(frames, mask_paths=(None, *frames.mask_paths[1:]))

@@ -5,11 +5,11 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from photometric_world import BallWorld, make_ball_world, table_of
+from photometric_world import BallWorld, CodedImage, make_ball_world, table_of
 from synthetic import unit
 
 from factors import RobustLoss, jacobian_errors
-from factors.patches import PatchPixels, patch_axes, planes_from
+from factors.patch_windows import PatchPixels, patch_axes, planes_from
 from factors.photometric import FAMILY, PhotometricBlock
 from factors.photometric_factor import PhotometricFactor, photometric_residuals
 from factors.sphere_image import SphereImage
@@ -37,7 +37,8 @@ def reference(world: BallWorld, patch: int, o: int, loss: RobustLoss, **options)
     return PhotometricFactor(
         int(table.hosts[patch]), int(table.targets[o]), PLANE + patch,
         patch_axes(table.bearings_rig[patch : patch + 1])[0], table.grid,
-        world.pixels.templates[patch].astype(float), world.images[table.targets[o]], noise,
+        world.pixels.templates[patch].astype(float), CodedImage(world.images[table.targets[o]]),
+        noise,
         **options,
     )  # fmt: skip
 
@@ -333,7 +334,7 @@ def test_residuals_vanish_at_the_truth() -> None:
     residuals, by_host, by_target, _ = photometric_residuals(
         world.world_T_rigs[host], world.world_T_rigs[target], table.planes[0],
         patch_axes(table.bearings_rig)[0], table.grid, pixels.templates[0].astype(float),
-        world.images[target],
+        CodedImage(world.images[target]),
     )  # fmt: skip
     assert np.abs(residuals).max() < 1.0 < np.abs(by_host).max()  # the ball is not flat
     # moving both frames together changes nothing: their Jacobians cancel in the world

@@ -9,7 +9,7 @@ from photometric_world import Texture, render
 from synthetic import unit
 from tiny_run import SETTINGS, Case, computed_stages
 
-from gsba import patches, photometric
+from gsba import patch_grid, photometric
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.config_file import load_config
 from gsba.geometry import erp_from_bearings
@@ -27,7 +27,7 @@ JOINT = RefineSettings.model_validate(
 
 def test_patches_are_spread_over_the_sphere() -> None:
     settings = PhotometricSettings(spacing_deg=10)
-    bearings = patches.candidates(GREY, ALL, settings)
+    bearings = patch_grid.candidates(GREY, ALL, settings)
     assert np.allclose(np.linalg.norm(bearings, axis=1), 1)
     # 4 pi / (10 deg)^2 cells, those beyond 80 degrees of latitude left empty
     assert 370 < len(bearings) < 430
@@ -39,18 +39,18 @@ def test_masked_flat_and_saturated_places_have_no_patch() -> None:
     settings = PhotometricSettings()
     usable = ALL.copy()
     usable[:, :200] = False
-    bearings = patches.candidates(GREY, usable, settings)
+    bearings = patch_grid.candidates(GREY, usable, settings)
     u = erp_from_bearings(bearings, WIDTH, WIDTH // 2)[:, 0]
     reach = settings.size // 2
     assert len(bearings) and (u > 200 + reach).all() and (u < WIDTH - reach).all()
-    assert len(patches.candidates(np.full_like(GREY, 90), ALL, settings)) == 0
-    assert len(patches.candidates(GREY, ~ALL, settings)) == 0
+    assert len(patch_grid.candidates(np.full_like(GREY, 90), ALL, settings)) == 0
+    assert len(patch_grid.candidates(GREY, ~ALL, settings)) == 0
 
 
 def test_coarser_masks_want_all_pixels() -> None:
     usable = np.ones((4, 8), bool)
     usable[3, 5] = False
-    assert np.array_equal(patches.coarser(usable, 2), [[1, 1, 1, 1], [1, 1, 0, 1]])
+    assert np.array_equal(patch_grid.coarser(usable, 2), [[1, 1, 1, 1], [1, 1, 0, 1]])
 
 
 def test_planes_pass_through_the_map() -> None:
@@ -61,7 +61,7 @@ def test_planes_pass_through_the_map() -> None:
     points[::15] *= 1.5  # of another surface
     bearings = unit(np.array([0, 0, 1.0]) + 0.05 * rng.normal(size=(50, 3)))
     settings = PhotometricSettings(slope_sigma=10.0)
-    planes, clear = patches.lay_planes(bearings, points, settings)
+    planes, clear = patch_grid.lay_planes(bearings, points, settings)
     assert np.count_nonzero(clear) > 40
     expected = bearings @ normal / offset
     assert np.abs(planes[clear, 0] / expected[clear] - 1).max() < 0.01
@@ -71,10 +71,11 @@ def test_a_map_without_points_near_gives_no_depth() -> None:
     rng = np.random.default_rng(2)
     bearings = unit(np.array([0, 0, -1.0]) + 0.05 * rng.normal(size=(5, 3)))
     points = 3 * unit(np.array([0, 0, 1.0]) + 0.05 * rng.normal(size=(100, 3)))
-    assert not patches.lay_planes(bearings, points, PhotometricSettings())[1].any()
-    assert not patches.lay_planes(bearings, points[:3], PhotometricSettings())[1].any()
+    assert not patch_grid.lay_planes(bearings, points, PhotometricSettings())[1].any()
+    assert not patch_grid.lay_planes(bearings, points[:3], PhotometricSettings())[1].any()
     scattered = unit(rng.normal(size=(200, 3))) * rng.uniform(1, 30, (200, 1))
-    clear = patches.lay_planes(unit(rng.normal(size=(50, 3))), scattered, PhotometricSettings())[1]
+    anywhere = unit(rng.normal(size=(50, 3)))
+    clear = patch_grid.lay_planes(anywhere, scattered, PhotometricSettings())[1]
     assert np.count_nonzero(clear) < 10
 
 
@@ -149,7 +150,7 @@ def test_a_solve_against_the_map_is_undone(case: Case) -> None:
 )
 def test_other_frames_are_refused_before_any_work(case: Case, change: dict, message: str) -> None:
     frames, *_ = _start(case, JOINT)
-    patches.check(frames)
+    photometric.check(frames, JOINT)
     with pytest.raises(GsbaError, match=message):
         Line(None, replace(frames, **change), None, JOINT, None)  # type: ignore[arg-type]
 
@@ -170,7 +171,7 @@ def test_the_family_needs_another() -> None:
 
 def test_wide_panoramas_are_halved(case: Case) -> None:
     frames, *_ = _start(case, JOINT)
-    levels, usable = patches.pyramid(frames, 0, PhotometricSettings(max_width=256), 2)
+    levels, usable = patch_grid.pyramid(frames, 0, PhotometricSettings(max_width=256), 2)
     assert [level.shape for level in levels] == [(128, 256), (64, 128), (32, 64)]
     assert usable.shape == (128, 256)
 

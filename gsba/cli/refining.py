@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gsba.cli.app import command
+from gsba.log import GsbaError
 
 if TYPE_CHECKING:
     from gsba.config import RefineSettings
@@ -24,22 +25,42 @@ Factors = Annotated[
 
 @command
 def refine(
-    frames: Annotated[Path, typer.Argument(help="Folder of 2:1 panoramas or of cube faces.")],
-    trajectory: Annotated[Path, typer.Argument(help="TUM, KITTI or stella_vslam map.msg.")],
+    frames: Annotated[
+        Path, typer.Argument(help="Folder of 2:1 panoramas or of cube faces, or a 2:1 video.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder of the run.", metavar="RUN")],
+    trajectory: Annotated[
+        Path | None, typer.Argument(help="TUM, KITTI or stella_vslam map.msg.")
+    ] = None,
+    keyframes: Annotated[
+        Path | None, typer.Option(help="Keyframe trajectory of the same run.", metavar="FILE")
+    ] = None,
+    no_trajectory: Annotated[
+        bool, typer.Option("--no-trajectory", help="Start from the images alone.")
+    ] = False,
     config: Config = None,
     overrides: Overrides = None,
     masks: Annotated[
-        Path | None, typer.Option(help="One mask for all frames, or a folder; white = use.")
+        Path | None,
+        typer.Option(
+            help="One mask for all frames, or a folder; white = use. auto: find the carrier."
+        ),
     ] = None,
     factors: Factors = None,
     timestamps: Annotated[
         Path | None, typer.Option(help="Times of the frames.", metavar="FILE")
     ] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames per second, from time 0.")] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(help="Frames per second, from time 0; of a video: frames kept per second."),
+    ] = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="Replace an earlier run.")] = False,
 ) -> None:
     """Refine the pose of every frame; the same call again resumes."""
+    if (trajectory is None) != no_trajectory:
+        raise GsbaError("give either a TRAJECTORY or --no-trajectory")
+    if keyframes is not None and no_trajectory:
+        raise GsbaError("--keyframes go with the TRAJECTORY of the same run")
     settings = _settings(config, overrides, factors)
     from gsba import pipeline
 
@@ -48,7 +69,8 @@ def refine(
         trajectory,
         out,
         settings,
-        masks=masks,
+        keyframes=keyframes,
+        masks="auto" if str(masks) == "auto" else masks,
         timestamps=timestamps,
         fps=fps,
         fresh=fresh,

@@ -1,12 +1,14 @@
 """Commands on finished runs: `export`, `evaluate`."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from gsba.cli.app import command
+from gsba.cli.splat import BackendName, FaceSize, Iterations, evaluate_splat, splat_settings
 from gsba.log import GsbaError
 
 
@@ -23,8 +25,23 @@ def export(
         Path | None, typer.Option(help="Folder to write; RUN/FORMAT by default.")
     ] = None,
     face_size: Annotated[int | None, typer.Option(help="Pixels of a cube face.")] = None,
+    up: Annotated[str, typer.Option(help="auto: turn the world upright; none: leave it.")] = "none",
+    scale: Annotated[
+        float | None, typer.Option(help="Metres between the two of --between.", metavar="LENGTH")
+    ] = None,
+    between: Annotated[
+        tuple[str, str] | None,
+        typer.Option(help="Two frames, or points x,y,z of the run's world.", metavar="A B"),
+    ] = None,
+    gps: Annotated[
+        Path | None, typer.Option(help="CSV or GPX: metres east, north, up.", metavar="FILE")
+    ] = None,
+    align: Annotated[
+        Path | None, typer.Option(help="True poses: their world and unit.", metavar="TRUTH.tum")
+    ] = None,
 ) -> None:
-    """Write a finished run as a dataset for another program."""
+    """Write a finished run as a dataset for another program, placed where you want it."""
+    from gsba.config_file import validated
     from gsba.export import ExportFormat
     from gsba.export import export as write
     from gsba.run_folder import claim
@@ -33,11 +50,16 @@ def export(
         raise GsbaError(f"--to {to} is not known: use one of {', '.join(ExportFormat)}")
     if face_size is not None and face_size < 1:
         raise GsbaError(f"--face-size {face_size} is out of range: use 1 or more pixels")
+    asked = {"up": up, "length": scale, "between": between}
+    asked |= {key: str(path) for key, path in (("gps", gps), ("align", align)) if path is not None}
+    settings = validated({"placement": asked}).placement
     from gsba.pipeline import load_run
+    from gsba.placement import place
 
     reconstruction, frames, *_ = load_run(run)
     folder = out or run / to
-    write(reconstruction, frames, folder, ExportFormat(to), face_size)
+    placement = place(reconstruction, frames, settings)
+    write(reconstruction, frames, folder, ExportFormat(to), face_size, placement)
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
     typer.echo(f"{to}: {folder}")
@@ -46,20 +68,50 @@ def export(
 @command
 def evaluate(
     estimate: Annotated[Path, typer.Argument(help="A run, or a trajectory file.", metavar="RUN")],
-    truth: Annotated[Path, typer.Option(help="True trajectory (TUM).")],
+    truth: Annotated[Path | None, typer.Option(help="True trajectory (TUM).")] = None,
+    depth: Annotated[
+        Path | None,
+        typer.Option(help="True depth maps: also say how far pixels are moved.", metavar="DIR"),
+    ] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the numbers here too.", metavar="FILE")
     ] = None,
+    splat: Annotated[
+        bool, typer.Option("--splat", help="Train splats on poses, and measure held-out frames.")
+    ] = False,
+    against: Annotated[
+        list[Path] | None, typer.Option(help="With --splat: other poses; repeatable.")
+    ] = None,
+    iterations: Iterations = None,
+    face_size: FaceSize = None,
+    backend: BackendName = "auto",
 ) -> None:
-    """Compare a run or a trajectory with the truth."""
+    """Compare a run or a trajectory with the truth, or what its poses are worth to a splat."""
+    if splat:
+        evaluate_splat(estimate, against or [], splat_settings(iterations, face_size, backend))
+    if truth is None:
+        if not splat:
+            raise GsbaError("nothing to compare with: give --truth FILE, or --splat")
+        return
     from gsba.evaluate import evaluate as compare
     from gsba.evaluate import format_table
+    from gsba.induced import depth_maps, induced_errors
     from gsba.read import read_trajectory
     from gsba.records import atomic_write
 
     path = estimate / "trajectory.tum" if estimate.is_dir() else estimate
-    errors = compare(read_trajectory(path), read_trajectory(truth))
+    found, true = read_trajectory(path), read_trajectory(truth)
+    errors, induced = compare(found, true), None
+    if depth is not None:
+        ranges = depth_maps(depth)
+        induced = induced_errors(found, true, ranges, 4 * ranges(0).shape[1])
     if json_file is not None:
-        text = json.dumps(errors.to_json(), indent=1) + "\n"
+        content = errors.to_json() | ({"induced": asdict(induced)} if induced else {})
+        text = json.dumps(content, indent=1) + "\n"
         atomic_write(json_file, lambda temporary: temporary.write_text(text))
     typer.echo(format_table({estimate.name: errors}))
+    if induced is not None:
+        typer.echo(
+            f"induced error, in pixels of a panorama four times as wide as the depth maps: median "
+            f"{induced.median_px:.4f}, 95th percentile {induced.percentile95_px:.4f}"
+        )

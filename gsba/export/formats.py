@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba.export.folder import output_folder
+from gsba.placement import Placement
 from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -29,16 +30,18 @@ def export(
     out: Path,
     to: ExportFormat,
     face_size: int | None = None,
+    placement: Placement | None = None,
 ) -> None:
     """Write a reconstruction in another program's format, all frames of it.
 
     Args:
-        reconstruction: poses and cloud; keeps its world and scale in every format but
-            nerfstudio's, whose `applied_transform` states the turn.
+        reconstruction: poses and cloud; nerfstudio's format alone turns its world, as the
+            `applied_transform` there states.
         frames: the frames it was made from, still on disk.
         out: folder to write; an earlier export there is replaced, anything else refused.
         to: the format.
         face_size: pixels of a cube face; None = see `gsba.export.images.face_size_for`.
+        placement: where to put the world; None = where the run has it. `transform.json` states it.
 
     Raises:
         GsbaError: `out` is in use, the format does not fit the frames, or the disk refuses;
@@ -49,8 +52,11 @@ def export(
         names = ", ".join(frames.names[f] for f in unrefined[:5])
         more = ", ..." if len(unrefined) > 5 else ""
         logger.warning("%d frames go out with unrefined poses: %s%s", len(unrefined), names, more)
+    placement = placement or Placement()
+    reconstruction = placement.apply(reconstruction)
     with output_folder(out, to.value) as partial:
-        _write(partial, reconstruction, frames, to, face_size)
+        _write(partial, reconstruction, frames, to, face_size, placement.up == "z")
+        placement.write(partial / "transform.json")
     logger.info(
         "%s: %d frames, %d points, in %s", to, len(frames), len(reconstruction.points_world), out
     )
@@ -62,6 +68,7 @@ def _write(
     frames: FrameSet,
     to: ExportFormat,
     face_size: int | None,
+    z_up: bool,
 ) -> None:
     from gsba.export import colmap, nerfstudio, ply
 
@@ -73,7 +80,7 @@ def _write(
         case ExportFormat.COLMAP_ERP:
             colmap.write_colmap_erp(partial, reconstruction, frames)
         case ExportFormat.NERFSTUDIO:
-            nerfstudio.write_nerfstudio(partial, reconstruction, frames, face_size)
+            nerfstudio.write_nerfstudio(partial, reconstruction, frames, face_size, z_up)
         case ExportFormat.PLY:
             ply.write_splat_points(
                 partial / "points3D.ply", reconstruction.points_world, reconstruction.point_colors

@@ -2,8 +2,9 @@
 
 nerfstudio's cameras have OpenGL axes (y up, z backward) and its world has z up, so the world
 is turned by NERFSTUDIO_R_WORLD, which `applied_transform` states and the cloud shares. Base names
-are unique, because nerfstudio looks for down-scaled images by base name. Splat trainers need the
-faces; the panoramas are for models that take equirectangular rays:
+are unique, because nerfstudio looks for down-scaled images by base name. Every eighth panorama is
+held out with all its faces: a face left in for training would give its siblings away. Splat
+trainers need the faces; the panoramas are for models that take equirectangular rays:
 `ns-train nerfacto --data OUT/transforms_erp.json`.
 """
 
@@ -27,21 +28,35 @@ from gsba.types import FACES, FrameSet, Reconstruction
 NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 _CV_R_GL = np.diag([1.0, -1, -1])  # OpenGL camera axes in our camera axes
 _CLOUD = "points3D.ply"
+_HOLD_OUT_EVERY = 8  # panoramas, as in the benchmarks of splat trainers
 
 
 def write_nerfstudio(
-    partial: Path, reconstruction: Reconstruction, frames: FrameSet, face_size: int | None
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    face_size: int | None,
+    z_up: bool = False,
 ) -> None:
-    """Write faces, cloud and transforms.json into `partial`; for panoramas the ERP variant too."""
-    points = reconstruction.points_world @ NERFSTUDIO_R_WORLD.T
+    """Write faces, cloud and transforms.json into `partial`; for panoramas the ERP variant too.
+
+    A world whose z points up already is not turned.
+    """
+    out_R_world = np.eye(3) if z_up else NERFSTUDIO_R_WORLD
+    points = reconstruction.points_world @ out_R_world.T
     write_splat_points(partial / _CLOUD, points, reconstruction.point_colors)
-    _write_face_dataset(partial, reconstruction, frames, face_size_for(frames, face_size))
+    size = face_size_for(frames, face_size)
+    _write_face_dataset(partial, reconstruction, frames, size, out_R_world)
     if frames.layout == "erp":
-        _write_erp_dataset(partial, reconstruction, frames)
+        _write_erp_dataset(partial, reconstruction, frames, out_R_world)
 
 
 def _write_face_dataset(
-    partial: Path, reconstruction: Reconstruction, frames: FrameSet, size: int
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    size: int,
+    out_R_world: np.ndarray,
 ) -> None:
     def image(f: int, face: str) -> str:
         return f"images/{frames.names[f]}_{face}{suffix_of(frames, f)}"
@@ -56,11 +71,11 @@ def _write_face_dataset(
     entries = []
     for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
         for face in frames.faces or FACES:
-            entry = _entry(image(f, face), world_T_rig, RIG_R_FACE[FACES.index(face)])
+            entry = _entry(image(f, face), out_R_world, world_T_rig, RIG_R_FACE[FACES.index(face)])
             if has_masks(frames):
                 entry["mask_path"] = mask(f, face)
             entries.append(entry)
-    _write_transforms(partial / "transforms.json", camera, entries)
+    _write_transforms(partial / "transforms.json", camera, entries, len(frames), out_R_world)
     write_faces(
         frames,
         size,
@@ -69,7 +84,9 @@ def _write_face_dataset(
     )
 
 
-def _write_erp_dataset(partial: Path, reconstruction: Reconstruction, frames: FrameSet) -> None:
+def _write_erp_dataset(
+    partial: Path, reconstruction: Reconstruction, frames: FrameSet, out_R_world: np.ndarray
+) -> None:
     def image(f: int) -> str:
         return f"images_erp/{frames.names[f]}{frames.paths[f][0].suffix}"
 
@@ -81,28 +98,43 @@ def _write_erp_dataset(partial: Path, reconstruction: Reconstruction, frames: Fr
     camera |= {"cx": width / 2, "cy": height / 2, "w": width, "h": height}
     entries = []
     for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
-        entry = _entry(image(f), world_T_rig, np.eye(3))
+        entry = _entry(image(f), out_R_world, world_T_rig, np.eye(3))
         if has_masks(frames):
             entry["mask_path"] = mask(f)
         entries.append(entry)
-    _write_transforms(partial / "transforms_erp.json", camera, entries)
+    _write_transforms(partial / "transforms_erp.json", camera, entries, len(entries), out_R_world)
     write_panoramas(frames, lambda f: partial / image(f), lambda f: partial / mask(f))
 
 
-def _entry(file_path: str, world_T_rig: np.ndarray, rig_R_camera: np.ndarray) -> dict[str, Any]:
+def _entry(
+    file_path: str, out_R_world: np.ndarray, world_T_rig: np.ndarray, rig_R_camera: np.ndarray
+) -> dict[str, Any]:
     """A frame of transforms.json; its matrix maps OpenGL camera axes to nerfstudio's world."""
     matrix = np.eye(4)
-    matrix[:3, :3] = NERFSTUDIO_R_WORLD @ world_T_rig[:3, :3] @ rig_R_camera @ _CV_R_GL
-    matrix[:3, 3] = NERFSTUDIO_R_WORLD @ world_T_rig[:3, 3]
+    matrix[:3, :3] = out_R_world @ world_T_rig[:3, :3] @ rig_R_camera @ _CV_R_GL
+    matrix[:3, 3] = out_R_world @ world_T_rig[:3, 3]
     return {"file_path": file_path, "transform_matrix": matrix.tolist()}
 
 
-def _write_transforms(path: Path, camera: dict[str, Any], entries: list[dict[str, Any]]) -> None:
-    applied = np.column_stack([NERFSTUDIO_R_WORLD, np.zeros(3)])
+def _write_transforms(
+    path: Path,
+    camera: dict[str, Any],
+    entries: list[dict[str, Any]],
+    num_frames: int,
+    out_R_world: np.ndarray,
+) -> None:
+    names = [str(entry["file_path"]) for entry in entries]  # frame by frame
+    per_frame = len(names) // num_frames
+    evaluated = [n for i, n in enumerate(names) if i // per_frame % _HOLD_OUT_EVERY == 0]
+    trained = [n for i, n in enumerate(names) if i // per_frame % _HOLD_OUT_EVERY != 0]
+    applied = np.column_stack([out_R_world, np.zeros(3)])
     document = {
         **camera,
         "applied_transform": applied.tolist(),
         "ply_file_path": _CLOUD,
+        "train_filenames": trained,
+        "val_filenames": evaluated,
+        "test_filenames": evaluated,
         "frames": entries,
     }
     path.write_text(json.dumps(document, indent=1) + "\n")

@@ -50,6 +50,13 @@ def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) 
     return CoarsePoses(_poses_at(trajectory, times), sources, offset)
 
 
+def without_trajectory(frames: FrameSet) -> CoarsePoses:
+    """Placeholder poses where there is no trajectory: one unit ahead for every frame."""
+    positions = np.outer(np.arange(len(frames)), [0.0, 0.0, 1.0])
+    poses = pose(np.tile(np.eye(3), (len(frames), 1, 1)), positions)
+    return CoarsePoses(poses, np.full(len(frames), PoseSource.NONE, np.uint8), 0.0)
+
+
 def _report(
     frames: FrameSet,
     sources: np.ndarray,
@@ -57,10 +64,10 @@ def _report(
     entries: np.ndarray,
     max_interpolation_s: float,
 ) -> None:
-    counts = np.bincount(sources, minlength=3)
+    counts = np.bincount(sources, minlength=len(PoseSource))
     _log.info(
         "coarse poses: %d from the trajectory, %d interpolated, %d extrapolated",
-        *(counts[s] for s in PoseSource),
+        *(counts[s] for s in PoseSource if s != PoseSource.NONE),
     )
     inside = np.clip(np.searchsorted(entries, times), 1, len(entries) - 1)
     gaps = entries[inside] - entries[inside - 1]

@@ -77,18 +77,43 @@ def scan(
     )
 
 
-def load_erp(frames: FrameSet, f: int) -> np.ndarray:
-    """Equirectangular image of frame f, (height, width, 3) uint8 RGB."""
+def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
+    """Panoramas of a folder in name order; nothing is asked of their times, which are 0, 1, ...
+
+    Raises:
+        GsbaError: no panoramas, or a mask that does not fit.
+    """
+    layout, _, found = _find_frames(Path(folder))
+    if layout != "erp":
+        raise GsbaError(f"{folder}: holds cube faces; panoramas are wanted here")
+    names = sorted(found, key=_natural)
+    paths = tuple(found[name] for name in names)
+    width, height = _common_size(paths, layout)
+    return FrameSet(
+        names=tuple(names),
+        paths=paths,
+        timestamps=np.arange(len(names), dtype=np.float64),
+        layout=layout,
+        faces=(),
+        width=width,
+        height=height,
+        mask_paths=find_masks(masks, names, (width, height)),
+    )
+
+
+def load_erp(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
+    """Equirectangular image of frame f, (height, width, 3) uint8 RGB, or (height, width) grey."""
     if frames.layout != "erp":
         raise ValueError("load_erp needs equirectangular frames")
-    return decode(frames.paths[f][0], (frames.width, frames.height))
+    return decode(frames.paths[f][0], (frames.width, frames.height), gray)
 
 
-def load_faces(frames: FrameSet, f: int) -> np.ndarray:
-    """Cube faces of frame f, (len(frames.faces), height, width, 3) uint8 RGB."""
+def load_faces(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
+    """Cube faces of frame f, (len(frames.faces), height, width[, 3]) uint8, RGB or grey."""
     if frames.layout != "cube":
         raise ValueError("load_faces needs cube frames")
-    return np.stack([decode(path, (frames.width, frames.height)) for path in frames.paths[f]])
+    size = frames.width, frames.height
+    return np.stack([decode(path, size, gray) for path in frames.paths[f]])
 
 
 def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Path, ...]]]:

@@ -147,7 +147,7 @@ def _times_from_list(names: Sequence[str], path: Path, rows: list[TimeRow]) -> n
 def _times_by_name(names: Sequence[str], path: Path, rows: list[TimeRow]) -> np.ndarray:
     by_name: dict[str, float] = {}
     for row in rows:
-        name = _stem(row.name or "")
+        name = stem_of(row.name or "")
         if name in by_name:
             raise GsbaError(f"{path}:{row.line}: a second time for frame '{name}'")
         by_name[name] = row.timestamp
@@ -161,7 +161,8 @@ def _times_by_name(names: Sequence[str], path: Path, rows: list[TimeRow]) -> np.
     return np.array([by_name[name] for name in names])
 
 
-def _stem(name: str) -> str:
+def stem_of(name: str) -> str:
+    """A frame's name: a file name without folder and image suffix."""
     path = Path(name.replace("\\", "/"))
     return path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name
 

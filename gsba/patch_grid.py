@@ -4,33 +4,18 @@ import functools
 
 import cv2
 import numpy as np
+from scipy.ndimage import correlate1d
 
-from factors.patches import PatchTable, patch_axes, pixel_grid
-from factors.sphere_image import halved
+from factors.patch_windows import PatchTable, over_poles, patch_axes, pixel_grid
 from gsba import read
 from gsba.config import PhotometricSettings
 from gsba.geometry import bearings_from_erp, erp_from_bearings
-from gsba.log import GsbaError
 from gsba.types import Counts, FrameSet, Landmarks
 
 _NEIGHBOURS = 8  # map points that a patch's plane is laid through
 _DARK, _BRIGHT = 3, 252  # grey values beyond which a pixel counts as saturated
 _EDGE_SHARE = 0.05  # of an edge's strength, beside that of a corner
 _MAX_LATITUDE = np.deg2rad(80.0)  # beyond, pixels of a panorama are mostly invented
-
-
-def check(frames: FrameSet) -> None:
-    """Refuse frames that patches cannot be sampled from.
-
-    Raises:
-        GsbaError: cube faces, or panoramas of an odd height.
-    """
-    if frames.layout != "erp" or frames.height % 2:
-        what = "cube faces" if frames.layout != "erp" else f"{frames.height} rows"
-        raise GsbaError(
-            f"the photometric family reads panoramas of even height, not {what}: leave it out of "
-            "--factors"
-        )
 
 
 def pyramid(
@@ -56,6 +41,17 @@ def pyramid(
     while len(levels) <= top and _divides(levels[-1]):
         levels.append(halved(levels[-1]))
     return levels, usable
+
+
+def halved(grey: np.ndarray) -> np.ndarray:
+    """The next level of a pyramid: (H, 2 H) to (H / 2, H) float32, low-passed; H in fours.
+
+    The filter [1 3 3 1] / 8 sits on the corners between pixels, so that bearings stay in place.
+    """
+    image, rows = np.asarray(grey, dtype=np.float32), 2
+    taps = np.array([1, 3, 3, 1], dtype=np.float32) / 8
+    tall = correlate1d(over_poles(image, rows), taps, axis=0, origin=-1)[rows:-rows][::2]
+    return correlate1d(tall, taps, axis=1, mode="wrap", origin=-1)[:, ::2]
 
 
 def coarser(usable: np.ndarray, step: int) -> np.ndarray:

@@ -1,0 +1,349 @@
+"""Compiled passes over patches of panoramas: cut templates, and align them to other frames.
+
+A patch is a plane piece of scene: the rays origin + spread @ (x, y) of an n x n grid of unit
+spacing, row-major in (x, y), x and y from -reach to reach. Images are spline coefficients
+(H, 2H) float32. All of it is one file, the sampler included, because numba renews a cached kernel
+when its file changes, not when a function it calls from another file does.
+"""
+
+import numpy as np
+from numba import njit
+
+from factors._patch_records import ALIGNED, FAR, FLAT, MASKED, UNLIKE, UNSTEADY
+
+_TRIAL_STEPS = 4  # after which a patch must look somewhat alike to go on
+_NEAR_POLE = 8.0  # half patches from a pole, within which each ray needs its own pixel
+_LEAST_CORNER = 1e-4  # determinant of the shift's information over its trace squared: no edge
+_LEAST_GREY = 1e-3  # variance in grey values squared, below which there is nothing
+
+_kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+
+
+@_kernel
+def _ray_pixel(origin, spread, x, y, width, height):
+    """Pixel (u, v) of the ray through (x, y) of a plane patch, u in [0, width]."""
+    a = origin[0] + spread[0, 0] * x + spread[0, 1] * y
+    b = origin[1] + spread[1, 0] * x + spread[1, 1] * y
+    c = origin[2] + spread[2, 0] * x + spread[2, 1] * y
+    u = width * (np.arctan2(a, c) / (2 * np.pi) + 0.5)
+    return u, height * (0.5 + np.arctan2(b, np.sqrt(a * a + c * c)) / np.pi)
+
+
+@_kernel
+def _weights(t):
+    """Cubic B-spline weights of the four samples around a place t in [0, 1) after the second."""
+    s = np.float32(1.0) - t
+    sixth = np.float32(1.0 / 6.0)
+    w0, w3 = sixth * s * s * s, sixth * t * t * t
+    w1 = np.float32(2.0 / 3.0) - t * t * (np.float32(1.0) - np.float32(0.5) * t)
+    return w0, w1, np.float32(1.0) - w0 - w1 - w3, w3
+
+
+@_kernel
+def _tap(coefficients, row, column):
+    """Coefficient at any row and column: round the seam, and over the poles."""
+    height, width = coefficients.shape
+    if row < 0:
+        row, column = -1 - row, column + width // 2
+    elif row >= height:
+        row, column = 2 * height - 1 - row, column + width // 2
+    return coefficients[row, column % width]
+
+
+@_kernel
+def _sample(coefficients, u, v):
+    """Value at pixel (u, v); u may lie any number of turns off, v up to a patch off the image."""
+    height, width = coefficients.shape
+    u, v = u - 0.5, v - 0.5
+    column, row = int(np.floor(u)), int(np.floor(v))
+    a0, a1, a2, a3 = _weights(np.float32(u - column))
+    b0, b1, b2, b3 = _weights(np.float32(v - row))
+    inside = column >= 1 and column < width - 2 and row >= 1 and row < height - 2
+    value = np.float32(0.0)
+    for k in range(4):
+        b = b0 if k == 0 else (b1 if k == 1 else (b2 if k == 2 else b3))
+        r = row - 1 + k
+        if inside:
+            c = coefficients[r]
+            c0, c1, c2, c3 = c[column - 1], c[column], c[column + 1], c[column + 2]
+        else:
+            c0, c1 = _tap(coefficients, r, column - 1), _tap(coefficients, r, column)
+            c2, c3 = _tap(coefficients, r, column + 1), _tap(coefficients, r, column + 2)
+        value += b * (a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3)
+    return value
+
+
+@_kernel
+def _pixel_map(origin, spread, half, width, height, nodes, quadratics):
+    """Pixels of the rays origin + spread @ (x, y), |x|, |y| <= half, as biquadratics.
+
+    Args:
+        origin (3,), spread (3, 2): a plane patch seen from the rig; rig frame, any length.
+        nodes (3, 3, 2): scratch, pixels of the patch's corners, edges and centre, x by rows.
+        quadratics (2, 3, 3): of u and v; coefficient [i, j] is of (x / half)^i (y / half)^j.
+
+    Returns:
+        False where a pole is too near for the polynomial: then each ray needs its own pixel.
+    """
+    for i in range(3):
+        for j in range(3):
+            x, y = (i - 1) * half, (j - 1) * half
+            u, v = _ray_pixel(origin, spread, x, y, width, height)
+            nodes[i, j, 0], nodes[i, j, 1] = u, v
+    centre = nodes[1, 1, 0]
+    for i in range(3):
+        for j in range(3):
+            nodes[i, j, 0] -= width * np.round((nodes[i, j, 0] - centre) / width)
+    for k in range(2):
+        q = quadratics[k]
+        for j in range(3):
+            before, at, after = nodes[0, j, k], nodes[1, j, k], nodes[2, j, k]
+            q[0, j], q[1, j], q[2, j] = at, 0.5 * (after - before), 0.5 * (after + before) - at
+        for i in range(3):
+            before, at, after = q[i, 0], q[i, 1], q[i, 2]
+            q[i, 0], q[i, 1], q[i, 2] = at, 0.5 * (after - before), 0.5 * (after + before) - at
+    size2 = np.sum(spread * spread)  # two squared steps, at least the square of the longest
+    return origin[0] ** 2 + origin[2] ** 2 > size2 * (_NEAR_POLE * half) ** 2
+
+
+@_kernel
+def _sample_grid(coefficients, origin, spread, reach, shift_x, shift_y, nodes, quadratics, out):
+    """Values (n * n,) of an n x n grid of unit spacing on the plane patch, off by a shift.
+
+    `out[i * n + j]` is at x = i - reach + shift_x, y = j - reach + shift_y, n = 2 reach + 1.
+    """
+    height, width = coefficients.shape
+    n, half = 2 * reach + 1, reach + 1.0
+    if not _pixel_map(origin, spread, half, width, height, nodes, quadratics):
+        for i in range(n):
+            for j in range(n):
+                x, y = i - reach + shift_x, j - reach + shift_y
+                u, v = _ray_pixel(origin, spread, x, y, width, height)
+                out[i * n + j] = _sample(coefficients, u, v)
+        return
+    p, q = quadratics[0], quadratics[1]
+    for i in range(n):
+        x = (i - reach + shift_x) / half
+        u0, v0 = p[0, 0] + x * (p[1, 0] + x * p[2, 0]), q[0, 0] + x * (q[1, 0] + x * q[2, 0])
+        u1, v1 = p[0, 1] + x * (p[1, 1] + x * p[2, 1]), q[0, 1] + x * (q[1, 1] + x * q[2, 1])
+        u2, v2 = p[0, 2] + x * (p[1, 2] + x * p[2, 2]), q[0, 2] + x * (q[1, 2] + x * q[2, 2])
+        for j in range(n):
+            y = (j - reach + shift_y) / half
+            out[i * n + j] = _sample(coefficients, u0 + y * (u1 + y * u2), v0 + y * (v1 + y * v2))
+
+
+@_kernel
+def _is_usable(mask, nodes):
+    """Whether all nodes of the last patch lie where the mask (H, W) allows; an empty one does."""
+    height, width = mask.shape
+    usable = True
+    for i in range(3 if height else 0):
+        for j in range(3):
+            row = min(max(int(np.floor(nodes[i, j, 1])), 0), height - 1)
+            usable &= mask[row, int(np.floor(nodes[i, j, 0])) % width]
+    return usable
+
+
+@_kernel
+def _statistics(window, values):
+    """Weighted mass, mean and sum of squares about the mean."""
+    mass = mean = square = 0.0
+    for k in range(len(window)):
+        mass += window[k]
+        mean += window[k] * values[k]
+    mean /= mass
+    for k in range(len(window)):
+        square += window[k] * (values[k] - mean) ** 2
+    return mass, mean, square
+
+
+@_kernel
+def _normal_matrix(templates, t, reach, normal):
+    """Write the normal matrix (8, 8) of a template; False where a shift is not determined."""
+    n = 2 * reach + 1
+    c = np.empty(8)
+    normal[:] = 0.0
+    for k in range(n * n):
+        x, y = k // n - reach, k % n - reach
+        c[0], c[1], c[6], c[7] = (
+            templates.by_x[t, k],
+            templates.by_y[t, k],
+            templates.grey[t, k],
+            1.0,
+        )
+        c[2], c[3], c[4], c[5] = c[0] * x, c[1] * x, c[0] * y, c[1] * y
+        for i in range(8):
+            for j in range(8):
+                normal[i, j] += templates.window[k] * c[i] * c[j]
+    trace = normal[0, 0] + normal[1, 1]
+    determinant = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
+    for r in range(8):
+        normal[r, r] += 1e-6 * normal[r, r] + (templates.prior if 2 <= r < 6 else 0.0)
+    return determinant > _LEAST_CORNER * trace * trace
+
+
+@_kernel
+def cut_templates(coefficients, mask, rows, origins, spreads, least_contrast, templates):
+    """Fill the rows (R,) of templates from their reference frame.
+
+    Args:
+        mask: (H, 2H) bool, True = use, or empty.
+        origins (T, 3), spreads (T, 3, 2): the plane patches.
+        least_contrast: standard deviation in grey values below which there is no texture.
+    """
+    window = templates.window
+    num = len(window)
+    reach = (int(np.round(np.sqrt(num))) - 1) // 2
+    nodes, quadratics = np.empty((3, 3, 2)), np.empty((2, 3, 3))
+    ahead, behind = np.empty(num, np.float32), np.empty(num, np.float32)
+    normal = np.empty((8, 8))
+    for t in rows:
+        origin, spread, values = origins[t], spreads[t], templates.grey[t]
+        for axis in range(2):
+            sx, sy = 0.5 * (1 - axis), 0.5 * axis
+            _sample_grid(coefficients, origin, spread, reach, sx, sy, nodes, quadratics, ahead)
+            _sample_grid(coefficients, origin, spread, reach, -sx, -sy, nodes, quadratics, behind)
+            slopes = templates.by_x[t] if axis == 0 else templates.by_y[t]
+            for k in range(num):
+                slopes[k] = ahead[k] - behind[k]
+        _sample_grid(coefficients, origin, spread, reach, 0.0, 0.0, nodes, quadratics, values)
+        if not _is_usable(mask, nodes):
+            templates.states[t] = MASKED
+            continue
+        mass, mean, square = _statistics(window, values)
+        for k in range(num):
+            values[k] -= mean
+        corner = _normal_matrix(templates, t, reach, normal)
+        if corner and square > mass * least_contrast * least_contrast:
+            templates.inverses[t] = np.linalg.inv(normal)
+            templates.states[t] = ALIGNED
+        else:
+            templates.states[t] = FLAT
+
+
+@_kernel
+def _gradient(templates, t, reach, values, gain, offset, b):
+    """Write the normal equations' right side (8,); returns the residual's weighted square."""
+    n = 2 * reach + 1
+    grey, by_x, by_y = templates.grey[t], templates.by_x[t], templates.by_y[t]
+    b[:] = 0.0
+    cost = 0.0
+    for i in range(n):
+        for j in range(n):
+            k, x, y = i * n + j, i - reach, j - reach
+            e = (values[k] - offset) / gain - grey[k]
+            weighted = templates.window[k] * e
+            cost += weighted * e
+            ex, ey = weighted * by_x[k], weighted * by_y[k]
+            b[0] += ex
+            b[1] += ey
+            b[2] += ex * x
+            b[3] += ey * x
+            b[4] += ex * y
+            b[5] += ey * y
+            b[6] += weighted * grey[k]
+            b[7] += weighted
+    return cost
+
+
+@_kernel
+def _judge(templates, t, values, mean, square, power, mass):
+    """ZNCC, and the residual's variance after gain and offset, in the template's grey values."""
+    cross = 0.0
+    for k in range(len(values)):
+        cross += templates.window[k] * (values[k] - mean) * templates.grey[t, k]
+    gain = max(cross / power, 1e-6)
+    rest = max(square - gain * cross, _LEAST_GREY * mass)
+    freedom = 1.0 - 8.0 / len(values)
+    return cross / np.sqrt(square * power), rest / (gain * gain * mass * freedom)
+
+
+@_kernel
+def align_templates(coefficients, mask, rows, sightings, max_shift, steps, tolerance, templates):
+    """Align templates to one frame by inverse-compositional Gauss-Newton.
+
+    The template's point q = (x, y) is looked for at origin + spread @ (shift + (1 + affine) q),
+    with a gain and an offset. Baker & Matthews, "Lucas-Kanade 20 Years On", IJCV 56(3), 2004.
+
+    Args:
+        rows (R,): sightings in this frame; their warps, scores, variances and states are written.
+        max_shift: template pixels, beyond which a patch is given up.
+        steps: at most.
+        tolerance: on the shift's last step, template pixels.
+    """
+    window = templates.window
+    reach = (int(np.round(np.sqrt(len(window)))) - 1) // 2
+    nodes, quadratics = np.empty((3, 3, 2)), np.empty((2, 3, 3))
+    values = np.empty(len(window), np.float32)
+    origin, spread = np.empty(3), np.empty((3, 2))
+    b, step = np.empty(8), np.empty(8)
+    for o in rows:
+        t, warp = sightings.templates[o], sightings.warps[o]
+        power = _statistics(window, templates.grey[t])[2]
+        gain = offset = 0.0
+        settled, state = False, UNSTEADY
+        for number in range(steps + 1):
+            _place(sightings, o, origin, spread)
+            _sample_grid(coefficients, origin, spread, reach, 0.0, 0.0, nodes, quadratics, values)
+            if number == 0 or settled:
+                mass, mean, square = _statistics(window, values)
+                if not square > _LEAST_GREY * mass:
+                    state = FLAT
+                    break
+                if settled:
+                    state = ALIGNED if _is_usable(mask, nodes) else MASKED
+                    sightings.scores[o], sightings.variances[o] = _judge(
+                        templates, t, values, mean, square, power, mass
+                    )
+                    break
+                gain, offset = np.sqrt(square / power), mean
+            cost = _gradient(templates, t, reach, values, gain, offset, b)
+            if number >= _TRIAL_STEPS and not cost < power:
+                state = UNLIKE
+                break
+            _solve(templates, t, warp, b, step)
+            offset += gain * step[7]
+            gain *= max(1.0 + step[6], 0.2)
+            if not _compose(warp, step) or not warp[0] ** 2 + warp[1] ** 2 < max_shift**2:
+                state = FAR
+                break
+            settled = step[0] ** 2 + step[1] ** 2 < tolerance**2
+        sightings.states[o] = state
+
+
+@_kernel
+def _place(sightings, o, origin, spread):
+    """Write the plane patch (3,), (3, 2) of a sighting under its warp."""
+    warp = sightings.warps[o]
+    for i in range(3):
+        p, q = sightings.spreads[o, i, 0], sightings.spreads[o, i, 1]
+        origin[i] = sightings.origins[o, i] + p * warp[0] + q * warp[1]
+        spread[i, 0] = p * (1.0 + warp[2]) + q * warp[3]
+        spread[i, 1] = p * warp[4] + q * (1.0 + warp[5])
+
+
+@_kernel
+def _solve(templates, t, warp, b, step):
+    """Write the Gauss-Newton step (8,), the affine part being drawn to none."""
+    b[2:6] += templates.prior * warp[2:6]
+    for r in range(8):
+        total = 0.0
+        for c in range(8):
+            total += templates.inverses[t, r, c] * b[c]
+        step[r] = total
+
+
+@_kernel
+def _compose(warp, step):
+    """warp := warp after the inverse of the step's warp; False where that has none."""
+    a, c, b, d = 1.0 + step[2], step[3], step[4], 1.0 + step[5]
+    determinant = a * d - b * c
+    if not determinant > 0.1:
+        return False
+    p, r, q, s = 1.0 + warp[2], warp[3], warp[4], 1.0 + warp[5]
+    na, nb = (p * d - q * c) / determinant, (q * a - p * b) / determinant
+    nc, nd = (r * d - s * c) / determinant, (s * a - r * b) / determinant
+    warp[0] -= na * step[0] + nb * step[1]
+    warp[1] -= nc * step[0] + nd * step[1]
+    warp[2], warp[3], warp[4], warp[5] = na - 1.0, nc, nb, nd - 1.0
+    return True

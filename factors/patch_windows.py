@@ -1,0 +1,307 @@
+"""Patches of a sphere image seen again in others: what they are, and their pixels gathered.
+
+Frames are taken one at a time: of each, the templates of the patches that it hosts and a small
+window around every patch that it shows. Memory grows with observations, never with the images.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factors._photometric_kernels import CODE_SCALE, CODE_ZERO
+from factors.bearing import tangent_basis
+from factors.sphere_image import SphereImage
+
+PAD = 2  # coefficients beyond the border: the support of the spline
+_LEAST_COSINE = 0.15  # of the angle between a patch's normal and the ray that sees it
+_MOST_ZOOM = 2.0  # change of a patch's size between host and target, either way
+
+
+@dataclass(frozen=True, slots=True)
+class PatchTable:
+    """Patches and the frames that should show them."""
+
+    hosts: np.ndarray  # (P,) int, frame whose pixels are the template
+    bearings_rig: np.ndarray  # (P, 3) float64, unit, centre in the host's rig frame
+    planes: np.ndarray  # (P, 3) float64, 1 / map units: inverse depth and slopes, see `planes_from`
+    plane_sigmas: np.ndarray  # (P, 3) float64, 1 / map units, of the prior on `planes`; inf = none
+    offsets: np.ndarray  # (P + 1,) int64: patch p owns targets[offsets[p]:offsets[p + 1]]
+    targets: np.ndarray  # (O,) int, frames, never the host and none twice for a patch
+    grid: np.ndarray  # (N, 2) float64, pixels on the tangent plane of the bearing
+
+    def __len__(self) -> int:
+        return len(self.hosts)
+
+    @property
+    def owners(self) -> np.ndarray:
+        """(O,) patch of every observation."""
+        return np.repeat(np.arange(len(self)), np.diff(self.offsets))
+
+    def select(self, observations: np.ndarray) -> "tuple[PatchTable, np.ndarray]":
+        """The table of some observations (O,) bool, and the patches (p,) that have any.
+
+        Frames keep their numbers.
+        """
+        counts = np.bincount(self.owners[observations], minlength=len(self))
+        rows = np.flatnonzero(counts)
+        part = replace(
+            self,
+            hosts=self.hosts[rows],
+            bearings_rig=self.bearings_rig[rows],
+            planes=self.planes[rows],
+            plane_sigmas=self.plane_sigmas[rows],
+            offsets=np.concatenate([[0], np.cumsum(counts[rows])]),
+            targets=self.targets[observations],
+        )
+        return part, rows
+
+    def check(self, num_frames: int) -> None:
+        """Refuse arrays that do not fit one another.
+
+        Raises:
+            ValueError: unequal lengths, indices out of range, values not finite, a patch that
+                names its host or a frame twice as target.
+        """
+        num = len(self.hosts)
+        wanted = {
+            "bearings_rig": (self.bearings_rig, (num, 3)),
+            "planes": (self.planes, (num, 3)),
+            "plane_sigmas": (self.plane_sigmas, (num, 3)),
+            "offsets": (self.offsets, (num + 1,)),
+        }
+        for name, (array, shape) in wanted.items():
+            if np.shape(array) != shape:
+                raise ValueError(f"{name} of {num} patches must be {shape}, not {np.shape(array)}")
+        if not (np.all(np.isfinite(self.bearings_rig)) and np.all(np.isfinite(self.planes))):
+            raise ValueError("bearings and planes must be finite")
+        if np.any(np.abs(np.linalg.norm(self.bearings_rig, axis=1) - 1) > 1e-6):
+            raise ValueError("bearings must be of length one")
+        if not np.all(self.planes[:, 0] > 0) or not np.all(self.plane_sigmas > 0):
+            raise ValueError("inverse depths and the sigmas of planes must be positive")
+        if self.offsets[0] != 0 or np.any(np.diff(self.offsets) < 0):
+            raise ValueError("offsets must start at 0 and not descend")
+        if self.offsets[-1] != len(self.targets):
+            raise ValueError(f"offsets end at {self.offsets[-1]}, targets at {len(self.targets)}")
+        frames = np.concatenate([self.hosts, self.targets])
+        if len(frames) and not (frames.min() >= 0 and frames.max() < num_frames):
+            raise ValueError(f"frame index out of range 0..{num_frames - 1}")
+        if np.any(self.hosts[self.owners] == self.targets):
+            raise ValueError("a patch must not be observed in its host")
+        if len(np.unique(self.owners * num_frames + self.targets)) < len(self.targets):
+            raise ValueError("a patch must not be observed twice in one frame")
+
+
+def pixel_grid(size: int, spacing_rad: float) -> np.ndarray:
+    """(size^2, 2) float64 tangents of a square patch's pixels, row by row."""
+    steps = spacing_rad * (np.arange(size) - (size - 1) / 2)
+    x, y = np.meshgrid(steps, steps)
+    return np.column_stack([x.ravel(), y.ravel()])
+
+
+def patch_axes(bearings_rig: np.ndarray) -> np.ndarray:
+    """(P, 3, 3) float64, rows: the unit bearing (P, 3) and the axes of its tangent plane."""
+    return np.concatenate([bearings_rig[:, None], tangent_basis(bearings_rig)], axis=1)
+
+
+def planes_from(
+    bearings_rig: np.ndarray, distances: np.ndarray, normals_rig: np.ndarray | None = None
+) -> np.ndarray:
+    """Inverse-depth planes (P, 3) of patches at distances (P,), map units.
+
+    Along bearing + x e1 + y e2 the plane is met at 1 / (theta0 + x theta1 + y theta2) of that
+    vector's length.
+
+    Args:
+        bearings_rig: (P, 3) unit.
+        distances: (P,) positive.
+        normals_rig: (P, 3) of any length, either sign, not at right angles to the bearing; None
+            lays the planes at right angles to the bearings.
+    """
+    inverse = 1.0 / np.asarray(distances, dtype=np.float64)
+    planes = np.zeros((len(inverse), 3))
+    planes[:, 0] = inverse
+    if normals_rig is not None:
+        along = np.einsum("pki,pi->pk", patch_axes(bearings_rig), normals_rig)
+        planes[:, 1:] = inverse[:, None] * along[:, 1:] / along[:, :1]
+    return planes
+
+
+def covisible_frames(table: PatchTable, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Frame pairs f < g that share a patch, as sorted CSR rows: starts (F + 1,), columns (Q,)."""
+    counts = np.diff(table.offsets)
+    codes = [np.zeros(0, dtype=np.int64)]
+    for count in np.unique(counts[counts > 0]):
+        rows = np.flatnonzero(counts == count)
+        seen = table.targets[table.offsets[rows][:, None] + np.arange(count)]
+        frames = np.sort(np.column_stack([table.hosts[rows], seen]), axis=1).astype(np.int64)
+        i, k = np.triu_indices(count + 1, 1)
+        codes.append(np.unique(frames[:, i] * num_frames + frames[:, k]))
+    first, second = np.divmod(np.unique(np.concatenate(codes)), num_frames)
+    starts = np.zeros(num_frames + 1, dtype=np.int64)
+    np.cumsum(np.bincount(first, minlength=num_frames), out=starts[1:])
+    return starts, second
+
+
+def patch_spans(
+    table: PatchTable, world_T_rigs: np.ndarray, planes: np.ndarray, rows: np.ndarray
+) -> np.ndarray:
+    """Vectors (R, 3, 3), rows: to the centre, and per tangent along e1 and e2.
+
+    In the targets' rig frames, of observations `rows (R,)`, times the inverse depth.
+    """
+    owners = table.owners[rows]
+    host, target = world_T_rigs[table.hosts[owners]], world_T_rigs[table.targets[rows]]
+    target_R_host = np.einsum("rji,rjk->rik", target[:, :3, :3], host[:, :3, :3])
+    c = np.einsum("rji,rj->ri", target[:, :3, :3], host[:, :3, 3] - target[:, :3, 3])
+    spans = np.einsum("rij,rkj->rki", target_R_host, patch_axes(table.bearings_rig)[owners])
+    return spans + planes[owners][:, :, None] * c[:, None, :]
+
+
+def poor_views(
+    table: PatchTable, world_T_rigs: np.ndarray, planes: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Reason -> observations (O,) bool that show their patch too badly to count.
+
+    "behind": a pixel of the patch has no positive depth; "grazing": the target sees it from behind
+    or along its surface; "zoom": far larger or smaller than the host does.
+    """
+    owners = table.owners
+    inverse_depths = np.column_stack([np.ones(len(table.grid)), table.grid]) @ planes.T
+    spans = patch_spans(table, world_T_rigs, planes, np.arange(len(owners)))
+    middle = spans[:, 0]
+    length = np.maximum(np.linalg.norm(middle, axis=1), 1e-12)
+    # area of the patch on the target's sphere per area on the host's
+    area = np.einsum("oi,oi->o", np.cross(spans[:, 1], spans[:, 2]), middle) / length**3
+    normals = np.einsum("pk,pki->pi", planes, patch_axes(table.bearings_rig))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.einsum("oij,oj->oi", world_T_rigs[table.hosts[owners], :3, :3], normals[owners])
+    rays = np.einsum("oij,oj->oi", world_T_rigs[table.targets, :3, :3], middle)
+    cosine = np.einsum("oi,oi->o", normals, rays) / length
+    return {
+        "behind": ~np.all(inverse_depths > 0, axis=0)[owners],
+        "grazing": ~(cosine > _LEAST_COSINE),
+        "zoom": ~((area < _MOST_ZOOM**2) & (area > _MOST_ZOOM**-2)),
+    }
+
+
+def pixels_of(bearings: np.ndarray, width: int) -> np.ndarray:
+    """Equirectangular pixels (..., 2), (u, v), corner origin, of vectors (..., 3), rig frame."""
+    x, y, z = bearings[..., 0], bearings[..., 1], bearings[..., 2]
+    per_radian = width / (2 * np.pi)
+    u = per_radian * np.arctan2(x, z) + width / 2
+    return np.stack([u, per_radian * np.arctan2(y, np.hypot(x, z)) + width / 4], axis=-1)
+
+
+def over_poles(image: np.ndarray, rows: int) -> np.ndarray:
+    """An image (H, 2 H) with `rows` more beyond either pole, where the sphere goes on."""
+    half = image.shape[1] // 2
+    above = np.roll(image[:rows][::-1], half, axis=1)
+    below = np.roll(image[-rows:][::-1], half, axis=1)
+    return np.concatenate([above, image, below], axis=0)
+
+
+def coded(image: SphereImage) -> np.ndarray:
+    """Spline coefficients in two bytes each, continued over seam and poles.
+
+    Returns:
+        (H + 2 PAD, 2 H + 2 PAD) int16, steps of 1 / CODE_SCALE grey values from CODE_ZERO.
+
+    Raises:
+        ValueError: values that are not finite.
+    """
+    tall = over_poles(image.coefficients, PAD)
+    if not np.all(np.isfinite(tall)):
+        raise ValueError("the grey values must be finite")
+    wide = np.concatenate([tall[:, -PAD:], tall, tall[:, :PAD]], axis=1)
+    steps = np.rint((wide - np.float32(CODE_ZERO)) * np.float32(CODE_SCALE))
+    return np.clip(steps, -32768, 32767).astype(np.int16)
+
+
+class PatchPixels:
+    """Templates and windows of a table's patches, taken frame by frame.
+
+    A window holds what the patch covers under the given poses and `margin` pixels around: that
+    far an observation may move before it is left out.
+    """
+
+    def __init__(
+        self, table: PatchTable, world_T_rigs: np.ndarray, width: int, margin: float = 6.0
+    ) -> None:
+        """Nothing is sampled yet.
+
+        Args:
+            table: patches; its frames index the poses.
+            world_T_rigs: (F, 4, 4) float64, where windows are looked for.
+            width: of the sphere images, pixels.
+            margin: pixels of that image at the equator.
+
+        Raises:
+            ValueError: the table does not fit itself or the poses.
+        """
+        table.check(len(world_T_rigs))
+        self.table, self.width, self.margin = table, width, margin
+        self.templates = np.full((len(table), len(table.grid)), 0.0, dtype=np.float32)
+        self.windows = np.zeros((len(table.targets), 4), dtype=np.int32)
+        self.starts = np.zeros(len(table.targets), dtype=np.int64)
+        self._world_T_rigs = world_T_rigs
+        self._chunks: list[np.ndarray] = []
+        self._length = 0
+
+    @property
+    def num_frames(self) -> int:
+        """Number of poses given."""
+        return len(self._world_T_rigs)
+
+    def take(self, frame: int, image: SphereImage) -> None:
+        """Cut what frame `frame` hosts and shows out of its image."""
+        width = image.coefficients.shape[1]
+        if width != self.width:
+            raise ValueError(f"image of {width} px where {self.width} px are expected")
+        self._take_templates(frame, image)
+        rows = np.flatnonzero(self.table.targets == frame)
+        if len(rows) == 0:
+            return
+        boxes, codes = self._boxes(rows), coded(image)
+        columns = np.arange(boxes[:, 2].max())
+        for o, (left, top, wide, high) in zip(rows, boxes.tolist(), strict=True):
+            first = left + PAD
+            band = codes[top + PAD : top + PAD + high]
+            if first >= 0 and first + wide <= codes.shape[1]:
+                cut = band[:, first : first + wide]
+            else:  # across the seam
+                cut = band[:, PAD + (left + columns[:wide]) % self.width]
+            self._chunks.append(cut.ravel())
+            self.starts[o] = self._length
+            self._length += cut.size
+        self.windows[rows] = boxes
+
+    def pixels(self) -> np.ndarray:
+        """(M,) int16: all windows back to back; they stay in one array from now on."""
+        joined = np.concatenate([np.zeros(0, np.int16), *self._chunks])
+        self._chunks = [joined]
+        return joined
+
+    def _take_templates(self, frame: int, image: SphereImage) -> None:
+        rows = np.flatnonzero(self.table.hosts == frame)
+        weights = np.column_stack([np.ones(len(self.table.grid)), self.table.grid])
+        directions = weights @ patch_axes(self.table.bearings_rig[rows])
+        self.templates[rows] = image.sample(directions)[0]
+
+    def _boxes(self, rows: np.ndarray) -> np.ndarray:
+        """First column and row, width and height (R, 4) int64 of the windows."""
+        spans = patch_spans(self.table, self._world_T_rigs, self.table.planes, rows)
+        weights = np.column_stack([np.ones(len(self.table.grid)), self.table.grid])
+        uv = pixels_of(weights @ spans, self.width)
+        height = self.width // 2
+        u, v = uv[..., 0], uv[..., 1]
+        u = u[:, :1] + (u - u[:, :1] + self.width / 2) % self.width - self.width / 2
+        low = np.maximum(np.floor(v.min(axis=1) - self.margin) - PAD, -PAD)
+        high = np.minimum(np.ceil(v.max(axis=1) + self.margin) + PAD, height + PAD)
+        steepest = np.maximum(np.abs(low + PAD - height / 2), np.abs(high - PAD - height / 2))
+        cosine = np.cos(np.minimum(np.pi / 2, np.pi * steepest / height))
+        margin = self.margin / np.maximum(cosine, 1e-3)
+        left = np.floor(u.min(axis=1) - margin) - PAD
+        right = np.ceil(u.max(axis=1) + margin) + PAD
+        ring = right - left >= self.width  # all around a pole
+        left[ring], right[ring] = -PAD, self.width + PAD
+        return np.stack([left, low, right - left, high - low], axis=1).astype(np.int64)

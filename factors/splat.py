@@ -1,0 +1,297 @@
+"""Direct alignment of captured panoramas to what a splat renders at their poses.
+
+A rendering at the last accepted pose, colour and expected depth, is a cloud of points with grey
+values. At another pose each point falls elsewhere in the captured frame; the residual is what the
+frame shows there less what the rendering has, after one gain and one offset per frame. So the
+rasteriser is never differentiated, and the six faces of a frame together give one 6x6 block. After
+Newcombe et al., DTAM, ICCV 2011 (tracking against a rendered model), on the sphere.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numba import njit
+
+from factors._host_factors import _square_root
+from factors._terms import pose_rows
+from factors.block import PoseSystem
+from factors.reprojection import FaceCameras
+from factors.robust import RobustLoss
+
+NAME = "splat"
+_MIN_SAMPLES = 50  # fewer say nothing about a pose
+_MIN_SPREAD = 1e-3  # floor of the residuals' spread, grey values 0..1
+
+
+@dataclass(frozen=True, slots=True)
+class RenderedView:
+    """What a splat shows from a pose, where that is certain."""
+
+    points_world: np.ndarray  # (N, 3) float64, world: pixels at their expected depth
+    grey: np.ndarray  # (N,) float64, 0..1
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """One frame between two renderings."""
+
+    view: RenderedView
+    grey: np.ndarray  # (N,) float64, of the view, gain and offset applied
+    sigma: float  # of a residual, grey values
+
+
+Render = Callable[[int, np.ndarray], RenderedView]  # row of pose_keys, world_T_rig (4, 4)
+
+
+class SplatBlock:
+    """Alignment of frames to a fixed splat; implements `factors.block.Block`.
+
+    No two frames share a residual: the map is the splat's, and its gauge is held by whatever else
+    is in the graph.
+
+    Attributes:
+        pose_keys: (F,) keys of the Pose3 variables `world_T_rig`.
+        pairs: (0, 2).
+    """
+
+    def __init__(
+        self,
+        pose_keys: Sequence[int],
+        images: Sequence[np.ndarray],
+        use: Sequence[np.ndarray | None],
+        cameras: FaceCameras,
+        render: Render,
+        loss: RobustLoss | None = None,
+        correlation: float = 25.0,
+    ) -> None:
+        """Prepare the captured frames for sampling.
+
+        Args:
+            pose_keys: (F,) keys of Pose3 variables.
+            images: (F,) of (C, H, W) float32 grey values 0..1 of a frame's faces, which should
+                overlap by a few pixels for sampling near their edges.
+            use: (F,) of (C, H, W) bool, pixels that may be sampled, or None.
+            cameras: of the faces.
+            render: the splat from a pose; called by `refresh`.
+            loss: robust loss on each whitened residual; None is Cauchy at one sigma.
+            correlation: pixels that err together and count as one; 25 made the errors of aligned
+                poses about as large as their covariance says, at faces of 48 to 192 pixels.
+
+        Raises:
+            ValueError: as many images and masks as keys are needed.
+        """
+        if not len(pose_keys) == len(images) == len(use):
+            raise ValueError("pose_keys, images and use must be equally long")
+        self.pose_keys = [int(key) for key in pose_keys]
+        self.pairs = np.zeros((0, 2), np.int64)
+        self.loss = loss or RobustLoss("cauchy", 1.0)
+        self.correlation = correlation
+        self._cameras, self._render = cameras, render
+        self._images = [_spline(image) for image in images]
+        whole = np.ones(self._images[0].shape if len(images) else (0, 0, 0), np.bool_)
+        self._use = [whole if mask is None else np.ascontiguousarray(mask) for mask in use]
+        self._frames: list[_Frame] = []
+
+    def refresh(self, values: gtsam.Values) -> None:
+        """Render at accepted poses; fit gain, offset and noise of every frame there."""
+        self._frames = []
+        for f, key in enumerate(self.pose_keys):
+            view = self._render(f, values.atPose3(key).matrix())
+            found, _, seen = self._sample(f, view, pose_rows(values, [key])[0], False)
+            gain, offset = _exposure(view.grey[seen], found[seen])
+            grey = gain * view.grey + offset
+            spread = 1.4826 * np.median(np.abs(found - grey)[seen]) if seen.any() else 0.0
+            self._frames.append(_Frame(view, grey, max(float(spread), _MIN_SPREAD)))
+
+    def linearize(self, values: gtsam.Values) -> PoseSystem:
+        """Gauss-Newton model with robust weights at `values`."""
+        num = len(self.pose_keys)
+        diagonal, gradient, cost = np.zeros((num, 6, 6)), np.zeros((num, 6)), 0.0
+        for f, pose in enumerate(pose_rows(values, self.pose_keys)):
+            diagonal[f], gradient[f], part = self._frame_system(f, pose)
+            cost += part
+        return PoseSystem(diagonal, np.zeros((0, 6, 6)), gradient, {NAME: cost})
+
+    def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
+        """Robust cost at tentative values."""
+        return self.costs(values)[NAME]
+
+    def accept(self) -> None:
+        """Nothing is tied to a proposal here."""
+
+    def costs(self, values: gtsam.Values) -> dict[str, float]:
+        """Robust cost under the last renderings."""
+        poses = pose_rows(values, self.pose_keys)
+        return {NAME: sum(self._frame_cost(f, pose) for f, pose in enumerate(poses))}
+
+    def residuals(self, values: gtsam.Values) -> list[np.ndarray]:
+        """Whitened residuals (N,) of each frame's samples, 0 where a sample is not seen."""
+        poses = pose_rows(values, self.pose_keys)
+        return [self._residuals(f, pose, False)[0] for f, pose in enumerate(poses)]
+
+    def factors(self) -> list[gtsam.CustomFactor]:
+        """The same cost under the last renderings as ordinary GTSAM factors, one per frame."""
+        return [self._factor(f, key) for f, key in enumerate(self.pose_keys)]
+
+    def _factor(self, f: int, key: int) -> gtsam.CustomFactor:
+        def error(_factor, values: gtsam.Values, jacobians) -> np.ndarray:
+            pose = pose_rows(values, [key])[0]
+            out = np.zeros(7)
+            if jacobians is None:
+                out[6] = np.sqrt(2 * self._frame_cost(f, pose))
+                return out
+            root, gradient, cost = self._frame_system(f, pose)
+            out[:6] = _square_root(root, gradient)
+            out[6] = np.sqrt(max(2 * cost - float(out @ out), 0.0))
+            jacobians[0] = np.asfortranarray(np.vstack([root, np.zeros((1, 6))]))
+            return out
+
+        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(7), [key], error)
+
+    def _frame_system(self, f: int, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """H (6, 6), gradient (6,) and cost of a frame at a pose row (12,)."""
+        residuals, jacobian = self._residuals(f, pose, True)
+        squared = residuals**2
+        share = 1 / self.correlation
+        weights = share * _weights(self.loss, squared)
+        weighted = jacobian * weights[:, None]
+        cost = share * float(self.loss.rho(squared).sum())
+        return weighted.T @ jacobian, weighted.T @ residuals, cost
+
+    def _frame_cost(self, f: int, pose: np.ndarray) -> float:
+        residuals, _ = self._residuals(f, pose, False)
+        return float(self.loss.rho(residuals**2).sum()) / self.correlation
+
+    def _residuals(
+        self, f: int, pose: np.ndarray, with_jacobian: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if not self._frames:
+            raise RuntimeError("refresh() comes before anything else")
+        frame = self._frames[f]
+        found, jacobian, seen = self._sample(f, frame.view, pose, with_jacobian)
+        if np.count_nonzero(seen) < _MIN_SAMPLES:
+            return np.zeros(len(seen)), np.zeros((len(seen), 6))
+        residuals = np.where(seen, (found - frame.grey) / frame.sigma, 0.0)
+        return residuals, jacobian / frame.sigma
+
+    def _sample(
+        self, f: int, view: RenderedView, pose: np.ndarray, with_jacobian: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Captured grey (N,), its Jacobian by the pose (N, 6), and where a point is seen (N,)."""
+        num, cameras = len(view.points_world), self._cameras
+        grey, seen = np.zeros(num), np.zeros(num, np.bool_)
+        jacobian = np.zeros((num if with_jacobian else 0, 6))
+        _sample_faces(
+            view.points_world,
+            pose,
+            np.ascontiguousarray(cameras.rig_R_faces),
+            np.asarray(cameras.focals, np.float64),
+            np.asarray(cameras.principals, np.float64),
+            self._images[f],
+            self._use[f],
+            with_jacobian,
+            grey,
+            jacobian,
+            seen,
+        )
+        return grey, jacobian, seen
+
+
+def _spline(image: np.ndarray) -> np.ndarray:
+    """Coefficients (C, H, W) of the cubic B-spline through each face."""
+    from scipy.ndimage import spline_filter
+
+    faces = [spline_filter(np.asarray(face, np.float64), 3, mode="mirror") for face in image]
+    return np.stack(faces)
+
+
+def _exposure(rendered: np.ndarray, captured: np.ndarray) -> tuple[float, float]:
+    """Gain and offset that carry rendered grey values (N,) to captured ones, by robust steps."""
+    if len(rendered) < _MIN_SAMPLES or np.ptp(rendered) < _MIN_SPREAD:
+        return 1.0, 0.0
+    columns = np.column_stack([rendered, np.ones(len(rendered))])
+    solution = np.array([1.0, float(np.median(captured - rendered))])
+    for _ in range(5):
+        residuals = captured - columns @ solution
+        scale = max(1.4826 * float(np.median(np.abs(residuals))), _MIN_SPREAD)
+        weighted = columns / (1 + (residuals / scale) ** 2)[:, None]
+        solution = np.linalg.lstsq(weighted.T @ columns, weighted.T @ captured, rcond=None)[0]
+    return float(solution[0]), float(solution[1])
+
+
+def _weights(loss: RobustLoss, squared: np.ndarray) -> np.ndarray:
+    """Weights 2 rho' (N,) of squared whitened residuals (N,)."""
+    c2 = loss.scale**2
+    if loss.kind == "huber":
+        return np.where(squared > c2, loss.scale / np.sqrt(np.maximum(squared, c2)), 1.0)
+    if loss.kind == "cauchy":
+        return c2 / (c2 + squared)
+    if loss.kind == "geman_mcclure":
+        return (c2 / (c2 + squared)) ** 2
+    return np.ones_like(squared)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cubic(t, values, slopes):
+    """Weights (4,) of a cubic B-spline at a fraction t, and their derivatives."""
+    s = 1 - t
+    values[0], values[3] = s * s * s / 6, t * t * t / 6
+    values[1] = 2 / 3 - 0.5 * t * t * (2 - t)
+    values[2] = 2 / 3 - 0.5 * s * s * (2 - s)
+    slopes[0], slopes[3] = -0.5 * s * s, 0.5 * t * t
+    slopes[1] = t * (1.5 * t - 2)
+    slopes[2] = -s * (1.5 * s - 2)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sample_faces(
+    points, pose, rig_R_faces, focals, principals, image, use, with_jacobian, grey, jacobian, seen
+):
+    """See SplatBlock._sample; a point belongs to the face along which it is furthest out."""
+    num_faces, height, width = image.shape
+    across, d_across, down, d_down = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
+    for n in range(len(points)):
+        x, y, z = points[n, 0] - pose[9], points[n, 1] - pose[10], points[n, 2] - pose[11]
+        dx = pose[0] * x + pose[3] * y + pose[6] * z
+        dy = pose[1] * x + pose[4] * y + pose[7] * z
+        dz = pose[2] * x + pose[5] * y + pose[8] * z
+        face, depth = 0, -1.0
+        for c in range(num_faces):
+            R = rig_R_faces[c]
+            forward = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
+            if forward > depth:
+                face, depth = c, forward
+        if not depth > 1e-9:
+            continue
+        R, focal = rig_R_faces[face], focals[face]
+        right = (R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) / depth
+        lower = (R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / depth
+        u = focal * right + principals[face, 0] - 0.5
+        v = focal * lower + principals[face, 1] - 0.5
+        column, row = int(np.floor(u)), int(np.floor(v))
+        if column < 1 or row < 1 or column > width - 3 or row > height - 3:
+            continue
+        if not (use[face, row, column] and use[face, row + 1, column + 1]):
+            continue
+        _cubic(u - column, across, d_across)
+        _cubic(v - row, down, d_down)
+        value = by_u = by_v = 0.0
+        for i in range(4):
+            for k in range(4):
+                coefficient = image[face, row - 1 + i, column - 1 + k]
+                value += down[i] * across[k] * coefficient
+                by_u += down[i] * d_across[k] * coefficient
+                by_v += d_down[i] * across[k] * coefficient
+        grey[n], seen[n] = value, True
+        if with_jacobian:
+            a, b = focal / depth * by_u, focal / depth * by_v
+            c = -(a * right + b * lower)
+            gx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c  # by the point in the rig
+            gy = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
+            gz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+            jacobian[n, 0] = gy * dz - gz * dy
+            jacobian[n, 1] = gz * dx - gx * dz
+            jacobian[n, 2] = gx * dy - gy * dx
+            jacobian[n, 3], jacobian[n, 4], jacobian[n, 5] = -gx, -gy, -gz

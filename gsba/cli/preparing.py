@@ -1,0 +1,65 @@
+"""Commands that prepare frames: `extract`, `mask`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gsba.cli.app import command
+from gsba.log import GsbaError
+
+
+@command
+def extract(
+    video: Annotated[Path, typer.Argument(help="Equirectangular (2:1) video.")],
+    out: Annotated[Path, typer.Option(help="Folder of the frames.", metavar="FRAMES")],
+    fps: Annotated[float | None, typer.Option(help="Frames kept per second; 1 if unsaid.")] = None,
+    every: Annotated[int | None, typer.Option(help="Keep one frame of so many.")] = None,
+    at: Annotated[
+        Path | None, typer.Option(help="Keep the frames at its times.", metavar="TRAJECTORY")
+    ] = None,
+    sharpest: Annotated[
+        bool, typer.Option("--sharpest", help="Keep the sharpest of each stretch, not the first.")
+    ] = False,
+    from_s: Annotated[float | None, typer.Option("--from", help="Seconds to start at.")] = None,
+    to_s: Annotated[float | None, typer.Option("--to", help="Seconds to end at.")] = None,
+    width: Annotated[int | None, typer.Option(help="Pixels across a frame.")] = None,
+    keep_standing: Annotated[
+        bool, typer.Option("--keep-standing", help="Keep frames while the camera stands, too.")
+    ] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Replace another extraction.")] = False,
+) -> None:
+    """Write frames of a video with their exact times; the same call again resumes."""
+    from gsba.config_file import validated
+    from gsba.video import extract as write
+
+    if sum(choice is not None for choice in (fps, every, at)) > 1:
+        raise GsbaError("--fps, --every and --at each say which frames to keep: pass one")
+    if from_s is not None and to_s is not None and to_s <= from_s:
+        raise GsbaError(f"--to {to_s:g} must be later than --from {from_s:g}")
+    asked = {"fps": fps, "every": every, "at": None if at is None else str(at)}
+    asked |= {"from_s": from_s, "to_s": to_s, "width": width}
+    chosen = {key: value for key, value in asked.items() if value is not None}
+    chosen |= {"sharpest": sharpest} | ({"standing_deg": 0.0} if keep_standing else {})
+    counts = write(video, out, validated({"video": chosen}).video, fresh)
+    why = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
+    typer.echo(f"{counts.kept} of {counts.received} frames kept{f' ({why})' if why else ''}: {out}")
+
+
+@command
+def mask(
+    frames: Annotated[Path, typer.Argument(help="Folder of 2:1 panoramas.")],
+    out: Annotated[Path, typer.Option(help="Folder of the masks.", metavar="DIR")],
+    masks: Annotated[
+        Path | None, typer.Option(help="Masks of your own, merged with what is found.")
+    ] = None,
+) -> None:
+    """Find what carries the camera and write it as a mask to look at and to use."""
+    from gsba.carrier import find_carrier, write_carrier
+    from gsba.read.frames import find_panoramas
+
+    found_frames = find_panoramas(frames, masks)
+    carrier = find_carrier(found_frames)
+    written = write_carrier(carrier, found_frames, out)
+    what = carrier.reason or f"the carrier is {100 * carrier.share:.1f}% of the picture"
+    typer.echo(f"{what}: {written[0]}" + (f", {out / 'merged'}" if masks is not None else ""))

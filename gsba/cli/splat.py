@@ -1,0 +1,127 @@
+"""Commands on splats: `train`, `render`; and the splat side of `evaluate`."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from gsba.cli.app import command
+from gsba.log import GsbaError
+
+if TYPE_CHECKING:
+    from gsba.config import SplatSettings
+
+Run = Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")]
+Iterations = Annotated[int | None, typer.Option(help="Views shown, one at a time.")]
+FaceSize = Annotated[int | None, typer.Option(help="Pixels of a cube face.")]
+BackendName = Annotated[str, typer.Option(help="auto, gsplat or cpu.")]
+
+
+@command
+def train(
+    run: Run,
+    iterations: Iterations = None,
+    face_size: FaceSize = None,
+    backend: BackendName = "auto",
+) -> None:
+    """Train a splat on a run's refined poses; the same call again resumes."""
+    settings = splat_settings(iterations, face_size, backend)
+    results = _compare(run, {}, settings, run / "splat")
+    mean = results["refined"].mean
+    typer.echo(
+        f"{results['refined'].num_gaussians} Gaussians, PSNR {mean.psnr:.2f} dB, SSIM "
+        f"{mean.ssim:.4f} on held-out frames: {run / 'splat' / 'refined' / 'point_cloud.ply'}"
+    )
+
+
+@command
+def render(
+    splat: Annotated[Path, typer.Argument(help="point_cloud.ply.", metavar="SPLAT")],
+    run: Run,
+    frame: Annotated[str, typer.Option(help="Frame of the run, by name.", metavar="NAME")],
+    out: Annotated[Path | None, typer.Option(help="Folder; RUN/renderings by default.")] = None,
+    face_size: FaceSize = None,
+    backend: BackendName = "auto",
+) -> None:
+    """Render a splat at the refined pose of a frame: six faces and a panorama."""
+    import numpy as np
+
+    from gsba import splatting
+    from gsba.evaluate_splat import write_image
+    from gsba.pipeline import load_run
+    from gsba.rig import CubeRig
+    from gsba.run_folder import claim
+    from gsba.splat import read_ply
+    from gsba.splat.backend import choose_backend
+    from gsba.types import FACES
+
+    settings = splat_settings(None, face_size, backend)
+    reconstruction, frames = load_run(run)
+    if frame not in frames.names:
+        raise GsbaError(f"no frame {frame!r} in {run}: its first is {frames.names[0]!r}")
+    gaussians, renderer = read_ply(splat), choose_backend(settings.backend)
+    near = splatting.near_of(reconstruction.world_T_rigs, settings)
+    pose = reconstruction.world_T_rigs[frames.names.index(frame)]
+    folder, rig = out or run / "renderings", CubeRig(settings.face_size, np.pi / 2)
+    faces = splatting.render_faces(gaussians, pose, rig, near, renderer)
+    panorama = splatting.render_panorama(gaussians, pose, 4 * settings.face_size, near, renderer)
+    for name, image in [*zip(FACES, faces, strict=True), ("erp", panorama)]:
+        write_image(folder / f"{frame}_{name}.png", image)
+    if folder.resolve().is_relative_to(run.resolve()):
+        claim(run.resolve(), folder.resolve())
+    typer.echo(f"{frame}: {folder}")
+
+
+def evaluate_splat(run: Path, against: Sequence[Path], settings: "SplatSettings") -> None:
+    """Train and measure a splat on the run's poses and on others."""
+    from gsba.evaluate_splat import format_table
+    from gsba.read import read_trajectory
+
+    out = run / "splat-evaluation"
+    others = {}
+    for path in against:
+        name = (
+            path.stem
+            if path.stem not in ("refined", *others)
+            else f"{path.parent.name}-{path.stem}"
+        )
+        others[name] = read_trajectory(path)
+    results = _compare(run, others, settings, out)
+    typer.echo(format_table(results))
+    typer.echo(f"Splats, pictures, curves and numbers in {out}.")
+
+
+def _compare(run: Path, others, settings: "SplatSettings", out: Path):
+    """Results of the run's own poses and of others."""
+    from gsba.evaluate_splat import compare, poses_for
+    from gsba.pipeline import load_run
+    from gsba.run_folder import claim
+    from gsba.splat.backend import choose_backend
+
+    reconstruction, frames = load_run(run)
+    sources = {"refined": reconstruction.world_T_rigs}
+    sources |= {name: poses_for(frames, trajectory) for name, trajectory in others.items()}
+    renderer = choose_backend(settings.backend)
+    results = compare(reconstruction, frames, sources, settings, renderer, out)
+    claim(run.resolve(), out.resolve())
+    return results
+
+
+def splat_settings(iterations: int | None, face_size: int | None, backend: str) -> "SplatSettings":
+    """Settings with what the command line asks for.
+
+    Raises:
+        GsbaError: a value out of range.
+    """
+    from pydantic import ValidationError
+
+    from gsba.config import SplatSettings
+
+    asked = {"iterations": iterations, "face_size": face_size, "backend": backend}
+    try:
+        return SplatSettings.model_validate({k: v for k, v in asked.items() if v is not None})
+    except ValidationError as error:
+        first = error.errors()[0]
+        option = str(first["loc"][0]).replace("_", "-")
+        raise GsbaError(f"--{option} {first['input']}: {first['msg']}") from None

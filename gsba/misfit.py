@@ -1,0 +1,106 @@
+"""Why a trajectory does not fit the images at all: reversed, mirrored, or of something else."""
+
+import numpy as np
+
+from gsba.config import VerifySettings
+from gsba.geometry import inverse, rotation_angle
+from gsba.log import GsbaError
+from gsba.motion import Steps
+from gsba.types import CoarsePoses, PoseSource
+
+_MIN_STEPS = 5  # fewer say nothing about a whole trajectory
+_FITS = 0.5  # part of the steps that must roughly agree: of random ones, a third does
+_LOOSE = {"max_rotation_deg": 20.0, "max_direction_deg": 60.0}  # roughly
+_DOUBTFUL = 0.6  # part below which another reading that explains the rest is the right one
+_EXPLAINS = 0.7  # part of the steps that a reading must explain to be named
+_WITHOUT = "or refine without it (--no-trajectory)"
+
+
+def refuse_useless(coarse: CoarsePoses) -> None:
+    """Refuse poses that say nothing.
+
+    Raises:
+        GsbaError: all poses are one and the same.
+    """
+    poses = coarse.world_T_rigs
+    if len(poses) > 1 and np.abs(poses - poses[0]).max() < 1e-12:
+        raise GsbaError(
+            f"all {len(poses)} poses of the trajectory are identical: check the file, {_WITHOUT}"
+        )
+
+
+def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -> None:
+    """Refuse a trajectory that most steps of the images contradict, with the likely reason.
+
+    Args:
+        coarse: the trajectory.
+        found: steps from the images.
+        settings: disagreement that counts as contradiction.
+
+    Raises:
+        GsbaError: most steps disagree.
+    """
+    own = coarse.sources == PoseSource.SLAM
+    judged = found.directed & own[:-1] & own[1:]
+    total = int(judged.sum())
+    if total < _MIN_STEPS:
+        return
+    shares = {
+        reading: _agreeing(steps, found, judged, settings)
+        for reading, steps in _readings(coarse.world_T_rigs).items()
+    }
+    best = max(shares, key=lambda reading: shares[reading])
+    explained = best and shares[best] >= _EXPLAINS and shares[""] < _DOUBTFUL
+    loose = settings.model_copy(update=_LOOSE)
+    if (
+        not explained
+        and _agreeing(_readings(coarse.world_T_rigs)[""], found, judged, loose) > _FITS
+    ):
+        return
+    text = f"the images contradict {round((1 - shares['']) * total)} of {total} steps"
+    if explained:
+        raise GsbaError(f"{text}: the trajectory is {best}, {_WITHOUT}")
+    raise GsbaError(
+        f"{text}: the trajectory is of another recording or on another clock; "
+        f"give the right one, {_WITHOUT}"
+    )
+
+
+def _readings(world_T_rigs: np.ndarray) -> dict[str, np.ndarray]:
+    """What a trajectory's steps (F - 1, 4, 4) would be if it had been written otherwise."""
+    steps = inverse(world_T_rigs[:-1]) @ world_T_rigs[1:]
+    backwards = world_T_rigs[::-1]
+    rig_T_worlds = inverse(world_T_rigs)
+    readings = {
+        "": steps,
+        "reversed in time: check its timestamps": inverse(backwards[:-1]) @ backwards[1:],
+        "camera-from-world: invert its poses": inverse(rig_T_worlds[:-1]) @ rig_T_worlds[1:],
+        "in axes of y up and z backward: convert it to y down and z forward": _flipped(
+            steps, [1, -1, -1]
+        ),
+        "turned by half about the vertical axis: its x and z point the other way": _flipped(
+            steps, [-1, 1, -1]
+        ),
+    }
+    for name, axis in zip("xyz", np.eye(3), strict=True):
+        mirrored = f"mirrored along {name}: it is no rigid motion of this camera, flip that axis"
+        readings[mirrored] = _flipped(steps, 1 - 2 * axis)
+    return readings
+
+
+def _flipped(steps: np.ndarray, signs: np.ndarray | list[int]) -> np.ndarray:
+    flip = np.diag([*signs, 1.0])
+    return flip @ steps @ flip
+
+
+def _agreeing(
+    steps: np.ndarray, found: Steps, judged: np.ndarray, settings: VerifySettings
+) -> float:
+    """Part of the judged steps that the images do not contradict."""
+    between = np.swapaxes(steps[:, :3, :3], 1, 2) @ found.f_T_nexts[:, :3, :3]
+    moved, seen = steps[:, :3, 3], found.f_T_nexts[:, :3, 3]
+    across = np.linalg.norm(np.cross(moved, seen), axis=1)
+    off = np.arctan2(across, np.einsum("fi,fi->f", moved, seen))
+    agree = rotation_angle(between) < np.deg2rad(settings.max_rotation_deg)
+    agree &= off < np.deg2rad(settings.max_direction_deg)
+    return float(agree[judged].mean())

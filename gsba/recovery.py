@@ -1,0 +1,209 @@
+"""Neighbours that the trajectory cannot guide: matched without it, and what that says about it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsba import matching, misfit, motion, pairs, verify
+from gsba.config import RefineSettings
+from gsba.geometry import inverse
+from gsba.matching import Gate, SearchableFrames
+from gsba.motion import Trust
+from gsba.types import CoarsePoses, Counts, Keypoints, Matches, VerifiedPairs
+
+_PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
+_ANYWHERE = Gate(np.pi, 1e3, np.pi)
+
+
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """Neighbours in time, verified with or without the trajectory, and its judgement."""
+
+    neighbours: VerifiedPairs
+    trust: Trust
+
+
+def run(
+    frames: SearchableFrames,
+    strongest: SearchableFrames,
+    keypoints: Keypoints,
+    guided: VerifiedPairs,
+    coarse: CoarsePoses,
+    timestamps: np.ndarray,
+    settings: RefineSettings,
+    num_threads: int,
+) -> Recovered:
+    """Match the neighbours that guidance lost, judge the trajectory, and guide anew from that.
+
+    Frames next to one another are compared as a whole: they share so much that repeated structure
+    does not mislead. Frames two apart, or with a pause between them, where it does, are only
+    matched along the steps found or the trajectory.
+
+    Args:
+        frames, strongest, keypoints: features of all frames.
+        guided: neighbours verified under the trajectory's guidance; all of them where it is right.
+        coarse: the trajectory.
+        timestamps: (F,) seconds.
+        settings: of pairs, matching, verification and priors.
+        num_threads: pairs matched at a time.
+
+    Raises:
+        GsbaError: the images contradict most of the trajectory.
+    """
+    chosen = pairs.adjacent(len(coarse.sources))
+    intervals = np.diff(timestamps)
+    close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
+    lost = _missing(np.column_stack([close, close + 1]), guided)
+    alone = _join(
+        [guided, match_anywhere(strongest, frames, keypoints, lost, settings, num_threads)]
+    )
+    misfit.refuse_misfit(coarse, motion.steps(alone, keypoints, settings.verify), settings.verify)
+    trust = _judge(alone, keypoints, coarse, settings)
+    if trust.sound:
+        return Recovered(guided, trust)
+    again = _missing(chosen, alone)
+    again = again[again[:, 1] - again[:, 0] == 2]
+    over = _match_along(trust.world_T_rigs, again, frames, keypoints, settings, num_threads)
+    neighbours = _join([alone, over])
+    doubtful = [p for p in _index(lost) if not _supported(p, neighbours, keypoints, settings)]
+    if doubtful:
+        neighbours = _without(neighbours, doubtful)
+        trust = _judge(neighbours, keypoints, coarse, settings)
+    counts = Counts(
+        len(chosen),
+        len(neighbours.matches.pairs),
+        "pairs",
+        {"no common geometry": len(chosen) - len(neighbours.matches.pairs)},
+    )
+    return Recovered(VerifiedPairs(neighbours.matches, neighbours.f0_T_f1s, counts), trust)
+
+
+def _match_along(
+    world_T_rigs: np.ndarray,
+    chosen: np.ndarray,
+    frames: SearchableFrames,
+    keypoints: Keypoints,
+    settings: RefineSettings,
+    num_threads: int,
+) -> VerifiedPairs:
+    """Match pairs (P, 2) guided by the start, and verify that they agree with it."""
+    prior, limit = settings.pairs.prior, np.deg2rad(settings.pairs.max_parallax_deg)
+    gates = [Gate(np.deg2rad(prior.rotation_deg), prior.direction, limit)] * len(chosen)
+    found = matching.run(chosen, world_T_rigs, gates, frames, settings.matching, num_threads)
+    f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
+    sigmas = np.zeros(len(chosen))
+    return verify.run(found, keypoints, f0_T_f1s, sigmas, settings.verify, settings.seed)
+
+
+def nothing_verified() -> VerifiedPairs:
+    """No pairs: what guidance finds where there is no trajectory."""
+    none = np.zeros((0, 2), np.int32)
+    matches = Matches(none, np.zeros(1, np.int64), none)
+    return VerifiedPairs(matches, np.zeros((0, 4, 4)), Counts(0, 0, "pairs"))
+
+
+def match_anywhere(
+    strongest: SearchableFrames,
+    frames: SearchableFrames,
+    keypoints: Keypoints,
+    chosen: np.ndarray,
+    settings: RefineSettings,
+    num_threads: int,
+    min_share: float | None = None,
+) -> VerifiedPairs:
+    """Match whole panoramas without any prediction, and verify their geometry alone.
+
+    Args:
+        strongest: features tried first, at a fraction of the cost.
+        frames: features tried for pairs that those do not settle.
+        keypoints: of all frames.
+        chosen: (P, 2) frame indices.
+        settings: of matching and verification.
+        num_threads: pairs matched at a time.
+        min_share: part of the matches that must be of one geometry; None = as for neighbours.
+    """
+    if min_share is not None:
+        settings = settings.model_copy(
+            update={"verify": settings.verify.model_copy(update={"min_share": min_share})}
+        )
+    nowhere = np.tile(np.eye(4), (len(keypoints.starts) - 1, 1, 1))
+
+    def verified(among: SearchableFrames, some: np.ndarray) -> VerifiedPairs:
+        gates = [_ANYWHERE] * len(some)
+        found = matching.run(some, nowhere, gates, among, settings.matching, num_threads)
+        return verify.run(found, keypoints, None, None, settings.verify, settings.seed)
+
+    first = verified(strongest, chosen)
+    rest = _missing(chosen, first)
+    return _join([first, verified(frames, rest)]) if len(rest) else first
+
+
+def _judge(
+    found: VerifiedPairs, keypoints: Keypoints, coarse: CoarsePoses, settings: RefineSettings
+) -> Trust:
+    steps = motion.steps(found, keypoints, settings.verify)
+    logs, sigmas = motion.length_ratios(found, steps, keypoints)
+    return motion.judge(coarse, steps, logs, sigmas, settings.verify, settings.priors)
+
+
+def _supported(
+    pair: tuple[int, int], found: VerifiedPairs, keypoints: Keypoints, settings: RefineSettings
+) -> bool:
+    """Whether a third frame confirms a step that no trajectory guided.
+
+    Either a pair that spans it fits the steps it is made of, or points that it shares with a step
+    beside it lie at distances in one proportion.
+    """
+    f = pair[0]
+    present = _index(found.matches.pairs)
+    if {(f - 1, f + 1), (f, f + 2)} & present:
+        return True
+    steps = motion.steps(found, keypoints, settings.verify)
+    if not steps.directed[f]:
+        return True  # a turn on the spot: whole panoramas agree on one rotation
+    sigmas = motion.length_ratios(found, steps, keypoints)[1]
+    return bool(np.isfinite(sigmas[max(f - 1, 0) : f + 1]).any()) or len(steps.verified) == 1
+
+
+def _index(some: np.ndarray) -> set[tuple[int, int]]:
+    return {(int(f0), int(f1)) for f0, f1 in some}
+
+
+def _missing(chosen: np.ndarray, found: VerifiedPairs) -> np.ndarray:
+    """Those of some pairs (P, 2) that were not verified."""
+    present = _index(found.matches.pairs)
+    rows = [pair for pair in chosen.tolist() if tuple(pair) not in present]
+    return np.array(rows, np.int32).reshape(-1, 2)
+
+
+def _without(found: VerifiedPairs, dropped: list[tuple[int, int]]) -> VerifiedPairs:
+    keep = [p for p, pair in enumerate(found.matches.pairs.tolist()) if tuple(pair) not in dropped]
+    return _taken(found, keep)
+
+
+def _taken(found: VerifiedPairs, rows: list[int]) -> VerifiedPairs:
+    """Some of verified pairs, in the order given."""
+    matches = [found.matches.of(p) for p in rows]
+    kept = Matches(
+        found.matches.pairs[rows].reshape(-1, 2),
+        np.cumsum([0, *map(len, matches)]),
+        np.concatenate([np.zeros((0, 2), np.int32), *matches]),
+    )
+    poses = found.f0_T_f1s[rows].reshape(-1, 4, 4)
+    return VerifiedPairs(kept, poses, found.counts)
+
+
+def _join(parts: list[VerifiedPairs]) -> VerifiedPairs:
+    """All pairs of several sets, those of the closest frames first."""
+    offsets = np.cumsum([0, *(len(part.matches.keypoints) for part in parts)])
+    matches = Matches(
+        np.concatenate([part.matches.pairs for part in parts]),
+        np.concatenate(
+            [[0], *(part.matches.offsets[1:] + o for part, o in zip(parts, offsets, strict=False))]
+        ).astype(np.int64),
+        np.concatenate([part.matches.keypoints for part in parts]),
+    )
+    poses = np.concatenate([part.f0_T_f1s for part in parts])
+    joined = VerifiedPairs(matches, poses, parts[0].counts)
+    gaps = matches.pairs[:, 1] - matches.pairs[:, 0]
+    return _taken(joined, np.lexsort((matches.pairs[:, 0], gaps)).tolist())

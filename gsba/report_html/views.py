@@ -1,0 +1,147 @@
+"""What the page draws, as numbers: map, displacements, shared points, residuals on the sphere."""
+
+from typing import Any
+
+import numpy as np
+
+from gsba.geometry import rotation_angle
+from gsba.types import CoarsePoses, Reconstruction
+
+_MAX_POINTS = 4000  # of the cloud, on the map
+_MAX_CELLS = 240  # of the match matrix, along a side
+_SPHERE_CELL_DEG = 5.0
+_MIN_IN_CELL = 5  # observations, or a cell says nothing
+
+
+def world_map(coarse: CoarsePoses, reconstruction: Reconstruction) -> dict[str, Any]:
+    """Positions and a thinned cloud in axes fit for looking at: two level ones, then up.
+
+    Up is the mean up axis of the rigs, or, if they agree on none, where the path extends least.
+    The first level axis is where it extends most.
+
+    Returns:
+        "before", "after" (F, 3), "points" (P, 3), "colors" (P, 3) and "up", how upright the rigs
+        are: the length of the mean up axis, 0..1.
+    """
+    positions = reconstruction.world_T_rigs[:, :3, 3]
+    axes, upright = _viewing_axes(reconstruction.world_T_rigs)
+    centre = np.median(positions, axis=0)
+    num = len(reconstruction.points_world)
+    which = np.unique(np.linspace(0, num - 1, min(num, _MAX_POINTS)).astype(int)) if num else []
+    extent = float(np.ptp(positions, axis=0).max()) or 1.0
+    points = (reconstruction.points_world[which] - centre) @ axes.T
+    near = np.abs(points).max(axis=1, initial=0) < 3 * extent
+    digits = max(0, 4 - int(np.floor(np.log10(extent))))
+    return {
+        "before": ((coarse.world_T_rigs[:, :3, 3] - centre) @ axes.T).round(digits),
+        "after": ((positions - centre) @ axes.T).round(digits),
+        "points": points[near].round(max(digits - 1, 0)),
+        "colors": reconstruction.point_colors[which][near],
+        "up": upright,
+    }
+
+
+def _viewing_axes(world_T_rigs: np.ndarray) -> tuple[np.ndarray, float]:
+    """Rows: two level axes and up, right-handed, in the world; and how far the rigs agree on up."""
+    positions = world_T_rigs[:, :3, 3] - world_T_rigs[:, :3, 3].mean(axis=0)
+    mean_up = -world_T_rigs[:, :3, 1].mean(axis=0)
+    upright = float(np.linalg.norm(mean_up))
+    if upright > 0.5:
+        up = mean_up / upright
+    else:
+        up = np.linalg.svd(np.vstack([positions, np.zeros((3, 3))]))[2][2]
+    level = positions - np.outer(positions @ up, up)
+    # A path without extent leaves the first axis open: any level one will do.
+    anywhere = 1e-9 * (np.eye(3) - np.outer(up, up))
+    first = np.linalg.svd(np.vstack([level, anywhere]))[2][0]
+    first -= up * (first @ up)
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(up, first), up]), upright
+
+
+def displacements(
+    coarse: CoarsePoses, reconstruction: Reconstruction
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far each frame moved (F,), map units, and turned (F,), degrees."""
+    before, after = coarse.world_T_rigs, reconstruction.world_T_rigs
+    moved = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+    turned = rotation_angle(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+    return moved, np.degrees(turned)
+
+
+def match_matrix(reconstruction: Reconstruction) -> dict[str, Any]:
+    """Points that frames share, symmetric, binned where there are many frames.
+
+    Returns:
+        "cells" (N, N) int, "frames_per_cell"; the diagonal is 0.
+    """
+    from scipy.sparse import csr_array
+
+    num_frames = len(reconstruction.world_T_rigs)
+    frames, points = reconstruction.observation_frames, reconstruction.observation_points
+    ones = np.ones(len(frames), np.int32)
+    shape = (num_frames, len(reconstruction.points_world))
+    seen = csr_array((ones, (frames, points)), shape=shape)
+    shared = (seen @ seen.T).tocoo()
+    step = -(-num_frames // _MAX_CELLS)
+    num = -(-num_frames // step)
+    off = shared.row != shared.col
+    cells = np.zeros((num, num), np.int64)
+    np.add.at(cells, (shared.row[off] // step, shared.col[off] // step), shared.data[off])
+    return {"cells": cells, "frames_per_cell": step}
+
+
+def residual_sphere(reconstruction: Reconstruction) -> dict[str, Any]:
+    """Residuals by direction in the rig: what is wrong with camera or stitching shows here.
+
+    Returns:
+        "rows", "columns" of an equirectangular grid; "median_deg" (rows, columns), the median
+        length; "east_deg", "south_deg", the median of its components (predicted minus observed);
+        "count". NaN where there are too few.
+    """
+    rows, columns = round(180 / _SPHERE_CELL_DEG), round(360 / _SPHERE_CELL_DEG)
+    bearings = reconstruction.observation_bearings
+    residuals = np.degrees(tangent_residuals(reconstruction))
+    longitude = np.arctan2(bearings[:, 0], bearings[:, 2])
+    latitude = np.arcsin(np.clip(bearings[:, 1], -1, 1))
+    column = np.clip(((longitude / np.pi + 1) / 2 * columns).astype(int), 0, columns - 1)
+    row = np.clip(((latitude / np.pi + 0.5) * rows).astype(int), 0, rows - 1)
+    cell = row * columns + column
+    lengths = np.linalg.norm(residuals, axis=1)
+    count = np.bincount(cell, minlength=rows * columns)
+    values = [lengths, residuals[:, 0], residuals[:, 1]]
+    medians = [_medians(value, cell, count).reshape(rows, columns) for value in values]
+    names = ("median_deg", "east_deg", "south_deg")
+    return {
+        "rows": rows,
+        "columns": columns,
+        "count": count.reshape(rows, columns),
+        **dict(zip(names, medians, strict=True)),
+    }
+
+
+def tangent_residuals(reconstruction: Reconstruction) -> np.ndarray:
+    """Predicted minus observed direction (O, 2), radians east and south on the sphere."""
+    poses = reconstruction.world_T_rigs[reconstruction.observation_frames]
+    offsets = reconstruction.points_world[reconstruction.observation_points] - poses[:, :3, 3]
+    predicted = np.einsum("oji,oj->oi", poses[:, :3, :3], offsets)
+    predicted /= np.maximum(np.linalg.norm(predicted, axis=1, keepdims=True), 1e-12)
+    bearings = reconstruction.observation_bearings
+    level = np.maximum(np.hypot(bearings[:, 0], bearings[:, 2]), 1e-9)
+    east = np.column_stack([bearings[:, 2], np.zeros(len(level)), -bearings[:, 0]]) / level[:, None]
+    south = np.cross(bearings, east)
+    across = np.column_stack([np.einsum("oi,oi->o", predicted, axis) for axis in (east, south)])
+    sine = np.linalg.norm(across, axis=1, keepdims=True)
+    angle = np.arctan2(sine, np.einsum("oi,oi->o", predicted, bearings)[:, None])
+    return across * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)
+
+
+def _medians(values: np.ndarray, cells: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Median of the values of each cell; NaN where there are fewer than `_MIN_IN_CELL`."""
+    ordered = values[np.lexsort((values, cells))]
+    starts = np.cumsum(count) - count
+    enough = count >= _MIN_IN_CELL
+    low, high = starts + (count - 1) // 2, starts + count // 2
+    out = np.full(len(count), np.nan)
+    out[enough] = (ordered[low[enough]] + ordered[high[enough]]) / 2
+    return out

@@ -1,0 +1,88 @@
+"""Adam on the parameters of a splat (Kingma and Ba, 2015), a learning rate for each group."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numba import njit
+
+from gsba.splat.gaussians import Gaussians, concatenate, zeros_like
+
+_BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """Learning rates of a step."""
+
+    means: float  # map units
+    log_scales: float
+    quaternions: float
+    opacity_logits: float
+    sh: float  # of the constant harmonic
+    sh_rest: float  # of the others
+
+
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """Running means of the gradients and of their squares."""
+
+    first: Gaussians
+    second: Gaussians
+
+    @classmethod
+    def zero(cls, gaussians: Gaussians) -> "Moments":
+        """Of Gaussians that have not moved yet."""
+        return cls(zeros_like(gaussians), zeros_like(gaussians))
+
+    def select(self, rows: np.ndarray) -> "Moments":
+        """Those of some Gaussians."""
+        return Moments(self.first.select(rows), self.second.select(rows))
+
+    def extended(self, new: Gaussians) -> "Moments":
+        """With zeros for further Gaussians."""
+        zeros = zeros_like(new)
+        return Moments(concatenate([self.first, zeros]), concatenate([self.second, zeros]))
+
+    def without_opacity(self) -> "Moments":
+        """Forget how opacities moved."""
+        zero = np.zeros_like(self.first.opacity_logits)
+        first, second = (
+            replace(part, opacity_logits=zero.copy()) for part in (self.first, self.second)
+        )
+        return Moments(first, second)
+
+
+def step(
+    gaussians: Gaussians, gradients: Gaussians, moments: Moments, rates: Rates, count: int
+) -> None:
+    """Move all parameters in place.
+
+    Args:
+        gaussians, gradients, moments: of equal shapes; gaussians and moments are changed.
+        count: number of this step, from 1.
+    """
+    correction1, correction2 = 1 - _BETA1**count, np.sqrt(1 - _BETA2**count)
+    for entry in fields(Gaussians):
+        rate = getattr(rates, entry.name)
+        rest = rates.sh_rest if entry.name == "sh" else rate
+        values, slopes, first, second = (
+            getattr(part, entry.name).reshape(len(gaussians), -1)
+            for part in (gaussians, gradients, moments.first, moments.second)
+        )
+        num_first = 3 if entry.name == "sh" else values.shape[1]
+        scales = np.full(values.shape[1], rest / correction1, np.float32)
+        scales[:num_first] = rate / correction1
+        _move(values, slopes, first, second, scales, np.float32(correction2))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _move(values, slopes, first, second, rates, correction2):
+    keep1, keep2 = np.float32(_BETA1), np.float32(_BETA2)
+    new1, new2, eps = np.float32(1 - _BETA1), np.float32(1 - _BETA2), np.float32(_EPS)
+    for g in range(values.shape[0]):
+        for k in range(values.shape[1]):
+            slope = slopes[g, k]
+            m = keep1 * first[g, k] + new1 * slope
+            v = keep2 * second[g, k] + new2 * slope * slope
+            first[g, k], second[g, k] = m, v
+            values[g, k] -= rates[k] * m / (np.sqrt(v) / correction2 + eps)

@@ -1,0 +1,92 @@
+"""Adaptive density control: clone, split and prune Gaussians as published with 3DGS."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsba.geometry import rotation_from_quaternion
+from gsba.splat.adam import Moments
+from gsba.splat.gaussians import Gaussians, concatenate
+
+SPLIT_SHRINK = 1.6  # a split Gaussian's halves are this much smaller
+RESET_OPACITY = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Pull:
+    """How strongly images have pulled at projected centres since the last densification."""
+
+    sums: np.ndarray  # (N,) float32, gradient lengths, image half-widths
+    counts: np.ndarray  # (N,) float32, views that saw the Gaussian
+
+    @classmethod
+    def none(cls, num: int) -> "Pull":
+        """Of Gaussians that no view has seen yet."""
+        return cls(np.zeros(num, np.float32), np.zeros(num, np.float32))
+
+    def add(self, centres: np.ndarray, seen: np.ndarray, size: int) -> None:
+        """Count one view, in place.
+
+        Args:
+            centres: (N, 2) gradients per pixel.
+            seen: (N,) bool.
+            size: pixels of the image.
+        """
+        self.sums[:] += 0.5 * size * np.hypot(centres[:, 0], centres[:, 1])
+        self.counts[:] += seen
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Thresholds of the density control."""
+
+    pull: float  # mean gradient from which on a Gaussian is densified, image half-widths
+    clone_scale: float  # smaller ones are cloned, larger ones split, map units
+    max_scale: float | None  # larger ones are pruned, map units; None = none
+    min_opacity: float  # fainter ones are pruned
+    max_gaussians: int  # the strongest pulls come first where there is no room for all
+
+
+def densify(
+    gaussians: Gaussians, moments: Moments, pull: Pull, limits: Limits, rng: np.random.Generator
+) -> tuple[Gaussians, Moments, bool]:
+    """Clone small and split large Gaussians that are pulled at, then prune.
+
+    Returns:
+        The Gaussians, their moments (zero for new ones), and whether the cap kept some out.
+    """
+    strength = pull.sums / np.maximum(pull.counts, 1)
+    chosen = np.flatnonzero(strength >= limits.pull)
+    room = max(limits.max_gaussians - len(gaussians), 0)
+    capped = len(chosen) > room
+    if capped:
+        chosen = np.sort(chosen[np.argsort(-strength[chosen], kind="stable")[:room]])
+    small = np.exp(gaussians.log_scales[chosen].max(axis=1)) <= limits.clone_scale
+    halves = gaussians.select(np.repeat(chosen[~small], 2))
+    scales = np.exp(halves.log_scales)
+    within = scales * rng.standard_normal(scales.shape, dtype=np.float32)
+    unit = halves.quaternions / np.linalg.norm(halves.quaternions, axis=1, keepdims=True)
+    shifts = np.einsum("nij,nj->ni", rotation_from_quaternion(unit), within)
+    halves = replace(
+        halves,
+        means=halves.means + shifts.astype(np.float32),
+        log_scales=halves.log_scales - np.float32(np.log(SPLIT_SHRINK)),
+    )
+    kept = np.ones(len(gaussians), bool)
+    kept[chosen[~small]] = False
+    new = concatenate([gaussians.select(chosen[small]), halves])
+    gaussians = concatenate([gaussians.select(kept), new])
+    moments = moments.select(kept).extended(new)
+    stays = 1 / (1 + np.exp(-gaussians.opacity_logits)) >= limits.min_opacity
+    if limits.max_scale is not None:
+        stays &= np.exp(gaussians.log_scales.max(axis=1)) <= limits.max_scale
+    if not stays.any():  # an empty splat could never recover
+        return gaussians, moments, capped
+    return gaussians.select(stays), moments.select(stays), capped
+
+
+def reset_opacity(gaussians: Gaussians, moments: Moments) -> tuple[Gaussians, Moments]:
+    """Make every Gaussian almost transparent, so that only those that are needed come back."""
+    highest = np.float32(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+    logits = np.minimum(gaussians.opacity_logits, highest)
+    return replace(gaussians, opacity_logits=logits), moments.without_opacity()

@@ -1,0 +1,102 @@
+"""The one type of a splat's Gaussians, and the cloud they start from."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from gsba.log import GsbaError
+
+SH_CONSTANT = 0.28209479177387814  # value of the harmonic of degree 0
+MAX_SH_DEGREE = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Gaussians:
+    """Parameters of N Gaussians as they are optimised and stored, one row each.
+
+    The colour seen along a unit direction is max(0, 0.5 + sum of harmonics times coefficients).
+    """
+
+    means: np.ndarray  # (N, 3) float32, world, map units
+    log_scales: np.ndarray  # (N, 3) float32, natural logarithm of the standard deviations
+    quaternions: np.ndarray  # (N, 4) float32, wxyz, any length: world from the Gaussian's axes
+    opacity_logits: np.ndarray  # (N,) float32
+    sh: np.ndarray  # (N, K, 3) float32, RGB coefficients of the K = (degree + 1)^2 harmonics
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree that there are coefficients for."""
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """The five parameter arrays, in the order of the fields."""
+        return tuple(getattr(self, entry.name) for entry in fields(self))
+
+    def select(self, rows: np.ndarray) -> "Gaussians":
+        """Copies of some rows: indices or a mask."""
+        return Gaussians(*(array[rows] for array in self.arrays()))
+
+    def is_finite(self) -> bool:
+        """Whether every parameter is a number."""
+        return all(bool(np.isfinite(array).all()) for array in self.arrays())
+
+
+def concatenate(parts: "list[Gaussians]") -> Gaussians:
+    """Several sets as one."""
+    columns = zip(*(part.arrays() for part in parts), strict=True)
+    return Gaussians(*(np.concatenate(column) for column in columns))
+
+
+def zeros_like(gaussians: Gaussians) -> Gaussians:
+    """All parameters zero, e.g. to gather gradients in."""
+    return Gaussians(*(np.zeros_like(array) for array in gaussians.arrays()))
+
+
+def from_cloud(
+    points_world: np.ndarray,
+    colors: np.ndarray,
+    sh_degree: int = MAX_SH_DEGREE,
+    opacity: float = 0.1,
+    neighbours: int = 3,
+) -> Gaussians:
+    """Round Gaussians at the points of a cloud, as wide as their neighbours are apart.
+
+    The start of Kerbl et al., 3D Gaussian Splatting, 2023: the standard deviation is the root
+    mean square distance to the three nearest points, limited to a tenth of the cloud's extent.
+
+    Args:
+        points_world: (N, 3) float, map units.
+        colors: (N, 3) uint8, RGB.
+        sh_degree: harmonics to make room for, 0 to 3; all but the constant one start at zero.
+        opacity: of every Gaussian, 0..1.
+        neighbours: nearest points that a width is taken from.
+
+    Raises:
+        GsbaError: no point at all, or points that are no numbers.
+    """
+    points = np.asarray(points_world, np.float64)
+    if len(points) == 0:
+        raise GsbaError("the cloud has no points to start a splat from: refine the run first")
+    if not np.isfinite(points).all():
+        raise GsbaError("the cloud has points that are not finite: refine the run again")
+    from scipy.spatial import cKDTree  # type: ignore[attr-defined]
+
+    spread = np.linalg.norm(points.std(axis=0))
+    if len(points) > 1:
+        distances, _ = cKDTree(points).query(points, k=min(neighbours, len(points) - 1) + 1)
+        widths = np.sqrt(np.mean(np.square(distances[:, 1:]), axis=1))
+        widths = np.clip(widths, 1e-4 * spread + 1e-9, max(0.1 * spread, 1e-8))
+    else:
+        widths = np.ones(1)
+    sh = np.zeros((len(points), (sh_degree + 1) ** 2, 3), np.float32)
+    sh[:, 0] = (np.asarray(colors, np.float64) / 255 - 0.5) / SH_CONSTANT
+    return Gaussians(
+        points.astype(np.float32),
+        np.repeat(np.log(widths)[:, None], 3, axis=1).astype(np.float32),
+        np.tile(np.array([1, 0, 0, 0], np.float32), (len(points), 1)),
+        np.full(len(points), np.log(opacity / (1 - opacity)), np.float32),
+        sh,
+    )

@@ -1,0 +1,86 @@
+"""How close two images are: PSNR, SSIM, and the training loss made of L1 and SSIM.
+
+SSIM as of Wang et al., Image Quality Assessment: From Error Visibility to Structural Similarity,
+2004: an 11 x 11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, values 0..1.
+"""
+
+import numpy as np
+
+_RADIUS, _SIGMA = 5, 1.5
+_C1, _C2 = 0.01**2, 0.03**2
+
+
+def psnr(image: np.ndarray, truth: np.ndarray, use: np.ndarray | None = None) -> float:
+    """Peak signal-to-noise ratio in dB over all pixels together; inf for equal images.
+
+    Args:
+        image, truth: (..., C), values 0..1.
+        use: (...) bool, pixels that count; None = all. At least one.
+    """
+    error = (np.asarray(image, np.float64) - truth) ** 2
+    mean = float(np.mean(error if use is None else error[use]))
+    return float("inf") if mean == 0 else -10 * float(np.log10(mean))
+
+
+def ssim(image: np.ndarray, truth: np.ndarray, use: np.ndarray | None = None) -> float:
+    """Mean structural similarity over the pixels whose window lies inside the image.
+
+    Args:
+        image, truth: (H, W, C), values 0..1, at least 11 pixels high and wide.
+        use: (H, W) bool, pixels that count; the others are taken as equal in both images, and
+            NaN is returned if no pixel with a whole window counts.
+    """
+    x, y = np.asarray(image, np.float64), np.asarray(truth, np.float64)
+    if use is not None:
+        x = np.where(use[..., None], x, y)
+    inner = (slice(_RADIUS, -_RADIUS), slice(_RADIUS, -_RADIUS))
+    values = _similarity(x, y)[0][inner].mean(axis=-1)
+    if use is not None:
+        values = values[use[inner]]
+    return float(values.mean()) if values.size else float("nan")
+
+
+def training_loss(
+    image: np.ndarray, truth: np.ndarray, use: np.ndarray | None, ssim_weight: float
+) -> tuple[float, np.ndarray]:
+    """The loss (1 - w) L1 + w (1 - SSIM) of 3DGS, and its derivative (H, W, C) by the image.
+
+    SSIM is taken at every pixel, with black around the image, as the published trainer does.
+
+    Args:
+        image, truth: (H, W, C) float32.
+        use: (H, W) bool, pixels that count (black in both elsewhere); None = all.
+        ssim_weight: w, 0..1.
+    """
+    if use is not None:
+        image, truth = image * use[..., None], truth * use[..., None]
+    difference = image - truth
+    values, slope = _similarity(image, truth)
+    loss = (1 - ssim_weight) * np.abs(difference).mean() + ssim_weight * (1 - values.mean())
+    slope = ((1 - ssim_weight) * np.sign(difference) - ssim_weight * slope) / image.size
+    if use is not None:
+        slope *= use[..., None]
+    return float(loss), slope.astype(np.float32)
+
+
+def _similarity(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """SSIM (H, W, C) at every pixel, and the derivative (H, W, C) of its sum by x.
+
+    The window is its own adjoint, so that the derivative takes three more passes of it.
+    """
+    mean_x, mean_y = _blur(x), _blur(y)
+    a1, b1 = 2 * mean_x * mean_y + _C1, mean_x**2 + mean_y**2 + _C1
+    a2 = 2 * (_blur(x * y) - mean_x * mean_y) + _C2
+    b2 = _blur(x * x) + _blur(y * y) - mean_x**2 - mean_y**2 + _C2
+    values = a1 * a2 / (b1 * b2)
+    by_square, by_product = -values / b2, 2 * a1 / (b1 * b2)
+    by_mean = 2 * mean_y * a2 / (b1 * b2) - 2 * mean_x * values / b1
+    by_mean -= by_product * mean_y + 2 * by_square * mean_x
+    return values, _blur(by_mean) + 2 * x * _blur(by_square) + y * _blur(by_product)
+
+
+def _blur(image: np.ndarray) -> np.ndarray:
+    import cv2
+
+    size = (2 * _RADIUS + 1, 2 * _RADIUS + 1)
+    return cv2.GaussianBlur(image, size, _SIGMA, borderType=cv2.BORDER_CONSTANT)

@@ -1,0 +1,166 @@
+"""Render Gaussians on the CPU: colour, expected depth and alpha, with analytic gradients.
+
+The image model of Kerbl et al., 3D Gaussian Splatting for Real-Time Radiance Field Rendering,
+2023: splats sorted by depth and blended from near to far over black. A splat counts where its
+alpha is 1/255 or more (its tiles and rows are bounded by exactly that ellipse), alpha is at most
+0.99, and a pixel that lets less than 1e-4 through takes no more.
+"""
+
+import functools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gsba.splat import _project, _tiles
+from gsba.splat.camera import FaceCamera
+from gsba.splat.gaussians import Gaussians, zeros_like
+
+
+@dataclass(frozen=True, slots=True)
+class Rendering:
+    """An image of a splat."""
+
+    color: np.ndarray  # (H, W, 3) float32, 0 = black; not limited above
+    depth: np.ndarray  # (H, W) float32, expected z in map units where alpha > 0, else 0
+    alpha: np.ndarray  # (H, W) float32, 0..1
+
+
+@dataclass(frozen=True, slots=True)
+class Gradients:
+    """Derivatives of a loss with respect to a splat."""
+
+    gaussians: Gaussians  # of every parameter
+    centres: np.ndarray  # (N, 2) float32, of the projected centres, per pixel
+    seen: np.ndarray  # (N,) bool, Gaussians that reach into the image
+
+
+@dataclass(frozen=True, slots=True)
+class Tape:
+    """What a rendering leaves for its gradients."""
+
+    gaussians: Gaussians
+    camera: FaceCamera
+    sh_degree: int
+    splats: np.ndarray  # (N, 10) float32, see _tiles
+    reach2: np.ndarray  # (N,) float32, 0 = not seen
+    offsets: np.ndarray  # (N + 1,) int64, entries of each splat
+    starts: np.ndarray  # (tiles + 1,) int64, rows of each tile
+    owners: np.ndarray  # (E,) int32, splat of each row
+    entries: np.ndarray  # (E,) int64, entry of each row
+    used: np.ndarray  # (tiles,) int64, rows blended
+    image: np.ndarray  # (5, rows * 16, columns * 16) float32
+
+
+def render(
+    gaussians: Gaussians,
+    camera: FaceCamera,
+    sh_degree: int | None = None,
+    near: float = 1e-2,
+    num_threads: int | None = None,
+) -> tuple[Rendering, Tape]:
+    """Render a splat.
+
+    Args:
+        gaussians: what to render.
+        camera: a pinhole image.
+        sh_degree: harmonics to use; None = all there are.
+        near: least z of a Gaussian's mean, map units.
+        num_threads: None = all cores. Results do not depend on it.
+
+    Returns:
+        The image, and what `differentiate` needs.
+    """
+    degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
+    num, across = len(gaussians), -(-camera.size // _tiles.TILE)
+    splats, reach2 = np.empty((num, 10), np.float32), np.empty(num, np.float32)
+    given = (camera.packed(), camera.size, near, *gaussians.arrays(), degree)
+    run = functools.partial(_in_parallel, num_threads or os.cpu_count() or 1)
+    run(num, 2048, _project.project, *given, splats, reach2)
+    offsets = np.zeros(num + 1, np.int64)
+    counts = offsets[1:]
+    run(num, 8192, _tiles.count_tiles, splats, reach2, across, across, counts)
+    np.cumsum(counts, out=counts)
+    seen = np.flatnonzero(reach2)
+    order = seen[np.argsort(splats[seen, 9], kind="stable")]
+    starts = np.empty(across * across + 1, np.int64)
+    owners, entries = np.empty(offsets[-1], np.int32), np.empty(offsets[-1], np.int64)
+    _tiles.fill_tiles(splats, reach2, order, offsets, across, across, starts, owners, entries)
+    image = np.empty((_tiles.CHANNELS, across * _tiles.TILE, across * _tiles.TILE), np.float32)
+    used = np.empty(across * across, np.int64)
+    given = (splats, reach2, starts, owners, across, image, used)
+    run(across * across, 8, _tiles.blend_tiles, *given)
+    tape = Tape(
+        gaussians, camera, degree, splats, reach2, offsets, starts, owners, entries, used, image
+    )
+    size = camera.size
+    alpha = image[4, :size, :size]
+    depth = np.divide(image[3, :size, :size], alpha, out=np.zeros_like(alpha), where=alpha > 0)
+    color = np.ascontiguousarray(np.moveaxis(image[:3, :size, :size], 0, -1))
+    return Rendering(color, depth, alpha.copy()), tape
+
+
+def differentiate(
+    tape: Tape,
+    d_color: np.ndarray,
+    d_depth: np.ndarray | None = None,
+    d_alpha: np.ndarray | None = None,
+    num_threads: int | None = None,
+) -> Gradients:
+    """Gradients of a loss from its derivatives with respect to a rendering.
+
+    Args:
+        tape: of that rendering.
+        d_color: (H, W, 3).
+        d_depth: (H, W), with respect to the expected depth; None = zero.
+        d_alpha: (H, W); None = zero.
+        num_threads: None = all cores.
+    """
+    size, image = tape.camera.size, tape.image
+    slopes = np.zeros_like(image)
+    slopes[:3, :size, :size] = np.moveaxis(d_color, -1, 0)
+    if d_depth is not None:
+        alpha = image[4, :size, :size]
+        share = np.divide(d_depth, alpha, out=np.zeros_like(alpha), where=alpha > 0)
+        slopes[3, :size, :size] = share
+        depth = np.divide(image[3, :size, :size], alpha, out=np.zeros_like(alpha), where=alpha > 0)
+        slopes[4, :size, :size] -= share * depth
+    if d_alpha is not None:
+        slopes[4, :size, :size] += d_alpha
+    run = functools.partial(_in_parallel, num_threads or os.cpu_count() or 1)
+    across, num = image.shape[1] // _tiles.TILE, len(tape.reach2)
+    shares = np.zeros((len(tape.entries), 10), np.float32)
+    rows = (tape.splats, tape.reach2, tape.starts, tape.owners, tape.entries)
+    given = (*rows, across, image, slopes, tape.used, shares)
+    run(across * across, 8, _tiles.differentiate_tiles, *given)
+    d_splats = np.empty((num, 10), np.float32)
+    run(num, 4096, _tiles.sum_entries, tape.offsets, shares, d_splats)
+    out = zeros_like(tape.gaussians)
+    means, log_scales, quaternions, _, sh = tape.gaussians.arrays()
+    given = (tape.camera.packed(), size, means, log_scales, quaternions, sh, tape.sh_degree)
+    given = (*given, tape.splats, tape.reach2, d_splats, *out.arrays())
+    run(num, 2048, _project.backproject, *given)
+    return Gradients(out, d_splats[:, :2].copy(), tape.reach2 > 0)
+
+
+def _in_parallel(
+    num_threads: int, num: int, grain: int, kernel: Callable[..., object], *given: Any
+) -> None:
+    """Call kernel(*given, begin, end) on ranges of `grain` items that cover 0..num - 1."""
+    if num_threads == 1 or num <= grain:
+        kernel(*given, 0, num)
+        return
+    running = [
+        _pool(num_threads).submit(kernel, *given, begin, min(begin + grain, num))
+        for begin in range(0, num, grain)
+    ]
+    for future in running:
+        future.result()
+
+
+@functools.cache
+def _pool(num_threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(num_threads, thread_name_prefix="splat")

@@ -1,0 +1,221 @@
+"""Train a splat on posed faces: 3D Gaussian Splatting as published (Kerbl et al., 2023).
+
+One view a step, in an order drawn anew for every round through the views; Adam; clone, split and
+prune; opacity resets. The published times are for 30,000 steps and shrink with the number asked
+for, down to sensible floors. Every random draw depends on the seed and the step alone, so that a
+run that was interrupted goes on to the same result.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsba.config import SplatSettings
+from gsba.log import GsbaError, track
+from gsba.records import RecordError, load_record, read_info, save_record
+from gsba.splat import adam
+from gsba.splat.backend import Backend
+from gsba.splat.camera import FaceCamera
+from gsba.splat.density import Limits, Pull, densify, reset_opacity
+from gsba.splat.gaussians import Gaussians
+from gsba.splat.metrics import training_loss
+
+logger = logging.getLogger(__name__)
+
+_PUBLISHED = 30_000  # steps that the published times are for
+_CHECK_EVERY = 20  # steps between looks for values that are not finite
+
+
+@dataclass(frozen=True, slots=True)
+class Views:
+    """Posed images to train on."""
+
+    cameras: Sequence[FaceCamera]  # (V,) all of one size
+    images: np.ndarray  # (V, H, W, 3) uint8, RGB
+    use: np.ndarray | None  # (V, H, W) bool, pixels that count; None = all
+    panoramas: np.ndarray  # (V,) int, which panorama each is a face of
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """A splat in training."""
+
+    step: int  # steps made
+    gaussians: Gaussians
+    moments: adam.Moments
+    pull: Pull
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """When what happens, in steps."""
+
+    densify_from: int
+    densify_until: int
+    densify_every: int
+    reset_every: int  # opacities
+    degree_every: int  # one more degree of the harmonics
+
+
+def times_for(iterations: int) -> Times:
+    """The published times, scaled to a number of steps."""
+    scale = iterations / _PUBLISHED
+    return Times(
+        densify_from=max(round(500 * scale), 100),
+        densify_until=iterations // 2,
+        densify_every=min(max(round(100 * scale), 50), 100),
+        reset_every=max(round(3000 * scale), 3000),  # short trainings cannot recover from one
+        degree_every=max(round(1000 * scale), 1),
+    )
+
+
+def extent_of(places: np.ndarray) -> float:
+    """Radius of the region that cameras at (N, 3) are in, times 1.1; 1 for a single place."""
+    radius = float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
+    return 1.1 * radius if radius > 0 else 1.0
+
+
+def train(
+    start: Gaussians,
+    views: Views,
+    settings: SplatSettings,
+    backend: Backend,
+    checkpoint: Path | None = None,
+    key: str = "",
+    watch: Callable[[int, Gaussians], object] | None = None,
+) -> Gaussians:
+    """Train a splat.
+
+    Args:
+        start: e.g. of `from_cloud`.
+        views: what it shall look like.
+        settings: length, rates and thresholds.
+        backend: the renderer.
+        checkpoint: file that keeps the training, and that it goes on from; None = none.
+        key: what the training depends on; a checkpoint of another key is not taken up.
+        watch: called with the steps made and the splat, after each step.
+
+    Raises:
+        GsbaError: all pixels masked, no Gaussian, or parameters that are no longer finite; the
+            last checkpoint with finite ones stays.
+    """
+    if len(views.images) == 0 or (views.use is not None and not views.use.any()):
+        raise GsbaError("no pixel to train a splat on: all frames are masked or held out")
+    if len(start) == 0:
+        raise GsbaError("no Gaussian to start from")
+    if len(start) > settings.max_gaussians:
+        logger.warning("the cloud has %d points, %d are used", len(start), settings.max_gaussians)
+        draw = np.random.default_rng(settings.seed)
+        start = start.select(np.sort(draw.permutation(len(start))[: settings.max_gaussians]))
+    state = _resume(checkpoint, key)
+    if state is None:
+        first = start.select(np.arange(len(start)))
+        state = State(0, first, adam.Moments.zero(first), Pull.none(len(first)))
+    trainer = _Trainer(views, settings, backend)
+    saved = time.monotonic()
+    steps = range(state.step, settings.iterations)
+    for _ in track(steps, "training the splat", total=len(steps)):
+        state = trainer.step(state)
+        last = state.step == settings.iterations
+        if (state.step % _CHECK_EVERY == 0 or last) and not state.gaussians.is_finite():
+            kept = "" if checkpoint is None else f"; the last good state is in {checkpoint}"
+            raise GsbaError(f"the splat is no longer finite at step {state.step}{kept}")
+        if watch is not None:
+            watch(state.step, state.gaussians)
+        due = time.monotonic() - saved > settings.checkpoint_every_s
+        if checkpoint is not None and (last or (due and state.gaussians.is_finite())):
+            save_record(checkpoint, state, {"key": key})
+            saved = time.monotonic()
+    return state.gaussians
+
+
+def _resume(checkpoint: Path | None, key: str) -> State | None:
+    if checkpoint is None or not checkpoint.exists():
+        return None
+    try:
+        if read_info(checkpoint).get("key") != key:
+            logger.info("%s is of other inputs or settings: training anew", checkpoint)
+            return None
+        state = load_record(checkpoint, State)
+    except RecordError as error:
+        logger.warning("training anew: %s", error)
+        return None
+    logger.info("going on from step %d of %s", state.step, checkpoint)
+    return state
+
+
+class _Trainer:
+    """What does not change between steps."""
+
+    def __init__(self, views: Views, settings: SplatSettings, backend: Backend) -> None:
+        self.views, self.settings, self.backend = views, settings, backend
+        self.times = times_for(settings.iterations)
+        self.extent = extent_of(np.array([camera.face_in_world for camera in views.cameras]))
+        self.near = settings.near * self.extent
+        self.capped = False
+
+    def step(self, state: State) -> State:
+        """One view; arrays of the state may be changed in place."""
+        settings, step = self.settings, state.step + 1
+        gaussians, moments, pull = state.gaussians, state.moments, state.pull
+        view = self._view(state.step)
+        degree = min(state.step // self.times.degree_every, settings.sh_degree)
+        truth = self.views.images[view].astype(np.float32) / 255
+        use = None if self.views.use is None else self.views.use[view]
+
+        def slope(color: np.ndarray) -> np.ndarray:
+            return training_loss(color, truth, use, settings.ssim_weight)[1]
+
+        camera = self.views.cameras[view]
+        found = self.backend.gradients(gaussians, camera, degree, self.near, slope)
+        adam.step(gaussians, found.gaussians, moments, self._rates(step), step)
+        times = self.times
+        if settings.densify and step <= times.densify_until:
+            pull.add(found.centres, found.seen, camera.size)
+            if step > times.densify_from and step % times.densify_every == 0:
+                gaussians, moments = self._densify(state, step)
+                pull = Pull.none(len(gaussians))
+            if step % times.reset_every == 0 and step < times.densify_until:
+                gaussians, moments = reset_opacity(gaussians, moments)
+        return State(step, gaussians, moments, pull)
+
+    def _view(self, step: int) -> int:
+        """Index of the view shown at a step."""
+        turn, place = divmod(step, len(self.views.cameras))
+        draw = np.random.default_rng([self.settings.seed, turn])
+        return int(draw.permutation(len(self.views.cameras))[place])
+
+    def _rates(self, step: int) -> adam.Rates:
+        settings = self.settings
+        done = step / settings.iterations
+        means = settings.rate_means ** (1 - done) * settings.rate_means_end**done
+        return adam.Rates(
+            means=means * self.extent,
+            log_scales=settings.rate_scales,
+            quaternions=settings.rate_rotations,
+            opacity_logits=settings.rate_opacities,
+            sh=settings.rate_colors,
+            sh_rest=settings.rate_colors / 20,
+        )
+
+    def _densify(self, state: State, step: int) -> tuple[Gaussians, adam.Moments]:
+        settings = self.settings
+        limits = Limits(
+            pull=settings.densify_pull,
+            clone_scale=settings.densify_scale * self.extent,
+            max_scale=settings.max_scale * self.extent if step > self.times.reset_every else None,
+            min_opacity=settings.min_opacity,
+            max_gaussians=settings.max_gaussians,
+        )
+        draw = np.random.default_rng([settings.seed, step, 1])
+        gaussians, moments, capped = densify(
+            state.gaussians, state.moments, state.pull, limits, draw
+        )
+        if capped and not self.capped:
+            self.capped = True
+            logger.warning("%d Gaussians are the most allowed", settings.max_gaussians)
+        return gaussians, moments

@@ -1,0 +1,164 @@
+"""Frames against a splat: the block that aligns rig poses to what the splat renders."""
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from factors import BearingTerm, FaceCameras, LandmarkBlock, RobustLoss
+from factors.splat import RenderedView, SplatBlock
+from gsba import cubemap, graph
+from gsba.config import SolverSettings
+from gsba.log import track
+from gsba.optimize import optimize
+from gsba.rig import RIG_R_FACE, CubeRig
+from gsba.splat.backend import Backend
+from gsba.splat.camera import face_camera
+from gsba.splat.gaussians import Gaussians
+from gsba.splatting import place_points
+from gsba.types import FACES, FrameSet, Reconstruction
+
+MIN_ALPHA = 0.95  # of a rendered pixel that is believed
+MAX_STEP = 0.1  # of the depth, between neighbouring pixels: more is an edge
+MAX_STEPS = 12  # of the solver at each size
+_GATE = np.deg2rad(1.0)  # of observations that join the splat
+_LUMA = np.array([0.299, 0.587, 0.114])
+_MARGIN_HFOV_DEG = 100.0  # of captured faces, so that samples beyond an edge find pixels
+
+
+def align(
+    gaussians: Gaussians,
+    frames: FrameSet,
+    world_T_rigs: np.ndarray,
+    near: float,
+    backend: Backend,
+    sizes: Sequence[int] = (48, 96, 192),
+    reconstruction: Reconstruction | None = None,
+) -> np.ndarray:
+    """Align the poses of all frames to a splat that stays as it is, from coarse to fine.
+
+    The splat holds the gauge. The coarsest faces have the widest basin and work alone; bearings,
+    where given, join from the second size on.
+
+    Args:
+        gaussians: the splat.
+        frames: captured frames.
+        world_T_rigs: (F, 4, 4) start, in the splat's world.
+        near: least z of a Gaussian, map units.
+        backend: the renderer.
+        sizes: pixels of a face at each level.
+        reconstruction: whose observations join as bearing factors; None = the splat alone.
+
+    Returns:
+        (F, 4, 4) float64.
+    """
+    which = np.arange(len(frames))
+    settings = SolverSettings(max_iterations=MAX_STEPS, relative_tolerance=1e-5)
+    poses = world_T_rigs
+    for level, size in enumerate(sizes):
+        blocks: list = [splat_block(gaussians, frames, which, size, near, backend)]
+        if reconstruction is not None and level > 0:
+            blocks.append(bearing_block(reconstruction, poses))
+        values = gtsam.Values()
+        for f in which:
+            values.insert(graph.X(int(f)), gtsam.Pose3(poses[f]))
+        found = optimize(gtsam.NonlinearFactorGraph(), blocks, values, settings).values
+        poses = np.stack([found.atPose3(graph.X(int(f))).matrix() for f in which])
+    return poses
+
+
+def bearing_block(reconstruction: Reconstruction, world_T_rigs: np.ndarray) -> LandmarkBlock:
+    """A run's observations as bearing factors, points placed under given poses (F, 4, 4)."""
+    which = np.arange(len(world_T_rigs))
+    landmarks, _ = place_points(reconstruction, world_T_rigs, which, float(_GATE))
+    tracks = landmarks.tracks
+    term = BearingTerm(
+        tracks.frames,
+        tracks.points,
+        reconstruction.observation_bearings[tracks.keypoints],
+        reconstruction.observation_sigmas[tracks.keypoints],
+    )
+    keys = [graph.X(int(f)) for f in which]
+    return LandmarkBlock(keys, landmarks.points_world, [term], RobustLoss("cauchy", 1.0))
+
+
+def splat_block(
+    gaussians: Gaussians,
+    frames: FrameSet,
+    which: np.ndarray,
+    size: int,
+    near: float,
+    backend: Backend,
+    loss: RobustLoss | None = None,
+) -> SplatBlock:
+    """The block of some frames against a fixed splat.
+
+    Args:
+        gaussians: the splat; its world is the poses'.
+        frames: captured frames.
+        which: frame indices; keys are graph.X(frame).
+        size: pixels of a rendered face; captured ones are sampled as densely. Coarse to fine is
+            one block after another.
+        near: least z of a Gaussian, map units.
+        backend: the renderer.
+        loss: see `factors.splat.SplatBlock`.
+    """
+    rendered = CubeRig(size, np.pi / 2)
+    captured = _captured_rig(frames, size)
+    images, use = [], []
+    for f in track(which, "cutting faces", total=len(which)):
+        faces, mask = cubemap.load(frames, int(f), captured)
+        images.append((faces @ _LUMA / 255).astype(np.float32))
+        use.append(mask)
+    num = len(FACES)
+    cameras = FaceCameras(
+        RIG_R_FACE, np.full(num, captured.focal), np.full((num, 2), captured.principal)
+    )
+
+    def render(_row: int, world_T_rig: np.ndarray) -> RenderedView:
+        return render_view(gaussians, world_T_rig, rendered, near, backend)
+
+    return SplatBlock([graph.X(int(f)) for f in which], images, use, cameras, render, loss)
+
+
+def render_view(
+    gaussians: Gaussians, world_T_rig: np.ndarray, rig: CubeRig, near: float, backend: Backend
+) -> RenderedView:
+    """Pixels of all faces that the splat is sure of, as points with grey values.
+
+    Args:
+        world_T_rig: (4, 4), where to render from.
+        rig: faces to render.
+    """
+    centres = np.arange(rig.size) + 0.5
+    grid = np.stack(np.meshgrid(centres, centres), axis=-1)
+    points, greys = [], []
+    for face in range(len(FACES)):
+        camera = face_camera(world_T_rig, face, rig)
+        image = backend.render(gaussians, camera, None, near)
+        sure = (image.alpha > MIN_ALPHA) & ~_edges(image.depth)
+        depth = image.depth[sure].astype(np.float64)
+        offsets = (grid[sure] - rig.principal) / rig.focal
+        local = np.column_stack([offsets, np.ones(len(offsets))]) * depth[:, None]
+        points.append(local @ camera.world_R_face.T + camera.face_in_world)
+        # What lies behind a pixel that is not quite opaque is unknown: leave its share out.
+        greys.append((image.color[sure] @ _LUMA) / image.alpha[sure])
+    return RenderedView(np.concatenate(points), np.concatenate(greys))
+
+
+def _edges(depth: np.ndarray) -> np.ndarray:
+    """Pixels (H, W) bool at a jump of the depth, where an expected depth is nobody's."""
+    low, high = depth.copy(), depth.copy()
+    for axis in (0, 1):
+        for shift in (1, -1):
+            other = np.roll(depth, shift, axis)
+            low, high = np.minimum(low, other), np.maximum(high, other)
+    return high - low > MAX_STEP * np.maximum(depth, 1e-9)
+
+
+def _captured_rig(frames: FrameSet, size: int) -> CubeRig:
+    """Faces as dense as rendered ones and a little wider; those of cube frames are as they are."""
+    if frames.layout == "cube":
+        return CubeRig(frames.width, np.pi / 2)
+    hfov = np.deg2rad(_MARGIN_HFOV_DEG)
+    return CubeRig(round(size * np.tan(hfov / 2)), hfov)

@@ -1,0 +1,279 @@
+"""Choose frames of a video and write them as images with their exact times.
+
+`FRAMES/NNNNNN.jpg` is frame NNNNNN of the video, counted from 0; `timestamps.csv` gives the seconds
+since the first one. `extract.json` says what was asked for, so that the same call resumes and
+another one does not mix its frames in.
+"""
+
+import csv
+import json
+import logging
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsba import __version__
+from gsba.config import VideoSettings
+from gsba.log import GsbaError, track
+from gsba.read import read_trajectory
+from gsba.read.times import read_times
+from gsba.records import atomic_write, disk_errors, remove_temporaries
+from gsba.store import digest, fingerprint
+from gsba.types import Counts
+from gsba.video.likeness import apparent_motion_deg, miniature, sharpness
+from gsba.video.timeline import Timeline, bgr, decode, luma, read_timeline
+
+logger = logging.getLogger(__name__)
+
+MARKER = "extract.json"
+TIMES = "timestamps.csv"
+_JOURNAL = "extract.partial.csv"  # what is there so far; gone when all is
+_JPEG_QUALITY = 95
+_EXACT = 1e-6  # seconds: closer times are equal
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """A frame that was written."""
+
+    name: str  # file name
+    timestamp: float  # seconds since the first frame of the video
+    index: int  # of the frame in the video
+    standing: int  # windows left out by then because the camera stood
+
+
+def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = False) -> Counts:
+    """Write frames of an equirectangular video to a folder that `gsba.read.scan` understands.
+
+    Times count from the first frame shown; they are the container's presentation times, whatever
+    the frame rate does. A call that was interrupted goes on where it stopped.
+
+    Args:
+        video: H.264, H.265 or whatever else FFmpeg decodes, 2:1.
+        out: folder of the frames, made if missing.
+        settings: which frames, and at what size.
+        replace: put up with another extraction in `out`, and replace it.
+
+    Returns:
+        Frames in the asked range, those kept, and why the others were not.
+
+    Raises:
+        GsbaError: the video or the folder cannot be used; no frame is in the range.
+    """
+    trajectory = None if settings.at is None else Path(settings.at)
+    if settings.at is not None and settings.sharpest:
+        raise GsbaError("--at names the very frames to keep: leave out --sharpest")
+    if not video.is_file():
+        raise GsbaError(f"{video}: no such file")
+    key = digest(__version__, settings, fingerprint([video, trajectory]))
+    done = _take_over(out, key, replace)
+    if done is not None:
+        logger.info("%s: %d frames, extracted before", out, done.kept)
+        return done
+    timeline = read_timeline(video)
+    if settings.width is not None and settings.width > timeline.width:
+        raise GsbaError(f"--width {settings.width}: {video} has only {timeline.width} pixels")
+    windows, received = _windows(video, timeline, settings)
+    _check_end(video, timeline, settings.to_s)
+    _write_marker(out, video, key, None)
+    before = _read_journal(out)
+    after, standing = _extract(video, timeline, windows, out, settings, before)
+    kept = before + after
+    if not kept:
+        raise GsbaError(f"{video}: none of its pictures could be decoded; copy it again")
+    counts = _counts(received, windows, kept, standing)
+    _write_times(out, kept)
+    _write_marker(out, video, key, counts)
+    (out / _JOURNAL).unlink(missing_ok=True)
+    why = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
+    logger.info("%s: kept %d of %d frames (%s)", out, counts.kept, received, why or "all")
+    return counts
+
+
+def _windows(
+    video: Path, timeline: Timeline, settings: VideoSettings
+) -> tuple[list[np.ndarray], int]:
+    """Groups of frame indices of which one each is kept, and how many frames are in the range."""
+    times = timeline.times
+    low, high = settings.from_s or 0.0, np.inf if settings.to_s is None else settings.to_s
+    inside = np.flatnonzero((times >= low - _EXACT) & (times <= high + _EXACT))
+    if not len(inside):
+        raise GsbaError(
+            f"{video}: no frame between {low:g} and {high:g} s; it lasts {times[-1]:.3f} s"
+        )
+    if settings.at is not None:
+        return _nearest_to(Path(settings.at), times, inside), len(inside)
+    if settings.every is not None:
+        slots = np.arange(len(inside)) // settings.every
+    else:
+        slots = np.floor((times[inside] - low + _EXACT) * settings.fps).astype(np.int64)
+    groups = np.split(inside, np.flatnonzero(np.diff(slots)) + 1)
+    return (groups if settings.sharpest else [group[:1] for group in groups]), len(inside)
+
+
+def _nearest_to(path: Path, times: np.ndarray, inside: np.ndarray) -> list[np.ndarray]:
+    """The frame nearest to each time of a trajectory, where there is one within half a frame."""
+    entries = read_trajectory(path).timestamps
+    interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    after = np.clip(np.searchsorted(times[inside], entries), 1, max(len(inside) - 1, 1))
+    after = np.minimum(after, len(inside) - 1)
+    before = np.maximum(after - 1, 0)
+    earlier = entries - times[inside[before]] <= times[inside[after]] - entries
+    nearest = inside[np.where(earlier, before, after)]
+    met = np.abs(times[nearest] - entries) <= 0.5 * interval + _EXACT
+    if not met.any():
+        raise GsbaError(
+            f"{path}: none of its times ({entries[0]:.3f} to {entries[-1]:.3f} s) is that of a "
+            f"frame (0 to {times[-1]:.3f} s): give a trajectory on the video's clock"
+        )
+    if not met.all():
+        logger.warning("%s: %d of %d times meet no frame", path, np.sum(~met), len(met))
+    return [np.array([index]) for index in np.unique(nearest[met])]
+
+
+def _check_end(video: Path, timeline: Timeline, to_s: float | None) -> None:
+    last = float(timeline.times[-1])
+    if timeline.is_cut_short and (to_s is None or to_s > last + _EXACT):
+        raise GsbaError(
+            f"{video}: claims to last {timeline.claimed_s:.1f} s, but its pictures end at "
+            f"{last:.3f} s: truncated; copy it again, or pass --to {last:.3f} to use what is there"
+        )
+
+
+def _extract(
+    video: Path,
+    timeline: Timeline,
+    windows: list[np.ndarray],
+    out: Path,
+    settings: VideoSettings,
+    before: list[_Kept],
+) -> tuple[list[_Kept], int]:
+    """Decode, choose and write what comes after the frames kept `before`.
+
+    Returns:
+        the frames kept, and how many of all windows were left out because the camera stood.
+    """
+    times, kept, last = timeline.times, list[_Kept](), None
+    standing = before[-1].standing if before else 0
+    todo = [window for window in windows if not before or window[0] > before[-1].index]
+    skip_standing = settings.standing_deg > 0 and settings.at is None
+    if before and todo and skip_standing:
+        for _, frame in decode(video, timeline, [before[-1].index]):
+            last = miniature(luma(frame))
+    best = _best_of_each(decode(video, timeline, _flat(todo)), todo, settings.sharpest)
+    for index, frame in track(best, "extracting frames", len(todo)):
+        if skip_standing:
+            small = miniature(luma(frame))
+            if last is not None and apparent_motion_deg(last, small) < settings.standing_deg:
+                standing += 1
+                continue
+            last = small
+        name, image = f"{index:06d}.jpg", _encoded(frame, settings.width)
+        atomic_write(out / name, lambda path, image=image: path.write_bytes(image))
+        kept.append(_Kept(name, float(times[index]), index, standing))
+        _append(out / _JOURNAL, kept[-1])
+    return kept, standing
+
+
+def _best_of_each(
+    frames: Iterable[tuple[int, Any]], windows: list[np.ndarray], sharpest: bool
+) -> Iterator[tuple[int, Any]]:
+    """The sharpest, or only, decoded frame of each window."""
+    window_of = {int(index): w for w, window in enumerate(windows) for index in window}
+    for _, group in groupby(frames, key=lambda item: window_of[item[0]]):
+        yield max(group, key=lambda item: sharpness(luma(item[1])) if sharpest else 0.0)
+
+
+def _flat(windows: list[np.ndarray]) -> list[int]:
+    return [int(index) for window in windows for index in window]
+
+
+def _encoded(frame: Any, width: int | None) -> bytes:
+    """A decoded picture as JPEG, narrower if asked."""
+    import cv2
+
+    pixels = bgr(frame)
+    if width is not None and width != pixels.shape[1]:
+        pixels = cv2.resize(pixels, (width, width // 2), interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+
+
+def _counts(received: int, windows: list[np.ndarray], kept: list[_Kept], standing: int) -> Counts:
+    damaged = len(windows) - len(kept) - standing
+    dropped = {
+        "not chosen": received - len(windows),
+        "while the camera stood": standing,
+        "damaged": damaged,
+    }
+    return Counts(received, len(kept), "frames", dropped)
+
+
+def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
+    """Make `out` ready; the counts of an equal extraction that is complete, else None."""
+    if out.exists() and not out.is_dir():
+        raise GsbaError(f"{out} is a file: choose another --out")
+    with disk_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+    remove_temporaries(out)
+    if not any(out.iterdir()):
+        return None
+    try:
+        marker = json.loads((out / MARKER).read_text(encoding="utf-8"))
+        counts = None if marker["counts"] is None else Counts(**marker["counts"])
+        same = marker["key"] == key
+    except (OSError, ValueError, TypeError, KeyError):
+        raise GsbaError(f"{out} is not empty and no extraction: choose another --out") from None
+    written = _read_times(out)
+    if same and (counts is None or all((out / n).is_file() for n in written)):
+        return counts
+    if not same and not replace:
+        raise GsbaError(
+            f"{out} holds another extraction (of {marker['video']}): choose another --out, or "
+            "--fresh to replace it"
+        )
+    with disk_errors(out):
+        for name in [*written, *(k.name for k in _read_journal(out)), TIMES, _JOURNAL, MARKER]:
+            (out / Path(name).name).unlink(missing_ok=True)
+    return None
+
+
+def _write_marker(out: Path, video: Path, key: str, counts: Counts | None) -> None:
+    entries = None if counts is None else asdict(counts)
+    marker = {"gsba": __version__, "video": str(video.resolve()), "key": key, "counts": entries}
+    text = json.dumps(marker, indent=1, ensure_ascii=False) + "\n"
+    atomic_write(out / MARKER, lambda path: path.write_text(text, encoding="utf-8"))
+
+
+def _append(path: Path, kept: _Kept) -> None:
+    with disk_errors(path), path.open("a", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerow([kept.name, repr(kept.timestamp), kept.index, kept.standing])
+
+
+def _read_journal(out: Path) -> list[_Kept]:
+    """Frames an interrupted call has written; a row cut off by a crash is none."""
+    try:
+        text = (out / _JOURNAL).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return []
+    kept = []
+    for row in csv.reader(text[: text.rfind("\n") + 1].splitlines()):
+        entry = _Kept(row[0], float(row[1]), int(row[2]), int(row[3]))
+        if not (out / entry.name).is_file():
+            break
+        kept.append(entry)
+    return kept
+
+
+def _read_times(out: Path) -> list[str]:
+    """Names of the images of a complete extraction."""
+    path = out / TIMES
+    return [row.name for row in read_times(path) if row.name] if path.is_file() else []
+
+
+def _write_times(out: Path, kept: list[_Kept]) -> None:
+    rows = "".join(f"{entry.name},{entry.timestamp!r}\n" for entry in kept)
+    atomic_write(out / TIMES, lambda path: path.write_text("name,timestamp\n" + rows))

@@ -1,0 +1,126 @@
+"""Which frames are to show a point: the one it is taken from, and those it is looked for in."""
+
+import numba
+import numpy as np
+
+from gsba.config import AlignSettings
+from gsba.types import Landmarks
+
+_SCALE_WEIGHT = 0.25  # of a squared log ratio of distances, against a squared angle
+
+
+def references(landmarks: Landmarks, world_T_rigs: np.ndarray) -> np.ndarray:
+    """Row (J,) of the observation of each point that is in the middle of all its observations.
+
+    Middle is where the sum of squared angles between views, and of squared log ratios of
+    distances, to the point's other observations is least.
+    """
+    centres = np.ascontiguousarray(world_T_rigs[:, :3, 3])
+    out = np.zeros(len(landmarks.points_world), np.int64)
+    _references(_starts(landmarks), landmarks.tracks.frames, centres, landmarks.points_world, out)
+    return out
+
+
+def views(
+    landmarks: Landmarks,
+    world_T_rigs: np.ndarray,
+    rows: np.ndarray,
+    extended: np.ndarray,
+    settings: AlignSettings,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Frames in which each point is looked for, its reference left out.
+
+    They are the frames of its observations, and where asked for those near its reference in space,
+    whatever their time, that see it from a like direction and distance: the most similar first.
+
+    Args:
+        landmarks: the points.
+        world_T_rigs: (F, 4, 4) current poses.
+        rows: (J,) observation each point is taken from.
+        extended: (J,) bool, points that are looked for where they have no observation.
+
+    Returns:
+        points (O,) and frames (O,), int64, by point.
+    """
+    centres = np.ascontiguousarray(world_T_rigs[:, :3, 3])
+    frames, points = landmarks.tracks.frames, landmarks.points_world
+    num_near = min(settings.near_frames, len(centres) - 1)
+    near = np.empty((len(centres), num_near), np.int64)
+    for f, centre in enumerate(centres):
+        distances = np.linalg.norm(centres - centre, axis=1)
+        distances[f] = -1
+        near[f] = np.argsort(distances, kind="stable")[1 : num_near + 1]
+    room = len(frames) + settings.max_views * len(points)
+    out = np.empty((2, room), np.int64)
+    limits = np.cos(np.deg2rad(settings.max_angle_deg)), settings.max_ratio
+    num = _views(
+        _starts(landmarks), frames, centres, points, rows, near, *limits, settings.max_views,
+        extended, out,
+    )  # fmt: skip
+    return out[0, :num].copy(), out[1, :num].copy()
+
+
+def _starts(landmarks: Landmarks) -> np.ndarray:
+    tracks = landmarks.tracks
+    return np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
+
+
+@numba.njit(cache=True, nogil=True)
+def _difference(ax, ay, az, bx, by, bz):
+    """Cosine of the angle, ratio of lengths, and how unlike two views of a point are."""
+    aa, bb = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz
+    if aa < 1e-300 or bb < 1e-300:
+        return -1.0, np.inf, np.inf
+    cosine = (ax * bx + ay * by + az * bz) / np.sqrt(aa * bb)
+    ratio = np.sqrt(bb / aa)
+    return cosine, ratio, 2.0 * (1.0 - cosine) + _SCALE_WEIGHT * np.log(ratio) ** 2
+
+
+@numba.njit(cache=True, nogil=True)
+def _references(starts, frames, centres, points, out):
+    for j in range(len(points)):
+        best = np.inf
+        for a in range(starts[j], starts[j + 1]):
+            va = points[j] - centres[frames[a]]
+            cost = 0.0
+            for b in range(starts[j], starts[j + 1]):
+                vb = points[j] - centres[frames[b]]
+                cost += _difference(va[0], va[1], va[2], vb[0], vb[1], vb[2])[2]
+            if cost < best or a == starts[j]:
+                best, out[j] = cost, a
+
+
+@numba.njit(cache=True, nogil=True)
+def _views(
+    starts, frames, centres, points, rows, near, min_cosine, max_ratio, max_views, extended, out
+):
+    listed = np.full(len(centres), -1)  # point that last listed each frame
+    costs = np.empty(near.shape[1])
+    num = 0
+    for j in range(len(points)):
+        host = frames[rows[j]]
+        va = points[j] - centres[host]
+        listed[host] = j
+        room = max_views
+        for a in range(starts[j], starts[j + 1]):
+            if listed[frames[a]] != j:
+                listed[frames[a]] = j
+                out[0, num], out[1, num] = j, frames[a]
+                num += 1
+                room -= 1
+        if not extended[j]:
+            continue
+        for k in range(near.shape[1]):
+            costs[k] = np.inf
+            if listed[near[host, k]] != j:
+                vb = points[j] - centres[near[host, k]]
+                cosine, ratio, cost = _difference(va[0], va[1], va[2], vb[0], vb[1], vb[2])
+                if cosine > min_cosine and ratio < max_ratio and ratio * max_ratio > 1:
+                    costs[k] = cost
+        for k in np.argsort(costs):
+            if room <= 0 or costs[k] == np.inf:
+                break
+            out[0, num], out[1, num] = j, near[host, k]
+            num += 1
+            room -= 1
+    return num

@@ -1,0 +1,278 @@
+"""The alignment stage on a rendered walk: better poses, right bookkeeping, bad frames survived."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gsba import adjust, align, graph
+from gsba.adjust import Adjustment
+from gsba.config import AlignSettings, RefineSettings
+from gsba.geometry import inverse, pose
+from gsba.rig import CubeRig
+from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Sighted, Tracks
+from tests.synthetic import bearings_of
+
+NUM, WIDTH = 6, 512
+RIG = CubeRig(128, np.pi / 2)
+PIXEL = 2 * np.pi / WIDTH
+SETTINGS = AlignSettings(patch_size=11)
+
+
+def _bearings(width: int) -> np.ndarray:
+    from gsba.geometry import bearings_from_erp
+
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
+    return bearings_from_erp(np.stack([u, v], axis=-1), width, width // 2)
+
+
+def _grey(points: np.ndarray) -> np.ndarray:
+    """Texture of space: waves a little longer than two pixels seen from 3 units away."""
+    rng = np.random.default_rng(0)
+    out = np.full(points.shape[:-1], 128.0)
+    for _ in range(60):
+        wave = rng.normal(size=3)
+        wave *= rng.uniform(0.15, 1) * 2 * np.pi / (5 * PIXEL * 3) / np.linalg.norm(wave)
+        out += 7 * np.sin(points @ wave + rng.uniform(0, 2 * np.pi))
+    return out
+
+
+def _hit(centre: np.ndarray, rays: np.ndarray, radius: float = 3.0) -> np.ndarray:
+    """Where rays (..., 3) from inside leave a sphere around the origin."""
+    along = rays @ centre
+    return centre + (np.sqrt(along**2 + radius**2 - centre @ centre) - along)[..., None] * rays
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> tuple[FrameSet, np.ndarray]:
+    """Panoramas inside a textured sphere, and their true poses."""
+    folder = tmp_path_factory.mktemp("frames")
+    rays = _bearings(WIDTH)
+    at = np.linspace(-0.7, 0.7, NUM)
+    positions = np.column_stack([at, 0.1 * np.sin(4 * at), 0.3 * at**2])
+    turns = np.array([cv2.Rodrigues(np.array([0.02, 0.3, 0.01]) * a)[0] for a in at])
+    world_T_rigs, paths = pose(turns, positions), []
+    rng = np.random.default_rng(1)
+    for f in range(NUM):
+        image = _grey(_hit(positions[f], rays @ turns[f].T)) + rng.normal(0, 2, rays.shape[:2])
+        paths.append((folder / f"{f}.png",))
+        cv2.imwrite(str(paths[-1][0]), np.clip(image * (1 + 0.05 * f) - 5 * f, 0, 255))
+    names = tuple(str(f) for f in range(NUM))
+    times = np.arange(NUM, dtype=float)
+    frames = FrameSet(names, tuple(paths), times, "erp", (), WIDTH, WIDTH // 2, (None,) * NUM)
+    return frames, world_T_rigs
+
+
+def _start(
+    world_T_rigs: np.ndarray, sigma_px: float = 0.3, num: int = 400
+) -> tuple[Landmarks, Keypoints]:
+    """Points on the sphere, seen by three frames each with a detector's noise."""
+    rng = np.random.default_rng(2)
+    rays = rng.normal(size=(num, 3))
+    points = 3 * rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    chosen = np.sort(np.argsort(rng.random((num, NUM)), axis=1)[:, :3], axis=1)
+    owners, frames = np.repeat(np.arange(num), 3), chosen.ravel()
+    order = np.lexsort((owners, frames))
+    starts = np.searchsorted(frames[order], np.arange(NUM + 1))
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    bearings = np.empty((len(order), 3))
+    for f in range(NUM):
+        rows = order[starts[f] : starts[f + 1]]
+        bearings[starts[f] : starts[f + 1]] = bearings_of(points[owners[rows]], world_T_rigs[f])
+    bearings += rng.normal(0, sigma_px * PIXEL, bearings.shape)
+    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    size = len(order)
+    keypoints = Keypoints(
+        starts, np.zeros((size, 2)), np.zeros(size, np.uint8), bearings,
+        np.full(size, sigma_px * PIXEL), np.full((size, 3), 50, np.uint8),
+    )  # fmt: skip
+    tracks = Tracks(
+        owners.astype(np.int32), frames.astype(np.int32),
+        (rank - starts[frames]).astype(np.int32), num,
+    )  # fmt: skip
+    return Landmarks(points, tracks, Counts(num, num, "tracks")), keypoints
+
+
+def _run(
+    walk: tuple[FrameSet, np.ndarray],
+    settings: AlignSettings = SETTINGS,
+    sigma_px: float = 0.3,
+) -> Sighted:
+    frames, world_T_rigs = walk
+    landmarks, keypoints = _start(world_T_rigs, sigma_px)
+    return align.run(
+        landmarks, world_T_rigs, keypoints, 1.0, frames, RIG, "align", None, settings, 2
+    )
+
+
+def _errors_px(sighted: Sighted, world_T_rigs: np.ndarray) -> np.ndarray:
+    """Angles between observations and the true directions of the points they are of."""
+    landmarks, _ = _start(world_T_rigs)
+    # The stage keeps the order of points; those it lost are found by the nearest direction.
+    tracks, keypoints = sighted.tracks, sighted.keypoints
+    found = keypoints.bearings_rig[keypoints.rows(tracks)]
+    errors = np.empty(len(tracks))
+    for f in range(NUM):
+        rows = np.flatnonzero(tracks.frames == f)
+        true = bearings_of(landmarks.points_world, world_T_rigs[f])
+        errors[rows] = np.arccos(np.clip(found[rows] @ true.T, -1, 1)).min(axis=1)
+    return errors[sighted.aligned[keypoints.rows(tracks)]] / PIXEL
+
+
+def test_observations_are_sub_pixel(walk) -> None:
+    sighted = _run(walk)
+    errors = _errors_px(sighted, walk[1])
+    assert len(errors) > 3 * 400  # more than the detector's: points were found in further frames
+    assert np.median(errors) < 0.06 and np.percentile(errors, 95) < 0.3
+    counts = sighted.counts
+    assert counts.received == counts.kept + sum(counts.dropped.values())
+
+
+def test_tracks_and_keypoints_belong_together(walk) -> None:
+    sighted = _run(walk)
+    tracks, keypoints = sighted.tracks, sighted.keypoints
+    rows = keypoints.rows(tracks)
+    assert sorted(rows) == list(range(len(keypoints.faces)))
+    assert np.all(np.diff(tracks.points) >= 0)
+    assert np.bincount(tracks.points).min() >= 2
+    cells = tracks.points.astype(int) * NUM + tracks.frames
+    assert len(np.unique(cells)) == len(cells)
+    np.testing.assert_allclose(RIG.bearings(keypoints.pixels, keypoints.faces),
+                               keypoints.bearings_rig, atol=1e-12)  # fmt: skip
+    assert keypoints.sqrt_infos is not None
+    determinant = np.linalg.det(keypoints.sqrt_infos)
+    np.testing.assert_allclose(determinant, keypoints.sigmas_rad**-2, rtol=1e-9)
+    assert (keypoints.colors == 50).all()
+
+
+def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
+    frames, world_T_rigs = walk
+    landmarks, keypoints = _start(world_T_rigs)
+    settings = RefineSettings(align=SETTINGS)
+    priors = graph.build(world_T_rigs, settings.priors)
+
+    def rotation_errors(solved: Adjustment) -> np.ndarray:
+        true = inverse(world_T_rigs[:-1]) @ world_T_rigs[1:]
+        found = inverse(solved.world_T_rigs[:-1]) @ solved.world_T_rigs[1:]
+        return np.linalg.norm(found[:, :3, :3] - true[:, :3, :3], axis=(1, 2))
+
+    start = replace(adjust.start(world_T_rigs), landmarks=landmarks)
+    common = priors, RIG, (6.0, 3.0), settings, 2
+    before = adjust.run(landmarks.tracks, keypoints, start, *common)
+    sighted = align.run(
+        before.landmarks, before.world_T_rigs, keypoints, before.noise, frames, RIG, "align",
+        None, SETTINGS, 2,
+    )  # fmt: skip
+    after, known = adjust.run_sighted(sighted, before, *common)
+    assert np.median(rotation_errors(after)) < 0.5 * np.median(rotation_errors(before))
+    assert 0.5 <= after.noise < 2 and all(step.accepted for step in after.rounds)
+    aligned = sighted.aligned
+    factor = known.sigmas_rad[aligned] / sighted.keypoints.sigmas_rad[aligned]
+    np.testing.assert_allclose(factor, factor[0])  # one for all, found from their residuals
+
+
+@pytest.mark.parametrize("grey", [0, 255])
+def test_a_frame_without_texture_keeps_what_it_had(walk, tmp_path: Path, grey: int) -> None:
+    frames, world_T_rigs = walk
+    blank = tmp_path / "blank.png"
+    cv2.imwrite(str(blank), np.full((WIDTH // 2, WIDTH), grey, np.uint8))
+    paths = (*frames.paths[:2], (blank,), *frames.paths[3:])
+    sighted = _run((replace(frames, paths=paths), world_T_rigs))
+    assert sighted.counts.dropped["no texture"] > 50
+    seen = np.bincount(sighted.tracks.frames, minlength=NUM)
+    assert seen.min() > 100
+    assert not sighted.aligned[slice(*sighted.keypoints.starts[2:4])].any()
+    assert np.isfinite(sighted.keypoints.sqrt_infos).all()
+
+
+def test_all_masked_leaves_the_former_observations(walk, tmp_path: Path) -> None:
+    frames, world_T_rigs = walk
+    mask = tmp_path / "mask.png"
+    cv2.imwrite(str(mask), np.zeros((WIDTH // 2, WIDTH), np.uint8))
+    sighted = _run((replace(frames, mask_paths=(mask,) * NUM), world_T_rigs))
+    landmarks, keypoints = _start(world_T_rigs)
+    assert sighted.counts.kept == 0
+    assert sighted.counts.dropped["masked"] == sighted.counts.received
+    assert len(sighted.tracks) == len(landmarks.tracks) and not sighted.aligned.any()
+    np.testing.assert_allclose(sighted.keypoints.sigmas_rad, keypoints.sigmas_rad)
+
+
+def test_points_at_a_centre_and_behind_walls_do_no_harm(walk) -> None:
+    frames, world_T_rigs = walk
+    landmarks, keypoints = _start(world_T_rigs)
+    points = landmarks.points_world.copy()
+    points[:50] *= 1e-9  # inside the camera's path
+    points[50:100] *= 50
+    points[100] = world_T_rigs[landmarks.tracks.frames[300], :3, 3]
+    moved = replace(landmarks, points_world=points)
+    sighted = align.run(
+        moved, world_T_rigs, keypoints, 1.0, frames, RIG, "align", None, SETTINGS, 2
+    )
+    assert np.isfinite(sighted.keypoints.bearings_rig).all()
+    assert np.isfinite(sighted.keypoints.sqrt_infos).all()
+
+
+def test_confirmed_points_are_looked_for_elsewhere(walk) -> None:
+    frames, world_T_rigs = walk
+    landmarks, keypoints = _start(world_T_rigs)
+    settings = AlignSettings(patch_size=11, min_track_length=4)  # longer than any here
+    short, confirmed = (
+        align.run(
+            landmarks, world_T_rigs, keypoints, 1.0, frames, RIG, "align", aligned, settings, 2
+        )
+        for aligned in (None, np.ones(len(keypoints.faces), bool))
+    )
+    assert short.counts.received == 2 * 400  # all observations but the references
+    assert confirmed.counts.received > 3 * 400
+
+
+def test_a_solution_that_loses_a_frame_is_told_apart(walk) -> None:
+    _, world_T_rigs = walk
+    landmarks, _ = _start(world_T_rigs)
+    before = replace(adjust.start(world_T_rigs), landmarks=landmarks)
+    tracks = landmarks.tracks
+    rows = tracks.frames != 3
+    fewer = Tracks(tracks.points[rows], tracks.frames[rows], tracks.keypoints[rows], 400)
+    without = replace(before, landmarks=replace(landmarks, tracks=fewer))
+    assert adjust.carries(before, before, 12) and adjust.carries(before, without, 12)
+    assert not adjust.carries(without, before, 12)
+
+
+def test_no_points_are_no_observations(walk) -> None:
+    frames, world_T_rigs = walk
+    none = adjust.start(world_T_rigs).landmarks
+    _, keypoints = _start(world_T_rigs)
+    sighted = align.run(none, world_T_rigs, keypoints, 1.0, frames, RIG, "align", None, SETTINGS, 2)
+    assert len(sighted.tracks) == 0 and sighted.counts.received == 0
+
+
+def test_cube_faces_are_aligned_like_panoramas(walk, tmp_path: Path) -> None:
+    """Faces cut from the same scene; observations near face edges are as good as others."""
+    from gsba.types import FACES
+
+    frames, world_T_rigs = walk
+    size = 160
+    rig = CubeRig(size, np.pi / 2)
+    centres = np.arange(size) + 0.5
+    grid = np.stack(np.meshgrid(centres, centres), axis=-1)
+    paths = []
+    for f in range(NUM):
+        group = []
+        for face in range(len(FACES)):
+            rays = rig.bearings(grid, face) @ world_T_rigs[f, :3, :3].T
+            group.append(tmp_path / f"{f}_{face}.png")
+            image = _grey(_hit(world_T_rigs[f, :3, 3], rays))
+            cv2.imwrite(str(group[-1]), np.clip(image, 0, 255))
+        paths.append(tuple(group))
+    cube = replace(frames, paths=tuple(paths), layout="cube", faces=FACES, width=size, height=size)
+    sighted = _run((cube, world_T_rigs))
+    errors = _errors_px(sighted, world_T_rigs)
+    rows = sighted.keypoints.rows(sighted.tracks)
+    rows = rows[sighted.aligned[rows]]
+    pixels = sighted.keypoints.pixels[rows] / RIG.size
+    edge = np.abs(pixels - 0.5).max(axis=1) > 0.47
+    assert len(errors) > 900 and np.median(errors) < 0.08
+    assert np.count_nonzero(edge) > 50 and np.median(errors[edge]) < 0.1

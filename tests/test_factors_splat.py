@@ -1,0 +1,165 @@
+"""Alignment to a rendering: in a room whose views are known in closed form."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import FaceCameras, RobustLoss
+from factors.splat import RenderedView, SplatBlock
+from gsba.graph import X
+from gsba.optimize import optimize
+from gsba.rig import RIG_R_FACE, CubeRig
+
+RIG = CubeRig(48, np.deg2rad(100))
+CAMERAS = FaceCameras(RIG_R_FACE, np.full(6, RIG.focal), np.full((6, 2), RIG.principal))
+GRID = np.stack(np.meshgrid(np.arange(48) + 0.5, np.arange(48) + 0.5), axis=-1)
+BEARINGS = np.stack([RIG.bearings(GRID, face) for face in range(6)])  # (6, 48, 48, 3)
+
+
+def look(world_T_rig: np.ndarray, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (..., 3) where rays meet the walls of a cube of half-width 2, and grey values."""
+    rays = bearings @ world_T_rig[:3, :3].T
+    centre = world_T_rig[:3, 3]
+    reach = np.min((2 - np.sign(rays) * centre) / np.maximum(np.abs(rays), 1e-9), axis=-1)
+    points = centre + reach[..., None] * rays
+    x, y, z = np.moveaxis(points, -1, 0)
+    waves = np.sin(2 * x + 1) + np.sin(2.3 * y - z) + np.cos(1.9 * z + 0.5 * x)
+    return points, 0.5 + 0.1 * waves
+
+
+def render(_frame: int, world_T_rig: np.ndarray) -> RenderedView:
+    points, grey = look(world_T_rig, BEARINGS[:, 4:-4:2, 4:-4:2].reshape(-1, 3))
+    return RenderedView(points, grey)
+
+
+def truth(num: int) -> list[gtsam.Pose3]:
+    rng = np.random.default_rng(0)
+    return [gtsam.Pose3.Expmap(rng.normal(0, 0.4, 6)) for _ in range(num)]
+
+
+def block_at(poses: list[gtsam.Pose3], loss: str = "cauchy", spoil: float = 0.0) -> SplatBlock:
+    """Frames captured at these poses with an exposure of their own, partly covered."""
+    images = []
+    for f, world_T_rig in enumerate(poses):
+        image = (1.1 - 0.1 * f) * look(world_T_rig.matrix(), BEARINGS)[1] - 0.03
+        image[0, : int(spoil * 48)] = 1.0  # somebody in the picture
+        images.append(image.astype(np.float32))
+    keys = [X(f) for f in range(len(poses))]
+    return SplatBlock(keys, images, [None] * len(poses), CAMERAS, render, RobustLoss(loss, 1.0))
+
+
+def values_of(poses: list[gtsam.Pose3]) -> gtsam.Values:
+    values = gtsam.Values()
+    for f, world_T_rig in enumerate(poses):
+        values.insert(X(f), world_T_rig)
+    return values
+
+
+def moved(poses: list[gtsam.Pose3], amount: float) -> list[gtsam.Pose3]:
+    rng = np.random.default_rng(1)
+    return [pose.retract(rng.normal(0, amount, 6)) for pose in poses]
+
+
+def errors(values: gtsam.Values, poses: list[gtsam.Pose3]) -> np.ndarray:
+    found = (pose.localCoordinates(values.atPose3(X(f))) for f, pose in enumerate(poses))
+    return np.abs(np.array(list(found)))
+
+
+@pytest.mark.parametrize("loss", ["none", "huber", "cauchy", "geman_mcclure"])
+def test_gradient_is_that_of_the_cost(loss: str) -> None:
+    poses = truth(2)
+    block, start = block_at(poses, loss), moved(poses, 0.02)
+    block.refresh(values_of(start))
+    at = moved(start, 0.01)
+    gradient = block.linearize(values_of(at)).gradient
+    for f in range(2):
+        for i in range(6):
+            costs = []
+            for sign in (1, -1):
+                other = list(at)
+                other[f] = at[f].retract(sign * 1e-6 * np.eye(6)[i])
+                costs.append(block.costs(values_of(other))["splat"])
+            expected = (costs[0] - costs[1]) / 2e-6
+            assert gradient[f, i] == pytest.approx(expected, abs=1e-3 * np.abs(gradient).max())
+
+
+def test_jacobians_of_the_residuals() -> None:
+    poses = truth(1)
+    block = block_at(poses)
+    block.refresh(values_of(moved(poses, 0.03)))
+    row = np.r_[poses[0].matrix()[:3, :3].ravel(), poses[0].matrix()[:3, 3]]
+    _, analytic = block._residuals(0, row, True)
+    numerical = np.empty_like(analytic)
+    for i in range(6):
+        pair = []
+        for sign in (1, -1):
+            pose = poses[0].retract(sign * 1e-6 * np.eye(6)[i])
+            pair.append(block.residuals(values_of([pose]))[0])
+        numerical[:, i] = (pair[0] - pair[1]) / 2e-6
+    same_face = np.abs(analytic - numerical).max(axis=1) < 1e-4 * np.abs(analytic).max()
+    assert same_face.mean() > 0.995  # a point that changes its face has no derivative
+
+
+def test_poses_are_found_again_under_another_exposure() -> None:
+    poses = truth(3)
+    start = values_of(moved(poses, 0.03))  # 1.7 degrees, 0.03 of a room 4 wide
+    result = optimize(gtsam.NonlinearFactorGraph(), [block_at(poses)], start)
+    assert errors(start, poses).max() > 0.03
+    assert errors(result.values, poses).max() < 5e-4
+
+
+def test_somebody_in_the_picture_is_let_go() -> None:
+    poses = truth(2)
+    start = values_of(moved(poses, 0.02))
+    block = block_at(poses, spoil=0.5)
+    result = optimize(gtsam.NonlinearFactorGraph(), [block], start)
+    assert errors(result.values, poses).max() < 2e-3
+
+
+def test_masked_pixels_are_not_sampled() -> None:
+    poses = truth(1)
+    image = look(poses[0].matrix(), BEARINGS)[1].astype(np.float32)
+    image[0] = 1.0
+    use = np.ones((6, 48, 48), bool)
+    use[0] = False
+    block = SplatBlock([X(0)], [image], [use], CAMERAS, render)
+    result = optimize(gtsam.NonlinearFactorGraph(), [block], values_of(moved(poses, 0.02)))
+    assert errors(result.values, poses).max() < 5e-4
+
+
+def test_both_doors_lead_to_the_same_place() -> None:
+    poses = truth(2)
+    start = values_of(moved(poses, 0.02))
+    block = block_at(poses)
+    block.refresh(start)
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in block.factors():
+        graph.push_back(factor)
+    assert graph.error(start) == pytest.approx(block.costs(start)["splat"])
+    system = block.linearize(start)
+    hessian, gradient = graph.linearize(start).hessian()
+    assert np.allclose(hessian[:6, :6], system.diagonal[0], rtol=1e-6)
+    assert np.allclose(-gradient[:6], system.gradient[0], rtol=1e-6)
+
+
+def test_a_frame_that_shows_nothing_stays_where_it_is() -> None:
+    poses = truth(1)
+    blind = SplatBlock(
+        [X(0)],
+        [np.zeros((6, 48, 48), np.float32)],
+        [np.zeros((6, 48, 48), bool)],
+        CAMERAS,
+        render,
+    )
+    blind.refresh(values_of(poses))
+    system = blind.linearize(values_of(poses))
+    assert not system.diagonal.any() and not system.gradient.any() and system.costs["splat"] == 0
+    with pytest.raises(RuntimeError, match="refresh"):
+        SplatBlock([X(0)], [np.zeros((6, 48, 48))], [None], CAMERAS, render).linearize(
+            values_of(poses)
+        )
+
+
+def test_lengths_must_agree() -> None:
+    with pytest.raises(ValueError, match="equally long"):
+        SplatBlock([X(0)], [], [], CAMERAS, render)

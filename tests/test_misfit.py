@@ -1,0 +1,65 @@
+"""Trajectories that are not of these images are refused, with the reason where there is one."""
+
+import numpy as np
+import pytest
+from synthetic import drifted, loop_walk, unit
+
+from gsba.config import VerifySettings
+from gsba.geometry import inverse, pose
+from gsba.log import GsbaError
+from gsba.misfit import refuse_misfit, refuse_useless
+from gsba.motion import Steps
+from gsba.types import CoarsePoses, PoseSource
+
+NUM = 30
+SLAM = drifted(loop_walk(NUM), np.random.default_rng(0))
+MIRROR, OPENGL = np.diag([-1.0, 1, 1, 1]), np.diag([1.0, -1, -1, 1])
+
+
+def _coarse(world_T_rigs: np.ndarray) -> CoarsePoses:
+    return CoarsePoses(world_T_rigs, np.full(len(world_T_rigs), PoseSource.SLAM, np.uint8), 0.0)
+
+
+def _found() -> Steps:
+    truth = loop_walk(NUM)
+    steps = inverse(truth[:-1]) @ truth[1:]
+    steps[:, :3, 3] = unit(steps[:, :3, 3])
+    every = np.ones(NUM - 1, bool)
+    return Steps(steps, every, every)
+
+
+def _another() -> np.ndarray:
+    rng = np.random.default_rng(5)
+    poses = pose(np.tile(np.eye(3), (NUM, 1, 1)), np.cumsum(rng.normal(size=(NUM, 3)), axis=0))
+    return poses
+
+
+@pytest.mark.parametrize(
+    ("poses", "said"),
+    [
+        (SLAM[::-1], "reversed in time"),
+        (inverse(SLAM), "camera-from-world"),
+        (MIRROR @ SLAM @ MIRROR, "mirrored along x"),
+        (OPENGL @ SLAM @ OPENGL, "y up and z backward"),
+        (_another(), "another recording"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_the_reason(poses: np.ndarray, said: str) -> None:
+    with pytest.raises(GsbaError, match=said) as refused:
+        refuse_misfit(_coarse(poses), _found(), VerifySettings())
+    assert "\n" not in str(refused.value) and "--no-trajectory" in str(refused.value)
+
+
+def test_many_outliers_are_no_reason_to_refuse() -> None:
+    refuse_misfit(_coarse(SLAM), _found(), VerifySettings())
+    bad = SLAM.copy()
+    rng = np.random.default_rng(0)
+    which = rng.choice(NUM, NUM // 3, replace=False)
+    bad[which, :3, 3] += 3 * unit(rng.normal(size=(len(which), 3)))
+    refuse_misfit(_coarse(bad), _found(), VerifySettings())
+
+
+def test_identical_poses_are_refused() -> None:
+    with pytest.raises(GsbaError, match="all 5 poses of the trajectory are identical"):
+        refuse_useless(_coarse(np.tile(SLAM[3], (5, 1, 1))))
+    refuse_useless(_coarse(SLAM))

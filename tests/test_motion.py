@@ -1,0 +1,176 @@
+"""Steps of the trajectory before the court of the images."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic import RIG, bearings_of, drifted, loop_walk, unit, with_noise
+
+from gsba import motion
+from gsba.config import PriorSettings, VerifySettings
+from gsba.geometry import inverse, pose, rotation_angle
+from gsba.motion import Trust
+from gsba.types import CoarsePoses, Counts, Keypoints, Matches, PoseSource, VerifiedPairs
+
+NUM_FRAMES, NUM_POINTS = 24, 80
+VERIFY, PRIORS = VerifySettings(), PriorSettings()
+TRUTH = loop_walk(NUM_FRAMES)
+
+
+def _seen(missing: tuple[int, ...] = ()) -> tuple[VerifiedPairs, Keypoints]:
+    """All neighbours but some verified; every frame sees every point."""
+    rng = np.random.default_rng(1)
+    points = rng.uniform(5, 8, (NUM_POINTS, 1)) * unit(rng.normal(size=(NUM_POINTS, 3)))
+    bearings = np.concatenate(
+        [with_noise(bearings_of(points, world_T_rig), 3e-4, rng) for world_T_rig in TRUTH]
+    )
+    keypoints = Keypoints(
+        np.arange(NUM_FRAMES + 1) * NUM_POINTS,
+        np.zeros((len(bearings), 2)),
+        np.zeros(len(bearings), np.uint8),
+        bearings,
+        np.full(len(bearings), RIG.focal),
+        np.zeros((len(bearings), 3), np.uint8),
+    )
+    steps = [f for f in range(NUM_FRAMES - 1) if f not in missing]
+    f0_T_f1s = (inverse(TRUTH[:-1]) @ TRUTH[1:])[steps]
+    f0_T_f1s[:, :3, 3] = unit(f0_T_f1s[:, :3, 3])
+    rows = np.tile(np.arange(NUM_POINTS, dtype=np.int32)[:, None], (len(steps), 2))
+    matches = Matches(
+        np.array([(f, f + 1) for f in steps], np.int32),
+        np.arange(len(steps) + 1) * NUM_POINTS,
+        rows,
+    )
+    counts = Counts(NUM_FRAMES - 1, len(steps), "pairs")
+    return VerifiedPairs(matches, f0_T_f1s, counts), keypoints
+
+
+def _judge(slam: np.ndarray, missing: tuple[int, ...] = (), lost: tuple[int, ...] = ()) -> Trust:
+    pairs, keypoints = _seen(missing)
+    sources = np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8)
+    sources[list(lost)] = PoseSource.INTERPOLATED
+    found = motion.steps(pairs, keypoints, VERIFY)
+    logs, sigmas = motion.length_ratios(pairs, found, keypoints)
+    coarse = CoarsePoses(slam, sources, 0.0)
+    return motion.judge(coarse, found, logs, sigmas, VERIFY, PRIORS)
+
+
+def _slam(seed: int = 0) -> np.ndarray:
+    return drifted(TRUTH, np.random.default_rng(seed))
+
+
+def test_ratios_of_lengths_come_from_common_points() -> None:
+    pairs, keypoints = _seen()
+    found = motion.steps(pairs, keypoints, VERIFY)
+    logs, sigmas = motion.length_ratios(pairs, found, keypoints)
+    true = np.linalg.norm(np.diff(TRUTH[:, :3, 3], axis=0), axis=1)
+    assert found.verified.all() and found.directed.all() and np.isfinite(sigmas).all()
+    np.testing.assert_allclose(logs, np.diff(np.log(true)), atol=0.03)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_plain_drift_is_not_accused(seed: int) -> None:
+    slam = _slam(seed)
+    trust = _judge(slam)
+    assert trust.sound and not trust.false_frames.any()
+    np.testing.assert_array_equal(trust.world_T_rigs, slam)
+
+
+@pytest.mark.parametrize("frames", [(7,), (1,), (4, 15, 20), (9, 10), (9, 11), (3, 4, 6)])
+def test_displaced_frames_are_named_and_chained_past(frames: tuple[int, ...]) -> None:
+    slam = _slam()
+    rng = np.random.default_rng(3)
+    for f in frames:
+        turn = Rotation.from_rotvec(np.deg2rad(12) * unit(rng.normal(size=3))).as_matrix()
+        slam[f] = slam[f] @ pose(turn, 1.5 * unit(rng.normal(size=3)))
+    trust = _judge(slam)
+    assert tuple(np.flatnonzero(trust.false_frames)) == frames
+    steps = inverse(trust.world_T_rigs[:-1]) @ trust.world_T_rigs[1:]
+    true = inverse(TRUTH[:-1]) @ TRUTH[1:]
+    between = np.swapaxes(steps[:, :3, :3], 1, 2) @ true[:, :3, :3]
+    assert np.degrees(rotation_angle(between)).max() < 1.6  # what an unaccused step may be off
+    lengths = np.linalg.norm(steps[:, :3, 3], axis=1) / np.linalg.norm(true[:, :3, 3], axis=1)
+    assert np.abs(np.log(lengths / np.median(lengths))).max() < 0.3
+
+
+def test_a_jump_for_good_costs_one_step() -> None:
+    slam = _slam()
+    slam[12:, :3, 3] += [2.0, 0, 1.0]
+    trust = _judge(slam)
+    assert np.flatnonzero(trust.false_steps).tolist() == [11]
+    assert np.flatnonzero(trust.false_frames).tolist() == [12]
+
+
+def test_a_step_too_long_in_the_right_direction_is_false() -> None:
+    slam = _slam()
+    slam[12:, :3, 3] += slam[12, :3, 3] - slam[11, :3, 3]
+    assert np.flatnonzero(_judge(slam).false_steps).tolist() == [11]
+
+
+def test_scale_that_drifts_slowly_is_followed() -> None:
+    steps = inverse(TRUTH[:-1]) @ TRUTH[1:]
+    steps[:, :3, 3] *= np.linspace(0.7, 1.3, len(steps))[:, None]
+    slam = [np.eye(4)]
+    for step in steps:
+        slam.append(slam[-1] @ step)
+    assert _judge(np.array(slam)).sound
+
+
+def test_guessed_poses_are_not_accused() -> None:
+    slam = _slam()
+    slam[5, :3, 3] += 3
+    trust = _judge(slam, lost=(5,))
+    assert trust.false_steps[4:6].all() and not trust.false_frames.any()
+
+
+def test_what_no_image_shows_stays_with_the_trajectory() -> None:
+    slam = _slam()
+    slam[3, :3, 3] += 3  # elsewhere, so that the start is chained anew
+    trust = _judge(slam, missing=(15,))
+    assert np.flatnonzero(trust.unseen_steps).tolist() == [15]
+    kept = inverse(trust.world_T_rigs[15]) @ trust.world_T_rigs[16]
+    np.testing.assert_allclose(kept, inverse(slam[15]) @ slam[16], atol=1e-9)
+
+
+def test_lengths_outvote_outliers_and_bridge_what_is_unknown() -> None:
+    true = np.exp(0.3 * np.sin(np.arange(40) / 4))
+    logs, sigmas = np.diff(np.log(true)), np.full(39, 0.02)
+    slam, noise = true.copy(), np.full(40, 0.1)
+    slam[[8, 9, 25]] *= [3, 0.2, 5]
+    found = motion.step_lengths(slam, noise, logs, sigmas)
+    np.testing.assert_allclose(found, true, rtol=0.03)
+    sigmas[30] = np.inf
+    noise[31:] = np.inf  # nothing known behind the break: the pace goes on
+    found = motion.step_lengths(slam, noise, logs, sigmas)
+    np.testing.assert_allclose(found[:31], true[:31], rtol=0.03)
+    assert found[31] == pytest.approx(found[30], rel=0.01)
+
+
+def test_a_turn_on_the_spot_is_seen_as_one() -> None:
+    """Steps without parallax have rotations only, better than an essential matrix knows them."""
+    rng = np.random.default_rng(4)
+    bearings0 = unit(rng.normal(size=(NUM_POINTS, 3)))
+    turn = Rotation.from_rotvec([0.02, 0.3, 0]).as_matrix()
+    bearings = np.concatenate([bearings0, with_noise(bearings0 @ turn, 3e-4, rng)])
+    keypoints = Keypoints(
+        np.array([0, NUM_POINTS, 2 * NUM_POINTS]),
+        np.zeros((len(bearings), 2)),
+        np.zeros(len(bearings), np.uint8),
+        bearings,
+        np.full(len(bearings), 3e-4),
+        np.zeros((len(bearings), 3), np.uint8),
+    )
+    rows = np.tile(np.arange(NUM_POINTS, dtype=np.int32)[:, None], (1, 2))
+    rough = Rotation.from_rotvec([0.001, 0, 0]).as_matrix()
+    f0_T_f1 = pose(turn @ rough, np.array([0.0, 0, 1]))[None]
+    matches = Matches(np.array([[0, 1]], np.int32), np.array([0, NUM_POINTS]), rows)
+    pairs = VerifiedPairs(matches, f0_T_f1, Counts(1, 1, "pairs"))
+    found = motion.steps(pairs, keypoints, VERIFY)
+    assert found.verified[0] and not found.directed[0]
+    error = np.degrees(rotation_angle(found.f_T_nexts[0, :3, :3].T @ turn))
+    assert error < 0.01  # 80 bearings of 0.017 degrees
+    slam = np.stack([np.eye(4), pose(np.eye(3), np.array([0.0, 0, 2]))])
+    coarse = CoarsePoses(slam, np.full(2, PoseSource.SLAM, np.uint8), 0.0)
+    trust = motion.judge(coarse, found, np.zeros(0), np.zeros(0), VERIFY, PRIORS)
+    assert trust.turning_only and trust.false_steps.all()
+    between = trust.world_T_rigs[0, :3, :3].T @ trust.world_T_rigs[1, :3, :3]
+    assert np.degrees(rotation_angle(between.T @ turn)) < 0.01

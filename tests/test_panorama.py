@@ -1,0 +1,81 @@
+"""Grey panoramas of frames of either layout."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gsba.geometry import bearings_from_erp
+from gsba.panorama import load_grey, width_for
+from gsba.rig import CubeRig
+from gsba.types import FACES, FrameSet
+
+SIZE = 64
+
+
+def _smooth(bearings: np.ndarray) -> np.ndarray:
+    x, y, z = np.moveaxis(bearings, -1, 0)
+    return 120 + 40 * x * y + 30 * np.sin(4 * z) + 20 * x
+
+
+def _erp_bearings(width: int) -> np.ndarray:
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
+    return bearings_from_erp(np.stack([u, v], axis=-1), width, width // 2)
+
+
+def _frames(paths: tuple[Path, ...], layout: str, faces: tuple[str, ...], size: tuple[int, int],
+            mask: Path | None = None) -> FrameSet:  # fmt: skip
+    return FrameSet(("a",), (paths,), np.zeros(1), layout, faces, *size, (mask,))
+
+
+def _cube(folder: Path, faces: tuple[str, ...], mask: Path | None = None) -> FrameSet:
+    rig, paths = CubeRig(SIZE, np.pi / 2), []
+    centres = np.arange(SIZE) + 0.5
+    grid = np.stack(np.meshgrid(centres, centres), axis=-1)
+    for name in faces:
+        paths.append(folder / f"{name}.png")
+        image = np.rint(_smooth(rig.bearings(grid, FACES.index(name))))
+        cv2.imwrite(str(paths[-1]), image.astype(np.uint8))
+    return _frames(tuple(paths), "cube", faces, (SIZE, SIZE), mask)
+
+
+def test_cube_faces_join_without_a_seam(tmp_path: Path) -> None:
+    frames = _cube(tmp_path, FACES)
+    width = width_for(frames, 4096)
+    grey, mask = load_grey(frames, 0, width)
+    assert grey.shape == (2 * SIZE, 4 * SIZE) and mask is None
+    # Rounded twice, once in the faces and once here; cubic between pixels.
+    np.testing.assert_allclose(grey, _smooth(_erp_bearings(width)), atol=1.6)
+
+
+def test_missing_faces_are_masked(tmp_path: Path) -> None:
+    frames = _cube(tmp_path, FACES[:4])
+    _, mask = load_grey(frames, 0, width_for(frames, 4096))
+    around = np.linspace(-np.pi / 4, np.pi / 4, 1001)  # of a face, whose edge is at atan(cos)
+    expected = np.mean(np.arctan(np.cos(around))) / (np.pi / 2)
+    assert mask is not None and mask.mean() == pytest.approx(expected, abs=0.01)
+    assert mask[SIZE].all() and not mask[0].any() and not mask[-1].any()
+
+
+def test_wide_panoramas_are_averaged_down(tmp_path: Path) -> None:
+    path, mask_path = tmp_path / "a.png", tmp_path / "mask.png"
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 255, (64, 128), dtype=np.uint8)
+    cv2.imwrite(str(path), image)
+    allowed = np.full((64, 128), 255, np.uint8)
+    allowed[10, 20] = 0
+    cv2.imwrite(str(mask_path), allowed)
+    frames = _frames((path,), "erp", (), (128, 64), mask_path)
+    width = width_for(frames, 100)
+    assert width == 64
+    grey, mask = load_grey(frames, 0, width)
+    expected = image.reshape(32, 2, 64, 2).mean(axis=(1, 3))
+    np.testing.assert_allclose(grey, expected, atol=0.6)
+    assert mask is not None and not mask[5, 10] and np.count_nonzero(~mask) == 1
+
+
+@pytest.mark.parametrize(("width", "limit", "expected"), [(1536, 4096, 1536), (5376, 4096, 2688)])
+def test_width(width: int, limit: int, expected: int) -> None:
+    frames = _frames((Path("a"),), "erp", (), (width, width // 2))
+    assert width_for(frames, limit) == expected

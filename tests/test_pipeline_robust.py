@@ -1,0 +1,72 @@
+"""The whole line on bad trajectories: displaced frames, gaps, none at all."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tiny_run import NUM_FRAMES, SETTINGS, Case
+
+from gsba import refine
+from gsba.evaluate import evaluate
+from gsba.geometry import pose
+from gsba.log import GsbaError
+from gsba.pipeline import RunResult
+from gsba.read import read_trajectory, write_tum
+from gsba.types import PoseStatus, Trajectory
+
+
+def _refine(case: Case, folder: Path, trajectory: Trajectory | None) -> RunResult:
+    slam = None
+    if trajectory is not None:
+        slam = folder / "slam.tum"
+        write_tum(slam, trajectory)
+    return refine(case.frames, slam, folder / "run", SETTINGS)
+
+
+def _as_good(case: Case, folder: Path) -> None:
+    """As good as from the trajectory that is merely drifting, up to noise."""
+    errors, clean = case.errors(folder / "run"), case.errors()
+    assert errors.num_matched == NUM_FRAMES
+    assert errors.ate.rmse < 1.5 * clean.ate.rmse
+    assert errors.rpe_rotation_deg.median < 1.5 * clean.rpe_rotation_deg.median
+
+
+def test_a_displaced_frame_is_named_and_repaired(case: Case, tmp_path: Path) -> None:
+    slam = read_trajectory(case.slam)
+    poses = slam.world_T_rigs.copy()
+    turn = Rotation.from_rotvec([0, np.deg2rad(15), 0]).as_matrix()
+    poses[4] = poses[4] @ pose(turn, np.array([0.4, 0.3, 0.0]))
+    result = _refine(case, tmp_path, Trajectory(slam.timestamps, poses))
+    assert result.report["trajectory"]["false_frames"] == ["000004"]
+    assert any("000004" in note and "not believed" in note for note in result.report["notes"])
+    _as_good(case, tmp_path)
+
+
+def test_no_trajectory_will_do(case: Case, tmp_path: Path) -> None:
+    result = _refine(case, tmp_path, None)
+    assert (result.reconstruction.pose_statuses == PoseStatus.REFINED).all()
+    assert result.report["gauge"].startswith("no trajectory")
+    assert any(note.startswith("no trajectory") for note in result.report["notes"])
+    _as_good(case, tmp_path)
+
+
+def test_a_few_poses_carry_the_rest(case: Case, tmp_path: Path) -> None:
+    slam = read_trajectory(case.slam)
+    _refine(case, tmp_path, Trajectory(slam.timestamps[:3], slam.world_T_rigs[:3]))
+    _as_good(case, tmp_path)
+
+
+def test_a_trajectory_in_other_axes_is_refused(case: Case, tmp_path: Path) -> None:
+    slam = read_trajectory(case.slam)
+    flip = np.diag([1.0, -1, -1, 1])
+    with pytest.raises(GsbaError, match="y up and z backward"):
+        _refine(case, tmp_path, Trajectory(slam.timestamps, flip @ slam.world_T_rigs @ flip))
+    assert not (tmp_path / "run/trajectory.tum").exists()
+
+
+def test_the_truth_needs_no_repair(case: Case, tmp_path: Path) -> None:
+    result = _refine(case, tmp_path, case.truth)
+    judgement = result.report["trajectory"]
+    assert judgement == {"false_frames": [], "false_steps": [], "unseen_steps": []}
+    assert evaluate(read_trajectory(tmp_path / "run/trajectory.tum"), case.truth).ate.rmse < 0.02

@@ -1,0 +1,357 @@
+"""Worlds turned upright, scaled and placed: exact where data are, robust where some are wrong."""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import export_scene as scene
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner, Result
+
+from gsba import gravity, read
+from gsba.alignment import level_similarity, robust_similarity
+from gsba.cli import app
+from gsba.config import PlacementSettings
+from gsba.export import ExportFormat, export
+from gsba.geometry import angular_errors, bearings_from_erp, pose, similarity
+from gsba.log import GsbaError
+from gsba.placement import Placement, place
+from gsba.read import local_from_geodetic, read_gps
+from gsba.types import FrameSet, Reconstruction, Trajectory
+
+ORIGIN = np.array([48.137, 11.575, 520.0])
+
+
+def _frames(num: int = scene.NUM_FRAMES) -> FrameSet:
+    names = tuple(f"frame_{f:04d}" for f in range(num))
+    paths = tuple((Path(name),) for name in names)
+    return FrameSet(names, paths, np.arange(num) * 0.5, "erp", (), 512, 256, (None,) * num)
+
+
+def _result(num: int = 40, straight: bool = False) -> Reconstruction:
+    """A walk in a world turned, scaled and shifted at random against level metres."""
+    rng = np.random.default_rng(3)
+    t = np.linspace(0, 1, num)
+    path = np.column_stack([30 * t, 8 * np.sin(7 * t) * (not straight), 1.5 + 0.2 * np.cos(9 * t)])
+    if straight:
+        path[:, 2] = 1.5
+    poses = pose(Rotation.from_rotvec(rng.normal(0, 0.3, (num, 3))).as_matrix(), path)
+    base = scene.reconstruction()
+    keep = base.observation_frames < 0
+    world = dataclasses.replace(
+        base,
+        world_T_rigs=poses,
+        pose_covariances=np.tile(np.diag([1.0, 2, 3, 4, 5, 6]) * 1e-6, (num, 1, 1)),
+        pose_statuses=np.zeros(num, np.uint8),
+        observation_points=base.observation_points[keep],
+        observation_frames=base.observation_frames[keep],
+        observation_bearings=base.observation_bearings[keep],
+        observation_sigmas=base.observation_sigmas[keep],
+    )
+    turn = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+    return Placement(0.21, turn, np.array([3.0, -2.0, 5.0])).apply(world)
+
+
+def _level(result: Reconstruction) -> np.ndarray:
+    """True level metres of the frames of `_result`: the inverse of what was done there."""
+    turn = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+    return (result.world_T_rigs[:, :3, 3] - [3.0, -2.0, 5.0]) @ turn / 0.21
+
+
+def _geodetic(local: np.ndarray) -> np.ndarray:
+    """Latitude, longitude, altitude of metres east, north, up: Newton on the forward formula."""
+    found = np.tile(ORIGIN, (len(local), 1))
+    for _ in range(6):
+        off = local - local_from_geodetic(found, ORIGIN)
+        metres = 111_320.0
+        found += np.column_stack(
+            [off[:, 1] / metres, off[:, 0] / metres / np.cos(np.deg2rad(ORIGIN[0])), off[:, 2]]
+        )
+    return found
+
+
+def _gps_csv(path: Path, times: Sequence[float] | np.ndarray, fixes: np.ndarray) -> Path:
+    rows = [
+        f"{t!r},{lat:.12f},{lon:.12f},{alt:.6f}"
+        for t, (lat, lon, alt) in zip(map(float, times), fixes, strict=True)
+    ]
+    path.write_text("\n".join(["timestamp,lat,lon,alt", *rows]) + "\n")
+    return path
+
+
+def test_local_metres_of_known_places() -> None:
+    """A degree of latitude at the equator and at the pole, of longitude at the equator."""
+    equator, pole = np.zeros(3), np.array([89.9999, 0, 0])
+    east = local_from_geodetic(np.array([[0, 0.001, 0]]), equator)[0]
+    np.testing.assert_allclose(east, [111.319491, 0, -0.000971], atol=1e-5)
+    north = local_from_geodetic(np.array([[0.001, 0, 0]]), equator)[0]
+    np.testing.assert_allclose(north[1], 110.574276, atol=1e-5)  # radius a (1 - e2)
+    high = local_from_geodetic(np.array([[89.9999, 0, 100.0]]), pole)[0]
+    np.testing.assert_allclose(high, [0, 0, 100], atol=1e-6)
+
+
+def test_covariances_and_angles_follow() -> None:
+    base = scene.reconstruction()
+    cov = np.tile(np.diag([1.0, 2, 3, 4, 5, 6]), (scene.NUM_FRAMES, 1, 1))
+    base = dataclasses.replace(base, pose_covariances=cov)
+    turn = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+    placement = Placement(2.0, turn, np.array([3.0, -2.0, 5.0]))
+    moved = placement.apply(base)
+    np.testing.assert_allclose(
+        np.diagonal(moved.pose_covariances, axis1=1, axis2=2)[0], [1, 2, 3, 16, 20, 24]
+    )
+    errors = angular_errors(
+        moved.world_T_rigs[moved.observation_frames],
+        moved.points_world[moved.observation_points],
+        moved.observation_bearings,
+    )
+    assert errors.max() < 1e-9  # the pictures still say the same
+    back = Placement(0.5, turn.T, -0.5 * turn.T @ placement.translation).apply(moved)
+    np.testing.assert_allclose(back.world_T_rigs, base.world_T_rigs, atol=1e-12)
+    np.testing.assert_allclose(placement.matrix @ placement.inverse, np.eye(4), atol=1e-12)
+
+
+def test_every_export_says_what_was_done(tmp_path: Path) -> None:
+    base, frames = scene.reconstruction(), scene.panoramas(tmp_path / "frames")
+    turn = Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix()
+    placement = Placement(3.0, turn, np.array([1.0, 2, 3]), unit="m", up="z")
+    export(base, frames, tmp_path / "tum", ExportFormat.TUM, placement=placement)
+    placed = read.read_trajectory(tmp_path / "tum/trajectory.tum").world_T_rigs
+    said = json.loads((tmp_path / "tum/transform.json").read_text())
+    assert (said["scale"], said["unit"], said["up"]) == (3.0, "m", "z")
+    for matrix, source, target in (
+        (said["matrix"], base.world_T_rigs, placed),
+        (said["inverse"], placed, base.world_T_rigs),
+    ):
+        homogeneous = np.column_stack([source[:, :3, 3], np.ones(len(source))])
+        carried = homogeneous @ np.array(matrix).T
+        np.testing.assert_allclose(carried[:, :3], target[:, :3, 3], atol=1e-12)
+    export(base, frames, tmp_path / "ns", ExportFormat.NERFSTUDIO, placement=placement)
+    document = json.loads((tmp_path / "ns/transforms.json").read_text())
+    np.testing.assert_array_equal(np.array(document["applied_transform"])[:, :3], np.eye(3))
+    front = np.array(document["frames"][0]["transform_matrix"])
+    np.testing.assert_allclose(front[:3, 3], placed[0, :3, 3], atol=1e-9)
+    export(base, frames, tmp_path / "plain", ExportFormat.TUM)
+    said = json.loads((tmp_path / "plain/transform.json").read_text())
+    np.testing.assert_array_equal(said["matrix"], np.eye(4))
+    assert said["unit"] == "map units"
+
+
+def test_scale_between_frames_or_points() -> None:
+    result, frames = _result(), _frames(40)
+    true = float(np.linalg.norm(_level(result)[30] - _level(result)[2]))
+    settings = PlacementSettings(length=true, between=("frame_0002", "frame_0030"))
+    placed = place(result, frames, settings)
+    assert placed.unit == "m" and placed.scale == pytest.approx(1 / 0.21, rel=1e-12)
+    placed = place(result, frames, PlacementSettings(length=5.0, between=("0,0,0", "0,0.5,0")))
+    assert placed.scale == pytest.approx(10)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2])
+@pytest.mark.parametrize("named", [False, True])
+def test_gps_is_exact_and_robust(tmp_path: Path, share: float, named: bool) -> None:
+    result, frames = _result(), _frames(40)
+    local = _level(result)
+    fixes = _geodetic(local + np.array([200.0, -100.0, 30.0]))
+    wrong = np.random.default_rng(4).choice(40, round(40 * share), replace=False)
+    fixes[wrong] += np.random.default_rng(5).normal(0, [1e-3, 1e-3, 60], (len(wrong), 3))
+    if named:
+        path = tmp_path / "gps.csv"
+        rows = [
+            f"{name}.jpg,{lat:.12f},{lon:.12f},{alt:.6f}"
+            for name, (lat, lon, alt) in zip(frames.names, fixes, strict=True)
+        ]
+        path.write_text("\n".join(["name,latitude,longitude,altitude", *rows]))
+    else:
+        path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, fixes)
+    placed = place(result, frames, PlacementSettings(gps=str(path)))
+    assert placed.scale == pytest.approx(1 / 0.21, rel=1e-6)
+    assert (placed.unit, placed.up) == ("m", "z") and placed.origin is not None
+    assert placed.grounds["gps"]["outliers"] == len(wrong)
+    positions = placed.apply(result).world_T_rigs[:, :3, 3]
+    right = np.setdiff1d(np.arange(40), wrong)
+    expected = local_from_geodetic(fixes[right], np.array(placed.origin))
+    np.testing.assert_allclose(positions[right], expected, atol=1e-4)
+    assert np.abs(positions).max() < 1000  # small numbers: the place on earth is kept apart
+
+
+def test_gps_noise_averages_out(tmp_path: Path) -> None:
+    result, frames = _result(), _frames(40)
+    noisy = _level(result) + np.random.default_rng(6).normal(0, 0.5, (40, 3))
+    path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, _geodetic(noisy))
+    placed = place(result, frames, PlacementSettings(gps=str(path)))
+    assert placed.scale == pytest.approx(1 / 0.21, rel=0.02)
+    assert placed.grounds["gps"]["rmse_m"] == pytest.approx(0.5 * np.sqrt(3), rel=0.25)
+
+
+def test_gpx_tracks_are_unix_time(tmp_path: Path) -> None:
+    points = "".join(
+        f'<trkpt lat="{48 + i * 1e-5}" lon="11"><ele>5{i}</ele>'
+        f"<time>2024-05-01T10:00:0{i}Z</time></trkpt>"
+        for i in range(3)
+    )
+    path = tmp_path / "t.gpx"
+    space = 'xmlns="http://www.topografix.com/GPX/1/1"'
+    path.write_text(
+        f'<?xml version="1.0"?>\n<gpx {space}><trk><trkseg>{points}</trkseg></trk></gpx>'
+    )
+    fixes = read_gps(path)
+    np.testing.assert_array_equal(fixes.timestamps, [1714557600, 1714557601, 1714557602])
+    np.testing.assert_allclose(fixes.geodetic[2], [48.00002, 11, 52])
+
+
+def test_heading_and_scale_with_gravity_known() -> None:
+    rng = np.random.default_rng(7)
+    source = rng.normal(size=(30, 3)) * [5, 1e-4, 0.5]
+    turn = Rotation.from_rotvec([0, 0, 2.2]).as_matrix()
+    target = 4.0 * source @ turn.T + [7, 8, 9]
+    target[:6] += rng.normal(0, 30, (6, 3))
+    (scale, rotation, shift), used, sigma = robust_similarity(source, target, level_similarity, 2)
+    assert scale == pytest.approx(4) and sigma < 1e-9 and not used[:6].any() and used[6:].all()
+    np.testing.assert_allclose(rotation, turn, atol=1e-9)
+    np.testing.assert_allclose(shift, [7, 8, 9], atol=1e-8)
+
+
+def test_robust_similarity_without_outliers_is_least_squares() -> None:
+    rng = np.random.default_rng(8)
+    source = rng.normal(size=(50, 3))
+    target = 2 * source + rng.normal(0, 0.1, (50, 3))
+    fit, used, _ = robust_similarity(source, target, similarity, 3)
+    assert used.all()
+    np.testing.assert_allclose(fit[1], similarity(source, target)[1], atol=1e-12)
+
+
+def test_truth_with_large_coordinates(tmp_path: Path) -> None:
+    result, frames = _result(), _frames(40)
+    far = np.array([691_234.5, 5_334_567.25, 540.0])
+    true = Placement(1 / 0.21, np.eye(3), far).apply(result).world_T_rigs
+    read.write_tum(tmp_path / "truth.tum", Trajectory(frames.timestamps + 0.004, true))
+    placed = place(result, frames, PlacementSettings(align=str(tmp_path / "truth.tum")))
+    assert np.abs(placed.translation).max() < 200 and placed.offset[1] == 5_334_600
+    positions = placed.points(result.world_T_rigs[:, :3, 3]) + placed.offset
+    np.testing.assert_allclose(positions, true[:, :3, 3], atol=1e-6)
+
+
+def test_truth_of_a_straight_walk_takes_the_roll_from_orientations(tmp_path: Path) -> None:
+    result, frames = _result(straight=True), _frames(40)
+    turn = Rotation.from_rotvec([1.0, 0.3, -0.4]).as_matrix()
+    true = Placement(7.0, turn, np.ones(3)).apply(result).world_T_rigs
+    read.write_tum(tmp_path / "truth.tum", Trajectory(frames.timestamps, true))
+    placed = place(result, frames, PlacementSettings(align=str(tmp_path / "truth.tum")))
+    np.testing.assert_allclose(placed.apply(result).world_T_rigs, true, atol=1e-9)
+
+
+def _posts(folder: Path, tilt: np.ndarray, num: int = 6) -> tuple[FrameSet, np.ndarray]:
+    """Panoramas of a room of vertical posts, and the rotations world_R_rig they were taken with."""
+    rng = np.random.default_rng(9)
+    width, height = 1024, 512
+    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + 0.5
+    rays = bearings_from_erp(grid, width, height)
+    edges = np.sort(rng.uniform(-np.pi, np.pi, 36))
+    shades = rng.uniform(40, 220, len(edges))
+    folder.mkdir()
+    rotations, paths = [], []
+    for f in range(num):
+        sway = Rotation.from_rotvec(rng.normal(0, 0.03, 3)).as_matrix()
+        world_R_rig = Rotation.from_rotvec([0, rng.uniform(-3, 3), 0]).as_matrix() @ tilt @ sway
+        rotations.append(world_R_rig)
+        world = rays @ world_R_rig.T  # y down: posts are lines of equal longitude
+        longitude = np.arctan2(world[..., 0], world[..., 2])
+        image = shades[np.searchsorted(edges, longitude) % len(edges)].astype(np.float32)
+        paths.append((folder / f"{f}.png",))
+        cv2.imwrite(str(paths[-1][0]), cv2.GaussianBlur(image, (0, 0), 1.0))
+    names = tuple(str(f) for f in range(num))
+    times = np.arange(float(num))
+    frames = FrameSet(names, tuple(paths), times, "erp", (), width, height, (None,) * num)
+    return frames, np.array(rotations)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 5.0])
+def test_vertical_edges_make_up_exact(tmp_path: Path, tilt_deg: float) -> None:
+    """A stick held askew, always to the same side, is what rigs' axes cannot tell from up."""
+    tilt = Rotation.from_rotvec([np.deg2rad(tilt_deg), 0, 0]).as_matrix()
+    frames, rotations = _posts(tmp_path / "frames", tilt)
+    turn = Rotation.from_rotvec([0.5, 1.0, -0.4]).as_matrix()
+    result = _result(len(frames))
+    result = dataclasses.replace(result, world_T_rigs=pose(turn @ rotations, np.zeros((6, 3))))
+    found = gravity.estimate(result, frames)
+    assert found is not None and found.num_edges >= 40
+    error = np.degrees(np.arccos(np.clip(found.up @ turn @ [0, -1, 0], -1, 1)))
+    assert error < 0.2  # edges drawn to a fraction of a pixel of 0.35 degrees
+    placed = place(result, frames, PlacementSettings(up="auto"))
+    np.testing.assert_allclose(placed.rotation @ found.up, [0, -1, 0], atol=1e-12)
+    assert placed.up == "-y" and placed.scale == 1.0
+
+
+def test_without_edges_the_rigs_decide(tmp_path: Path) -> None:
+    frames = scene.panoramas(tmp_path / "frames")  # soft blobs, nothing straight
+    found = gravity.estimate(scene.reconstruction(), frames)
+    assert found is not None and found.num_edges == 0
+    np.testing.assert_array_equal(found.up, found.by_rigs)
+    tumbling = scene.reconstruction()
+    poses = tumbling.world_T_rigs.copy()
+    poses[:, :3, :3] = Rotation.random(len(poses), random_state=1).as_matrix()
+    with pytest.raises(GsbaError, match="agree on no way up"):
+        settings = PlacementSettings(up="auto")
+        place(dataclasses.replace(tumbling, world_T_rigs=poses), frames, settings)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "holds no positions"),
+        ("name,lat\n", "names no latitude and longitude"),
+        ("lat,lon\n1,2\n", "says neither frame nor time"),
+        ("time,lat,lon\n1,2\n", "gps.csv:2: 2 cells under 3 columns"),
+        ("time,lat,lon\n1,north,3\n", "latitude 'north' is not a number"),
+        ("time,lat,lon\n1,95,3\n", "is no latitude and longitude"),
+        ("time,lat,lon\n1,5,3\n1,5,4\n", "two positions at one time"),
+        ("time,lat,lon\n900,5,3\n901,5,4\n", "no overlap in time"),
+        ("name,lat,lon\nelsewhere,5,3\n", "0 of its positions are of refined frames"),
+        ("<gpx><trk/></gpx>", "holds no track points"),
+        ("<gpx><trk>", "neither a CSV table nor a GPX track"),
+        ("<gpx><trkpt lat='1' lon='2'/></gpx>", "has no time"),
+    ],
+)
+def test_bad_gps_files(tmp_path: Path, content: str, message: str) -> None:
+    (tmp_path / "gps.csv").write_text(content)
+    with pytest.raises(GsbaError) as failure:
+        place(_result(), _frames(40), PlacementSettings(gps=str(tmp_path / "gps.csv")))
+    assert message in str(failure.value) and "\n" not in str(failure.value)
+
+
+def test_positions_on_a_line_leave_a_roll_open(tmp_path: Path) -> None:
+    result, frames = _result(straight=True), _frames(40)
+    path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, _geodetic(_level(result)))
+    with pytest.raises(GsbaError, match="lie on a line: add --up auto"):
+        place(result, frames, PlacementSettings(gps=str(path)))
+
+
+def _gsba(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def test_bad_options(tmp_path: Path) -> None:
+    result, frames = _result(), _frames(40)
+    truth = tmp_path / "t.tum"
+    read.write_tum(truth, Trajectory(frames.timestamps + 100, result.world_T_rigs))
+    for settings, message in (
+        (PlacementSettings(length=2.0), "need one another"),
+        (PlacementSettings(length=2.0, between=("a", "b"), gps="g"), "pass one"),
+        (PlacementSettings(up="auto", align=str(truth)), "leave out --up auto"),
+        (PlacementSettings(align=str(truth)), "0 of its poses are within"),
+        (PlacementSettings(length=2.0, between=("nobody", "0,0,0")), "--between nobody"),
+        (PlacementSettings(length=2.0, between=("0,0,0", "0,0,0")), "both are at one place"),
+    ):
+        with pytest.raises(GsbaError, match=message):
+            place(result, frames, settings)
+    for options, message in (
+        (("--up", "down"), 'placement.up = "down" is not allowed: use one of "auto", "none"'),
+        (("--scale", -1, "--between", "a", "b"), "placement.length = -1.0"),
+    ):
+        out = _gsba("export", tmp_path, "--to", "tum", *options)
+        assert out.exit_code == 1 and message in out.stderr and len(out.stderr.splitlines()) == 1

@@ -1,0 +1,94 @@
+"""Neighbours matched without the trajectory where it misleads, and only there."""
+
+from unittest.mock import patch
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from synthetic import bearings_of, features_of, unit, with_noise
+
+from gsba import adjust, features, frontend, recovery
+from gsba.config import RefineSettings
+from gsba.geometry import inverse, pose, rotation_angle
+from gsba.matching import SearchableFrames
+from gsba.recovery import Recovered
+from gsba.types import CoarsePoses, Keypoints, PoseSource
+
+NUM, NUM_FRAMES = 250, 8
+TRUTH = pose(
+    np.tile(np.eye(3), (NUM_FRAMES, 1, 1)), np.outer(np.arange(NUM_FRAMES), [0.3, 0.0, 0.05])
+)
+SETTINGS = RefineSettings()
+TIMES = np.arange(NUM_FRAMES, dtype=float)
+
+
+def _scene(cut: int | None = None) -> tuple[SearchableFrames, Keypoints]:
+    """A short walk among points with descriptors; from frame `cut` on, among others."""
+    rng = np.random.default_rng(0)
+    frames = []
+    for place in range(2):
+        points = rng.uniform(2, 5, (NUM, 1)) * unit(rng.normal(size=(NUM, 3))) + [1, 0, 0]
+        descriptors = (200 * rng.random((NUM, 64)) ** 4).astype(np.uint8)
+        for f in range(NUM_FRAMES):
+            if (cut is not None and f >= cut) == bool(place):
+                bearings = with_noise(bearings_of(points, TRUTH[f]), 3e-4, rng)
+                frames.append(features_of(bearings, descriptors))
+    return SearchableFrames(frames.__getitem__), features.gather(frames)
+
+
+def _run(slam: np.ndarray, cut: int | None = None, times: np.ndarray = TIMES) -> Recovered:
+    frames, keypoints = _scene(cut)
+    start = adjust.start(slam)
+    guided = frontend.match_neighbours(frames, frames, keypoints, start, SETTINGS, 1)
+    coarse = CoarsePoses(slam, np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8), 0.0)
+    return recovery.run(frames, frames, keypoints, guided, coarse, times, SETTINGS, 1)
+
+
+def test_a_right_trajectory_is_left_alone() -> None:
+    with patch.object(recovery, "match_anywhere", wraps=recovery.match_anywhere) as anywhere:
+        recovered = _run(TRUTH)
+    assert all(len(call.args[3]) == 0 for call in anywhere.call_args_list)
+    assert recovered.trust.sound and len(recovered.neighbours.matches.pairs) == 2 * NUM_FRAMES - 3
+
+
+def test_neighbours_of_a_false_pose_are_matched_without_it() -> None:
+    slam = TRUTH.copy()
+    slam[4] = slam[4] @ pose(Rotation.from_rotvec([0, 1.5, 0]).as_matrix(), np.array([0, 2.0, 0]))
+    recovered = _run(slam)
+    assert np.flatnonzero(recovered.trust.false_frames).tolist() == [4]
+    found = recovered.neighbours
+    pairs = found.matches.pairs
+    assert len(pairs) == 2 * NUM_FRAMES - 3  # those two apart, too
+    assert (np.diff(pairs[:, 1] - pairs[:, 0]) >= 0).all()
+    for p, (f0, f1) in enumerate(pairs):
+        rows = found.matches.of(p)
+        assert len(rows) > 0.8 * NUM and (rows[:, 0] == rows[:, 1]).all()
+        true = inverse(TRUTH[f0]) @ TRUTH[f1]
+        assert np.degrees(rotation_angle(found.f0_T_f1s[p, :3, :3])) < 0.1
+        assert found.f0_T_f1s[p, :3, 3] @ unit(true[:3, 3]) > np.cos(np.deg2rad(1))
+
+
+def test_frames_with_a_pause_between_them_are_no_neighbours() -> None:
+    slam = TRUTH.copy()
+    slam[4:, :3, 3] += [0, 2.0, 0]
+    times = np.arange(NUM_FRAMES) + 5.0 * (np.arange(NUM_FRAMES) >= 4)
+    assert np.flatnonzero(_run(slam).trust.false_steps).tolist() == [3]
+    paused = _run(slam, times=times).trust
+    assert np.flatnonzero(paused.unseen_steps).tolist() == [3] and not paused.false_steps.any()
+
+
+def test_two_places_stay_two() -> None:
+    recovered = _run(TRUTH, cut=5)
+    assert np.flatnonzero(recovered.trust.unseen_steps).tolist() == [4]
+    crossing = recovered.neighbours.matches.pairs
+    assert not ((crossing[:, 0] < 5) & (crossing[:, 1] >= 5)).any()
+    np.testing.assert_allclose(recovered.trust.world_T_rigs, TRUTH, atol=1e-6)
+
+
+def test_a_lone_look_alike_without_a_third_view_is_not_believed() -> None:
+    """A step that whole panoramas agree on, but no third frame confirms."""
+    frames, keypoints = _scene(cut=5)
+    pair = np.array([[1, 2]], np.int32)
+    empty = recovery.match_anywhere(frames, frames, keypoints, pair[:0], SETTINGS, 1)
+    alone = recovery.match_anywhere(frames, frames, keypoints, pair, SETTINGS, 1)
+    assert len(empty.matches.pairs) == 0
+    assert not recovery._supported((1, 2), alone, keypoints, SETTINGS)

@@ -1,0 +1,75 @@
+"""Frames aligned to a splat of the tiny walk."""
+
+import gtsam
+import numpy as np
+import pytest
+from tiny_run import Case
+
+from gsba.config import SplatSettings
+from gsba.evaluate import evaluate
+from gsba.geometry import pose
+from gsba.rig import RIG_R_FACE, CubeRig
+from gsba.splat.backend import CpuBackend
+from gsba.splat.gaussians import Gaussians, from_cloud
+from gsba.splat.train import train
+from gsba.splat_align import align, bearing_block, render_view
+from gsba.splatting import load_faces, make_views, near_of, start_cloud
+from gsba.types import Trajectory
+
+BACKEND = CpuBackend(2)
+
+
+@pytest.fixture(scope="module")
+def splat(case: Case) -> Gaussians:
+    """A splat of all frames, trained just long enough to show the larger things."""
+    settings = SplatSettings(
+        iterations=300, face_size=48, sh_degree=0, rate_scales=0.02, rate_colors=0.01
+    )
+    poses = case.result.reconstruction.world_T_rigs
+    every = np.arange(len(poses))
+    views = make_views(*load_faces(case.result.frames, every, 48), poses)
+    start = start_cloud(case.result.reconstruction, poses, every, 0)
+    return train(start, views, settings, BACKEND)
+
+
+def distances(found: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(found[:, :3, 3] - poses[:, :3, 3], axis=1)
+
+
+def test_perturbed_poses_come_back(case: Case, splat: Gaussians) -> None:
+    reconstruction, frames = case.result.reconstruction, case.result.frames
+    poses = reconstruction.world_T_rigs
+    near = near_of(poses, SplatSettings())
+    rng = np.random.default_rng(0)
+    moved = np.stack(
+        [gtsam.Pose3(p).retract(rng.normal(0, [0.003] * 3 + [0.02] * 3)).matrix() for p in poses]
+    )
+    alone = align(splat, frames, moved, near, BACKEND, (24, 48))
+    both = align(splat, frames, moved, near, BACKEND, (24, 48), reconstruction)
+    start, first = (np.median(distances(p, poses)) for p in (moved, alone))
+    assert first < 0.6 * start
+    times = frames.timestamps
+    shape = evaluate(Trajectory(times, both), Trajectory(times, poses))
+    assert shape.ate.rmse < 0.05 * start  # the gauge is the splat's, the shape the bearings'
+    assert np.median(distances(both, poses)) < 0.8 * start
+
+
+def test_bearings_hold_what_the_run_found(case: Case) -> None:
+    reconstruction = case.result.reconstruction
+    block = bearing_block(reconstruction, reconstruction.world_T_rigs)
+    assert len(block.points_world) > 0.5 * len(reconstruction.points_world)
+
+
+def test_a_view_is_points_on_what_was_rendered() -> None:
+    """A wall of opaque Gaussians two units ahead: points lie on it, in its colour."""
+    across = np.linspace(-4, 4, 60)
+    x, y = np.meshgrid(across, across)
+    points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)])
+    wall = from_cloud(points, np.full((x.size, 3), 200, np.uint8), 0, opacity=0.99)
+    world_T_rig = pose(np.eye(3), np.array([0.1, 0.0, 0.2]))
+    view = render_view(wall, world_T_rig, CubeRig(32, np.pi / 2), 0.01, BACKEND)
+    assert len(view.grey) > 500
+    ahead = (view.points_world - world_T_rig[:3, 3]) @ RIG_R_FACE[0]
+    middle = np.abs(ahead[:, 0] / ahead[:, 2]) < 0.9
+    assert np.allclose(view.points_world[middle, 2], 2, atol=1e-3)
+    assert np.allclose(view.grey[middle], 200 / 255, atol=1e-3)

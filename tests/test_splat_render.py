@@ -1,0 +1,173 @@
+"""The CPU rasteriser against a dense one in float64, and its gradients against differences."""
+
+import dataclasses
+
+import dense_splat
+import numpy as np
+import pytest
+
+from gsba.rig import CubeRig
+from gsba.splat import _tiles
+from gsba.splat.camera import FaceCamera, face_camera
+from gsba.splat.gaussians import Gaussians
+from gsba.splat.rasterise import differentiate, render
+
+SIZE = 40  # not a multiple of the tile: the last tiles reach beyond the image
+
+
+def scene(seed: int, num: int, pixels: float = 3.0) -> tuple[Gaussians, FaceCamera]:
+    """Gaussians in front of, around and behind a tilted face; some large, some faint."""
+    rng = np.random.default_rng(seed)
+    world_T_rig = np.eye(4)
+    world_T_rig[:3, :3] = dense_splat.rotation(rng.normal(size=4))
+    world_T_rig[:3, 3] = rng.normal(size=3)
+    camera = face_camera(world_T_rig, 1, CubeRig(SIZE, np.deg2rad(90)))
+    z = rng.uniform(1, 6, num) * np.where(rng.random(num) < 0.1, -1, 1)
+    local = np.column_stack([rng.uniform(-1.4, 1.4, (num, 2)) * np.abs(z)[:, None], z])
+    widths = np.log(pixels / camera.focal * np.abs(z))[:, None] + rng.normal(0, 0.6, (num, 3))
+    return Gaussians(
+        (local @ camera.world_R_face.T + camera.face_in_world).astype(np.float32),
+        widths.astype(np.float32),
+        rng.normal(size=(num, 4)).astype(np.float32),
+        rng.normal(0, 2.5, num).astype(np.float32),
+        rng.normal(0, 0.3, (num, 16, 3)).astype(np.float32),
+    ), camera
+
+
+def stacked(gaussians: Gaussians, camera: FaceCamera, **options) -> np.ndarray:
+    image, _ = render(gaussians, camera, **options)
+    return np.dstack([image.color, image.depth, image.alpha])
+
+
+def test_exponential() -> None:
+    x = np.linspace(-79, 0, 100_001, dtype=np.float32)
+    error = _tiles.exp_of(x) / np.exp(x.astype(np.float64)) - 1
+    assert (np.abs(error) < 1.2e-7 * (2 - x)).all()  # roundings of float32, one of the argument
+    assert _tiles.exp_of(np.float32([-1e9, 0]))[1] == 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("degree", range(4))
+def test_image_is_that_of_the_dense_reference(seed: int, degree: int) -> None:
+    gaussians, camera = scene(seed, 150)
+    ours = stacked(gaussians, camera, sh_degree=degree, num_threads=2)
+    reference = dense_splat.render(gaussians, camera, degree)
+    scale = np.array([1, 1, 1, 6, 1])  # depths reach 6
+    # An alpha within rounding of 1/255 may fall on either side: such a pixel is off by 1/255.
+    off = np.abs(ours - reference).max(axis=2) > 1e-4 * scale.max()
+    assert off.mean() < 2e-3
+    assert np.abs((ours - reference) / scale)[~off].max() < 1e-4
+
+
+def test_large_opaque_gaussians_fill_pixels_up() -> None:
+    gaussians, camera = scene(5, 300, pixels=9)
+    opaque = dataclasses.replace(gaussians, opacity_logits=np.full(300, 6, np.float32))
+    reference = dense_splat.render(opaque, camera, 3)
+    assert (reference[..., 4] > 0.999).mean() > 0.5  # else early termination is not at work
+    image, tape = render(opaque, camera)
+    assert tape.used.sum() < len(tape.owners)
+    assert np.quantile(np.abs(image.color - reference[..., :3]), 0.999) < 1e-4
+
+
+def test_number_of_threads_changes_nothing() -> None:
+    gaussians, camera = scene(1, 5000, pixels=1)
+    d_color = np.random.default_rng(0).normal(size=(SIZE, SIZE, 3)).astype(np.float32)
+    results = []
+    for num_threads in (1, 3):
+        image, tape = render(gaussians, camera, num_threads=num_threads)
+        gradients = differentiate(tape, d_color, num_threads=num_threads)
+        results.append([image.color, image.depth, *gradients.gaussians.arrays()])
+    for one, other in zip(*results, strict=True):
+        assert np.array_equal(one, other)
+
+
+def numerical(loss, gaussians: Gaussians, name: str, picks: np.ndarray) -> np.ndarray:
+    """Central differences in float64 of some entries of a parameter array."""
+    base = Gaussians(*(array.astype(np.float64) for array in gaussians.arrays()))
+    values = getattr(base, name)
+    slopes = np.empty(len(picks))
+    for i, pick in enumerate(picks):
+        losses = []
+        for step in (1e-6, -1e-6):
+            moved = values.copy()
+            moved.flat[pick] += step
+            losses.append(loss(dataclasses.replace(base, **{name: moved})))
+        slopes[i] = (losses[0] - losses[1]) / 2e-6
+    return slopes
+
+
+@pytest.mark.parametrize("name", [entry.name for entry in dataclasses.fields(Gaussians)])
+@pytest.mark.parametrize("seed", [10, 11])
+def test_gradients_are_those_of_the_dense_reference(seed: int, name: str) -> None:
+    gaussians, camera = scene(seed, 30, pixels=4)
+    rng = np.random.default_rng(seed)
+    weights = rng.normal(size=(SIZE, SIZE, 5))
+
+    def loss(moved: Gaussians) -> float:
+        return float(np.sum(weights * dense_splat.render(moved, camera, 3)))
+
+    _, tape = render(gaussians, camera)
+    d_image = weights.astype(np.float32)
+    gradients = differentiate(tape, d_image[..., :3], d_image[..., 3], d_image[..., 4])
+    analytic = getattr(gradients.gaussians, name)
+    picks = rng.permutation(analytic.size)[:60]
+    expected = numerical(loss, gaussians, name, picks)
+    # A step across a threshold (alpha of 1/255) makes a difference of no meaning: a jump / 2e-6.
+    smooth = np.abs(expected) < 1e3
+    assert smooth.mean() > 0.9
+    scale = np.abs(expected[smooth]).max()
+    assert np.abs(analytic.flat[picks] - expected)[smooth].max() < 1e-4 * scale
+
+
+def test_gradients_of_a_torch_reference() -> None:
+    """Autograd through a dense image of one channel sum, where torch is installed."""
+    torch = pytest.importorskip("torch", reason="torch is not installed (extra 'splat')")
+    gaussians, camera = scene(3, 20, pixels=4)
+    means = torch.tensor(gaussians.means, dtype=torch.float64, requires_grad=True)
+    logits = torch.tensor(gaussians.opacity_logits, dtype=torch.float64, requires_grad=True)
+    world_R_face = torch.tensor(camera.world_R_face)
+    local = (means - torch.tensor(camera.face_in_world)) @ world_R_face
+    v, u = torch.meshgrid(*(torch.arange(SIZE) + 0.5,) * 2, indexing="ij")
+    alpha_sum, through = torch.zeros(SIZE, SIZE), torch.ones(SIZE, SIZE, dtype=torch.float64)
+    for g in torch.argsort(local[:, 2]):
+        x, y, z = local[g]
+        if z <= 1e-2:
+            continue
+        limit = 1.3 * 0.5 * SIZE / camera.focal
+        zero = torch.zeros(())
+        right = torch.stack(
+            [camera.focal / z, zero, -camera.focal / z * (x / z).clamp(-limit, limit)]
+        )
+        down = torch.stack(
+            [zero, camera.focal / z, -camera.focal / z * (y / z).clamp(-limit, limit)]
+        )
+        axes = torch.tensor(
+            dense_splat.rotation(gaussians.quaternions[g].astype(float))
+            * np.exp(gaussians.log_scales[g])
+        )
+        root = torch.stack([right, down]) @ world_R_face.T @ axes
+        inverse = torch.linalg.inv(root @ root.T + 0.3 * torch.eye(2))
+        du, dv = u - camera.focal * x / z - SIZE / 2, v - camera.focal * y / z - SIZE / 2
+        power = inverse[0, 0] * du**2 + 2 * inverse[0, 1] * du * dv + inverse[1, 1] * dv**2
+        alpha = (torch.sigmoid(logits[g]) * torch.exp(-power / 2)).clamp(max=0.99)
+        alpha = torch.where((alpha >= 1 / 255) & (through >= 1e-4), alpha, 0.0)
+        alpha_sum = alpha_sum + alpha * through
+        through = through * (1 - alpha)
+    weights = np.random.default_rng(0).normal(size=(SIZE, SIZE))
+    (alpha_sum * torch.tensor(weights)).sum().backward()
+    image, tape = render(gaussians, camera)
+    assert np.abs(image.alpha - alpha_sum.detach().numpy()).max() < 1e-4
+    gradients = differentiate(tape, np.zeros((SIZE, SIZE, 3)), None, weights).gaussians
+    for ours, theirs in ((gradients.means, means), (gradients.opacity_logits, logits)):
+        expected = theirs.grad.numpy()
+        assert np.abs(ours - expected).max() < 1e-4 * np.abs(expected).max()
+
+
+def test_nothing_in_sight_is_black() -> None:
+    gaussians, camera = scene(0, 10)
+    behind = camera.face_in_world - 5 * camera.world_R_face[:, 2]
+    gone = dataclasses.replace(gaussians, means=np.tile(behind, (10, 1)).astype(np.float32))
+    image, tape = render(gone, camera)
+    assert not image.color.any() and not image.alpha.any() and not image.depth.any()
+    gradients = differentiate(tape, np.ones((SIZE, SIZE, 3)))
+    assert not gradients.seen.any() and not gradients.gaussians.means.any()

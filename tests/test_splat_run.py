@@ -1,0 +1,166 @@
+"""Splats of a run: views, start clouds, training and evaluation from the command line."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tiny_run import Case
+from typer.testing import CliRunner
+
+from gsba import splatting
+from gsba.cli import app
+from gsba.config import SplatSettings
+from gsba.evaluate_splat import compare, poses_for
+from gsba.geometry import pose
+from gsba.log import GsbaError
+from gsba.pipeline import load_run
+from gsba.read import read_trajectory, write_tum
+from gsba.rig import CubeRig
+from gsba.splat import from_cloud, read_ply
+from gsba.splat.backend import CpuBackend
+from gsba.types import Trajectory
+
+TINY = ["--iterations", "30", "--face-size", "32", "--backend", "cpu"]
+
+
+def call(*arguments: object) -> str:
+    result = CliRunner().invoke(app, ["-q", *map(str, arguments)])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.fixture(scope="module")
+def run(case: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the finished run with a trained splat."""
+    out = case.copy(tmp_path_factory.mktemp("splat") / "run")
+    call("train", out, *TINY)
+    return out
+
+
+def test_train_writes_a_splat_and_its_metrics(run: Path) -> None:
+    splat = read_ply(run / "splat/refined/point_cloud.ply")
+    assert len(splat) > 100 and splat.sh_degree == 3
+    content = json.loads((run / "splat/results.json").read_text())
+    refined = content["sources"]["refined"]
+    assert len(refined["frames"]) == 1 and refined["mean"]["psnr"] > 12
+    assert [int(step) for step in refined["curve"]] == list(range(3, 31, 3))
+    assert content["lpips"].startswith("not computed")
+
+
+def test_render_writes_faces_and_a_panorama(run: Path) -> None:
+    frame = load_run(run)[1].names[2]
+    ply = run / "splat/refined/point_cloud.ply"
+    call("render", ply, run, "--frame", frame, "--face-size", 32)
+    shapes = {path.name: cv2.imread(str(path)).shape for path in (run / "renderings").iterdir()}
+    assert shapes[f"{frame}_erp.png"] == (64, 128, 3)
+    assert shapes[f"{frame}_down.png"] == (32, 32, 3) and len(shapes) == 7
+    failed = CliRunner().invoke(app, ["render", str(ply), str(run), "--frame", "nonsense"])
+    assert failed.exit_code == 1 and "no frame 'nonsense'" in failed.output
+
+
+def test_evaluate_compares_sources_and_resumes(case: Case, run: Path, tmp_path: Path) -> None:
+    """The same poses in another world and scale are worth the same."""
+    found = read_trajectory(run / "trajectory.tum")
+    turn = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], float)
+    places = 3 * found.world_T_rigs[:, :3, 3] @ turn.T + 1
+    moved = pose(turn @ found.world_T_rigs[:, :3, :3], places)
+    write_tum(tmp_path / "moved.tum", Trajectory(found.timestamps, moved))
+    arguments = ("evaluate", run, "--splat", "--against", tmp_path / "moved.tum", *TINY)
+    table = call(*arguments)
+    content = json.loads((run / "splat-evaluation/results.json").read_text())["sources"]
+    psnrs = [content[name]["mean"]["psnr"] for name in ("refined", "moved")]
+    assert abs(psnrs[0] - psnrs[1]) < 0.3  # rounding sends the trainings apart
+    assert "moved" in table and len(list((run / "splat-evaluation/pictures").iterdir())) == 1
+    again = call(*arguments)
+    assert again == table
+
+
+def test_evaluate_needs_something_to_compare_with(run: Path) -> None:
+    failed = CliRunner().invoke(app, ["evaluate", str(run)])
+    assert failed.exit_code == 1 and "--truth" in failed.output
+
+
+@pytest.mark.parametrize(
+    "option", [("--iterations", "0"), ("--face-size", "3"), ("--backend", "x")]
+)
+def test_bad_options_are_one_line(run: Path, option: tuple[str, str]) -> None:
+    failed = CliRunner().invoke(app, ["train", str(run), *option])
+    assert failed.exit_code == 1 and failed.output.startswith(f"error: {option[0]} {option[1]}")
+
+
+def test_held_out_frames_are_whole_and_spread() -> None:
+    usable = np.ones(20, bool)
+    usable[3] = False
+    split = splatting.split_frames(usable, 8)
+    assert split.held_out.tolist() == [5, 13] and len(split.training) == 17
+    assert not np.isin(3, split.training)
+    with pytest.raises(GsbaError, match="too few"):
+        splatting.split_frames(usable[:3], 8)
+
+
+def test_start_cloud_lies_in_the_world_of_the_poses(case: Case) -> None:
+    reconstruction = case.result.reconstruction
+    poses = reconstruction.world_T_rigs
+    frames = np.arange(len(poses))
+    cloud = splatting.start_cloud(reconstruction, poses, frames, 0)
+    known = {tuple(np.round(point, 2)) for point in reconstruction.points_world}
+    same = [tuple(np.round(point, 2)) in known for point in cloud.means.astype(float)]
+    assert len(cloud) > 0.5 * len(known) and np.mean(same) > 0.7
+    doubled = poses.copy()
+    doubled[:, :3, 3] *= 2
+    twice = splatting.start_cloud(reconstruction, doubled, frames, 0)
+    assert len(twice) == len(cloud) and np.allclose(twice.means, 2 * cloud.means, rtol=1e-3)
+
+
+def test_poses_are_found_by_time(case: Case) -> None:
+    frames = case.result.frames
+    part = Trajectory(frames.timestamps[1:3], case.truth.world_T_rigs[1:3])
+    poses = poses_for(frames, part)
+    assert np.isfinite(poses[1:3]).all() and np.isnan(poses[3:]).all()
+    with pytest.raises(GsbaError, match="one clock"):
+        poses_for(frames, Trajectory(part.timestamps + 1e4, part.world_T_rigs))
+
+
+def test_a_panorama_shows_what_the_faces_show(run: Path) -> None:
+    reconstruction, _ = load_run(run)
+    splat = read_ply(run / "splat/refined/point_cloud.ply")
+    where, backend = reconstruction.world_T_rigs[0], CpuBackend(1)
+    panorama = splatting.render_panorama(splat, where, 256, 0.01, backend)
+    faces = splatting.render_faces(splat, where, CubeRig(65, np.pi / 2), 0.01, backend)
+    assert np.abs(panorama[64, 128].astype(int) - faces[0, 32, 32]).max() < 12  # straight ahead
+    assert np.abs(panorama[64, 192].astype(int) - faces[1, 32, 32]).max() < 12  # right
+
+
+def test_a_masked_face_is_left_out(case: Case) -> None:
+    images = np.zeros((6, 16, 16, 3), np.uint8)
+    use = np.ones((6, 16, 16), bool)
+    use[5] = False
+    views = splatting.make_views(images, use, np.eye(4)[None])
+    assert len(views.cameras) == 5 and views.use is None
+    nothing = splatting.make_views(images, np.zeros_like(use), np.eye(4)[None])
+    gaussians = from_cloud(np.ones((2, 3)), np.zeros((2, 3), np.uint8))
+    with pytest.raises(GsbaError, match="held-out frames are masked"):
+        splatting.measure(gaussians, nothing, SplatSettings(), 0.01, CpuBackend(1))
+
+
+def test_panoramas_at_one_place_are_scored_apart() -> None:
+    images = np.zeros((12, 16, 16, 3), np.uint8)
+    images[6:] = 128
+    views = splatting.make_views(images, np.ones((12, 16, 16), bool), np.eye(4)[None].repeat(2, 0))
+    gaussians = from_cloud(np.full((2, 3), 99.0), np.zeros((2, 3), np.uint8))
+    scores = splatting.measure(gaussians, views, SplatSettings(), 0.01, CpuBackend(1))
+    assert list(scores) == [0, 1] and scores[0].psnr > scores[1].psnr
+    assert scores[1].psnr == pytest.approx(-20 * np.log10(128 / 255), abs=1e-3)
+
+
+def test_too_few_common_frames_are_refused(case: Case, tmp_path: Path) -> None:
+    frames = case.result.frames
+    sources = {"none": np.full((len(frames), 4, 4), np.nan)}
+    settings = SplatSettings(iterations=2, face_size=16)
+    with pytest.raises(GsbaError, match="too few"):
+        compare(
+            case.result.reconstruction, frames, sources, settings, CpuBackend(1), tmp_path / "out"
+        )
+    assert not (tmp_path / "out").exists()

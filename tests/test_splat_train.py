@@ -1,0 +1,228 @@
+"""Training: density control, Adam, and a small splat that is found again from its images."""
+
+import dataclasses
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsba.config import SplatSettings
+from gsba.geometry import pose
+from gsba.log import GsbaError
+from gsba.rig import CubeRig
+from gsba.splat import adam
+from gsba.splat.backend import CpuBackend, choose_backend
+from gsba.splat.camera import face_camera
+from gsba.splat.density import Limits, Pull, densify, reset_opacity
+from gsba.splat.gaussians import Gaussians, from_cloud
+from gsba.splat.metrics import psnr
+from gsba.splat.rasterise import render
+from gsba.splat.train import Views, extent_of, times_for, train
+
+SIZE = 32
+RIG = CubeRig(SIZE, np.pi / 2)
+SETTINGS = SplatSettings(iterations=320, face_size=SIZE, sh_degree=1, seed=3)
+LIMITS = Limits(2e-4, 0.1, 1.0, 5e-3, 1000)
+
+
+def scene() -> tuple[Gaussians, Views]:
+    """Coloured blobs on a wall, and views of it from a row of places."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-2, 2, (150, 2)), rng.uniform(1.8, 2.2, 150)])
+    truth = from_cloud(points, rng.integers(0, 256, (150, 3)).astype(np.uint8), 1)
+    truth = dataclasses.replace(truth, opacity_logits=np.full(150, 3, np.float32))
+    places = np.column_stack([np.linspace(-0.5, 0.5, 6), np.zeros(6), np.linspace(0, 0.3, 6)])
+    cameras = [face_camera(pose(np.eye(3), place), 0, RIG) for place in places]
+    images = [render(truth, camera)[0].color for camera in cameras]
+    return truth, Views(
+        cameras, (np.clip(images, 0, 1) * 255 + 0.5).astype(np.uint8), None, np.arange(6)
+    )
+
+
+def start(truth: Gaussians) -> Gaussians:
+    """Where a cloud with noise and no colour would start."""
+    rng = np.random.default_rng(1)
+    points = truth.means + rng.normal(0, 0.03, truth.means.shape)
+    return from_cloud(points, np.full((len(truth), 3), 128, np.uint8), 1)
+
+
+def quality(splat: Gaussians, views: Views) -> float:
+    found = [render(splat, camera)[0].color for camera in views.cameras]
+    return psnr(np.clip(found, 0, 1), views.images / 255)
+
+
+def same(one: Gaussians, other: Gaussians) -> bool:
+    pairs = zip(one.arrays(), other.arrays(), strict=True)
+    return all(np.array_equal(a, b) for a, b in pairs)
+
+
+def test_images_are_learned_the_same_way_every_time() -> None:
+    truth, views = scene()
+    first = start(truth)
+    kept = first.select(np.arange(len(first)))
+    splat = train(first, views, SETTINGS, CpuBackend(1))
+    assert same(first, kept)  # what was passed in stays
+    assert quality(splat, views) > quality(first, views) + 10
+    assert same(splat, train(first, views, SETTINGS, CpuBackend(2)))
+    other = SETTINGS.model_copy(update={"seed": 4})
+    assert not same(splat, train(first, views, other, CpuBackend(1)))
+
+
+def test_an_interrupted_training_goes_on_to_the_same_result(tmp_path: Path) -> None:
+    truth, views = scene()
+    often = SETTINGS.model_copy(update={"checkpoint_every_s": 1e-9})
+    whole = train(start(truth), views, often, CpuBackend(1))
+
+    def stop(step: int, gaussians: Gaussians) -> None:
+        if step == 130:
+            raise KeyboardInterrupt
+
+    path = tmp_path / "checkpoint.npz"
+    with pytest.raises(KeyboardInterrupt):
+        train(start(truth), views, often, CpuBackend(1), path, "key", stop)
+    steps: list[int] = []
+    rest = train(
+        start(truth), views, often, CpuBackend(1), path, "key", lambda step, _: steps.append(step)
+    )
+    assert steps == list(range(130, 321)) and same(rest, whole)
+    assert same(train(start(truth), views, often, CpuBackend(1), path, "key"), whole)
+    short = often.model_copy(update={"iterations": 3})
+    assert len(train(start(truth), views, short, CpuBackend(1), path, "other key")) == 150
+
+
+class Poison(CpuBackend):
+    """Gradients that turn bad after a while."""
+
+    calls = 0
+
+    def gradients(self, *arguments):
+        found = super().gradients(*arguments)
+        self.calls += 1
+        if self.calls > 30:
+            found.gaussians.means[5] = np.nan
+        return found
+
+
+def test_what_is_not_finite_stops_the_training(tmp_path: Path) -> None:
+    truth, views = scene()
+    often = SETTINGS.model_copy(update={"checkpoint_every_s": 1e-9})
+    path = tmp_path / "checkpoint.npz"
+    with pytest.raises(GsbaError, match=r"no longer finite at step 40; .*checkpoint\.npz"):
+        train(start(truth), views, often, Poison(1), path, "key")
+    states: list[tuple[int, bool]] = []
+    train(
+        start(truth),
+        views,
+        often.model_copy(update={"iterations": 31}),
+        CpuBackend(1),
+        path,
+        "key",
+        lambda step, splat: states.append((step, splat.is_finite())),
+    )
+    assert states == [(31, True)]  # went on from step 30, the last good one
+
+
+def test_the_cap_is_kept_and_said(caplog: pytest.LogCaptureFixture) -> None:
+    truth, views = scene()
+    tight = SETTINGS.model_copy(update={"max_gaussians": 155, "densify_pull": 1e-9})
+    sizes: list[int] = []
+    with caplog.at_level(logging.WARNING, "gsba"):
+        train(start(truth), views, tight, CpuBackend(1), watch=lambda _, s: sizes.append(len(s)))
+    assert max(sizes) <= 155 and "155 Gaussians are the most allowed" in caplog.text
+    tiny = SETTINGS.model_copy(update={"max_gaussians": 100, "iterations": 2})
+    assert len(train(start(truth), views, tiny, CpuBackend(1))) == 100
+
+
+def test_nothing_to_train_on_is_refused() -> None:
+    truth, views = scene()
+    masked = dataclasses.replace(views, use=np.zeros(views.images.shape[:3], bool))
+    with pytest.raises(GsbaError, match="all frames are masked"):
+        train(start(truth), masked, SETTINGS, CpuBackend(1))
+    with pytest.raises(GsbaError, match="no Gaussian"):
+        train(start(truth).select(np.zeros(150, bool)), views, SETTINGS, CpuBackend(1))
+
+
+def test_published_times_at_the_published_length() -> None:
+    times = times_for(30_000)
+    assert (times.densify_from, times.densify_until, times.densify_every) == (500, 15_000, 100)
+    assert (times.reset_every, times.degree_every) == (3000, 1000)
+
+
+def test_extent() -> None:
+    places = np.array([[-2.0, 0, 0], [2, 0, 0]])
+    assert extent_of(places) == pytest.approx(2.2) and extent_of(places[:1]) == 1
+
+
+def test_first_step_of_adam_is_the_rate() -> None:
+    gaussians, _ = scene()
+    before = gaussians.select(np.arange(150))
+    rng = np.random.default_rng(0)
+    parts = (rng.normal(size=array.shape).astype(np.float32) for array in gaussians.arrays())
+    gradients = Gaussians(*parts)
+    rates = adam.Rates(1e-3, 2e-3, 3e-3, 4e-3, 5e-3, 6e-3)
+    adam.step(gaussians, gradients, adam.Moments.zero(gaussians), rates, 1)
+    moved = gaussians.means - before.means
+    assert np.allclose(moved, -1e-3 * np.sign(gradients.means), atol=1e-6)
+    moved = gaussians.sh - before.sh
+    assert np.allclose(moved[:, 0], -5e-3 * np.sign(gradients.sh[:, 0]), atol=1e-6)
+    assert np.allclose(moved[:, 1:], -6e-3 * np.sign(gradients.sh[:, 1:]), atol=1e-6)
+
+
+def grid(scales: list[float], pulls: list[float]) -> tuple[Gaussians, adam.Moments, Pull]:
+    num = len(scales)
+    points = np.column_stack([10.0 * np.arange(num), np.zeros((num, 2))])
+    gaussians = from_cloud(points, np.zeros((num, 3), np.uint8), 0)
+    logs = np.log(np.repeat(np.array(scales, np.float32)[:, None], 3, axis=1))
+    gaussians = dataclasses.replace(gaussians, log_scales=logs)
+    pull = Pull(np.array(pulls, np.float32) * 2, np.full(num, 2, np.float32))
+    return gaussians, adam.Moments.zero(gaussians), pull
+
+
+def test_small_are_cloned_and_large_are_split() -> None:
+    gaussians, moments, pull = grid([0.05, 0.5, 0.5], [1, 1, 0])
+    moments.first.means[:] = 1
+    found, after, capped = densify(gaussians, moments, pull, LIMITS, np.random.default_rng(0))
+    assert not capped and len(found) == 5
+    near = [np.flatnonzero(np.abs(found.means[:, 0] - x) < 3) for x in (0, 10, 20)]
+    assert [len(rows) for rows in near] == [2, 2, 1]
+    assert np.allclose(found.means[near[0]], 0)  # a clone lies where it came from
+    assert np.allclose(np.exp(found.log_scales[near[1]]), 0.5 / 1.6)
+    assert len(np.unique(found.means[near[1]], axis=0)) == 2
+    assert after.first.means[:, 0].tolist() == [1, 1, 0, 0, 0]  # new ones have not moved
+
+
+def test_faint_and_huge_are_pruned() -> None:
+    gaussians, moments, pull = grid([0.05, 2.0, 0.05], [0, 0, 0])
+    gaussians.opacity_logits[2] = -7
+    found, _, _ = densify(gaussians, moments, pull, LIMITS, np.random.default_rng(0))
+    assert found.means[:, 0].tolist() == [0]
+    gaussians.opacity_logits[:] = -7
+    found, _, _ = densify(gaussians, moments, pull, LIMITS, np.random.default_rng(0))
+    assert len(found) == 3  # rather than none
+
+
+def test_strongest_pulls_come_first_under_the_cap() -> None:
+    gaussians, moments, pull = grid([0.05] * 4, [1, 3, 2, 4])
+    limits = dataclasses.replace(LIMITS, max_gaussians=6)
+    found, _, capped = densify(gaussians, moments, pull, limits, np.random.default_rng(0))
+    assert capped and found.means[4:, 0].tolist() == [10, 30]
+
+
+def test_reset_of_opacity() -> None:
+    gaussians, moments, _ = grid([0.05] * 2, [0, 0])
+    gaussians.opacity_logits[:] = [2, -6]
+    moments.second.opacity_logits[:] = 1
+    found, after = reset_opacity(gaussians, moments)
+    assert np.allclose(1 / (1 + np.exp(-found.opacity_logits)), [0.01, 1 / (1 + np.exp(6))])
+    assert not after.second.opacity_logits.any()
+
+
+def test_a_missing_gsplat_is_one_line() -> None:
+    try:
+        backend = choose_backend("gsplat")
+    except GsbaError as error:
+        assert "\n" not in str(error) and "--backend cpu" in str(error)
+        assert choose_backend("auto").name == "cpu"
+    else:
+        assert backend.name == "gsplat"

@@ -1,0 +1,337 @@
+"""Frames from videos made here: which, when, how sharp, resumed, and what is refused."""
+
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from gsba import read
+from gsba.cli import app
+from gsba.config import VideoSettings
+from gsba.log import GsbaError
+from gsba.types import Trajectory
+from gsba.video import extract, extraction, is_video
+from gsba.video.likeness import apparent_motion_deg, miniature, sharpness
+
+av = pytest.importorskip("av", reason="PyAV is not installed")
+
+HEIGHT, WIDTH, BITS = 128, 256, 10
+TICK = Fraction(1, 90_000)
+
+
+def _world(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    """A smooth random panorama (H, W, 3) uint8, continuous over the seam."""
+    rng = np.random.default_rng(seed)
+    noise = np.tile(rng.normal(size=(height, width, 3)), (1, 3, 1))
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)[:, width : 2 * width]
+    return np.clip(128 + 40 * smooth / smooth.std(), 0, 255).astype(np.uint8)
+
+
+def _picture(index: int, yaw: float, blur: float = 0.0) -> np.ndarray:
+    """The world turned by `yaw` pixels, with the index written above the horizon."""
+    shift = np.array([[1, 0, yaw % WIDTH], [0, 1, 0]], np.float32)
+    picture = cv2.warpAffine(np.tile(_world(), (1, 2, 1)), shift, (2 * WIDTH, HEIGHT))[:, WIDTH:]
+    picture = np.ascontiguousarray(picture)
+    if blur:
+        picture = cv2.GaussianBlur(picture, (0, 0), blur)
+    for bit in range(BITS):
+        picture[:16, 24 * bit : 24 * bit + 24] = 255 * (index >> bit & 1)
+    return picture
+
+
+def _index_in(image: np.ndarray) -> int:
+    scale = image.shape[0] / HEIGHT
+    cells = [image[int(8 * scale), int((24 * bit + 12) * scale)].mean() for bit in range(BITS)]
+    return sum(int(cell > 128) << bit for bit, cell in enumerate(cells))
+
+
+def _encode(
+    path: Path, pictures: list[np.ndarray], ticks: list[int], codec: str = "libx264"
+) -> Path:
+    """A video whose pictures are shown at exactly the given ticks."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(
+            codec, rate=30, options={"crf": "12", "x265-params": "log-level=none"}
+        )
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt, stream.gop_size = "yuv420p", 12
+        stream.time_base = stream.codec_context.time_base = TICK
+        for picture, tick in zip(pictures, ticks, strict=True):
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = tick, TICK
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def _steady(num: int) -> list[int]:
+    """Ticks of 29.97 frames per second."""
+    return [3003 * i for i in range(num)]
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """90 frames of a turning camera at 29.97 fps; every seventh is sharp, the others blurred."""
+    pictures = [_picture(i, 1.5 * i, 0 if i % 7 == 3 else 1.5) for i in range(90)]
+    return _encode(tmp_path_factory.mktemp("film") / "walk.mp4", pictures, _steady(90))
+
+
+def _indices(folder: Path) -> list[int]:
+    return [_index_in(cv2.imread(str(p))) for p in sorted(folder.glob("*.jpg"))]
+
+
+def _times(folder: Path) -> dict[str, float]:
+    rows = (folder / "timestamps.csv").read_text().splitlines()
+    assert rows[0] == "name,timestamp"
+    return {name: float(time) for name, time in (row.split(",") for row in rows[1:])}
+
+
+@pytest.mark.parametrize(
+    ("suffix", "codec"), [("mp4", "libx264"), ("mov", "libx265"), ("mkv", "libx264")]
+)
+def test_times_are_those_of_presentation(tmp_path: Path, suffix: str, codec: str) -> None:
+    """Variable frame rate, B-frames, a first frame not at zero: each image has its own time."""
+    if codec not in av.codecs_available:
+        pytest.skip(f"this FFmpeg has no {codec}")
+    rng = np.random.default_rng(1)
+    milliseconds = np.cumsum(rng.integers(20, 60, 40)) + 700  # what Matroska can express
+    pictures = [_picture(i, 2 * i) for i in range(40)]
+    video = _encode(tmp_path / f"v.{suffix}", pictures, [90 * int(t) for t in milliseconds], codec)
+    counts = extract(video, tmp_path / "frames", VideoSettings(every=3))
+    assert (counts.received, counts.kept) == (40, 14)
+    times = _times(tmp_path / "frames")
+    expected = (milliseconds - milliseconds[0])[::3] / 1e3
+    np.testing.assert_allclose(list(times.values()), expected, atol=1e-9)
+    assert list(times) == [f"{i:06d}.jpg" for i in range(0, 40, 3)]
+    assert _indices(tmp_path / "frames") == list(range(0, 40, 3))
+    frames = read.scan(tmp_path / "frames")
+    np.testing.assert_array_equal(frames.timestamps, list(times.values()))
+    assert (frames.width, frames.height) == (WIDTH, HEIGHT)
+
+
+def test_one_frame_a_second_and_the_sharpest_of_it(film: Path, tmp_path: Path) -> None:
+    extract(film, tmp_path / "first", VideoSettings(fps=3))
+    assert _indices(tmp_path / "first") == [0, 10, 20, 30, 40, 50, 60, 70, 80]
+    extract(film, tmp_path / "sharp", VideoSettings(fps=3, sharpest=True))
+    chosen = _indices(tmp_path / "sharp")
+    assert len(chosen) == 9 and all(i % 7 == 3 for i in chosen)
+    times = list(_times(tmp_path / "sharp").values())
+    np.testing.assert_allclose(times, np.array(chosen) * 1001 / 30_000, atol=1e-9)
+
+
+def test_range_and_width(film: Path, tmp_path: Path) -> None:
+    settings = VideoSettings(every=5, from_s=1.0, to_s=2.0, width=128)
+    counts = extract(film, tmp_path / "frames", settings)
+    assert _indices(tmp_path / "frames") == [30, 35, 40, 45, 50, 55]
+    assert counts.dropped["not chosen"] == counts.received - 6
+    assert cv2.imread(str(tmp_path / "frames/000030.jpg")).shape == (64, 128, 3)
+
+
+def test_frames_at_the_times_of_a_trajectory(film: Path, tmp_path: Path) -> None:
+    wanted = np.array([3, 4, 40, 89])
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    times = np.append(wanted * 1001 / 30_000 + 1e-4, 99.0)  # stella's clock rounds; one is outside
+    read.write_tum(tmp_path / "keyframes.tum", Trajectory(times, poses))
+    settings = VideoSettings(at=str(tmp_path / "keyframes.tum"))
+    extract(film, tmp_path / "frames", settings)
+    assert _indices(tmp_path / "frames") == list(wanted)
+    read.write_tum(tmp_path / "late.tum", Trajectory(times + 50, poses))
+    with pytest.raises(GsbaError, match=r"late\.tum: none of its times"):
+        extract(film, tmp_path / "none", VideoSettings(at=str(tmp_path / "late.tum")))
+
+
+def test_a_standing_camera_is_left_out_even_while_people_pass(tmp_path: Path) -> None:
+    yaws = [2.0 * min(i, 10) + 2.0 * max(i - 30, 0) for i in range(42)]
+    pictures = [_picture(i, yaw) for i, yaw in enumerate(yaws)]
+    for i, picture in enumerate(pictures):  # somebody walks through
+        cv2.rectangle(picture, (6 * i, 50), (6 * i + 20, 90), (200, 30, 30), -1)
+    video = _encode(tmp_path / "v.mp4", pictures, _steady(42))
+    counts = extract(video, tmp_path / "frames", VideoSettings(every=1))
+    assert _indices(tmp_path / "frames") == [*range(11), *range(31, 42)]
+    assert counts.dropped["while the camera stood"] == 20
+    extract(video, tmp_path / "all", VideoSettings(every=1, standing_deg=0))
+    assert _indices(tmp_path / "all") == list(range(42))
+
+
+def test_likeness_measures() -> None:
+    grey = cv2.cvtColor(_world(), cv2.COLOR_RGB2GRAY)
+    blurred = cv2.GaussianBlur(grey, (0, 0), 1.0)
+    assert sharpness(grey) > 1.5 * sharpness(blurred)
+    wide = cv2.cvtColor(_world(3, 2048, 1024), cv2.COLOR_RGB2GRAY)
+    wide = cv2.GaussianBlur(wide, (0, 0), 12)
+    small = miniature(wide)
+    assert apparent_motion_deg(small, miniature(wide // 2)) < 0.03  # exposure is no motion
+    for pixels in (1, 2):  # of 2048: 0.18 and 0.35 degrees around the horizon
+        moved = apparent_motion_deg(small, miniature(np.roll(wide, pixels, axis=1)))
+        assert 0.3 * pixels * 360 / 2048 < moved <= pixels * 360 / 2048
+    assert apparent_motion_deg(np.ones((64, 128), np.float32), np.ones((64, 128), np.float32)) == 0
+
+
+def test_an_interrupted_extraction_goes_on(
+    film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = VideoSettings(fps=6, sharpest=True)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    extract(film, whole, settings)
+    encode, calls = extraction._encoded, []
+
+    def fail_at_fifth(*arguments: object) -> bytes:
+        calls.append(arguments)
+        if len(calls) == 5:
+            raise KeyboardInterrupt
+        return encode(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(extraction, "_encoded", fail_at_fifth)
+    with pytest.raises(KeyboardInterrupt):
+        extract(film, parts, settings)
+    assert len(list(parts.glob("*.jpg"))) == 4 and not (parts / "timestamps.csv").exists()
+    extract(film, parts, settings)
+    assert len(calls) == 5 + 14  # 18 in all: the first four are not done again
+    for path in sorted(whole.iterdir()):
+        assert (parts / path.name).read_bytes() == path.read_bytes(), path.name
+    extract(film, parts, settings)  # complete: nothing to do
+    assert len(calls) == 5 + 14
+    assert sorted(p.name for p in parts.iterdir()) == sorted(p.name for p in whole.iterdir())
+
+
+def test_frames_of_two_extractions_do_not_mix(film: Path, tmp_path: Path) -> None:
+    out = tmp_path / "frames"
+    extract(film, out, VideoSettings(every=30))
+    with pytest.raises(GsbaError, match=r"another extraction.*--fresh"):
+        extract(film, out, VideoSettings(every=20))
+    extract(film, out, VideoSettings(every=20), replace=True)
+    assert _indices(out) == [0, 20, 40, 60, 80]
+    assert json.loads((out / "extract.json").read_text())["counts"]["kept"] == 5
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/holiday.jpg").write_bytes(b"mine")
+    with pytest.raises(GsbaError, match="not empty and no extraction"):
+        extract(film, tmp_path / "photos", VideoSettings(), replace=True)
+
+
+def test_colours_survive(tmp_path: Path) -> None:
+    """What names no colour matrix is taken for BT.709; flat colours come back within JPEG's."""
+    flat = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    flat[:, : WIDTH // 2], flat[:, WIDTH // 2 :] = (180, 60, 40), (40, 90, 170)
+    path = tmp_path / "v.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"crf": "4"})
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        frame = av.VideoFrame.from_ndarray(flat, format="rgb24")
+        frame = frame.reformat(format="yuv420p", dst_colorspace="ITU709")
+        for i in range(3):
+            frame.pts = i
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    extract(path, tmp_path / "frames", VideoSettings(every=1, standing_deg=0))
+    back = cv2.imread(str(tmp_path / "frames/000001.jpg"))[..., ::-1]
+    np.testing.assert_allclose(back[64, 64].astype(int), (180, 60, 40), atol=4)
+    np.testing.assert_allclose(back[64, 192].astype(int), (40, 90, 170), atol=4)
+
+
+def _gsba(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def _fails(result: Result, message: str) -> None:
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: "), result.stderr
+    assert message in lines[0], lines[0]
+    assert result.exit_code == 1
+
+
+def test_command(film: Path, tmp_path: Path) -> None:
+    result = _gsba("extract", film, "--out", tmp_path / "f", "--every", 30, "--width", 64)
+    assert result.exit_code == 0 and result.stdout.startswith("3 of 90 frames kept")
+    _fails(_gsba("extract", film, "--out", tmp_path / "f"), "holds another extraction")
+    assert _gsba("extract", film, "--out", tmp_path / "f", "--fresh").exit_code == 0
+
+
+def test_bad_options(film: Path, tmp_path: Path) -> None:
+    out = ("--out", tmp_path / "f")
+    _fails(_gsba("extract", film, *out, "--fps", 1, "--every", 2), "pass one")
+    _fails(_gsba("extract", film, *out, "--fps", -1), "video.fps = -1.0 is not allowed")
+    _fails(_gsba("extract", film, *out, "--width", 999), "video.width")
+    _fails(_gsba("extract", film, *out, "--width", 512), "has only 256 pixels")
+    _fails(_gsba("extract", film, *out, "--from", 2, "--to", 1), "later than --from")
+    _fails(_gsba("extract", film, *out, "--from", 20), "no frame between 20 and inf s")
+    _fails(_gsba("extract", film, *out, "--at", tmp_path / "x.tum"), "x.tum: ")
+    _fails(_gsba("extract", film, *out, "--at", "x.tum", "--sharpest"), "leave out --sharpest")
+    _fails(_gsba("extract", tmp_path / "none.mp4", *out), "none.mp4: no such file")
+    _fails(_gsba("extract", film, "--out", film), "is a file")
+
+
+@pytest.mark.parametrize(
+    ("size", "message"),
+    [((256, 144), "is 256x144; an equirectangular video is 2:1"), ((128, 128), "square: one lens")],
+)
+def test_other_shapes_are_refused(tmp_path: Path, size: tuple[int, int], message: str) -> None:
+    pictures = [_world(i, *size) for i in range(3)]
+    video = _encode(tmp_path / "v.mp4", pictures, _steady(3))
+    _fails(_gsba("extract", video, "--out", tmp_path / "f"), message)
+
+
+def test_raw_fisheyes_are_refused(tmp_path: Path) -> None:
+    v, u = np.ogrid[:HEIGHT, :WIDTH]
+    outside = np.hypot(u % HEIGHT - HEIGHT / 2, v - HEIGHT / 2) > HEIGHT / 2
+    picture = _world()
+    picture[np.broadcast_to(outside, picture.shape[:2])] = 0
+    video = _encode(tmp_path / "v.mp4", [picture] * 3, _steady(3))
+    _fails(_gsba("extract", video, "--out", tmp_path / "f"), "raw dual-fisheye; stitch it")
+    night = [(_world() // 8).astype(np.uint8)] * 3  # dark all over is no pair of circles
+    extract(_encode(tmp_path / "n.mp4", night, _steady(3)), tmp_path / "n", VideoSettings(every=1))
+
+
+def test_one_stream_a_lens_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "v.insv"
+    with av.open(str(path), "w", format="mp4") as container:
+        streams = [container.add_stream("libx264", rate=30) for _ in range(2)]
+        for stream in streams:
+            stream.width = stream.height = HEIGHT
+            stream.pix_fmt = "yuv420p"
+        for stream in streams:
+            frame = av.VideoFrame.from_ndarray(_world(0, HEIGHT, HEIGHT), format="rgb24")
+            container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+    assert is_video(path)
+    _fails(_gsba("extract", path, "--out", tmp_path / "f"), "2 video streams of 128x128: a raw")
+
+
+def test_broken_files_are_one_line(film: Path, tmp_path: Path) -> None:
+    data = film.read_bytes()
+    files = {"text.mp4": b"not a video" * 99, "empty.mp4": b"", "cut.mp4": data[: len(data) // 2]}
+    for name, content in files.items():  # an MP4 has its index at the end: half of it has none
+        (tmp_path / name).write_bytes(content)
+        result = _gsba("extract", tmp_path / name, "--out", tmp_path / "f")
+        _fails(result, f"{name}: cannot be read as video")
+    odd = tmp_path / "odd.mp4"
+    odd.write_bytes(data.replace(b"avc1", b"zzzz").replace(b"avcC", b"zzzC"))
+    _fails(_gsba("extract", odd, "--out", tmp_path / "f"), "no decoder for its pictures")
+
+
+def test_a_truncated_video_says_how_far_it_goes(film: Path, tmp_path: Path) -> None:
+    whole = tmp_path / "whole.mkv"
+    with av.open(str(film)) as source, av.open(str(whole), "w") as target:
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                target.mux(packet)
+    cut = tmp_path / "cut.mkv"
+    cut.write_bytes(whole.read_bytes()[: int(0.5 * whole.stat().st_size)])
+    result = _gsba("extract", cut, "--out", tmp_path / "f")
+    _fails(result, "truncated; copy it again, or pass --to")
+    end = result.stderr.split("--to ")[1].split()[0]
+    assert _gsba("extract", cut, "--out", tmp_path / "f", "--to", end).exit_code == 0
+    assert 0 in _indices(tmp_path / "f")
+
+
+def test_missing_library_is_one_line(
+    film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "av", None)
+    result = _gsba("extract", film, "--out", tmp_path / "f")
+    _fails(result, "reading video needs PyAV: pip install 'gsba[video]'")

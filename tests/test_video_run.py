@@ -1,0 +1,64 @@
+"""A video refined in one call is its extracted folder, refined."""
+
+from fractions import Fraction
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tiny_run import SETTINGS, Case, computed_stages
+
+from gsba import read, refine
+from gsba.config import VideoSettings
+from gsba.log import GsbaError
+from gsba.video import extract
+
+av = pytest.importorskip("av", reason="PyAV is not installed")
+
+
+def test_video_and_folder_give_the_same(case: Case, tmp_path: Path) -> None:
+    video = tmp_path / "walk.mp4"
+    walk = case.result.frames
+    with av.open(str(video), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"crf": "12"})
+        stream.width, stream.height, stream.pix_fmt = walk.width, walk.height, "yuv420p"
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 90_000)
+        for (path,), time in zip(walk.paths, walk.timestamps, strict=True):
+            picture = cv2.imread(str(path))
+            frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
+            frame.pts, frame.time_base = round(time * 90_000), Fraction(1, 90_000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    settings = SETTINGS.model_copy(update={"video": VideoSettings(every=1)})
+    out = tmp_path / "from-video"
+    direct = refine(video, case.slam, out, settings)
+    extract(video, tmp_path / "frames", settings.video)
+    folder = refine(tmp_path / "frames", case.slam, tmp_path / "from-folder", settings)
+    np.testing.assert_array_equal(
+        direct.reconstruction.world_T_rigs, folder.reconstruction.world_T_rigs
+    )
+    np.testing.assert_allclose(
+        direct.frames.timestamps, walk.timestamps - walk.timestamps[0], atol=1e-4
+    )
+    assert case.errors(out).ate.rmse < 3 * case.errors().ate.rmse  # as good as from the images
+
+    assert computed_stages(refine(video, case.slam, out, settings)) == []  # resumed
+
+
+def test_bad_input_fails_before_decoding(tmp_path: Path) -> None:
+    (tmp_path / "walk.mp4").write_bytes(b"no video")
+    with pytest.raises(GsbaError, match=r"nowhere\.tum"):
+        refine(tmp_path / "walk.mp4", tmp_path / "nowhere.tum", tmp_path / "run")
+    read.write_tum(
+        tmp_path / "slam.tum",
+        read.read_trajectory(_two_poses(tmp_path / "two.tum")),
+    )
+    with pytest.raises(GsbaError, match=r"walk\.mp4: cannot be read as video"):
+        refine(tmp_path / "walk.mp4", tmp_path / "slam.tum", tmp_path / "run")
+    with pytest.raises(GsbaError, match="--fps 0: must be a positive"):
+        refine(tmp_path / "walk.mp4", tmp_path / "slam.tum", tmp_path / "run", fps=0)
+
+
+def _two_poses(path: Path) -> Path:
+    path.write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n")
+    return path
