@@ -7,6 +7,7 @@ import json
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -129,9 +130,14 @@ def _nested_model(model: type[BaseModel], key: str) -> type[BaseModel] | None:
     return annotation if is_model else None
 
 
+@cache
+def _whole_schema(model: type[BaseModel]) -> dict[str, Any]:
+    return model.model_json_schema()
+
+
 def _schema(model: type[BaseModel], key: str) -> dict[str, Any]:
     """JSON schema of one setting, references to enums resolved."""
-    whole = model.model_json_schema()
+    whole = _whole_schema(model)
 
     def resolve(node: Any) -> Any:
         if isinstance(node, list):
