@@ -10,7 +10,7 @@ from factors import LandmarkBlock, RobustLoss
 from factors.patch_windows import PatchPixels, PatchTable, patch_spans, poor_views
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
-from gsba import adjust, graph, patch_grid
+from gsba import adjust, graph, patch_grid, triangulate
 from gsba.adjust import Adjustment, Round
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.log import GsbaError, track
@@ -215,7 +215,8 @@ def _solve(
             break
         weights = doubts
     accepted = landmarks.error(result.values) <= chosen.max_growth * before
-    return _adjusted(solved, landmarks, result, accepted), weights, residuals
+    adjusted = _adjusted(solved, keypoints, result, accepted, settings, num_threads)
+    return adjusted, weights, residuals
 
 
 def make_block(
@@ -288,18 +289,30 @@ def _frame_weights(
 
 
 def _adjusted(
-    solved: Adjustment, landmarks: LandmarkBlock, result: OptimizeResult, accepted: bool
+    solved: Adjustment,
+    keypoints: Keypoints,
+    result: OptimizeResult,
+    accepted: bool,
+    settings: RefineSettings,
+    num_threads: int,
 ) -> Adjustment:
-    """The solution with the joint solve's poses and points, or as it was if not accepted."""
-    tracks = solved.landmarks.tracks
+    """The solution with the joint solve's poses, or as it was if not accepted.
+
+    Points are placed anew as after a bundle adjustment: those of the solve lie closer to most
+    observations than noise allows.
+    """
+    tracks, least = solved.landmarks.tracks, settings.rounds.min_observations
     gate = solved.rounds[-1].gate_sigmas if solved.rounds else np.inf
+    rows, poses = keypoints.rows(tracks), adjust.poses_of(result.values, len(solved.world_T_rigs))
+    bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
+    placed = triangulate.run(
+        tracks, bearings, sigmas, poses, gate * solved.noise, settings.triangulate, num_threads
+    )
+    after = replace(solved, world_T_rigs=poses, landmarks=placed)
+    accepted &= adjust.carries(after, solved, least)
+    support = len(placed.tracks)
     note = Round(
-        gate, solved.noise, len(tracks), tracks.num_points, len(tracks), accepted,
-        result.history, result.reason,
+        gate, solved.noise, len(tracks), tracks.num_points, support, accepted, result.history,
+        result.reason,
     )  # fmt: skip
-    rounds = (*solved.rounds, note)
-    if not accepted:
-        return replace(solved, rounds=rounds)
-    placed = replace(solved.landmarks, points_world=landmarks.points_world)
-    world_T_rigs = adjust.poses_of(result.values, len(solved.world_T_rigs))
-    return Adjustment(world_T_rigs, placed, solved.noise, rounds)
+    return replace(after if accepted else solved, rounds=(*solved.rounds, note))
