@@ -49,7 +49,14 @@ RECORDED = {  # coarse trajectories; every row is run from the first, `DEFAULT` 
     "apartment": ("coarse.tum",),
 }
 WALKS = {"demo_rectangle": ("rectangle", "locked"), "demo_oval": ("oval", "forward")}
-FACTOR_SETS = ("slam", "bearing", "reprojection", "bearing+reprojection")
+FACTOR_SETS = {  # row -> options of `gsba refine`
+    "slam": [],  # nothing runs
+    "bearing": ["--factors", "bearing"],
+    "bearing-unaligned": ["--factors", "bearing", "--set", "align.rounds=0"],
+    "reprojection": ["--factors", "reprojection"],
+    "bearing+reprojection": ["--factors", "bearing,reprojection"],
+    "no-trajectory": ["--no-trajectory"],
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,13 +126,14 @@ class Bench:
 
     def refine(self, walk: Walk, frames: FrameSet, trajectory: str, factor_set: str) -> dict:
         """A whole run with one factor set, without a dataset: the peer writes none either."""
-        head = _head(walk, factor_set, trajectory)
+        head = _head(walk, factor_set, None if factor_set == "no-trajectory" else trajectory)
         folder = self.out / walk.name / f"{factor_set}-{Path(trajectory).stem}"
         inputs = [walk.folder / trajectory, *([walk.mask] if walk.mask else [])]
         key = {"code": self.code, "input": _digest([*_images(frames), *inputs])}
-        command = _refine_command(
-            walk.folder / "images", walk.folder / trajectory, folder / "run", factor_set, walk.mask
-        )
+        given = [] if factor_set == "no-trajectory" else [str(walk.folder / trajectory)]
+        given += ["--masks", str(walk.mask)] if walk.mask else []
+        images, run = walk.folder / "images", folder / "run"
+        command = _refine_command(images, run, [*given, *FACTOR_SETS[factor_set]])
 
         def finish() -> dict:
             report = json.loads((folder / "run/report.json").read_text())
@@ -136,7 +144,7 @@ class Bench:
 
     def peer(self, walk: Walk, frames: FrameSet, mode: str) -> dict:
         """One of the peer's modes, which take neither trajectory nor mask."""
-        head = _head(walk, mode, None)
+        head = {**_head(walk, mode, None), "peer": True}
         folder = self.out / walk.name / mode
         key = {"pycolmap": version("pycolmap"), "input": _digest(_images(frames))}
         links = self.out / walk.name / "images"  # nothing but the frames
@@ -163,8 +171,8 @@ class Bench:
             row = json.loads(kept.read_text())
             ended = "errors" in row or (row["timed_out"] and row["wall_s"] >= self.timeout_s)
             if row["key"] == key and ended:
-                return row
-        if head["trajectory"] and not self.warm:
+                return {**row, **head}
+        if "peer" not in head and not self.warm:
             _compile_kernels(self.out / "warm-up")
             self.warm = True
         print(f"{head['sequence']}: running {folder.name}", file=sys.stderr, flush=True)
@@ -202,13 +210,9 @@ def _outcome(finish: Callable[[], dict]) -> dict[str, Any]:
         return {"reason": str(error)}
 
 
-def _refine_command(
-    frames: Path, trajectory: Path, run: Path, factor_set: str, mask: Path | None
-) -> list[str]:
-    command = [sys.executable, "-c", "from gsba.cli import main; main()", "refine"]
-    command += [str(frames), str(trajectory), "--out", str(run), "--fresh"]
-    command += ["--factors", factor_set.replace("+", ","), "--set", "export.formats=[]"]
-    return command + (["--masks", str(mask)] if mask else [])
+def _refine_command(frames: Path, run: Path, options: list[str]) -> list[str]:
+    command = [sys.executable, "-c", "from gsba.cli import main; main()", "refine", str(frames)]
+    return [*command, *options, "--out", str(run), "--fresh", "--set", "export.formats=[]"]
 
 
 def _compile_kernels(out: Path) -> None:
@@ -216,7 +220,8 @@ def _compile_kernels(out: Path) -> None:
     folder = out / "walk"
     _make_walk(folder, "'open', num_frames=8, width=512")
     images, trajectory = folder / "images", folder / "slam.tum"
-    _require(_refine_command(images, trajectory, out / "run", FACTOR_SETS[-1], None), out)
+    options = [str(trajectory), *FACTOR_SETS["bearing+reprojection"]]
+    _require(_refine_command(images, out / "run", options), out)
 
 
 def _make_walk(folder: Path, arguments: str) -> None:

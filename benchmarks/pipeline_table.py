@@ -44,7 +44,7 @@ def verdicts(rows: Sequence[dict]) -> Iterator[tuple[str, bool]]:
         yield text, part <= MAX_PART
         text = f"median residual {residual:.4f}°, at most {MAX_RESIDUAL}°"
         yield text, residual <= MAX_RESIDUAL
-    yield from _against_peers(ours, [row for row in rows if not row["trajectory"]])
+    yield from _against_peers(ours, [row for row in rows if row.get("peer")])
 
 
 def _against_peers(ours: dict, peers: Sequence[dict]) -> Iterator[tuple[str, bool]]:

@@ -79,8 +79,8 @@ class PairSettings(_Settings):
     max_baseline_depths: float = Field(default=2.0, gt=0)  # longest baseline in median scene depths
     max_loop_neighbours: int = Field(default=8, ge=0)  # nearest frames in space outside the window
     max_parallax_deg: float = Field(default=60.0, gt=0, le=180)
-    strongest_per_face: int = Field(default=200, ge=16)  # keypoints that find neighbours' geometry
-    scarce_matches: int = Field(default=60, ge=0)  # below, a pair is matched with all keypoints
+    strongest_per_face: int = Field(default=150, ge=16)  # keypoints that find neighbours' geometry
+    scarce_matches: int = Field(default=40, ge=0)  # below, a pair is matched with all keypoints
     prior: GateSettings = GateSettings(rotation_deg=4.0, direction=0.4)  # coarse trajectory
     loop_deg: float = Field(default=2.0, gt=0)  # around a known point, besides drift
     refined: GateSettings = GateSettings(rotation_deg=0.4, direction=0.005)  # solved map
@@ -136,7 +136,7 @@ class AlignSettings(_Settings):
     """Patches around the map's points, aligned to every frame that shows them."""
 
     rounds: int = Field(default=2, ge=0)  # of alignment and bundle adjustment; 0 = none
-    patch_size: int = Field(default=15, ge=5, le=41)  # pixels across, odd
+    patch_size: int = Field(default=11, ge=5, le=41)  # pixels across, odd
     max_width: int = Field(default=4096, ge=64)  # of a panorama; wider ones are halved till under
     max_views: int = Field(default=16, ge=1)  # frames that a point is looked for in
     near_frames: int = Field(default=40, ge=0)  # nearest in space, among which views are found
