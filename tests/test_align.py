@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from synthetic import bearings_of
 
 from gsba import adjust, align, graph
 from gsba.adjust import Adjustment
@@ -13,7 +14,6 @@ from gsba.config import AlignSettings, RefineSettings
 from gsba.geometry import inverse, pose
 from gsba.rig import CubeRig
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Sighted, Tracks
-from tests.synthetic import bearings_of
 
 NUM, WIDTH = 6, 512
 RIG = CubeRig(128, np.pi / 2)
