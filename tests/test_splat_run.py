@@ -44,8 +44,9 @@ def test_train_writes_a_splat_and_its_metrics(run: Path) -> None:
     assert len(splat) > 100 and splat.sh_degree == 3
     content = json.loads((run / "splat/results.json").read_text())
     refined = content["sources"]["refined"]
-    assert len(refined["frames"]) == 1 and refined["mean"]["psnr"] > 12
-    assert [int(step) for step in refined["curve"]] == list(range(3, 31, 3))
+    curve = refined["curve"]
+    assert [int(step) for step in curve] == list(range(3, 31, 3))
+    assert len(refined["frames"]) == 1 and curve["30"]["psnr"] > curve["3"]["psnr"] + 0.5
     assert content["lpips"].startswith("not computed")
 
 
