@@ -38,7 +38,7 @@ class LearnedExtractor:
         self._model = _load(settings.extractor, str(settings.weights), settings.max_per_face)
 
     def __call__(self, face_rgb: np.ndarray, mask: np.ndarray | None) -> FaceKeypoints:
-        import torch
+        import torch  # pyright: ignore[reportMissingImports]
 
         size = face_rgb.shape[0]
         side = -(-size // _STEP) * _STEP
@@ -76,8 +76,8 @@ def check_weights(settings: FeatureSettings) -> None:
 def _load(name: str, weights: str, max_per_face: int) -> Any:
     """The network in inference mode; one for all threads."""
     try:
-        import kornia.feature
-        import torch
+        import kornia.feature  # pyright: ignore[reportMissingImports]
+        import torch  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise GsbaError(
             f"features.extractor = {name} needs kornia and torch: pip install 'gsba[learned]'"
