@@ -14,7 +14,7 @@ from gsba import panorama
 from gsba.config import AlignSettings
 from gsba.log import track
 from gsba.rig import CubeRig, owner_faces
-from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Sighted, Tracks
+from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
 from gsba.views import references, views
 
 _WINDOW = 0.6  # standard deviation of the patch's window, part of half a patch
@@ -41,7 +41,7 @@ def run(
     world_T_rigs: np.ndarray,
     keypoints: Keypoints,
     noise: float,
-    frames: FrameSet,
+    greys: panorama.Greys,
     rig: CubeRig,
     name: str,
     aligned: np.ndarray | None,
@@ -52,13 +52,14 @@ def run(
 
     The patch around a point is cut from the frame in the middle of its observations, as a plane
     that faces it; poses and depth carry it into others, where a shift, a small affine change,
-    gain and offset are found. Images are read twice, one per thread at a time.
+    gain and offset are found. Images are wanted twice, one per thread at a time.
 
     Args:
         landmarks: points and their observations so far.
         world_T_rigs: (F, 4, 4) poses they were solved with.
         keypoints: of those observations.
         noise: of those, in units of their sigmas.
+        greys: the frames' images.
         rig: faces that pixels are given on.
         name: beside the progress bar.
         aligned: (N,) bool, which of the keypoints patches have confirmed; None = none.
@@ -72,8 +73,7 @@ def run(
     hosts = landmarks.tracks.frames[rows].astype(np.int64)
     extended = _extended(landmarks, keypoints, aligned, settings.min_track_length)
     points, seeing = views(landmarks, world_T_rigs, rows, extended, settings)
-    width = panorama.width_for(frames, settings.max_width)
-    origins, spreads, depths = _patches(landmarks.points_world, world_T_rigs[hosts], width)
+    origins, spreads, depths = _patches(landmarks.points_world, world_T_rigs[hosts], greys.width)
     plane = world_T_rigs[hosts, :3, :3] @ spreads * depths[:, None, None]
     sightings = expect(
         points, *_carried(landmarks.points_world[points], plane[points], world_T_rigs[seeing])
@@ -88,14 +88,14 @@ def run(
     def align(image: SphereImage, mask: _Mask, chosen: np.ndarray) -> None:
         patches.align(image, mask, chosen, sightings, reach, _STEPS, _TOLERANCE)
 
-    _stream(cut, frames, width, hosts, f"{name}: templates", num_threads)
-    _stream(align, frames, width, seeing, name, num_threads)
-    kept, found, dropped = _accepted(patches, sightings, seeing, 2 * np.pi / width, settings)
+    _stream(cut, greys, hosts, f"{name}: templates", num_threads)
+    _stream(align, greys, seeing, name, num_threads)
+    kept, found, dropped = _accepted(patches, sightings, seeing, 2 * np.pi / greys.width, settings)
     at_hosts = _at_hosts(patches, sightings, kept, hosts, origins, spreads)
-    former = _former(landmarks, keypoints, noise, [found, at_hosts], len(frames))
+    former = _former(landmarks, keypoints, noise, [found, at_hosts], greys.num_frames)
     colors = keypoints.colors[keypoints.rows(landmarks.tracks)[rows]]
     counts = Counts(len(points), len(found.points), "observations", dropped)
-    return _pack([found, at_hosts, former], colors, len(frames), rig, counts)
+    return _pack([found, at_hosts, former], colors, greys.num_frames, rig, counts)
 
 
 def _patches(
@@ -127,18 +127,17 @@ def _carried(
 
 def _stream(
     work: Callable[[SphereImage, _Mask, np.ndarray], None],
-    frames: FrameSet,
-    width: int,
+    greys: panorama.Greys,
     frame_of: np.ndarray,
     title: str,
     num_threads: int,
 ) -> None:
     """Do `work(image, mask, rows of a frame)` for every frame that has rows, `frame_of (R,)`."""
     order = np.argsort(frame_of, kind="stable")
-    bounds = np.searchsorted(frame_of[order], np.arange(len(frames) + 1))
+    bounds = np.searchsorted(frame_of[order], np.arange(greys.num_frames + 1))
 
     def one(frame: int) -> None:
-        grey, mask = panorama.load_grey(frames, frame, width)
+        grey, mask = greys[frame]
         work(SphereImage.of(grey, smooth=True), mask, order[bounds[frame] : bounds[frame + 1]])
 
     with ThreadPoolExecutor(num_threads) as pool:

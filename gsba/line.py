@@ -17,6 +17,7 @@ from gsba import (
     features,
     frontend,
     graph,
+    panorama,
     photometric,
     places,
     recovery,
@@ -73,24 +74,23 @@ class Line:
         self.undone: list[str] = []  # solutions that were not taken
         self.frame_weights = np.ones(len(frames))  # of each frame's pixels
         self.latest = "keypoints"  # the stage that the next one builds on
-        paths = [path for group in frames.paths for path in group]
-        inputs = [fingerprint(paths), fingerprint(frames.mask_paths), frames.timestamps.tolist()]
-        start = [coarse.world_T_rigs.tolist(), settings.read]
-        store.stage("frames", [inputs, start], lambda: frames, FrameSet)
+        paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
+        start = coarse.world_T_rigs.tolist(), settings.read
+        inputs = [fingerprint(paths), frames.timestamps.tolist(), *start]
+        store.stage("frames", inputs, lambda: frames, FrameSet)
         found = extraction.run(store, frames, self.rig, settings, self.num_threads)
-        self.keypoints = store.stage(
-            "keypoints",
-            None,
-            lambda: features.gather(found[name] for name in frames.names),
-            Keypoints,
-            ["frames", "features"],
-        )
-        self.observed = self.keypoints  # those that the latest solution is made of
-        self.aligned: np.ndarray | None = None  # which of them patches have confirmed
 
         def load(frame: int) -> Features:
             return found[frames.names[frame]]
 
+        def gather() -> Keypoints:
+            return features.gather(map(load, range(len(frames))))
+
+        before = ["frames", "features"]
+        self.keypoints = store.stage("keypoints", None, gather, Keypoints, before)
+        self.observed = self.keypoints  # those that the latest solution is made of
+        self.aligned: np.ndarray | None = None  # which of them patches have confirmed
+        self.greys = panorama.Greys(frames, settings.align.max_width)
         self.searchable = SearchableFrames(load)
         self.strongest = SearchableFrames(load, settings.pairs.strongest_per_face)
 
@@ -274,7 +274,7 @@ class Line:
                 solved.world_T_rigs,
                 self.observed,
                 solved.noise,
-                self.frames,
+                self.greys,
                 self.rig,
                 name,
                 self.aligned,

@@ -54,6 +54,25 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
     return _fit(grey, width), None if whole else _fit_mask(usable, width)
 
 
+class Greys:
+    """Grey panoramas of frames that are read again and again: the first ones stay in memory."""
+
+    def __init__(self, frames: FrameSet, max_width: int, limit_mb: float = 128.0) -> None:
+        self.num_frames, self.width = len(frames), width_for(frames, max_width)
+        self._frames = frames
+        self._room = int(limit_mb * 2**20 / self.width**2)  # images of width^2 / 2, and masks
+        self._kept: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
+
+    def __getitem__(self, frame: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """As `load_grey`, from any thread."""
+        found = self._kept.get(frame)
+        if found is None:
+            found = load_grey(self._frames, frame, self.width)
+            if len(self._kept) < self._room:
+                self._kept[frame] = found
+        return found
+
+
 def _fit(grey: np.ndarray, width: int) -> np.ndarray:
     """An image averaged down to a width."""
     if grey.shape[1] == width:

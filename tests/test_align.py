@@ -12,6 +12,7 @@ from gsba import adjust, align, graph
 from gsba.adjust import Adjustment
 from gsba.config import AlignSettings, RefineSettings
 from gsba.geometry import inverse, pose
+from gsba.panorama import Greys
 from gsba.rig import CubeRig
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Sighted, Tracks
 
@@ -104,7 +105,16 @@ def _run(
     frames, world_T_rigs = walk
     landmarks, keypoints = _start(world_T_rigs, sigma_px)
     return align.run(
-        landmarks, world_T_rigs, keypoints, 1.0, frames, RIG, "align", None, settings, 2
+        landmarks,
+        world_T_rigs,
+        keypoints,
+        1.0,
+        Greys(frames, 4096),
+        RIG,
+        "align",
+        None,
+        settings,
+        2,
     )
 
 
@@ -163,8 +173,8 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
     common = priors, RIG, (6.0, 3.0), settings, 2
     before = adjust.run(landmarks.tracks, keypoints, start, *common)
     sighted = align.run(
-        before.landmarks, before.world_T_rigs, keypoints, before.noise, frames, RIG, "align",
-        None, SETTINGS, 2,
+        before.landmarks, before.world_T_rigs, keypoints, before.noise, Greys(frames, 4096), RIG,
+        "align", None, SETTINGS, 2,
     )  # fmt: skip
     after, known = adjust.run_sighted(sighted, before, *common)
     assert np.median(rotation_errors(after)) < 0.5 * np.median(rotation_errors(before))
@@ -209,7 +219,7 @@ def test_points_at_a_centre_and_behind_walls_do_no_harm(walk) -> None:
     points[100] = world_T_rigs[landmarks.tracks.frames[300], :3, 3]
     moved = replace(landmarks, points_world=points)
     sighted = align.run(
-        moved, world_T_rigs, keypoints, 1.0, frames, RIG, "align", None, SETTINGS, 2
+        moved, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None, SETTINGS, 2
     )
     assert np.isfinite(sighted.keypoints.bearings_rig).all()
     assert np.isfinite(sighted.keypoints.sqrt_infos).all()
@@ -221,7 +231,16 @@ def test_confirmed_points_are_looked_for_elsewhere(walk) -> None:
     settings = AlignSettings(patch_size=11, min_track_length=4)  # longer than any here
     short, confirmed = (
         align.run(
-            landmarks, world_T_rigs, keypoints, 1.0, frames, RIG, "align", aligned, settings, 2
+            landmarks,
+            world_T_rigs,
+            keypoints,
+            1.0,
+            Greys(frames, 4096),
+            RIG,
+            "align",
+            aligned,
+            settings,
+            2,
         )
         for aligned in (None, np.ones(len(keypoints.faces), bool))
     )
@@ -245,7 +264,9 @@ def test_no_points_are_no_observations(walk) -> None:
     frames, world_T_rigs = walk
     none = adjust.start(world_T_rigs).landmarks
     _, keypoints = _start(world_T_rigs)
-    sighted = align.run(none, world_T_rigs, keypoints, 1.0, frames, RIG, "align", None, SETTINGS, 2)
+    sighted = align.run(
+        none, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None, SETTINGS, 2
+    )
     assert len(sighted.tracks) == 0 and sighted.counts.received == 0
 
 
