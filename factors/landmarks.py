@@ -1,9 +1,7 @@
 """Batched observations of shared landmarks, eliminated inside: the block and its two doors."""
 
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
+from collections.abc import Sequence
 
 import gtsam
 import numpy as np
@@ -12,6 +10,7 @@ from factors._host_factors import host_factors
 from factors._kernels import eliminate_range, polish_range, residuals_range
 from factors._observations import Term, check_term, sort_observations
 from factors._terms import pose_rows
+from factors._threads import balanced_ranges, run_in_threads
 from factors.block import PoseSystem
 from factors.robust import RobustLoss
 
@@ -89,7 +88,7 @@ class LandmarkBlock:
         """Reduced pose system at `values`: robust weights, landmarks eliminated."""
         poses = pose_rows(values, self.pose_keys)
         num_f, num_p = len(self.pose_keys), len(self._columns)
-        ranges = self._ranges()
+        ranges = balanced_ranges(self._obs.offsets, self.num_threads)
         sums = [
             (
                 np.zeros((num_f, 6, 6)),
@@ -106,7 +105,7 @@ class LandmarkBlock:
                 *sums[i], self._point_costs,
             )  # fmt: skip
 
-        self._run(work, len(ranges))
+        run_in_threads(work, len(ranges))
         total = sums[0]
         for other in sums[1:]:
             for target, part in zip(total, other, strict=True):
@@ -168,12 +167,12 @@ class LandmarkBlock:
         poses = pose_rows(values, self.pose_keys)
         residuals = np.empty((len(self._order), 2))
         valid = np.empty(len(self._order), dtype=np.bool_)
-        ranges = self._ranges()
+        ranges = balanced_ranges(self._obs.offsets, self.num_threads)
 
         def work(i: int) -> None:
             residuals_range(*ranges[i], self._obs, self._points, poses, residuals, valid)
 
-        self._run(work, len(ranges))
+        run_in_threads(work, len(ranges))
         return residuals, valid
 
     def _move(
@@ -185,7 +184,7 @@ class LandmarkBlock:
         tolerance: float,
     ) -> float:
         points, costs = np.empty_like(self._points), np.empty_like(self._point_costs)
-        ranges = self._ranges()
+        ranges = balanced_ranges(self._obs.offsets, self.num_threads)
         substitute = steps is not None
 
         def work(i: int) -> None:
@@ -196,7 +195,7 @@ class LandmarkBlock:
                 substitute, num_steps, tolerance, self._point_costs, points, costs,
             )  # fmt: skip
 
-        self._run(work, len(ranges))
+        run_in_threads(work, len(ranges))
         self._trial = points, costs
         return float(costs.sum())
 
@@ -217,22 +216,6 @@ class LandmarkBlock:
         starts = np.zeros(num_f + 1, dtype=np.int64)
         np.cumsum(np.bincount(rows[upper], minlength=num_f), out=starts[1:])
         return starts, shared.indices[upper].astype(np.int64)
-
-    def _ranges(self) -> list[tuple[int, int]]:
-        """Runs of landmarks with about the same number of observations, one per thread."""
-        offsets = self._obs.offsets
-        targets = np.linspace(0, offsets[-1], self.num_threads + 1)[1:-1]
-        bounds = np.unique([0, *np.searchsorted(offsets, targets), len(self._points)])
-        if len(bounds) < 2:
-            return [(0, 0)]
-        return [(int(a), int(b)) for a, b in pairwise(bounds)]
-
-    def _run(self, work: Callable[[int], None], num: int) -> None:
-        if num == 1:
-            work(0)
-            return
-        with ThreadPoolExecutor(num) as pool:
-            list(pool.map(work, range(num)))
 
     def _named(self, costs: np.ndarray) -> dict[str, float]:
         return {name: float(cost) for name, cost in zip(self.families, costs, strict=True)}

@@ -1,11 +1,9 @@
 """Photometric family: patches of one frame seen in others, their planes eliminated, two doors."""
 
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
-from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -14,6 +12,7 @@ from factors._photometric_host import host_factors
 from factors._photometric_kernels import DIMS, PatchData, observe_range
 from factors._photometric_schur import eliminate_range
 from factors._terms import pose_rows
+from factors._threads import balanced_ranges, run_in_threads
 from factors.block import PoseSystem
 from factors.patch_windows import PatchPixels, covisible_frames, patch_axes, poor_views
 from factors.robust import RobustLoss
@@ -239,12 +238,12 @@ class PhotometricBlock:
         size = num_o if dims else 0
         hessians, gradients = np.empty((size, DIMS, DIMS)), np.empty((size, DIMS))
         errors = np.empty(num_o)
-        ranges = self._ranges()
+        ranges = balanced_ranges(self.table.offsets, self.num_threads)
 
         def work(i: int) -> None:
             observe_range(*ranges[i], self._data, planes, poses, dims, hessians, gradients, errors)
 
-        self._run(work, len(ranges))
+        run_in_threads(work, len(ranges))
         return (hessians, gradients), errors
 
     def _patch_costs(self, planes: np.ndarray, errors: np.ndarray) -> np.ndarray:
@@ -310,19 +309,3 @@ class PhotometricBlock:
         self._costs = np.full(len(self.table), np.inf)
         self._trial: tuple[np.ndarray, np.ndarray] | None = None
         self._schur: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-
-    def _ranges(self) -> list[tuple[int, int]]:
-        """Runs of patches with about the same number of observations, one per thread."""
-        offsets = self.table.offsets
-        targets = np.linspace(0, offsets[-1], self.num_threads + 1)[1:-1]
-        bounds = np.unique([0, *np.searchsorted(offsets, targets), len(self.table)])
-        if len(bounds) < 2:
-            return [(0, 0)]
-        return [(int(a), int(b)) for a, b in pairwise(bounds)]
-
-    def _run(self, work: Callable[[int], None], num: int) -> None:
-        if num == 1:
-            work(0)
-            return
-        with ThreadPoolExecutor(num) as pool:
-            list(pool.map(work, range(num)))

@@ -180,7 +180,7 @@ def build_report(
         "machine": _machine(),
         "versions": {name: _version(name) for name in _PACKAGES},
     }
-    return _plain(report)
+    return plain(report)
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
@@ -279,22 +279,23 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _plain(value: Any) -> Any:
-    """Values JSON can hold; what is not finite becomes null."""
+def plain(value: Any, digits: int = 17) -> Any:
+    """Values JSON can hold, floats to `digits`; what is not finite becomes null."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {
-            entry.name: _plain(getattr(value, entry.name)) for entry in dataclasses.fields(value)
+            entry.name: plain(getattr(value, entry.name), digits)
+            for entry in dataclasses.fields(value)
         }
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item, digits) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
+        return plain(value.tolist(), digits)
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item, digits) for item in value]
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, float):
-        return value if math.isfinite(value) else None
+        return float(f"{value:.{digits}g}") if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value

@@ -31,7 +31,6 @@ def run(
         seed: of the sampling.
         num_threads: pairs verified at a time.
     """
-
     estimates = _estimates(matches, keypoints, settings, seed, num_threads)
     kept = []
     dropped = {"too few matches": 0, "rotation contradicts": 0, "direction contradicts": 0}

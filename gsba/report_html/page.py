@@ -11,7 +11,7 @@ import numpy as np
 
 from gsba.log import GsbaError
 from gsba.records import atomic_write
-from gsba.report import frame_quality
+from gsba.report import frame_quality, plain
 from gsba.report_html import pictures, views
 from gsba.types import CoarsePoses, FrameSet, Reconstruction
 
@@ -47,7 +47,7 @@ def write_html(
         "erp_width": frames.width if frames.layout == "erp" else 4 * frames.width,
         "worst": _worst(frames, reconstruction),
     }
-    text = _assembled(json.dumps(_plain(data), allow_nan=False, separators=(",", ":")))
+    text = _assembled(json.dumps(plain(data, digits=6), allow_nan=False, separators=(",", ":")))
     atomic_write(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
@@ -90,16 +90,3 @@ def _worst(frames: FrameSet, reconstruction: Reconstruction) -> list[dict[str, A
         except GsbaError as error:
             logger.warning("report.html: no picture of frame %s (%s)", frames.names[f], error)
     return found
-
-
-def _plain(value: Any) -> Any:
-    """Values JSON can hold, floats to six digits; what is not finite becomes null."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return float(f"{value:.6g}") if np.isfinite(value) else None
-    return value
