@@ -33,6 +33,7 @@ _GAUGE = (
 AUTO = "auto"  # in place of masks: find the carrier
 _OUTPUTS = (
     "trajectory.tum",
+    "coarse.tum",
     "poses.csv",
     "points.ply",
     "config.toml",
@@ -198,6 +199,9 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
     out = store.root
     trajectory = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
     read.write_tum(out / "trajectory.tum", trajectory)
+    (out / "coarse.tum").unlink(missing_ok=True)
+    if (coarse.sources != PoseSource.NONE).any():
+        read.write_tum(out / "coarse.tum", Trajectory(frames.timestamps, coarse.world_T_rigs))
     write_poses(out / "poses.csv", frames, coarse, reconstruction)
     write_points(out / "points.ply", reconstruction)
     atomic_write(out / "config.toml", lambda path: path.write_text(to_toml(settings)))

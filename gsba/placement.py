@@ -92,6 +92,34 @@ class Placement:
         path.write_text(text, encoding="utf-8")
 
 
+def read_placement(path: Path) -> Placement:
+    """Where an export is, by the transform.json in it.
+
+    Raises:
+        GsbaError: no such file, or none that gsba wrote.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        scale, rotation = float(content["scale"]), np.array(content["rotation"], np.float64)
+        origin, up = content["origin"], content["up"]
+        if origin is not None:
+            origin = tuple(float(origin[key]) for key in ("latitude", "longitude", "altitude"))
+        return Placement(
+            scale,
+            rotation.reshape(3, 3),
+            np.array(content["translation"], np.float64).reshape(3),
+            str(content["unit"]),
+            up,
+            np.array(content["offset"], np.float64).reshape(3),
+            origin,
+            content["grounds"],
+        )
+    except OSError as error:
+        raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, TypeError, KeyError):
+        raise GsbaError(f"{path}: not a transform.json of gsba: export again") from None
+
+
 def place(
     reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings
 ) -> Placement:
