@@ -103,7 +103,7 @@ def read_placement(path: Path) -> Placement:
         scale, rotation = float(content["scale"]), np.array(content["rotation"], np.float64)
         origin, up = content["origin"], content["up"]
         if origin is not None:
-            origin = tuple(float(origin[key]) for key in ("latitude", "longitude", "altitude"))
+            origin = origin["latitude"], origin["longitude"], origin["altitude"]
         return Placement(
             scale,
             rotation.reshape(3, 3),

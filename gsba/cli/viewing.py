@@ -18,8 +18,8 @@ def view(
     from gsba.view import load_scene, serve
 
     shown = serve(load_scene(run), port)
-    typer.echo(f"http://127.0.0.1:{shown.server.get_port()} shows {run}; Ctrl-C ends it.")
     try:
+        typer.echo(f"http://127.0.0.1:{shown.server.get_port()} shows {run}; Ctrl-C ends it.")
         while True:
             time.sleep(3600)
     except KeyboardInterrupt:
