@@ -256,7 +256,7 @@ class PlacementSettings(_Settings):
     up: Literal["auto", "none"] = "none"  # auto: gravity from rigs and vertical edges
     length: float | None = Field(default=None, gt=0)  # metres between the two of `between`
     between: tuple[str, str] | None = None  # frames by name, or points "x,y,z" of the run's world
-    gps: str | None = None  # file of positions: metres, east-north-up
+    gps: str | None = None  # file of positions, or "exif": metres, east-north-up
     align: str | None = None  # TUM file of true poses: its world and unit
 
 

@@ -18,7 +18,7 @@ from gsba.line import ExtraFactors, Line
 from gsba.log import GsbaError
 from gsba.misfit import refuse_useless
 from gsba.motion import describe
-from gsba.placement import Placement, check, place
+from gsba.placement import EXIF, Placement, check, place
 from gsba.report import build_report, take_notes, write_poses, write_report
 from gsba.report_html import write_html
 from gsba.store import RunStore, atomic_write, fingerprint, load_stage
@@ -104,6 +104,7 @@ def refine(
         frame_set, fresh = read.scan(out / "frames", masks=mask_files), False
     else:
         frame_set = read.scan(frames, timestamps, fps, mask_files)
+    check(settings.placement, frame_set)
     coarse = _coarse(frame_set, given, settings)
     with RunStore(out, origin, fresh) as store:
         if masks == AUTO:
@@ -170,6 +171,8 @@ def _extract(
 ) -> None:
     """Write the frames of the video that a run is about to `out`/frames."""
     chosen = settings.video
+    if settings.placement.gps == EXIF:
+        raise GsbaError("--gps exif: a video's frames have no tags; give positions as a file")
     if fps is not None:
         if not fps > 0:
             raise GsbaError(f"--fps {fps}: must be a positive number of frames per second")
