@@ -1,4 +1,4 @@
-"""GPS tags of pictures, written here byte by byte, and by Pillow where there is one."""
+"""GPS tags of pictures, written here byte by byte, and by Pillow."""
 
 import struct
 from collections.abc import Sequence
@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from test_placement import ORIGIN, _frames, _geodetic, _level, _result
 from typer.testing import CliRunner
 
@@ -124,22 +125,24 @@ def test_no_fix_is_no_position(tmp_path: Path) -> None:
 
 def test_damage_is_told_apart_from_absence(tmp_path: Path) -> None:
     whole = _tiff(MUNICH, "<")
-    for cut in range(2, len(whole)):  # wherever it ends
+    for cut in range(8, len(whole)):  # wherever it ends behind its header
         path = _jpeg(tmp_path / "cut.jpg", whole[:cut])
         with pytest.raises(ValueError, match="damaged EXIF data"):
             gps_of(path)
     endless = whole[:8] + b"\xff\xff" + whole[10:]
     with pytest.raises(ValueError, match="damaged EXIF data"):
         gps_of(_jpeg(tmp_path / "endless.jpg", endless))
+    (tmp_path / "text.jpg").write_text("no picture")
+    with pytest.raises(GsbaError, match=r"text\.jpg: is no picture"):
+        gps_of(tmp_path / "text.jpg")
 
 
-def test_pillow_writes_what_is_read(tmp_path: Path) -> None:
-    image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
-    exif = image.Exif()
+def test_what_pillow_writes_is_read(tmp_path: Path) -> None:
+    exif = Image.Exif()
     thirds = (Fraction(48), Fraction(8), Fraction(13754, 1000))
     exif[0x8825] = {1: "N", 2: thirds, 3: "W", 4: (11.0, 34.0, 34.0464), 5: b"\x01", 6: 12.5}
     for name in ("a.jpg", "a.png"):
-        image.fromarray(PIXELS).save(tmp_path / name, exif=exif)
+        Image.fromarray(PIXELS).save(tmp_path / name, exif=exif)
         wanted = (48 + 8 / 60 + 13.754 / 3600, -(11 + 34 / 60 + 34.0464 / 3600), -12.5)
         assert gps_of(tmp_path / name) == pytest.approx(wanted, abs=1e-8)
 
