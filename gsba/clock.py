@@ -8,7 +8,6 @@ clock than the given one is believed only where turns pin it down, where no thir
 as well, and where it explains the images markedly better.
 """
 
-import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,8 +16,6 @@ import numpy as np
 from gsba.clock_fit import ClockFit, merged, noise
 from gsba.motion import Steps
 from gsba.types import Trajectory
-
-logger = logging.getLogger(__name__)
 
 MIN_STEPS = 5  # fewer cannot tell a clock
 _KNOWN, _KNOWN_S = 0.25, 0.05  # of the frames' interval, and seconds: a clock less sure is unknown
@@ -42,6 +39,11 @@ class Clock:
     def times(self, timestamps: np.ndarray) -> np.ndarray:
         """Times (n,) on the trajectory's clock of times (n,) on the frames'."""
         return self.start + self.offset + self.rate * (timestamps - self.start)
+
+    def on_frames(self, trajectory: Trajectory) -> Trajectory:
+        """A trajectory with its times on the frames' clock."""
+        times = self.start + (trajectory.timestamps - self.start - self.offset) / self.rate
+        return Trajectory(times, trajectory.world_T_rigs)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +79,11 @@ def estimate(
     given = Clock(float(timestamps[0]), offset, 1.0)
     turns = merged(timestamps, found.f_T_nexts[:, :3, :3], found.verified)
     if len(turns) < MIN_STEPS:
-        why = f"the clock could not be checked: {len(turns)} steps of images to compare"
-        return ClockEstimate(given, given, *(4 * [np.nan]), "unclear", why)
+        nan, why = (
+            float("nan"),
+            f"the clock could not be checked: {len(turns)} steps of images to compare",
+        )
+        return ClockEstimate(given, given, nan, nan, nan, nan, "unclear", why)
     fit = ClockFit(turns, trajectory)
     start = np.array([offset, 1.0])
     interval = float(np.median(np.diff(timestamps)))
@@ -150,7 +155,8 @@ def _judged(
     else:
         verdict, note = "corrected", _correction(found, offset_sigma, rate_sigma, degrees)
     used = found if verdict == "corrected" else given
-    return ClockEstimate(used, found, offset_sigma, rate_sigma, *degrees, verdict, note)
+    before, after = degrees
+    return ClockEstimate(used, found, offset_sigma, rate_sigma, before, after, verdict, note)
 
 
 def _correction(found: Clock, offset_sigma: float, rate_sigma: float, degrees: list[float]) -> str:
@@ -165,15 +171,16 @@ def _correction(found: Clock, offset_sigma: float, rate_sigma: float, degrees: l
 
 
 def describe(estimate: ClockEstimate) -> dict[str, Any]:
-    """The estimate for the report."""
+    """The estimate for the report: seconds, and degrees of a step's rotation."""
     return {
         "verdict": estimate.verdict,
         "offset_s": estimate.clock.offset,
         "rate": estimate.clock.rate,
         "found_offset_s": estimate.found.offset,
-        "found_offset_sigma_s": estimate.offset_sigma,
+        "offset_sigma_s": estimate.offset_sigma,
         "found_rate": estimate.found.rate,
-        "found_rate_sigma": estimate.rate_sigma,
-        "disagreement_deg": [estimate.before_deg, estimate.after_deg],
+        "rate_sigma": estimate.rate_sigma,
+        "disagreement_given_deg": estimate.before_deg,
+        "disagreement_found_deg": estimate.after_deg,
         "note": estimate.note,
     }
