@@ -16,6 +16,8 @@ class ReadSettings(_Settings):
         default=10.0, gt=0
     )  # longer gaps are still filled, but reported
     clock_offset_s: float | None = None  # s to add to frame times; None = clocks agree or one fits
+    clock: Literal["auto", "given"] = "auto"  # auto: corrected by how the camera turns, where sure
+    max_clock_shift_s: float = Field(default=10.0, gt=0)  # furthest that the correction may go
 
 
 class VideoSettings(_Settings):

@@ -24,6 +24,7 @@ from gsba import (
     tracks,
 )
 from gsba.adjust import Adjustment
+from gsba.clock import ClockEstimate
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
 from gsba.matching import MatchContext, SearchableFrames
@@ -66,9 +67,10 @@ class Line:
         photometric.check(frames, settings)
         self.rig = cubemap.rig_for(frames, settings.cubemap)
         self.custom = None if extra_factors is None else uuid.uuid4().hex  # resumes nothing
-        self.extra = list(extra_factors(coarse)) if extra_factors is not None else []
         self.trust: Trust | None = None
-        self._set_priors()
+        self.clock: ClockEstimate | None = None
+        self._make_extra = extra_factors or (lambda _: ())
+        self.follow(coarse)
         self.counts: dict[str, list[Counts]] = {}
         self.solutions: dict[str, Adjustment] = {}
         self.undone: list[str] = []  # solutions that were not taken
@@ -99,6 +101,11 @@ class Line:
             self.num_threads,
         )
 
+    def follow(self, coarse: CoarsePoses) -> None:
+        """Start from these poses, and hold to them."""
+        self.coarse, self.extra = coarse, list(self._make_extra(coarse))
+        self._set_priors()
+
     def _set_priors(self) -> None:
         """What the trajectory says, as far as it is trusted, and the caller's own factors."""
         coarse, priors, trust = self.coarse.world_T_rigs, self.settings.priors, self.trust
@@ -117,17 +124,17 @@ class Line:
         trusted = self.coarse if self.trust is None else self.trust
         return adjust.start(trusted.world_T_rigs)
 
-    def match_neighbours(self) -> VerifiedPairs:
+    def match_neighbours(self, name: str = "neighbours") -> VerifiedPairs:
         """Verified matches of frames next to one another in time."""
         if (self.coarse.sources == PoseSource.NONE).all():
             return recovery.nothing_verified()
         pairs = self._stage(
-            "neighbours",
+            name,
             self._matching(),
             lambda: frontend.match_neighbours(self.context, self.start()),
             VerifiedPairs,
         )
-        self.counts["neighbours"] = [pairs.counts]
+        self.counts[name] = [pairs.counts]
         return pairs
 
     def judge(self, guided: VerifiedPairs) -> VerifiedPairs:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba.blame import chained, false_frames
+from gsba.blame import chained, false_frames, limits
 from gsba.config import PriorSettings, VerifySettings
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.types import CoarsePoses, FrameSet, Keypoints, PoseSource, VerifiedPairs
@@ -225,7 +225,14 @@ def judge(
         start = _chain(coarse.world_T_rigs, chosen, own)
     else:
         start = coarse.world_T_rigs
-    named = false_frames(wrong, slam, chosen, own, verify)
+    seen = slam.copy()
+    seen[found.verified, :3, :3] = found.f_T_nexts[found.verified, :3, :3]
+    seen[found.directed, :3, 3] = (
+        lengths[found.directed, None] * found.f_T_nexts[found.directed, :3, 3]
+    )
+    named = false_frames(
+        wrong, slam, chosen, own, limits(slam, seen, known & found.directed, verify)
+    )
     return Trust(start, wrong, named, unseen, lengths, False)
 
 

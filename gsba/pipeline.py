@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba import read, video
+from gsba import read, timing, video
 from gsba.adjust import Adjustment
 from gsba.carrier import Carrier, find_carrier, write_carrier
 from gsba.config import RefineSettings
@@ -22,7 +22,15 @@ from gsba.placement import EXIF, Placement, check, place
 from gsba.report import build_report, take_notes, write_poses, write_report
 from gsba.report_html import write_html
 from gsba.store import RunStore, atomic_write, fingerprint, load_stage
-from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, Reconstruction, Trajectory
+from gsba.types import (
+    CoarsePoses,
+    Counts,
+    FrameSet,
+    PoseSource,
+    Reconstruction,
+    Trajectory,
+    VerifiedPairs,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -110,12 +118,13 @@ def refine(
         if masks == AUTO:
             frame_set = _without_carrier(store, frame_set)
         line = Line(store, frame_set, coarse, settings, extra_factors)
-        return _write(line, line.reconstruct(_solve(line, settings)))
+        guided = timing.match_neighbours(line, given, _coarse)
+        return _write(line, line.reconstruct(_solve(line, guided, settings)))
 
 
-def _solve(line: Line, settings: RefineSettings) -> Adjustment:
+def _solve(line: Line, guided: VerifiedPairs, settings: RefineSettings) -> Adjustment:
     """All stages from the coarse trajectory to the last solution."""
-    neighbours, rounds = line.judge(line.match_neighbours()), settings.rounds
+    neighbours, rounds = line.judge(guided), settings.rounds
     solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)
     adjacent = line.match_along_epipolars(solved)
     near = line.match_known_points("near", solved, loops_closed=False)
@@ -214,6 +223,7 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
     undone = [n for n, s in line.solutions.items() if not all(r.accepted for r in s.rounds)]
     undone += [name for name in line.undone if name not in undone]
     judgement, findings = describe(line.trust, frames) if line.trust else ({}, [])
+    judgement, findings = timing.describe(line.clock, judgement, findings)
     notes = findings + take_notes(frames, coarse, reconstruction, undone, line.frame_weights)
     report = build_report(
         settings=settings,

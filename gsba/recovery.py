@@ -4,15 +4,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsba import misfit, motion, pairs
+from gsba import clock, misfit, motion, pairs
+from gsba.clock import ClockEstimate
 from gsba.config import RefineSettings
 from gsba.frontend import verified
 from gsba.geometry import inverse
 from gsba.matching import Gate, MatchContext
 from gsba.motion import Trust
-from gsba.types import CoarsePoses, Counts, Keypoints, Matches, VerifiedPairs
+from gsba.types import CoarsePoses, Counts, Keypoints, Matches, Trajectory, VerifiedPairs
 
 _PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
+_MANY_LOST = 0.2  # part of the neighbours
 _ANYWHERE = Gate(np.pi, 1e3, np.pi)
 
 
@@ -67,6 +69,34 @@ def run(
         {"no common geometry": len(chosen) - len(neighbours.matches.pairs)},
     )
     return Recovered(VerifiedPairs(neighbours.matches, neighbours.f0_T_f1s, counts), trust)
+
+
+def check_clock(
+    context: MatchContext,
+    guided: VerifiedPairs,
+    coarse: CoarsePoses,
+    timestamps: np.ndarray,
+    trajectory: Trajectory,
+) -> ClockEstimate:
+    """Whether the trajectory turns when the images do, or at other times.
+
+    Args:
+        context: of the run.
+        guided: neighbours verified under the trajectory's guidance. Where it lost many, whole
+            panoramas are compared: a clock that is off loses the turns, which tell it.
+        coarse: the trajectory at the frames' times.
+        timestamps: (F,) seconds.
+        trajectory: all its entries.
+    """
+    settings, intervals = context.settings, np.diff(timestamps)
+    close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
+    chosen = np.column_stack([close, close + 1])
+    lost = _missing(chosen, guided)
+    if len(lost) > _MANY_LOST * len(chosen):
+        guided = _join([guided, match_anywhere(context, lost)])
+    steps = motion.steps(guided, context.keypoints, settings.verify)
+    reach = settings.read.max_clock_shift_s
+    return clock.estimate(timestamps, steps, trajectory, coarse.time_offset, reach)
 
 
 def _match_along(

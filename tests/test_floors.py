@@ -15,15 +15,15 @@ import gsba
 ROOT = Path(__file__).parents[1]
 FLOORS = (
     {"factors"},
-    {"", "types", "geometry", "config", "config_file", "log"},
-    {"rig", "records", "run_folder", "search", "store", "read", "panorama", "views"},
-    {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
-    | {"graph", "optimize", "filter", "align", "splat", "patch_grid"},
-    {"adjust", "blame", "frontend", "learned", "misfit", "motion", "photometric", "places"}
-    | {"reconstruction", "recovery", "splat_align", "splatting"},
-    {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"}
-    | {"alignment", "carrier", "gravity", "placement"},
-    {"demo", "extraction", "line", "pipeline", "view"},
+    {"", "config", "config_file", "geometry", "log", "types"},
+    {"panorama", "read", "records", "rig", "run_folder", "search", "store", "views"},
+    {"align", "cubemap", "features", "filter", "graph", "matching", "optimize", "pairs"}
+    | {"patch_grid", "splat", "tracks", "triangulate", "verify"},
+    {"adjust", "blame", "clock", "clock_fit", "frontend", "learned", "misfit", "motion"}
+    | {"photometric", "places", "reconstruction", "recovery", "splat_align", "splatting"},
+    {"alignment", "carrier", "evaluate", "evaluate_splat", "export", "gravity", "induced"}
+    | {"placement", "report", "report_html", "video"},
+    {"demo", "extraction", "line", "pipeline", "timing", "view"},
     {"cli"},
     {"benchmarks"},
 )
