@@ -1,7 +1,6 @@
 """Features of every frame of a run, stored frame by frame."""
 
 from functools import partial
-from pathlib import Path
 
 from gsba import cubemap, features
 from gsba.config import RefineSettings
@@ -20,11 +19,11 @@ def run(
     if chosen.extractor == "sift":
         make_extractor = partial(features.SiftExtractor, chosen)
     else:
-        from gsba.learned import LearnedExtractor, check_weights
+        from gsba.learned import LearnedExtractor, find_weights
 
-        check_weights(chosen)
-        make_extractor = partial(LearnedExtractor, chosen)
-        weights = fingerprint([Path(chosen.weights or "")])
+        found = find_weights(settings)  # of the matcher too: before the work, not after
+        make_extractor = partial(LearnedExtractor, chosen, found["features"])
+        weights = fingerprint([found["features"]])
 
     def compute(name: str) -> Features:
         images, masks = cubemap.load(frames, index[name], rig)
@@ -33,5 +32,6 @@ def run(
     inputs = {
         name: fingerprint([*frames.paths[f], frames.mask_paths[f]]) for name, f in index.items()
     }
-    key = [settings.cubemap, settings.features, weights]
+    relevant = chosen.model_dump(exclude={"weights", "accept_noncommercial", "download"})
+    key = [settings.cubemap, relevant, weights]
     return store.per_frame("features", key, inputs, compute, Features, num_threads=num_threads)

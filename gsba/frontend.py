@@ -128,7 +128,8 @@ def match_known_points(
         chosen = np.concatenate([chosen, loops])
     gates = [_point_gate(np.deg2rad(settings.pairs.point_deg))] * len(chosen)
     known = points_by_keypoint(solved, keypoints)
-    return matching.run(chosen, poses, gates, frames, settings.matching, num_threads, known)
+    search = matching.guided  # where a point is known this well, no network knows better
+    return matching.run(chosen, poses, gates, frames, settings.matching, num_threads, known, search)
 
 
 def median_depth(solved: Adjustment) -> float:

@@ -130,7 +130,9 @@ def match_anywhere(
 
     def verified(among: SearchableFrames, some: np.ndarray) -> VerifiedPairs:
         gates = [_ANYWHERE] * len(some)
-        found = matching.run(some, nowhere, gates, among, settings.matching, num_threads)
+        found = matching.run(
+            some, nowhere, gates, among, settings.matching, num_threads, matcher=matching.guided
+        )  # nothing predicts which faces a learned matcher should compare
         return verify.run(found, keypoints, None, None, settings.verify, settings.seed)
 
     first = verified(strongest, chosen)
