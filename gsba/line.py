@@ -17,6 +17,7 @@ from gsba import (
     features,
     frontend,
     graph,
+    learned,
     panorama,
     photometric,
     places,
@@ -26,7 +27,7 @@ from gsba import (
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
-from gsba.matching import SearchableFrames
+from gsba.matching import MatchContext, SearchableFrames
 from gsba.motion import Trust
 from gsba.photometric import PhotometricResult
 from gsba.places import Closed, connected
@@ -78,7 +79,8 @@ class Line:
         start = coarse.world_T_rigs.tolist(), settings.read
         inputs = [fingerprint(paths), frames.timestamps.tolist(), *start]
         store.stage("frames", inputs, lambda: frames, FrameSet)
-        found = extraction.run(store, frames, self.rig, settings, self.num_threads)
+        weights = learned.find_weights(settings)
+        found = extraction.run(store, frames, self.rig, settings, self.num_threads, weights)
 
         def load(frame: int) -> Features:
             return found[frames.names[frame]]
@@ -91,8 +93,15 @@ class Line:
         self.observed = self.keypoints  # those that the latest solution is made of
         self.aligned: np.ndarray | None = None  # which of them patches have confirmed
         self.greys = panorama.Greys(frames, settings.align.max_width)
-        self.searchable = SearchableFrames(load)
-        self.strongest = SearchableFrames(load, settings.pairs.strongest_per_face)
+        self.context = MatchContext(
+            SearchableFrames(load),
+            SearchableFrames(load, settings.pairs.strongest_per_face),
+            self.keypoints,
+            settings,
+            self.num_threads,
+            learned.make_matcher(settings, weights, self.rig.size),
+        )
+        self.compared = fingerprint(path for stage, path in weights.items() if stage == "matching")
 
     def _set_priors(self) -> None:
         """What the trajectory says, as far as it is trusted, and the caller's own factors."""
@@ -119,14 +128,7 @@ class Line:
         pairs = self._stage(
             "neighbours",
             self._matching(),
-            lambda: frontend.match_neighbours(
-                self.searchable,
-                self.strongest,
-                self.keypoints,
-                self.start(),
-                self.settings,
-                self.num_threads,
-            ),
+            lambda: frontend.match_neighbours(self.context, self.start()),
             VerifiedPairs,
         )
         self.counts["neighbours"] = [pairs.counts]
@@ -137,16 +139,7 @@ class Line:
         recovered = self._stage(
             "steps",
             [self._matching(), self.settings.priors],
-            lambda: recovery.run(
-                self.searchable,
-                self.strongest,
-                self.keypoints,
-                guided,
-                self.coarse,
-                self.frames.timestamps,
-                self.settings,
-                self.num_threads,
-            ),
+            lambda: recovery.run(self.context, guided, self.coarse, self.frames.timestamps),
             Recovered,
         )
         pairs = recovered.neighbours
@@ -167,9 +160,7 @@ class Line:
         pairs = self._stage(
             name,
             self._matching(),
-            lambda: frontend.match_loops(
-                self.searchable, self.keypoints, solved, self.settings, self.num_threads
-            ),
+            lambda: frontend.match_loops(self.context, solved),
             VerifiedPairs,
         )
         self.counts[name] = [pairs.counts]
@@ -189,14 +180,7 @@ class Line:
         closed = self._stage(
             "places",
             self._matching(),
-            lambda: places.run(
-                self.strongest,
-                self.keypoints,
-                solved,
-                unseen,
-                self.settings,
-                self.num_threads,
-            ),
+            lambda: places.run(self.context, solved, unseen),
             Closed,
         )
         self.counts["places"] = [closed.counts]
@@ -213,9 +197,7 @@ class Line:
         return self._stage(
             "adjacent",
             self._matching(),
-            lambda: frontend.match_along_epipolars(
-                self.searchable, solved, self.settings, self.num_threads
-            ),
+            lambda: frontend.match_along_epipolars(self.context, solved),
             Matches,
         )
 
@@ -224,14 +206,7 @@ class Line:
         return self._stage(
             name,
             self._matching(),
-            lambda: frontend.match_known_points(
-                self.searchable,
-                self.keypoints,
-                solved,
-                self.settings,
-                self.num_threads,
-                loops_closed,
-            ),
+            lambda: frontend.match_known_points(self.context, solved, loops_closed),
             Matches,
         )
 
@@ -335,7 +310,8 @@ class Line:
 
     def _matching(self) -> list[object]:
         settings = self.settings
-        return [settings.pairs, settings.matching, settings.verify, settings.seed]
+        how = settings.matching.model_dump(exclude={"weights"}), self.compared
+        return [settings.pairs, how, settings.verify, settings.seed]
 
     def _solving(self) -> list[object]:
         settings = self.settings

@@ -14,12 +14,12 @@ from typing import Protocol
 
 import numpy as np
 
-from gsba.config import MatchingSettings
+from gsba.config import MatchingSettings, RefineSettings
 from gsba.geometry import inverse
 from gsba.log import track
 from gsba.rig import RIG_R_FACE, owner_faces
 from gsba.search import HEAD, Cells, Limits, Rows, passes, search
-from gsba.types import Features, Matches
+from gsba.types import Features, Keypoints, Matches
 
 _CELLS = 8  # cells along a face's side
 _NO_MATCHES = np.zeros((0, 2), np.int32)
@@ -227,7 +227,6 @@ class SearchableFrames:
         load: reads the features of a frame.
         strongest: keypoints of a face to match, None for all.
         capacity: frames kept in memory.
-        matcher: compares two frames, None for `guided`.
     """
 
     def __init__(
@@ -235,7 +234,6 @@ class SearchableFrames:
         load: Callable[[int], Features],
         strongest: int | None = None,
         capacity: int = 96,
-        matcher: Matcher | None = None,
     ) -> None:
         first = load(0)
         axes = principal_axes(first.descriptors) if len(first) else None
@@ -243,7 +241,6 @@ class SearchableFrames:
         self._features = lru_cache(max(capacity // 8, 2))(load)
         self._lock = Lock()
         self.strongest = strongest
-        self.matcher = matcher or guided
 
     def __getitem__(self, frame: int) -> Searchable:
         with self._lock:
@@ -268,6 +265,34 @@ def guided(
     return match_pair(first, second, f0_T_f1, gate, settings, points_f0)
 
 
+@dataclass(frozen=True, slots=True)
+class MatchContext:
+    """What a run's frames are matched by: their features, and how."""
+
+    frames: SearchableFrames
+    strongest: SearchableFrames  # the same with the strongest keypoints only
+    keypoints: Keypoints  # of all frames
+    settings: RefineSettings  # of pairs, matching and verification
+    num_threads: int  # pairs matched at a time
+    matcher: Matcher = guided  # compares two frames
+
+    def match(
+        self,
+        pairs: np.ndarray,
+        world_T_rigs: np.ndarray,
+        gates: Sequence[Gate],
+        points_rig: Sequence[np.ndarray] | None = None,
+        *,
+        strongest: bool = False,
+        guided_only: bool = False,
+    ) -> Matches:
+        """Match frame pairs as `run` does, on demand by guided search whatever the matcher."""
+        frames = self.strongest if strongest else self.frames
+        how = self.settings.matching, self.num_threads
+        matcher = guided if guided_only else self.matcher
+        return run(pairs, world_T_rigs, gates, frames, *how, points_rig, matcher)
+
+
 def run(
     pairs: np.ndarray,
     world_T_rigs: np.ndarray,
@@ -276,7 +301,7 @@ def run(
     settings: MatchingSettings,
     num_threads: int,
     points_rig: Sequence[np.ndarray] | None = None,
-    matcher: Matcher | None = None,
+    matcher: Matcher = guided,
 ) -> Matches:
     """Match frame pairs.
 
@@ -288,15 +313,14 @@ def run(
         settings: similarity and distinctiveness.
         num_threads: pairs matched at a time.
         points_rig: (F) arrays (K_f, 3), see `match_pair`; frame 0 of a pair must be known.
-        matcher: instead of the frames' own.
+        matcher: compares two frames.
     """
-    compare = matcher or frames.matcher
     f0_T_f1s = inverse(world_T_rigs[pairs[:, 0]]) @ world_T_rigs[pairs[:, 1]]
 
     def match(p: int) -> np.ndarray:
         f0, f1 = (int(f) for f in pairs[p])
         points = None if points_rig is None else points_rig[f0]
-        return compare(frames, (f0, f1), f0_T_f1s[p], gates[p], settings, points)
+        return matcher(frames, (f0, f1), f0_T_f1s[p], gates[p], settings, points)
 
     order = np.lexsort((pairs[:, 1], pairs[:, 0]))  # pairs that share frames follow one another
     rows = [_NO_MATCHES] * len(pairs)

@@ -174,7 +174,8 @@ def _transparent_lightglue(extractor: str) -> dict:
             if ".ffn.3." in name:
                 value.zero_()
             elif "final_proj" in name:
-                value.copy_(400 * torch.eye(len(value)) if value.ndim == 2 else 0 * value)
+                gain = 4000 if extractor == "xfeat" else 400  # what tells descriptors apart
+                value.copy_(gain * torch.eye(len(value)) if value.ndim == 2 else 0 * value)
             elif "matchability" in name:
                 value.fill_(0.0 if value.ndim == 2 else 10.0)
             elif "input_proj" in name:

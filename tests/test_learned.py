@@ -3,10 +3,13 @@
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from learned_networks import DIMENSIONS, EXTRACTORS, OfficialSuperPoint, save_extractors, torch
+from scipy.ndimage import map_coordinates
 
+import gsba.learned
 from gsba import refine
 from gsba.config import FeatureSettings, RefineSettings
 from gsba.learned import LearnedExtractor, find_weights
@@ -74,7 +77,7 @@ def test_a_shifted_image_shifts_its_keypoints(weights: dict[str, Path], name: st
     same = distances.min(axis=1) < 0.02
     assert len(same) > 10 and same.mean() > 0.7
     likeness = (before.descriptors[inside] * after.descriptors[nearest]).sum(axis=1)
-    assert (likeness[same] > 0.99).mean() > 0.9
+    assert (likeness[same] > 0.9).mean() > 0.9
 
 
 @pytest.mark.parametrize("name", EXTRACTORS)
@@ -120,26 +123,24 @@ def test_superpoint_is_that_of_the_paper(weights: dict[str, Path]) -> None:
     image = _image(128)
     found = _extractor(weights, "superpoint", 1000)(image, None)
     assert found.scores is not None
-    grey = image.astype(np.float64) @ [0.299, 0.587, 0.114]
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
     with torch.inference_mode():
-        heat, dense = model(torch.from_numpy(np.rint(grey).astype(np.float32) / 255)[None, None])
+        heat, dense = model(torch.from_numpy(grey)[None, None])
     columns, rows = (found.pixels - 0.5).astype(int).T
-    # OpenCV's grey is rounded in fixed point: a grey value apart at times.
-    np.testing.assert_allclose(found.scores, heat.numpy()[rows, columns], rtol=1e-2)
-    around = [
+    np.testing.assert_allclose(found.scores, heat.numpy()[rows, columns], rtol=1e-5)
+    for beside in (heat.numpy()[rows, columns - 1], heat.numpy()[rows - 1, columns]):
+        assert not np.isclose(found.scores, beside, rtol=1e-4).any()
+    around = [  # a few lie beside hotter ones that others have suppressed
         heat.numpy()[max(r - 4, 0) : r + 5, max(c - 4, 0) : c + 5].max()
         for r, c in zip(rows, columns, strict=True)
     ]
-    np.testing.assert_allclose(found.scores, around, rtol=1e-2)
-    # Descriptors lie on a grid of 8 pixels, the first at 3.5 from the first pixel's centre.
-    at = (found.pixels - 4) / 8
-    inside = ((at > 0) & (at < 15)).all(axis=1)
-    near = np.rint(at[inside]).astype(int)
-    close = np.abs(at[inside] - near).max(axis=1) < 0.1
-    assert close.sum() >= 3
-    expected = dense.numpy()[:, near[close, 1], near[close, 0]].T
-    likeness = (found.descriptors[inside][close] * expected).sum(axis=1)
-    assert (likeness > 0.99).all()
+    assert np.isclose(found.scores, around, rtol=1e-5).mean() > 0.8
+    # Descriptors between those of cells, the first at 3.5 and, as published, the last at 127.
+    at = (found.pixels - 4) * (15 / 123.5)
+    inside = ((at >= 0) & (at <= 15)).all(axis=1)
+    sampled = [map_coordinates(c, at[inside][:, ::-1].T, order=1) for c in dense.numpy()]
+    expected = np.array(sampled).T / np.linalg.norm(sampled, axis=0)[:, None]
+    np.testing.assert_allclose(found.descriptors[inside], expected, atol=1e-4)
 
 
 def test_weights_of_transformers_are_the_same_network(
@@ -187,6 +188,7 @@ def test_missing_library_is_one_line(
     _load.cache_clear()
     for ours in ("detectors", "magicleap"):
         monkeypatch.delitem(sys.modules, f"gsba.learned.{ours}", raising=False)
+        monkeypatch.delattr(gsba.learned, ours, raising=False)
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(GsbaError, match=r"pip install 'gsba\[learned\]'"):
         _extractor(weights, name)

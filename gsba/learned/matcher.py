@@ -1,5 +1,6 @@
 """Learned matchers between the faces of two frames that see the same things."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,15 @@ from gsba.config import MatchingSettings, RefineSettings
 from gsba.features import FaceKeypoints
 from gsba.learned.interfaces import FaceNetwork
 from gsba.learned.weights import missing_library
-from gsba.matching import Gate, Matcher, SearchableFrames, one_to_one, strongest_of, within_gate
+from gsba.matching import (
+    Gate,
+    Matcher,
+    SearchableFrames,
+    guided,
+    one_to_one,
+    strongest_of,
+    within_gate,
+)
 from gsba.rig import owner_faces
 from gsba.types import FACES, Features
 
@@ -17,26 +26,28 @@ _MIN_SHARE = 0.1  # of a face's keypoints that the other one must be expected to
 _MIN_KEYPOINTS = 8  # on either face
 
 
-def make_matcher(settings: RefineSettings, weights: Path, size: int) -> Matcher:
-    """The learned matcher that settings choose.
+def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: int) -> Matcher:
+    """The matcher that settings choose: our own search, or a learned one.
 
     Args:
         settings: `matching.matcher` and `features.extractor`.
-        weights: file of the matcher.
+        weights: files of learned networks (`find_weights`).
         size: pixels of a face.
 
     Raises:
         GsbaError: weights of another network, or a library is not installed.
     """
     name = settings.matching.matcher
+    if name == "guided":
+        return guided
     try:
         if name == "superglue":
             from gsba.learned.magicleap import SuperGlue
 
-            return FaceMatcher(SuperGlue(weights), size)
+            return FaceMatcher(SuperGlue(weights["matching"]), size)
         from gsba.learned.lightglue import LightGlue
 
-        return FaceMatcher(LightGlue(settings.features.extractor, weights), size)
+        return FaceMatcher(LightGlue(settings.features.extractor, weights["matching"]), size)
     except ImportError:
         raise missing_library(f"matching.matcher = {name}") from None
 
