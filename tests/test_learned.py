@@ -12,6 +12,7 @@ from scipy.ndimage import map_coordinates
 import gsba.learned
 from gsba import refine
 from gsba.config import FeatureSettings, RefineSettings
+from gsba.config_file import load_config
 from gsba.learned import LearnedExtractor, find_weights
 from gsba.learned.extractor import _load
 from gsba.log import GsbaError
@@ -290,6 +291,28 @@ def test_weights_are_fetched_only_when_asked(
     monkeypatch.setattr(module.urllib.request, "urlopen", offline)
     with pytest.raises(GsbaError, match=r"could not download depth-save\.pth \(no route\); get it"):
         find_weights(_settings("disk", download=True))
+
+
+def test_options_say_where_weights_are(tmp_path: Path) -> None:
+    """A folder is for all, files go before it wherever they stand; a name decides whose it is."""
+    from gsba.cli.refining import _networks
+
+    file, glue = tmp_path / "mine.pth", tmp_path / "aliked_LightGlue.pth"
+    file.touch()
+    glue.touch()
+    for given, expected in (
+        ([tmp_path], (tmp_path, tmp_path)),
+        ([file, tmp_path], (file, tmp_path)),
+        ([tmp_path, glue], (tmp_path, glue)),
+        ([glue, file], (file, glue)),
+        ([], (None, None)),
+    ):
+        settings = load_config(overrides=_networks(given, False, False))
+        found = settings.features.weights, settings.matching.weights
+        assert found == tuple(None if path is None else str(path) for path in expected)
+        assert not settings.features.accept_noncommercial and not settings.features.download
+    chosen = load_config(overrides=_networks(None, True, True)).features
+    assert chosen.accept_noncommercial and chosen.download
 
 
 def test_refine_fails_before_it_starts(case, tmp_path: Path) -> None:
