@@ -48,8 +48,10 @@ class CubemapSettings(_Settings):
 class FeatureSettings(_Settings):
     """Keypoints on faces."""
 
-    extractor: Literal["sift", "aliked", "disk"] = "sift"
-    weights: str | None = None  # file of a learned extractor's weights
+    extractor: Literal["sift", "aliked", "disk", "xfeat", "superpoint"] = "sift"
+    weights: str | None = None  # of a learned extractor: file, or folder with the official file
+    accept_noncommercial: bool = False  # use weights whose licence forbids commercial use
+    download: bool = False  # fetch missing weights from their authors
     max_per_face: int = Field(default=600, ge=16)
     contrast_threshold: float = Field(default=0.02, gt=0)
     sigma_px: float = Field(
@@ -61,8 +63,10 @@ class FeatureSettings(_Settings):
 
 
 class MatchingSettings(_Settings):
-    """Guided descriptor matching."""
+    """Descriptor matching, guided by predicted poses."""
 
+    matcher: Literal["guided", "lightglue", "superglue"] = "guided"
+    weights: str | None = None  # of a learned matcher: file, or folder with the official file
     min_similarity: float = Field(default=0.8, ge=-1, le=1)  # cosine of both descriptors
     max_ratio: float = Field(default=0.9, gt=0, le=1)  # distance to the best over that to the next
 
@@ -289,4 +293,16 @@ class RefineSettings(_Settings):
     def _geometry_first(self) -> "RefineSettings":
         if set(self.factors) == {"photometric"}:
             raise ValueError("factors: photometric starts from bearing or reprojection; add one")
+        return self
+
+    @model_validator(mode="after")
+    def _one_family(self) -> "RefineSettings":
+        matcher, extractor = self.matching.matcher, self.features.extractor
+        fitting = {
+            "lightglue": ("aliked", "disk", "xfeat", "superpoint"),
+            "superglue": ("superpoint",),
+        }.get(matcher, (extractor,))
+        if extractor not in fitting:
+            choices = ", ".join(fitting)
+            raise ValueError(f"matching.matcher = {matcher} needs features.extractor = {choices}")
         return self

@@ -17,6 +17,7 @@ from gsba import (
     features,
     frontend,
     graph,
+    learned,
     panorama,
     photometric,
     places,
@@ -80,7 +81,8 @@ class Line:
         start = coarse.world_T_rigs.tolist(), settings.read
         inputs = [fingerprint(paths), frames.timestamps.tolist(), *start]
         store.stage("frames", inputs, lambda: frames, FrameSet)
-        found = extraction.run(store, frames, self.rig, settings, self.num_threads)
+        weights = learned.find_weights(settings)
+        found = extraction.run(store, frames, self.rig, settings, self.num_threads, weights)
 
         def load(frame: int) -> Features:
             return found[frames.names[frame]]
@@ -99,7 +101,9 @@ class Line:
             self.keypoints,
             settings,
             self.num_threads,
+            learned.make_matcher(settings, weights, self.rig.size),
         )
+        self.compared = fingerprint(path for stage, path in weights.items() if stage == "matching")
 
     def follow(self, coarse: CoarsePoses) -> None:
         """Start from these poses, and hold to them."""
@@ -313,7 +317,8 @@ class Line:
 
     def _matching(self) -> list[object]:
         settings = self.settings
-        return [settings.pairs, settings.matching, settings.verify, settings.seed]
+        how = settings.matching.model_dump(exclude={"weights"}), self.compared
+        return [settings.pairs, how, settings.verify, settings.seed]
 
     def _solving(self) -> list[object]:
         settings = self.settings

@@ -137,7 +137,8 @@ def match_anywhere(
 
     def match(some: np.ndarray, strongest: bool) -> VerifiedPairs:
         gates = [_ANYWHERE] * len(some)
-        found = context.match(some, nowhere, gates, strongest=strongest)
+        # Nothing predicts which faces a learned matcher should compare.
+        found = context.match(some, nowhere, gates, strongest=strongest, guided_only=True)
         return verified(found, None, None, context)
 
     first = match(chosen, strongest=True)

@@ -80,6 +80,7 @@ class Features:
     sigmas_rad: np.ndarray  # (K,) float64, radians, per-axis localisation noise
     descriptors: np.ndarray  # (K, D) uint8 or float32, unit length up to one common factor
     colors: np.ndarray  # (K, 3) uint8, RGB at the keypoint
+    scores: np.ndarray | None = None  # (K,) float32, a network's confidence in each keypoint
 
     def __len__(self) -> int:
         return len(self.faces)
