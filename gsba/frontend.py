@@ -2,70 +2,43 @@
 
 import numpy as np
 
-from gsba import matching, pairs, verify
+from gsba import pairs, verify
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.geometry import inverse
-from gsba.matching import Gate, SearchableFrames
+from gsba.matching import Gate, MatchContext
 from gsba.types import Keypoints, Matches, VerifiedPairs
 
 
-def match_neighbours(
-    frames: SearchableFrames,
-    strongest: SearchableFrames,
-    keypoints: Keypoints,
-    start: Adjustment,
-    settings: RefineSettings,
-    num_threads: int,
-) -> VerifiedPairs:
-    """Match frames next to one another in time, guided by the trajectory, and verify them.
-
-    Args:
-        frames, keypoints: features of all frames.
-        strongest: the same frames with the strongest keypoints only.
-        start: the coarse poses.
-        settings: of matching and verification.
-        num_threads: pairs matched at a time.
-    """
-    world_T_rigs = start.world_T_rigs
+def match_neighbours(context: MatchContext, start: Adjustment) -> VerifiedPairs:
+    """Match frames next to one another in time, guided by the coarse poses, and verify them."""
+    world_T_rigs, settings = start.world_T_rigs, context.settings
     chosen = pairs.adjacent(len(world_T_rigs))
     prior = settings.pairs.prior
     gate = _gate(prior.rotation_deg, prior.direction, settings)
 
-    def match(among: SearchableFrames, pairs_: np.ndarray) -> Matches:
-        gates = [gate] * len(pairs_)
-        return matching.run(pairs_, world_T_rigs, gates, among, settings.matching, num_threads)
-
     # The strongest keypoints are enough to find a pair's geometry, at a tenth of the cost.
-    found = match(strongest, chosen)
+    found = context.match(chosen, world_T_rigs, [gate] * len(chosen), strongest=True)
     scarce = np.flatnonzero(np.diff(found.offsets) < settings.pairs.scarce_matches)
     if len(scarce):
-        found = _replaced(found, scarce, match(frames, chosen[scarce]))
+        again = context.match(chosen[scarce], world_T_rigs, [gate] * len(scarce))
+        found = _replaced(found, scarce, again)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
     exact = np.zeros(len(chosen))
-    return verify.run(
-        found, keypoints, f0_T_f1s, exact, settings.verify, settings.seed, num_threads
-    )
+    return verified(found, f0_T_f1s, exact, context)
 
 
-def match_loops(
-    frames: SearchableFrames,
-    keypoints: Keypoints,
-    solved: Adjustment,
-    settings: RefineSettings,
-    num_threads: int,
-) -> VerifiedPairs:
+def match_loops(context: MatchContext, solved: Adjustment) -> VerifiedPairs:
     """Match frames close in space but far in time, as far as drift leaves them predictable.
 
     Only known points are looked for, as far around their predicted bearing as drift can have moved
     them. What repeats at a distance, arches or columns, is further off than that.
 
     Args:
-        frames, keypoints: features of all frames.
+        context: of the run.
         solved: poses and points that are right between neighbours.
-        settings: of pairs, matching and verification.
-        num_threads: pairs matched at a time.
     """
+    settings, keypoints = context.settings, context.keypoints
     world_T_rigs, positions = solved.world_T_rigs, solved.world_T_rigs[:, :3, 3]
     depth = median_depth(solved)
     chosen = pairs.covisible(positions, depth, settings.pairs)[1]
@@ -77,58 +50,38 @@ def match_loops(
         for drift in drifts
     ]
     known = points_by_keypoint(solved, keypoints)
-    found = matching.run(chosen, world_T_rigs, gates, frames, settings.matching, num_threads, known)
+    found = context.match(chosen, world_T_rigs, gates, known)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
-    return verify.run(
-        found, keypoints, f0_T_f1s, drifts, settings.verify, settings.seed, num_threads
-    )
+    return verified(found, f0_T_f1s, drifts, context)
 
 
-def match_along_epipolars(
-    frames: SearchableFrames, solved: Adjustment, settings: RefineSettings, num_threads: int
-) -> Matches:
-    """Match neighbours in time again, along the epipolar lines of poses that are nearly right.
-
-    Args:
-        frames: features of all frames.
-        solved: the current solution.
-        settings: of pairs and matching.
-        num_threads: pairs matched at a time.
-    """
-    chosen, refined = pairs.adjacent(len(solved.world_T_rigs)), settings.pairs.refined
-    gates = [_gate(refined.rotation_deg, refined.direction, settings)] * len(chosen)
-    poses = solved.world_T_rigs
-    return matching.run(chosen, poses, gates, frames, settings.matching, num_threads)
+def match_along_epipolars(context: MatchContext, solved: Adjustment) -> Matches:
+    """Match neighbours in time again, along the epipolar lines of poses that are nearly right."""
+    poses, refined = solved.world_T_rigs, context.settings.pairs.refined
+    chosen = pairs.adjacent(len(poses))
+    gates = [_gate(refined.rotation_deg, refined.direction, context.settings)] * len(chosen)
+    return context.match(chosen, poses, gates)
 
 
-def match_known_points(
-    frames: SearchableFrames,
-    keypoints: Keypoints,
-    solved: Adjustment,
-    settings: RefineSettings,
-    num_threads: int,
-    loops_closed: bool,
-) -> Matches:
+def match_known_points(context: MatchContext, solved: Adjustment, loops_closed: bool) -> Matches:
     """Match frames further apart only where a known point must appear.
 
     Prediction is the verification: what merely looks alike elsewhere, a column further on, is not
     a candidate.
 
     Args:
-        frames, keypoints: features of all frames.
+        context: of the run.
         solved: the current solution.
-        settings: of pairs and matching.
-        num_threads: pairs matched at a time.
         loops_closed: whether frames far apart in time are predictable too.
     """
-    poses = solved.world_T_rigs
-    near, loops = pairs.covisible(poses[:, :3, 3], median_depth(solved), settings.pairs)
+    poses, settings = solved.world_T_rigs, context.settings.pairs
+    near, loops = pairs.covisible(poses[:, :3, 3], median_depth(solved), settings)
     chosen = near[near[:, 1] - near[:, 0] > 2]
     if loops_closed:
         chosen = np.concatenate([chosen, loops])
-    gates = [_point_gate(np.deg2rad(settings.pairs.point_deg))] * len(chosen)
-    known = points_by_keypoint(solved, keypoints)
-    return matching.run(chosen, poses, gates, frames, settings.matching, num_threads, known)
+    gates = [_point_gate(np.deg2rad(settings.point_deg))] * len(chosen)
+    known = points_by_keypoint(solved, context.keypoints)
+    return context.match(chosen, poses, gates, known)
 
 
 def median_depth(solved: Adjustment) -> float:
@@ -146,6 +99,19 @@ def points_by_keypoint(solved: Adjustment, keypoints: Keypoints) -> list[np.ndar
     offsets = solved.landmarks.points_world[tracks.points] - world_T_rig[:, :3, 3]
     known[keypoints.rows(tracks)] = np.einsum("oji,oj->oi", world_T_rig[:, :3, :3], offsets)
     return np.split(known, keypoints.starts[1:-1])
+
+
+def verified(
+    found: Matches,
+    f0_T_f1s: np.ndarray | None,
+    sigmas: np.ndarray | None,
+    context: MatchContext,
+) -> VerifiedPairs:
+    """Matches whose geometry holds: see `verify.run`."""
+    settings, threads = context.settings, context.num_threads
+    return verify.run(
+        found, context.keypoints, f0_T_f1s, sigmas, settings.verify, settings.seed, threads
+    )
 
 
 def _replaced(matches: Matches, indices: np.ndarray, others: Matches) -> Matches:

@@ -26,7 +26,7 @@ from gsba import (
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
-from gsba.matching import SearchableFrames
+from gsba.matching import MatchContext, SearchableFrames
 from gsba.motion import Trust
 from gsba.photometric import PhotometricResult
 from gsba.places import Closed, connected
@@ -91,8 +91,13 @@ class Line:
         self.observed = self.keypoints  # those that the latest solution is made of
         self.aligned: np.ndarray | None = None  # which of them patches have confirmed
         self.greys = panorama.Greys(frames, settings.align.max_width)
-        self.searchable = SearchableFrames(load)
-        self.strongest = SearchableFrames(load, settings.pairs.strongest_per_face)
+        self.context = MatchContext(
+            SearchableFrames(load),
+            SearchableFrames(load, settings.pairs.strongest_per_face),
+            self.keypoints,
+            settings,
+            self.num_threads,
+        )
 
     def _set_priors(self) -> None:
         """What the trajectory says, as far as it is trusted, and the caller's own factors."""
@@ -119,14 +124,7 @@ class Line:
         pairs = self._stage(
             "neighbours",
             self._matching(),
-            lambda: frontend.match_neighbours(
-                self.searchable,
-                self.strongest,
-                self.keypoints,
-                self.start(),
-                self.settings,
-                self.num_threads,
-            ),
+            lambda: frontend.match_neighbours(self.context, self.start()),
             VerifiedPairs,
         )
         self.counts["neighbours"] = [pairs.counts]
@@ -137,16 +135,7 @@ class Line:
         recovered = self._stage(
             "steps",
             [self._matching(), self.settings.priors],
-            lambda: recovery.run(
-                self.searchable,
-                self.strongest,
-                self.keypoints,
-                guided,
-                self.coarse,
-                self.frames.timestamps,
-                self.settings,
-                self.num_threads,
-            ),
+            lambda: recovery.run(self.context, guided, self.coarse, self.frames.timestamps),
             Recovered,
         )
         pairs = recovered.neighbours
@@ -167,9 +156,7 @@ class Line:
         pairs = self._stage(
             name,
             self._matching(),
-            lambda: frontend.match_loops(
-                self.searchable, self.keypoints, solved, self.settings, self.num_threads
-            ),
+            lambda: frontend.match_loops(self.context, solved),
             VerifiedPairs,
         )
         self.counts[name] = [pairs.counts]
@@ -189,14 +176,7 @@ class Line:
         closed = self._stage(
             "places",
             self._matching(),
-            lambda: places.run(
-                self.strongest,
-                self.keypoints,
-                solved,
-                unseen,
-                self.settings,
-                self.num_threads,
-            ),
+            lambda: places.run(self.context, solved, unseen),
             Closed,
         )
         self.counts["places"] = [closed.counts]
@@ -213,9 +193,7 @@ class Line:
         return self._stage(
             "adjacent",
             self._matching(),
-            lambda: frontend.match_along_epipolars(
-                self.searchable, solved, self.settings, self.num_threads
-            ),
+            lambda: frontend.match_along_epipolars(self.context, solved),
             Matches,
         )
 
@@ -224,14 +202,7 @@ class Line:
         return self._stage(
             name,
             self._matching(),
-            lambda: frontend.match_known_points(
-                self.searchable,
-                self.keypoints,
-                solved,
-                self.settings,
-                self.num_threads,
-                loops_closed,
-            ),
+            lambda: frontend.match_known_points(self.context, solved, loops_closed),
             Matches,
         )
 

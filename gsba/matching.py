@@ -13,12 +13,12 @@ from threading import Lock
 
 import numpy as np
 
-from gsba.config import MatchingSettings
+from gsba.config import MatchingSettings, RefineSettings
 from gsba.geometry import inverse
 from gsba.log import track
 from gsba.rig import RIG_R_FACE, owner_faces
 from gsba.search import HEAD, Cells, Limits, Rows, search
-from gsba.types import Features, Matches
+from gsba.types import Features, Keypoints, Matches
 
 _CELLS = 8  # cells along a face's side
 _NO_MATCHES = np.zeros((0, 2), np.int32)
@@ -177,6 +177,31 @@ class SearchableFrames:
     def __getitem__(self, frame: int) -> Searchable:
         with self._lock:
             return self._get(int(frame))
+
+
+@dataclass(frozen=True, slots=True)
+class MatchContext:
+    """What a run's frames are matched by: their features, and how."""
+
+    frames: SearchableFrames
+    strongest: SearchableFrames  # the same with the strongest keypoints only
+    keypoints: Keypoints  # of all frames
+    settings: RefineSettings  # of pairs, matching and verification
+    num_threads: int  # pairs matched at a time
+
+    def match(
+        self,
+        pairs: np.ndarray,
+        world_T_rigs: np.ndarray,
+        gates: Sequence[Gate],
+        points_rig: Sequence[np.ndarray] | None = None,
+        *,
+        strongest: bool = False,
+    ) -> Matches:
+        """Match frame pairs as `run` does."""
+        frames = self.strongest if strongest else self.frames
+        how = self.settings.matching, self.num_threads
+        return run(pairs, world_T_rigs, gates, frames, *how, points_rig)
 
 
 def run(

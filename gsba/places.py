@@ -7,7 +7,7 @@ against the map: repeated structure makes perfect loops to the wrong place, but 
 drift than the path can have, or disagree with one another.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -18,7 +18,7 @@ from gsba.config import RefineSettings
 from gsba.frontend import median_depth, points_by_keypoint
 from gsba.geometry import inverse, pose, rotation_angle, similarity
 from gsba.graph import X
-from gsba.matching import SearchableFrames
+from gsba.matching import MatchContext, SearchableFrames
 from gsba.types import Counts, Keypoints, Landmarks, VerifiedPairs
 
 _WORDS = 64  # of the vocabulary
@@ -53,29 +53,19 @@ class Closed:
     counts: Counts  # of pairs compared
 
 
-def run(
-    strongest: SearchableFrames,
-    keypoints: Keypoints,
-    solved: Adjustment,
-    unseen: np.ndarray,
-    settings: RefineSettings,
-    num_threads: int,
-) -> Closed:
+def run(context: MatchContext, solved: Adjustment, unseen: np.ndarray) -> Closed:
     """Find places met again, and bend the map so that they coincide.
 
     Args:
-        strongest: features to compare.
-        keypoints: of all frames.
+        context: of the run; its strongest features are compared.
         solved: poses and points that are right between neighbours.
         unseen: (F - 1,) bool, steps that no images confirm: they may be off by their length.
-        settings: of pairs, matching and verification.
-        num_threads: pairs matched at a time.
     """
-    looks = describe(strongest, len(solved.world_T_rigs), settings.seed)
+    settings, keypoints = context.settings, context.keypoints
+    looks = describe(context.strongest, len(solved.world_T_rigs), settings.seed)
     chosen = candidates(looks, solved, unseen, settings)
-    verified = recovery.match_anywhere(
-        strongest, strongest, keypoints, chosen, settings, num_threads, _MIN_SHARE
-    )
+    strongest = replace(context, frames=context.strongest)
+    verified = recovery.match_anywhere(strongest, chosen, _MIN_SHARE)
     loops = _measure(verified, keypoints, solved, settings.seed)
     within = [loop for loop in loops if _within_drift(loop, solved, unseen, settings)]
     believed = consistent(within, solved, settings.pairs.window)

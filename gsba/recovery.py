@@ -1,13 +1,14 @@
 """Neighbours that the trajectory cannot guide: matched without it, and what that says about it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsba import matching, misfit, motion, pairs, verify
+from gsba import misfit, motion, pairs
 from gsba.config import RefineSettings
+from gsba.frontend import verified
 from gsba.geometry import inverse
-from gsba.matching import Gate, SearchableFrames
+from gsba.matching import Gate, MatchContext
 from gsba.motion import Trust
 from gsba.types import CoarsePoses, Counts, Keypoints, Matches, VerifiedPairs
 
@@ -24,14 +25,7 @@ class Recovered:
 
 
 def run(
-    frames: SearchableFrames,
-    strongest: SearchableFrames,
-    keypoints: Keypoints,
-    guided: VerifiedPairs,
-    coarse: CoarsePoses,
-    timestamps: np.ndarray,
-    settings: RefineSettings,
-    num_threads: int,
+    context: MatchContext, guided: VerifiedPairs, coarse: CoarsePoses, timestamps: np.ndarray
 ) -> Recovered:
     """Match the neighbours that guidance lost, judge the trajectory, and guide anew from that.
 
@@ -40,30 +34,27 @@ def run(
     matched along the steps found or the trajectory.
 
     Args:
-        frames, strongest, keypoints: features of all frames.
+        context: of the run.
         guided: neighbours verified under the trajectory's guidance; all of them where it is right.
         coarse: the trajectory.
         timestamps: (F,) seconds.
-        settings: of pairs, matching, verification and priors.
-        num_threads: pairs matched at a time.
 
     Raises:
         GsbaError: the images contradict most of the trajectory.
     """
+    settings, keypoints = context.settings, context.keypoints
     chosen = pairs.adjacent(len(coarse.sources))
     intervals = np.diff(timestamps)
     close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
     lost = _missing(np.column_stack([close, close + 1]), guided)
-    alone = _join(
-        [guided, match_anywhere(strongest, frames, keypoints, lost, settings, num_threads)]
-    )
+    alone = _join([guided, match_anywhere(context, lost)])
     misfit.refuse_misfit(coarse, motion.steps(alone, keypoints, settings.verify), settings.verify)
     trust = _judge(alone, keypoints, coarse, settings)
     if trust.sound:
         return Recovered(guided, trust)
     again = _missing(chosen, alone)
     again = again[again[:, 1] - again[:, 0] == 2]
-    over = _match_along(trust.world_T_rigs, again, frames, keypoints, settings, num_threads)
+    over = _match_along(context, trust.world_T_rigs, again)
     neighbours = _join([alone, over])
     doubtful = [p for p in _index(lost) if not _supported(p, neighbours, keypoints, settings)]
     if doubtful:
@@ -79,20 +70,15 @@ def run(
 
 
 def _match_along(
-    world_T_rigs: np.ndarray,
-    chosen: np.ndarray,
-    frames: SearchableFrames,
-    keypoints: Keypoints,
-    settings: RefineSettings,
-    num_threads: int,
+    context: MatchContext, world_T_rigs: np.ndarray, chosen: np.ndarray
 ) -> VerifiedPairs:
     """Match pairs (P, 2) guided by the start, and verify that they agree with it."""
-    prior, limit = settings.pairs.prior, np.deg2rad(settings.pairs.max_parallax_deg)
+    settings = context.settings.pairs
+    prior, limit = settings.prior, np.deg2rad(settings.max_parallax_deg)
     gates = [Gate(np.deg2rad(prior.rotation_deg), prior.direction, limit)] * len(chosen)
-    found = matching.run(chosen, world_T_rigs, gates, frames, settings.matching, num_threads)
+    found = context.match(chosen, world_T_rigs, gates)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
-    sigmas = np.zeros(len(chosen))
-    return verify.run(found, keypoints, f0_T_f1s, sigmas, settings.verify, settings.seed)
+    return verified(found, f0_T_f1s, np.zeros(len(chosen)), context)
 
 
 def nothing_verified() -> VerifiedPairs:
@@ -103,39 +89,32 @@ def nothing_verified() -> VerifiedPairs:
 
 
 def match_anywhere(
-    strongest: SearchableFrames,
-    frames: SearchableFrames,
-    keypoints: Keypoints,
-    chosen: np.ndarray,
-    settings: RefineSettings,
-    num_threads: int,
-    min_share: float | None = None,
+    context: MatchContext, chosen: np.ndarray, min_share: float | None = None
 ) -> VerifiedPairs:
     """Match whole panoramas without any prediction, and verify their geometry alone.
 
+    The strongest features are tried first, and all for pairs that those do not settle.
+
     Args:
-        strongest: features tried first, at a fraction of the cost.
-        frames: features tried for pairs that those do not settle.
-        keypoints: of all frames.
+        context: of the run.
         chosen: (P, 2) frame indices.
-        settings: of matching and verification.
-        num_threads: pairs matched at a time.
         min_share: part of the matches that must be of one geometry; None = as for neighbours.
     """
     if min_share is not None:
-        settings = settings.model_copy(
-            update={"verify": settings.verify.model_copy(update={"min_share": min_share})}
-        )
-    nowhere = np.tile(np.eye(4), (len(keypoints.starts) - 1, 1, 1))
+        least = context.settings.verify.model_copy(update={"min_share": min_share})
+        context = replace(context, settings=context.settings.model_copy(update={"verify": least}))
+    nowhere = np.tile(np.eye(4), (len(context.keypoints.starts) - 1, 1, 1))
 
-    def verified(among: SearchableFrames, some: np.ndarray) -> VerifiedPairs:
+    def match(some: np.ndarray, strongest: bool) -> VerifiedPairs:
         gates = [_ANYWHERE] * len(some)
-        found = matching.run(some, nowhere, gates, among, settings.matching, num_threads)
-        return verify.run(found, keypoints, None, None, settings.verify, settings.seed)
+        found = context.match(some, nowhere, gates, strongest=strongest)
+        return verified(found, None, None, context)
 
-    first = verified(strongest, chosen)
+    first = match(chosen, strongest=True)
+    if context.strongest is context.frames:
+        return first
     rest = _missing(chosen, first)
-    return _join([first, verified(frames, rest)]) if len(rest) else first
+    return _join([first, match(rest, strongest=False)]) if len(rest) else first
 
 
 def _judge(

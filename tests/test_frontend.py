@@ -8,7 +8,7 @@ from gsba import features, frontend
 from gsba.adjust import Adjustment
 from gsba.config import PairSettings, RefineSettings
 from gsba.geometry import pose
-from gsba.matching import SearchableFrames
+from gsba.matching import MatchContext, SearchableFrames
 from gsba.types import Counts, Keypoints, Landmarks, Tracks, VerifiedPairs
 
 NUM = 300
@@ -40,7 +40,9 @@ def _scene(shift: float) -> tuple[SearchableFrames, Keypoints, Adjustment]:
 def _loops_to_last(shift: float, loop_deg: float = 2.0) -> tuple[VerifiedPairs, np.ndarray]:
     """All loops, and the rows of those that end in the last frame."""
     settings = RefineSettings(pairs=PairSettings(window=2, loop_deg=loop_deg))
-    found = frontend.match_loops(*_scene(shift), settings, 1)
+    frames, keypoints, solved = _scene(shift)
+    context = MatchContext(frames, frames, keypoints, settings, 1)
+    found = frontend.match_loops(context, solved)
     return found, np.flatnonzero(found.matches.pairs[:, 1] == LAST)
 
 

@@ -11,7 +11,7 @@ from gsba import features, places
 from gsba.adjust import Adjustment
 from gsba.config import PairSettings, RefineSettings
 from gsba.geometry import inverse, pose, rotation_angle
-from gsba.matching import SearchableFrames
+from gsba.matching import MatchContext, SearchableFrames
 from gsba.places import Loop
 from gsba.types import Counts, Keypoints, Landmarks, Tracks
 
@@ -84,6 +84,10 @@ def test_looks_do_not_depend_on_heading() -> None:
         np.testing.assert_allclose(one, other, atol=1e-5)
 
 
+def _context(frames: SearchableFrames, keypoints: Keypoints) -> MatchContext:
+    return MatchContext(frames, frames, keypoints, SETTINGS, 1)
+
+
 def test_the_same_place_looks_most_alike() -> None:
     looks = places.describe(_scene()[0], NUM_FRAMES, 0)
     far = [f for f in range(NUM_FRAMES) if 4 < f < NUM_FRAMES - 4]
@@ -98,7 +102,7 @@ def test_a_map_torn_in_two_is_joined_where_it_meets(heading: float) -> None:
     torn = _moved(_split(whole), by)
     unseen = SEEN.copy()
     unseen[NUM_FRAMES // 2 - 1] = True
-    closed = places.run(strongest, keypoints, torn, unseen, SETTINGS, 1)
+    closed = places.run(_context(strongest, keypoints), torn, unseen)
     assert len(closed.pairs) >= 3
     relative = inverse(closed.solved.world_T_rigs[0]) @ closed.solved.world_T_rigs
     true = inverse(whole.world_T_rigs[0]) @ whole.world_T_rigs
@@ -121,7 +125,7 @@ def test_a_confirmed_path_is_not_bent_further_than_it_drifts() -> None:
     """The same torn map, but every step was confirmed by images: then the loops are the error."""
     strongest, keypoints, whole = _scene()
     torn = _moved(_split(whole), pose(np.eye(3), np.array([3.0, 0, 0])))
-    closed = places.run(strongest, keypoints, torn, SEEN, SETTINGS, 1)
+    closed = places.run(_context(strongest, keypoints), torn, SEEN)
     assert len(closed.pairs) == 0 and closed.solved is torn
 
 

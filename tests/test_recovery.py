@@ -9,7 +9,7 @@ from synthetic import bearings_of, features_of, unit, with_noise
 from gsba import adjust, features, frontend, recovery
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, pose, rotation_angle
-from gsba.matching import SearchableFrames
+from gsba.matching import MatchContext, SearchableFrames
 from gsba.recovery import Recovered
 from gsba.types import CoarsePoses, Keypoints, PoseSource
 
@@ -35,18 +35,22 @@ def _scene(cut: int | None = None) -> tuple[SearchableFrames, Keypoints]:
     return SearchableFrames(frames.__getitem__), features.gather(frames)
 
 
-def _run(slam: np.ndarray, cut: int | None = None, times: np.ndarray = TIMES) -> Recovered:
+def _context(cut: int | None = None) -> MatchContext:
     frames, keypoints = _scene(cut)
-    start = adjust.start(slam)
-    guided = frontend.match_neighbours(frames, frames, keypoints, start, SETTINGS, 1)
+    return MatchContext(frames, frames, keypoints, SETTINGS, 1)
+
+
+def _run(slam: np.ndarray, cut: int | None = None, times: np.ndarray = TIMES) -> Recovered:
+    context = _context(cut)
+    guided = frontend.match_neighbours(context, adjust.start(slam))
     coarse = CoarsePoses(slam, np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8), 0.0)
-    return recovery.run(frames, frames, keypoints, guided, coarse, times, SETTINGS, 1)
+    return recovery.run(context, guided, coarse, times)
 
 
 def test_a_right_trajectory_is_left_alone() -> None:
     with patch.object(recovery, "match_anywhere", wraps=recovery.match_anywhere) as anywhere:
         recovered = _run(TRUTH)
-    assert all(len(call.args[3]) == 0 for call in anywhere.call_args_list)
+    assert all(len(call.args[1]) == 0 for call in anywhere.call_args_list)
     assert recovered.trust.sound and len(recovered.neighbours.matches.pairs) == 2 * NUM_FRAMES - 3
 
 
@@ -86,9 +90,9 @@ def test_two_places_stay_two() -> None:
 
 def test_a_lone_look_alike_without_a_third_view_is_not_believed() -> None:
     """A step that whole panoramas agree on, but no third frame confirms."""
-    frames, keypoints = _scene(cut=5)
+    context = _context(cut=5)
     pair = np.array([[1, 2]], np.int32)
-    empty = recovery.match_anywhere(frames, frames, keypoints, pair[:0], SETTINGS, 1)
-    alone = recovery.match_anywhere(frames, frames, keypoints, pair, SETTINGS, 1)
+    empty = recovery.match_anywhere(context, pair[:0])
+    alone = recovery.match_anywhere(context, pair)
     assert len(empty.matches.pairs) == 0
-    assert not recovery._supported((1, 2), alone, keypoints, SETTINGS)
+    assert not recovery._supported((1, 2), alone, context.keypoints, SETTINGS)
