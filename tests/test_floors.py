@@ -16,14 +16,15 @@ ROOT = Path(__file__).parents[1]
 FLOORS = (
     {"factors"},
     {"", "types", "geometry", "config", "config_file", "log"},
-    {"rig", "records", "run_folder", "search", "store", "read", "panorama", "views"},
+    {"rig", "records", "run_folder", "search", "store", "read", "panorama", "views"}
+    | {"sweep", "turning"},
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter", "align", "splat", "patch_grid"},
     {"adjust", "blame", "frontend", "learned", "misfit", "motion", "photometric", "places"}
     | {"reconstruction", "recovery", "splat_align", "splatting"},
     {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"}
-    | {"alignment", "carrier", "gravity", "placement"},
-    {"demo", "extraction", "line", "pipeline"},
+    | {"alignment", "carrier", "distractors", "gravity", "placement"},
+    {"demo", "extraction", "line", "masking", "pipeline", "segment"},
     {"cli"},
     {"benchmarks"},
 )

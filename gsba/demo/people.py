@@ -84,9 +84,7 @@ def paste_people(
     return out, np.isfinite(nearest)
 
 
-def _hit(
-    person: Person, origin: np.ndarray, rays: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _hit(person: Person, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance (N,) of the body along rays (N, 3), inf beside it, and where on it, (2, N) 0 to 1.
 
     Both the rays and their origin (3,), which is outside, are seen from the middle of the body.
