@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
 from common import machine
 
 from gsba import RefineSettings, refine

@@ -7,7 +7,7 @@ while those agree with one another on what was behind it. A pixel is accused onl
 neighbours could have seen it.
 """
 
-import logging
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,8 +19,6 @@ from gsba import panorama, sweep
 from gsba.geometry import bearings_from_erp, erp_from_bearings, inverse
 from gsba.read import load_erp, load_mask
 from gsba.types import FrameSet, Landmarks
-
-logger = logging.getLogger(__name__)
 
 _WIDTH = 512  # pixels across the panoramas that are compared
 _NEIGHBOURS = 6
@@ -86,6 +84,7 @@ class Scene:
         self._known, self._rays = known, _rays(self.width)
         self._room = int(limit_mb * 2**20 / (1.5 * self.width**2))
         self._kept: dict[int, np.ndarray] = {}
+        self._lock = threading.Lock()
         tracks = landmarks.tracks
         order = np.argsort(tracks.frames, kind="stable")
         starts = np.searchsorted(tracks.frames[order], np.arange(len(frames) + 1))
@@ -127,9 +126,10 @@ class Scene:
         kept = self._kept.get(frame)
         if kept is None:
             kept = _load(self._frames, frame, self.width)
-            self._kept[frame] = kept
-            while len(self._kept) > max(self._room, 1):
-                self._kept.pop(next(iter(self._kept)), None)
+            with self._lock:
+                self._kept[frame] = kept
+                while len(self._kept) > max(self._room, 1):
+                    self._kept.pop(next(iter(self._kept)))
         picture = kept[..., :-1].astype(np.float32)
         picture[kept[..., -1] == 0] = -1.0
         return picture

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba import masking, read, video
+from gsba import masking, photometric, read, video
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.config_file import to_toml
@@ -187,6 +187,7 @@ def _without_distractors(
     store: RunStore, frames: FrameSet, coarse: CoarsePoses, settings: RefineSettings
 ) -> tuple[FrameSet, dict[str, list[Counts]]]:
     """Frames without what a first solution, plainer than the last, does not explain."""
+    photometric.check(frames, settings)  # before the first solution, not after
     plain = settings.model_copy(
         update={
             "align": settings.align.model_copy(update={"rounds": 0}),
