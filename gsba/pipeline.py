@@ -2,15 +2,14 @@
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsba import read, timing, video
+from gsba import masking, photometric, read, timing, video
 from gsba.adjust import Adjustment
-from gsba.carrier import Carrier, find_carrier, write_carrier
 from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.export import ExportFormat, export, write_points
@@ -21,7 +20,8 @@ from gsba.motion import describe
 from gsba.placement import EXIF, Placement, check, place
 from gsba.report import build_report, take_notes, write_poses, write_report
 from gsba.report_html import write_html
-from gsba.store import RunStore, atomic_write, fingerprint, load_stage
+from gsba.segment import Segment
+from gsba.store import RunStore, atomic_write, load_stage
 from gsba.types import (
     CoarsePoses,
     Counts,
@@ -38,7 +38,6 @@ _GAUGE = (
     "Sim(3)-aligned to the coarse trajectory over its refined SLAM poses: its world and scale; "
     "covariances hold the first pose and the distance to the frame furthest from it"
 )
-AUTO = "auto"  # in place of masks: find the carrier
 _OUTPUTS = (
     "trajectory.tum",
     "coarse.tum",
@@ -72,7 +71,8 @@ def refine(
     settings: RefineSettings | None = None,
     *,
     keyframes: Path | None = None,
-    masks: Path | str | None = None,
+    masks: masking.Masks = None,
+    segment: Segment | None = None,
     timestamps: Path | None = None,
     fps: float | None = None,
     fresh: bool = False,
@@ -90,7 +90,10 @@ def refine(
         out: folder of the run.
         settings: see `gsba.config`.
         keyframes: second trajectory file of the same run, with its keyframes: they lead.
-        masks: one ERP mask for all frames, or a folder of one for each; white = use; or "auto".
+        masks: one ERP mask for all frames, or a folder of one for each; white = use; "carrier" or
+            "distractors" to find what carries the camera or what moves by itself, "auto" for both;
+            or several of these.
+        segment: a command or a callable that masks faces; see `gsba.segment.segmented`.
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         fresh: forget an earlier run in `out`.
@@ -103,21 +106,23 @@ def refine(
     frames, out = Path(frames), Path(out)
     settings, origin = settings or RefineSettings(), {"frames": frames}
     check(settings.placement)
-    mask_files = None if masks is None or masks == AUTO else Path(masks)
+    chosen = masking.choose(masks, segment)
     paths = {"trajectory": trajectory, "keyframes": keyframes}
     origin |= {name: Path(path) for name, path in paths.items() if path is not None}
     given = _given(origin, timestamps)  # fails before hours of decoding, not after
     if video.is_video(frames):
         _extract(out, origin, settings, fps, fresh)
-        frame_set, fresh = read.scan(out / "frames", masks=mask_files), False
+        frame_set, fresh = read.scan(out / "frames", masks=chosen.given), False
     else:
-        frame_set = read.scan(frames, timestamps, fps, mask_files)
+        frame_set = read.scan(frames, timestamps, fps, chosen.given)
     check(settings.placement, frame_set)
     coarse = _coarse(frame_set, given, settings)
     with RunStore(out, origin, fresh) as store:
-        if masks == AUTO:
-            frame_set = _without_carrier(store, frame_set)
+        frame_set, counts = masking.before(store, frame_set, chosen), {}
+        if chosen.distractors:
+            frame_set, counts = _without_distractors(store, frame_set, coarse, given, settings)
         line = Line(store, frame_set, coarse, settings, extra_factors)
+        line.counts |= counts
         guided = timing.match_neighbours(line, given, _coarse)
         return _write(line, line.reconstruct(_solve(line, guided, settings)))
 
@@ -191,18 +196,27 @@ def _extract(
         store.claim(out / "frames")
 
 
-def _without_carrier(store: RunStore, frames: FrameSet) -> FrameSet:
-    """Frames whose mask leaves out the carrier, if there is one."""
-    inputs = fingerprint(path for group in frames.paths for path in group)
-    found = store.stage("carrier", inputs, lambda: find_carrier(frames), Carrier)
-    path = store.root / "carrier.png"
-    if not (path.exists() and store.records["carrier"].resumed):  # a new file would undo all stages
-        write_carrier(found, frames, store.root)
-    for name in ("carrier.png", "carrier_check.jpg"):
-        store.claim(store.root / name)
-    if not found.share:
-        return frames
-    return replace(frames, mask_paths=(path,) * len(frames))
+def _without_distractors(
+    store: RunStore,
+    frames: FrameSet,
+    coarse: CoarsePoses,
+    given: Trajectory | None,
+    settings: RefineSettings,
+) -> tuple[FrameSet, dict[str, list[Counts]]]:
+    """Frames without what a first solution, plainer than the last, does not explain."""
+    photometric.check(frames, settings)  # before the first solution, not after
+    plain = settings.model_copy(
+        update={
+            "align": settings.align.model_copy(update={"rounds": 0}),
+            "factors": tuple(name for name in settings.factors if name != "photometric"),
+        }
+    )
+    with store.named("first"):
+        line = Line(store, frames, coarse, plain, None)
+        solved = _solve(line, timing.match_neighbours(line, given, _coarse), plain)
+    after, threads = f"first-{line.latest}", line.num_threads
+    frames, counts = masking.after(store, frames, solved, after, threads)
+    return frames, {"distractors": [counts]}
 
 
 def _write(line: Line, reconstruction: Reconstruction) -> RunResult:

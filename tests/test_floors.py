@@ -16,14 +16,15 @@ ROOT = Path(__file__).parents[1]
 FLOORS = (
     {"factors"},
     {"", "config", "config_file", "geometry", "log", "types"},
-    {"panorama", "read", "records", "rig", "run_folder", "search", "store", "views"},
+    {"panorama", "read", "records", "rig", "run_folder", "search", "store", "sweep"}
+    | {"turning", "views"},
     {"align", "cubemap", "features", "filter", "graph", "matching", "optimize", "pairs"}
     | {"patch_grid", "splat", "tracks", "triangulate", "verify"},
     {"adjust", "blame", "clock", "clock_fit", "frontend", "learned", "misfit", "motion"}
     | {"photometric", "places", "reconstruction", "recovery", "splat_align", "splatting"},
-    {"alignment", "carrier", "evaluate", "evaluate_splat", "export", "gravity", "induced"}
-    | {"placement", "report", "report_html", "video"},
-    {"demo", "extraction", "line", "pipeline", "timing", "view"},
+    {"alignment", "carrier", "distractors", "evaluate", "evaluate_splat", "export"}
+    | {"gravity", "induced", "placement", "report", "report_html", "video"},
+    {"demo", "extraction", "line", "masking", "pipeline", "segment", "timing", "view"},
     {"cli"},
     {"benchmarks"},
 )

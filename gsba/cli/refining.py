@@ -39,6 +39,18 @@ Download = Annotated[
     bool, typer.Option("--download", help="Fetch missing weights from their authors.")
 ]
 
+Masks = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="One mask for all frames, or a folder; white = use. carrier, distractors: find "
+        "them; auto: both. Repeatable."
+    ),
+]
+Segment = Annotated[
+    str | None,
+    typer.Option(help="Your own masks of faces: called with IMAGES MASKS.", metavar="COMMAND"),
+]
+
 
 @command
 def refine(
@@ -57,12 +69,8 @@ def refine(
     ] = False,
     config: Config = None,
     overrides: Overrides = None,
-    masks: Annotated[
-        Path | None,
-        typer.Option(
-            help="One mask for all frames, or a folder; white = use. auto: find the carrier."
-        ),
-    ] = None,
+    masks: Masks = None,
+    segment: Segment = None,
     factors: Factors = None,
     timestamps: Annotated[
         Path | None, typer.Option(help="Times of the frames.", metavar="FILE")
@@ -91,7 +99,8 @@ def refine(
         out,
         settings,
         keyframes=keyframes,
-        masks="auto" if str(masks) == "auto" else masks,
+        masks=masks,
+        segment=segment,
         timestamps=timestamps,
         fps=fps,
         fresh=fresh,
