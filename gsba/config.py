@@ -213,6 +213,29 @@ class PhotometricSettings(_Settings):
     polish_steps: int = Field(default=0, ge=0)  # of planes, after each step of the poses
 
 
+class SplatFactorSettings(_Settings):
+    """Poses refined against a splat of their own frames; see also `SplatSettings`."""
+
+    sizes: tuple[int, ...] = Field(default=(48, 96), min_length=1)  # pixels of a face, in order
+    first_steps: int = Field(default=300, ge=1)  # of training, before poses move at each size
+    steps: int = Field(default=100, ge=1)  # of training, after each move of the poses
+    moves: int = Field(default=3, ge=1)  # of the poses, at most, at each size
+    solver_steps: int = Field(default=2, ge=1)  # of Levenberg-Marquardt in a move
+    min_gain_db: float = Field(default=0.01, ge=0)  # of held-out frames, or a move is undone
+    max_growth: float = Field(default=1.05, gt=0)  # of all geometric cost, or a move is undone
+    held_out_every: int = Field(default=8, ge=2)  # panoramas that judge: no splat sees them
+    max_gaussians: int = Field(default=30_000, ge=1)
+    sh_degree: int = Field(default=1, ge=0, le=3)
+    backend: Literal["auto", "gsplat", "cpu"] = "auto"
+
+    @field_validator("sizes")
+    @classmethod
+    def _rendered(cls, sizes: tuple[int, ...]) -> tuple[int, ...]:
+        if min(sizes) < 16:
+            raise ValueError("a face has at least 16 pixels")
+        return sizes
+
+
 class ExportSettings(_Settings):
     """Datasets written at the end of a run."""
 
@@ -275,16 +298,18 @@ class RefineSettings(_Settings):
     rounds: RoundSettings = RoundSettings()
     align: AlignSettings = AlignSettings()
     solver: SolverSettings = SolverSettings()
-    factors: tuple[Literal["bearing", "reprojection", "photometric"], ...] = Field(
+    factors: tuple[Literal["bearing", "reprojection", "photometric", "splat"], ...] = Field(
         default=("bearing",), min_length=1
     )
     photometric: PhotometricSettings = PhotometricSettings()
+    splat: SplatFactorSettings = SplatFactorSettings()
     export: ExportSettings = ExportSettings()
     placement: PlacementSettings = PlacementSettings()
     seed: int = 0
 
     @model_validator(mode="after")
     def _geometry_first(self) -> "RefineSettings":
-        if set(self.factors) == {"photometric"}:
-            raise ValueError("factors: photometric starts from bearing or reprojection; add one")
+        if not {"bearing", "reprojection"} & set(self.factors):
+            named = " and ".join(self.factors)
+            raise ValueError(f"factors: {named} starts from bearing or reprojection; add one")
         return self

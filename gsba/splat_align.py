@@ -1,6 +1,7 @@
 """Frames against a splat: the block that aligns rig poses to what the splat renders."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -24,6 +25,17 @@ MAX_STEPS = 12  # of the solver at each size
 _GATE = np.deg2rad(1.0)  # of observations that join the splat
 _LUMA = np.array([0.299, 0.587, 0.114])
 _MARGIN_HFOV_DEG = 100.0  # of captured faces, so that samples beyond an edge find pixels
+
+
+@dataclass(frozen=True, slots=True)
+class Captured:
+    """Grey faces of frames, to be aligned to renderings of one size."""
+
+    which: np.ndarray  # (W,) int, frame indices
+    size: int  # pixels of a rendered face
+    rig: CubeRig  # the captured faces
+    images: tuple[np.ndarray, ...]  # (W,) of (6, S, S) float32, 0..1
+    use: tuple[np.ndarray | None, ...]  # (W,) of (6, S, S) bool, pixels that count; None = all
 
 
 def align(
@@ -56,7 +68,7 @@ def align(
     settings = SolverSettings(max_iterations=MAX_STEPS, relative_tolerance=1e-5)
     poses = world_T_rigs
     for level, size in enumerate(sizes):
-        blocks: list = [splat_block(gaussians, frames, which, size, near, backend)]
+        blocks: list = [splat_block(gaussians, capture(frames, which, size), near, backend)]
         if reconstruction is not None and level > 0:
             blocks.append(bearing_block(reconstruction, poses))
         values = gtsam.Values()
@@ -82,43 +94,41 @@ def bearing_block(reconstruction: Reconstruction, world_T_rigs: np.ndarray) -> L
     return LandmarkBlock(keys, landmarks.points_world, [term], RobustLoss("cauchy", 1.0))
 
 
+def capture(frames: FrameSet, which: np.ndarray, size: int) -> Captured:
+    """Grey faces of some frames, as dense as rendered ones of `size` pixels."""
+    rig = _captured_rig(frames, size)
+    images, use = [], []
+    for f in track(which, "cutting faces", total=len(which)):
+        faces, mask = cubemap.load(frames, int(f), rig)
+        images.append((faces @ _LUMA / 255).astype(np.float32))
+        use.append(mask)
+    return Captured(which, size, rig, tuple(images), tuple(use))
+
+
 def splat_block(
     gaussians: Gaussians,
-    frames: FrameSet,
-    which: np.ndarray,
-    size: int,
+    captured: Captured,
     near: float,
     backend: Backend,
     loss: RobustLoss | None = None,
 ) -> SplatBlock:
-    """The block of some frames against a fixed splat.
+    """The block of captured frames against a fixed splat.
 
     Args:
         gaussians: the splat; its world is the poses'.
-        frames: captured frames.
-        which: frame indices; keys are graph.X(frame).
-        size: pixels of a rendered face; captured ones are sampled as densely. Coarse to fine is
-            one block after another.
+        captured: frames; keys are graph.X(frame). Coarse to fine is one block after another.
         near: least z of a Gaussian, map units.
         backend: the renderer.
         loss: see `factors.splat.SplatBlock`.
     """
-    rendered = CubeRig(size, np.pi / 2)
-    captured = _captured_rig(frames, size)
-    images, use = [], []
-    for f in track(which, "cutting faces", total=len(which)):
-        faces, mask = cubemap.load(frames, int(f), captured)
-        images.append((faces @ _LUMA / 255).astype(np.float32))
-        use.append(mask)
-    num = len(FACES)
-    cameras = FaceCameras(
-        RIG_R_FACE, np.full(num, captured.focal), np.full((num, 2), captured.principal)
-    )
+    rendered, rig, num = CubeRig(captured.size, np.pi / 2), captured.rig, len(FACES)
+    cameras = FaceCameras(RIG_R_FACE, np.full(num, rig.focal), np.full((num, 2), rig.principal))
 
     def render(_row: int, world_T_rig: np.ndarray) -> RenderedView:
         return render_view(gaussians, world_T_rig, rendered, near, backend)
 
-    return SplatBlock([graph.X(int(f)) for f in which], images, use, cameras, render, loss)
+    keys = [graph.X(int(f)) for f in captured.which]
+    return SplatBlock(keys, captured.images, captured.use, cameras, render, loss)
 
 
 def render_view(
