@@ -217,8 +217,10 @@ class SplatFactorSettings(_Settings):
     """Poses refined against a splat of their own frames; see also `SplatSettings`."""
 
     sizes: tuple[int, ...] = Field(default=(48, 96), min_length=1)  # pixels of a face, in order
-    first_steps: int = Field(default=300, ge=1)  # of training, before poses move at each size
-    steps: int = Field(default=100, ge=1)  # of training, after each move of the poses
+    first_steps: int = Field(default=200, ge=1)  # of training, before poses move at each size
+    steps: int = Field(
+        default=200, ge=1
+    )  # of training after each move: a splat that has yet to follow speaks against it
     moves: int = Field(default=3, ge=1)  # of the poses, at most, at each size
     solver_steps: int = Field(default=2, ge=1)  # of Levenberg-Marquardt in a move
     min_gain_db: float = Field(default=0.01, ge=0)  # of held-out frames, or a move is undone

@@ -8,7 +8,7 @@ import numpy as np
 
 from factors import BearingTerm, FaceCameras, LandmarkBlock, RobustLoss
 from factors.splat import RenderedView, SplatBlock
-from gsba import cubemap, graph
+from gsba import graph
 from gsba.config import SolverSettings
 from gsba.log import track
 from gsba.optimize import optimize
@@ -16,13 +16,14 @@ from gsba.rig import RIG_R_FACE, CubeRig
 from gsba.splat.backend import Backend
 from gsba.splat.camera import face_camera
 from gsba.splat.gaussians import Gaussians
-from gsba.splatting import place_points
+from gsba.splatting import cut_faces, place_points
 from gsba.types import FACES, FrameSet, Reconstruction
 
 MIN_ALPHA = 0.95  # of a rendered pixel that is believed
 MAX_STEP = 0.1  # of the depth, between neighbouring pixels: more is an edge
-MAX_STEPS = 12  # of the solver at each size
-_GATE = np.deg2rad(1.0)  # of observations that join the splat
+MAX_STEPS = 30  # of the solver at each size
+GATES_DEG = (16.0, 5.0, 1.5, 0.5)  # of observations at the first sizes; then the last
+_GATE_SIGMAS = 10.0  # wider gates loosen the loss in proportion
 _LUMA = np.array([0.299, 0.587, 0.114])
 _MARGIN_HFOV_DEG = 100.0  # of captured faces, so that samples beyond an edge find pixels
 
@@ -44,13 +45,13 @@ def align(
     world_T_rigs: np.ndarray,
     near: float,
     backend: Backend,
-    sizes: Sequence[int] = (48, 96, 192),
+    sizes: Sequence[int] = (24, 48, 96, 192),
     reconstruction: Reconstruction | None = None,
 ) -> np.ndarray:
     """Align the poses of all frames to a splat that stays as it is, from coarse to fine.
 
-    The splat holds the gauge. The coarsest faces have the widest basin and work alone; bearings,
-    where given, join from the second size on.
+    The splat holds the gauge. The coarsest faces have the widest basin; observations, where given,
+    join from the start, with a gate and a loss that tighten from size to size.
 
     Args:
         gaussians: the splat.
@@ -69,8 +70,9 @@ def align(
     poses = world_T_rigs
     for level, size in enumerate(sizes):
         blocks: list = [splat_block(gaussians, capture(frames, which, size), near, backend)]
-        if reconstruction is not None and level > 0:
-            blocks.append(bearing_block(reconstruction, poses))
+        if reconstruction is not None:
+            gate = float(np.deg2rad(GATES_DEG[min(level, len(GATES_DEG) - 1)]))
+            blocks.append(bearing_block(reconstruction, poses, gate))
         values = gtsam.Values()
         for f in which:
             values.insert(graph.X(int(f)), gtsam.Pose3(poses[f]))
@@ -79,17 +81,23 @@ def align(
     return poses
 
 
-def bearing_block(reconstruction: Reconstruction, world_T_rigs: np.ndarray) -> LandmarkBlock:
-    """A run's observations as bearing factors, points placed under given poses (F, 4, 4)."""
+def bearing_block(
+    reconstruction: Reconstruction, world_T_rigs: np.ndarray, gate_rad: float
+) -> LandmarkBlock:
+    """A run's observations as bearing factors, points placed under given poses.
+
+    Args:
+        world_T_rigs: (F, 4, 4).
+        gate_rad: observations further from their point are left out; what such a gate lets in is
+            believed less than what the run has found.
+    """
     which = np.arange(len(world_T_rigs))
-    landmarks, _ = place_points(reconstruction, world_T_rigs, which, float(_GATE))
+    landmarks, _ = place_points(reconstruction, world_T_rigs, which, gate_rad)
     tracks = landmarks.tracks
-    term = BearingTerm(
-        tracks.frames,
-        tracks.points,
-        reconstruction.observation_bearings[tracks.keypoints],
-        reconstruction.observation_sigmas[tracks.keypoints],
-    )
+    sigmas = reconstruction.observation_sigmas[tracks.keypoints]
+    spread = gate_rad / (_GATE_SIGMAS * float(np.median(sigmas))) if len(sigmas) else 1.0
+    bearings = reconstruction.observation_bearings[tracks.keypoints]
+    term = BearingTerm(tracks.frames, tracks.points, bearings, max(1.0, spread) * sigmas)
     keys = [graph.X(int(f)) for f in which]
     return LandmarkBlock(keys, landmarks.points_world, [term], RobustLoss("cauchy", 1.0))
 
@@ -99,7 +107,7 @@ def capture(frames: FrameSet, which: np.ndarray, size: int) -> Captured:
     rig = _captured_rig(frames, size)
     images, use = [], []
     for f in track(which, "cutting faces", total=len(which)):
-        faces, mask = cubemap.load(frames, int(f), rig)
+        faces, mask = cut_faces(frames, int(f), rig)
         images.append((faces @ _LUMA / 255).astype(np.float32))
         use.append(mask)
     return Captured(which, size, rig, tuple(images), tuple(use))
