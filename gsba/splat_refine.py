@@ -206,17 +206,17 @@ class _Turns:
         moved, growth, result = self._moved(before.state.gaussians, poses)
         stayed = self._trained(before.state, poses, settings, chosen.steps)
         went = self._trained(before.state, moved, settings, chosen.steps)
-        psnrs = [
-            self._judged(state.gaussians, where, settings)
-            for state, where in ((stayed, poses), (went, moved))
-        ]
+        before_db = self._judged(stayed.gaussians, poses, settings)
+        after_db = self._judged(went.gaussians, moved, settings)
         after = self._placed(moved)
-        accepted = psnrs[1] >= psnrs[0] + chosen.min_gain_db and growth <= chosen.max_growth
+        accepted = after_db >= before_db + chosen.min_gain_db and growth <= chosen.max_growth
         least = self.settings.rounds.min_observations
         accepted &= adjust.carries(replace(self.solved, landmarks=after), self.solved, least)
-        move = Move(settings.face_size, *psnrs, growth, *_way(poses, moved), accepted)
-        logger.info("faces of %d px: held out %.2f -> %.2f dB, %s", settings.face_size, *psnrs,
-                    "taken" if accepted else "undone")  # fmt: skip
+        turned, shifted = _way(poses, moved)
+        size = settings.face_size
+        move = Move(size, before_db, after_db, growth, turned, shifted, accepted)
+        taken = "taken" if accepted else "undone"
+        logger.info("faces of %d px: held out %.2f, %.2f dB, %s", size, before_db, after_db, taken)
         tracks = self.solved.landmarks.tracks
         note = Round(
             self._gate(), self.solved.noise, len(tracks), tracks.num_points, len(after.tracks),
@@ -304,6 +304,5 @@ def _way(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
     turns = np.einsum("fji,fjk->fik", before[:, :3, :3], after[:, :3, :3])
     cosines = (np.trace(turns, axis1=1, axis2=2) - 1) / 2
     shifts = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
-    return float(np.degrees(np.median(np.arccos(np.clip(cosines, -1, 1))))), float(
-        np.median(shifts)
-    )
+    angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    return float(np.median(angles)), float(np.median(shifts))
