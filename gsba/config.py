@@ -1,6 +1,6 @@
 """Settings: one frozen model per stage, defaults that run a sensible job with no file."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -216,7 +216,9 @@ class PhotometricSettings(_Settings):
 class SplatFactorSettings(_Settings):
     """Poses refined against a splat of their own frames; see also `SplatSettings`."""
 
-    sizes: tuple[int, ...] = Field(default=(48, 96), min_length=1)  # pixels of a face, in order
+    sizes: tuple[Annotated[int, Field(ge=16)], ...] = Field(
+        default=(48, 96), min_length=1
+    )  # pixels of a face, in order
     first_steps: int = Field(default=200, ge=1)  # of training, before poses move at each size
     steps: int = Field(
         default=200, ge=1
@@ -229,13 +231,6 @@ class SplatFactorSettings(_Settings):
     max_gaussians: int = Field(default=30_000, ge=1)
     sh_degree: int = Field(default=1, ge=0, le=3)
     backend: Literal["auto", "gsplat", "cpu"] = "auto"
-
-    @field_validator("sizes")
-    @classmethod
-    def _rendered(cls, sizes: tuple[int, ...]) -> tuple[int, ...]:
-        if min(sizes) < 16:
-            raise ValueError("a face has at least 16 pixels")
-        return sizes
 
 
 class ExportSettings(_Settings):

@@ -103,6 +103,8 @@ def test_an_interrupted_refinement_goes_on_to_the_same_result(
 def test_a_run_with_all_families(case: Case, tmp_path: Path) -> None:
     out = case.copy(tmp_path / "run")
     settings = settings_for(("bearing", "photometric", "splat"))
+    few = settings.photometric.model_copy(update={"spacing_deg": 20.0, "depth_levels": 0})
+    settings = settings.model_copy(update={"photometric": few})
     result = case.refine(out, settings)
     assert computed_stages(result)[:2] == ["photometric", "splat"]
     (move,) = result.report["splat"]
@@ -119,5 +121,5 @@ def test_a_run_with_all_families(case: Case, tmp_path: Path) -> None:
 def test_settings_are_checked() -> None:
     with pytest.raises(GsbaError, match="splat starts from bearing or reprojection"):
         load_config(None, ['factors=["splat"]'])
-    with pytest.raises(GsbaError, match="at least 16"):
+    with pytest.raises(GsbaError, match="16"):
         load_config(None, ["splat.sizes=[8]"])
