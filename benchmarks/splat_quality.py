@@ -40,7 +40,12 @@ REFINED = {
     "splat": {"factors": ("bearing", "splat")},
 }  # row -> settings of `gsba refine`; the first row is the one that targets are about
 SOURCES = ("raw", "unaligned", "default", "splat", "colmap", "truth")
-RATES = {"rate_means": 5e-4, "rate_means_end": 5e-6, "rate_scales": 0.015}  # of short trainings
+RATES = {  # of short trainings, whose last views must not leave their exposure behind
+    "rate_means": 5e-4,
+    "rate_means_end": 5e-6,
+    "rate_scales": 0.015,
+    "rate_fade": 0.1,
+}
 PEER = "spherical-incremental"
 GAIN_DB, GAIN_SSIM = 4.66, 0.073  # of refined over raw poses, at least
 SHORT_DB = 0.1  # of refined poses behind true ones, at most

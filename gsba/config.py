@@ -225,7 +225,9 @@ class SplatFactorSettings(_Settings):
     )  # of training after each move: a splat that has yet to follow speaks against it
     moves: int = Field(default=3, ge=1)  # of the poses, at most, at each size
     solver_steps: int = Field(default=2, ge=1)  # of Levenberg-Marquardt in a move
-    min_gain_db: float = Field(default=0.01, ge=0)  # of held-out frames, or a move is undone
+    min_gain_db: float = Field(
+        default=0.05, ge=0
+    )  # of held-out frames, or a move is undone: chance alone gives 0.03
     max_growth: float = Field(default=1.05, gt=0)  # of all geometric cost, or a move is undone
     held_out_every: int = Field(default=8, ge=2)  # panoramas that judge: no splat sees them
     max_gaussians: int = Field(default=30_000, ge=1)
@@ -261,6 +263,7 @@ class SplatSettings(_Settings):
     rate_rotations: float = Field(default=1e-3, gt=0)
     rate_opacities: float = Field(default=0.05, gt=0)
     rate_colors: float = Field(default=2.5e-3, gt=0)  # a twentieth of it for what varies by view
+    rate_fade: float = Field(default=1.0, gt=0, le=1)  # of all but the means' rate, at the end
     densify: bool = True
     densify_pull: float = Field(default=2e-4, gt=0)  # gradient of a centre, image half-widths
     densify_scale: float = Field(default=0.01, gt=0)  # smaller: cloned, larger: split; of extent

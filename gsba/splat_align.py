@@ -21,7 +21,7 @@ from gsba.types import FACES, FrameSet, Reconstruction
 
 MIN_ALPHA = 0.95  # of a rendered pixel that is believed
 MAX_STEP = 0.1  # of the depth, between neighbouring pixels: more is an edge
-MAX_STEPS = 30  # of the solver at each size
+MAX_STEPS = 15  # of the solver at each size
 GATES_DEG = (16.0, 5.0, 1.5, 0.5)  # of observations at the first sizes; then the last
 _GATE_SIGMAS = 10.0  # wider gates loosen the loss in proportion
 _LUMA = np.array([0.299, 0.587, 0.114])

@@ -21,7 +21,14 @@ from gsba.types import Keypoints, Trajectory
 
 def settings_for(factors: tuple[str, ...] = ("bearing", "splat"), **splat) -> RefineSettings:
     """Small faces, few steps, a held-out frame in four."""
-    small = {"sizes": (24,), "first_steps": 60, "steps": 20, "moves": 1, "held_out_every": 4}
+    small = {
+        "sizes": (24,),
+        "first_steps": 60,
+        "steps": 20,
+        "moves": 1,
+        "held_out_every": 4,
+        "min_gain_db": 0.01,
+    }
     chosen = {"factors": factors, "splat": {**small, "backend": "cpu", **splat}}
     return RefineSettings.model_validate({**SETTINGS.model_dump(), **chosen})
 

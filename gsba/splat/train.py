@@ -233,13 +233,14 @@ class Trainer:
         settings = self.settings
         done = step / settings.iterations
         means = settings.rate_means ** (1 - done) * settings.rate_means_end**done
+        fade = settings.rate_fade**done
         return adam.Rates(
             means=means * self.extent,
-            log_scales=settings.rate_scales,
-            quaternions=settings.rate_rotations,
-            opacity_logits=settings.rate_opacities,
-            sh=settings.rate_colors,
-            sh_rest=settings.rate_colors / 20,
+            log_scales=fade * settings.rate_scales,
+            quaternions=fade * settings.rate_rotations,
+            opacity_logits=fade * settings.rate_opacities,
+            sh=fade * settings.rate_colors,
+            sh_rest=fade * settings.rate_colors / 20,
         )
 
     def _densify(self, state: State, step: int) -> tuple[Gaussians, adam.Moments]:
