@@ -1,6 +1,6 @@
 """Settings: one frozen model per stage, defaults that run a sensible job with no file."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -219,6 +219,28 @@ class PhotometricSettings(_Settings):
     polish_steps: int = Field(default=0, ge=0)  # of planes, after each step of the poses
 
 
+class SplatFactorSettings(_Settings):
+    """Poses refined against a splat of their own frames; see also `SplatSettings`."""
+
+    sizes: tuple[Annotated[int, Field(ge=16)], ...] = Field(
+        default=(48, 96), min_length=1
+    )  # pixels of a face, in order
+    first_steps: int = Field(default=200, ge=1)  # of training, before poses move at each size
+    steps: int = Field(
+        default=200, ge=1
+    )  # of training after each move: a splat that has yet to follow speaks against it
+    moves: int = Field(default=3, ge=1)  # of the poses, at most, at each size
+    solver_steps: int = Field(default=2, ge=1)  # of Levenberg-Marquardt in a move
+    min_gain_db: float = Field(
+        default=0.05, ge=0
+    )  # of held-out frames, or a move is undone: chance alone gives 0.03
+    max_growth: float = Field(default=1.05, gt=0)  # of all geometric cost, or a move is undone
+    held_out_every: int = Field(default=8, ge=2)  # panoramas that judge: no splat sees them
+    max_gaussians: int = Field(default=30_000, ge=1)
+    sh_degree: int = Field(default=1, ge=0, le=3)
+    backend: Literal["auto", "gsplat", "cpu"] = "auto"
+
+
 class ExportSettings(_Settings):
     """Datasets written at the end of a run."""
 
@@ -247,6 +269,7 @@ class SplatSettings(_Settings):
     rate_rotations: float = Field(default=1e-3, gt=0)
     rate_opacities: float = Field(default=0.05, gt=0)
     rate_colors: float = Field(default=2.5e-3, gt=0)  # a twentieth of it for what varies by view
+    rate_fade: float = Field(default=1.0, gt=0, le=1)  # of all but the means' rate, at the end
     densify: bool = True
     densify_pull: float = Field(default=2e-4, gt=0)  # gradient of a centre, image half-widths
     densify_scale: float = Field(default=0.01, gt=0)  # smaller: cloned, larger: split; of extent
@@ -281,18 +304,20 @@ class RefineSettings(_Settings):
     rounds: RoundSettings = RoundSettings()
     align: AlignSettings = AlignSettings()
     solver: SolverSettings = SolverSettings()
-    factors: tuple[Literal["bearing", "reprojection", "photometric"], ...] = Field(
+    factors: tuple[Literal["bearing", "reprojection", "photometric", "splat"], ...] = Field(
         default=("bearing",), min_length=1
     )
     photometric: PhotometricSettings = PhotometricSettings()
+    splat: SplatFactorSettings = SplatFactorSettings()
     export: ExportSettings = ExportSettings()
     placement: PlacementSettings = PlacementSettings()
     seed: int = 0
 
     @model_validator(mode="after")
     def _geometry_first(self) -> "RefineSettings":
-        if set(self.factors) == {"photometric"}:
-            raise ValueError("factors: photometric starts from bearing or reprojection; add one")
+        if not {"bearing", "reprojection"} & set(self.factors):
+            named = " and ".join(self.factors)
+            raise ValueError(f"factors: {named} starts from bearing or reprojection; add one")
         return self
 
     @model_validator(mode="after")

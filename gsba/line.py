@@ -22,6 +22,7 @@ from gsba import (
     photometric,
     places,
     recovery,
+    splat_refine,
     tracks,
 )
 from gsba.adjust import Adjustment
@@ -34,7 +35,8 @@ from gsba.photometric import PhotometricResult
 from gsba.places import Closed, connected
 from gsba.reconstruction import assemble
 from gsba.recovery import Recovered
-from gsba.store import RunStore, fingerprint
+from gsba.splat_refine import Move, SplatResult
+from gsba.store import RunStore, digest, fingerprint
 from gsba.types import (
     CoarsePoses,
     Counts,
@@ -76,6 +78,7 @@ class Line:
         self.solutions: dict[str, Adjustment] = {}
         self.undone: list[str] = []  # solutions that were not taken
         self.frame_weights = np.ones(len(frames))  # of each frame's pixels
+        self.moves: tuple[Move, ...] = ()  # of the poses against a splat
         self.latest = "keypoints"  # the stage that the next one builds on
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
         start = coarse.world_T_rigs.tolist(), settings.read
@@ -302,6 +305,26 @@ class Line:
         self.frame_weights = result.frame_weights
         return result.adjustment
 
+    def refine_on_splat(self, solved: Adjustment) -> Adjustment:
+        """Joint refinement by the observations so far, patches, and a splat of the frames."""
+        name, settings = "splat", self.settings
+        key = [self._solving(), settings.splat, settings.photometric, settings.factors]
+        turns = self.store.root / "stages" / name / "turns.npz"
+
+        def compute() -> SplatResult:
+            further = photometric.joint(
+                self.frames, solved, self.frame_weights, settings, self.num_threads
+            )
+            given = self.frames, self.observed, solved, self.priors, self.rig, settings
+            start = digest(key, solved.world_T_rigs.tolist())
+            return splat_refine.run(*given, self.num_threads, further, turns, start)
+
+        result = self._stage(name, key, compute, SplatResult)
+        turns.unlink(missing_ok=True)
+        self.counts[name], self.solutions[name] = list(result.counts), result.adjustment
+        self.moves = result.moves
+        return result.adjustment
+
     def reconstruct(self, solved: Adjustment) -> Reconstruction:
         """Covariances, and everything back in the trajectory's world."""
 
@@ -323,7 +346,11 @@ class Line:
     def _solving(self) -> list[object]:
         settings = self.settings
         relevant = [settings.triangulate, settings.rounds, settings.priors, settings.solver]
-        return [*relevant, [f for f in settings.factors if f != "photometric"], self.custom]
+        return [
+            *relevant,
+            [f for f in settings.factors if f not in ("photometric", "splat")],
+            self.custom,
+        ]
 
     def _stage(self, name: str, key: object, compute: Callable[[], T], returns: type[T]) -> T:
         """A stage that builds on the one before it."""

@@ -144,6 +144,8 @@ def _solve(line: Line, guided: VerifiedPairs, settings: RefineSettings) -> Adjus
         solved = line.solve_aligned(number, line.align(number, solved), solved)
     if "photometric" in settings.factors:
         solved = line.solve_photometric(solved)
+    if "splat" in settings.factors:
+        solved = line.refine_on_splat(solved)
     return solved
 
 
@@ -250,6 +252,7 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
         gauge=_GAUGE if (coarse.sources != PoseSource.NONE).any() else _OWN_GAUGE,
         notes=notes,
         trajectory=judgement,
+        moves=line.moves,
     )
     write_report(out / "report.json", report)
     write_html(out / "report.html", frames, coarse, reconstruction, report)

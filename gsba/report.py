@@ -137,6 +137,7 @@ def build_report(
     gauge: str,
     notes: Sequence[str] = (),
     trajectory: Mapping[str, Any] | None = None,
+    moves: Sequence[object] = (),
 ) -> dict[str, Any]:
     """Content of report.json: plain values only.
 
@@ -148,6 +149,7 @@ def build_report(
         gauge: a sentence on where the refined map sits.
         notes: what the user should know: frames without images, unmatched frames, ...
         trajectory: the images' judgement of it, see `gsba.motion.describe`.
+        moves: of the poses against a splat, see `gsba.splat_refine.Move`.
     """
     quality = frame_quality(reconstruction)
     residuals = np.degrees(angular_residuals(reconstruction))
@@ -175,6 +177,7 @@ def build_report(
         "trajectory": trajectory,
         "stages": stage_rows,
         "solver": solver,
+        "splat": moves,
         "frames": _frame_rows(frames, coarse, reconstruction, quality),
         "settings": settings,
         "machine": _machine(),

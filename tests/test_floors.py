@@ -21,7 +21,8 @@ FLOORS = (
     {"align", "cubemap", "features", "filter", "graph", "matching", "optimize", "pairs"}
     | {"patch_grid", "splat", "tracks", "triangulate", "verify"},
     {"adjust", "blame", "clock", "clock_fit", "frontend", "learned", "misfit", "motion"}
-    | {"photometric", "places", "reconstruction", "recovery", "splat_align", "splatting"},
+    | {"photometric", "places", "reconstruction", "recovery", "splat_align", "splat_refine"}
+    | {"splatting"},
     {"alignment", "carrier", "distractors", "evaluate", "evaluate_splat", "export"}
     | {"gravity", "induced", "placement", "report", "report_html", "video"},
     {"demo", "extraction", "line", "masking", "pipeline", "segment", "timing", "view"},

@@ -19,7 +19,7 @@ Overrides = Annotated[
 ]
 Factors = Annotated[
     str | None,
-    typer.Option(help="Factor families, commas between: bearing, reprojection, photometric."),
+    typer.Option(help="Families, commas between: bearing, reprojection, photometric, splat."),
 ]
 Weights = Annotated[
     list[Path] | None,
