@@ -9,6 +9,7 @@ import numpy as np
 
 from factors import tangent_basis
 from factors.patches import ALIGNED, REASONS, PatchSet, Sightings, expect, found_at
+from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
 from gsba import panorama
 from gsba.config import AlignSettings
@@ -47,6 +48,7 @@ def run(
     aligned: np.ndarray | None,
     settings: AlignSettings,
     num_threads: int,
+    field: SphereField | None = None,
 ) -> Sighted:
     """Observe every point anew, in the frames that should show it.
 
@@ -65,19 +67,22 @@ def run(
         aligned: (N,) bool, which of the keypoints patches have confirmed; None = none.
         settings: limits and sizes.
         num_threads: frames worked on at a time.
+        field: what the camera bends: keypoints are as observed, the map as corrected.
 
     Returns:
         Tracks of aligned observations, and of former ones where a point was not aligned.
     """
+    field = field or SphereField.none()
     rows = references(landmarks, world_T_rigs)
     hosts = landmarks.tracks.frames[rows].astype(np.int64)
     extended = _extended(landmarks, keypoints, aligned, settings.min_track_length)
     points, seeing = views(landmarks, world_T_rigs, rows, extended, settings)
-    origins, spreads, depths = _patches(landmarks.points_world, world_T_rigs[hosts], greys.width)
-    plane = world_T_rigs[hosts, :3, :3] @ spreads * depths[:, None, None]
-    sightings = expect(
-        points, *_carried(landmarks.points_world[points], plane[points], world_T_rigs[seeing])
+    origins, spreads, depths = _patches(
+        landmarks.points_world, world_T_rigs[hosts], greys.width, field
     )
+    plane = world_T_rigs[hosts, :3, :3] @ spreads * depths[:, None, None]
+    there = _carried(landmarks.points_world[points], plane[points], world_T_rigs[seeing])
+    sightings = expect(points, field.observed(there[0]), there[1])
     reach = _SEARCH * settings.max_shift_px
     sigmas = settings.affine_sigma, settings.grey_sigma
     patches = PatchSet(len(hosts), settings.patch_size, _WINDOW, *sigmas)
@@ -99,17 +104,18 @@ def run(
 
 
 def _patches(
-    points_world: np.ndarray, world_T_hosts: np.ndarray, width: int
+    points_world: np.ndarray, world_T_hosts: np.ndarray, width: int, field: SphereField
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Plane patches that face their hosts, one panorama pixel to a step.
 
     Returns:
-        origins (J, 3), the points' unit bearings; spreads (J, 3, 2) across them; depths (J,).
+        origins (J, 3), the points' unit bearings, as observed; spreads (J, 3, 2) across them;
+        depths (J,).
     """
     offsets = points_world - world_T_hosts[:, :3, 3]
     local = np.einsum("jba,jb->ja", world_T_hosts[:, :3, :3], offsets)
     depths = np.linalg.norm(local, axis=1)
-    origins = local / np.maximum(depths, 1e-300)[:, None]
+    origins = field.observed(local / np.maximum(depths, 1e-300)[:, None])
     spreads = 2 * np.pi / width * np.swapaxes(tangent_basis(origins), 1, 2)
     return origins, np.ascontiguousarray(spreads), depths
 

@@ -9,6 +9,7 @@ from typing import TypeVar
 import gtsam
 import numpy as np
 
+from factors.sphere_field import SphereField
 from gsba import (
     adjust,
     align,
@@ -21,6 +22,7 @@ from gsba import (
     photometric,
     places,
     recovery,
+    stitching,
     tracks,
 )
 from gsba.adjust import Adjustment
@@ -32,6 +34,7 @@ from gsba.photometric import PhotometricResult
 from gsba.places import Closed, connected
 from gsba.reconstruction import assemble
 from gsba.recovery import Recovered
+from gsba.stitching import Stitching
 from gsba.store import RunStore, fingerprint
 from gsba.types import (
     CoarsePoses,
@@ -88,7 +91,8 @@ class Line:
 
         before = ["frames", "features"]
         self.keypoints = store.stage("keypoints", None, gather, Keypoints, before)
-        self.observed = self.keypoints  # those that the latest solution is made of
+        self.observed = self.keypoints  # those that the latest solution is made of, as observed
+        self.stitching: Stitching | None = None  # the field that corrects them
         self.aligned: np.ndarray | None = None  # which of them patches have confirmed
         self.greys = panorama.Greys(frames, settings.align.max_width)
         self.context = MatchContext(
@@ -251,6 +255,7 @@ class Line:
                 self.aligned,
                 self.settings.align,
                 self.num_threads,
+                self.field,
             )
 
         key = self.settings.align.model_dump(exclude={"rounds"})
@@ -263,9 +268,10 @@ class Line:
         name, gates = f"aligned{number}", self.settings.rounds.aligned
 
         def compute() -> tuple[Adjustment, Keypoints]:
-            return adjust.run_sighted(
-                sighted, before, self.priors, self.rig, gates, self.settings, self.num_threads
-            )
+            there = replace(sighted, keypoints=self._corrected(sighted.keypoints))
+            given = self.priors, self.rig, gates, self.settings, self.num_threads
+            solved, found = adjust.run_sighted(there, before, *given)
+            return solved, stitching.with_noise_of(sighted.keypoints, found)
 
         key = [self._solving(), gates]
         solved, keypoints = self._stage(name, key, compute, tuple[Adjustment, Keypoints])
@@ -277,12 +283,50 @@ class Line:
         self.observed, self.aligned = keypoints, sighted.aligned
         return solved
 
+    def straighten(self, number: int, sighted: Sighted, solved: Adjustment) -> Adjustment:
+        """The map with what stitching bends taken out, where all frames share it."""
+        name, settings = f"stitching{number}", self.settings
+        is_first, is_off = number == 1, settings.stitching.mode == "off"
+        undone = self.solutions[f"aligned{number}"] is not solved
+        if is_off or undone or self.frames.layout != "erp" or not (is_first or self.field):
+            return solved
+
+        def compute() -> Stitching:
+            given = sighted, self.observed, solved, self.field, self.priors, self.rig
+            return stitching.run(*given, settings, self.num_threads)
+
+        key = [self._solving(), settings.stitching, settings.rounds.aligned]
+        found = self._stage(name, key, compute, Stitching)
+        self.counts[name] = [found.counts]
+        if not found.field:
+            return solved
+        self.solutions[name] = found.adjustment
+        if not adjust.carries(found.adjustment, solved, settings.rounds.min_observations):
+            self.undone.append(name)
+            return solved
+        self.stitching, self.observed = found, found.keypoints
+        return found.adjustment
+
+    @property
+    def field(self) -> SphereField:
+        """What is known of what stitching bends."""
+        return SphereField.none() if self.stitching is None else self.stitching.field
+
+    @property
+    def corrected(self) -> FrameSet:
+        """The frames, read as the field straightens them."""
+        return replace(self.frames, correction=tuple(self.field.coefficients.tolist()))
+
+    def _corrected(self, keypoints: Keypoints) -> Keypoints:
+        return stitching.corrected(keypoints, self.field, self.rig)
+
     def solve_photometric(self, solved: Adjustment) -> Adjustment:
         """Joint refinement by the observations so far and the grey values of patches."""
         name, settings = "photometric", self.settings
 
         def compute() -> PhotometricResult:
-            given = self.frames, self.observed, solved, self.priors, self.rig
+            observed = self._corrected(self.observed)
+            given = self.corrected, observed, solved, self.priors, self.rig
             return photometric.run(*given, settings, self.num_threads)
 
         key = [self._solving(), settings.photometric]
@@ -295,12 +339,14 @@ class Line:
         """Covariances, and everything back in the trajectory's world."""
 
         def compute() -> Reconstruction:
+            observed = self._corrected(self.observed)
             covariances = adjust.pose_covariances(
-                solved, self.priors, self.observed, self.rig, self.settings, self.num_threads
+                solved, self.priors, observed, self.rig, self.settings, self.num_threads
             )
             least = self.settings.rounds.min_observations
             false = None if self.trust is None else self.trust.false_frames
-            return assemble(solved, covariances, self.observed, self.coarse, least, false)
+            correction = self.corrected.correction
+            return assemble(solved, covariances, observed, self.coarse, least, false, correction)
 
         return self._stage("reconstruction", self._solving(), compute, Reconstruction)
 

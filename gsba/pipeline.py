@@ -125,7 +125,8 @@ def _solve(line: Line, settings: RefineSettings) -> Adjustment:
         final = number == rounds.map_passes and settings.align.rounds == 0
         solved = line.solve(f"refined{number}", [adjacent, wide], solved, rounds.refined, final)
     for number in range(1, settings.align.rounds + 1):
-        solved = line.solve_aligned(number, line.align(number, solved), solved)
+        sighted = line.align(number, solved)
+        solved = line.straighten(number, sighted, line.solve_aligned(number, sighted, solved))
     if "photometric" in settings.factors:
         solved = line.solve_photometric(solved)
     return solved
@@ -161,7 +162,8 @@ def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:
         GsbaError: `out` is no finished run.
     """
     reconstruction = load_stage(out, "reconstruction", Reconstruction)
-    return reconstruction, load_stage(out, "frames", FrameSet)
+    frames = load_stage(out, "frames", FrameSet)
+    return reconstruction, replace(frames, correction=reconstruction.correction)
 
 
 def _extract(
@@ -194,7 +196,7 @@ def _without_carrier(store: RunStore, frames: FrameSet) -> FrameSet:
 
 def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
     """Poses, cloud, report and datasets."""
-    store, settings, frames, coarse = line.store, line.settings, line.frames, line.coarse
+    store, settings, frames, coarse = line.store, line.settings, line.corrected, line.coarse
     out = store.root
     trajectory = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
     read.write_tum(out / "trajectory.tum", trajectory)
@@ -236,7 +238,7 @@ def _export(
 
     def compute() -> Counts:
         size = line.settings.export.face_size
-        export(reconstruction, line.frames, folder, to, size, placement)
+        export(reconstruction, line.corrected, folder, to, size, placement)
         return Counts(len(line.frames), len(line.frames), "frames")
 
     key = [line.settings.export.face_size, placement.to_json()]

@@ -21,12 +21,17 @@ logger = logging.getLogger(__name__)
 
 PARTS = 4  # of the sequence: each is predicted by the field that the others give
 _LEAST_FRAMES = 2 * PARTS
+_LEAST_POINTS = 50  # of a part
 _SPREADS = (1e-4, 3e-4, 1e-3, 3e-3)  # radians: a priori, of coefficients of degree 1; falls with
 # the square of the degree
 _GOOD_ENOUGH = 0.95  # of the best gain: the smoothest field that reaches it is taken
 _POSE_DAMPING = 1e-4  # of the poses' information, against the map's free similarity
 _POINT_DAMPING = 1e-9
 _MOST = 60_000  # observations that a field is found from
+_PROBE = (
+    20_000,
+    4,
+)  # observations, degree: of a first look, which must promise half of what is asked
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +40,12 @@ class Stitching:
 
     field: SphereField  # coefficients (0,): nothing is corrected
     adjustment: Adjustment
+    keypoints: Keypoints  # of the adjustment, as observed
     degree: int  # of the best field, taken or not
     part_gains: np.ndarray  # (PARTS,) float64, share of the robust cost of each part of the
     # sequence that the field of the other parts takes off, poses and points adjusted with and
     # without it
-    accepted: bool
-    counts: Counts  # of observations
+    counts: Counts  # of observations the field was found from
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +67,9 @@ class _System:
         step = np.zeros(len(self.gradient))
         num = min(len(step), len(coefficients))
         step[:num] = -coefficients[:num]
-        return _System(self.cost - self.gain(step), self.gradient + self.hessian @ step, self.hessian)
+        return _System(
+            self.cost - self.gain(step), self.gradient + self.hessian @ step, self.hessian
+        )
 
 
 def corrected(keypoints: Keypoints, field: SphereField, rig: CubeRig) -> Keypoints:
@@ -103,8 +110,8 @@ def run(
     are worth. The field is taken where every part gains, and all together enough.
 
     Args:
-        sighted: candidate tracks, and the keypoints as observed.
-        keypoints: of `sighted`, with the noise they turned out to have, as observed.
+        sighted: candidate tracks and their keypoints, as observed.
+        keypoints: the same with the noise they turned out to have.
         before: the map solved with `field`.
         field: so far.
         priors: factors on the poses, gauge included.
@@ -112,38 +119,52 @@ def run(
         settings: limits, loss, solver.
         num_threads: of the solver.
     """
-    chosen, solved = settings.stitching, before
-    evidence, degree, spread = np.zeros(PARTS), 0, _SPREADS[0]
+    chosen, given = settings.stitching, (rig, settings, num_threads)
+    whole = _MOST, chosen.max_degree, chosen.min_gain
+    probe = _PROBE[0], min(_PROBE[1], chosen.max_degree), 0.5 * chosen.min_gain
+    now = Stitching(field, before, keypoints, 0, np.zeros(PARTS), Counts(0, 0, "observations"))
+    systems, spread = [], 0.0
+    for most, max_degree, least in [whole] if field else [probe, whole]:
+        systems, counts = _systems(now, most, max_degree, *given)
+        if not systems:
+            return replace(now, counts=counts)
+        degree, spread, gains = _choose(systems, max_degree)
+        costs = np.array([part.cost for part in systems])
+        now = replace(now, degree=degree, part_gains=gains / costs, counts=counts)
+        if gains.sum() < least * costs.sum() or np.any(gains <= 0):
+            return now
     for number in range(chosen.rounds):
-        landmarks = _chosen_landmarks(solved.landmarks, settings.seed)
-        parts = _parts(landmarks)
-        counts = Counts(len(solved.landmarks.tracks), len(landmarks.tracks), "observations")
-        if parts is None:
-            return Stitching(field, before, 0, evidence, bool(field), counts)
-        systems = [
-            _system(part, keypoints, solved, field, rig, settings, num_threads) for part in parts
-        ]
-        if number == 0:
-            degree, spread, gains = _choose(systems, chosen.max_degree)
-            costs = np.array([part.cost for part in systems])
-            evidence = gains / np.maximum(costs, 1e-300)
-            if gains.sum() < chosen.min_gain * costs.sum() or np.any(gains <= 0):
-                break
-        field = SphereField(_fitted(systems, degree, spread))
-        solved = adjust.run(
-            sighted.tracks, corrected(keypoints, field, rig), replace(solved, noise=1.0), priors,
-            rig, settings.rounds.aligned[-1:], settings, num_threads,
-        )  # fmt: skip
-    else:
-        logger.info("stitching: %.4f deg rms, degree %d", np.rad2deg(field.rms_rad), degree)
-        return Stitching(field, solved, degree, evidence, True, counts)
-    return Stitching(field, before, degree, evidence, bool(field), counts)
+        if number:
+            systems, _ = _systems(now, _MOST, chosen.max_degree, *given)
+        field = SphereField(_fitted(systems, now.degree, spread))
+        there = replace(sighted, keypoints=corrected(sighted.keypoints, field, rig))
+        gates = settings.rounds.aligned[-1:]
+        solved, found = adjust.run_sighted(there, now.adjustment, priors, rig, gates, *given[1:])
+        keypoints = with_noise_of(sighted.keypoints, found)
+        now = replace(now, field=field, adjustment=solved, keypoints=keypoints)
+    logger.info("stitching: %.4f deg rms, degree %d", np.rad2deg(field.rms_rad), now.degree)
+    return now
 
 
-def _chosen_landmarks(landmarks: Landmarks, seed: int) -> Landmarks:
-    """A share of the points, drawn at random, where there are more observations than needed."""
+def _systems(
+    now: Stitching,
+    most: int,
+    max_degree: int,
+    rig: CubeRig,
+    settings: RefineSettings,
+    num_threads: int,
+) -> tuple[list[_System], Counts]:
+    """Models of the cost of each part of the sequence; none where there is too little."""
+    landmarks = _drawn(now.adjustment.landmarks, most, settings.seed)
+    counts = Counts(len(now.adjustment.landmarks.tracks), len(landmarks.tracks), "observations")
+    parts = _parts(landmarks)
+    return [_system(part, now, max_degree, rig, settings, num_threads) for part in parts], counts
+
+
+def _drawn(landmarks: Landmarks, most: int, seed: int) -> Landmarks:
+    """A share of the points, drawn at random, where there are more than `most` observations."""
     tracks = landmarks.tracks
-    share = _MOST / max(len(tracks), 1)
+    share = most / max(len(tracks), 1)
     if share >= 1:
         return landmarks
     drawn = np.random.default_rng(seed).random(tracks.num_points) < share
@@ -163,11 +184,11 @@ def _of_points(landmarks: Landmarks, chosen: np.ndarray) -> Landmarks:
     return Landmarks(landmarks.points_world[chosen], kept, landmarks.counts)
 
 
-def _parts(landmarks: Landmarks) -> list[Landmarks] | None:
-    """The points of each part of the sequence; None where there is too little."""
+def _parts(landmarks: Landmarks) -> list[Landmarks]:
+    """The points of each part of the sequence; no part where there is too little."""
     tracks = landmarks.tracks
-    if len(np.unique(tracks.frames)) < _LEAST_FRAMES or tracks.num_points < 50 * PARTS:
-        return None
+    if len(np.unique(tracks.frames)) < _LEAST_FRAMES or tracks.num_points < _LEAST_POINTS * PARTS:
+        return []
     seen = np.bincount(tracks.points, minlength=tracks.num_points)
     means = np.bincount(tracks.points, tracks.frames, tracks.num_points) / np.maximum(seen, 1)
     ranks = np.argsort(np.argsort(means, kind="stable"), kind="stable")
@@ -177,16 +198,15 @@ def _parts(landmarks: Landmarks) -> list[Landmarks] | None:
 
 def _system(
     landmarks: Landmarks,
-    keypoints: Keypoints,
-    solved: Adjustment,
-    field: SphereField,
+    now: Stitching,
+    max_degree: int,
     rig: CubeRig,
     settings: RefineSettings,
     num_threads: int,
 ) -> _System:
-    """Model of the robust cost of some points over changes of the field."""
+    """Model of the robust cost of some points over fields."""
+    keypoints, solved, field, noise = now.keypoints, now.adjustment, now.field, now.adjustment.noise
     there = corrected(keypoints, field, rig)
-    noise = solved.noise
     block = adjust.landmark_block(landmarks, there, rig, noise, settings, num_threads)
     block.polish(adjust.values_of(solved.world_T_rigs))
     tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
@@ -195,13 +215,7 @@ def _system(
         there.bearings_rig[rows],
     )  # fmt: skip
     observed = keypoints.bearings_rig[rows]
-    by_field = -np.einsum(
-        "oij,ojk->oik", tangent_basis(observed), harmonics(observed, settings.stitching.max_degree)
-    )
-    # as tangent vectors at the corrected bearing
-    by_field = tangent_basis(there.bearings_rig[rows]) @ (
-        np.swapaxes(tangent_basis(observed), 1, 2) @ by_field
-    )
+    by_field = -tangent_basis(there.bearings_rig[rows]) @ harmonics(observed, max_degree)
     roots = np.eye(2) / there.sigmas_rad[rows, None, None]
     if there.sqrt_infos is not None:
         roots = there.sqrt_infos[rows]

@@ -20,7 +20,7 @@ FLOORS = (
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter", "align", "splat", "patch_grid"},
     {"adjust", "blame", "frontend", "learned", "misfit", "motion", "photometric", "places"}
-    | {"reconstruction", "recovery", "splat_align", "splatting"},
+    | {"reconstruction", "recovery", "splat_align", "splatting", "stitching"},
     {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"}
     | {"alignment", "carrier", "gravity", "placement"},
     {"demo", "extraction", "line", "pipeline"},
