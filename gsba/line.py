@@ -222,17 +222,8 @@ class Line:
 
         def compute() -> Adjustment:
             chained = tracks.run(matches, np.diff(self.keypoints.starts))
-            return adjust.run(
-                chained,
-                self.keypoints,
-                start,
-                self.priors,
-                self.rig,
-                gates,
-                self.settings,
-                self.num_threads,
-                final,
-            )
+            given = chained, self.keypoints, start, self.priors, self.rig
+            return adjust.run(*given, gates, self.settings, self.num_threads, final)
 
         solved = self._stage(name, [self._solving(), gates, final], compute, Adjustment)
         self.counts[name] = [solved.landmarks.counts]
@@ -244,19 +235,9 @@ class Line:
         name = f"align{number}"
 
         def compute() -> Sighted:
-            return align.run(
-                solved.landmarks,
-                solved.world_T_rigs,
-                self.observed,
-                solved.noise,
-                self.greys,
-                self.rig,
-                name,
-                self.aligned,
-                self.settings.align,
-                self.num_threads,
-                self.field,
-            )
+            given = solved.landmarks, solved.world_T_rigs, self.observed, solved.noise
+            how = name, self.aligned, self.settings.align, self.num_threads, self.field
+            return align.run(*given, self.greys, self.rig, *how)
 
         key = self.settings.align.model_dump(exclude={"rounds"})
         sighted = self._stage(name, key, compute, Sighted)
