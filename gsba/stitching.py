@@ -28,10 +28,7 @@ _GOOD_ENOUGH = 0.95  # of the best gain: the smoothest field that reaches it is 
 _POSE_DAMPING = 1e-4  # of the poses' information, against the map's free similarity
 _POINT_DAMPING = 1e-9
 _MOST = 60_000  # observations that a field is found from
-_PROBE = 20_000, 4  # observations and degree of a first look, which must promise half the gain
-    20_000,
-    4,
-)  # observations, degree: of a first look, which must promise half the gain
+_PROBE = 20_000, 4  # observations and degree of a first look: half the gain must show there
 
 
 @dataclass(frozen=True, slots=True)
