@@ -77,8 +77,9 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
                     sighted, observed, solved, field, priors, rig, settings, threads
                 )
                 solved, observed, field = result.adjustment, result.keypoints, result.field
-                print("parts gain", np.round(result.part_gains, 3), "degree", result.degree,
-                      "rms", round(float(np.rad2deg(field.rms_rad)), 4), "deg", flush=True)  # fmt: skip
+                print(
+                    f"parts gain {result.part_gains.round(3)}, degree {result.degree}", flush=True
+                )
         variants.append(Variant(name, solved, field))
     last = variants[-1]
     placed = place(last, held.tracks, keypoints, settings)

@@ -92,7 +92,7 @@ class Line:
         before = ["frames", "features"]
         self.keypoints = store.stage("keypoints", None, gather, Keypoints, before)
         self.observed = self.keypoints  # those that the latest solution is made of, as observed
-        self.stitching: Stitching | None = None  # the field that corrects them
+        self.stitching: Stitching | None = None  # with the field that corrects them, if any
         self.aligned: np.ndarray | None = None  # which of them patches have confirmed
         self.greys = panorama.Greys(frames, settings.align.max_width)
         self.context = MatchContext(
@@ -280,6 +280,7 @@ class Line:
         found = self._stage(name, key, compute, Stitching)
         self.counts[name] = [found.counts]
         if not found.field:
+            self.stitching = found
             return solved
         self.solutions[name] = found.adjustment
         if not adjust.carries(found.adjustment, solved, settings.rounds.min_observations):

@@ -19,8 +19,9 @@ from gsba.log import GsbaError
 from gsba.misfit import refuse_useless
 from gsba.motion import describe
 from gsba.placement import Placement, check, place
-from gsba.report import build_report, take_notes, write_poses, write_report
-from gsba.report_html import write_html
+from gsba.report import build_report, plain, take_notes, write_poses, write_report
+from gsba.report_html import residual_sphere, write_html
+from gsba.stitching import describe as describe_field
 from gsba.store import RunStore, atomic_write, fingerprint, load_stage
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, Reconstruction, Trajectory
 
@@ -221,7 +222,9 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
         gauge=_GAUGE if (coarse.sources != PoseSource.NONE).any() else _OWN_GAUGE,
         notes=notes,
         trajectory=judgement,
+        stitching=line.stitching and describe_field(line.stitching),
     )
+    report["residual_sphere"] = plain(residual_sphere(reconstruction), digits=4)
     write_report(out / "report.json", report)
     write_html(out / "report.html", frames, coarse, reconstruction, report)
     for name in _OUTPUTS:

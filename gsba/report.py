@@ -137,6 +137,7 @@ def build_report(
     gauge: str,
     notes: Sequence[str] = (),
     trajectory: Mapping[str, Any] | None = None,
+    stitching: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Content of report.json: plain values only.
 
@@ -148,6 +149,7 @@ def build_report(
         gauge: a sentence on where the refined map sits.
         notes: what the user should know: frames without images, unmatched frames, ...
         trajectory: the images' judgement of it, see `gsba.motion.describe`.
+        stitching: the field of directions, see `gsba.stitching.describe`.
     """
     quality = frame_quality(reconstruction)
     residuals = np.degrees(angular_residuals(reconstruction))
@@ -173,6 +175,7 @@ def build_report(
         "gauge": gauge,
         "notes": notes,
         "trajectory": trajectory,
+        "stitching": stitching,
         "stages": stage_rows,
         "solver": solver,
         "frames": _frame_rows(frames, coarse, reconstruction, quality),

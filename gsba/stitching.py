@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import dataclass, replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -67,6 +68,22 @@ class _System:
         return _System(
             self.cost - self.gain(step), self.gradient + self.hessian @ step, self.hessian
         )
+
+
+def describe(found: Stitching) -> dict[str, Any]:
+    """What report.json says of a field."""
+    field = found.field
+    rays = np.random.default_rng(0).normal(size=(2000, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    largest = np.linalg.norm(field.displacements(rays), axis=1).max()
+    return {
+        "taken": bool(field),
+        "degree": found.degree,
+        "rms_deg": np.rad2deg(field.rms_rad),
+        "max_deg": np.rad2deg(largest),
+        "gain_of_unseen_parts": found.part_gains,
+        "coefficients_rad": field.coefficients,
+    }
 
 
 def corrected(keypoints: Keypoints, field: SphereField, rig: CubeRig) -> Keypoints:
