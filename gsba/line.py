@@ -286,6 +286,8 @@ class Line:
         if not adjust.carries(found.adjustment, solved, settings.rounds.min_observations):
             self.undone.append(name)
             return solved
+        if self.stitching is not None:  # what it gained is known best from where none was
+            found = replace(found, part_gains=self.stitching.part_gains)
         self.stitching, self.observed = found, found.keypoints
         return found.adjustment
 
