@@ -24,6 +24,8 @@ _STEPS = 12
 _TOLERANCE = 0.02  # of the last step, pixels
 _LEAST_SIGMA = 0.03  # pixels: what sampling and a plane for the surface cost the best of patches
 
+_STRAIGHT = SphereField.none()
+
 _Mask: TypeAlias = np.ndarray | None  # (H, 2H) bool, True = use
 
 
@@ -48,7 +50,7 @@ def run(
     aligned: np.ndarray | None,
     settings: AlignSettings,
     num_threads: int,
-    field: SphereField | None = None,
+    field: SphereField = _STRAIGHT,
 ) -> Sighted:
     """Observe every point anew, in the frames that should show it.
 
@@ -72,19 +74,16 @@ def run(
     Returns:
         Tracks of aligned observations, and of former ones where a point was not aligned.
     """
-    field = field or SphereField.none()
     rows = references(landmarks, world_T_rigs)
     hosts = landmarks.tracks.frames[rows].astype(np.int64)
     extended = _extended(landmarks, keypoints, aligned, settings.min_track_length)
     points, seeing = views(landmarks, world_T_rigs, rows, extended, settings)
-    origins, spreads, depths = _patches(
-        landmarks.points_world, world_T_rigs[hosts], greys.width, field
-    )
+    placed = landmarks.points_world, world_T_rigs[hosts], greys.width, field
+    origins, spreads, depths = _patches(*placed)
     plane = world_T_rigs[hosts, :3, :3] @ spreads * depths[:, None, None]
-    there = _carried(landmarks.points_world[points], plane[points], world_T_rigs[seeing])
-    sightings = expect(points, field.observed(there[0]), there[1])
-    reach = _SEARCH * settings.max_shift_px
-    sigmas = settings.affine_sigma, settings.grey_sigma
+    at, across = _carried(landmarks.points_world[points], plane[points], world_T_rigs[seeing])
+    sightings = expect(points, field.observed(at), across)
+    sigmas, reach = (settings.affine_sigma, settings.grey_sigma), _SEARCH * settings.max_shift_px
     patches = PatchSet(len(hosts), settings.patch_size, _WINDOW, *sigmas)
 
     def cut(image: SphereImage, mask: _Mask, chosen: np.ndarray) -> None:
