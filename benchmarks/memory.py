@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.common import machine, measure, peak_mb
 from gsba import align, panorama, read
 from gsba.config import AlignSettings
-from gsba.geometry import bearings_from_erp, erp_from_bearings, pose
+from gsba.geometry import pose
 from gsba.records import atomic_write
 from gsba.rig import CubeRig, owner_faces
 from gsba.types import Counts, Keypoints, Landmarks, Tracks

@@ -55,8 +55,8 @@ def run(
     """Observe every point anew, in the frames that should show it.
 
     The patch around a point is cut from the frame in the middle of its observations, as a plane
-    that faces it; poses and depth carry it into others, where a shift, a small affine change,
-    gain and offset are found. Images are wanted twice, one per thread at a time.
+    facing it; poses and depth carry it into others, where shift, a small affine change, gain and
+    offset are found. Images are wanted twice, one per thread at a time.
 
     Args:
         landmarks: points and their observations so far.
@@ -69,7 +69,7 @@ def run(
         aligned: (N,) bool, which of the keypoints patches have confirmed; None = none.
         settings: limits and sizes.
         num_threads: frames worked on at a time.
-        field: what the camera bends: keypoints are as observed, the map as corrected.
+        field: of the camera; keypoints are as observed, the map as corrected.
 
     Returns:
         Tracks of aligned observations, and of former ones where a point was not aligned.
@@ -78,12 +78,12 @@ def run(
     hosts = landmarks.tracks.frames[rows].astype(np.int64)
     extended = _extended(landmarks, keypoints, aligned, settings.min_track_length)
     points, seeing = views(landmarks, world_T_rigs, rows, extended, settings)
-    placed = landmarks.points_world, world_T_rigs[hosts], greys.width, field
-    origins, spreads, depths = _patches(*placed)
-    plane = world_T_rigs[hosts, :3, :3] @ spreads * depths[:, None, None]
-    at, across = _carried(landmarks.points_world[points], plane[points], world_T_rigs[seeing])
+    placed = landmarks.points_world, world_T_rigs[hosts]
+    origins, spreads, planes = _patches(*placed, greys.width, field)
+    at, across = _carried(landmarks.points_world[points], planes[points], world_T_rigs[seeing])
     sightings = expect(points, field.observed(at), across)
-    sigmas, reach = (settings.affine_sigma, settings.grey_sigma), _SEARCH * settings.max_shift_px
+    reach = _SEARCH * settings.max_shift_px
+    sigmas = settings.affine_sigma, settings.grey_sigma
     patches = PatchSet(len(hosts), settings.patch_size, _WINDOW, *sigmas)
 
     def cut(image: SphereImage, mask: _Mask, chosen: np.ndarray) -> None:
@@ -97,8 +97,8 @@ def run(
     kept, found, dropped = _accepted(patches, sightings, seeing, 2 * np.pi / greys.width, settings)
     at_hosts = _at_hosts(patches, sightings, kept, hosts, origins, spreads)
     former = _former(landmarks, keypoints, noise, [found, at_hosts], greys.num_frames)
-    colors = keypoints.colors[keypoints.rows(landmarks.tracks)[rows]]
     counts = Counts(len(points), len(found.points), "observations", dropped)
+    colors = keypoints.colors[keypoints.rows(landmarks.tracks)[rows]]
     return _pack([found, at_hosts, former], colors, greys.num_frames, rig, counts)
 
 
@@ -109,14 +109,15 @@ def _patches(
 
     Returns:
         origins (J, 3), the points' unit bearings, as observed; spreads (J, 3, 2) across them;
-        depths (J,).
+        the same axes (J, 3, 2) at the points, in the world.
     """
     offsets = points_world - world_T_hosts[:, :3, 3]
     local = np.einsum("jba,jb->ja", world_T_hosts[:, :3, :3], offsets)
     depths = np.linalg.norm(local, axis=1)
     origins = field.observed(local / np.maximum(depths, 1e-300)[:, None])
     spreads = 2 * np.pi / width * np.swapaxes(tangent_basis(origins), 1, 2)
-    return origins, np.ascontiguousarray(spreads), depths
+    planes = world_T_hosts[:, :3, :3] @ spreads * depths[:, None, None]
+    return origins, np.ascontiguousarray(spreads), planes
 
 
 def _carried(
