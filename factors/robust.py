@@ -50,3 +50,13 @@ class RobustLoss:
         if self.kind == "geman_mcclure":
             return 0.5 * squared * c2 / (c2 + squared)
         return 0.5 * squared
+
+    def weights(self, squared: np.ndarray) -> np.ndarray:
+        """Weights (N,) = 2 rho'(s) of squared whitened residual norms (N,)."""
+        c2 = self.scale**2
+        if self.kind == "huber":
+            return np.sqrt(np.minimum(1.0, c2 / np.maximum(squared, 1e-300)))
+        if self.kind == "none":
+            return np.ones_like(squared, dtype=np.float64)
+        weights = c2 / (c2 + squared)
+        return weights if self.kind == "cauchy" else weights**2

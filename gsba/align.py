@@ -9,6 +9,7 @@ import numpy as np
 
 from factors import tangent_basis
 from factors.patches import ALIGNED, REASONS, PatchSet, Sightings, expect, found_at
+from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
 from gsba import panorama
 from gsba.config import AlignSettings
@@ -22,6 +23,8 @@ _SEARCH = 3.0  # shifts followed while aligning, in largest accepted ones
 _STEPS = 12
 _TOLERANCE = 0.02  # of the last step, pixels
 _LEAST_SIGMA = 0.03  # pixels: what sampling and a plane for the surface cost the best of patches
+
+_STRAIGHT = SphereField.none()
 
 _Mask: TypeAlias = np.ndarray | None  # (H, 2H) bool, True = use
 
@@ -47,12 +50,13 @@ def run(
     aligned: np.ndarray | None,
     settings: AlignSettings,
     num_threads: int,
+    field: SphereField = _STRAIGHT,
 ) -> Sighted:
     """Observe every point anew, in the frames that should show it.
 
     The patch around a point is cut from the frame in the middle of its observations, as a plane
-    that faces it; poses and depth carry it into others, where a shift, a small affine change,
-    gain and offset are found. Images are wanted twice, one per thread at a time.
+    facing it; poses and depth carry it into others, where shift, a small affine change, gain and
+    offset are found. Images are wanted twice, one per thread at a time.
 
     Args:
         landmarks: points and their observations so far.
@@ -65,6 +69,7 @@ def run(
         aligned: (N,) bool, which of the keypoints patches have confirmed; None = none.
         settings: limits and sizes.
         num_threads: frames worked on at a time.
+        field: of the camera; keypoints are as observed, the map as corrected.
 
     Returns:
         Tracks of aligned observations, and of former ones where a point was not aligned.
@@ -73,11 +78,10 @@ def run(
     hosts = landmarks.tracks.frames[rows].astype(np.int64)
     extended = _extended(landmarks, keypoints, aligned, settings.min_track_length)
     points, seeing = views(landmarks, world_T_rigs, rows, extended, settings)
-    origins, spreads, depths = _patches(landmarks.points_world, world_T_rigs[hosts], greys.width)
-    plane = world_T_rigs[hosts, :3, :3] @ spreads * depths[:, None, None]
-    sightings = expect(
-        points, *_carried(landmarks.points_world[points], plane[points], world_T_rigs[seeing])
-    )
+    placed = landmarks.points_world, world_T_rigs[hosts]
+    origins, spreads, planes = _patches(*placed, greys.width, field)
+    at, across = _carried(landmarks.points_world[points], planes[points], world_T_rigs[seeing])
+    sightings = expect(points, field.observed(at), across)
     reach = _SEARCH * settings.max_shift_px
     sigmas = settings.affine_sigma, settings.grey_sigma
     patches = PatchSet(len(hosts), settings.patch_size, _WINDOW, *sigmas)
@@ -93,25 +97,27 @@ def run(
     kept, found, dropped = _accepted(patches, sightings, seeing, 2 * np.pi / greys.width, settings)
     at_hosts = _at_hosts(patches, sightings, kept, hosts, origins, spreads)
     former = _former(landmarks, keypoints, noise, [found, at_hosts], greys.num_frames)
-    colors = keypoints.colors[keypoints.rows(landmarks.tracks)[rows]]
     counts = Counts(len(points), len(found.points), "observations", dropped)
+    colors = keypoints.colors[keypoints.rows(landmarks.tracks)[rows]]
     return _pack([found, at_hosts, former], colors, greys.num_frames, rig, counts)
 
 
 def _patches(
-    points_world: np.ndarray, world_T_hosts: np.ndarray, width: int
+    points_world: np.ndarray, world_T_hosts: np.ndarray, width: int, field: SphereField
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Plane patches that face their hosts, one panorama pixel to a step.
 
     Returns:
-        origins (J, 3), the points' unit bearings; spreads (J, 3, 2) across them; depths (J,).
+        origins (J, 3), the points' unit bearings, as observed; spreads (J, 3, 2) across them;
+        the same axes (J, 3, 2) at the points, in the world.
     """
     offsets = points_world - world_T_hosts[:, :3, 3]
     local = np.einsum("jba,jb->ja", world_T_hosts[:, :3, :3], offsets)
     depths = np.linalg.norm(local, axis=1)
-    origins = local / np.maximum(depths, 1e-300)[:, None]
+    origins = field.observed(local / np.maximum(depths, 1e-300)[:, None])
     spreads = 2 * np.pi / width * np.swapaxes(tangent_basis(origins), 1, 2)
-    return origins, np.ascontiguousarray(spreads), depths
+    planes = world_T_hosts[:, :3, :3] @ spreads * depths[:, None, None]
+    return origins, np.ascontiguousarray(spreads), planes
 
 
 def _carried(

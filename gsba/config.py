@@ -166,6 +166,17 @@ class AlignSettings(_Settings):
         return size
 
 
+class StitchingSettings(_Settings):
+    """What stitching bends, found as a smooth field on the sphere that all frames share."""
+
+    mode: Literal["auto", "off"] = "auto"  # auto: taken where it predicts what it has not seen
+    max_degree: int = Field(default=10, ge=1, le=16)  # of its harmonics: 180 degrees over it
+    min_gain: float = Field(
+        default=0.03, ge=0, lt=1
+    )  # share of the robust cost of unseen observations that it must take off
+    rounds: int = Field(default=2, ge=1)  # of the field and the bundle adjustment after it
+
+
 class PriorSettings(_Settings):
     """What the trajectory is worth in the graph."""
 
@@ -303,6 +314,7 @@ class RefineSettings(_Settings):
     priors: PriorSettings = PriorSettings()
     rounds: RoundSettings = RoundSettings()
     align: AlignSettings = AlignSettings()
+    stitching: StitchingSettings = StitchingSettings()
     solver: SolverSettings = SolverSettings()
     factors: tuple[Literal["bearing", "reprojection", "photometric", "splat"], ...] = Field(
         default=("bearing",), min_length=1

@@ -8,10 +8,9 @@ import numpy as np
 from gsba import read
 from gsba.config import CubemapSettings
 from gsba.geometry import erp_from_bearings
+from gsba.read.corrected import PAD, wrapped
 from gsba.rig import CubeRig
 from gsba.types import FACES, FrameSet
-
-_PAD = 4  # pixels of wrap-around: the support of bicubic sampling
 
 
 def rig_for(frames: FrameSet, settings: CubemapSettings) -> CubeRig:
@@ -61,7 +60,7 @@ def cut(erp: np.ndarray, rig: CubeRig) -> np.ndarray:
         width = 2 * round(density / 2)
         height = width // 2
         erp = cv2.resize(erp, (width, height), interpolation=cv2.INTER_AREA)
-    padded = _wrap(erp)
+    padded = wrapped(erp)
     maps = _face_maps(rig, width, height)
     return np.stack(
         [
@@ -74,7 +73,7 @@ def cut(erp: np.ndarray, rig: CubeRig) -> np.ndarray:
 def cut_mask(mask: np.ndarray, rig: CubeRig) -> np.ndarray:
     """Nearest-neighbour faces (6, size, size) bool of an ERP mask (H, 2H) bool."""
     height, width = mask.shape
-    padded = _wrap(mask.astype(np.uint8))
+    padded = wrapped(mask.astype(np.uint8))
     maps = _face_maps(rig, width, height)
     return np.stack(
         [
@@ -82,15 +81,6 @@ def cut_mask(mask: np.ndarray, rig: CubeRig) -> np.ndarray:
             for face in range(len(FACES))
         ]
     )
-
-
-def _wrap(erp: np.ndarray) -> np.ndarray:
-    """Pad by what lies beyond the border on the sphere: the other side of seam and poles."""
-    half = erp.shape[1] // 2
-    above = np.roll(erp[:_PAD][::-1], half, axis=1)
-    below = np.roll(erp[-_PAD:][::-1], half, axis=1)
-    tall = np.concatenate([above, erp, below], axis=0)
-    return np.concatenate([tall[:, -_PAD:], tall, tall[:, :_PAD]], axis=1)
 
 
 @functools.lru_cache(maxsize=2)
@@ -101,5 +91,5 @@ def _face_maps(rig: CubeRig, width: int, height: int) -> np.ndarray:
     maps = np.empty((len(FACES), 2, rig.size, rig.size), np.float32)
     for face in range(len(FACES)):
         erp_pixels = erp_from_bearings(rig.bearings(grid, face), width, height)
-        maps[face] = np.moveaxis(erp_pixels - 0.5 + _PAD, -1, 0)
+        maps[face] = np.moveaxis(erp_pixels - 0.5 + PAD, -1, 0)
     return maps

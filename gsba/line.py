@@ -9,6 +9,7 @@ from typing import TypeVar
 import gtsam
 import numpy as np
 
+from factors.sphere_field import SphereField
 from gsba import (
     adjust,
     align,
@@ -23,6 +24,7 @@ from gsba import (
     places,
     recovery,
     splat_refine,
+    stitching,
     tracks,
 )
 from gsba.adjust import Adjustment
@@ -36,6 +38,7 @@ from gsba.places import Closed, connected
 from gsba.reconstruction import assemble
 from gsba.recovery import Recovered
 from gsba.splat_refine import Move, SplatResult
+from gsba.stitching import Stitching
 from gsba.store import RunStore, digest, fingerprint
 from gsba.types import (
     CoarsePoses,
@@ -95,7 +98,8 @@ class Line:
 
         before = ["frames", "features"]
         self.keypoints = store.stage("keypoints", None, gather, Keypoints, before)
-        self.observed = self.keypoints  # those that the latest solution is made of
+        self.observed = self.keypoints  # those that the latest solution is made of, as observed
+        self.stitching: Stitching | None = None  # with the field that corrects them, if any
         self.aligned: np.ndarray | None = None  # which of them patches have confirmed
         self.greys = panorama.Greys(frames, settings.align.max_width)
         self.context = MatchContext(
@@ -232,17 +236,8 @@ class Line:
 
         def compute() -> Adjustment:
             chained = tracks.run(matches, np.diff(self.keypoints.starts))
-            return adjust.run(
-                chained,
-                self.keypoints,
-                start,
-                self.priors,
-                self.rig,
-                gates,
-                self.settings,
-                self.num_threads,
-                final,
-            )
+            given = chained, self.keypoints, start, self.priors, self.rig
+            return adjust.run(*given, gates, self.settings, self.num_threads, final)
 
         solved = self._stage(name, [self._solving(), gates, final], compute, Adjustment)
         self.counts[name] = [solved.landmarks.counts]
@@ -254,18 +249,9 @@ class Line:
         name = f"align{number}"
 
         def compute() -> Sighted:
-            return align.run(
-                solved.landmarks,
-                solved.world_T_rigs,
-                self.observed,
-                solved.noise,
-                self.greys,
-                self.rig,
-                name,
-                self.aligned,
-                self.settings.align,
-                self.num_threads,
-            )
+            given = solved.landmarks, solved.world_T_rigs, self.observed, solved.noise
+            how = name, self.aligned, self.settings.align, self.num_threads, self.field
+            return align.run(*given, self.greys, self.rig, *how)
 
         key = self.settings.align.model_dump(exclude={"rounds"})
         sighted = self._stage(name, key, compute, Sighted)
@@ -277,9 +263,10 @@ class Line:
         name, gates = f"aligned{number}", self.settings.rounds.aligned
 
         def compute() -> tuple[Adjustment, Keypoints]:
-            return adjust.run_sighted(
-                sighted, before, self.priors, self.rig, gates, self.settings, self.num_threads
-            )
+            there = replace(sighted, keypoints=self._corrected(sighted.keypoints))
+            given = self.priors, self.rig, gates, self.settings, self.num_threads
+            solved, found = adjust.run_sighted(there, before, *given)
+            return solved, stitching.with_noise_of(sighted.keypoints, found)
 
         key = [self._solving(), gates]
         solved, keypoints = self._stage(name, key, compute, tuple[Adjustment, Keypoints])
@@ -291,12 +278,53 @@ class Line:
         self.observed, self.aligned = keypoints, sighted.aligned
         return solved
 
+    def straighten(self, number: int, sighted: Sighted, solved: Adjustment) -> Adjustment:
+        """The map with what stitching bends taken out, where all frames share it."""
+        name, settings = f"stitching{number}", self.settings
+        is_first, is_off = number == 1, settings.stitching.mode == "off"
+        undone = self.solutions[f"aligned{number}"] is not solved
+        if is_off or undone or self.frames.layout != "erp" or not (is_first or self.field):
+            return solved
+
+        def compute() -> Stitching:
+            given = sighted, self.observed, solved, self.field, self.priors, self.rig
+            return stitching.run(*given, settings, self.num_threads)
+
+        key = [self._solving(), settings.stitching, settings.rounds.aligned]
+        found = self._stage(name, key, compute, Stitching)
+        self.counts[name] = [found.counts]
+        if not found.field:
+            self.stitching = found
+            return solved
+        self.solutions[name] = found.adjustment
+        if not adjust.carries(found.adjustment, solved, settings.rounds.min_observations):
+            self.undone.append(name)
+            return solved
+        if self.stitching is not None:  # what it gained is known best from where none was
+            found = replace(found, part_gains=self.stitching.part_gains)
+        self.stitching, self.observed = found, found.keypoints
+        return found.adjustment
+
+    @property
+    def field(self) -> SphereField:
+        """What is known of what stitching bends."""
+        return SphereField.none() if self.stitching is None else self.stitching.field
+
+    @property
+    def corrected(self) -> FrameSet:
+        """The frames, read as the field straightens them."""
+        return replace(self.frames, correction=tuple(self.field.coefficients.tolist()))
+
+    def _corrected(self, keypoints: Keypoints) -> Keypoints:
+        return stitching.corrected(keypoints, self.field, self.rig)
+
     def solve_photometric(self, solved: Adjustment) -> Adjustment:
         """Joint refinement by the observations so far and the grey values of patches."""
         name, settings = "photometric", self.settings
 
         def compute() -> PhotometricResult:
-            given = self.frames, self.observed, solved, self.priors, self.rig
+            observed = self._corrected(self.observed)
+            given = self.corrected, observed, solved, self.priors, self.rig
             return photometric.run(*given, settings, self.num_threads)
 
         key = [self._solving(), settings.photometric]
@@ -329,12 +357,14 @@ class Line:
         """Covariances, and everything back in the trajectory's world."""
 
         def compute() -> Reconstruction:
+            observed = self._corrected(self.observed)
             covariances = adjust.pose_covariances(
-                solved, self.priors, self.observed, self.rig, self.settings, self.num_threads
+                solved, self.priors, observed, self.rig, self.settings, self.num_threads
             )
             least = self.settings.rounds.min_observations
             false = None if self.trust is None else self.trust.false_frames
-            return assemble(solved, covariances, self.observed, self.coarse, least, false)
+            correction = self.corrected.correction
+            return assemble(solved, covariances, observed, self.coarse, least, false, correction)
 
         return self._stage("reconstruction", self._solving(), compute, Reconstruction)
 

@@ -18,9 +18,10 @@ from gsba.log import GsbaError
 from gsba.misfit import refuse_useless
 from gsba.motion import describe
 from gsba.placement import EXIF, Placement, check, place
-from gsba.report import build_report, take_notes, write_poses, write_report
-from gsba.report_html import write_html
+from gsba.report import build_report, plain, take_notes, write_poses, write_report
+from gsba.report_html import residual_sphere, write_html
 from gsba.segment import Segment
+from gsba.stitching import describe as describe_field
 from gsba.store import RunStore, atomic_write, load_stage
 from gsba.types import (
     CoarsePoses,
@@ -141,7 +142,8 @@ def _solve(line: Line, guided: VerifiedPairs, settings: RefineSettings) -> Adjus
         final = number == rounds.map_passes and settings.align.rounds == 0
         solved = line.solve(f"refined{number}", [adjacent, wide], solved, rounds.refined, final)
     for number in range(1, settings.align.rounds + 1):
-        solved = line.solve_aligned(number, line.align(number, solved), solved)
+        sighted = line.align(number, solved)
+        solved = line.straighten(number, sighted, line.solve_aligned(number, sighted, solved))
     if "photometric" in settings.factors:
         solved = line.solve_photometric(solved)
     if "splat" in settings.factors:
@@ -179,7 +181,8 @@ def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:
         GsbaError: `out` is no finished run.
     """
     reconstruction = load_stage(out, "reconstruction", Reconstruction)
-    return reconstruction, load_stage(out, "frames", FrameSet)
+    frames = load_stage(out, "frames", FrameSet)
+    return reconstruction, replace(frames, correction=reconstruction.correction)
 
 
 def _extract(
@@ -223,7 +226,7 @@ def _without_distractors(
 
 def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
     """Poses, cloud, report and datasets."""
-    store, settings, frames, coarse = line.store, line.settings, line.frames, line.coarse
+    store, settings, frames, coarse = line.store, line.settings, line.corrected, line.coarse
     out = store.root
     trajectory = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
     read.write_tum(out / "trajectory.tum", trajectory)
@@ -253,7 +256,9 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
         notes=notes,
         trajectory=judgement,
         moves=line.moves,
+        stitching=line.stitching and describe_field(line.stitching),
     )
+    report["residual_sphere"] = plain(residual_sphere(reconstruction), digits=4)
     write_report(out / "report.json", report)
     write_html(out / "report.html", frames, coarse, reconstruction, report)
     for name in _OUTPUTS:
@@ -270,7 +275,7 @@ def _export(
 
     def compute() -> Counts:
         size = line.settings.export.face_size
-        export(reconstruction, line.frames, folder, to, size, placement)
+        export(reconstruction, line.corrected, folder, to, size, placement)
         return Counts(len(line.frames), len(line.frames), "frames")
 
     key = [line.settings.export.face_size, placement.to_json()]

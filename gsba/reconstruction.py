@@ -14,6 +14,7 @@ def assemble(
     coarse: CoarsePoses,
     min_observations: int,
     false_frames: np.ndarray | None = None,
+    correction: tuple[float, ...] = (),
 ) -> Reconstruction:
     """Carry the solution back to the trajectory's world and gather what exports need.
 
@@ -24,6 +25,7 @@ def assemble(
         coarse: poses that define the world; interpolated ones have no say in it.
         min_observations: frames with fewer count as unrefined.
         false_frames: (F,) bool, frames whose coarse pose has no say either.
+        correction: of the frames, which the keypoints have.
     """
     world_T_rigs, landmarks = adjustment.world_T_rigs, adjustment.landmarks
     seen = np.bincount(landmarks.tracks.frames, minlength=len(world_T_rigs))
@@ -61,4 +63,5 @@ def assemble(
         landmarks.tracks.frames,
         bearings,
         adjustment.noise * keypoints.sigmas_rad[rows],
+        correction,
     )

@@ -138,6 +138,7 @@ def build_report(
     notes: Sequence[str] = (),
     trajectory: Mapping[str, Any] | None = None,
     moves: Sequence[object] = (),
+    stitching: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Content of report.json: plain values only.
 
@@ -150,6 +151,7 @@ def build_report(
         notes: what the user should know: frames without images, unmatched frames, ...
         trajectory: the images' judgement of it, see `gsba.motion.describe`.
         moves: of the poses against a splat, see `gsba.splat_refine.Move`.
+        stitching: the field of directions, see `gsba.stitching.describe`.
     """
     quality = frame_quality(reconstruction)
     residuals = np.degrees(angular_residuals(reconstruction))
@@ -175,6 +177,7 @@ def build_report(
         "gauge": gauge,
         "notes": notes,
         "trajectory": trajectory,
+        "stitching": stitching,
         "stages": stage_rows,
         "solver": solver,
         "splat": moves,

@@ -48,6 +48,8 @@ class FrameSet:
     width: int  # pixels of one image (ERP or face)
     height: int  # pixels
     mask_paths: tuple[Path | None, ...]  # (F,) ERP masks, white = use; None = use all
+    correction: tuple[float, ...] = ()  # of what stitching bends: coefficients of a
+    # factors.SphereField, radians; panoramas and masks are read as straightened by it
 
     def __len__(self) -> int:
         return len(self.names)
@@ -176,3 +178,4 @@ class Reconstruction:
     observation_frames: np.ndarray  # (O,) int32
     observation_bearings: np.ndarray  # (O, 3) float64, unit, rig frame
     observation_sigmas: np.ndarray  # (O,) float64, radians
+    correction: tuple[float, ...] = ()  # of the frames, which these bearings have: see FrameSet

@@ -22,7 +22,7 @@ FLOORS = (
     | {"patch_grid", "splat", "tracks", "triangulate", "verify"},
     {"adjust", "blame", "clock", "clock_fit", "frontend", "learned", "misfit", "motion"}
     | {"photometric", "places", "reconstruction", "recovery", "splat_align", "splat_refine"}
-    | {"splatting"},
+    | {"splatting", "stitching"},
     {"alignment", "carrier", "distractors", "evaluate", "evaluate_splat", "export"}
     | {"gravity", "induced", "placement", "report", "report_html", "video"},
     {"demo", "extraction", "line", "masking", "pipeline", "segment", "timing", "view"},

@@ -96,13 +96,18 @@ def write_panoramas(
 ) -> None:
     """Link or copy every panorama, and write its mask where the frames have masks.
 
+    Panoramas that are corrected are written anew.
+
     Args:
         frames: panoramas.
         image_path: file of the image, by frame index.
         mask_path: file of the mask (PNG, 0 = ignore, 255 = use).
     """
     for f in track(range(len(frames)), "copying panoramas"):
-        link_or_copy(frames.paths[f][0], image_path(f))
+        if frames.correction:
+            write_image(image_path(f), load_erp(frames, f))
+        else:
+            link_or_copy(frames.paths[f][0], image_path(f))
         if has_masks(frames):
             mask = load_mask(frames, f)
             if mask is None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba.log import GsbaError, track
+from gsba.read.corrected import straightened
 from gsba.read.images import decode, image_size, is_image
 from gsba.read.masks import find_masks
 from gsba.read.times import frame_times
@@ -102,10 +103,14 @@ def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
 
 
 def load_erp(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
-    """Equirectangular image of frame f, (height, width, 3) uint8 RGB, or (height, width) grey."""
+    """Equirectangular image of frame f, (height, width, 3) uint8 RGB, or (height, width) grey.
+
+    Where the frames have a correction, it is applied.
+    """
     if frames.layout != "erp":
         raise ValueError("load_erp needs equirectangular frames")
-    return decode(frames.paths[f][0], (frames.width, frames.height), gray)
+    erp = decode(frames.paths[f][0], (frames.width, frames.height), gray)
+    return straightened(erp, frames.correction) if frames.correction else erp
 
 
 def load_faces(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:

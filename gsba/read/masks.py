@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba.log import GsbaError
+from gsba.read.corrected import straightened
 from gsba.read.images import IMAGE_SUFFIXES, decode, image_size, is_image
 from gsba.types import FrameSet
 
@@ -49,7 +50,10 @@ def find_masks(
 
 
 def load_mask(frames: FrameSet, f: int) -> np.ndarray | None:
-    """ERP mask of frame f, (H, 2H) bool, True = use; None if the frame has none."""
+    """ERP mask of frame f, (H, 2H) bool, True = use; None if the frame has none.
+
+    Where the frames have a correction, it is applied.
+    """
     path = frames.mask_paths[f]
     if path is None:
         return None
@@ -57,7 +61,8 @@ def load_mask(frames: FrameSet, f: int) -> np.ndarray | None:
     values = decode(path, size, gray=True)
     if values.max() == 1:
         raise GsbaError(f"{path}: mask holds 0 and 1; write 255 where pixels are to be used")
-    return values > 127
+    usable = values > 127
+    return straightened(usable, frames.correction) if frames.correction else usable
 
 
 def _frame_name(path: Path) -> str:

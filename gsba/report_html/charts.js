@@ -135,11 +135,11 @@ function matrix(canvas, scale) {
   });
 }
 
-function sphere(canvas, scale) {
-  const { rows, columns, median_deg: median, east_deg: east, south_deg: south, count } = D.sphere;
+function sphere(canvas, scale, data) {
+  const { rows, columns, median_deg: median, east_deg: east, south_deg: south, count } = data;
   const known = median.flat().filter(v => v !== null).sort((a, b) => a - b);
   const high = known.length ? known[Math.floor(.98 * (known.length - 1))] : 1;
-  const solid = (i, j) => count[i][j] >= 20 && east[i][j] !== null;
+  const solid = (i, j) => !count || (count[i][j] >= 20 && east[i][j] !== null);
   const biases = east.flatMap((row, i) => row.flatMap((e, j) => solid(i, j) ? [Math.hypot(e, south[i][j])] : [])).sort((a, b) => a - b);
   const stretch = biases[Math.floor(.98 * (biases.length - 1))] || 1;
   surface(canvas, (g, width, height) => {
@@ -160,8 +160,10 @@ function sphere(canvas, scale) {
   hover(canvas, (x, y) => {
     const i = Math.floor(y / canvas.clientHeight * rows), j = Math.floor(x / canvas.clientWidth * columns);
     if (!median[i] || median[i][j] === undefined) return null;
+    const where = `longitude ${num((j + .5) * 360 / columns - 180)}°, latitude ${num(90 - (i + .5) * 180 / rows)}°`;
+    if (!count) return [`${where}\ncorrected by ${num(east[i][j] * pxPerDeg)} px right, ${num(south[i][j] * pxPerDeg)} px down`, -1];
     const bias = median[i][j] === null ? "too few observations" :
       `median ${residualText(median[i][j])}\nsystematic ${num(east[i][j] * pxPerDeg)} px right, ${num(south[i][j] * pxPerDeg)} px down`;
-    return [`longitude ${num((j + .5) * 360 / columns - 180)}°, latitude ${num(90 - (i + .5) * 180 / rows)}°\n${bias}\n${num(count[i][j])} observations`, -1];
+    return [`${where}\n${bias}\n${num(count[i][j])} observations`, -1];
   });
 }

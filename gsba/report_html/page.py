@@ -39,11 +39,12 @@ def write_html(
     """
     data = {
         "run": path.resolve().parent.name,
-        "report": report,
+        "report": {name: value for name, value in report.items() if name != "residual_sphere"},
         "map": views.world_map(coarse, reconstruction),
         "frames": _frames(frames, coarse, reconstruction),
         "matches": views.match_matrix(reconstruction),
         "sphere": views.residual_sphere(reconstruction),
+        "field": views.field_sphere(reconstruction.correction),
         "erp_width": frames.width if frames.layout == "erp" else 4 * frames.width,
         "worst": _worst(frames, reconstruction),
     }

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba.geometry import rotation_angle
+from gsba.geometry import bearings_from_erp, rotation_angle
 from gsba.types import CoarsePoses, Reconstruction
 
 _MAX_POINTS = 4000  # of the cloud, on the map
@@ -120,6 +120,36 @@ def residual_sphere(reconstruction: Reconstruction) -> dict[str, Any]:
     }
 
 
+def field_sphere(correction: tuple[float, ...]) -> dict[str, Any] | None:
+    """The field that frames were corrected by, on the grid of `residual_sphere`, and its names.
+
+    "east_deg", "south_deg": from where a direction was observed to where it really points.
+    """
+    if not correction:
+        return None
+    from factors.sphere_field import SphereField
+
+    rows, columns = round(180 / _SPHERE_CELL_DEG), round(360 / _SPHERE_CELL_DEG)
+    centres = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
+    bearings = bearings_from_erp(np.stack(centres, axis=-1).reshape(-1, 2), columns, rows)
+    moved = np.degrees(SphereField(np.array(correction)).displacements(bearings))
+    parts = [np.einsum("oi,oi->o", moved, axis).reshape(rows, columns) for axis in _axes(bearings)]
+    return {
+        "rows": rows,
+        "columns": columns,
+        "median_deg": np.hypot(*parts),
+        "east_deg": parts[0],
+        "south_deg": parts[1],
+    }
+
+
+def _axes(bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors (O, 3) to the east and to the south on the sphere."""
+    level = np.maximum(np.hypot(bearings[:, 0], bearings[:, 2]), 1e-9)
+    east = np.column_stack([bearings[:, 2], np.zeros(len(level)), -bearings[:, 0]]) / level[:, None]
+    return east, np.cross(bearings, east)
+
+
 def tangent_residuals(reconstruction: Reconstruction) -> np.ndarray:
     """Predicted minus observed direction (O, 2), radians east and south on the sphere."""
     poses = reconstruction.world_T_rigs[reconstruction.observation_frames]
@@ -127,10 +157,7 @@ def tangent_residuals(reconstruction: Reconstruction) -> np.ndarray:
     predicted = np.einsum("oji,oj->oi", poses[:, :3, :3], offsets)
     predicted /= np.maximum(np.linalg.norm(predicted, axis=1, keepdims=True), 1e-12)
     bearings = reconstruction.observation_bearings
-    level = np.maximum(np.hypot(bearings[:, 0], bearings[:, 2]), 1e-9)
-    east = np.column_stack([bearings[:, 2], np.zeros(len(level)), -bearings[:, 0]]) / level[:, None]
-    south = np.cross(bearings, east)
-    across = np.column_stack([np.einsum("oi,oi->o", predicted, axis) for axis in (east, south)])
+    across = np.column_stack([np.einsum("oi,oi->o", predicted, a) for a in _axes(bearings)])
     sine = np.linalg.norm(across, axis=1, keepdims=True)
     angle = np.arctan2(sine, np.einsum("oi,oi->o", predicted, bearings)[:, None])
     return across * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)

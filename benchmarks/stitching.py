@@ -1,0 +1,177 @@
+"""What a shared field of directions is worth at points that no solve has seen.
+
+    python -m benchmarks.stitching FRAMES TRAJECTORY --out WORK [--masks FILE] [--markdown FILE]
+
+A fifth of the points is held out. Poses come from the other points: from features' bearings
+alone, from aligned patches, and from aligned patches with a field. Held-out points are aligned
+once, under the last of these, and judged under each: placed anew by their observations, how far
+these are off (reprojection), and how much the pixels of two views of a patch differ where poses
+and depth put them, after gain and offset (grey).
+"""
+
+import argparse
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.common import machine
+from factors import tangent_basis
+from factors.sphere_field import SphereField
+from factors.sphere_image import SphereImage
+from gsba import adjust, align, cubemap, graph, panorama, refine, stitching, triangulate
+from gsba.adjust import Adjustment
+from gsba.config import RefineSettings
+from gsba.geometry import angular_errors
+from gsba.records import atomic_write
+from gsba.store import load_stage
+from gsba.types import FrameSet, Keypoints, Landmarks, Sighted, Tracks
+
+SHARE = 0.2  # of points held out
+GATE = 1e3  # sigmas: no held-out observation is left out by its own residual
+REACH = 5  # pixels from the middle of a patch
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """Poses, and the field that goes with them."""
+
+    name: str
+    solved: Adjustment
+    field: SphereField
+
+
+def split(landmarks: Landmarks, seed: int) -> tuple[Landmarks, Landmarks]:
+    """Points to solve with, and points held out."""
+    held = np.random.default_rng(seed).random(landmarks.tracks.num_points) < SHARE
+    return stitching._of_points(landmarks, ~held), stitching._of_points(landmarks, held)
+
+
+def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[Variant], Sighted]:
+    """Variants from the points not held out; held-out points aligned under the last."""
+    keypoints = load_stage(run, "keypoints", Keypoints)
+    start, rig = load_stage(run, "refined1", Adjustment), cubemap.rig_for(frames, settings.cubemap)
+    greys = panorama.Greys(frames, settings.align.max_width)
+    priors = graph.build(start.world_T_rigs, settings.priors)
+    used, held = split(start.landmarks, settings.seed)
+    none, threads = SphereField.none(), 2
+    common = priors, rig, settings.rounds.aligned, settings, threads
+
+    bearing = adjust.run(
+        used.tracks, keypoints, start, priors, rig, settings.rounds.refined[-1:], settings, threads
+    )
+    variants = [Variant("bearing", bearing, none)]
+    for name, uses_field in (("aligned", False), ("aligned, field", True)):
+        solved, observed, aligned, field = bearing, keypoints, None, none
+        for number in (1, 2):
+            sighted = align.run(
+                solved.landmarks, solved.world_T_rigs, observed, solved.noise, greys, rig,
+                f"{name} {number}", aligned, settings.align, threads, field,
+            )  # fmt: skip
+            there = replace(sighted, keypoints=stitching.corrected(sighted.keypoints, field, rig))
+            solved, found = adjust.run_sighted(there, solved, *common)
+            observed = stitching.with_noise_of(sighted.keypoints, found)
+            aligned = sighted.aligned
+            if uses_field:
+                result = stitching.run(
+                    sighted, observed, solved, field, priors, rig, settings, threads
+                )
+                solved, observed, field = result.adjustment, result.keypoints, result.field
+                print(
+                    f"parts gain {result.part_gains.round(3)}, degree {result.degree}", flush=True
+                )
+        variants.append(Variant(name, solved, field))
+    last = variants[-1]
+    placed = place(last, held.tracks, keypoints, settings)
+    sighted = align.run(
+        placed, last.solved.world_T_rigs, keypoints, start.noise, greys, rig, "held out", None,
+        settings.align, threads, last.field,
+    )  # fmt: skip
+    return variants, sighted
+
+
+def place(
+    variant: Variant, tracks: Tracks, keypoints: Keypoints, settings: RefineSettings
+) -> Landmarks:
+    """Points under a variant's poses."""
+    rows = keypoints.rows(tracks)
+    bearings = variant.field.corrected(keypoints.bearings_rig[rows])
+    given = keypoints.sigmas_rad[rows], variant.solved.world_T_rigs, GATE, settings.triangulate
+    return triangulate.run(tracks, bearings, *given, 2)
+
+
+def reprojections(variant: Variant, landmarks: Landmarks, keypoints: Keypoints) -> np.ndarray:
+    """Angles (O,) of observations to their points, radians."""
+    tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
+    return angular_errors(
+        variant.solved.world_T_rigs[tracks.frames],
+        landmarks.points_world[tracks.points],
+        variant.field.corrected(keypoints.bearings_rig[rows]),
+    )
+
+
+def grey_differences(
+    variant: Variant, landmarks: Landmarks, images: list[SphereImage]
+) -> np.ndarray:
+    """Root mean square (N,) of what patches differ by in neighbouring views, grey values."""
+    tracks, poses = landmarks.tracks, variant.solved.world_T_rigs
+    first = np.flatnonzero(np.diff(tracks.points) == 0)  # consecutive observations of a point
+    steps = np.arange(-REACH, REACH + 1)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * images[0].pixel_rad
+    out = np.empty(len(first))
+    for i, row in enumerate(first):
+        point, seen = landmarks.points_world[tracks.points[row]], []
+        for k in (row, row + 1):
+            pose = poses[tracks.frames[k]]
+            local = (point - pose[:3, 3]) @ pose[:3, :3]
+            if k == row:
+                depth, axes = np.linalg.norm(local), tangent_basis(local / np.linalg.norm(local))
+                patch = (local + depth * grid @ axes) @ pose[:3, :3].T + pose[:3, 3]
+            rays = (patch - pose[:3, 3]) @ pose[:3, :3]
+            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+            seen.append(images[tracks.frames[k]].sample(variant.field.observed(rays))[0])
+        a, b = seen[0] - seen[0].mean(), seen[1] - seen[1].mean()
+        gain = np.sqrt(np.sum(a * a) / max(np.sum(b * b), 1e-12))
+        out[i] = np.sqrt(np.mean((a - gain * b) ** 2))
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("frames", type=Path)
+    parser.add_argument("trajectory", type=Path)
+    parser.add_argument("--masks", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--markdown", type=Path)
+    options = parser.parse_args()
+    settings = RefineSettings.model_validate(
+        {"align": {"rounds": 0}, "export": {"formats": ()}, "stitching": {"mode": "auto"}}
+    )
+    result = refine(options.frames, options.trajectory, options.out, settings, masks=options.masks)
+    settings = RefineSettings()
+    variants, sighted = solve(options.out, result.frames, settings)
+    greys = panorama.Greys(result.frames, settings.align.max_width)
+    images = [SphereImage.of(greys[f][0]) for f in range(len(result.frames))]
+    pixel = np.degrees(images[0].pixel_rad)
+    lines = [
+        f"{options.frames.parent.name}: {sighted.tracks.num_points} held-out points, "
+        f"{len(sighted.tracks)} observations; panoramas {greys.width} wide.\n",
+        "| poses from | field rms ° | reprojection px, median | 90% | grey, median | mean |",
+        "|---|---|---|---|---|---|",
+    ]
+    for variant in variants:
+        placed = place(variant, sighted.tracks, sighted.keypoints, settings)
+        angles = np.degrees(reprojections(variant, placed, sighted.keypoints)) / pixel
+        grey = grey_differences(variant, placed, images)
+        lines.append(
+            f"| {variant.name} | {np.degrees(variant.field.rms_rad):.3f} | {np.median(angles):.3f} "
+            f"| {np.percentile(angles, 90):.3f} | {np.median(grey):.2f} | {np.mean(grey):.2f} |"
+        )
+        print(lines[-1], flush=True)
+    table = "\n".join([*lines, "", f"{machine()}.", ""])
+    if options.markdown is not None:
+        atomic_write(options.markdown, lambda file: file.write_text(table))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,233 @@
+"""A smooth displacement field on the sphere: vector spherical harmonics, without rotations.
+
+What a 360-degree camera's calibration and stitching leave is fixed to its directions. The field
+is a sum of gradients and curls of real spherical harmonics from degree 1 on, orthonormal over the
+sphere. The curls of degree 1 are left out: they are rotations, which poses hold already.
+"""
+
+from dataclasses import dataclass
+from math import factorial
+
+import numpy as np
+from numba import njit
+
+from factors.bearing import tangent_basis
+
+_SETTLE = 6  # fixed-point steps that undo a field; each gains the field's slope as a factor
+
+_kernel = njit(cache=True, nogil=True, error_model="numpy")
+
+
+def num_harmonics(degree: int) -> int:
+    """Coefficients of a field up to a degree."""
+    return max(2 * degree * (degree + 2) - 3, 0)
+
+
+def degree_of(num: int) -> int:
+    """Degree of a field with so many coefficients.
+
+    Raises:
+        ValueError: no degree has so many.
+    """
+    degree = 0
+    while num_harmonics(degree) < num:
+        degree += 1
+    if num_harmonics(degree) != num:
+        raise ValueError(f"no degree has {num} coefficients")
+    return degree
+
+
+def degrees_of(num: int) -> np.ndarray:
+    """Degree (K,) of each of the first coefficients, from 1."""
+    each = [np.full(3 if k == 1 else 4 * k + 2, k) for k in range(1, degree_of(num) + 1)]
+    return np.concatenate([*each, np.zeros(0, int)]).astype(np.int64)
+
+
+def harmonics(bearings: np.ndarray, degree: int) -> np.ndarray:
+    """Tangent vectors of each harmonic.
+
+    Args:
+        bearings: (N, 3) float64, unit.
+        degree: highest.
+
+    Returns:
+        (N, 3, K) float64, by degree, in each the gradients before the curls; orthonormal over
+        the sphere. Solid harmonics by their Cartesian recurrences, which know no pole.
+    """
+    flat = np.ascontiguousarray(bearings, dtype=np.float64)
+    out = np.zeros((len(flat), 3, num_harmonics(degree)))
+    if degree:
+        _fill(flat, _norms(degree), out)
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class SphereField:
+    """Displacements of directions, in the rig frame."""
+
+    coefficients: np.ndarray  # (K,) float64, radians, of `harmonics`; K = 0: no field
+
+    @classmethod
+    def none(cls) -> "SphereField":
+        """The field that moves nothing."""
+        return cls(np.zeros(0))
+
+    def __bool__(self) -> bool:
+        return bool(np.any(self.coefficients))
+
+    @property
+    def rms_rad(self) -> float:
+        """Root mean square displacement over the sphere."""
+        return float(np.sqrt(np.sum(self.coefficients**2) / (4 * np.pi)))
+
+    def displacements(self, bearings: np.ndarray) -> np.ndarray:
+        """Tangent vectors (..., 3), radians, at unit bearings (..., 3)."""
+        flat = np.ascontiguousarray(bearings, dtype=np.float64).reshape(-1, 3)
+        out = np.zeros_like(flat)
+        degree = degree_of(len(self.coefficients))
+        if degree:
+            _sum_fields(flat, _norms(degree), self.coefficients, out)
+        return out.reshape(np.shape(bearings))
+
+    def corrected(self, bearings: np.ndarray) -> np.ndarray:
+        """Where observed bearings (..., 3), unit, really point: along the field's arcs."""
+        return _moved(bearings, self.displacements(bearings)) if self else bearings
+
+    def observed(self, directions: np.ndarray) -> np.ndarray:
+        """Bearings (..., 3) under which directions (..., 3), unit, are observed: the inverse."""
+        if not self:
+            return directions
+        found = directions
+        for _ in range(_SETTLE):
+            off = directions - self.corrected(found)
+            found = found + off
+            found = found / np.linalg.norm(found, axis=-1, keepdims=True)
+        return found
+
+    def corrected_roots(self, bearings: np.ndarray, roots: np.ndarray) -> np.ndarray:
+        """Square-root informations (N, 2, 2) on the tangent bases of the corrected bearings.
+
+        Args:
+            bearings: (N, 3) observed.
+            roots: (N, 2, 2) on their tangent bases.
+        """
+        if not self:
+            return roots
+        there = tangent_basis(self.corrected(bearings))
+        return roots @ (tangent_basis(bearings) @ np.swapaxes(there, 1, 2))
+
+
+def field_residuals(
+    bearings: np.ndarray, directions: np.ndarray, degree: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals that a field of zero leaves, and their Jacobian by its coefficients.
+
+    The residual is the log map of the direction at the observed bearing, less the displacement
+    there: to first order in both, that of `bearing_residuals` at the corrected bearing.
+
+    Args:
+        bearings: (N, 3) observed, unit.
+        directions: (N, 3) expected, unit.
+        degree: of the field.
+
+    Returns:
+        residuals (N, 2), radians on `tangent_basis(bearings)`; Jacobian (N, 2, K).
+    """
+    axes = tangent_basis(bearings)
+    across = np.einsum("nij,nj->ni", axes, directions)
+    sine = np.linalg.norm(across, axis=1)
+    angle = np.arctan2(sine, np.einsum("ni,ni->n", bearings, directions))
+    residuals = across * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)[:, None]
+    return residuals, -np.einsum("nij,njk->nik", axes, harmonics(bearings, degree))
+
+
+def _moved(bearings: np.ndarray, tangents: np.ndarray) -> np.ndarray:
+    """Unit bearings moved along arcs."""
+    angles = np.linalg.norm(tangents, axis=-1, keepdims=True)
+    return np.cos(angles) * bearings + np.sinc(angles / np.pi) * tangents
+
+
+def _norms(degree: int) -> np.ndarray:
+    """(degree + 1, degree + 1) factors [l, m] that make gradients orthonormal."""
+    out = np.zeros((degree + 1, degree + 1))
+    for n in range(1, degree + 1):
+        for m in range(n + 1):
+            area = (2 * n + 1) / (4 * np.pi) * factorial(n - m) / factorial(n + m)
+            out[n, m] = np.sqrt(area * (2 if m else 1) / (n * (n + 1)))
+    return out
+
+
+@_kernel
+def _start_of(n):
+    """First coefficient of a degree."""
+    return 0 if n == 1 else 2 * n * n - 5
+
+
+@_kernel
+def _put(n, column, norm, value, gx, gy, gz, x, y, z, out):
+    """Write a harmonic's gradient, tangent part of the solid one's, and its curl."""
+    gx, gy, gz = (
+        norm * (gx - n * value * x),
+        norm * (gy - n * value * y),
+        norm * (gz - n * value * z),
+    )
+    k = _start_of(n) + column
+    out[0, k], out[1, k], out[2, k] = gx, gy, gz
+    if n > 1:
+        k += 2 * n + 1
+        out[0, k], out[1, k], out[2, k] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
+
+
+@_kernel
+def _harmonics_at(x, y, z, norms, solid, out):
+    """Write the harmonics (3, K) at one direction; solid (2, 3, 4) is scratch.
+
+    solid[i, j]: value and gradient of the solid harmonic of cosines (i = 0) or sines (1), of
+    degree l - 1, l and l + 1 (j).
+    """
+    degree = len(norms) - 1
+    c, cx, cy, cz, s, sx, sy, sz = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for m in range(degree + 1):
+        solid[:] = 0.0
+        solid[0, 1, 0], solid[0, 1, 1], solid[0, 1, 2], solid[0, 1, 3] = c, cx, cy, cz
+        solid[1, 1, 0], solid[1, 1, 1], solid[1, 1, 2], solid[1, 1, 3] = s, sx, sy, sz
+        for n in range(m, degree + 1):
+            for i in range(2 if m else 1):
+                before, at, after = solid[i, 0], solid[i, 1], solid[i, 2]
+                if n:
+                    column = 2 * m - 1 + i if m else 0
+                    _put(n, column, norms[n, m], at[0], at[1], at[2], at[3], x, y, z, out)
+                a, b, d = 2.0 * n + 1.0, float(n + m), 1.0 / (n - m + 1)
+                after[0] = d * (a * z * at[0] - b * before[0])
+                after[1] = d * (a * z * at[1] - b * (before[1] + 2 * x * before[0]))
+                after[2] = d * (a * z * at[2] - b * (before[2] + 2 * y * before[0]))
+                after[3] = d * (a * (z * at[3] + at[0]) - b * (before[3] + 2 * z * before[0]))
+                for k in range(4):
+                    before[k], at[k] = at[k], after[k]
+        f = 2.0 * m + 1.0
+        c, cx, cy, cz, s, sx, sy, sz = (
+            f * (x * c - y * s), f * (c + x * cx - y * sx), f * (x * cy - s - y * sy),
+            f * (x * cz - y * sz), f * (y * c + x * s), f * (y * cx + s + x * sx),
+            f * (c + y * cy + x * sy), f * (y * cz + x * sz),
+        )  # fmt: skip
+
+
+@_kernel
+def _fill(bearings, norms, out):
+    """Harmonics (N, 3, K) at unit bearings (N, 3)."""
+    solid = np.empty((2, 3, 4))
+    for i in range(len(bearings)):
+        x, y, z = bearings[i, 0], bearings[i, 1], bearings[i, 2]
+        _harmonics_at(x, y, z, norms, solid, out[i])
+
+
+@_kernel
+def _sum_fields(bearings, norms, coefficients, out):
+    """Displacements (N, 3) at unit bearings (N, 3)."""
+    solid, each = np.empty((2, 3, 4)), np.empty((3, len(coefficients)))
+    for i in range(len(bearings)):
+        x, y, z = bearings[i, 0], bearings[i, 1], bearings[i, 2]
+        _harmonics_at(x, y, z, norms, solid, each)
+        for k in range(len(coefficients)):
+            for j in range(3):
+                out[i, j] += coefficients[k] * each[j, k]

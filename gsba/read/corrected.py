@@ -1,0 +1,68 @@
+"""Panoramas resampled so that what stitching bends is straight."""
+
+import functools
+
+import numpy as np
+
+from gsba.geometry import bearings_from_erp, erp_from_bearings
+
+PAD = 4  # pixels of wrap-around: the support of bicubic sampling, and more
+_COARSE = 512  # width of the grid that a field is evaluated on; it turns over 18 degrees or more
+_BAND = 256  # rows of which coordinates are held in double precision
+
+
+def wrapped(erp: np.ndarray) -> np.ndarray:
+    """Pad by what lies beyond the border on the sphere: the other side of seam and poles."""
+    half = erp.shape[1] // 2
+    above = np.roll(erp[:PAD][::-1], half, axis=1)
+    below = np.roll(erp[-PAD:][::-1], half, axis=1)
+    tall = np.concatenate([above, erp, below], axis=0)
+    return np.concatenate([tall[:, -PAD:], tall, tall[:, :PAD]], axis=1)
+
+
+def straightened(erp: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
+    """A panorama as a camera without the field would have taken it.
+
+    Args:
+        erp: (H, 2H[, C]) uint8, or bool for a mask.
+        correction: coefficients of the field, see `factors.sphere_field`.
+
+    Returns:
+        The like, resampled (Lanczos; masks by their nearest pixel).
+    """
+    import cv2
+
+    height, width = erp.shape[:2]
+    maps = _maps(correction, width, height)
+    if erp.dtype == bool:
+        nearest = cv2.remap(wrapped(erp.astype(np.uint8)), maps[0], maps[1], cv2.INTER_NEAREST)
+        return nearest > 0
+    return cv2.remap(wrapped(erp), maps[0], maps[1], cv2.INTER_LANCZOS4)
+
+
+@functools.lru_cache(maxsize=1)
+def _maps(correction: tuple[float, ...], width: int, height: int) -> np.ndarray:
+    """Places (2, H, W) float32 in the padded panorama, OpenCV pixels."""
+    import cv2
+
+    offsets = wrapped(_offsets(correction))
+    out = np.empty((2, height, width), np.float32)
+    columns, scale = np.arange(width) + 0.5, offsets.shape[1] - 2 * PAD
+    for first in range(0, height, _BAND):
+        rows = np.arange(first, min(first + _BAND, height)) + 0.5
+        pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
+        places = (pixels * (scale / width) - 0.5 + PAD).astype(np.float32)
+        moved = cv2.remap(offsets, places[..., 0], places[..., 1], cv2.INTER_CUBIC)
+        found = erp_from_bearings(bearings_from_erp(pixels, width, height) + moved, width, height)
+        out[:, first : first + len(rows)] = np.moveaxis(found - 0.5 + PAD, -1, 0)
+    return out
+
+
+def _offsets(correction: tuple[float, ...]) -> np.ndarray:
+    """From true to observed directions (h, 2h, 3) float32, on a coarse panorama."""
+    from factors.sphere_field import SphereField
+
+    centres = np.meshgrid(np.arange(_COARSE) + 0.5, np.arange(_COARSE // 2) + 0.5)
+    directions = bearings_from_erp(np.stack(centres, axis=-1), _COARSE, _COARSE // 2)
+    observed = SphereField(np.array(correction)).observed(directions)
+    return (observed - directions).astype(np.float32)

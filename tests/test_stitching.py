@@ -1,0 +1,181 @@
+"""The field of directions: found where it is, left alone where it is not, handed on to frames."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from synthetic import RIG, World, make_world
+
+from factors.sphere_field import SphereField, num_harmonics
+from gsba import adjust, graph, stitching
+from gsba.adjust import Adjustment
+from gsba.config import RefineSettings
+from gsba.geometry import bearings_from_erp, pose_similarity
+from gsba.optimize import optimize
+from gsba.read.corrected import straightened
+from gsba.stitching import Stitching, corrected, with_noise_of
+from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
+
+SIGMA = 2e-4  # radians
+SETTINGS = RefineSettings.model_validate(
+    {"stitching": {"max_degree": 5}, "solver": {"num_threads": 1}}
+)
+
+
+def _bent(world: World, field: SphereField) -> Keypoints:
+    keypoints = world.keypoints
+    bearings = field.observed(keypoints.bearings_rig)
+    return replace(keypoints, bearings_rig=bearings)
+
+
+def _true_field() -> SphereField:
+    """0.1 degrees, smooth: of degrees 2 and 3."""
+    drawn = np.random.default_rng(3).normal(size=num_harmonics(3))
+    drawn[:3] = 0
+    return SphereField(np.deg2rad(0.1) * np.sqrt(4 * np.pi) * drawn / np.linalg.norm(drawn))
+
+
+@cache
+def _found(bent: bool) -> tuple[World, Adjustment, Keypoints, Stitching]:
+    """World, the map solved without a field, keypoints, and what was found."""
+    world = make_world(0, num_frames=16, num_points=900, sigma_rad=SIGMA, false_share=0.02)
+    keypoints = _bent(world, _true_field() if bent else SphereField.none())
+    sighted = Sighted(
+        keypoints, np.ones(len(keypoints.faces), bool), world.tracks, Counts(0, 0, "observations")
+    )
+    priors = graph.build(world.world_T_rigs, SETTINGS.priors)
+    start = adjust.start(world.world_T_rigs)
+    given = priors, RIG, (30.0, 6.0), SETTINGS, 1
+    solved, calibrated = adjust.run_sighted(sighted, start, *given)
+    none = SphereField.none()
+    found = stitching.run(sighted, calibrated, solved, none, priors, RIG, SETTINGS, 1)
+    return world, solved, keypoints, found
+
+
+def _errors(world: World, adjustment: Adjustment) -> tuple[float, float]:
+    """Root mean square error of positions, and of rotations in radians, after Sim(3)."""
+    poses, true = adjustment.world_T_rigs, world.world_T_rigs
+    scale, rotation, shift = pose_similarity(poses, true)
+    off = scale * poses[:, :3, 3] @ rotation.T + shift - true[:, :3, 3]
+    turned = rotation @ poses[:, :3, :3] - true[:, :3, :3]
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1)))), float(
+        np.sqrt(np.mean(np.sum(turned**2, axis=(1, 2))) / 2)
+    )
+
+
+def test_a_bent_camera_is_straightened() -> None:
+    """Noise of 16 bearings a point and degree of freedom leaves less than a tenth of the field."""
+    world, before, keypoints, found = _found(True)
+    assert np.all(found.part_gains > 0.2)
+    truth = _true_field().displacements(keypoints.bearings_rig)
+    off = found.field.displacements(keypoints.bearings_rig) - truth
+    off -= _turned(keypoints.bearings_rig, off)
+    shape = np.sqrt(np.mean(np.sum(truth**2, axis=1)))
+    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 0.2 * shape
+    assert found.adjustment.noise * found.keypoints.sigmas_rad[0] < 1.2 * SIGMA
+    assert before.noise * found.keypoints.sigmas_rad[0] > 0
+    positions, rotations = _errors(world, found.adjustment)
+    old_positions, old_rotations = _errors(world, before)
+    assert positions < 0.5 * old_positions and rotations < 0.5 * old_rotations
+
+
+def _turned(bearings: np.ndarray, tangents: np.ndarray) -> np.ndarray:
+    """The part of tangents (N, 3) that is a rotation: poses take it up."""
+    turns = np.stack([np.cross(axis, bearings) for axis in np.eye(3)], axis=-1)
+    amounts = np.linalg.lstsq(turns.reshape(-1, 3), tangents.ravel(), rcond=None)[0]
+    return turns @ amounts
+
+
+def test_a_straight_camera_is_left_alone() -> None:
+    _, before, _, found = _found(False)
+    assert not found.field and found.adjustment is before
+    assert abs(found.part_gains.sum()) < 0.03
+
+
+def test_parts_do_not_share_points() -> None:
+    _, before, _, _ = _found(False)
+    parts = stitching._parts(before.landmarks)
+    assert len(parts) == stitching.PARTS
+    assert sum(part.tracks.num_points for part in parts) == before.landmarks.tracks.num_points
+    means = [np.mean(part.tracks.frames) for part in parts]
+    assert np.all(np.diff(means) > 0)
+
+
+def test_too_little_is_left_alone() -> None:
+    world, before, keypoints, _ = _found(False)
+    few = before.landmarks.tracks.points < 40
+    tracks = before.landmarks.tracks
+    some = Tracks(tracks.points[few], tracks.frames[few], tracks.keypoints[few], 40)
+    landmarks = replace(
+        before.landmarks, points_world=before.landmarks.points_world[:40], tracks=some
+    )
+    small = replace(before, landmarks=landmarks)
+    sighted = Sighted(keypoints, np.ones(len(keypoints.faces), bool), some, Counts(0, 0, "o"))
+    found = stitching.run(
+        sighted, keypoints, small, SphereField.none(), graph.build(world.world_T_rigs,
+        SETTINGS.priors), RIG, SETTINGS, 1,
+    )  # fmt: skip
+    assert not found.field and found.adjustment is small
+
+
+def test_model_predicts_the_cost() -> None:
+    """Gain of the quadratic model against what bundle adjustment with the field really gains."""
+    world = make_world(1, num_frames=10, num_points=300, sigma_rad=SIGMA, false_share=0)
+    keypoints, plain = _bent(world, _true_field()), SETTINGS.solver.model_copy(
+        update={"loss": "none", "relative_tolerance": 1e-9}
+    )  # fmt: skip
+    settings = SETTINGS.model_copy(update={"solver": plain})
+    priors = graph.build(world.world_T_rigs, settings.priors)
+    landmarks = Landmarks(world.points_world, world.tracks, Counts(0, 0, "tracks"))
+
+    def solved(field: SphereField) -> tuple[Adjustment, float]:
+        given = corrected(keypoints, field, RIG), RIG, 1.0, settings, 1
+        block = adjust.landmark_block(landmarks, *given)
+        result = optimize(priors, [block], adjust.values_of(world.world_T_rigs), plain)
+        poses = adjust.poses_of(result.values, len(world.world_T_rigs))
+        return Adjustment(poses, landmarks, 1.0, ()), block.error(result.values)
+
+    before, cost = solved(SphereField.none())
+    now = Stitching(SphereField.none(), before, keypoints, 0, np.zeros(4), Counts(0, 0, "o"))
+    system = stitching._system(landmarks, now, 3, RIG, settings, 1)
+    assert system.cost == pytest.approx(cost, rel=0.02)  # poses are at their best already
+    field = SphereField(stitching._fitted([system], 3, 1e-2))
+    after, least = solved(field)
+    assert system.gain(field.coefficients) == pytest.approx(cost - least, rel=0.02)
+    assert least < 0.1 * cost
+    again = stitching._system(
+        landmarks, replace(now, field=field, adjustment=after), 3, RIG, settings, 1
+    )
+    assert again.cost == pytest.approx(cost, rel=0.05)  # extrapolated back to no field
+
+
+def test_noise_carries_over() -> None:
+    keypoints = _found(True)[2]
+    roots = np.tile(np.eye(2), (len(keypoints.faces), 1, 1))
+    shaped = replace(keypoints, sqrt_infos=roots)
+    louder = replace(shaped, sigmas_rad=2 * shaped.sigmas_rad, sqrt_infos=roots / 2)
+    back = with_noise_of(shaped, corrected(louder, _true_field(), RIG))
+    np.testing.assert_allclose(back.sigmas_rad, louder.sigmas_rad)
+    np.testing.assert_allclose(back.sqrt_infos, louder.sqrt_infos)
+
+
+def test_panoramas_are_straightened() -> None:
+    """Brightness that depends on the observed direction must come to lie on the true one."""
+    width = 512
+    centres = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
+    rays = bearings_from_erp(np.stack(centres, axis=-1), width, width // 2)
+    field = SphereField(8 * _true_field().coefficients)  # 0.8 degrees, more than a pixel
+
+    def shade(directions: np.ndarray) -> np.ndarray:
+        return 128 + 60 * np.sin(7 * directions[..., 0] + 5 * directions[..., 1]) * np.cos(
+            9 * directions[..., 2]
+        )
+
+    captured = np.rint(shade(field.corrected(rays))).astype(np.uint8)
+    correction = tuple(field.coefficients.tolist())
+    off = straightened(captured, correction).astype(float) - shade(rays)
+    assert np.abs(off).max() < 2.0  # rounding twice, and bicubic offsets
+    assert np.abs(captured - shade(rays)).max() > 5
+    mask = straightened(captured > 128, correction)
+    assert mask.dtype == bool and np.mean(mask == (shade(rays) > 128)) > 0.97
