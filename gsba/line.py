@@ -12,12 +12,14 @@ import numpy as np
 from gsba import (
     adjust,
     align,
+    components,
     cubemap,
     extraction,
     features,
     frontend,
     graph,
     panorama,
+    parts,
     photometric,
     places,
     recovery,
@@ -32,6 +34,8 @@ from gsba.photometric import PhotometricResult
 from gsba.places import Closed, connected
 from gsba.reconstruction import assemble
 from gsba.recovery import Recovered
+from gsba.registered import Registered, follow, side_by_side
+from gsba.segments import Joint
 from gsba.store import RunStore, fingerprint
 from gsba.types import (
     CoarsePoses,
@@ -68,6 +72,9 @@ class Line:
         self.custom = None if extra_factors is None else uuid.uuid4().hex  # resumes nothing
         self.extra = list(extra_factors(coarse)) if extra_factors is not None else []
         self.trust: Trust | None = None
+        self.joints: tuple[Joint, ...] = ()  # of pieces of the trajectory
+        self.parts: np.ndarray | None = None  # (F,) that nothing ties together yet
+        self.registered: Registered | None = None
         self._set_priors()
         self.counts: dict[str, list[Counts]] = {}
         self.solutions: dict[str, Adjustment] = {}
@@ -106,7 +113,7 @@ class Line:
             self.priors = graph.build(coarse, priors)
         else:
             start = trust.world_T_rigs
-            believed = start if trust.false_steps.all() else coarse
+            believed = start if trust.false_steps.all() else side_by_side(coarse, self.registered)
             false = trust.false_steps, trust.false_frames
             self.priors = graph.build(believed, priors, *false, start[0])
         for factor in self.extra:
@@ -145,7 +152,8 @@ class Line:
                 f"no two neighbouring frames match ({pairs.counts.received} pairs, with and "
                 "without the trajectory): frames must follow one another closely and show texture"
             )
-        self.trust = recovered.trust
+        self.trust, self.coarse, self.joints = recovered.trust, recovered.coarse, recovered.joints
+        self.parts = components.parted(pairs.matches.pairs, self.trust.held_steps)
         if (self.coarse.sources == PoseSource.NONE).all():
             self.coarse = replace(self.coarse, world_T_rigs=self.trust.world_T_rigs)
         self._set_priors()
@@ -170,7 +178,8 @@ class Line:
 
     def _meet_places(self, solved: Adjustment, loops: VerifiedPairs) -> Adjustment:
         """The map bent so that places met again meet, where guided search could not reach them."""
-        unseen = self.trust.unseen_steps if self.trust else np.zeros(len(self.frames) - 1, bool)
+        unseen, trust = np.zeros(len(self.frames) - 1, bool), self.trust
+        unseen = trust.unseen_steps if trust and self.registered is None else unseen
         if connected(unseen, loops.matches.pairs) and len(loops.matches.pairs):
             return solved
         closed = self._stage(
@@ -188,10 +197,30 @@ class Line:
             self._set_priors()
         return closed.solved
 
-    def match_along_epipolars(self, solved: Adjustment) -> Matches:
+    def register(
+        self, neighbours: VerifiedPairs, solved: Adjustment, matches: list[Matches]
+    ) -> tuple[Adjustment, list[Matches]]:
+        """Parts of the map joined where they meet, frames in none of them registered."""
+        least, trust = self.settings.rounds.min_observations, self.trust
+        if trust is None:
+            return solved, matches
+        nothing, scarce = np.zeros_like(trust.held_steps), components.starving(solved, least)
+        tied = components.parted(neighbours.matches.pairs, nothing, scarce)
+        if tied is None:
+            return solved, matches
+        given = self.context, solved, tied, trust.held_steps, self.frames.timestamps
+        found = self._stage("registered", self._matching(), lambda: parts.run(*given), Registered)
+        self.counts["registered"] = [found.counts]
+        self.registered, self.parts = found, components.several(found.components)
+        self.coarse, self.trust, self.joints = follow(found, self.coarse, trust, self.joints)
+        self._set_priors()
+        adjacent = self.match_along_epipolars(found.solved, "adjacent2")
+        return found.solved, [adjacent, *(components.within(m, tied) for m in matches[1:])]
+
+    def match_along_epipolars(self, solved: Adjustment, name: str = "adjacent") -> Matches:
         """Matches of neighbours in time along their solved epipolar lines."""
         return self._stage(
-            "adjacent",
+            name,
             self._matching(),
             lambda: frontend.match_along_epipolars(self.context, solved),
             Matches,
@@ -217,7 +246,8 @@ class Line:
         """Bundle adjustment in rounds over the tracks that matches make."""
 
         def compute() -> Adjustment:
-            chained = tracks.run(matches, np.diff(self.keypoints.starts))
+            tied = [components.within(some, self.parts) for some in matches]
+            chained = tracks.run(tied, np.diff(self.keypoints.starts))
             return adjust.run(
                 chained,
                 self.keypoints,
@@ -295,12 +325,12 @@ class Line:
         """Covariances, and everything back in the trajectory's world."""
 
         def compute() -> Reconstruction:
-            covariances = adjust.pose_covariances(
-                solved, self.priors, self.observed, self.rig, self.settings, self.num_threads
-            )
+            given = self.priors, self.observed, self.rig, self.settings, self.num_threads
+            covariances = adjust.pose_covariances(solved, *given, self.parts)
             least = self.settings.rounds.min_observations
             false = None if self.trust is None else self.trust.false_frames
-            return assemble(solved, covariances, self.observed, self.coarse, least, false)
+            given = self.observed, self.coarse, least, false, self.parts
+            return assemble(solved, covariances, *given)
 
         return self._stage("reconstruction", self._solving(), compute, Reconstruction)
 

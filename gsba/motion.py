@@ -53,6 +53,11 @@ class Trust:
         """Whether every step of the trajectory was confirmed."""
         return not (self.false_steps.any() or self.unseen_steps.any())
 
+    @property
+    def held_steps(self) -> np.ndarray:
+        """Steps (F - 1,) bool that no image shows, but the trajectory may know."""
+        return self.unseen_steps & ~self.false_steps
+
 
 def steps(pairs: VerifiedPairs, keypoints: Keypoints, settings: VerifySettings) -> Steps:
     """Relative poses of neighbours among verified pairs.

@@ -1,28 +1,37 @@
 """A run from frames and a coarse trajectory to refined poses, a cloud and datasets."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsba import read, video
+from gsba import read, registered, turning, video
 from gsba.adjust import Adjustment
 from gsba.carrier import Carrier, find_carrier, write_carrier
+from gsba.components import largest, taken
 from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.export import ExportFormat, export, write_points
 from gsba.line import ExtraFactors, Line
 from gsba.log import GsbaError
 from gsba.misfit import refuse_useless
-from gsba.motion import describe
+from gsba.motion import Trust, describe
 from gsba.placement import Placement, check, place
 from gsba.report import build_report, take_notes, write_poses, write_report
 from gsba.report_html import write_html
 from gsba.store import RunStore, atomic_write, fingerprint, load_stage
-from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, Reconstruction, Trajectory
+from gsba.types import (
+    CoarsePoses,
+    Counts,
+    FrameSet,
+    PoseSource,
+    Reconstruction,
+    Trajectory,
+    VerifiedPairs,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +67,7 @@ class RunResult:
 
 def refine(
     frames: Path | str,
-    trajectory: Path | str | None,
+    trajectory: Path | str | Sequence[Path | str] | None,
     out: Path | str,
     settings: RefineSettings | None = None,
     *,
@@ -76,8 +85,10 @@ def refine(
 
     Args:
         frames: folder of 2:1 panoramas or of cube faces, or a video, for `out`/frames.
-        trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig. None = start from the images
-            alone: the first step's length is the unit and the first frame the world.
+        trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig. Several are pieces of one run,
+            on one clock, each with a world and scale of its own: the first one's are kept. None =
+            start from the images alone: the first step's length is the unit and the first frame
+            the world.
         out: folder of the run.
         settings: see `gsba.config`.
         keyframes: second trajectory file of the same run, with its keyframes: they lead.
@@ -95,8 +106,7 @@ def refine(
     settings, origin = settings or RefineSettings(), {"frames": frames}
     check(settings.placement)
     mask_files = None if masks is None or masks == AUTO else Path(masks)
-    paths = {"trajectory": trajectory, "keyframes": keyframes}
-    origin |= {name: Path(path) for name, path in paths.items() if path is not None}
+    origin |= _trajectories(trajectory, keyframes)
     given = _given(origin, timestamps)  # fails before hours of decoding, not after
     if video.is_video(frames):
         _extract(out, origin, settings, fps, fresh)
@@ -108,22 +118,38 @@ def refine(
         if masks == AUTO:
             frame_set = _without_carrier(store, frame_set)
         line = Line(store, frame_set, coarse, settings, extra_factors)
-        return _write(line, line.reconstruct(_solve(line, settings)))
+        neighbours = line.judge(line.match_neighbours())
+        if line.trust is not None and line.trust.turning_only:
+            return _write(line, _turned(line, line.trust))
+        return _write(line, line.reconstruct(_solve(line, neighbours, settings)))
 
 
-def _solve(line: Line, settings: RefineSettings) -> Adjustment:
-    """All stages from the coarse trajectory to the last solution."""
-    neighbours, rounds = line.judge(line.match_neighbours()), settings.rounds
+def _turned(line: Line, trust: Trust) -> Reconstruction:
+    """Rotations alone, of a camera that stayed in one place."""
+    settings = line.settings
+    key = [settings.matching, settings.rounds.min_observations]
+
+    def compute() -> Reconstruction:
+        return turning.run(line.context, trust.world_T_rigs, line.coarse)
+
+    return line.store.stage("reconstruction", key, compute, Reconstruction, [line.latest])
+
+
+def _solve(line: Line, neighbours: VerifiedPairs, settings: RefineSettings) -> Adjustment:
+    """All stages from verified neighbours to the last solution."""
+    rounds = settings.rounds
     solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)
     adjacent = line.match_along_epipolars(solved)
     near = line.match_known_points("near", solved, loops_closed=False)
-    solved = line.solve("dense", [adjacent, near], solved, rounds.dense)
+    matches = [adjacent, near]
+    solved = line.solve("dense", matches, solved, rounds.dense)
+    solved, matches = line.register(neighbours, solved, matches)
     loops, solved = line.close_loops(solved)
-    solved = line.solve("closed", [adjacent, near, loops.matches], solved, rounds.loops)
+    solved = line.solve("closed", [*matches, loops.matches], solved, rounds.loops)
     for number in range(1, rounds.map_passes + 1):
         wide = line.match_known_points(f"everywhere{number}", solved, loops_closed=True)
         final = number == rounds.map_passes and settings.align.rounds == 0
-        solved = line.solve(f"refined{number}", [adjacent, wide], solved, rounds.refined, final)
+        solved = line.solve(f"refined{number}", [matches[0], wide], solved, rounds.refined, final)
     for number in range(1, settings.align.rounds + 1):
         solved = line.solve_aligned(number, line.align(number, solved), solved)
     if "photometric" in settings.factors:
@@ -131,22 +157,32 @@ def _solve(line: Line, settings: RefineSettings) -> Adjustment:
     return solved
 
 
-def _given(origin: Mapping[str, Path], timestamps: Path | None) -> Trajectory | None:
-    """The trajectory of the files of a run, if any."""
-    if "trajectory" not in origin:
-        return None
-    trajectory = read.read_trajectory(origin["trajectory"], timestamps)
+def _trajectories(
+    trajectory: Path | str | Sequence[Path | str] | None, keyframes: Path | None
+) -> dict[str, Path]:
+    """The files that poses come from, by what they are."""
+    given = [trajectory] if isinstance(trajectory, Path | str) else list(trajectory or ())
+    if keyframes is not None and len(given) > 1:
+        raise GsbaError("keyframes go with one trajectory: give either several, or keyframes")
+    origin = {f"trajectory{n or ''}": Path(path) for n, path in enumerate(given)}
+    return origin if keyframes is None else origin | {"keyframes": Path(keyframes)}
+
+
+def _given(origin: Mapping[str, Path], timestamps: Path | None) -> list[Trajectory]:
+    """The trajectories of the files of a run, in pieces that each have a world of their own."""
+    given = [path for name, path in origin.items() if name.startswith("trajectory")]
+    pieces = [read.read_trajectory(path, timestamps) for path in given]
     if "keyframes" in origin:
         keyframes = read.read_trajectory(origin["keyframes"], timestamps)
-        trajectory = read.follow_keyframes(trajectory, keyframes)
-    return trajectory
+        pieces = [read.follow_keyframes(pieces[0], keyframes)]
+    return [part for piece in pieces for part in read.split_restarts(piece)]
 
 
-def _coarse(frames: FrameSet, given: Trajectory | None, settings: RefineSettings) -> CoarsePoses:
+def _coarse(frames: FrameSet, given: Sequence[Trajectory], settings: RefineSettings) -> CoarsePoses:
     """Start poses of frames, refused where no video could have them."""
-    if given is None:
+    if not given:
         return read.without_trajectory(frames)
-    coarse = read.associate(frames, given, settings.read)
+    coarse = read.associate_pieces(frames, given, settings.read)
     refuse_useless(coarse)
     if np.ptp(coarse.world_T_rigs[:, :3, 3], axis=0).max() == 0:
         logger.warning("the trajectory only turns: positions come from the images alone")
@@ -155,13 +191,14 @@ def _coarse(frames: FrameSet, given: Trajectory | None, settings: RefineSettings
 
 
 def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:
-    """Result of a finished run and the frames it was made from.
+    """Result of a finished run and the frames it was made from: the largest of its maps.
 
     Raises:
         GsbaError: `out` is no finished run.
     """
     reconstruction = load_stage(out, "reconstruction", Reconstruction)
-    return reconstruction, load_stage(out, "frames", FrameSet)
+    frames = load_stage(out, "frames", FrameSet)
+    return taken(reconstruction, frames, largest(reconstruction))
 
 
 def _extract(
@@ -193,21 +230,23 @@ def _without_carrier(store: RunStore, frames: FrameSet) -> FrameSet:
 
 
 def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
-    """Poses, cloud, report and datasets."""
+    """Poses, cloud, report and datasets; of several maps that nothing ties together the largest."""
     store, settings, frames, coarse = line.store, line.settings, line.frames, line.coarse
-    out = store.root
-    trajectory = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
-    read.write_tum(out / "trajectory.tum", trajectory)
+    out, rows = store.root, largest(reconstruction)
+    main, shown = taken(reconstruction, frames, rows)
+    read.write_tum(out / "trajectory.tum", Trajectory(shown.timestamps, main.world_T_rigs))
     write_poses(out / "poses.csv", frames, coarse, reconstruction)
-    write_points(out / "points.ply", reconstruction)
+    write_points(out / "points.ply", main)
     atomic_write(out / "config.toml", lambda path: path.write_text(to_toml(settings)))
-    placement = place(reconstruction, frames, settings.placement)
+    placement = place(main, shown, settings.placement)
     for name in settings.export.formats:
-        _export(line, ExportFormat(name), reconstruction, placement)
+        _export(line, ExportFormat(name), main, shown, placement)
     undone = [n for n, s in line.solutions.items() if not all(r.accepted for r in s.rounds)]
     undone += [name for name in line.undone if name not in undone]
     judgement, findings = describe(line.trust, frames) if line.trust else ({}, [])
-    notes = findings + take_notes(frames, coarse, reconstruction, undone, line.frame_weights)
+    joined, more = registered.describe(line.registered, line.joints, frames)
+    notes = findings + more
+    notes += take_notes(frames, coarse, reconstruction, undone, line.frame_weights)
     report = build_report(
         settings=settings,
         frames=frames,
@@ -218,17 +257,23 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
         solver=[{"stage": name, "rounds": s.rounds} for name, s in line.solutions.items()],
         gauge=_GAUGE if (coarse.sources != PoseSource.NONE).any() else _OWN_GAUGE,
         notes=notes,
-        trajectory=judgement,
+        trajectory=judgement | joined,
     )
     write_report(out / "report.json", report)
-    write_html(out / "report.html", frames, coarse, reconstruction, report)
+    page = report | {"frames": [report["frames"][f] for f in rows]}
+    start = replace(coarse, world_T_rigs=coarse.world_T_rigs[rows], sources=coarse.sources[rows])
+    write_html(out / "report.html", shown, start, main, page)
     for name in _OUTPUTS:
         store.claim(out / name)
     return RunResult(out, frames, coarse, reconstruction, report)
 
 
 def _export(
-    line: Line, to: ExportFormat, reconstruction: Reconstruction, placement: Placement
+    line: Line,
+    to: ExportFormat,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    placement: Placement,
 ) -> None:
     folder, name = line.store.root / to.value, f"export-{to.value}"
     if not folder.exists():
@@ -236,8 +281,8 @@ def _export(
 
     def compute() -> Counts:
         size = line.settings.export.face_size
-        export(reconstruction, line.frames, folder, to, size, placement)
-        return Counts(len(line.frames), len(line.frames), "frames")
+        export(reconstruction, frames, folder, to, size, placement)
+        return Counts(len(line.frames), len(frames), "frames")
 
     key = [line.settings.export.face_size, placement.to_json()]
     line.store.stage(name, key, compute, Counts, [line.latest])

@@ -14,6 +14,7 @@ def assemble(
     coarse: CoarsePoses,
     min_observations: int,
     false_frames: np.ndarray | None = None,
+    components: np.ndarray | None = None,
 ) -> Reconstruction:
     """Carry the solution back to the trajectory's world and gather what exports need.
 
@@ -24,6 +25,7 @@ def assemble(
         coarse: poses that define the world; interpolated ones have no say in it.
         min_observations: frames with fewer count as unrefined.
         false_frames: (F,) bool, frames whose coarse pose has no say either.
+        components: (F,) map of each frame, each carried to its own coarse poses; None = one map.
     """
     world_T_rigs, landmarks = adjustment.world_T_rigs, adjustment.landmarks
     seen = np.bincount(landmarks.tracks.frames, minlength=len(world_T_rigs))
@@ -31,13 +33,23 @@ def assemble(
     known = refined & (coarse.sources == PoseSource.SLAM)
     if false_frames is not None:
         known &= ~false_frames
-    known = known if np.count_nonzero(known) > 1 else np.ones(len(known), bool)
-    scale, rotation, translation = pose_similarity(world_T_rigs[known], coarse.world_T_rigs[known])
-    placed = pose(
-        rotation @ world_T_rigs[:, :3, :3],
-        scale * world_T_rigs[:, :3, 3] @ rotation.T + translation,
-    )
-    stretch = np.array([1, 1, 1, scale, scale, scale])
+    groups = np.zeros(len(seen), np.int32) if components is None else components
+    placed, stretch = np.empty_like(world_T_rigs), np.ones((len(seen), 6))
+    points_world = np.empty_like(landmarks.points_world)
+    tracks = landmarks.tracks
+    hosts = tracks.frames[np.searchsorted(tracks.points, np.arange(tracks.num_points))]
+    for group in np.unique(groups):
+        inside = groups == group
+        chosen = known & inside if np.count_nonzero(known & inside) > 1 else inside
+        move = pose_similarity(world_T_rigs[chosen], coarse.world_T_rigs[chosen])
+        scale, rotation, translation = move
+        turned = rotation @ world_T_rigs[inside, :3, :3]
+        placed[inside] = pose(
+            turned, scale * world_T_rigs[inside, :3, 3] @ rotation.T + translation
+        )
+        stretch[inside, 3:] = scale
+        there = inside[hosts]
+        points_world[there] = scale * landmarks.points_world[there] @ rotation.T + translation
     rows = keypoints.rows(landmarks.tracks)
     points = landmarks.tracks.points
     lengths = np.bincount(points, minlength=len(landmarks.points_world))
@@ -52,13 +64,14 @@ def assemble(
     )
     return Reconstruction(
         placed,
-        covariances * stretch[:, None] * stretch,
+        covariances * stretch[:, :, None] * stretch[:, None, :],
         np.where(refined, PoseStatus.REFINED, PoseStatus.UNREFINED).astype(np.uint8),
-        scale * landmarks.points_world @ rotation.T + translation,
+        points_world,
         np.rint(colors).astype(np.uint8),
         np.bincount(points, errors, len(lengths)) / lengths,
         points,
         landmarks.tracks.frames,
         bearings,
         adjustment.noise * keypoints.sigmas_rad[rows],
+        components,
     )

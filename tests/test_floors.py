@@ -19,7 +19,18 @@ FLOORS = (
     {"rig", "records", "run_folder", "search", "store", "read", "panorama", "views"},
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter", "align", "splat", "patch_grid"},
-    {"adjust", "blame", "frontend", "learned", "misfit", "motion", "photometric", "places"}
+    {
+        "adjust",
+        "blame",
+        "components",
+        "frontend",
+        "learned",
+        "misfit",
+        "motion",
+        "photometric",
+        "places",
+    }
+    | {"meetings", "parts", "registered", "resection", "segments", "turning"}
     | {"reconstruction", "recovery", "splat_align", "splatting"},
     {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"}
     | {"alignment", "carrier", "gravity", "placement"},

@@ -30,7 +30,8 @@ def refine(
     ],
     out: Annotated[Path, typer.Option(help="Folder of the run.", metavar="RUN")],
     trajectory: Annotated[
-        Path | None, typer.Argument(help="TUM, KITTI or stella_vslam map.msg.")
+        list[Path] | None,
+        typer.Argument(help="TUM, KITTI or stella_vslam map.msg; several are pieces of one run."),
     ] = None,
     keyframes: Annotated[
         Path | None, typer.Option(help="Keyframe trajectory of the same run.", metavar="FILE")
@@ -57,7 +58,7 @@ def refine(
     fresh: Annotated[bool, typer.Option("--fresh", help="Replace an earlier run.")] = False,
 ) -> None:
     """Refine the pose of every frame; the same call again resumes."""
-    if (trajectory is None) != no_trajectory:
+    if (not trajectory) != no_trajectory:
         raise GsbaError("give either a TRAJECTORY or --no-trajectory")
     if keyframes is not None and no_trajectory:
         raise GsbaError("--keyframes go with the TRAJECTORY of the same run")
