@@ -34,22 +34,7 @@ def assemble(
     if false_frames is not None:
         known &= ~false_frames
     groups = np.zeros(len(seen), np.int32) if components is None else components
-    placed, stretch = np.empty_like(world_T_rigs), np.ones((len(seen), 6))
-    points_world = np.empty_like(landmarks.points_world)
-    tracks = landmarks.tracks
-    hosts = tracks.frames[np.searchsorted(tracks.points, np.arange(tracks.num_points))]
-    for group in np.unique(groups):
-        inside = groups == group
-        chosen = known & inside if np.count_nonzero(known & inside) > 1 else inside
-        move = pose_similarity(world_T_rigs[chosen], coarse.world_T_rigs[chosen])
-        scale, rotation, translation = move
-        turned = rotation @ world_T_rigs[inside, :3, :3]
-        placed[inside] = pose(
-            turned, scale * world_T_rigs[inside, :3, 3] @ rotation.T + translation
-        )
-        stretch[inside, 3:] = scale
-        there = inside[hosts]
-        points_world[there] = scale * landmarks.points_world[there] @ rotation.T + translation
+    placed, points_world, stretch = _placed(adjustment, coarse.world_T_rigs, known, groups)
     rows = keypoints.rows(landmarks.tracks)
     points = landmarks.tracks.points
     lengths = np.bincount(points, minlength=len(landmarks.points_world))
@@ -75,3 +60,31 @@ def assemble(
         adjustment.noise * keypoints.sigmas_rad[rows],
         components,
     )
+
+
+def _placed(
+    adjustment: Adjustment, target_T_rigs: np.ndarray, known: np.ndarray, groups: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses, points, and factors (F, 6) of the standard deviations, each map in its own world.
+
+    Args:
+        adjustment: the last solution.
+        target_T_rigs: (F, 4, 4) poses that define the worlds.
+        known: (F,) bool, frames that say where their map goes; all, where fewer than two do.
+        groups: (F,) map of each frame.
+    """
+    poses, landmarks = adjustment.world_T_rigs, adjustment.landmarks
+    placed, stretch = np.empty_like(poses), np.ones((len(poses), 6))
+    points, tracks = np.empty_like(landmarks.points_world), landmarks.tracks
+    hosts = tracks.frames[np.searchsorted(tracks.points, np.arange(tracks.num_points))]
+    for group in np.unique(groups):
+        inside = groups == group
+        chosen = known & inside if np.count_nonzero(known & inside) > 1 else inside
+        move = pose_similarity(poses[chosen], target_T_rigs[chosen])
+        scale, rotation, translation = move
+        positions = scale * poses[inside, :3, 3] @ rotation.T + translation
+        placed[inside] = pose(rotation @ poses[inside, :3, :3], positions)
+        stretch[inside, 3:] = scale
+        there = inside[hosts]
+        points[there] = scale * landmarks.points_world[there] @ rotation.T + translation
+    return placed, points, stretch
