@@ -14,7 +14,6 @@ from gsba.geometry import erp_from_bearings, inverse, pose
 _WIDTH = 4096  # of the virtual panorama
 _MIN_SPREAD = 0.02  # middle eigenvalue of the inliers' bearings: not in one narrow cone
 _MIN_SHARE = 0.2  # of the candidates
-_MAX_SIGMA = 0.1  # of the position, part of the points' median distance
 _RIVAL = 1.5  # by how much a pose must outweigh the next one that is elsewhere
 _ELSEWHERE = 0.3  # part of the median distance, or radians
 
@@ -55,8 +54,6 @@ def resect(
         _MIN_SPREAD
     ):
         reason = "all points lie one way"
-    elif _position_sigma(world_T_rig, points_world[inliers], settings) > _MAX_SIGMA * depth:
-        reason = "its points leave the position open"
     else:
         rest = np.flatnonzero(~inliers)
         rival = _estimate(bearings[rest], points_world[rest], settings, seed)
@@ -89,20 +86,3 @@ def _estimate(
     rig_T_world = found["cam_from_world"].matrix()
     rig_T_world = pose(rig_T_world[:, :3], rig_T_world[:, 3])
     return inverse(rig_T_world), np.asarray(found["inlier_mask"], bool)
-
-
-def _position_sigma(
-    world_T_rig: np.ndarray, points_world: np.ndarray, settings: VerifySettings
-) -> float:
-    """Largest standard deviation of the position if every bearing errs by the threshold."""
-    offsets = points_world - world_T_rig[:3, 3]
-    distances = np.linalg.norm(offsets, axis=1, keepdims=True)
-    rays = offsets / distances
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    cross = np.cross(np.eye(3)[None], rays[:, None, :])  # rows: a turn about each axis
-    jacobian = np.concatenate([np.swapaxes(cross, 1, 2), -across / distances[..., None]], axis=2)
-    information = np.einsum("mki,mkj->ij", jacobian, jacobian)
-    covariance = np.linalg.pinv(information) * np.deg2rad(settings.max_error_deg) ** 2
-    if np.linalg.matrix_rank(information) < 6:
-        return np.inf
-    return float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))

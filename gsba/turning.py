@@ -145,11 +145,11 @@ def _system(
         shape=(2 * found.num_points, shape[0]),
     )
     totals = np.bincount(found.points, roots**2, found.num_points)
-    shared = gather @ whitened
-    explained = shared.T @ diags(np.repeat(1 / np.maximum(totals, 1e-300), 2)) @ shared
+    shared, inverses = gather @ whitened, np.repeat(1 / np.maximum(totals, 1e-300), 2)
+    explained = shared.T @ diags(inverses) @ shared
     system = (whitened.T @ whitened - explained).tocsc()[3:, 3:]
     right = (np.sqrt(weights)[:, None] * residuals).reshape(-1)
-    return system, whitened.T @ right
+    return system, whitened.T @ right - shared.T @ (inverses * (gather @ right))
 
 
 def _solved(system, right: np.ndarray) -> np.ndarray:

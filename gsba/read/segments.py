@@ -13,7 +13,7 @@ from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
 
 _log = logging.getLogger(__name__)
 
-_JUMP = 8.0  # median speeds: no step of the walk itself
+_JUMP = 4.0  # median speeds: no step of the walk itself
 _ALONE = 12  # entries on either side without another jump: two of them are an excursion and back
 _NEAR_ORIGIN = 3.0  # median steps
 _NEAR_ORIGIN_DEG = 20.0
