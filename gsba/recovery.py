@@ -73,6 +73,7 @@ def run(
     )
     neighbours = VerifiedPairs(neighbours.matches, neighbours.f0_T_f1s, counts)
     guessed = segments.guessed(joints, len(coarse.sources))
+    guessed |= trust.unseen_steps & motion.leaps(coarse.world_T_rigs, timestamps)
     trust = replace(trust, false_steps=trust.false_steps | guessed)
     return Recovered(neighbours, trust, coarse, joints)
 

@@ -77,10 +77,11 @@ def refine(
         fresh=fresh,
     )
     summary = json.loads((out / "report.json").read_text())["summary"]
-    typer.echo(
-        f"{summary['refined']} of {summary['frames']} frames refined, {summary['points']} points, "
-        f"median residual {summary['median_residual_deg']:.4f} deg: {out}"
-    )
+    residual = summary["median_residual_deg"]
+    found = "rotations only, no points"
+    if residual is not None:
+        found = f"{summary['points']} points, median residual {residual:.4f} deg"
+    typer.echo(f"{summary['refined']} of {summary['frames']} frames refined, {found}: {out}")
 
 
 @command
