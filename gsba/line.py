@@ -4,6 +4,7 @@ import os
 import uuid
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TypeVar
 
 import gtsam
@@ -208,8 +209,9 @@ class Line:
         tied = components.parted(neighbours.matches.pairs, nothing, scarce)
         if tied is None:
             return solved, matches
-        given = self.context, solved, tied, trust.held_steps, self.frames.timestamps
-        found = self._stage("registered", self._matching(), lambda: parts.run(*given), Registered)
+        given = self.context, solved, tied, trust.held_steps, ~trust.unseen_steps
+        compute = partial(parts.run, *given, self.frames.timestamps)
+        found = self._stage("registered", self._matching(), compute, Registered)
         self.counts["registered"] = [found.counts]
         self.registered, self.parts = found, components.several(found.components)
         self.coarse, self.trust, self.joints = follow(found, self.coarse, trust, self.joints)
@@ -219,12 +221,8 @@ class Line:
 
     def match_along_epipolars(self, solved: Adjustment, name: str = "adjacent") -> Matches:
         """Matches of neighbours in time along their solved epipolar lines."""
-        return self._stage(
-            name,
-            self._matching(),
-            lambda: frontend.match_along_epipolars(self.context, solved),
-            Matches,
-        )
+        compute = partial(frontend.match_along_epipolars, self.context, solved)
+        return self._stage(name, self._matching(), compute, Matches)
 
     def match_known_points(self, name: str, solved: Adjustment, loops_closed: bool) -> Matches:
         """Matches of solved points in frames further apart."""

@@ -26,6 +26,7 @@ from gsba.types import Counts, Landmarks
 _LOOKS = 3  # places compared for each frame of a part; twice as many for a frame alone
 _SAMPLED = 24  # frames of a part that are looked for elsewhere
 _BESIDE = 3  # frames from a break that are compared whatever they look like
+_BEST = 2  # meetings whose surroundings are compared too
 _MIN_SHARE = 0.25  # of the matches, to measure a pair at all: agreement decides
 _MIN_MAP = 3  # frames of a part that is a map
 _BEHIND = 3.0  # times the pace: a frame alone is no further off than that
@@ -38,6 +39,7 @@ def run(
     solved: Adjustment,
     parts: np.ndarray,
     held: np.ndarray,
+    seen: np.ndarray,
     timestamps: np.ndarray,
 ) -> Registered:
     """Join the parts of a map where they meet, and register frames that are in none.
@@ -47,14 +49,15 @@ def run(
         solved: poses and points, right within every part.
         parts: (F,) int, see `gsba.components.parted`.
         held: (F - 1,) bool, steps that no image shows but the trajectory knows.
+        seen: (F - 1,) bool, steps that images show: what becomes of frames with too few points.
         timestamps: (F,) seconds.
     """
-    joining = _Joining(context, solved, parts, held, timestamps)
+    joining = _Joining(context, solved, parts, held, held | seen, timestamps)
     component = 0
     while joining.begin(component):
         progress = True
         while progress:
-            progress = joining.by_images() or joining.by_trajectory()
+            progress = joining.by_images() or joining.by_ties()
         component += 1
     return joining.result()
 
@@ -68,10 +71,12 @@ class _Joining:
         solved: Adjustment,
         parts: np.ndarray,
         held: np.ndarray,
+        ties: np.ndarray,
         timestamps: np.ndarray,
     ) -> None:
         num = len(parts)
-        self.context, self.solved, self.parts, self.held = context, solved, parts, held
+        self.context, self.solved, self.parts = context, solved, parts
+        self.held, self.ties = held, ties
         self.times, self.depth = timestamps, median_depth(solved)
         self.looks = places.describe(context.strongest, num, context.settings.seed)
         self.poses = solved.world_T_rigs.copy()
@@ -113,9 +118,9 @@ class _Joining:
                 return True
         return False
 
-    def by_trajectory(self) -> bool:
-        """Carry one more part along with the map that the trajectory ties it to."""
-        for f in np.flatnonzero(self.held).tolist():
+    def by_ties(self) -> bool:
+        """Carry one more part along with the map that the trajectory or a step ties it to."""
+        for f in np.flatnonzero(self.ties).tolist():
             for inner, outer in ((f, f + 1), (f + 1, f)):
                 if self.components[inner] == self.current and self.components[outer] < 0:
                     rows = np.flatnonzero((self.parts == self.parts[outer]) & (self.components < 0))
@@ -146,15 +151,26 @@ class _Joining:
         """Scale and move that carry a part to where it meets the map; None if it does not."""
         sampled = np.linspace(0, len(rows) - 1, _SAMPLED).astype(int)
         sampled = rows[np.unique([*sampled, *range(_BESIDE), *range(-_BESIDE, 0)])]
-        chosen = np.sort(self._candidates(sampled, inside, _LOOKS), axis=1)
+        chosen = self._candidates(sampled, inside, _LOOKS)
         strongest = replace(self.context, frames=self.context.strongest)
-        verified = recovery.match_anywhere(strongest, chosen, _MIN_SHARE)
-        outside = np.zeros(len(self.parts), bool)
-        outside[rows] = True
+        meetings = self._meetings(strongest, chosen)
+        group = agreeing(meetings, self.poses, self.depth)
+        if meetings and not group:  # too few of them, perhaps: look around the best
+            around = self._around(meetings, rows, inside, chosen)
+            meetings += self._meetings(self.context, around)
+            group = agreeing(meetings, self.poses, self.depth)
+        if not group or (self._held(rows) and not all(map(self._plausible, group))):
+            return None
+        return refined(group, self.poses)
+
+    def _meetings(self, context: MatchContext, chosen: np.ndarray) -> list[Meeting]:
+        """What pairs (P, 2) of a frame outside and one inside the map ask for."""
+        verified = recovery.match_anywhere(context, np.sort(chosen, axis=1), _MIN_SHARE)
+        outside = set(chosen[:, 0].tolist())
         meetings = []
         for p, (f0, f1) in enumerate(verified.matches.pairs.tolist()):
             matched = verified.matches.of(p)
-            (f, g), columns = ((f0, f1), (0, 1)) if outside[f0] else ((f1, f0), (1, 0))
+            (f, g), columns = ((f0, f1), (0, 1)) if f0 in outside else ((f1, f0), (1, 0))
             own = self.known[f][matched[:, columns[0]]]
             theirs = self.known[g][matched[:, columns[1]]]
             both = np.isfinite(own).all(axis=1) & np.isfinite(theirs).all(axis=1)
@@ -162,10 +178,18 @@ class _Joining:
             meeting = measure(f, g, own[both], theirs[both], self.poses, seed)
             if meeting is not None:
                 meetings.append(meeting)
-        group = agreeing(meetings, self.poses, self.depth)
-        if not group or (self._held(rows) and not all(map(self._plausible, group))):
-            return None
-        return refined(group, self.poses)
+        return meetings
+
+    def _around(
+        self, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray, chosen: np.ndarray
+    ) -> np.ndarray:
+        """Pairs (P, 2) beside the meetings of the most points that were not compared yet."""
+        best = sorted(meetings, key=lambda meeting: -len(meeting.own))[:_BEST]
+        reach = range(-_BESIDE + 1, _BESIDE)
+        found = {(m.f + i, m.g + j) for m in best for i in reach for j in reach}
+        found &= {(int(f), int(g)) for f in rows for g in inside}
+        found -= {(int(f), int(g)) for f, g in chosen}
+        return np.array(sorted(found), np.int32).reshape(-1, 2)
 
     def _held(self, rows: np.ndarray) -> bool:
         """Whether the trajectory ties a part to the map."""
@@ -237,19 +261,19 @@ class _Joining:
         return True
 
     def result(self) -> Registered:
-        """The map as it is now; frames in no part of it stay beside the one before them."""
-        lost = self.components < 0
-        for f in np.flatnonzero(lost).tolist():
+        """The map as it is now; a frame in no part of it is apart, beside the one before it."""
+        lost, maps = self.components < 0, int(self.components.max()) + 1
+        for n, f in enumerate(np.flatnonzero(lost).tolist()):
             placed = np.flatnonzero(~lost)
             nearest = int(placed[np.argmin(np.abs(placed - f))])
-            self.components[f] = self.components[nearest]
+            self.components[f] = maps + n
             self.scales[f], self.moves[f] = self.scales[nearest], self.moves[nearest]
             self.poses[f] = carried(self.poses[f], float(self.scales[f]), self.moves[f])
         order = by_size(self.components)
         offsets = self._side_by_side(order)
-        num, together = int(self.parts.max()) + 1, int(order.max()) + 1
-        dropped = {"frames alone": int(lost.sum()), "apart": together - 1}
-        kept = num - together - int(lost.sum())
+        num, alone = int(self.parts.max()) + 1, int(lost.sum())
+        dropped = {"frames alone": alone, "apart": maps - 1}
+        kept = num - maps - alone
         return Registered(
             _moved(self.solved, self.poses, self.scales, self.moves, offsets),
             order.astype(np.int32),

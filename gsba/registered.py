@@ -87,14 +87,15 @@ def describe(
     if registered is None:
         return judgement, notes
     alone, lost = names[registered.alone].tolist(), names[registered.lost].tolist()
-    count = int(registered.components.max()) + 1
-    maps = [names[registered.components == c].tolist() for c in range(count)]
+    own = registered.components[~registered.lost]
+    maps = [names[registered.components == c].tolist() for c in np.unique(own)]
+    count = len(maps)
     judgement |= {"registered": alone, "not_registered": lost}
     judgement["maps"] = maps if count > 1 else []
     if alone:
         notes.append(f"registered against the map: {', '.join(alone)}")
     if lost:
-        notes.append(f"could not be registered, placed by guess: {', '.join(lost)}")
+        notes.append(f"could not be registered, not exported: {', '.join(lost)}")
     if count > 1:
         parts = "; ".join(f"{m[0]} to {m[-1]} ({len(m)} frames)" for m in maps[1:])
         notes.append(

@@ -21,6 +21,7 @@ NUM, POINTS, HALF = 40, 1500, 20
 TRUTH = loop_walk(NUM)
 TIMES = np.arange(NUM, dtype=float)
 NOBODY = np.zeros(NUM - 1, bool)
+BREAK = np.arange(NUM - 1) == HALF - 1
 SETTINGS = RefineSettings(pairs=PairSettings(window=8, max_baseline_depths=0.8))
 SCALE = 1.7
 MOVE = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -3.0, 8.0]))
@@ -99,7 +100,7 @@ def _errors(found: Registered, true: np.ndarray = TRUTH) -> tuple[float, float]:
 def test_two_maps_of_any_scale_are_joined_where_they_meet(scale: float) -> None:
     context, whole, late = _scene()
     torn = _torn(whole, late, scale, MOVE)
-    found = parts.run(context, torn, _halves(), NOBODY, TIMES)
+    found = parts.run(context, torn, _halves(), NOBODY, ~BREAK, TIMES)
     assert not found.components.any() and found.met.all() and not found.lost.any()
     np.testing.assert_allclose(found.scales[HALF:], 1 / scale, rtol=0.005)
     off, turned = _errors(found)
@@ -110,7 +111,7 @@ def test_two_maps_of_any_scale_are_joined_where_they_meet(scale: float) -> None:
 
 def test_strangers_stay_apart() -> None:
     context, whole, late = _scene(strange=True)
-    found = parts.run(context, _torn(whole, late, SCALE, MOVE), _halves(), NOBODY, TIMES)
+    found = parts.run(context, _torn(whole, late, SCALE, MOVE), _halves(), NOBODY, ~BREAK, TIMES)
     np.testing.assert_array_equal(found.components, np.arange(NUM) >= HALF)
     assert found.counts.dropped == {"frames alone": 0, "apart": 1}
     # Side by side: no frame of one is as near to the other as to its own.
@@ -123,7 +124,7 @@ def test_strangers_that_the_trajectory_ties_together_stay_where_it_has_them() ->
     context, whole, _ = _scene(strange=True)
     held = NOBODY.copy()
     held[HALF - 1] = True
-    found = parts.run(context, whole, _halves(), held, TIMES)
+    found = parts.run(context, whole, _halves(), held, ~BREAK, TIMES)
     assert not found.components.any() and not found.met[HALF:].any()
     np.testing.assert_allclose(found.solved.world_T_rigs, TRUTH, atol=1e-12)
 
@@ -135,10 +136,10 @@ def test_a_join_that_asks_for_more_than_drift_is_not_believed_against_the_trajec
     held[HALF - 1] = True
     step = far.world_T_rigs[HALF, :3, 3] - far.world_T_rigs[HALF - 1, :3, 3]
     assert np.linalg.norm(step) > 40  # the trajectory vouches for a long step: as long may it err
-    joined = parts.run(context, far, _halves(), held, TIMES)
+    joined = parts.run(context, far, _halves(), held, ~BREAK, TIMES)
     assert joined.met.all()
     turned = _torn(whole, late, 3.0, np.eye(4))
-    kept = parts.run(context, turned, _halves(), held, TIMES)
+    kept = parts.run(context, turned, _halves(), held, ~BREAK, TIMES)
     assert not kept.met[HALF:].any()
     np.testing.assert_allclose(kept.solved.world_T_rigs, turned.world_T_rigs, atol=1e-12)
 
@@ -147,7 +148,7 @@ def test_frames_alone_are_registered_against_the_map() -> None:
     context, whole, _ = _scene()
     alone = (7, 13, 14)
     whole = _without_map(whole, alone)
-    found = parts.run(context, whole, _halves(alone), NOBODY, TIMES)
+    found = parts.run(context, whole, _halves(alone), NOBODY, NOBODY, TIMES)
     np.testing.assert_array_equal(np.flatnonzero(found.alone), alone)
     off, turned = _errors(found)
     assert off < 0.02 and turned < 0.2
@@ -156,13 +157,20 @@ def test_frames_alone_are_registered_against_the_map() -> None:
 
 def test_a_frame_of_elsewhere_is_not_registered() -> None:
     context, whole, _ = _scene(strange=True)
-    alone = (30,)  # among the first half's frames it would be a stranger
-    parts_of = np.zeros(NUM, int)
-    parts_of[30] = 1
+    parts_of = (np.arange(NUM) == 30).astype(int)
     rest = _without_map(whole, tuple(range(HALF, NUM)))
-    found = parts.run(context, rest, parts_of, NOBODY, TIMES)
-    np.testing.assert_array_equal(np.flatnonzero(found.lost), alone)
-    assert not found.alone.any() and found.counts.dropped["frames alone"] == 1
+    found = parts.run(context, rest, parts_of, NOBODY, NOBODY, TIMES)
+    np.testing.assert_array_equal(np.flatnonzero(found.lost), [30])
+    np.testing.assert_array_equal(found.components, parts_of)  # apart: a guess is not exported
+    assert not found.alone.any() and found.counts.dropped == {"frames alone": 1, "apart": 0}
+
+
+def test_a_frame_with_too_few_points_stays_where_its_steps_have_it() -> None:
+    context, whole, _ = _scene(strange=True)
+    parts_of = (np.arange(NUM) == 30).astype(int)
+    rest = _without_map(whole, tuple(range(HALF, NUM)))
+    found = parts.run(context, rest, parts_of, NOBODY, ~NOBODY, TIMES)
+    assert not found.lost.any() and not found.components.any()
 
 
 def _trust(poses: np.ndarray, unseen: np.ndarray) -> Trust:
@@ -179,16 +187,12 @@ def test_a_piece_of_the_trajectory_goes_where_its_frames_were_carried() -> None:
     slam = np.full(NUM, PoseSource.SLAM, np.uint8)
     coarse = CoarsePoses(torn.world_T_rigs, slam, 0.0, segments)
     joints = (Joint(HALF, NUM - 1, 2.0, MOVE, GUESS),)
-    found = parts.run(context, torn, _halves(), NOBODY, TIMES)
+    found = parts.run(context, torn, _halves(), NOBODY, ~BREAK, TIMES)
     moved, trust, joints = follow(found, coarse, _trust(torn.world_T_rigs, unseen), joints)
     np.testing.assert_allclose(moved.world_T_rigs, found.solved.world_T_rigs, atol=1e-9)
     assert joints[0].how == PLACES and trust.false_steps[HALF - 1]
-    # The piece's own poses, as they were before the guess, now lie in the first one's world.
-    own = carried(TRUTH[HALF:], 1.0, np.eye(4))
-    before = carried(inverse(MOVE)[None], 1.0, np.eye(4))  # any pose will do
-    guessed = carried(before, 2.0, MOVE)
-    again = carried(guessed, found.scales[-1], found.moves[-1])
-    np.testing.assert_allclose(
-        carried(before, joints[0].scale, joints[0].world_T_own), again, atol=1e-9
-    )
-    assert len(own) == HALF
+    # What the piece's own poses were before the guess now lies where the map has them.
+    own = carried(MOVE[None], 1.0, np.eye(4))  # any pose will do
+    again = carried(carried(own, 2.0, MOVE), found.scales[-1], found.moves[-1])
+    joined = carried(own, joints[0].scale, joints[0].world_T_own)
+    np.testing.assert_allclose(joined, again, atol=1e-9)
