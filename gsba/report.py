@@ -201,7 +201,8 @@ def write_poses(
     """Write poses.csv: world_T_rig, its quality and its covariance for every frame.
 
     Covariances are of the tangent [rotation (radians), translation (map units)] in the rig frame;
-    the upper triangle is written row by row. Cells of unknown values are empty.
+    the upper triangle is written row by row. Cells of unknown values are empty. Frames of the same
+    `map` share a world; 0 is the largest.
     """
     quality = frame_quality(reconstruction)
     rows, columns = np.triu_indices(6)
@@ -216,10 +217,12 @@ def write_poses(
             reconstruction.pose_covariances[:, rows, columns],
         ]
     )
+    maps = reconstruction.components
     header = ["frame", "timestamp", "status", "source", "num_observations", "median_residual_deg"]
     header += ["tx", "ty", "tz", "qw", "qx", "qy", "qz"]
     header += [f"std_{axis}_deg" for axis in _AXES[:3]] + [f"std_{axis}" for axis in _AXES[3:]]
     header += [f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in zip(rows, columns, strict=True)]
+    header += ["map"]
 
     def write(temporary: Path) -> None:
         with temporary.open("w", newline="", encoding="utf-8") as file:
@@ -232,6 +235,7 @@ def write_poses(
                     [name, repr(float(frames.timestamps[f])), status, source]
                     + [int(quality.num_observations[f]), _cell(quality.median_residuals_deg[f])]
                     + [_cell(value) for value in numbers[f]]
+                    + [0 if maps is None else int(maps[f])]
                 )
 
     atomic_write(path, write)

@@ -1,7 +1,7 @@
 """Neighbours matched under the given clock, and under the right one where that is another."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from gsba import clock, recovery
@@ -12,35 +12,38 @@ from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory, VerifiedPa
 
 logger = logging.getLogger(__name__)
 
-Associate = Callable[[FrameSet, Trajectory, RefineSettings], CoarsePoses]
+Associate = Callable[[FrameSet, Sequence[Trajectory], RefineSettings], CoarsePoses]
 
 
-def match_neighbours(line: Line, given: Trajectory | None, associate: Associate) -> VerifiedPairs:
+def match_neighbours(
+    line: Line, given: Sequence[Trajectory], associate: Associate
+) -> VerifiedPairs:
     """Verified neighbours in time, after the clock has been set right.
 
     Args:
         line: of the run; keeps the estimate, and starts from poses at the right times.
-        given: all entries of the trajectory; None = there is none.
+        given: all entries of the trajectory; of several, each piece may have a clock of its own,
+            and all are taken as they are.
         associate: poses of frames from a trajectory.
     """
     guided = line.match_neighbours()
     settings, coarse, times = line.settings, line.coarse, line.frames.timestamps
-    absent = given is None or (coarse.sources == PoseSource.NONE).all()
-    if given is None or absent or settings.read.clock == "given":
+    absent = len(given) != 1 or (coarse.sources == PoseSource.NONE).all()
+    if absent or settings.read.clock == "given":
         return guided
-    context = line.context
+    context, trajectory = line.context, given[0]
 
     def compute() -> ClockEstimate:
-        return recovery.check_clock(context, guided, coarse, times, given)
+        return recovery.check_clock(context, guided, coarse, times, trajectory)
 
-    key = [given.timestamps.tolist(), given.world_T_rigs.tolist()]
+    key = [trajectory.timestamps.tolist(), trajectory.world_T_rigs.tolist()]
     estimate = line.store.stage("clock", key, compute, ClockEstimate, [line.latest])
     line.latest, line.clock = "clock", estimate
     if estimate.verdict != "corrected":
         return guided
     settled = settings.read.model_copy(update={"clock_offset_s": 0.0})
     settings = settings.model_copy(update={"read": settled})
-    line.follow(associate(line.frames, estimate.clock.on_frames(given), settings))
+    line.follow(associate(line.frames, [estimate.clock.on_frames(trajectory)], settings))
     return line.match_neighbours("neighbours_on_time")
 
 

@@ -20,12 +20,14 @@ FLOORS = (
     | {"turning", "views"},
     {"align", "cubemap", "features", "filter", "graph", "matching", "optimize", "pairs"}
     | {"patch_grid", "splat", "tracks", "triangulate", "verify"},
-    {"adjust", "blame", "clock", "clock_fit", "frontend", "learned", "misfit", "motion"}
-    | {"photometric", "places", "reconstruction", "recovery", "splat_align", "splat_refine"}
-    | {"splatting", "stitching"},
+    {"adjust", "blame", "clock", "clock_fit", "components", "frontend", "learned"}
+    | {"meetings", "misfit", "motion", "parts", "photometric", "places", "reconstruction"}
+    | {"recovery", "registered", "resection", "segments", "splat_align", "splat_refine"}
+    | {"rotation_only", "splatting", "stitching"},
     {"alignment", "carrier", "distractors", "evaluate", "evaluate_splat", "export"}
     | {"gravity", "induced", "placement", "report", "report_html", "video"},
-    {"demo", "extraction", "line", "masking", "pipeline", "segment", "timing", "view"},
+    {"demo", "extraction", "inputs", "line", "masking", "matching_stages", "pipeline"}
+    | {"results", "segment", "timing", "view"},
     {"cli"},
     {"benchmarks"},
 )

@@ -59,7 +59,8 @@ def refine(
     ],
     out: Annotated[Path, typer.Option(help="Folder of the run.", metavar="RUN")],
     trajectory: Annotated[
-        Path | None, typer.Argument(help="TUM, KITTI or stella_vslam map.msg.")
+        list[Path] | None,
+        typer.Argument(help="TUM, KITTI or stella_vslam map.msg; several are pieces of one run."),
     ] = None,
     keyframes: Annotated[
         Path | None, typer.Option(help="Keyframe trajectory of the same run.", metavar="FILE")
@@ -85,7 +86,7 @@ def refine(
     fresh: Annotated[bool, typer.Option("--fresh", help="Replace an earlier run.")] = False,
 ) -> None:
     """Refine the pose of every frame; the same call again resumes."""
-    if (trajectory is None) != no_trajectory:
+    if (not trajectory) != no_trajectory:
         raise GsbaError("give either a TRAJECTORY or --no-trajectory")
     if keyframes is not None and no_trajectory:
         raise GsbaError("--keyframes go with the TRAJECTORY of the same run")
@@ -111,10 +112,10 @@ def refine(
 def _summary(out: Path) -> str:
     """One line on a finished run."""
     summary = json.loads((out / "report.json").read_text())["summary"]
-    return (
-        f"{summary['refined']} of {summary['frames']} frames refined, {summary['points']} points, "
-        f"median residual {summary['median_residual_deg']:.4f} deg: {out}"
-    )
+    residual, found = summary["median_residual_deg"], "rotations only, no points"
+    if residual is not None:
+        found = f"{summary['points']} points, median residual {residual:.4f} deg"
+    return f"{summary['refined']} of {summary['frames']} frames refined, {found}: {out}"
 
 
 @command
