@@ -1,12 +1,14 @@
 r"""Draw the pictures of README and docs from what `gsba demo` leaves.
 
     gsba demo --frames 24 --width 768
-    gsba evaluate gsba-demo/run --splat --against gsba-demo/walk/slam.tum \
-        --iterations 2000 --face-size 160
     python docs/pictures.py gsba-demo
+    python benchmarks/splat_quality.py --scenes demo_rectangle --out splats \
+        --iterations 1500 --face-size 96 --max-gaussians 40000
+    python docs/pictures.py gsba-demo --splats splats/demo_rectangle/splats
 
-Writes docs/images: trajectory.svg, residuals.jpg, cloud.jpg and, where splats were evaluated,
-splats.svg. The colours are those of report.html.
+Writes docs/images: trajectory.svg, residuals.jpg, cloud.jpg and, from what either
+benchmarks/splat_quality.py or gsba evaluate --splat left, splats.svg. The colours are those of
+report.html.
 """
 
 import argparse
@@ -38,6 +40,7 @@ def main() -> None:
     )
     parser.add_argument("demo", type=Path, help="folder that gsba demo wrote")
     parser.add_argument("--run", type=Path, help="run to draw; DEMO/run by default")
+    parser.add_argument("--splats", type=Path, help="folder with pictures/ and results.json")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "images")
     arguments = parser.parse_args()
     run = arguments.run or arguments.demo / "run"
@@ -48,9 +51,8 @@ def main() -> None:
     (arguments.out / "trajectory.svg").write_text(trajectory(found, frames, coarse, truth))
     write(arguments.out / "residuals.jpg", residuals(found, frames))
     write(arguments.out / "cloud.jpg", cloud(found))
-    pictures = sorted((run / "splat-evaluation" / "pictures").glob("*.jpg"))
-    if pictures:
-        (arguments.out / "splats.svg").write_text(splats(pictures[len(pictures) // 2]))
+    if arguments.splats is not None:
+        (arguments.out / "splats.svg").write_text(splats(arguments.splats))
 
 
 def trajectory(
@@ -216,26 +218,36 @@ def cloud(found: Reconstruction) -> np.ndarray:
     return cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)
 
 
-def splats(path: Path) -> str:
+def splats(folder: Path) -> str:
     """SVG: faces of a held-out frame as captured, and as splats on coarse and refined poses are."""
-    sheet = cv2.imread(str(path))[..., ::-1]  # a row each: captured, refined, coarse
+    scores = json.loads((folder / "results.json").read_text())["sources"]
+    pictures = sorted((folder / "pictures").glob("*.jpg"))
+    path = pictures[len(pictures) // 2]
+    sheet = cv2.imread(str(path))[..., ::-1]  # a row of faces: as captured, then of each source
     size = sheet.shape[1] // 6
-    shown = {"captured": 0, "splat on coarse poses": 2, "splat on refined poses": 1}
-    scores = json.loads((path.parents[1] / "results.json").read_text())
-    print(json.dumps(scores)[:300])
+    coarse = next(name for name in scores if name not in ("refined", "truth"))
+    shown = [("captured", 0, QUIET)]
+    for name, label, color in (
+        (coarse, "on coarse poses", BEFORE),
+        ("refined", "on refined poses", AFTER),
+    ):
+        found = scores[name]["frames"][path.stem]["psnr"]
+        shown.append((f"{label}, {found:.1f} dB", 1 + list(scores).index(name), color))
     wide, gap, head = 286, 12, 52
-    width, height = 3 * wide + 4 * gap, head + 2 * wide + 2 * gap
+    width, height = 3 * wide + 4 * gap, head + 2 * wide + gap
     body = []
-    for column, (label, row) in enumerate(shown.items()):
+    for column, (label, row, color) in enumerate(shown):
         faces = [sheet[row * size : (row + 1) * size, c * size : (c + 1) * size] for c in (0, 1)]
-        image = cv2.resize(np.concatenate(faces), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        image = cv2.resize(
+            np.concatenate(faces), (2 * wide, 4 * wide), interpolation=cv2.INTER_CUBIC
+        )
         data = base64.b64encode(jpeg(image, 34_000)).decode()
         x = gap + column * (wide + gap)
         body.append(
             f'<image x="{x}" y="{head}" width="{wide}" height="{2 * wide}" '
             f'href="data:image/jpeg;base64,{data}"/>'
         )
-        body.append(_text(x + 2, 33, label, (QUIET, BEFORE, AFTER)[column], 15, 600))
+        body.append(_text(x + 2, 33, label, color, 15, 600))
     return _page(width, height, body)
 
 
