@@ -13,13 +13,13 @@ _MIN_STEP_S = 0.2  # shortest after merging
 _SPACING = 0.25  # of a step, between offsets tried
 _MAX_RATE = 0.03  # largest deviation of the rate that is tried
 _RATE_SIGMA = 0.02  # what is expected of it
-_TRIED = 6  # candidates of the grid
-_ITERATIONS = 40
+_TRIED = 5  # candidates of the grid
+_ITERATIONS = 20
 _WIDTH = 2.0  # of the loss, standard deviations
 _MIN_SIGMA = np.deg2rad(0.03)  # of a rotation, per axis: images know no better
 _ROUGH_SIGMA = np.deg2rad(1.0)  # least of it on the grid
 _QUIET, _QUIET_LENGTH = 0.4, 1.367  # quantile that noise is read from; of unit Gaussian 3-vectors
-_SCANNED = 49  # shifts within a step of the best, for its uncertainty
+_SCANNED = 41  # shifts within a step of the best, for its uncertainty
 _INFLATION = 3.0  # of standard deviations
 _CERTAIN = 4.0  # standard deviations within which no shift may do as well
 
@@ -150,7 +150,7 @@ class ClockFit:
             else:
                 damping *= 10
             narrowed = max(0.7 * sigma, noise(residuals))
-            if damping > 1e6 or (narrowed == sigma and np.abs(step[0]) < 1e-5):
+            if damping > 1e6 or (narrowed == sigma and np.abs(step[0]) < 1e-4 * self.turns.step):
                 break
             sigma = narrowed
         return parameters

@@ -20,7 +20,15 @@ FLOORS = (
     {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
     | {"graph", "optimize", "filter", "align", "splat", "patch_grid"},
     {"adjust", "blame", "frontend", "learned", "misfit", "motion", "photometric", "places"}
-    | {"clock", "clock_fit", "reconstruction", "recovery", "splat_align", "splatting"},
+    | {
+        "clock",
+        "clock_fit",
+        "pose_graph",
+        "reconstruction",
+        "recovery",
+        "splat_align",
+        "splatting",
+    },
     {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"}
     | {"alignment", "carrier", "gravity", "placement"},
     {"demo", "extraction", "line", "pipeline", "timing"},
