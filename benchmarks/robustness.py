@@ -1,21 +1,28 @@
-"""How badly wrong a trajectory may be: drift, outliers, gaps and scale drift, swept one by one.
+"""How badly wrong a trajectory may be: drift, outliers, gaps, scale, clock, swept one by one.
 
 Renders a walk (or takes FRAMES and their TRUTH), spoils its exact trajectory by growing amounts,
-refines each and compares with the truth. Frames are searched for features once.
+refines each and compares with the truth. Frames are searched for features once. `missing loop`
+leaves out the last frames, pictures and all, of a drifting trajectory, so that it never returns;
+`false loops` forces loops between places that have nothing in common into the run.
 """
 
 import argparse
 import json
+import shutil
 import time
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from common import machine
+from false_loops import forged_loops
 from scipy.spatial.transform import Rotation
 
 from gsba import refine
+from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.demo import degrade, make_walk
 from gsba.evaluate import evaluate
@@ -29,8 +36,21 @@ DRIFTS = (0.0, 0.02, 0.05, 0.1, 0.2)  # of the path
 OUTLIERS = (0.05, 0.1, 0.2, 0.3)  # of the frames
 GAPS = (5, 10, 20)  # frames
 SCALES = (0.1, 0.3)  # half the range over the run
+CLOCKS = ((0.2, 1.0), (0.7, 1.0), (0.7, 1.01), (-2.0, 0.99))  # offset in seconds, rate
+MISSING = (5, 10, 20)  # last frames left out
+MISSING_DRIFT = 0.05  # of the path, of the trajectory whose loop is missing
+FALSE_LOOPS = (3, 8)  # in a row, between frames a quarter and three quarters into the walk
 TURN_DEG_PER_DRIFT = 100.0  # degrees of rotation drift that go with a drift of one path length
 OUTLIER_STEPS, OUTLIER_DEG = (1.0, 3.0), (5.0, 20.0)  # how far off: least and most
+
+
+class Point(NamedTuple):
+    """A trajectory to refine."""
+
+    sweep: str
+    amount: float
+    trajectory: Trajectory
+    outliers: list[int]  # frames that were displaced
 
 
 def spoiled(truth: Trajectory, seed: int) -> Iterator[tuple[str, float, Trajectory, list[int]]]:
@@ -49,6 +69,17 @@ def spoiled(truth: Trajectory, seed: int) -> Iterator[tuple[str, float, Trajecto
         yield "gap", gap, Trajectory(base.timestamps[kept], base.world_T_rigs[kept]), []
     for amount in SCALES:
         yield "scale", amount, Trajectory(truth.timestamps, rescaled(truth, amount)), []
+    for offset, rate in CLOCKS:
+        times = offset + rate * base.timestamps
+        yield f"clock, rate {rate:g}", offset, Trajectory(times, base.world_T_rigs), []
+    turn = TURN_DEG_PER_DRIFT * MISSING_DRIFT
+    drifting = degrade(truth, seed, rotation_drift_deg=turn, translation_drift=MISSING_DRIFT)
+    for missing in MISSING:
+        left = slice(0, -missing)
+        open_end = Trajectory(drifting.timestamps[left], drifting.world_T_rigs[left])
+        yield "missing loop", missing, open_end, []
+    for count in FALSE_LOOPS:
+        yield "false loops", count, base, []
     backwards = Trajectory(base.timestamps, base.world_T_rigs[::-1].copy())
     yield "reversed", 1, backwards, []
     flip = np.diag([-1.0, 1, 1, 1])
@@ -102,6 +133,54 @@ def _point(run: Callable[[], dict[str, Any]], names: list[str], truth: Trajector
     }
 
 
+def _row(
+    point: Point, frames: Path, truth: Trajectory, work: Path, settings: RefineSettings
+) -> dict[str, Any]:
+    """One refinement, in a folder of its own where it is not of the same frames and stages."""
+    slam, folder, false, trajectory = (
+        work / "slam.tum",
+        work / "run",
+        nullcontext(),
+        point.trajectory,
+    )
+    write_tum(slam, trajectory)
+    all_names = sorted(path.stem for path in frames.iterdir() if path.suffix != ".csv")
+    names, before = [all_names[f] for f in point.outliers], trajectory
+    if point.sweep.startswith("clock"):
+        before = Trajectory(truth.timestamps, trajectory.world_T_rigs)
+    elif point.sweep == "missing loop":
+        folder = work / f"run-cut{point.amount}"
+        frames = _without_last(frames, truth, int(point.amount), work / f"cut{point.amount}")
+    elif point.sweep == "false loops":
+        folder = work / f"run-false{point.amount}"
+        false = forged_loops(len(all_names) // 4, len(all_names) // 2, int(point.amount))
+    with false:
+        run = partial(_report, frames, slam, folder, settings, point.sweep == "false loops")
+        errors = _point(run, names, truth, folder)
+    ate = evaluate(before, truth).ate.rmse
+    return {"sweep": point.sweep, "amount": point.amount, "ate_before": ate, **errors}
+
+
+def _report(
+    frames: Path, slam: Path, out: Path, settings: RefineSettings, fresh: bool
+) -> dict[str, Any]:
+    return refine(frames, slam, out, settings, fresh=fresh).report
+
+
+def _without_last(frames: Path, truth: Trajectory, missing: int, folder: Path) -> Path:
+    """A folder of links to all frames but the last ones, and their times."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    images = sorted(path for path in frames.iterdir() if path.suffix != ".csv")[:-missing]
+    for image in images:
+        (folder / image.name).symlink_to(image.resolve())
+    rows = [
+        f"{image.name},{t!r}" for image, t in zip(images, truth.timestamps.tolist(), strict=False)
+    ]
+    (folder / "timestamps.csv").write_text("\n".join(["name,timestamp", *rows]) + "\n")
+    return folder
+
+
 def to_markdown(rows: list[dict[str, Any]]) -> str:
     """Table of all points."""
     lines = [
@@ -128,6 +207,7 @@ def main() -> None:
     parser.add_argument("--truth", type=Path, help="their exact trajectory")
     parser.add_argument("--name", default="robustness", help="of the result files")
     parser.add_argument("--set", action="append", default=[], metavar="STAGE.KEY=VALUE")
+    parser.add_argument("--only", action="append", metavar="SWEEP", help="the others are kept")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     frames, truth_path = arguments.frames, arguments.truth
@@ -135,20 +215,19 @@ def main() -> None:
         walk = make_walk(arguments.work / "walk", num_frames=40, width=768, seed=arguments.seed)
         frames, truth_path = walk.frames_dir, walk.truth_path
     truth = read_trajectory(truth_path)
-    all_names = sorted(path.stem for path in frames.iterdir() if path.suffix != ".csv")
-    out, slam = arguments.work / "run", arguments.work / "slam.tum"
     settings = load_config(None, ['export.formats=["tum"]', *arguments.set])
-    rows = []
+    kept = RESULTS / f"{arguments.name}.json"
+    rows = json.loads(kept.read_text()) if arguments.only and kept.exists() else []
     for sweep, amount, trajectory, outliers in spoiled(truth, arguments.seed):
-        write_tum(slam, trajectory)
-        names = [all_names[f] for f in outliers]
-        before = evaluate(trajectory, truth).ate.rmse
-        point = _point(lambda: refine(frames, slam, out, settings).report, names, truth, out)
-        rows.append({"sweep": sweep, "amount": amount, "ate_before": before, **point})
-        print(rows[-1], flush=True)
+        if arguments.only and sweep not in arguments.only:
+            continue
+        point = Point(sweep, amount, trajectory, outliers)
+        row = _row(point, frames, truth, arguments.work, settings)
+        rows = [r for r in rows if (r["sweep"], r["amount"]) != (sweep, amount)] + [row]
+        print(row, flush=True)
     head = f"{machine()}; seed {arguments.seed}; settings {arguments.set or 'defaults'}\n\n"
     (RESULTS / f"{arguments.name}.md").write_text(head + to_markdown(rows) + "\n")
-    (RESULTS / f"{arguments.name}.json").write_text(json.dumps(rows, indent=1) + "\n")
+    kept.write_text(json.dumps(rows, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -13,13 +13,13 @@ _MIN_STEP_S = 0.2  # shortest after merging
 _SPACING = 0.25  # of a step, between offsets tried
 _MAX_RATE = 0.03  # largest deviation of the rate that is tried
 _RATE_SIGMA = 0.02  # what is expected of it
-_TRIED = 6  # candidates of the grid
-_ITERATIONS = 40
+_TRIED = 5  # candidates of the grid
+_ITERATIONS = 20
 _WIDTH = 2.0  # of the loss, standard deviations
 _MIN_SIGMA = np.deg2rad(0.03)  # of a rotation, per axis: images know no better
 _ROUGH_SIGMA = np.deg2rad(1.0)  # least of it on the grid
 _QUIET, _QUIET_LENGTH = 0.4, 1.367  # quantile that noise is read from; of unit Gaussian 3-vectors
-_SCANNED = 49  # shifts within a step of the best, for its uncertainty
+_SCANNED = 41  # shifts within a step of the best, for its uncertainty
 _INFLATION = 3.0  # of standard deviations
 _CERTAIN = 4.0  # standard deviations within which no shift may do as well
 
@@ -92,24 +92,30 @@ class ClockFit:
         self._rough_sigma = max(0.5 * typical, _ROUGH_SIGMA)
 
     def residuals(self, parameters: np.ndarray) -> np.ndarray:
-        """Rotations (N, 3) in radians from what the images say to what the trajectory says.
+        """Rotations in radians from what the images say to what the trajectory says.
 
         Where it has no poses, it says that nothing turns.
+
+        Args:
+            parameters: (..., 2) shift and rate.
+
+        Returns:
+            (..., N, 3).
         """
-        times = self.turns.middle + parameters[0] + parameters[1] * self._from_middle()
-        inside = ((times >= self.span[0]) & (times <= self.span[1])).all(axis=1)
-        found = -self.turns.rotvecs
-        first, second = (self._rotations(times[inside, k]) for k in range(2))
-        turned = _product(_conjugate(first), second)
-        found[inside] = _log(_product(_conjugate(self._seen[inside]), turned))
-        return found
+        shifts, rates = parameters[..., 0, None, None], parameters[..., 1, None, None]
+        times = self.turns.middle + shifts + rates * self._from_middle()
+        inside = ((times >= self.span[0]) & (times <= self.span[1])).all(axis=-1)
+        at = self._rotations(np.clip(times, *self.span))
+        turned = _product(_conjugate(at[..., 0, :]), at[..., 1, :])
+        found = _log(_product(_conjugate(self._seen), turned))
+        return np.where(inside[..., None], found, -self.turns.rotvecs)
 
     def _rotations(self, times: np.ndarray) -> np.ndarray:
-        """Quaternions (n, 4) of the trajectory within its span, turning evenly between entries."""
+        """Quaternions (..., 4) of the trajectory in its span, turning evenly between entries."""
         before = np.clip(np.searchsorted(self._entries, times) - 1, 0, len(self._onward) - 1)
         span = self._entries[before + 1] - self._entries[before]
         share = (times - self._entries[before]) / span
-        return _product(self._at[before], _exp(share[:, None] * self._onward[before]))
+        return _product(self._at[before], _exp(share[..., None] * self._onward[before]))
 
     def cost(self, parameters: np.ndarray, sigma: float) -> float:
         """Mean disagreement of a step, from 0 to 1 (Geman and McClure, 1987).
@@ -150,7 +156,7 @@ class ClockFit:
             else:
                 damping *= 10
             narrowed = max(0.7 * sigma, noise(residuals))
-            if damping > 1e6 or (narrowed == sigma and np.abs(step[0]) < 1e-5):
+            if damping > 1e6 or (narrowed == sigma and np.abs(step[0]) < 1e-4 * self.turns.step):
                 break
             sigma = narrowed
         return parameters
@@ -198,7 +204,7 @@ class ClockFit:
         """
         shifts = self.turns.step * np.linspace(-1, 1, _SCANNED)
         tried = parameters + np.column_stack([shifts, np.zeros(_SCANNED)])
-        residuals = [self.residuals(p) for p in tried]
+        residuals = self.residuals(tried)
         sigma = min(map(noise, residuals))
         losses = [_WIDTH**2 * len(r) * _bounded(r, sigma) for r in residuals]
         return shifts, np.array(losses), sigma
@@ -266,11 +272,9 @@ class ClockFit:
     def _jacobian(self, parameters: np.ndarray) -> np.ndarray:
         """Derivatives (N, 3, 2) of residuals, over a part of a step: entries make them jagged."""
         reach = 0.1 * self.turns.step
-        columns = []
-        for step in (np.array([reach, 0]), np.array([0, reach / self.turns.ends[1]])):
-            change = self.residuals(parameters + step) - self.residuals(parameters - step)
-            columns.append(change / (2 * step.sum()))
-        return np.stack(columns, axis=-1)
+        steps = np.diag([reach, reach / self.turns.ends[1]])
+        ahead, back = self.residuals(parameters + np.stack([steps, -steps]))
+        return np.moveaxis((ahead - back) / (2 * np.diag(steps))[:, None, None], 0, -1)
 
     @staticmethod
     def _prior(free: int) -> np.ndarray:
@@ -298,10 +302,18 @@ def noise(residuals: np.ndarray) -> float:
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Products (n, 4) of quaternions, wxyz."""
-    real = a[:, 0] * b[:, 0] - np.sum(a[:, 1:] * b[:, 1:], axis=1)
-    imaginary = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])
-    return np.column_stack([real, imaginary])
+    """Products (..., 4) of quaternions, wxyz."""
+    p, q, r, s = np.moveaxis(a, -1, 0)
+    w, x, y, z = np.moveaxis(b, -1, 0)
+    return np.stack(
+        [
+            p * w - q * x - r * y - s * z,
+            p * x + q * w + r * z - s * y,
+            p * y - q * z + r * w + s * x,
+            p * z + q * y - r * x + s * w,
+        ],
+        axis=-1,
+    )
 
 
 def _conjugate(wxyz: np.ndarray) -> np.ndarray:
@@ -309,14 +321,14 @@ def _conjugate(wxyz: np.ndarray) -> np.ndarray:
 
 
 def _exp(rotvecs: np.ndarray) -> np.ndarray:
-    """Unit quaternions (n, 4), wxyz, of rotation vectors (n, 3)."""
-    half = 0.5 * np.linalg.norm(rotvecs, axis=1, keepdims=True)
-    return np.hstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * rotvecs])
+    """Unit quaternions (..., 4), wxyz, of rotation vectors (..., 3)."""
+    half = 0.5 * np.linalg.norm(rotvecs, axis=-1, keepdims=True)
+    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * rotvecs], axis=-1)
 
 
 def _log(wxyz: np.ndarray) -> np.ndarray:
-    """Rotation vectors (n, 3), at most half a turn, of unit quaternions (n, 4)."""
-    wxyz = np.where(wxyz[:, :1] < 0, -wxyz, wxyz)
-    sine = np.linalg.norm(wxyz[:, 1:], axis=1, keepdims=True)
-    angle = 2 * np.arctan2(sine, wxyz[:, :1])
-    return wxyz[:, 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
+    """Rotation vectors (..., 3), at most half a turn, of unit quaternions (..., 4)."""
+    wxyz = np.where(wxyz[..., :1] < 0, -wxyz, wxyz)
+    sine = np.linalg.norm(wxyz[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, wxyz[..., :1])
+    return wxyz[..., 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from gsba import recovery
+from gsba import pose_graph, recovery
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.frontend import median_depth, points_by_keypoint
@@ -68,7 +68,8 @@ def run(context: MatchContext, solved: Adjustment, unseen: np.ndarray) -> Closed
     verified = recovery.match_anywhere(strongest, chosen, _MIN_SHARE)
     loops = _measure(verified, keypoints, solved, settings.seed)
     within = [loop for loop in loops if within_drift(loop, solved, unseen, settings)]
-    believed = consistent(within, solved, settings.pairs.window)
+    agreeing = consistent(within, solved, settings.pairs.window)
+    believed = _affordable(agreeing, solved, unseen)
     counts = Counts(
         len(chosen),
         len(believed),
@@ -76,7 +77,8 @@ def run(context: MatchContext, solved: Adjustment, unseen: np.ndarray) -> Closed
         {
             "no common geometry": len(chosen) - len(loops),
             "further than drift": len(loops) - len(within),
-            "contradicted": len(within) - len(believed),
+            "contradicted": len(within) - len(agreeing),
+            "bend confirmed steps": len(agreeing) - len(believed),
         },
     )
     pairs = np.array([(loop.f0, loop.f1) for loop in believed], np.int32).reshape(-1, 2)
@@ -293,6 +295,16 @@ def _closes(one: Loop, other: Loop, poses: np.ndarray, depth: float) -> bool:
     )
 
 
+def _affordable(loops: list[Loop], solved: Adjustment, unseen: np.ndarray) -> list[Loop]:
+    """Loops that the path can meet without bending steps that images confirm."""
+    if not loops:
+        return loops
+    pairs = np.array([(loop.f0, loop.f1) for loop in loops])
+    asserted = np.array([loop.f0_T_f1 for loop in loops])
+    kept = pose_graph.affordable(solved.world_T_rigs, unseen, pairs, asserted)
+    return [loop for loop, stays in zip(loops, kept, strict=True) if stays]
+
+
 def bend(solved: Adjustment, loops: list[Loop], unseen: np.ndarray) -> Adjustment:
     """Spread what loops leave open over the path: a pose graph of its steps and the loops.
 
@@ -304,20 +316,9 @@ def bend(solved: Adjustment, loops: list[Loop], unseen: np.ndarray) -> Adjustmen
         unseen: (F - 1,) bool, steps that give way first.
     """
     poses = solved.world_T_rigs
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for f, world_T_rig in enumerate(poses):
-        values.insert(X(f), gtsam.Pose3(world_T_rig))
-    graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(poses[0]), _sigmas(1e-6, 1e-6)))
-    steps = inverse(poses[:-1]) @ poses[1:]
-    lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
-    typical = float(np.median(lengths)) or 1.0
-    for f, step in enumerate(steps):
-        loose = _sigmas(0.5, float(max(lengths[f], typical)))
-        noise = loose if unseen[f] else _sigmas(np.deg2rad(0.2), 0.02 * typical)
-        graph.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), gtsam.Pose3(step), noise))
-    robust = gtsam.noiseModel.Robust.Create(
-        gtsam.noiseModel.mEstimator.Cauchy.Create(2.0), _sigmas(np.deg2rad(0.3), 0.05 * typical)
-    )
+    graph, values, noise = pose_graph.path(poses, unseen)
+    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(2.0)
+    robust = gtsam.noiseModel.Robust.Create(cauchy, noise)
     for loop in loops:
         between = gtsam.Pose3(loop.f0_T_f1)
         graph.add(gtsam.BetweenFactorPose3(X(loop.f0), X(loop.f1), between, robust))
@@ -329,7 +330,3 @@ def bend(solved: Adjustment, loops: list[Loop], unseen: np.ndarray) -> Adjustmen
     points = np.einsum("jik,jk->ji", moves[:, :3, :3], solved.landmarks.points_world)
     landmarks = Landmarks(points + moves[:, :3, 3], tracks, solved.landmarks.counts)
     return Adjustment(bent, landmarks, solved.noise, ())
-
-
-def _sigmas(rotation: float, translation: float) -> gtsam.noiseModel.Base:
-    return gtsam.noiseModel.Diagonal.Sigmas(np.array([rotation] * 3 + [translation] * 3))

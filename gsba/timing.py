@@ -53,8 +53,9 @@ def describe(
     """What the report says of the trajectory, and the notes, with the clock's."""
     if estimate is None:
         return judgement, notes
-    if estimate.note:
-        level = logging.WARNING if estimate.verdict == "corrected" else logging.INFO
-        logger.log(level, estimate.note)
+    if estimate.verdict == "corrected":
+        logger.warning(estimate.note)
         notes = [*notes, estimate.note]
+    elif estimate.note:
+        logger.info(estimate.note)
     return judgement | {"clock": clock.describe(estimate)}, notes

@@ -58,7 +58,7 @@ def _off(estimate: ClockEstimate, true: Clock) -> float:
     return float(np.abs(estimate.clock.times(TIMES) - true.times(TIMES)).max())
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("offset", "rate"), [(0.7, 1.01), (-2.3, 0.99), (0.25, 1.0)])
 def test_offset_and_rate_are_found(offset: float, rate: float, seed: int) -> None:
     true = Clock(TIMES[0], offset, rate)
@@ -70,14 +70,14 @@ def test_offset_and_rate_are_found(offset: float, rate: float, seed: int) -> Non
     assert (found.clock.rate != 1) == (rate != 1)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_outliers_do_not_mislead(seed: int) -> None:
     true = Clock(TIMES[0], 1.2, 1.0)
     found = _estimate(*_case(true, seed=seed, outliers=0.05))
     assert found.verdict == "corrected" and _off(found, true) < 0.05
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("outliers", [0.0, 0.1])
 def test_a_right_clock_is_left_alone(seed: int, outliers: float) -> None:
     true = Clock(TIMES[0], 0.0, 1.0)

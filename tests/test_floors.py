@@ -21,9 +21,9 @@ FLOORS = (
     {"align", "cubemap", "features", "filter", "graph", "matching", "optimize", "pairs"}
     | {"patch_grid", "splat", "tracks", "triangulate", "verify"},
     {"adjust", "blame", "clock", "clock_fit", "components", "frontend", "learned"}
-    | {"meetings", "misfit", "motion", "parts", "photometric", "places", "reconstruction"}
-    | {"recovery", "registered", "resection", "segments", "splat_align", "splat_refine"}
-    | {"rotation_only", "splatting", "stitching"},
+    | {"meetings", "misfit", "motion", "parts", "photometric", "places", "pose_graph"}
+    | {"reconstruction", "recovery", "registered", "resection", "rotation_only", "segments"}
+    | {"splat_align", "splat_refine", "splatting", "stitching"},
     {"alignment", "carrier", "distractors", "evaluate", "evaluate_splat", "export"}
     | {"gravity", "induced", "placement", "report", "report_html", "video"},
     {"demo", "extraction", "inputs", "line", "masking", "matching_stages", "pipeline"}

@@ -65,8 +65,19 @@ def test_a_trajectory_in_other_axes_is_refused(case: Case, tmp_path: Path) -> No
     assert not (tmp_path / "run/trajectory.tum").exists()
 
 
+def test_a_clock_that_is_off_is_set_right(case: Case, tmp_path: Path) -> None:
+    slam = read_trajectory(case.slam)
+    shifted = Trajectory(0.7 + 1.01 * slam.timestamps, slam.world_T_rigs)
+    result = _refine(case, tmp_path, shifted)
+    clock = result.report["trajectory"]["clock"]
+    assert clock["verdict"] == "corrected" and clock["note"] in result.report["notes"]
+    assert clock["offset_s"] == pytest.approx(0.7, abs=0.05)  # a tenth of the frames' interval
+    _as_good(case, tmp_path)
+
+
 def test_the_truth_needs_no_repair(case: Case, tmp_path: Path) -> None:
     result = _refine(case, tmp_path, case.truth)
     judgement = result.report["trajectory"]
-    assert judgement == {"false_frames": [], "false_steps": [], "unseen_steps": []}
+    assert not any(judgement[name] for name in ("false_frames", "false_steps", "unseen_steps"))
+    assert judgement["clock"]["verdict"] != "corrected" and judgement["clock"]["offset_s"] == 0
     assert evaluate(read_trajectory(tmp_path / "run/trajectory.tum"), case.truth).ate.rmse < 0.02

@@ -1,0 +1,68 @@
+"""Loops forged by hand: frames that pretend to stand where others do, as identical bays would."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from unittest.mock import patch
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsba import frontend
+from gsba.adjust import Adjustment
+from gsba.geometry import inverse
+from gsba.matching import MatchContext
+from gsba.types import Counts, Matches, VerifiedPairs
+
+MAX_DEG = 0.5  # between a keypoint and where the forged pose would see the other frame's point
+
+
+def forge(context: MatchContext, solved: Adjustment, pairs: list[tuple[int, int]]) -> VerifiedPairs:
+    """Verified matches of frames that see nothing in common.
+
+    The second frame of a pair is given the pose of the first one's successor; keypoints that
+    happen to lie where points of the map would then be seen are its matches.
+    """
+    known = frontend.points_by_keypoint(solved, context.keypoints)
+    rows, poses = [], []
+    for f0, f1 in pairs:
+        f0_T_f1 = inverse(solved.world_T_rigs[f0]) @ solved.world_T_rigs[f0 + 1]
+        mine = np.flatnonzero(np.isfinite(known[f0]).all(axis=1))
+        seen = (known[f0][mine] - f0_T_f1[:3, 3]) @ f0_T_f1[:3, :3]
+        seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+        away, theirs = cKDTree(context.keypoints.bearings_of(f1)).query(seen)
+        _, first = np.unique(theirs, return_index=True)
+        first = first[away[first] < np.radians(MAX_DEG)]
+        rows.append(np.column_stack([mine[first], theirs[first]]).astype(np.int32))
+        f0_T_f1[:3, 3] /= np.linalg.norm(f0_T_f1[:3, 3])
+        poses.append(f0_T_f1)
+    matches = Matches(
+        np.array(pairs, np.int32), np.cumsum([0, *map(len, rows)]), np.concatenate(rows)
+    )
+    return VerifiedPairs(matches, np.array(poses), Counts(len(pairs), len(pairs), "pairs"))
+
+
+@contextmanager
+def forged_loops(first: int, far: int, count: int) -> Iterator[list[int]]:
+    """Runs find `count` false loops besides their own: frame `first` + n with n + `far` further on.
+
+    Yields:
+        Matches of each forged pair, once a run has come past its loops.
+    """
+    honest, sizes = frontend.match_loops, []
+
+    def match_loops(context: MatchContext, solved: Adjustment) -> VerifiedPairs:
+        found = honest(context, solved)
+        pairs = [(first + n, first + n + far) for n in range(count)]
+        false = forge(context, solved, pairs)
+        sizes[:] = np.diff(false.matches.offsets).tolist()
+        ours, theirs = found.matches, false.matches
+        both = Matches(
+            np.concatenate([ours.pairs, theirs.pairs]),
+            np.concatenate([ours.offsets, ours.offsets[-1] + theirs.offsets[1:]]),
+            np.concatenate([ours.keypoints, theirs.keypoints]),
+        )
+        poses = np.concatenate([found.f0_T_f1s, false.f0_T_f1s])
+        return VerifiedPairs(both, poses, found.counts)
+
+    with patch.object(frontend, "match_loops", match_loops):
+        yield sizes
