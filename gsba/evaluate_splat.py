@@ -125,16 +125,23 @@ def compare(
             key,
             lpips,
         )
-    lines = format_table(results)
-    measured = NO_LPIPS if lpips is None else "computed"
-    content = {"lpips": measured, "settings": settings.model_dump(), "sources": to_json(results)}
-    atomic_write(out / "table.txt", lambda path: path.write_text(lines + "\n"))
-    atomic_write(out / "results.json", lambda path: path.write_text(json.dumps(content, indent=1)))
-    _write_curves(out / "curves.png", results)
+    _write(out, results, settings, lpips is not None)
     _write_pictures(
         out / "pictures", frames, split, faces[1][0], sources, splats, settings, backend
     )
     return results
+
+
+def _write(
+    out: Path, results: Mapping[str, SourceResult], settings: SplatSettings, with_lpips: bool
+) -> None:
+    """Table, numbers and curves."""
+    lines = format_table(results)
+    measured = "computed" if with_lpips else NO_LPIPS
+    content = {"lpips": measured, "settings": settings.model_dump(), "sources": to_json(results)}
+    atomic_write(out / "table.txt", lambda path: path.write_text(lines + "\n"))
+    atomic_write(out / "results.json", lambda path: path.write_text(json.dumps(content, indent=1)))
+    _write_curves(out / "curves.png", results)
 
 
 def _one(
