@@ -137,28 +137,25 @@ def official_lightglue(state: dict, num_layers: int, prefix: str = "") -> dict:
     return {prefix + name: value for name, value in state.items()}
 
 
-def save_transparent_matchers(folder: Path) -> dict[tuple[str, str], Path]:
-    """Matchers by (name, extractor) whose attention changes nothing: they compare descriptors.
+def save_transparent_matcher(folder: Path, matcher: str, extractor: str) -> Path:
+    """File of a matcher whose attention changes nothing: it compares descriptors.
 
-    Of two keypoints they make a match where each is the other's most alike, so that what they
-    find on known descriptors is known.
+    Of two keypoints it makes a match where each is the other's most alike, so that what it finds
+    on known descriptors is known.
     """
-    paths = {}
-    for extractor in EXTRACTORS:
-        path = folder / f"{extractor}_lightglue.pth"
-        if extractor == "xfeat":
-            path = folder / "xfeat-lighterglue.pt"
+    if matcher == "lightglue":
+        names = {"xfeat": "xfeat-lighterglue.pt"}
+        path = folder / names.get(extractor, f"{extractor}_lightglue.pth")
         torch.save(_transparent_lightglue(extractor), path)
-        paths["lightglue", extractor] = path
-    paths["superglue", "superpoint"] = folder / "superglue_outdoor.pth"
+        return path
     glue = OfficialSuperGlue()
     with torch.no_grad():
         glue.final_proj.weight.copy_(400 * torch.eye(256)[..., None])
         for layer in (glue.kenc.encoder[-1], *(x.mlp[-1] for x in glue.gnn.layers)):
             layer.weight.zero_()
             layer.bias.zero_()
-    torch.save(glue.state_dict(), paths["superglue", "superpoint"])
-    return paths
+    torch.save(glue.state_dict(), folder / "superglue_outdoor.pth")
+    return folder / "superglue_outdoor.pth"
 
 
 def lightglue(extractor: str):

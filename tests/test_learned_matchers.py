@@ -1,5 +1,7 @@
 """Learned matchers: every extractor with every matcher, on geometry that is known."""
 
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,7 @@ from learned_networks import (
     lightglue,
     official_lightglue,
     save_extractors,
-    save_transparent_matchers,
+    save_transparent_matcher,
     torch,
 )
 from scipy.spatial.transform import Rotation
@@ -48,13 +50,14 @@ def extractors(folder: Path) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def matchers(folder: Path) -> dict[tuple[str, str], Path]:
-    return save_transparent_matchers(folder)
+def matcher_file(folder: Path) -> Callable[[str, str], Path]:
+    """Makes the file of a matcher (name, extractor), once."""
+    return cache(partial(save_transparent_matcher, folder))
 
 
 @pytest.fixture(scope="module")
-def seen(extractors: dict[str, Path]) -> dict[str, tuple[Features, Features]]:
-    """By extractor, two frames at one place, the second turned to the right by one face."""
+def seen(extractors: dict[str, Path]) -> Callable[[str], tuple[Features, ...]]:
+    """Two frames at one place, the second turned to the right by one face, by extractor."""
     rng = np.random.default_rng(0)
     faces = rng.integers(0, 256, (6, RIG.size, RIG.size, 3)).astype(np.uint8)
     turned = faces.copy()
@@ -62,14 +65,13 @@ def seen(extractors: dict[str, Path]) -> dict[str, tuple[Features, Features]]:
         turned[FACES.index(face)] = faces[FACES.index(source)]
     around = np.zeros((6, RIG.size, RIG.size), bool)
     around[: len(SEES)] = True  # above and below, images turn too, and no network follows that
-    found = {}
-    for name in EXTRACTORS:
-        chosen = _settings(name).features
-        extractor = LearnedExtractor(chosen, extractors[name])
-        found[name] = tuple(
-            features.extract(views, around, RIG, extractor) for views in (faces, turned)
-        )
-    return found
+
+    def see(name: str) -> tuple[Features, ...]:
+        extractor = LearnedExtractor(_settings(name).features, extractors[name])
+        views = (faces, turned)
+        return tuple(features.extract(view, around, RIG, extractor) for view in views)
+
+    return cache(see)
 
 
 def _settings(extractor: str, matcher: str = "guided") -> RefineSettings:
@@ -83,36 +85,35 @@ def _frames(found: tuple[Features, ...], strongest: int | None = None) -> Search
 
 @pytest.mark.parametrize(("extractor", "matcher"), COMBINATIONS)
 def test_contract(
-    seen: dict[str, tuple[Features, Features]],
-    matchers: dict[tuple[str, str], Path],
+    seen: Callable[[str], tuple[Features, ...]],
+    matcher_file: Callable[[str, str], Path],
     extractor: str,
     matcher: str,
 ) -> None:
     """What both frames see is matched to itself, once each, the same way every time, by threads
     too; and a prediction that excludes it leaves nothing."""
-    settings, found = _settings(extractor, matcher), seen[extractor]
-    weights = {} if matcher == "guided" else {"matching": matchers[matcher, extractor]}
+    settings, found = _settings(extractor, matcher), seen(extractor)
+    weights = {} if matcher == "guided" else {"matching": matcher_file(matcher, extractor)}
     compare = make_matcher(settings, weights, RIG.size)
-    pairs, poses = np.array([[0, 1], [0, 1], [0, 1]]), np.array([np.eye(4), TURN])
+    poses = np.array([np.eye(4), TURN])
 
-    def match(poses: np.ndarray, strongest: int | None, threads: int) -> matching.Matches:
-        frames, gates = _frames(found, strongest), [GATE] * len(pairs)
-        how = settings.matching, threads
-        return matching.run(pairs, poses, gates, frames, *how, matcher=compare)
+    def match(poses: np.ndarray, strongest: int | None = None, num: int = 1) -> matching.Matches:
+        pairs, frames = np.array([[0, 1]] * num), _frames(found, strongest)
+        how = settings.matching, num
+        return matching.run(pairs, poses, [GATE] * num, frames, *how, matcher=compare)
 
-    matched = match(poses, None, 3)
+    matched = match(poses, num=2)
     rows = matched.of(0)
-    for p in (1, 2):
-        np.testing.assert_array_equal(rows, matched.of(p))
-    np.testing.assert_array_equal(rows, match(poses, None, 1).of(0))
+    np.testing.assert_array_equal(rows, matched.of(1))
+    np.testing.assert_array_equal(rows, match(poses).of(0))
     assert rows.dtype == np.int32 and len(rows) > 0.9 * len(found[0])
     assert all(len(np.unique(column)) == len(rows) for column in rows.T)
     there = found[1].bearings_rig[rows[:, 1]] @ TURN[:3, :3].T
     np.testing.assert_allclose(found[0].bearings_rig[rows[:, 0]], there, atol=1e-6)
-    few = match(poses, 10, 1).of(0)
+    few = match(poses, 10).of(0)
     assert 30 < len(few) <= 40 and set(map(tuple, few)) <= set(map(tuple, rows))
     aside = np.array([np.eye(4), pose(Rotation.from_rotvec([0, 1.65, 0]).as_matrix(), [0, 0, 0])])
-    wrong = match(aside, None, 1).of(0)  # 4.5 degrees off, 1.5 allowed
+    wrong = match(aside).of(0)  # 4.5 degrees off, 1.5 allowed
     assert not np.isin(rows[:, 0] * 10_000 + rows[:, 1], wrong @ [10_000, 1]).any()
 
 
@@ -275,9 +276,9 @@ def _face(seed: int, num: int, size: int, dim: int) -> features.FaceKeypoints:
 
 
 def test_lightglue_counts_pixels_from_the_first_centre(
-    matchers: dict[tuple[str, str], Path], monkeypatch: pytest.MonkeyPatch
+    matcher_file: Callable[[str, str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    glue, given = LightGlue("aliked", matchers["lightglue", "aliked"]), []
+    glue, given = LightGlue("aliked", matcher_file("lightglue", "aliked")), []
     answer = {"matches": [torch.tensor([[2, 1]])], "scores": [torch.tensor([0.5])]}
     monkeypatch.setattr(glue, "_model", lambda data: (given.append(data), answer)[1])
     face = _face(0, 5, 96, 128)
@@ -290,9 +291,10 @@ def test_lightglue_counts_pixels_from_the_first_centre(
     assert sent["image_size"].tolist() == [[96, 96]] and scores.tolist() == [0.5]
 
 
-def test_superglue_is_that_of_the_paper(tmp_path: Path) -> None:
-    """Random weights in the authors' layout give the probabilities of the paper's network, with
-    faces of different numbers of keypoints."""
+@pytest.mark.parametrize(("num", "tolerance"), [(40, 1e-3), (25, 0.02)])
+def test_superglue_is_that_of_the_paper(num: int, tolerance: float, tmp_path: Path) -> None:
+    """Random weights in the authors' layout give the probabilities of the paper's network. The
+    smaller of two faces is filled up, which moves the transport until it has converged."""
     torch.manual_seed(2)
     model = OfficialSuperGlue().eval()
     with torch.no_grad():
@@ -300,10 +302,10 @@ def test_superglue_is_that_of_the_paper(tmp_path: Path) -> None:
             if isinstance(module, torch.nn.BatchNorm1d):
                 module.running_mean.normal_(0, 0.1)
                 module.running_var.uniform_(0.5, 1.5)
-        model.final_proj.weight.mul_(30)  # decided enough to pass the threshold
+        model.final_proj.weight.mul_(60)  # decided enough to pass the threshold
     path = tmp_path / "superglue_outdoor.pth"
     torch.save(model.state_dict(), path)
-    faces = _face(3, 40, 128, 256), _face(4, 25, 128, 256)
+    faces = _face(3, 40, 128, 256), _face(4, num, 128, 256)
     matched, scores = SuperGlue(path)(*faces, 128)
     sides = [
         [
@@ -314,26 +316,23 @@ def test_superglue_is_that_of_the_paper(tmp_path: Path) -> None:
     ]
     with torch.inference_mode():
         likely = model(sides, 128).numpy()
-    rows, columns = np.nonzero(
-        (likely == likely.max(axis=1, keepdims=True))
-        & (likely == likely.max(axis=0, keepdims=True))
-        & (likely > 0.2)
-    )
-    assert len(rows) > 3
-    np.testing.assert_array_equal(matched, np.column_stack([rows, columns]))
-    np.testing.assert_allclose(scores, likely[rows, columns], rtol=1e-3)
+    best = (likely == likely.max(axis=1, keepdims=True)) & (likely == likely.max(axis=0))
+    sure = np.argwhere(best & (likely > 0.2 + tolerance))
+    assert len(sure) > 3 and set(map(tuple, sure)) <= set(map(tuple, matched))
+    assert (likely[tuple(matched.T)] > 0.2 - tolerance).all()
+    np.testing.assert_allclose(scores, likely[tuple(matched.T)], atol=tolerance)
     swapped, _ = SuperGlue(path)(*faces[::-1], 128)
     assert set(map(tuple, swapped[:, ::-1])) == set(map(tuple, matched))
 
 
 def test_wrong_weights_are_one_line(
-    extractors: dict[str, Path], matchers: dict[tuple[str, str], Path]
+    extractors: dict[str, Path], matcher_file: Callable[[str, str], Path]
 ) -> None:
     for extractor, matcher, path, usual in (
         ("aliked", "lightglue", extractors["aliked"], "aliked_lightglue"),
-        ("disk", "lightglue", matchers["lightglue", "superpoint"], "disk_lightglue"),
-        ("superpoint", "lightglue", matchers["lightglue", "aliked"], "superpoint_lightglue"),
-        ("superpoint", "superglue", matchers["lightglue", "aliked"], "superglue_outdoor"),
+        ("disk", "lightglue", matcher_file("lightglue", "superpoint"), "disk_lightglue"),
+        ("superpoint", "lightglue", matcher_file("lightglue", "aliked"), "superpoint_lightglue"),
+        ("superpoint", "superglue", matcher_file("lightglue", "aliked"), "superglue_outdoor"),
     ):
         with pytest.raises(
             GsbaError, match=f"weights of another network than .*{usual}"

@@ -94,7 +94,8 @@ def test_the_gate_is_as_wide_as_it_says(scene: Scene) -> None:
 def test_other_matchers_pass_the_same_gate(scene: Scene, gate: Gate) -> None:
     """What guided search finds among true matches is what `within_gate` lets through."""
     turned = F0_T_F1.copy()
-    turned[:3, :3] = Rotation.from_rotvec([0.004, 0.007, 0.003]).as_matrix() @ turned[:3, :3]
+    turn = np.deg2rad(0.9) * F0_T_F1[:3, 3] / np.linalg.norm(F0_T_F1[:3, 3])
+    turned[:3, :3] = Rotation.from_rotvec(turn).as_matrix() @ turned[:3, :3]
     points = scene.points if gate is POINT else None
     first, second = scene.first(), scene.second()
     true = np.column_stack([np.arange(NUM), np.argsort(scene.shuffle)])

@@ -22,7 +22,7 @@ from gsba.rig import owner_faces
 from gsba.types import FACES, Features
 
 _PARALLAX_RAD = np.deg2rad(10.0)  # that a pair of faces is expected to differ by
-_MIN_SHARE = 0.1  # of a face's keypoints that the other one must be expected to see
+_MIN_SHARE = 0.05  # of a face's keypoints that the other one must be expected to see
 _MIN_KEYPOINTS = 8  # on either face
 
 
@@ -109,8 +109,8 @@ def overlapping_faces(
 ) -> list[tuple[int, int]]:
     """Pairs of faces, of frame 0 and frame 1, that should see the same things.
 
-    At least a tenth of the keypoints of one must lie on the other if far away, or if near enough
-    to be seen 10 degrees off.
+    At least a twentieth of the keypoints of one must lie on the other, if far away or if near
+    enough to be seen 10 degrees off.
 
     Args:
         bearings0, bearings1: (n, 3) keypoints of both frames, each in its own rig frame.
