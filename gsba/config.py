@@ -39,8 +39,8 @@ class CubemapSettings(_Settings):
     hfov_deg: float = Field(default=96.0, ge=90, le=120)
     face_size: int | None = Field(default=None, ge=64)  # pixels; None = by oversampling
     oversampling: float = Field(default=0.5, ge=0.25, le=4)  # face pixels per panorama pixel
-    min_face_size: int = Field(default=256, ge=64)  # pixels; bounds on the automatic size
-    max_face_size: int = Field(default=1024, ge=64)
+    min_face_size: int = Field(default=192, ge=64)  # pixels; bounds on the automatic size
+    max_face_size: int = Field(default=768, ge=64)
 
 
 class FeatureSettings(_Settings):
@@ -256,7 +256,7 @@ class PlacementSettings(_Settings):
     up: Literal["auto", "none"] = "none"  # auto: gravity from rigs and vertical edges
     length: float | None = Field(default=None, gt=0)  # metres between the two of `between`
     between: tuple[str, str] | None = None  # frames by name, or points "x,y,z" of the run's world
-    gps: str | None = None  # file of positions: metres, east-north-up
+    gps: str | None = None  # file of positions, or "exif": metres, east-north-up
     align: str | None = None  # TUM file of true poses: its world and unit
 
 

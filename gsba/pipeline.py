@@ -17,7 +17,7 @@ from gsba.line import ExtraFactors, Line
 from gsba.log import GsbaError
 from gsba.misfit import refuse_useless
 from gsba.motion import describe
-from gsba.placement import Placement, check, place
+from gsba.placement import EXIF, Placement, check, place
 from gsba.report import build_report, take_notes, write_poses, write_report
 from gsba.report_html import write_html
 from gsba.segment import Segment
@@ -32,6 +32,7 @@ _GAUGE = (
 )
 _OUTPUTS = (
     "trajectory.tum",
+    "coarse.tum",
     "poses.csv",
     "points.ply",
     "config.toml",
@@ -106,6 +107,7 @@ def refine(
         frame_set, fresh = read.scan(out / "frames", masks=chosen.given), False
     else:
         frame_set = read.scan(frames, timestamps, fps, chosen.given)
+    check(settings.placement, frame_set)
     coarse = _coarse(frame_set, given, settings)
     with RunStore(out, origin, fresh) as store:
         frame_set, counts = masking.before(store, frame_set, chosen), {}
@@ -174,6 +176,8 @@ def _extract(
 ) -> None:
     """Write the frames of the video that a run is about to `out`/frames."""
     chosen = settings.video
+    if settings.placement.gps == EXIF:
+        raise GsbaError("--gps exif: a video's frames have no tags; give positions as a file")
     if fps is not None:
         if not fps > 0:
             raise GsbaError(f"--fps {fps}: must be a positive number of frames per second")
@@ -208,6 +212,9 @@ def _write(line: Line, reconstruction: Reconstruction) -> RunResult:
     out = store.root
     trajectory = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
     read.write_tum(out / "trajectory.tum", trajectory)
+    (out / "coarse.tum").unlink(missing_ok=True)
+    if (coarse.sources != PoseSource.NONE).any():
+        read.write_tum(out / "coarse.tum", Trajectory(frames.timestamps, coarse.world_T_rigs))
     write_poses(out / "poses.csv", frames, coarse, reconstruction)
     write_points(out / "points.ply", reconstruction)
     atomic_write(out / "config.toml", lambda path: path.write_text(to_toml(settings)))

@@ -24,13 +24,25 @@ FLOORS = (
     | {"reconstruction", "recovery", "splat_align", "splatting"},
     {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"}
     | {"alignment", "carrier", "distractors", "gravity", "placement"},
-    {"demo", "extraction", "line", "masking", "pipeline", "segment"},
+    {"demo", "extraction", "line", "masking", "pipeline", "segment", "view"},
     {"cli"},
     {"benchmarks"},
 )
 STAGES = 3  # the floor whose modules must not import one another
 FACTORS_MAY_USE = {"factors", "gtsam", "numba", "numpy", "scipy"}
-HEAVY = {"av", "cv2", "gtsam", "kornia", "numba", "open3d", "pycolmap", "scipy", "torch", "trimesh"}
+HEAVY = {
+    "av",
+    "cv2",
+    "gtsam",
+    "kornia",
+    "numba",
+    "open3d",
+    "pycolmap",
+    "scipy",
+    "torch",
+    "trimesh",
+    "viser",
+}
 
 FILES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path

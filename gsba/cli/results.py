@@ -34,7 +34,8 @@ def export(
         typer.Option(help="Two frames, or points x,y,z of the run's world.", metavar="A B"),
     ] = None,
     gps: Annotated[
-        Path | None, typer.Option(help="CSV or GPX: metres east, north, up.", metavar="FILE")
+        Path | None,
+        typer.Option(help="CSV, GPX, or exif (of the frames): metres east, north, up."),
     ] = None,
     align: Annotated[
         Path | None, typer.Option(help="True poses: their world and unit.", metavar="TRUTH.tum")

@@ -1,6 +1,7 @@
 """What a run starts from: frames, masks and a coarse trajectory on one clock."""
 
 from gsba.read.associate import associate, without_trajectory
+from gsba.read.exif import read_exif_gps
 from gsba.read.frames import load_erp, load_faces, scan
 from gsba.read.gps import GpsFixes, local_from_geodetic, read_gps
 from gsba.read.keyframes import follow_keyframes
@@ -15,6 +16,7 @@ __all__ = [
     "load_faces",
     "load_mask",
     "local_from_geodetic",
+    "read_exif_gps",
     "read_gps",
     "read_trajectory",
     "scan",
