@@ -107,8 +107,7 @@ def carrier_rows(frames: FrameSet, work: Path) -> list[Row]:
     bag = low > np.deg2rad(65 + 5 * np.sin(3 * longitude + 1))
     stick = (np.abs(longitude - 0.7 - low / 3) < 0.06) & (low > np.deg2rad(35))
     outline, rows = bag | stick, []
-    grain = rng.normal(0, 8, (height, width, 1))
-    look = np.clip(np.array([38, 34, 30]) + grain, 0, 255)
+    look = np.array([38, 34, 30]) * (1 + 0.3 * np.sin(5 * longitude + 20 * low))[..., None]
     turns = np.round(np.cumsum(rng.normal(0, 0.06, len(frames))) * width).astype(int)
     for name, moves in (("carrier, lock off", 0 * turns), ("carrier, lock on", turns)):
         folder = work / name.replace(", ", "-").replace(" ", "-")

@@ -30,11 +30,12 @@ _CELL = 8  # pixels: the grid on which distances are bounded
 _EMPTY = np.float32(-1e9)  # a cell of it without points
 _PATCH = 5  # pixels over which differences are averaged
 _CAP = 60.0  # grey levels
-_WEAK, _STRONG = 5.0, 10.0  # grey levels: of a distractor's pixels, and of some of them
-_NOISE = 2.0  # grey levels that nine in ten pixels of good pictures stay below
+_WEAK, _STRONG = 5.0, 14.0  # grey levels: of a distractor's pixels, and of some of them
+_NOISE = 1.0  # grey levels that half of the pixels of good pictures stay below
+_WORST = 5.0  # grey levels: where half of the pixels do not, nothing can be told
 _AGREE = 2.0  # spreads of the neighbours that a pixel must be away from their median
 _THIN = 5  # pixels: narrower is an edge
-_LEAST_AREA = 80  # strong pixels at the equator
+_LEAST_AREA = 120  # strong pixels at the equator
 _CLOSED = 13  # pixels: gaps up to this are closed
 _GROWN = 3  # pixels: the rim is blurred
 _MOST = 0.35  # of a picture: more is a wrong pose, or light that changed
@@ -106,10 +107,8 @@ class Scene:
         score = _score(own, others, n_T_own, self._rays, lowest, highest)
         score[(seen < min(_WITNESSES, len(near))) | ~usable] = 0
         found = _decide(score) & usable
-        share = _share(found)
-        if share > _MOST:
-            reason = f"{100 * share:.0f}% of it fits no neighbour: its pose or its light is off"
-            return _packed(np.zeros(shape, bool), reason)
+        if np.median(score) > _WORST or _share(found) > _MOST:
+            return _packed(np.zeros(shape, bool), "fits no neighbour: its pose or light is off")
         return _packed(found, "")
 
     def _neighbours(self, frame: int) -> np.ndarray:
@@ -245,7 +244,7 @@ def _score(
 
 def _decide(score: np.ndarray) -> np.ndarray:
     """Distractors (h, w) bool: connected, not thin, and strong somewhere."""
-    noise = max(1.0, float(np.quantile(score, 0.9)) / _NOISE)
+    noise = max(1.0, float(np.median(score)) / _NOISE)
     wide = _wrapped(score)
     weak = cv2.morphologyEx(
         (wide > noise * _WEAK).astype(np.uint8), cv2.MORPH_OPEN, np.ones((_THIN, _THIN), np.uint8)

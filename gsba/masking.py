@@ -44,7 +44,7 @@ def choose(masks: Masks, segment: Segment | None = None) -> Choice:
     """What `--masks` and `--segment` ask for.
 
     Args:
-        masks: a file or a folder, "carrier", "distractors", "auto" (both of these), or several.
+        masks: a file or a folder, "carrier" (or "auto"), "distractors", or several of these.
         segment: see `gsba.segment`.
 
     Raises:
@@ -55,9 +55,8 @@ def choose(masks: Masks, segment: Segment | None = None) -> Choice:
     files = [Path(value) for value in values if str(value) not in words]
     if len(files) > 1:
         raise GsbaError(f"--masks {files[0]} and {files[1]}: give one file or one folder")
-    auto = AUTO in words
     return Choice(
-        files[0] if files else None, auto or CARRIER in words, auto or DISTRACTORS in words, segment
+        files[0] if files else None, bool(words & {AUTO, CARRIER}), DISTRACTORS in words, segment
     )
 
 

@@ -45,9 +45,9 @@ def refine(
         out: folder of the run.
         settings: see `gsba.config`.
         keyframes: second trajectory file of the same run, with its keyframes: they lead.
-        masks: one ERP mask for all frames, or a folder of one for each; white = use; "carrier" or
-            "distractors" to find what carries the camera or what moves by itself, "auto" for both;
-            or several of these.
+        masks: one ERP mask for all frames, or a folder of one for each; white = use; "carrier" (or
+            "auto") to find what carries the camera, "distractors" for what moves by itself; or
+            several of these.
         segment: a command or a callable that masks faces; see `gsba.segment.segmented`.
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.

@@ -42,8 +42,8 @@ Download = Annotated[
 Masks = Annotated[
     list[Path] | None,
     typer.Option(
-        help="One mask for all frames, or a folder; white = use. carrier, distractors: find "
-        "them; auto: both. Repeatable."
+        help="One mask for all frames, or a folder; white = use. carrier (or auto), "
+        "distractors: find them. Repeatable."
     ),
 ]
 Segment = Annotated[
