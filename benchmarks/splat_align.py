@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("--truth", type=Path, required=True)
     parser.add_argument("--degrees", type=float, default=0.3)
     parser.add_argument("--path-share", type=float, default=0.01, help="of the path's length")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[48, 96, 192])
+    parser.add_argument("--sizes", type=int, nargs="+", default=[24, 48, 96, 192])
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     show_log()

@@ -225,13 +225,14 @@ def pose_covariances(
     rig: CubeRig,
     settings: RefineSettings,
     num_threads: int,
+    components: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Marginal covariances (F, 6, 6) with the first pose and the extent of the map held fixed."""
+    """Marginal covariances (F, 6, 6) with the first pose and the extent of each map held fixed."""
     block = landmark_block(
         adjustment.landmarks, keypoints, rig, adjustment.noise, settings, num_threads
     )
     held = gtsam.NonlinearFactorGraph(priors)
-    held.push_back(graph.fixed_scale(adjustment.world_T_rigs))
+    held.push_back(graph.fixed_scale(adjustment.world_T_rigs, components))
     keys = [graph.X(f) for f in range(len(adjustment.world_T_rigs))]
     return marginal_covariances(held, [block], values_of(adjustment.world_T_rigs), keys)
 

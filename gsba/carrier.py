@@ -4,8 +4,8 @@ Bag, stick, tripod, car roof or a painted nadir are fixed to the rig, so each of
 its colour over the run. That gives sure pixels, connected to the nadir without crossing an edge
 (beyond which plain floor would stay as it is, too); a graph cut on the median
 picture, in which the world has smeared away, finds the rest up to the outline (Rother, Kolmogorov,
-Blake, GrabCut, SIGGRAPH 2004). Frames must turn with the rig: with direction lock on, a carrier
-that turns below the locked picture is not found.
+Blake, GrabCut, SIGGRAPH 2004). With direction lock on, pictures do not turn with the camera and the
+carrier turns below them: how far is found for each frame (`gsba.turning`), and taken back first.
 """
 
 import logging
@@ -18,6 +18,7 @@ import numpy as np
 from gsba.log import GsbaError, track
 from gsba.read import load_erp, load_mask
 from gsba.records import atomic_write
+from gsba.turning import band_of, find_turns
 from gsba.types import FrameSet
 
 logger = logging.getLogger(__name__)
@@ -25,6 +26,9 @@ logger = logging.getLogger(__name__)
 _WIDTH = 1024  # pixels across the pictures that are compared
 _MAX_FRAMES = 48
 _MIN_FRAMES = 6  # fewer do not tell what is fixed
+_LEAST_TURN = np.deg2rad(2.0)  # less is the noise of finding turns
+_LEAST_GAIN = 1.05  # of how well pixels stay: what turning must bring to be believed
+_LEAST_FOUND = 0.95  # of the carrier found without it
 _WRAP = 64  # pixels over the seam
 _SURE = 0.25  # of the world's typical change: below it, a pixel is fixed
 _SURE_LEVELS = (2.0, 5.0)  # bounds on that, grey levels
@@ -38,7 +42,8 @@ _GROWN = 3  # pixels: a cut through the carrier's blurred rim is no use
 class Carrier:
     """Pixels that are not of the world."""
 
-    mask: np.ndarray  # (H, 2H) bool, True = use; at the size of the frames
+    mask: np.ndarray  # (H, 2H) bool, True = use; at the size of the frames, for turns of 0
+    turns: np.ndarray  # (F,) float64, radians to the right, of the carrier in each frame
     median: np.ndarray  # (h, 2h, 3) uint8 RGB, the median picture
     share: float  # part of the picture that is the carrier; 0 = none found
     reason: str  # why there is none, or ""
@@ -58,9 +63,35 @@ def find_carrier(frames: FrameSet) -> Carrier:
     if len(frames) < _MIN_FRAMES:
         raise GsbaError(f"{len(frames)} frames do not tell what is fixed to the camera: give more")
     chosen = np.unique(np.linspace(0, len(frames) - 1, _MAX_FRAMES).astype(int))
-    pictures = np.stack(
-        [_small(load_erp(frames, int(f))) for f in track(chosen, "looking for the carrier")]
-    )
+    pictures, bands = [], []
+    for f in track(range(len(frames)), "looking for the carrier"):
+        picture = _small(load_erp(frames, f))
+        bands.append(band_of(picture))
+        if f in chosen:
+            pictures.append(picture)
+    pictures, still = np.stack(pictures), np.zeros(len(frames))
+    median, found, reason = _look(pictures)
+    turns, gain = find_turns(np.stack(bands))
+    logger.debug("gain of turning %.2f, by %.1f deg", gain, np.rad2deg(np.ptp(turns)))
+    if np.ptp(turns) > _LEAST_TURN and gain > _LEAST_GAIN:
+        back = -turns[chosen] / (2 * np.pi) * pictures.shape[2]
+        turned = [np.roll(p, round(by), axis=1) for p, by in zip(pictures, back, strict=True)]
+        other = _look(np.stack(turned))
+        if other[1].sum() > _LEAST_FOUND * found.sum():
+            (median, found, reason), still = other, turns
+    turns = still
+    grown = cv2.dilate(_wrapped(found.astype(np.uint8)), np.ones((_GROWN, _GROWN), np.uint8))
+    grown = grown[:, _WRAP:-_WRAP] if found.any() else found.astype(np.uint8)
+    size = (frames.width, frames.height)
+    full = cv2.resize(grown.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) < 0.5
+    share = float(np.mean(~full))
+    turning = ", turning below it" if turns.any() else ""
+    logger.info("carrier: %s", reason or f"{100 * share:.1f}% of the picture{turning}")
+    return Carrier(full, turns, median, share, reason)
+
+
+def _look(pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray, str]:
+    """Median picture (h, w, 3) uint8, the carrier in it (h, w) bool, and why there is none."""
     median, change = _median_and_change(pictures)
     height = len(median)
     world = float(np.median(change[height // 4 : height * 5 // 8]))
@@ -74,24 +105,24 @@ def find_carrier(frames: FrameSet) -> Carrier:
     found = _cut(median, sure) if sure.any() else sure
     reason = "" if found.any() else "nothing at the nadir stays fixed"
     outline = _outline_sharpness(median, found)
+    logger.debug("outline %.2f", outline)
     if found.any() and outline < _MIN_OUTLINE:
         reason = f"what stays fixed at the nadir has no outline ({100 * outline:.0f}% of it sharp)"
         found = np.zeros_like(found)
-    grown = cv2.dilate(_wrapped(found.astype(np.uint8)), np.ones((_GROWN, _GROWN), np.uint8))
-    grown = grown[:, _WRAP:-_WRAP] if found.any() else found.astype(np.uint8)
-    size = (frames.width, frames.height)
-    full = cv2.resize(grown.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) < 0.5
-    share = float(np.mean(~full))
-    logger.debug("outline %.2f", outline)
-    logger.info("carrier: %s", reason or f"{100 * share:.1f}% of the picture")
-    return Carrier(full, median, share, reason)
+    return median, found, reason
 
 
-def write_carrier(carrier: Carrier, frames: FrameSet, out: Path) -> list[Path]:
+def carrier_mask(carrier: Carrier, frames: FrameSet, frame: int) -> np.ndarray:
+    """Where a frame shows the world, (H, 2H) bool, True = use."""
+    return np.roll(carrier.mask, round(carrier.turns[frame] / (2 * np.pi) * frames.width), axis=1)
+
+
+def write_carrier(carrier: Carrier, frames: FrameSet, out: Path, merge: bool = True) -> list[Path]:
     """Write what was found, to look at and to use.
 
     `carrier.png` is the mask (white = use), `carrier_check.jpg` the median picture with the
-    outline. Where the frames have masks of their own, `merged/NAME.png` has both for each frame.
+    outline. Where the frames have masks of their own, or the carrier turns, `merged/NAME.png` has
+    all there is for each frame, unless `merge` is False.
 
     Returns:
         the files.
@@ -108,9 +139,10 @@ def write_carrier(carrier: Carrier, frames: FrameSet, out: Path) -> list[Path]:
     atomic_write(written[1], lambda path: path.write_bytes(encoded.tobytes()))
     for f, name in enumerate(frames.names):
         own = load_mask(frames, f)
-        if own is not None:
+        if merge and (own is not None or carrier.turns.any()):
+            found = carrier_mask(carrier, frames, f)
             written.append(out / "merged" / f"{name}.png")
-            _write_png(written[-1], own & carrier.mask)
+            _write_png(written[-1], found if own is None else own & found)
     return written
 
 

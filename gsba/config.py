@@ -1,6 +1,6 @@
 """Settings: one frozen model per stage, defaults that run a sensible job with no file."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -16,6 +16,8 @@ class ReadSettings(_Settings):
         default=10.0, gt=0
     )  # longer gaps are still filled, but reported
     clock_offset_s: float | None = None  # s to add to frame times; None = clocks agree or one fits
+    clock: Literal["auto", "given"] = "auto"  # auto: corrected by how the camera turns, where sure
+    max_clock_shift_s: float = Field(default=10.0, gt=0)  # furthest that the correction may go
 
 
 class VideoSettings(_Settings):
@@ -39,15 +41,17 @@ class CubemapSettings(_Settings):
     hfov_deg: float = Field(default=96.0, ge=90, le=120)
     face_size: int | None = Field(default=None, ge=64)  # pixels; None = by oversampling
     oversampling: float = Field(default=0.5, ge=0.25, le=4)  # face pixels per panorama pixel
-    min_face_size: int = Field(default=256, ge=64)  # pixels; bounds on the automatic size
-    max_face_size: int = Field(default=1024, ge=64)
+    min_face_size: int = Field(default=192, ge=64)  # pixels; bounds on the automatic size
+    max_face_size: int = Field(default=768, ge=64)
 
 
 class FeatureSettings(_Settings):
     """Keypoints on faces."""
 
-    extractor: Literal["sift", "aliked", "disk"] = "sift"
-    weights: str | None = None  # file of a learned extractor's weights
+    extractor: Literal["sift", "aliked", "disk", "xfeat", "superpoint"] = "sift"
+    weights: str | None = None  # of a learned extractor: file, or folder with the official file
+    accept_noncommercial: bool = False  # use weights whose licence forbids commercial use
+    download: bool = False  # fetch missing weights from their authors
     max_per_face: int = Field(default=600, ge=16)
     contrast_threshold: float = Field(default=0.02, gt=0)
     sigma_px: float = Field(
@@ -59,8 +63,10 @@ class FeatureSettings(_Settings):
 
 
 class MatchingSettings(_Settings):
-    """Guided descriptor matching."""
+    """Descriptor matching, guided by predicted poses."""
 
+    matcher: Literal["guided", "lightglue", "superglue"] = "guided"
+    weights: str | None = None  # of a learned matcher: file, or folder with the official file
     min_similarity: float = Field(default=0.8, ge=-1, le=1)  # cosine of both descriptors
     max_ratio: float = Field(default=0.9, gt=0, le=1)  # distance to the best over that to the next
 
@@ -224,6 +230,28 @@ class PhotometricSettings(_Settings):
     polish_steps: int = Field(default=0, ge=0)  # of planes, after each step of the poses
 
 
+class SplatFactorSettings(_Settings):
+    """Poses refined against a splat of their own frames; see also `SplatSettings`."""
+
+    sizes: tuple[Annotated[int, Field(ge=16)], ...] = Field(
+        default=(48, 96), min_length=1
+    )  # pixels of a face, in order
+    first_steps: int = Field(default=200, ge=1)  # of training, before poses move at each size
+    steps: int = Field(
+        default=200, ge=1
+    )  # of training after each move: a splat that has yet to follow speaks against it
+    moves: int = Field(default=3, ge=1)  # of the poses, at most, at each size
+    solver_steps: int = Field(default=2, ge=1)  # of Levenberg-Marquardt in a move
+    min_gain_db: float = Field(
+        default=0.05, ge=0
+    )  # of held-out frames, or a move is undone: chance alone gives 0.03
+    max_growth: float = Field(default=1.05, gt=0)  # of all geometric cost, or a move is undone
+    held_out_every: int = Field(default=8, ge=2)  # panoramas that judge: no splat sees them
+    max_gaussians: int = Field(default=30_000, ge=1)
+    sh_degree: int = Field(default=1, ge=0, le=3)
+    backend: Literal["auto", "gsplat", "cpu"] = "auto"
+
+
 class ExportSettings(_Settings):
     """Datasets written at the end of a run."""
 
@@ -252,6 +280,7 @@ class SplatSettings(_Settings):
     rate_rotations: float = Field(default=1e-3, gt=0)
     rate_opacities: float = Field(default=0.05, gt=0)
     rate_colors: float = Field(default=2.5e-3, gt=0)  # a twentieth of it for what varies by view
+    rate_fade: float = Field(default=1.0, gt=0, le=1)  # of all but the means' rate, at the end
     densify: bool = True
     densify_pull: float = Field(default=2e-4, gt=0)  # gradient of a centre, image half-widths
     densify_scale: float = Field(default=0.01, gt=0)  # smaller: cloned, larger: split; of extent
@@ -267,7 +296,7 @@ class PlacementSettings(_Settings):
     up: Literal["auto", "none"] = "none"  # auto: gravity from rigs and vertical edges
     length: float | None = Field(default=None, gt=0)  # metres between the two of `between`
     between: tuple[str, str] | None = None  # frames by name, or points "x,y,z" of the run's world
-    gps: str | None = None  # file of positions: metres, east-north-up
+    gps: str | None = None  # file of positions, or "exif": metres, east-north-up
     align: str | None = None  # TUM file of true poses: its world and unit
 
 
@@ -287,16 +316,30 @@ class RefineSettings(_Settings):
     align: AlignSettings = AlignSettings()
     stitching: StitchingSettings = StitchingSettings()
     solver: SolverSettings = SolverSettings()
-    factors: tuple[Literal["bearing", "reprojection", "photometric"], ...] = Field(
+    factors: tuple[Literal["bearing", "reprojection", "photometric", "splat"], ...] = Field(
         default=("bearing",), min_length=1
     )
     photometric: PhotometricSettings = PhotometricSettings()
+    splat: SplatFactorSettings = SplatFactorSettings()
     export: ExportSettings = ExportSettings()
     placement: PlacementSettings = PlacementSettings()
     seed: int = 0
 
     @model_validator(mode="after")
     def _geometry_first(self) -> "RefineSettings":
-        if set(self.factors) == {"photometric"}:
-            raise ValueError("factors: photometric starts from bearing or reprojection; add one")
+        if not {"bearing", "reprojection"} & set(self.factors):
+            named = " and ".join(self.factors)
+            raise ValueError(f"factors: {named} starts from bearing or reprojection; add one")
+        return self
+
+    @model_validator(mode="after")
+    def _one_family(self) -> "RefineSettings":
+        matcher, extractor = self.matching.matcher, self.features.extractor
+        fitting = {
+            "lightglue": ("aliked", "disk", "xfeat", "superpoint"),
+            "superglue": ("superpoint",),
+        }.get(matcher, (extractor,))
+        if extractor not in fitting:
+            choices = ", ".join(fitting)
+            raise ValueError(f"matching.matcher = {matcher} needs features.extractor = {choices}")
         return self

@@ -21,6 +21,7 @@ from gsba.splat.gaussians import Gaussians
 from gsba.splat.ply import write_ply
 from gsba.splat.train import Views, train
 from gsba.splatting import (
+    Distance,
     Score,
     Split,
     load_faces,
@@ -38,7 +39,7 @@ from gsba.types import FrameSet, Reconstruction, Trajectory
 
 logger = logging.getLogger(__name__)
 
-LPIPS = "not computed: no weights"
+NO_LPIPS = "not computed: no weights"
 _COLORS = ((200, 60, 40), (30, 110, 200), (40, 150, 60), (150, 60, 160), (220, 140, 20))  # RGB
 _CURVE_POINTS = 10  # measurements during a training
 
@@ -78,6 +79,7 @@ def compare(
     settings: SplatSettings,
     backend: Backend,
     out: Path,
+    lpips: Distance | None = None,
 ) -> dict[str, SourceResult]:
     """Train and measure a splat for each source of poses; resumes what is done.
 
@@ -90,6 +92,7 @@ def compare(
         settings: of all trainings alike.
         backend: the renderer.
         out: folder to write.
+        lpips: distance of images for the last measurement; None = leave it out.
 
     Raises:
         GsbaError: too few frames have a pose in every source, or a training fails.
@@ -120,9 +123,11 @@ def compare(
             backend,
             out / name,
             key,
+            lpips,
         )
     lines = format_table(results)
-    content = {"lpips": LPIPS, "settings": settings.model_dump(), "sources": to_json(results)}
+    measured = NO_LPIPS if lpips is None else "computed"
+    content = {"lpips": measured, "settings": settings.model_dump(), "sources": to_json(results)}
     atomic_write(out / "table.txt", lambda path: path.write_text(lines + "\n"))
     atomic_write(out / "results.json", lambda path: path.write_text(json.dumps(content, indent=1)))
     _write_curves(out / "curves.png", results)
@@ -143,6 +148,7 @@ def _one(
     backend: Backend,
     out: Path,
     key: str,
+    lpips: Distance | None,
 ) -> tuple[Gaussians, SourceResult]:
     """Train on one source, and measure on the way."""
     near = near_of(poses[split.training], settings)
@@ -157,7 +163,7 @@ def _one(
     start = start_cloud(reconstruction, poses, split.training, settings.sh_degree)
     splat = train(start, training, settings, backend, out / "checkpoint.npz", key, watch)
     write_ply(out / "point_cloud.ply", splat)
-    scores = measure(splat, held_out, settings, near, backend)
+    scores = measure(splat, held_out, settings, near, backend, lpips)
     by_frame = {frames.names[split.held_out[i]]: score for i, score in scores.items()}
     return splat, SourceResult(by_frame, mean_score(scores.values()), curve, len(splat))
 
@@ -180,13 +186,14 @@ def to_json(results: Mapping[str, SourceResult]) -> dict[str, object]:
 def format_table(results: Mapping[str, SourceResult]) -> str:
     """Text table with a line per source; the first source is what the others are compared with."""
     rows = [
-        ["", "PSNR", "SSIM", "PSNR exp.", "vs. first", "Gaussians"],
-        ["", "dB", "", "dB", "dB", ""],
+        ["", "PSNR", "SSIM", "LPIPS", "PSNR exp.", "vs. first", "Gaussians"],
+        ["", "dB", "", "", "dB", "dB", ""],
     ]
     first = next(iter(results.values())).mean.psnr
     for name, result in results.items():
         mean = result.mean
-        cells = [name, f"{mean.psnr:.2f}", f"{mean.ssim:.4f}", f"{mean.psnr_exposed:.2f}"]
+        far = "" if mean.lpips is None else f"{mean.lpips:.4f}"
+        cells = [name, f"{mean.psnr:.2f}", f"{mean.ssim:.4f}", far, f"{mean.psnr_exposed:.2f}"]
         rows.append([*cells, f"{mean.psnr - first:+.2f}", str(result.num_gaussians)])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
@@ -197,14 +204,13 @@ def format_table(results: Mapping[str, SourceResult]) -> str:
         for row in rows
     ]
     num = len(next(iter(results.values())).frames)
-    return "\n".join(
-        [
-            *lines,
-            f"Means over {num} held-out panoramas at each source's own poses. exp.: after the gain",
-            "of each channel that fits best. vs. first: PSNR less that of the first source.",
-            f"LPIPS {LPIPS}.",
-        ]
-    )
+    notes = [
+        f"Means over {num} held-out panoramas at each source's own poses. exp.: after the gain",
+        "of each channel that fits best. vs. first: PSNR less that of the first source.",
+    ]
+    if any(result.mean.lpips is None for result in results.values()):
+        notes.append(f"LPIPS {NO_LPIPS}.")
+    return "\n".join([*lines, *notes])
 
 
 def _write_pictures(

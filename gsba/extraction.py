@@ -1,30 +1,39 @@
 """Features of every frame of a run, stored frame by frame."""
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
 from gsba import cubemap, features
 from gsba.config import RefineSettings
+from gsba.learned import LearnedExtractor
 from gsba.rig import CubeRig
 from gsba.store import PerFrame, RunStore, fingerprint
 from gsba.types import Features, FrameSet
 
 
 def run(
-    store: RunStore, frames: FrameSet, rig: CubeRig, settings: RefineSettings, num_threads: int
+    store: RunStore,
+    frames: FrameSet,
+    rig: CubeRig,
+    settings: RefineSettings,
+    num_threads: int,
+    weights: Mapping[str, Path],
 ) -> PerFrame[Features]:
-    """Features by frame name; image and mask are read, cut and released one at a time."""
+    """Features by frame name; image and mask are read, cut and released one at a time.
+
+    Args:
+        store, frames, rig, settings: of the run.
+        num_threads: frames treated at a time.
+        weights: files of learned networks (`learned.find_weights`).
+    """
     features.keep_freed_memory()
     index = {name: f for f, name in enumerate(frames.names)}
-    chosen, weights = settings.features, None
+    chosen = settings.features
     if chosen.extractor == "sift":
         make_extractor = partial(features.SiftExtractor, chosen)
     else:
-        from gsba.learned import LearnedExtractor, check_weights
-
-        check_weights(chosen)
-        make_extractor = partial(LearnedExtractor, chosen)
-        weights = fingerprint([Path(chosen.weights or "")])
+        make_extractor = partial(LearnedExtractor, chosen, weights["features"])
 
     def compute(name: str) -> Features:
         images, masks = cubemap.load(frames, index[name], rig)
@@ -33,5 +42,7 @@ def run(
     inputs = {
         name: fingerprint([*frames.paths[f], frames.mask_paths[f]]) for name, f in index.items()
     }
-    key = [settings.cubemap, settings.features, weights]
+    relevant = chosen.model_dump(exclude={"weights", "accept_noncommercial", "download"})
+    files = fingerprint(path for stage, path in weights.items() if stage == "features")
+    key = [settings.cubemap, relevant, files]
     return store.per_frame("features", key, inputs, compute, Features, num_threads=num_threads)

@@ -20,6 +20,7 @@ class FaceKeypoints:
     pixels: np.ndarray  # (K, 2) float64, (u, v), corner origin
     sigmas_px: np.ndarray  # (K,) float64, per-axis localisation noise, face pixels
     descriptors: np.ndarray  # (K, D)
+    scores: np.ndarray | None = None  # (K,) float32, a network's confidence
 
 
 # Parameters of mallopt(3), from malloc.h.
@@ -94,13 +95,16 @@ def extract(
         extractor: the detector.
     """
     usable = [face for face in range(len(FACES)) if masks is None or masks[face].any()]
-    parts = []
+    parts, scores = [], []
     for face in usable or [0]:  # one at least: the extractor knows the shape of nothing
         found = extractor(faces_rgb[face], None if masks is None else masks[face])
         bearings = rig.bearings(found.pixels, face)
         own = owner_faces(bearings) == face
         parts.append(_record(found, bearings, own, face, faces_rgb[face], rig))
-    return Features(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        if found.scores is not None:
+            scores.append(found.scores[own])
+    columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Features(*columns, np.concatenate(scores) if scores else None)
 
 
 def _record(

@@ -81,7 +81,8 @@ def match_known_points(context: MatchContext, solved: Adjustment, loops_closed: 
         chosen = np.concatenate([chosen, loops])
     gates = [_point_gate(np.deg2rad(settings.point_deg))] * len(chosen)
     known = points_by_keypoint(solved, context.keypoints)
-    return context.match(chosen, poses, gates, known)
+    # Where a point is known this well, no network knows better.
+    return context.match(chosen, poses, gates, known, guided_only=True)
 
 
 def median_depth(solved: Adjustment) -> float:

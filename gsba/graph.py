@@ -57,12 +57,31 @@ def build(
     return graph
 
 
-def fixed_scale(world_T_rigs: np.ndarray) -> gtsam.NonlinearFactorGraph:
-    """A tight factor on the distance from the first frame to the one furthest from it."""
-    distances = np.linalg.norm(world_T_rigs[:, :3, 3] - world_T_rigs[0, :3, 3], axis=1)
-    far = int(np.argmax(distances))
+def fixed_scale(
+    world_T_rigs: np.ndarray, components: np.ndarray | None = None
+) -> gtsam.NonlinearFactorGraph:
+    """A tight factor on the distance from the first frame to the one furthest from it.
+
+    Args:
+        world_T_rigs: (F, 4, 4).
+        components: (F,) map of each frame; each gets such a factor, and those behind the first
+            frame's a fixed pose besides. None = there is one.
+    """
     held = gtsam.NonlinearFactorGraph()
-    if distances[far] > 0:
-        noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-6 * float(distances[far]))
-        held.add(gtsam.RangeFactorPose3(X(0), X(far), float(distances[far]), noise))
+    if components is None:
+        components = np.zeros(len(world_T_rigs), np.int32)
+    for component in np.unique(components):
+        rows = np.flatnonzero(components == component)
+        first = int(rows[0])
+        offsets = world_T_rigs[rows, :3, 3] - world_T_rigs[first, :3, 3]
+        distances = np.linalg.norm(offsets, axis=1)
+        far, distance = int(rows[np.argmax(distances)]), float(distances.max())
+        if distance > 0:
+            noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-6 * distance)
+            held.add(gtsam.RangeFactorPose3(X(first), X(far), distance, noise))
+        if first > 0:
+            sigmas = np.array([1e-6] * 3 + [1e-6 * max(distance, 1e-12)] * 3)
+            fixed = gtsam.Pose3(world_T_rigs[first])
+            noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+            held.add(gtsam.PriorFactorPose3(X(first), fixed, noise))
     return held

@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
+from typing import Protocol
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from gsba.config import MatchingSettings, RefineSettings
 from gsba.geometry import inverse
 from gsba.log import track
 from gsba.rig import RIG_R_FACE, owner_faces
-from gsba.search import HEAD, Cells, Limits, Rows, search
+from gsba.search import HEAD, Cells, Limits, Rows, passes, search
 from gsba.types import Features, Keypoints, Matches
 
 _CELLS = 8  # cells along a face's side
@@ -64,11 +65,7 @@ def searchable(
             them, but the search is fast if the first columns hold most of the descriptors.
         strongest: keypoints of a face to search among, None for all.
     """
-    if strongest is not None:
-        ranks = np.arange(len(features)) - np.searchsorted(features.faces, features.faces)
-        chosen = np.flatnonzero(ranks < strongest)
-    else:
-        chosen = np.arange(len(features))
+    chosen = strongest_of(features, strongest)
     bearings = features.bearings_rig[chosen]
     faces = owner_faces(bearings)
     local = np.einsum("kji,kj->ki", RIG_R_FACE[faces], bearings)
@@ -100,6 +97,14 @@ def searchable(
     )
 
 
+def strongest_of(features: Features, per_face: int | None) -> np.ndarray:
+    """Indices, ascending, of the strongest keypoints of each face; of all for None."""
+    if per_face is None:
+        return np.arange(len(features))
+    ranks = np.arange(len(features)) - np.searchsorted(features.faces, features.faces)
+    return np.flatnonzero(ranks < per_face)
+
+
 def match_pair(
     first: Searchable,
     second: Searchable,
@@ -121,37 +126,72 @@ def match_pair(
         (m, 2) int32 keypoint indices in frame 0 and frame 1, sorted, unique.
     """
     rotation = f0_T_f1[:3, :3].astype(np.float32)
-    translation = f0_T_f1[:3, 3]
-    length = np.linalg.norm(translation)
-    direction = (translation / max(length, 1e-12)).astype(np.float32)
-    if points_f0 is None:
-        targets = np.full((len(first.keypoints), 3), np.nan, np.float32)
-    else:
-        offsets = points_f0[first.keypoints] - translation
-        targets = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
+    direction, limits = _limits(f0_T_f1, gate, settings)
     best, similarity = search(
         Rows(first.bearings, first.descriptors, first.tails),
         Rows(second.bearings @ rotation.T, second.descriptors, second.tails),
         Cells(second.starts, second.centres @ rotation.T, second.radii),
-        targets.astype(np.float32),
+        _targets(f0_T_f1, points_f0, first.keypoints),
         points_f0 is not None,
-        tuple(direction),
-        Limits(
-            np.float32(gate.rotation_rad),
-            np.float32(gate.direction if length > 1e-12 else 1e3),
-            np.float32(2 * np.sin(min(gate.max_parallax_rad, np.pi) / 2)),
-            np.float32(gate.point_rad),
-            np.float32(settings.min_similarity),
-            np.float32(settings.max_ratio),
-        ),
+        direction,
+        limits,
     )
     rows = np.flatnonzero(best >= 0)
     pairs = np.column_stack([first.keypoints[rows], second.keypoints[best[rows]]])
-    return _one_to_one(pairs, similarity[rows])
+    return one_to_one(pairs, similarity[rows])
 
 
-def _one_to_one(pairs: np.ndarray, similarity: np.ndarray) -> np.ndarray:
-    """Keep the best match of every keypoint that took part under several orientations."""
+def within_gate(
+    pairs: np.ndarray,
+    first: Features,
+    second: Features,
+    f0_T_f1: np.ndarray,
+    gate: Gate,
+    points_f0: np.ndarray | None = None,
+) -> np.ndarray:
+    """Which matches (m, 2) `match_pair` would have considered under the same gate: (m,) bool."""
+    rotation = f0_T_f1[:3, :3].astype(np.float32)
+    direction, limits = _limits(f0_T_f1, gate, MatchingSettings())
+    return passes(
+        first.bearings_rig[pairs[:, 0]].astype(np.float32),
+        second.bearings_rig[pairs[:, 1]].astype(np.float32) @ rotation.T,
+        _targets(f0_T_f1, points_f0, pairs[:, 0]),
+        points_f0 is not None,
+        direction,
+        limits,
+    )
+
+
+def _limits(
+    f0_T_f1: np.ndarray, gate: Gate, settings: MatchingSettings
+) -> tuple[tuple[np.float32, ...], Limits]:
+    """Unit vector of the predicted motion, and a gate as the compiled search takes it."""
+    length = np.linalg.norm(f0_T_f1[:3, 3])
+    limits = Limits(
+        np.float32(gate.rotation_rad),
+        np.float32(gate.direction if length > 1e-12 else 1e3),
+        np.float32(2 * np.sin(min(gate.max_parallax_rad, np.pi) / 2)),
+        np.float32(gate.point_rad),
+        np.float32(settings.min_similarity),
+        np.float32(settings.max_ratio),
+    )
+    return tuple((f0_T_f1[:3, 3] / max(length, 1e-12)).astype(np.float32)), limits
+
+
+def _targets(
+    f0_T_f1: np.ndarray, points_f0: np.ndarray | None, keypoints: np.ndarray
+) -> np.ndarray:
+    """Directions (n, 3) float32 from frame 1, in frame 0's axes, of the points of keypoints (n,)
+    of frame 0; NaN where unknown."""
+    if points_f0 is None:
+        return np.full((len(keypoints), 3), np.nan, np.float32)
+    offsets = points_f0[keypoints] - f0_T_f1[:3, 3]
+    lengths = np.linalg.norm(offsets, axis=1, keepdims=True)
+    return (offsets / np.maximum(lengths, 1e-12)).astype(np.float32)
+
+
+def one_to_one(pairs: np.ndarray, similarity: np.ndarray) -> np.ndarray:
+    """Keep the best match of every keypoint that took part under several orientations or faces."""
     order = np.argsort(-similarity, kind="stable")
     pairs = pairs[order]
     for column in (0, 1):
@@ -160,8 +200,34 @@ def _one_to_one(pairs: np.ndarray, similarity: np.ndarray) -> np.ndarray:
     return pairs[np.argsort(pairs[:, 0])].astype(np.int32)
 
 
+class Matcher(Protocol):
+    """Finds corresponding keypoints of two frames whose relative pose is predicted.
+
+    `guided` compares descriptors one by one; a learned matcher looks at all keypoints of two
+    faces at once. Either way nothing outside the gate is returned.
+    """
+
+    def __call__(
+        self,
+        frames: "SearchableFrames",
+        pair: tuple[int, int],
+        f0_T_f1: np.ndarray,
+        gate: Gate,
+        settings: MatchingSettings,
+        points_f0: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Matches (m, 2) int32 of a pair of frames, sorted, one to one; see `match_pair`."""
+        ...
+
+
 class SearchableFrames:
-    """Searchable features of frames, read when asked for; the latest used stay in memory."""
+    """Features of frames and how to match them; read when asked for, the latest used are kept.
+
+    Args:
+        load: reads the features of a frame.
+        strongest: keypoints of a face to match, None for all.
+        capacity: frames kept in memory.
+    """
 
     def __init__(
         self,
@@ -172,11 +238,31 @@ class SearchableFrames:
         first = load(0)
         axes = principal_axes(first.descriptors) if len(first) else None
         self._get = lru_cache(capacity)(lambda frame: searchable(load(frame), axes, strongest))
+        self._features = lru_cache(max(capacity // 8, 2))(load)
         self._lock = Lock()
+        self.strongest = strongest
 
     def __getitem__(self, frame: int) -> Searchable:
         with self._lock:
             return self._get(int(frame))
+
+    def features(self, frame: int) -> Features:
+        """All features of a frame, as they were extracted."""
+        with self._lock:
+            return self._features(int(frame))
+
+
+def guided(
+    frames: SearchableFrames,
+    pair: tuple[int, int],
+    f0_T_f1: np.ndarray,
+    gate: Gate,
+    settings: MatchingSettings,
+    points_f0: np.ndarray | None = None,
+) -> np.ndarray:
+    """The Matcher that searches the gate for each descriptor's nearest: `match_pair`."""
+    first, second = frames[pair[0]], frames[pair[1]]
+    return match_pair(first, second, f0_T_f1, gate, settings, points_f0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,6 +274,7 @@ class MatchContext:
     keypoints: Keypoints  # of all frames
     settings: RefineSettings  # of pairs, matching and verification
     num_threads: int  # pairs matched at a time
+    matcher: Matcher = guided  # compares two frames
 
     def match(
         self,
@@ -197,11 +284,13 @@ class MatchContext:
         points_rig: Sequence[np.ndarray] | None = None,
         *,
         strongest: bool = False,
+        guided_only: bool = False,
     ) -> Matches:
-        """Match frame pairs as `run` does."""
+        """Match frame pairs as `run` does, on demand by guided search whatever the matcher."""
         frames = self.strongest if strongest else self.frames
         how = self.settings.matching, self.num_threads
-        return run(pairs, world_T_rigs, gates, frames, *how, points_rig)
+        matcher = guided if guided_only else self.matcher
+        return run(pairs, world_T_rigs, gates, frames, *how, points_rig, matcher)
 
 
 def run(
@@ -212,6 +301,7 @@ def run(
     settings: MatchingSettings,
     num_threads: int,
     points_rig: Sequence[np.ndarray] | None = None,
+    matcher: Matcher = guided,
 ) -> Matches:
     """Match frame pairs.
 
@@ -223,13 +313,14 @@ def run(
         settings: similarity and distinctiveness.
         num_threads: pairs matched at a time.
         points_rig: (F) arrays (K_f, 3), see `match_pair`; frame 0 of a pair must be known.
+        matcher: compares two frames.
     """
     f0_T_f1s = inverse(world_T_rigs[pairs[:, 0]]) @ world_T_rigs[pairs[:, 1]]
 
     def match(p: int) -> np.ndarray:
-        f0, f1 = pairs[p]
+        f0, f1 = (int(f) for f in pairs[p])
         points = None if points_rig is None else points_rig[f0]
-        return match_pair(frames[f0], frames[f1], f0_T_f1s[p], gates[p], settings, points)
+        return matcher(frames, (f0, f1), f0_T_f1s[p], gates[p], settings, points)
 
     order = np.lexsort((pairs[:, 1], pairs[:, 0]))  # pairs that share frames follow one another
     rows = [_NO_MATCHES] * len(pairs)

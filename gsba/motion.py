@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba.blame import chained, false_frames
+from gsba.blame import chained, false_frames, limits
 from gsba.config import PriorSettings, VerifySettings
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.types import CoarsePoses, FrameSet, Keypoints, PoseSource, VerifiedPairs
@@ -25,6 +25,7 @@ _STILL = np.deg2rad(0.1)  # median: what a mere turn leaves over of bearings
 _RATIO_SIGMA = 0.02  # least noise of the logarithm of a ratio of lengths
 _SMOOTH_SIGMA = 0.5  # of the same where nothing is measured: walkers keep their pace
 _LENGTH_ROUNDS = 20  # of reweighting
+_LEAP = 4.0  # median speeds
 _ROUGH = 3.0  # standard deviations of the prior: a step further off starts from the images
 
 
@@ -52,6 +53,11 @@ class Trust:
     def sound(self) -> bool:
         """Whether every step of the trajectory was confirmed."""
         return not (self.false_steps.any() or self.unseen_steps.any())
+
+    @property
+    def held_steps(self) -> np.ndarray:
+        """Steps (F - 1,) bool that no image shows, but the trajectory may know."""
+        return self.unseen_steps & ~self.false_steps
 
 
 def steps(pairs: VerifiedPairs, keypoints: Keypoints, settings: VerifySettings) -> Steps:
@@ -225,7 +231,14 @@ def judge(
         start = _chain(coarse.world_T_rigs, chosen, own)
     else:
         start = coarse.world_T_rigs
-    named = false_frames(wrong, slam, chosen, own, verify)
+    seen = slam.copy()
+    seen[found.verified, :3, :3] = found.f_T_nexts[found.verified, :3, :3]
+    seen[found.directed, :3, 3] = (
+        lengths[found.directed, None] * found.f_T_nexts[found.directed, :3, 3]
+    )
+    named = false_frames(
+        wrong, slam, chosen, own, limits(slam, seen, known & found.directed, verify)
+    )
     return Trust(start, wrong, named, unseen, lengths, False)
 
 
@@ -251,6 +264,14 @@ def _from_images_alone(
     return Trust(start, every, nobody, ~found.verified, lengths, turning_only)
 
 
+def leaps(world_T_rigs: np.ndarray, timestamps: np.ndarray) -> np.ndarray:
+    """Steps (F - 1,) bool much faster than the rest: without images, they are another world's."""
+    lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
+    speeds = lengths / np.diff(timestamps)
+    moving = speeds[speeds > 0]
+    return speeds > _LEAP * np.median(moving) if len(moving) else np.zeros(len(speeds), bool)
+
+
 def describe(trust: Trust, frames: FrameSet) -> tuple[dict[str, list[Any]], list[str]]:
     """The judgement by the names of frames, for the report, and what to note of it."""
     names = np.array(frames.names)
@@ -269,14 +290,9 @@ def describe(trust: Trust, frames: FrameSet) -> tuple[dict[str, list[Any]], list
         notes.append(f"the images contradict the trajectory at {', '.join(false)}: not believed")
     if trust.turning_only:
         notes.append("no frame has parallax to the next: no depth can be had, rotations only")
-    if trust.unseen_steps.any():
-        steps = ", ".join(f"{a} to {b}" for a, b in judgement["unseen_steps"])
-        held = (
-            "what follows is placed by guess"
-            if trust.false_steps.all()
-            else ("held by the trajectory alone")
-        )
-        notes.append(f"no images in common, {held}: {steps}")
+    if trust.held_steps.any():
+        steps = ", ".join(f"{a} to {b}" for a, b in between(trust.held_steps))
+        notes.append(f"no images in common, held by the trajectory alone: {steps}")
     for note in notes:
         logger.warning(note)
     return judgement, notes

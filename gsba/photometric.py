@@ -219,6 +219,31 @@ def _solve(
     return adjusted, weights, residuals
 
 
+def joint(
+    frames: FrameSet,
+    solved: Adjustment,
+    frame_weights: np.ndarray,
+    settings: RefineSettings,
+    num_threads: int,
+) -> list[PhotometricBlock]:
+    """The patches of a solved map, to join the solve of a further family; none if not asked for.
+
+    Args:
+        frame_weights: (F,) of each frame's pixels, see `PhotometricResult`.
+    """
+    if "photometric" not in settings.factors:
+        return []
+    level = settings.photometric.levels[-1]
+    pixels, _ = _patches(frames, solved, level, settings, num_threads)
+    if pixels is None:
+        return []
+    start = make_block(pixels, np.ones(len(pixels.table.targets)), settings, num_threads)
+    noise = _noise(start, adjust.values_of(solved.world_T_rigs)) * settings.photometric.inflation
+    block = make_block(pixels, start.counted * 1.0, settings, num_threads, noise)
+    block.weigh(frame_weights)
+    return [block]
+
+
 def make_block(
     pixels: PatchPixels,
     weights: np.ndarray,

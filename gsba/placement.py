@@ -23,6 +23,7 @@ from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
 
 logger = logging.getLogger(__name__)
 
+EXIF = "exif"  # in place of a file of positions: those in the pictures
 _UP_WORLD = np.array([0.0, -1.0, 0.0])  # of an upright world: y down, as cameras have it
 _TOLERANCE_S = 0.02  # of true poses around a frame
 _FAR = 1e4  # coordinates beyond lose digits as float32: an offset is kept apart
@@ -92,6 +93,34 @@ class Placement:
         path.write_text(text, encoding="utf-8")
 
 
+def read_placement(path: Path) -> Placement:
+    """Where an export is, by the transform.json in it.
+
+    Raises:
+        GsbaError: no such file, or none that gsba wrote.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        scale, rotation = float(content["scale"]), np.array(content["rotation"], np.float64)
+        origin, up = content["origin"], content["up"]
+        if origin is not None:
+            origin = origin["latitude"], origin["longitude"], origin["altitude"]
+        return Placement(
+            scale,
+            rotation.reshape(3, 3),
+            np.array(content["translation"], np.float64).reshape(3),
+            str(content["unit"]),
+            up,
+            np.array(content["offset"], np.float64).reshape(3),
+            origin,
+            content["grounds"],
+        )
+    except OSError as error:
+        raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, TypeError, KeyError):
+        raise GsbaError(f"{path}: not a transform.json of gsba: export again") from None
+
+
 def place(
     reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings
 ) -> Placement:
@@ -102,7 +131,8 @@ def place(
         frames: its frames; their pictures are read to find the vertical.
         settings: `up` alone turns as little as it takes to make -y the way up. With `length`
             the unit becomes the metre. `gps` gives metres east, north and up; together with `up` it
-            decides heading, scale and place only. `align` gives the world of the true poses.
+            decides heading, scale and place only; "exif" takes the positions in the pictures.
+            `align` gives the world of the true poses.
 
     Raises:
         GsbaError: settings that exclude one another, or data that do not suffice.
@@ -126,8 +156,11 @@ def place(
     return placement
 
 
-def check(settings: PlacementSettings) -> None:
-    """Raise GsbaError for settings that exclude one another and for files that cannot be read."""
+def check(settings: PlacementSettings, frames: FrameSet | None = None) -> None:
+    """Raise GsbaError for settings that exclude one another and for files that cannot be read.
+
+    With `frames`, those of a run, also for pictures without the positions that are asked for.
+    """
     if (settings.length is None) != (settings.between is None):
         raise GsbaError("--scale LENGTH and --between A B need one another")
     ways = [settings.length is not None, settings.gps is not None, settings.align is not None]
@@ -135,7 +168,10 @@ def check(settings: PlacementSettings) -> None:
         raise GsbaError("--scale, --gps and --align each decide the scale: pass one")
     if settings.align is not None and settings.up != "none":
         raise GsbaError("--align decides which way is up: leave out --up auto")
-    if settings.gps is not None:
+    if settings.gps == EXIF:
+        if frames is not None:
+            read.read_exif_gps(frames)
+    elif settings.gps is not None:
         read.read_gps(Path(settings.gps))
     if settings.align is not None:
         read.read_trajectory(Path(settings.align))
@@ -191,7 +227,7 @@ def _on_earth(
     reconstruction: Reconstruction, frames: FrameSet, path: Path, upright: Placement
 ) -> Placement:
     """East, north and up in metres around the middle of the fixes."""
-    fixes = read.read_gps(path)
+    fixes = read.read_exif_gps(frames) if str(path) == EXIF else read.read_gps(path)
     rows, geodetic = _fixes_of_frames(path, fixes, frames)
     good = reconstruction.pose_statuses[rows] == PoseStatus.REFINED
     rows, geodetic = rows[good], geodetic[good]
@@ -219,7 +255,7 @@ def _on_earth(
             "rmse_m": sigma,
         },
     }
-    logger.info("%s: %d of %d positions agree to %.3g m", path, used.sum(), len(used), sigma)
+    logger.info("--gps %s: %d of %d positions agree to %.3g m", path, used.sum(), len(used), sigma)
     where = (float(origin[0]), float(origin[1]), float(origin[2]))
     return Placement(*fit, unit="m", up="z", origin=where, grounds=grounds)
 

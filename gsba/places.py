@@ -67,7 +67,7 @@ def run(context: MatchContext, solved: Adjustment, unseen: np.ndarray) -> Closed
     strongest = replace(context, frames=context.strongest)
     verified = recovery.match_anywhere(strongest, chosen, _MIN_SHARE)
     loops = _measure(verified, keypoints, solved, settings.seed)
-    within = [loop for loop in loops if _within_drift(loop, solved, unseen, settings)]
+    within = [loop for loop in loops if within_drift(loop, solved, unseen, settings)]
     believed = consistent(within, solved, settings.pairs.window)
     counts = Counts(
         len(chosen),
@@ -187,6 +187,14 @@ def relative_map(
     Returns:
         f0_T_f1 (4, 4) in the units of frame 0, and how many points agree; None if too few.
     """
+    found = relative_similarity(points0, points1, seed)
+    return None if found is None else (found[1], int(found[2].sum()))
+
+
+def relative_similarity(
+    points0: np.ndarray, points1: np.ndarray, seed: int
+) -> tuple[float, np.ndarray, np.ndarray] | None:
+    """As `relative_map`; also frame 1's unit in units of frame 0, and which points (m,) agree."""
     if len(points0) < _MIN_POINTS:
         return None
     rng = np.random.default_rng(seed)
@@ -201,8 +209,8 @@ def relative_map(
         best = _agree(points0, points1, np.flatnonzero(best))
     if best.sum() < _MIN_POINTS:
         return None
-    _, rotation, translation = similarity(points1[best], points0[best])
-    return pose(rotation, translation), int(best.sum())
+    scale, rotation, translation = similarity(points1[best], points0[best])
+    return scale, pose(rotation, translation), best
 
 
 def _agree(points0: np.ndarray, points1: np.ndarray, chosen: np.ndarray) -> np.ndarray:
@@ -221,7 +229,7 @@ def _cosines(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("mi,mi->m", a, b) / np.maximum(lengths, 1e-12)
 
 
-def _within_drift(
+def within_drift(
     loop: Loop, solved: Adjustment, unseen: np.ndarray, settings: RefineSettings
 ) -> bool:
     """Whether a loop asks for no more than the path between its frames can have drifted."""

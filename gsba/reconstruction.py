@@ -15,6 +15,7 @@ def assemble(
     min_observations: int,
     false_frames: np.ndarray | None = None,
     correction: tuple[float, ...] = (),
+    components: np.ndarray | None = None,
 ) -> Reconstruction:
     """Carry the solution back to the trajectory's world and gather what exports need.
 
@@ -26,6 +27,7 @@ def assemble(
         min_observations: frames with fewer count as unrefined.
         false_frames: (F,) bool, frames whose coarse pose has no say either.
         correction: of the frames, which the keypoints have.
+        components: (F,) map of each frame, each carried to its own coarse poses; None = one map.
     """
     world_T_rigs, landmarks = adjustment.world_T_rigs, adjustment.landmarks
     seen = np.bincount(landmarks.tracks.frames, minlength=len(world_T_rigs))
@@ -33,13 +35,8 @@ def assemble(
     known = refined & (coarse.sources == PoseSource.SLAM)
     if false_frames is not None:
         known &= ~false_frames
-    known = known if np.count_nonzero(known) > 1 else np.ones(len(known), bool)
-    scale, rotation, translation = pose_similarity(world_T_rigs[known], coarse.world_T_rigs[known])
-    placed = pose(
-        rotation @ world_T_rigs[:, :3, :3],
-        scale * world_T_rigs[:, :3, 3] @ rotation.T + translation,
-    )
-    stretch = np.array([1, 1, 1, scale, scale, scale])
+    groups = np.zeros(len(seen), np.int32) if components is None else components
+    placed, points_world, stretch = _placed(adjustment, coarse.world_T_rigs, known, groups)
     rows = keypoints.rows(landmarks.tracks)
     points = landmarks.tracks.points
     lengths = np.bincount(points, minlength=len(landmarks.points_world))
@@ -54,9 +51,9 @@ def assemble(
     )
     return Reconstruction(
         placed,
-        covariances * stretch[:, None] * stretch,
+        covariances * stretch[:, :, None] * stretch[:, None, :],
         np.where(refined, PoseStatus.REFINED, PoseStatus.UNREFINED).astype(np.uint8),
-        scale * landmarks.points_world @ rotation.T + translation,
+        points_world,
         np.rint(colors).astype(np.uint8),
         np.bincount(points, errors, len(lengths)) / lengths,
         points,
@@ -64,4 +61,33 @@ def assemble(
         bearings,
         adjustment.noise * keypoints.sigmas_rad[rows],
         correction,
+        components,
     )
+
+
+def _placed(
+    adjustment: Adjustment, target_T_rigs: np.ndarray, known: np.ndarray, groups: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses, points, and factors (F, 6) of the standard deviations, each map in its own world.
+
+    Args:
+        adjustment: the last solution.
+        target_T_rigs: (F, 4, 4) poses that define the worlds.
+        known: (F,) bool, frames that say where their map goes; all, where fewer than two do.
+        groups: (F,) map of each frame.
+    """
+    poses, landmarks = adjustment.world_T_rigs, adjustment.landmarks
+    placed, stretch = np.empty_like(poses), np.ones((len(poses), 6))
+    points, tracks = np.empty_like(landmarks.points_world), landmarks.tracks
+    hosts = tracks.frames[np.searchsorted(tracks.points, np.arange(tracks.num_points))]
+    for group in np.unique(groups):
+        inside = groups == group
+        chosen = known & inside if np.count_nonzero(known & inside) > 1 else inside
+        move = pose_similarity(poses[chosen], target_T_rigs[chosen])
+        scale, rotation, translation = move
+        positions = scale * poses[inside, :3, 3] @ rotation.T + translation
+        placed[inside] = pose(rotation @ poses[inside, :3, :3], positions)
+        stretch[inside, 3:] = scale
+        there = inside[hosts]
+        points[there] = scale * landmarks.points_world[there] @ rotation.T + translation
+    return placed, points, stretch

@@ -4,15 +4,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsba import misfit, motion, pairs
+from gsba import clock, misfit, motion, pairs, segments
+from gsba.clock import ClockEstimate
 from gsba.config import RefineSettings
 from gsba.frontend import verified
 from gsba.geometry import inverse
 from gsba.matching import Gate, MatchContext
 from gsba.motion import Trust
-from gsba.types import CoarsePoses, Counts, Keypoints, Matches, VerifiedPairs
+from gsba.segments import Joint
+from gsba.types import CoarsePoses, Counts, Keypoints, Matches, Trajectory, VerifiedPairs
 
 _PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
+_MANY_LOST = 0.2  # part of the neighbours
 _ANYWHERE = Gate(np.pi, 1e3, np.pi)
 
 
@@ -22,6 +25,8 @@ class Recovered:
 
     neighbours: VerifiedPairs
     trust: Trust
+    coarse: CoarsePoses  # the trajectory, its pieces in one world
+    joints: tuple[Joint, ...] = ()  # of those pieces
 
 
 def run(
@@ -48,10 +53,12 @@ def run(
     close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
     lost = _missing(np.column_stack([close, close + 1]), guided)
     alone = _join([guided, match_anywhere(context, lost)])
-    misfit.refuse_misfit(coarse, motion.steps(alone, keypoints, settings.verify), settings.verify)
+    steps = motion.steps(alone, keypoints, settings.verify)
+    coarse, joints = _joined(coarse, alone, steps, keypoints)
+    misfit.refuse_misfit(coarse, steps, settings.verify)
     trust = _judge(alone, keypoints, coarse, settings)
-    if trust.sound:
-        return Recovered(guided, trust)
+    if trust.sound and not joints:
+        return Recovered(guided, trust, coarse)
     again = _missing(chosen, alone)
     again = again[again[:, 1] - again[:, 0] == 2]
     over = _match_along(context, trust.world_T_rigs, again)
@@ -66,7 +73,48 @@ def run(
         "pairs",
         {"no common geometry": len(chosen) - len(neighbours.matches.pairs)},
     )
-    return Recovered(VerifiedPairs(neighbours.matches, neighbours.f0_T_f1s, counts), trust)
+    neighbours = VerifiedPairs(neighbours.matches, neighbours.f0_T_f1s, counts)
+    guessed = segments.guessed(joints, len(coarse.sources))
+    guessed |= trust.unseen_steps & motion.leaps(coarse.world_T_rigs, timestamps)
+    trust = replace(trust, false_steps=trust.false_steps | guessed)
+    return Recovered(neighbours, trust, coarse, joints)
+
+
+def _joined(
+    coarse: CoarsePoses, found: VerifiedPairs, steps: motion.Steps, keypoints: Keypoints
+) -> tuple[CoarsePoses, tuple[Joint, ...]]:
+    """The trajectory with its pieces in one world, if there are several."""
+    if coarse.segments is None:
+        return coarse, ()
+    return segments.join(coarse, steps, *motion.length_ratios(found, steps, keypoints))
+
+
+def check_clock(
+    context: MatchContext,
+    guided: VerifiedPairs,
+    coarse: CoarsePoses,
+    timestamps: np.ndarray,
+    trajectory: Trajectory,
+) -> ClockEstimate:
+    """Whether the trajectory turns when the images do, or at other times.
+
+    Args:
+        context: of the run.
+        guided: neighbours verified under the trajectory's guidance. Where it lost many, whole
+            panoramas are compared: a clock that is off loses the turns, which tell it.
+        coarse: the trajectory at the frames' times.
+        timestamps: (F,) seconds.
+        trajectory: all its entries.
+    """
+    settings, intervals = context.settings, np.diff(timestamps)
+    close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
+    chosen = np.column_stack([close, close + 1])
+    lost = _missing(chosen, guided)
+    if len(lost) > _MANY_LOST * len(chosen):
+        guided = _join([guided, match_anywhere(context, lost)])
+    steps = motion.steps(guided, context.keypoints, settings.verify)
+    reach = settings.read.max_clock_shift_s
+    return clock.estimate(timestamps, steps, trajectory, coarse.time_offset, reach)
 
 
 def _match_along(
@@ -107,7 +155,8 @@ def match_anywhere(
 
     def match(some: np.ndarray, strongest: bool) -> VerifiedPairs:
         gates = [_ANYWHERE] * len(some)
-        found = context.match(some, nowhere, gates, strongest=strongest)
+        # Nothing predicts which faces a learned matcher should compare.
+        found = context.match(some, nowhere, gates, strongest=strongest, guided_only=True)
         return verified(found, None, None, context)
 
     first = match(chosen, strongest=True)

@@ -137,6 +137,7 @@ def build_report(
     gauge: str,
     notes: Sequence[str] = (),
     trajectory: Mapping[str, Any] | None = None,
+    moves: Sequence[object] = (),
     stitching: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Content of report.json: plain values only.
@@ -149,6 +150,7 @@ def build_report(
         gauge: a sentence on where the refined map sits.
         notes: what the user should know: frames without images, unmatched frames, ...
         trajectory: the images' judgement of it, see `gsba.motion.describe`.
+        moves: of the poses against a splat, see `gsba.splat_refine.Move`.
         stitching: the field of directions, see `gsba.stitching.describe`.
     """
     quality = frame_quality(reconstruction)
@@ -178,6 +180,7 @@ def build_report(
         "stitching": stitching,
         "stages": stage_rows,
         "solver": solver,
+        "splat": moves,
         "frames": _frame_rows(frames, coarse, reconstruction, quality),
         "settings": settings,
         "machine": _machine(),
@@ -198,7 +201,8 @@ def write_poses(
     """Write poses.csv: world_T_rig, its quality and its covariance for every frame.
 
     Covariances are of the tangent [rotation (radians), translation (map units)] in the rig frame;
-    the upper triangle is written row by row. Cells of unknown values are empty.
+    the upper triangle is written row by row. Cells of unknown values are empty. Frames of the same
+    `map` share a world; 0 is the largest.
     """
     quality = frame_quality(reconstruction)
     rows, columns = np.triu_indices(6)
@@ -213,10 +217,12 @@ def write_poses(
             reconstruction.pose_covariances[:, rows, columns],
         ]
     )
+    maps = reconstruction.components
     header = ["frame", "timestamp", "status", "source", "num_observations", "median_residual_deg"]
     header += ["tx", "ty", "tz", "qw", "qx", "qy", "qz"]
     header += [f"std_{axis}_deg" for axis in _AXES[:3]] + [f"std_{axis}" for axis in _AXES[3:]]
     header += [f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in zip(rows, columns, strict=True)]
+    header += ["map"]
 
     def write(temporary: Path) -> None:
         with temporary.open("w", newline="", encoding="utf-8") as file:
@@ -229,6 +235,7 @@ def write_poses(
                     [name, repr(float(frames.timestamps[f])), status, source]
                     + [int(quality.num_observations[f]), _cell(quality.median_residuals_deg[f])]
                     + [_cell(value) for value in numbers[f]]
+                    + [0 if maps is None else int(maps[f])]
                 )
 
     atomic_write(path, write)

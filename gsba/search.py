@@ -102,6 +102,28 @@ def search(first, second, cells, targets, only_targets, direction, limits):
 
 
 @_kernel
+def passes(bearings0, bearings1, targets, only_targets, direction, limits):
+    """Which rows of two frames, paired one to one, `search` would compare: (n,) bool.
+
+    Args:
+        bearings0, bearings1: (n, 3) float32, frame 0's axes.
+        targets, only_targets, direction, limits: as for `search`.
+    """
+    n = len(bearings0)
+    passed = np.zeros(n, np.bool_)
+    for i in range(n):
+        other = bearings1[i, 0], bearings1[i, 1], bearings1[i, 2]
+        if only_targets:
+            target = targets[i, 0], targets[i, 1], targets[i, 2]
+            passed[i] = _distance(target, other) <= limits.point  # not so where NaN
+        else:
+            bearing = bearings0[i, 0], bearings0[i, 1], bearings0[i, 2]
+            circle = _great_circle(bearing, direction, limits)
+            passed[i] = _in_band(other, _ZERO, bearing, direction, circle, limits)
+    return passed
+
+
+@_kernel
 def _nothing(n):
     """Best candidate of n rows, its similarity, and that of the best elsewhere: none yet."""
     return np.full(n, -1, np.int32), np.full(n, -1, np.float32), np.full(n, -1, np.float32)

@@ -1,13 +1,14 @@
 """Frames against a splat: the block that aligns rig poses to what the splat renders."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
 from factors import BearingTerm, FaceCameras, LandmarkBlock, RobustLoss
 from factors.splat import RenderedView, SplatBlock
-from gsba import cubemap, graph
+from gsba import graph
 from gsba.config import SolverSettings
 from gsba.log import track
 from gsba.optimize import optimize
@@ -15,15 +16,27 @@ from gsba.rig import RIG_R_FACE, CubeRig
 from gsba.splat.backend import Backend
 from gsba.splat.camera import face_camera
 from gsba.splat.gaussians import Gaussians
-from gsba.splatting import place_points
+from gsba.splatting import cut_faces, place_points
 from gsba.types import FACES, FrameSet, Reconstruction
 
 MIN_ALPHA = 0.95  # of a rendered pixel that is believed
 MAX_STEP = 0.1  # of the depth, between neighbouring pixels: more is an edge
-MAX_STEPS = 12  # of the solver at each size
-_GATE = np.deg2rad(1.0)  # of observations that join the splat
+MAX_STEPS = 15  # of the solver at each size
+GATES_DEG = (16.0, 5.0, 1.5, 0.5)  # of observations at the first sizes; then the last
+_GATE_SIGMAS = 10.0  # wider gates loosen the loss in proportion
 _LUMA = np.array([0.299, 0.587, 0.114])
 _MARGIN_HFOV_DEG = 100.0  # of captured faces, so that samples beyond an edge find pixels
+
+
+@dataclass(frozen=True, slots=True)
+class Captured:
+    """Grey faces of frames, to be aligned to renderings of one size."""
+
+    which: np.ndarray  # (W,) int, frame indices
+    size: int  # pixels of a rendered face
+    rig: CubeRig  # the captured faces
+    images: tuple[np.ndarray, ...]  # (W,) of (6, S, S) float32, 0..1
+    use: tuple[np.ndarray | None, ...]  # (W,) of (6, S, S) bool, pixels that count; None = all
 
 
 def align(
@@ -32,13 +45,13 @@ def align(
     world_T_rigs: np.ndarray,
     near: float,
     backend: Backend,
-    sizes: Sequence[int] = (48, 96, 192),
+    sizes: Sequence[int] = (24, 48, 96, 192),
     reconstruction: Reconstruction | None = None,
 ) -> np.ndarray:
     """Align the poses of all frames to a splat that stays as it is, from coarse to fine.
 
-    The splat holds the gauge. The coarsest faces have the widest basin and work alone; bearings,
-    where given, join from the second size on.
+    The splat holds the gauge. The coarsest faces have the widest basin; observations, where given,
+    join from the start, with a gate and a loss that tighten from size to size.
 
     Args:
         gaussians: the splat.
@@ -56,9 +69,10 @@ def align(
     settings = SolverSettings(max_iterations=MAX_STEPS, relative_tolerance=1e-5)
     poses = world_T_rigs
     for level, size in enumerate(sizes):
-        blocks: list = [splat_block(gaussians, frames, which, size, near, backend)]
-        if reconstruction is not None and level > 0:
-            blocks.append(bearing_block(reconstruction, poses))
+        blocks: list = [splat_block(gaussians, capture(frames, which, size), near, backend)]
+        if reconstruction is not None:
+            gate = float(np.deg2rad(GATES_DEG[min(level, len(GATES_DEG) - 1)]))
+            blocks.append(bearing_block(reconstruction, poses, gate))
         values = gtsam.Values()
         for f in which:
             values.insert(graph.X(int(f)), gtsam.Pose3(poses[f]))
@@ -67,58 +81,62 @@ def align(
     return poses
 
 
-def bearing_block(reconstruction: Reconstruction, world_T_rigs: np.ndarray) -> LandmarkBlock:
-    """A run's observations as bearing factors, points placed under given poses (F, 4, 4)."""
+def bearing_block(
+    reconstruction: Reconstruction, world_T_rigs: np.ndarray, gate_rad: float
+) -> LandmarkBlock:
+    """A run's observations as bearing factors, points placed under given poses.
+
+    Args:
+        world_T_rigs: (F, 4, 4).
+        gate_rad: observations further from their point are left out; what such a gate lets in is
+            believed less than what the run has found.
+    """
     which = np.arange(len(world_T_rigs))
-    landmarks, _ = place_points(reconstruction, world_T_rigs, which, float(_GATE))
+    landmarks, _ = place_points(reconstruction, world_T_rigs, which, gate_rad)
     tracks = landmarks.tracks
-    term = BearingTerm(
-        tracks.frames,
-        tracks.points,
-        reconstruction.observation_bearings[tracks.keypoints],
-        reconstruction.observation_sigmas[tracks.keypoints],
-    )
+    sigmas = reconstruction.observation_sigmas[tracks.keypoints]
+    spread = gate_rad / (_GATE_SIGMAS * float(np.median(sigmas))) if len(sigmas) else 1.0
+    bearings = reconstruction.observation_bearings[tracks.keypoints]
+    term = BearingTerm(tracks.frames, tracks.points, bearings, max(1.0, spread) * sigmas)
     keys = [graph.X(int(f)) for f in which]
     return LandmarkBlock(keys, landmarks.points_world, [term], RobustLoss("cauchy", 1.0))
 
 
+def capture(frames: FrameSet, which: np.ndarray, size: int) -> Captured:
+    """Grey faces of some frames, as dense as rendered ones of `size` pixels."""
+    rig = _captured_rig(frames, size)
+    images, use = [], []
+    for f in track(which, "cutting faces", total=len(which)):
+        faces, mask = cut_faces(frames, int(f), rig)
+        images.append((faces @ _LUMA / 255).astype(np.float32))
+        use.append(mask)
+    return Captured(which, size, rig, tuple(images), tuple(use))
+
+
 def splat_block(
     gaussians: Gaussians,
-    frames: FrameSet,
-    which: np.ndarray,
-    size: int,
+    captured: Captured,
     near: float,
     backend: Backend,
     loss: RobustLoss | None = None,
 ) -> SplatBlock:
-    """The block of some frames against a fixed splat.
+    """The block of captured frames against a fixed splat.
 
     Args:
         gaussians: the splat; its world is the poses'.
-        frames: captured frames.
-        which: frame indices; keys are graph.X(frame).
-        size: pixels of a rendered face; captured ones are sampled as densely. Coarse to fine is
-            one block after another.
+        captured: frames; keys are graph.X(frame). Coarse to fine is one block after another.
         near: least z of a Gaussian, map units.
         backend: the renderer.
         loss: see `factors.splat.SplatBlock`.
     """
-    rendered = CubeRig(size, np.pi / 2)
-    captured = _captured_rig(frames, size)
-    images, use = [], []
-    for f in track(which, "cutting faces", total=len(which)):
-        faces, mask = cubemap.load(frames, int(f), captured)
-        images.append((faces @ _LUMA / 255).astype(np.float32))
-        use.append(mask)
-    num = len(FACES)
-    cameras = FaceCameras(
-        RIG_R_FACE, np.full(num, captured.focal), np.full((num, 2), captured.principal)
-    )
+    rendered, rig, num = CubeRig(captured.size, np.pi / 2), captured.rig, len(FACES)
+    cameras = FaceCameras(RIG_R_FACE, np.full(num, rig.focal), np.full((num, 2), rig.principal))
 
     def render(_row: int, world_T_rig: np.ndarray) -> RenderedView:
         return render_view(gaussians, world_T_rig, rendered, near, backend)
 
-    return SplatBlock([graph.X(int(f)) for f in which], images, use, cameras, render, loss)
+    keys = [graph.X(int(f)) for f in captured.which]
+    return SplatBlock(keys, captured.images, captured.use, cameras, render, loss)
 
 
 def render_view(

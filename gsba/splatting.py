@@ -1,6 +1,6 @@
 """From a run to splats: posed faces, start clouds, training, and metrics of held-out frames."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from gsba.splat.train import Views, extent_of
 from gsba.types import FACES, FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
 
 _GATE = np.deg2rad(3.0)  # of an observation under poses that may have drifted
+_MAX_TIMES = 8  # samples of a panorama along a pixel of a face, at most
 _PANORAMA_HFOV_DEG = 94.0  # of the faces a panorama is sampled from
 
 
@@ -36,6 +37,7 @@ class Score:
     psnr: float  # dB, over the pixels of all faces together
     ssim: float  # mean over faces
     psnr_exposed: float  # dB, after the gain of each channel that fits best: exposure aside
+    lpips: float | None = None  # mean over faces; None = there were no weights
 
 
 def split_frames(usable: np.ndarray, every: int) -> Split:
@@ -70,25 +72,38 @@ def load_faces(frames: FrameSet, which: np.ndarray, size: int) -> tuple[np.ndarr
     images = np.empty((len(which), 6, size, size, 3), np.uint8)
     use = np.ones((len(which), 6, size, size), bool)
     for i, f in enumerate(track(which, "cutting faces", total=len(which))):
-        if frames.layout == "cube" and frames.width != size:
-            images[i], use[i] = _shrunk_faces(frames, int(f), size)
-            continue
-        images[i], mask = cubemap.load(frames, int(f), rig)
+        images[i], mask = cut_faces(frames, int(f), rig)
         if mask is not None:
             use[i] = mask
     return images.reshape(-1, size, size, 3), use.reshape(-1, size, size)
 
 
-def _shrunk_faces(frames: FrameSet, frame: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Faces that came as faces, at another size."""
+def cut_faces(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.ndarray | None]:
+    """Faces whose pixels are means over their area, as a renderer's are.
+
+    Sampling a panorama that was shrunk to the density of a face's middle would blur its corners,
+    where three times as many pixels share an angle.
+
+    Returns:
+        (6, size, size, 3) uint8 RGB, and where they may be used, bool or None.
+    """
     import cv2
 
-    whole, mask = cubemap.load(frames, frame, CubeRig(frames.width, np.pi / 2))
-    mask = np.ones(whole.shape[:3], bool) if mask is None else mask
-    way = cv2.INTER_AREA if size < frames.width else cv2.INTER_CUBIC
-    images = [cv2.resize(image, (size, size), interpolation=way) for image in whole]
-    shares = [cv2.resize(m.astype(np.float32), (size, size), interpolation=way) for m in mask]
-    return np.stack(images), np.stack(shares) > 0.999
+    if frames.layout == "cube":
+        whole = CubeRig(frames.width, np.pi / 2)
+    else:
+        times = -(-frames.width / (2 * np.pi) // rig.focal)  # until no denser in the middle
+        whole = replace(rig, size=int(np.clip(times, 1, _MAX_TIMES)) * rig.size)
+    images, mask = cubemap.load(frames, frame, whole)
+    if whole.size == rig.size:
+        return images, mask
+    shape = (rig.size, rig.size)
+    way = cv2.INTER_AREA if rig.size < whole.size else cv2.INTER_CUBIC
+    images = np.stack([cv2.resize(image, shape, interpolation=way) for image in images])
+    if mask is None:
+        return images, None
+    shares = [cv2.resize(m.astype(np.float32), shape, interpolation=way) for m in mask]
+    return images, np.stack(shares) > 0.999
 
 
 def make_views(images: np.ndarray, use: np.ndarray, world_T_rigs: np.ndarray) -> Views:
@@ -157,8 +172,16 @@ def start_cloud(
     return from_cloud(landmarks.points_world, reconstruction.point_colors[known], sh_degree)
 
 
+Distance = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]
+
+
 def measure(
-    gaussians: Gaussians, views: Views, settings: SplatSettings, near: float, backend: Backend
+    gaussians: Gaussians,
+    views: Views,
+    settings: SplatSettings,
+    near: float,
+    backend: Backend,
+    lpips: Distance | None = None,
 ) -> dict[int, Score]:
     """Scores of panoramas, by their number in the views.
 
@@ -168,6 +191,7 @@ def measure(
         settings: degree of the harmonics.
         near: least z of a Gaussian, map units.
         backend: the renderer.
+        lpips: see `gsba.splat.lpips`; None = leave it out.
 
     Raises:
         GsbaError: no panorama has a pixel to measure.
@@ -176,7 +200,7 @@ def measure(
         raise GsbaError("no pixel to measure a splat on: all held-out frames are masked")
     return {
         int(i): _score(
-            gaussians, views, np.flatnonzero(views.panoramas == i), settings, near, backend
+            gaussians, views, np.flatnonzero(views.panoramas == i), settings, near, backend, lpips
         )
         for i in np.unique(views.panoramas)
     }
@@ -189,25 +213,32 @@ def _score(
     settings: SplatSettings,
     near: float,
     backend: Backend,
+    lpips: Distance | None,
 ) -> Score:
-    found, truth, similarities = [], [], []
+    found, truth, similarities, distances = [], [], [], []
     for v in rows:
         color = backend.render(gaussians, views.cameras[v], settings.sh_degree, near).color
         image, real = np.clip(color, 0, 1), views.images[v].astype(np.float32) / 255
         use = np.ones(real.shape[:2], bool) if views.use is None else views.use[v]
         similarities.append(ssim(image, real, use))
+        if lpips is not None:
+            distances.append(lpips(image, real, use))
         found.append(image[use])
         truth.append(real[use])
     image, real = np.concatenate(found), np.concatenate(truth)
     gains = np.sum(image * real, axis=0) / np.maximum(np.sum(image * image, axis=0), 1e-9)
     exposed = psnr(np.clip(gains * image, 0, 1), real)
-    return Score(psnr(image, real), float(np.nanmean(similarities)), exposed)
+    far = float(np.mean(distances)) if distances else None
+    return Score(psnr(image, real), float(np.nanmean(similarities)), exposed, far)
 
 
 def mean_score(scores: Iterable[Score]) -> Score:
     """Mean of each metric over panoramas."""
+    scores = list(scores)
     columns = ((s.psnr, s.ssim, s.psnr_exposed) for s in scores)
-    return Score(*(float(np.mean(column)) for column in zip(*columns, strict=True)))
+    distances = [s.lpips for s in scores if s.lpips is not None]
+    far = float(np.mean(distances)) if distances else None
+    return Score(*(float(np.mean(column)) for column in zip(*columns, strict=True)), far)
 
 
 def near_of(world_T_rigs: np.ndarray, settings: SplatSettings) -> float:

@@ -16,6 +16,7 @@ import resource
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -57,6 +58,7 @@ class RunStore:
     def __init__(self, root: Path, origin: Mapping[str, Path], fresh: bool = False) -> None:
         self.root = root
         self.records: dict[str, StageRecord] = {}  # stages of this call, in order
+        self._prefix = ""
         self._lock = open_run_folder(root, origin, fresh)
 
     def __enter__(self) -> "RunStore":
@@ -64,6 +66,15 @@ class RunStore:
 
     def __exit__(self, *_: object) -> None:
         os.close(self._lock)
+
+    @contextmanager
+    def named(self, prefix: str) -> Iterator[None]:
+        """Meanwhile stages, and those they come after, are named `prefix-NAME`."""
+        before, self._prefix = self._prefix, f"{prefix}-"
+        try:
+            yield
+        finally:
+            self._prefix = before
 
     def stage(
         self,
@@ -84,6 +95,7 @@ class RunStore:
             after: names of earlier stages of this call whose results `compute` uses.
         """
         key = self._key(name, settings, after)
+        name = self._prefix + name
         path = _stage_path(self.root, name)
         stored = _load_if_current(path, key, returns)
         if stored is not None:
@@ -117,6 +129,7 @@ class RunStore:
             num_threads: frames computed at a time.
         """
         base = self._key(name, settings, after)
+        name = self._prefix + name
         keys = {item: digest(base, item, depends) for item, depends in items.items()}
         folder = self.root / STAGES / name
         frames = PerFrame(folder, keys, compute, returns)
@@ -148,8 +161,8 @@ class RunStore:
         claim(self.root, path)
 
     def _key(self, name: str, settings: object, after: Sequence[str]) -> str:
-        keys = [self.records[stage].key for stage in after]
-        return digest(__version__, FORMAT, name, settings, keys)
+        keys = [self.records[self._prefix + stage].key for stage in after]
+        return digest(__version__, FORMAT, self._prefix + name, settings, keys)
 
     def _note(self, record: StageRecord) -> None:
         self.records[record.name] = record

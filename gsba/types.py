@@ -70,6 +70,8 @@ class CoarsePoses:
     world_T_rigs: np.ndarray  # (F, 4, 4) float64, map units
     sources: np.ndarray  # (F,) uint8, PoseSource
     time_offset: float  # seconds added to frame times to reach the trajectory's clock
+    segments: np.ndarray | None = None  # (F,) int32, piece of the trajectory that each frame's pose
+    # is of, ascending; pieces have worlds of their own until joined; None = there is one
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,7 @@ class Features:
     sigmas_rad: np.ndarray  # (K,) float64, radians, per-axis localisation noise
     descriptors: np.ndarray  # (K, D) uint8 or float32, unit length up to one common factor
     colors: np.ndarray  # (K, 3) uint8, RGB at the keypoint
+    scores: np.ndarray | None = None  # (K,) float32, a network's confidence in each keypoint
 
     def __len__(self) -> int:
         return len(self.faces)
@@ -178,3 +181,5 @@ class Reconstruction:
     observation_bearings: np.ndarray  # (O, 3) float64, unit, rig frame
     observation_sigmas: np.ndarray  # (O,) float64, radians
     correction: tuple[float, ...] = ()  # of the frames, which these bearings have: see FrameSet
+    components: np.ndarray | None = None  # (F,) int32, map that each frame is in, 0 = the largest:
+    # nothing ties one map to another, each has a world of its own; None = there is one

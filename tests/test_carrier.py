@@ -11,7 +11,7 @@ from tiny_run import SETTINGS, Case, computed_stages
 from typer.testing import CliRunner
 
 from gsba import refine
-from gsba.carrier import find_carrier
+from gsba.carrier import carrier_mask, find_carrier, write_carrier
 from gsba.cli import app
 from gsba.export.images import write_image
 from gsba.geometry import bearings_from_erp, erp_from_bearings
@@ -90,6 +90,29 @@ def test_without_a_carrier_everything_is_used(tmp_path: Path, plain_floor: bool)
     assert carrier.mask.all() and carrier.share == 0 and carrier.reason
 
 
+@pytest.mark.parametrize("look", ["dark", "coloured"])
+def test_a_carrier_that_turns_below_the_picture_is_found(tmp_path: Path, look: str) -> None:
+    """As with direction lock: each frame has its own turn, and its own mask."""
+    frames, image, mask = _walk(tmp_path / "frames", None), _looks()[look], _outline()
+    rng = np.random.default_rng(3)
+    turns = np.round(np.cumsum(rng.normal(0, 30, len(frames)))).astype(int)  # columns
+    for turn, (path,) in zip(turns, frames.paths, strict=True):
+        pasted, outline = np.roll(image, turn, axis=1), np.roll(mask, turn, axis=1)
+        picture = cv2.imread(str(path))[..., ::-1].copy()
+        noisy = pasted[outline] + rng.normal(0, 2, pasted[outline].shape)
+        picture[outline] = np.clip(noisy, 0, 255)
+        write_image(path, picture)
+    carrier = find_carrier(frames)
+    found = [~carrier_mask(carrier, frames, f) for f in range(len(frames))]
+    for f, turn in enumerate(turns):
+        assert _overlap(found[f], np.roll(mask, turn, axis=1)) >= 0.9
+    written = write_carrier(carrier, frames, tmp_path / "m")
+    assert len(written) == 2 + len(frames)
+    merged = find_panoramas(tmp_path / "frames", tmp_path / "m/merged")
+    last = cv2.imread(str(merged.mask_paths[-1]), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(last == 0, found[-1])
+
+
 def test_what_cannot_be_told_is_refused(tmp_path: Path, case: Case) -> None:
     standing = _walk(tmp_path / "standing", _looks()["dark"], speed=0.0)
     first = standing.paths[0][0].read_bytes()
@@ -138,7 +161,7 @@ def test_refine_leaves_the_carrier_out(case: Case, tmp_path: Path) -> None:
         for (path,), t in zip(walk.paths, walk.timestamps.tolist(), strict=True)
     ]
     (tmp_path / "frames/timestamps.csv").write_text("\n".join(times))
-    result = refine(tmp_path / "frames", case.slam, tmp_path / "run", SETTINGS, masks="auto")
+    result = refine(tmp_path / "frames", case.slam, tmp_path / "run", SETTINGS, masks="carrier")
     found = cv2.imread(str(tmp_path / "run/carrier.png"), cv2.IMREAD_UNCHANGED) == 0
     assert _overlap(found, mask) >= 0.9
     seen = erp_from_bearings(result.reconstruction.observation_bearings, WIDTH, HEIGHT)
@@ -146,5 +169,5 @@ def test_refine_leaves_the_carrier_out(case: Case, tmp_path: Path) -> None:
     assert not found[rows, columns].any()
     assert len(list((tmp_path / "run/colmap/masks").rglob("*.png"))) == 6 * len(walk)
     assert "carrier.png" in json.loads((tmp_path / "run/gsba.json").read_text())["wrote"]
-    again = refine(tmp_path / "frames", case.slam, tmp_path / "run", SETTINGS, masks="auto")
+    again = refine(tmp_path / "frames", case.slam, tmp_path / "run", SETTINGS, masks="carrier")
     assert computed_stages(again) == []

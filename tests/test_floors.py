@@ -15,21 +15,37 @@ import gsba
 ROOT = Path(__file__).parents[1]
 FLOORS = (
     {"factors"},
-    {"", "types", "geometry", "config", "config_file", "log"},
-    {"rig", "records", "run_folder", "search", "store", "read", "panorama", "views"},
-    {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
-    | {"graph", "optimize", "filter", "align", "splat", "patch_grid"},
-    {"adjust", "blame", "frontend", "learned", "misfit", "motion", "photometric", "places"}
-    | {"reconstruction", "recovery", "splat_align", "splatting", "stitching"},
-    {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"}
-    | {"alignment", "carrier", "gravity", "placement"},
-    {"demo", "extraction", "line", "pipeline"},
+    {"", "config", "config_file", "geometry", "log", "types"},
+    {"panorama", "read", "records", "rig", "run_folder", "search", "store", "sweep"}
+    | {"turning", "views"},
+    {"align", "cubemap", "features", "filter", "graph", "matching", "optimize", "pairs"}
+    | {"patch_grid", "splat", "tracks", "triangulate", "verify"},
+    {"adjust", "blame", "clock", "clock_fit", "components", "frontend", "learned"}
+    | {"meetings", "misfit", "motion", "parts", "photometric", "places", "reconstruction"}
+    | {"recovery", "registered", "resection", "segments", "splat_align", "splat_refine"}
+    | {"rotation_only", "splatting", "stitching"},
+    {"alignment", "carrier", "distractors", "evaluate", "evaluate_splat", "export"}
+    | {"gravity", "induced", "placement", "report", "report_html", "video"},
+    {"demo", "extraction", "inputs", "line", "masking", "matching_stages", "pipeline"}
+    | {"results", "segment", "timing", "view"},
     {"cli"},
     {"benchmarks"},
 )
 STAGES = 3  # the floor whose modules must not import one another
 FACTORS_MAY_USE = {"factors", "gtsam", "numba", "numpy", "scipy"}
-HEAVY = {"av", "cv2", "gtsam", "kornia", "numba", "open3d", "pycolmap", "scipy", "torch", "trimesh"}
+HEAVY = {
+    "av",
+    "cv2",
+    "gtsam",
+    "kornia",
+    "numba",
+    "open3d",
+    "pycolmap",
+    "scipy",
+    "torch",
+    "trimesh",
+    "viser",
+}
 
 FILES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path

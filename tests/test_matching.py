@@ -10,7 +10,7 @@ from synthetic import bearings_of, features_of, unit, with_noise
 from gsba import matching
 from gsba.config import MatchingSettings
 from gsba.geometry import pose
-from gsba.matching import Gate, SearchableFrames, match_pair, searchable
+from gsba.matching import Gate, SearchableFrames, match_pair, searchable, within_gate
 from gsba.types import Features
 
 NUM = 400
@@ -88,6 +88,20 @@ def test_the_gate_is_as_wide_as_it_says(scene: Scene) -> None:
     wide = Gate(np.deg2rad(2.2), 0.01, np.deg2rad(80))
     found = _match(scene.first(), scene.second(), wide, f0_T_f1=turned)
     assert len(found) == NUM and scene.correct(found).all()
+
+
+@pytest.mark.parametrize("gate", [BAND, POINT])
+def test_other_matchers_pass_the_same_gate(scene: Scene, gate: Gate) -> None:
+    """What guided search finds among true matches is what `within_gate` lets through."""
+    turned = F0_T_F1.copy()
+    turned[:3, :3] = Rotation.from_rotvec([0.004, 0.007, 0.003]).as_matrix() @ turned[:3, :3]
+    points = scene.points if gate is POINT else None
+    first, second = scene.first(), scene.second()
+    true = np.column_stack([np.arange(NUM), np.argsort(scene.shuffle)])
+    inside = within_gate(true, first, second, turned, gate, points)
+    assert 0.1 * NUM < inside.sum() < 0.9 * NUM
+    found = _match(first, second, gate, points, turned)
+    np.testing.assert_array_equal(found[scene.correct(found)], true[inside])
 
 
 def test_uncertain_directions_widen_the_gate_with_parallax(scene: Scene) -> None:

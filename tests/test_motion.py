@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import RIG, bearings_of, drifted, loop_walk, unit, with_noise
 
 from gsba import motion
+from gsba.blame import chained
 from gsba.config import PriorSettings, VerifySettings
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.motion import Trust
@@ -73,6 +74,32 @@ def test_plain_drift_is_not_accused(seed: int) -> None:
     trust = _judge(slam)
     assert trust.sound and not trust.false_frames.any()
     np.testing.assert_array_equal(trust.world_T_rigs, slam)
+
+
+def _fast_drift(rng: np.random.Generator) -> np.ndarray:
+    """Every step off by a third of its length: more than half of them beyond what is believed."""
+    steps = inverse(TRUTH[:-1]) @ TRUTH[1:]
+    typical = np.median(np.linalg.norm(steps[:, :3, 3], axis=1))
+    turns = np.deg2rad(1) * rng.normal(size=(len(steps), 3))
+    steps[:, :3, :3] = steps[:, :3, :3] @ Rotation.from_rotvec(turns).as_matrix()
+    steps[:, :3, 3] += 0.2 * typical * rng.normal(size=(len(steps), 3))
+    return chained(steps)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_fast_drift_loses_steps_but_accuses_no_frame(seed: int) -> None:
+    trust = _judge(_fast_drift(np.random.default_rng(seed)))
+    assert trust.false_steps.any() and not trust.false_frames.any()
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_outliers_are_told_from_fast_drift(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    slam = _fast_drift(rng)
+    for f in (6, 17):
+        turn = Rotation.from_rotvec(np.deg2rad(15) * unit(rng.normal(size=3))).as_matrix()
+        slam[f] = slam[f] @ pose(turn, 2 * unit(rng.normal(size=3)))
+    assert np.flatnonzero(_judge(slam).false_frames).tolist() == [6, 17]
 
 
 @pytest.mark.parametrize("frames", [(7,), (1,), (4, 15, 20), (9, 10), (9, 11), (3, 4, 6)])

@@ -51,9 +51,9 @@ def test_no_trajectory_will_do(case: Case, tmp_path: Path) -> None:
     _as_good(case, tmp_path)
 
 
-def test_a_few_poses_carry_the_rest(case: Case, tmp_path: Path) -> None:
+def test_two_poses_carry_the_rest(case: Case, tmp_path: Path) -> None:
     slam = read_trajectory(case.slam)
-    _refine(case, tmp_path, Trajectory(slam.timestamps[:3], slam.world_T_rigs[:3]))
+    _refine(case, tmp_path, Trajectory(slam.timestamps[:2], slam.world_T_rigs[:2]))
     _as_good(case, tmp_path)
 
 

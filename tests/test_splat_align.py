@@ -56,7 +56,7 @@ def test_perturbed_poses_come_back(case: Case, splat: Gaussians) -> None:
 
 def test_bearings_hold_what_the_run_found(case: Case) -> None:
     reconstruction = case.result.reconstruction
-    block = bearing_block(reconstruction, reconstruction.world_T_rigs)
+    block = bearing_block(reconstruction, reconstruction.world_T_rigs, np.deg2rad(1.0))
     assert len(block.points_world) > 0.5 * len(reconstruction.points_world)
 
 

@@ -18,7 +18,7 @@ from gsba.splat.density import Limits, Pull, densify, reset_opacity
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.metrics import psnr
 from gsba.splat.rasterise import render
-from gsba.splat.train import Views, extent_of, times_for, train
+from gsba.splat.train import Views, advance, begin, extent_of, times_for, train
 
 SIZE = 32
 RIG = CubeRig(SIZE, np.pi / 2)
@@ -121,6 +121,19 @@ def test_what_is_not_finite_stops_the_training(tmp_path: Path) -> None:
         lambda step, splat: states.append((step, splat.is_finite())),
     )
     assert states == [(31, True)]  # went on from step 30, the last good one
+
+
+def test_a_part_of_a_training_leaves_its_start_alone() -> None:
+    truth, views = scene()
+    state = begin(start(truth), SETTINGS)
+    first = state.copy()
+    once = advance(
+        advance(state, views, SETTINGS, CpuBackend(1), 8), views, SETTINGS, CpuBackend(1), 4
+    )
+    assert once.step == 12 and same(state.gaussians, first.gaussians)
+    assert same(once.gaussians, advance(state, views, SETTINGS, CpuBackend(1), 12).gaussians)
+    with pytest.raises(GsbaError, match="no longer finite at step 40"):
+        advance(state, views, SETTINGS, Poison(1), 40)
 
 
 def test_the_cap_is_kept_and_said(caplog: pytest.LogCaptureFixture) -> None:

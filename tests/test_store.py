@@ -135,6 +135,22 @@ def test_a_change_reruns_just_what_depends_on_it(
     assert calls.names == expected
 
 
+def test_stages_of_two_names_do_not_meet(tmp_path: Path) -> None:
+    calls = _Calls()
+    for _ in range(2):
+        with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+            with store.named("first"):
+                store.stage("a", None, lambda: calls.tracks("first a"), Tracks)
+                store.stage("b", None, lambda: calls.tracks("first b", 1), Tracks, ["a"])
+                each = store.per_frame("c", None, {"f": 0}, calls.tracks, Tracks, ["b"])
+            store.stage("b", None, lambda: calls.tracks("b", 2), Tracks, ["first-b"])
+            assert [*store.records] == ["first-a", "first-b", "first-c", "b"]
+            assert load_stage(tmp_path / "run", "first-b", Tracks).keypoints[0] == 1
+            assert load_stage(tmp_path / "run", "b", Tracks).keypoints[0] == 2
+            assert len(each["f"]) == 4
+    assert calls.names == ["first a", "first b", "f", "b"]
+
+
 def test_another_version_computes_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _run(tmp_path / "run", _Calls())
     monkeypatch.setattr(store_module, "__version__", "999")

@@ -62,4 +62,6 @@ def mask(
     carrier = find_carrier(found_frames)
     written = write_carrier(carrier, found_frames, out)
     what = carrier.reason or f"the carrier is {100 * carrier.share:.1f}% of the picture"
-    typer.echo(f"{what}: {written[0]}" + (f", {out / 'merged'}" if masks is not None else ""))
+    if carrier.turns.any():
+        what += ", turning below it: a mask for each frame"
+    typer.echo(f"{what}: {written[0]}" + (f", {out / 'merged'}" if len(written) > 2 else ""))

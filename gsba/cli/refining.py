@@ -19,7 +19,36 @@ Overrides = Annotated[
 ]
 Factors = Annotated[
     str | None,
-    typer.Option(help="Factor families, commas between: bearing, reprojection, photometric."),
+    typer.Option(help="Families, commas between: bearing, reprojection, photometric, splat."),
+]
+Weights = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="Weights of a learned extractor or matcher: a file, or a folder that holds them under "
+        "their official names; repeatable.",
+        metavar="PATH",
+    ),
+]
+Consent = Annotated[
+    bool,
+    typer.Option(
+        "--accept-noncommercial", help="Use weights whose licence forbids commercial use."
+    ),
+]
+Download = Annotated[
+    bool, typer.Option("--download", help="Fetch missing weights from their authors.")
+]
+
+Masks = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="One mask for all frames, or a folder; white = use. carrier, distractors: find "
+        "them; auto: both. Repeatable."
+    ),
+]
+Segment = Annotated[
+    str | None,
+    typer.Option(help="Your own masks of faces: called with IMAGES MASKS.", metavar="COMMAND"),
 ]
 
 
@@ -30,7 +59,8 @@ def refine(
     ],
     out: Annotated[Path, typer.Option(help="Folder of the run.", metavar="RUN")],
     trajectory: Annotated[
-        Path | None, typer.Argument(help="TUM, KITTI or stella_vslam map.msg.")
+        list[Path] | None,
+        typer.Argument(help="TUM, KITTI or stella_vslam map.msg; several are pieces of one run."),
     ] = None,
     keyframes: Annotated[
         Path | None, typer.Option(help="Keyframe trajectory of the same run.", metavar="FILE")
@@ -40,12 +70,8 @@ def refine(
     ] = False,
     config: Config = None,
     overrides: Overrides = None,
-    masks: Annotated[
-        Path | None,
-        typer.Option(
-            help="One mask for all frames, or a folder; white = use. auto: find the carrier."
-        ),
-    ] = None,
+    masks: Masks = None,
+    segment: Segment = None,
     factors: Factors = None,
     timestamps: Annotated[
         Path | None, typer.Option(help="Times of the frames.", metavar="FILE")
@@ -54,13 +80,17 @@ def refine(
         float | None,
         typer.Option(help="Frames per second, from time 0; of a video: frames kept per second."),
     ] = None,
+    weights: Weights = None,
+    accept_noncommercial: Consent = False,
+    download: Download = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Replace an earlier run.")] = False,
 ) -> None:
     """Refine the pose of every frame; the same call again resumes."""
-    if (trajectory is None) != no_trajectory:
+    if (not trajectory) != no_trajectory:
         raise GsbaError("give either a TRAJECTORY or --no-trajectory")
     if keyframes is not None and no_trajectory:
         raise GsbaError("--keyframes go with the TRAJECTORY of the same run")
+    overrides = [*_networks(weights, accept_noncommercial, download), *(overrides or ())]
     settings = _settings(config, overrides, factors)
     from gsba import pipeline
 
@@ -70,16 +100,22 @@ def refine(
         out,
         settings,
         keyframes=keyframes,
-        masks="auto" if str(masks) == "auto" else masks,
+        masks=masks,
+        segment=segment,
         timestamps=timestamps,
         fps=fps,
         fresh=fresh,
     )
+    typer.echo(_summary(out))
+
+
+def _summary(out: Path) -> str:
+    """One line on a finished run."""
     summary = json.loads((out / "report.json").read_text())["summary"]
-    typer.echo(
-        f"{summary['refined']} of {summary['frames']} frames refined, {summary['points']} points, "
-        f"median residual {summary['median_residual_deg']:.4f} deg: {out}"
-    )
+    residual, found = summary["median_residual_deg"], "rotations only, no points"
+    if residual is not None:
+        found = f"{summary['points']} points, median residual {residual:.4f} deg"
+    return f"{summary['refined']} of {summary['frames']} frames refined, {found}: {out}"
 
 
 @command
@@ -125,6 +161,25 @@ def show_config(
     from gsba.config_file import to_toml
 
     typer.echo(to_toml(_settings(config, overrides, factors)), nl=False)
+
+
+def _networks(weights: list[Path] | None, accept_noncommercial: bool, download: bool) -> list[str]:
+    """Overrides for what the options on learned networks say.
+
+    A folder is for both the extractor and the matcher; a file goes before it, and is for the
+    matcher if its name says so (LightGlue, LighterGlue, SuperGlue), else for the extractor.
+    """
+    changes = []
+    for path in sorted(weights or (), key=Path.is_file):
+        stages = ["matching"] if "glue" in path.name.lower() else ["features"]
+        if path.is_dir():
+            stages = ["features", "matching"]
+        changes += [f"{stage}.weights={json.dumps(str(path))}" for stage in stages]
+    if accept_noncommercial:
+        changes.append("features.accept_noncommercial=true")
+    if download:
+        changes.append("features.download=true")
+    return changes
 
 
 def _settings(

@@ -8,7 +8,14 @@ from typing import Annotated
 import typer
 
 from gsba.cli.app import command
-from gsba.cli.splat import BackendName, FaceSize, Iterations, evaluate_splat, splat_settings
+from gsba.cli.splat import (
+    BackendName,
+    FaceSize,
+    Iterations,
+    LpipsWeights,
+    evaluate_splat,
+    splat_settings,
+)
 from gsba.log import GsbaError
 
 
@@ -34,7 +41,8 @@ def export(
         typer.Option(help="Two frames, or points x,y,z of the run's world.", metavar="A B"),
     ] = None,
     gps: Annotated[
-        Path | None, typer.Option(help="CSV or GPX: metres east, north, up.", metavar="FILE")
+        Path | None,
+        typer.Option(help="CSV, GPX, or exif (of the frames): metres east, north, up."),
     ] = None,
     align: Annotated[
         Path | None, typer.Option(help="True poses: their world and unit.", metavar="TRUTH.tum")
@@ -85,10 +93,12 @@ def evaluate(
     iterations: Iterations = None,
     face_size: FaceSize = None,
     backend: BackendName = "auto",
+    lpips: LpipsWeights = None,
 ) -> None:
     """Compare a run or a trajectory with the truth, or what its poses are worth to a splat."""
     if splat:
-        evaluate_splat(estimate, against or [], splat_settings(iterations, face_size, backend))
+        settings = splat_settings(iterations, face_size, backend)
+        evaluate_splat(estimate, against or [], settings, lpips or [])
     if truth is None:
         if not splat:
             raise GsbaError("nothing to compare with: give --truth FILE, or --splat")

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 Run = Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")]
 Iterations = Annotated[int | None, typer.Option(help="Views shown, one at a time.")]
 FaceSize = Annotated[int | None, typer.Option(help="Pixels of a cube face.")]
+LpipsWeights = Annotated[
+    list[Path] | None, typer.Option("--lpips", help="Weights of LPIPS; repeatable.", metavar="FILE")
+]
 BackendName = Annotated[str, typer.Option(help="auto, gsplat or cpu.")]
 
 
@@ -24,10 +27,11 @@ def train(
     iterations: Iterations = None,
     face_size: FaceSize = None,
     backend: BackendName = "auto",
+    lpips: LpipsWeights = None,
 ) -> None:
     """Train a splat on a run's refined poses; the same call again resumes."""
     settings = splat_settings(iterations, face_size, backend)
-    results = _compare(run, {}, settings, run / "splat")
+    results = _compare(run, {}, settings, run / "splat", lpips or [])
     mean = results["refined"].mean
     typer.echo(
         f"{results['refined'].num_gaussians} Gaussians, PSNR {mean.psnr:.2f} dB, SSIM "
@@ -73,7 +77,9 @@ def render(
     typer.echo(f"{frame}: {folder}")
 
 
-def evaluate_splat(run: Path, against: Sequence[Path], settings: "SplatSettings") -> None:
+def evaluate_splat(
+    run: Path, against: Sequence[Path], settings: "SplatSettings", lpips: Sequence[Path]
+) -> None:
     """Train and measure a splat on the run's poses and on others."""
     from gsba.evaluate_splat import format_table
     from gsba.read import read_trajectory
@@ -87,23 +93,27 @@ def evaluate_splat(run: Path, against: Sequence[Path], settings: "SplatSettings"
             else f"{path.parent.name}-{path.stem}"
         )
         others[name] = read_trajectory(path)
-    results = _compare(run, others, settings, out)
+    results = _compare(run, others, settings, out, lpips)
     typer.echo(format_table(results))
     typer.echo(f"Splats, pictures, curves and numbers in {out}.")
 
 
-def _compare(run: Path, others, settings: "SplatSettings", out: Path):
+def _compare(
+    run: Path, others, settings: "SplatSettings", out: Path, lpips_weights: Sequence[Path]
+):
     """Results of the run's own poses and of others."""
     from gsba.evaluate_splat import compare, poses_for
     from gsba.pipeline import load_run
     from gsba.run_folder import claim
     from gsba.splat.backend import choose_backend
+    from gsba.splat.lpips import Lpips
 
+    lpips = Lpips(lpips_weights) if lpips_weights else None
     reconstruction, frames = load_run(run)
     sources = {"refined": reconstruction.world_T_rigs}
     sources |= {name: poses_for(frames, trajectory) for name, trajectory in others.items()}
     renderer = choose_backend(settings.backend)
-    results = compare(reconstruction, frames, sources, settings, renderer, out)
+    results = compare(reconstruction, frames, sources, settings, renderer, out, lpips)
     claim(run.resolve(), out.resolve())
     return results
 

@@ -52,6 +52,8 @@ def export(
         names = ", ".join(frames.names[f] for f in unrefined[:5])
         more = ", ..." if len(unrefined) > 5 else ""
         logger.warning("%d frames go out with unrefined poses: %s%s", len(unrefined), names, more)
+    if len(reconstruction.points_world) == 0:
+        logger.warning("no points: the poses alone go out, and trainers need a start cloud")
     placement = placement or Placement()
     reconstruction = placement.apply(reconstruction)
     with output_folder(out, to.value) as partial:

@@ -1,4 +1,4 @@
-"""Images and masks of an export, one frame in memory at a time.
+"""Images and masks of an export, a few frames in memory at a time.
 
 Faces are cut with bicubic sampling, low-passed first where they are much coarser than the
 panorama. They are written as PNG where the frame is PNG, else as JPEG of quality 95. Images that
@@ -9,6 +9,7 @@ file system allows it, else copies, so that an export stays whole when it is mov
 import os
 import shutil
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from gsba.types import FACES, FrameSet
 
 JPEG_QUALITY = 95
 MIN_FACE_SIZE = 16  # pixels
+_AT_ONCE = 4  # frames at most: an 8K panorama and its faces take 250 MB
 
 
 def face_size_for(frames: FrameSet, face_size: int | None) -> int:
@@ -61,9 +63,9 @@ def write_faces(
         image_path: file of the image, by frame index and face name.
         mask_path: file of the mask (PNG, 0 = ignore, 255 = use).
     """
-    rig = CubeRig(size, np.pi / 2)
-    for f in track(range(len(frames)), "cutting faces"):
-        faces = frames.faces or FACES
+    rig, faces = CubeRig(size, np.pi / 2), frames.faces or FACES
+
+    def write(f: int) -> None:
         paths = [image_path(f, face) for face in faces]
         if frames.layout == "erp":
             from gsba.cubemap import cut
@@ -79,6 +81,14 @@ def write_faces(
             _write_all(paths, _resized(load_faces(frames, f), size))
         if has_masks(frames):
             _write_face_masks(frames, f, rig, [mask_path(f, face) for face in faces], faces)
+
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, _AT_ONCE)) as pool:
+        running = [pool.submit(write, f) for f in range(len(frames))]
+        try:
+            for future in track(running, "cutting faces"):
+                future.result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
 def write_panoramas(

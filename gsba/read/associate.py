@@ -40,14 +40,14 @@ def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) 
     offset = _clock_offset(frames.timestamps, trajectory.timestamps, settings.clock_offset_s)
     times = frames.timestamps + offset
     entries = trajectory.timestamps
-    nearest = np.abs(entries[_nearest(entries, times)] - times)
-    seen = nearest <= _half_interval(frames.timestamps, entries)
+    away = np.abs(entries[nearest(entries, times)] - times)
+    seen = away <= _half_interval(frames.timestamps, entries)
     outside = (times < entries[0]) | (times > entries[-1])
     sources = np.where(
         seen, PoseSource.SLAM, np.where(outside, PoseSource.EXTRAPOLATED, PoseSource.INTERPOLATED)
     ).astype(np.uint8)
     _report(frames, sources, times, entries, settings.max_interpolation_s)
-    return CoarsePoses(_poses_at(trajectory, times), sources, offset)
+    return CoarsePoses(poses_at(trajectory, times), sources, offset)
 
 
 def without_trajectory(frames: FrameSet) -> CoarsePoses:
@@ -136,7 +136,7 @@ def _offsets_that_fit(frame_times: np.ndarray, entries: np.ndarray) -> list[floa
         shifted = few - shift
         if shifted[-1] > many[-1] + tolerance:
             continue
-        residuals = shifted - many[_nearest(many, shifted)]
+        residuals = shifted - many[nearest(many, shifted)]
         if np.abs(residuals).max() <= tolerance:
             found.append(float(sign * (shift + np.median(residuals))))
             if len(found) == 2:
@@ -144,7 +144,7 @@ def _offsets_that_fit(frame_times: np.ndarray, entries: np.ndarray) -> list[floa
     return found
 
 
-def _poses_at(trajectory: Trajectory, times: np.ndarray) -> np.ndarray:
+def poses_at(trajectory: Trajectory, times: np.ndarray) -> np.ndarray:
     """Poses (F, 4, 4) of a trajectory at any times (F,)."""
     from scipy.spatial.transform import Rotation, Slerp
 
@@ -176,7 +176,7 @@ def _faded(duration: np.ndarray, time_constant: float) -> np.ndarray:
     return -time_constant * np.expm1(-duration / time_constant)
 
 
-def _nearest(sorted_values: np.ndarray, queries: np.ndarray) -> np.ndarray:
+def nearest(sorted_values: np.ndarray, queries: np.ndarray) -> np.ndarray:
     """Index of the nearest of sorted values (N,), N >= 2, for each query (Q,)."""
     right = np.clip(np.searchsorted(sorted_values, queries), 1, len(sorted_values) - 1)
     left = right - 1

@@ -24,7 +24,7 @@ def world_map(coarse: CoarsePoses, reconstruction: Reconstruction) -> dict[str, 
         are: the length of the mean up axis, 0..1.
     """
     positions = reconstruction.world_T_rigs[:, :3, 3]
-    axes, upright = _viewing_axes(reconstruction.world_T_rigs)
+    axes, upright = viewing_axes(reconstruction.world_T_rigs)
     centre = np.median(positions, axis=0)
     num = len(reconstruction.points_world)
     which = np.unique(np.linspace(0, num - 1, min(num, _MAX_POINTS)).astype(int)) if num else []
@@ -41,7 +41,7 @@ def world_map(coarse: CoarsePoses, reconstruction: Reconstruction) -> dict[str, 
     }
 
 
-def _viewing_axes(world_T_rigs: np.ndarray) -> tuple[np.ndarray, float]:
+def viewing_axes(world_T_rigs: np.ndarray) -> tuple[np.ndarray, float]:
     """Rows: two level axes and up, right-handed, in the world; and how far the rigs agree on up."""
     positions = world_T_rigs[:, :3, 3] - world_T_rigs[:, :3, 3].mean(axis=0)
     mean_up = -world_T_rigs[:, :3, 1].mean(axis=0)

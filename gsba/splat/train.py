@@ -49,6 +49,12 @@ class State:
     moments: adam.Moments
     pull: Pull
 
+    def copy(self) -> "State":
+        """With arrays of its own: a step may change those of its state in place."""
+        rows = np.arange(len(self.gaussians))
+        pull = Pull(self.pull.sums.copy(), self.pull.counts.copy())
+        return State(self.step, self.gaussians.select(rows), self.moments.select(rows), pull)
+
 
 @dataclass(frozen=True, slots=True)
 class Times:
@@ -103,27 +109,17 @@ def train(
         GsbaError: all pixels masked, no Gaussian, or parameters that are no longer finite; the
             last checkpoint with finite ones stays.
     """
-    if len(views.images) == 0 or (views.use is not None and not views.use.any()):
-        raise GsbaError("no pixel to train a splat on: all frames are masked or held out")
-    if len(start) == 0:
-        raise GsbaError("no Gaussian to start from")
-    if len(start) > settings.max_gaussians:
-        logger.warning("the cloud has %d points, %d are used", len(start), settings.max_gaussians)
-        draw = np.random.default_rng(settings.seed)
-        start = start.select(np.sort(draw.permutation(len(start))[: settings.max_gaussians]))
     state = _resume(checkpoint, key)
     if state is None:
-        first = start.select(np.arange(len(start)))
-        state = State(0, first, adam.Moments.zero(first), Pull.none(len(first)))
-    trainer = _Trainer(views, settings, backend)
+        state = begin(start, settings)
+    trainer = Trainer(views, settings, backend)
     saved = time.monotonic()
     steps = range(state.step, settings.iterations)
     for _ in track(steps, "training the splat", total=len(steps)):
         state = trainer.step(state)
         last = state.step == settings.iterations
-        if (state.step % _CHECK_EVERY == 0 or last) and not state.gaussians.is_finite():
-            kept = "" if checkpoint is None else f"; the last good state is in {checkpoint}"
-            raise GsbaError(f"the splat is no longer finite at step {state.step}{kept}")
+        if state.step % _CHECK_EVERY == 0 or last:
+            _require_finite(state, checkpoint)
         if watch is not None:
             watch(state.step, state.gaussians)
         due = time.monotonic() - saved > settings.checkpoint_every_s
@@ -131,6 +127,44 @@ def train(
             save_record(checkpoint, state, {"key": key})
             saved = time.monotonic()
     return state.gaussians
+
+
+def begin(start: Gaussians, settings: SplatSettings) -> State:
+    """A training that has not made a step; where there are too many Gaussians, a part of them.
+
+    Raises:
+        GsbaError: no Gaussian.
+    """
+    if len(start) == 0:
+        raise GsbaError("no Gaussian to start from")
+    rows = np.arange(len(start))
+    if len(start) > settings.max_gaussians:
+        logger.warning("the cloud has %d points, %d are used", len(start), settings.max_gaussians)
+        draw = np.random.default_rng(settings.seed)
+        rows = np.sort(draw.permutation(len(start))[: settings.max_gaussians])
+    first = start.select(rows)
+    return State(0, first, adam.Moments.zero(first), Pull.none(len(first)))
+
+
+def advance(
+    state: State, views: Views, settings: SplatSettings, backend: Backend, steps: int
+) -> State:
+    """Train for some steps; the state passed in stays as it is.
+
+    Raises:
+        GsbaError: all pixels masked, or parameters that are no longer finite.
+    """
+    trainer, state = Trainer(views, settings, backend), state.copy()
+    for _ in track(range(steps), "training the splat"):
+        state = trainer.step(state)
+    _require_finite(state, None)
+    return state
+
+
+def _require_finite(state: State, checkpoint: Path | None) -> None:
+    if not state.gaussians.is_finite():
+        kept = "" if checkpoint is None else f"; the last good state is in {checkpoint}"
+        raise GsbaError(f"the splat is no longer finite at step {state.step}{kept}")
 
 
 def _resume(checkpoint: Path | None, key: str) -> State | None:
@@ -148,10 +182,16 @@ def _resume(checkpoint: Path | None, key: str) -> State | None:
     return state
 
 
-class _Trainer:
-    """What does not change between steps."""
+class Trainer:
+    """What does not change between steps.
+
+    Raises:
+        GsbaError: all pixels are masked.
+    """
 
     def __init__(self, views: Views, settings: SplatSettings, backend: Backend) -> None:
+        if len(views.images) == 0 or (views.use is not None and not views.use.any()):
+            raise GsbaError("no pixel to train a splat on: all frames are masked or held out")
         self.views, self.settings, self.backend = views, settings, backend
         self.times = times_for(settings.iterations)
         self.extent = extent_of(np.array([camera.face_in_world for camera in views.cameras]))
@@ -193,13 +233,14 @@ class _Trainer:
         settings = self.settings
         done = step / settings.iterations
         means = settings.rate_means ** (1 - done) * settings.rate_means_end**done
+        fade = settings.rate_fade**done
         return adam.Rates(
             means=means * self.extent,
-            log_scales=settings.rate_scales,
-            quaternions=settings.rate_rotations,
-            opacity_logits=settings.rate_opacities,
-            sh=settings.rate_colors,
-            sh_rest=settings.rate_colors / 20,
+            log_scales=fade * settings.rate_scales,
+            quaternions=fade * settings.rate_rotations,
+            opacity_logits=fade * settings.rate_opacities,
+            sh=fade * settings.rate_colors,
+            sh_rest=fade * settings.rate_colors / 20,
         )
 
     def _densify(self, state: State, step: int) -> tuple[Gaussians, adam.Moments]:

@@ -1,0 +1,261 @@
+r"""Draw the pictures of README and docs from what `gsba demo` leaves.
+
+    gsba demo --frames 24 --width 768
+    gsba evaluate gsba-demo/run --splat --against gsba-demo/walk/slam.tum \
+        --iterations 2000 --face-size 160
+    python docs/pictures.py gsba-demo
+
+Writes docs/images: trajectory.svg, residuals.jpg, cloud.jpg and, where splats were evaluated,
+splats.svg. The colours are those of report.html.
+"""
+
+import argparse
+import base64
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gsba.geometry import similarity
+from gsba.pipeline import load_run
+from gsba.read import load_erp, read_trajectory
+from gsba.report_html.pictures import picture, worst_frames
+from gsba.report_html.views import viewing_axes
+from gsba.types import FrameSet, Reconstruction, Trajectory
+
+PAGE, LINE, INK, QUIET = "#f6f6f3", "#e3e3dd", "#1b1c1e", "#6b6e73"
+BEFORE, AFTER, TRUE = "#d9822b", "#1769aa", "#1b1c1e"
+FONT = "system-ui,-apple-system,'Segoe UI',Roboto,Helvetica,Arial,sans-serif"
+MAP, CHART, HEIGHT, MARGIN = 470, 400, 420, 36  # pixels
+MAX_POINTS = 1600  # of the cloud, on the map
+VECTOR_GAIN = 120  # times longer than the residual is
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("demo", type=Path, help="folder that gsba demo wrote")
+    parser.add_argument("--run", type=Path, help="run to draw; DEMO/run by default")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "images")
+    arguments = parser.parse_args()
+    run = arguments.run or arguments.demo / "run"
+    found, frames = load_run(run)
+    truth = read_trajectory(arguments.demo / "walk" / "groundtruth.tum")
+    coarse = read_trajectory(run / "coarse.tum")
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / "trajectory.svg").write_text(trajectory(found, frames, coarse, truth))
+    write(arguments.out / "residuals.jpg", residuals(found, frames))
+    write(arguments.out / "cloud.jpg", cloud(found))
+    pictures = sorted((run / "splat-evaluation" / "pictures").glob("*.jpg"))
+    if pictures:
+        (arguments.out / "splats.svg").write_text(splats(pictures[len(pictures) // 2]))
+
+
+def trajectory(
+    found: Reconstruction, frames: FrameSet, coarse: Trajectory, truth: Trajectory
+) -> str:
+    """SVG: the walk from above, before and after, and the error of every frame."""
+    refined = Trajectory(frames.timestamps, found.world_T_rigs)
+    errors = [position_errors(poses, truth) for poses in (coarse, refined)]
+    axes, _ = viewing_axes(found.world_T_rigs)
+    centre = np.median(found.world_T_rigs[:, :3, 3], axis=0)
+
+    def level(points: np.ndarray) -> np.ndarray:
+        return ((points - centre) @ axes.T)[:, :2] * [1, -1]
+
+    paths = [level(p.world_T_rigs[:, :3, 3]) for p in (coarse, refined)]
+    low, high = np.min([p.min(0) for p in paths], 0), np.max([p.max(0) for p in paths], 0)
+    scale = 0.72 * min(
+        (MAP - 2 * MARGIN) / (high - low)[0], (HEIGHT - 2 * MARGIN) / (high - low)[1]
+    )
+    middle = np.array([MAP / 2, HEIGHT / 2 + 8])
+
+    def place(points: np.ndarray) -> np.ndarray:
+        return (points - (low + high) / 2) * scale + middle
+
+    points = place(level(found.points_world))
+    inside = np.all((points > [10, 54]) & (points < [MAP - 10, HEIGHT - 10]), axis=1)
+    rows = np.flatnonzero(inside)
+    rows = rows[:: max(1, len(rows) // MAX_POINTS)]
+    dots = "".join(f"M{x:.0f} {y:.0f}h.01" for x, y in points[rows])
+    body = [
+        f'<path d="{dots}" stroke="#b9b7ae" stroke-width="1.8" stroke-linecap="round"/>',
+        *(
+            f'<polyline points="{_joined(place(path))}" fill="none" stroke="{color}" '
+            f'stroke-width="2.6" stroke-linejoin="round" stroke-linecap="round"/>'
+            for path, color in zip(paths, (BEFORE, AFTER), strict=True)
+        ),
+        *(
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.4" fill="{AFTER}"/>'
+            for x, y in place(paths[1])
+        ),
+        _text(24, 34, "From above", INK, 15, 600),
+    ]
+    body += _error_chart(*errors)
+    return _page(MAP + CHART + 20, HEIGHT, body)
+
+
+def _page(width: int, height: int, body: list[str]) -> str:
+    """SVG of a rounded sheet with this on it."""
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" '
+        f'height="{height}" font-family="{FONT}">\n'
+        f'<rect x=".5" y=".5" width="{width - 1}" height="{height - 1}" rx="14" fill="{PAGE}" '
+        f'stroke="{LINE}"/>\n' + "\n".join(body) + "\n</svg>\n"
+    )
+
+
+def position_errors(poses: Trajectory, truth: Trajectory) -> np.ndarray:
+    """Distance (F,) of every pose from the truth, in its units, after the best Sim(3)."""
+    assert np.allclose(poses.timestamps, truth.timestamps, atol=1e-6)
+    source, target = (p.world_T_rigs[:, :3, 3] for p in (poses, truth))
+    scale, rotation, shift = similarity(source, target)
+    return np.linalg.norm(scale * source @ rotation.T + shift - target, axis=1)
+
+
+def _error_chart(before: np.ndarray, after: np.ndarray) -> list[str]:
+    """Position error of every frame before and after, on a logarithmic axis."""
+    left, right, top, bottom = MAP + 66, MAP + CHART - 8, 70, HEIGHT - 52
+    lowest = np.floor(np.log10(max(min(before.min(), after.min()), 1e-9)))
+    highest = np.ceil(np.log10(max(before.max(), after.max())))
+
+    def y_of(values: np.ndarray | float) -> np.ndarray:
+        share = (np.log10(np.maximum(values, 10**lowest)) - lowest) / (highest - lowest)
+        return bottom - share * (bottom - top)
+
+    x = np.linspace(left, right, len(before))
+    body = [_text(MAP + 24, 34, "Position error of every frame", INK, 15, 600)]
+    for power in range(int(lowest), int(highest) + 1):
+        y = float(y_of(10.0**power))
+        body.append(f'<path d="M{left} {y:.1f}H{right}" stroke="{LINE}"/>')
+        label = f"{10.0**power:.9f}".rstrip("0").rstrip(".")
+        body.append(_text(left - 10, y + 4, label, QUIET, 12, anchor="end"))
+    for x0, y0, y1 in zip(x, y_of(before), y_of(after), strict=True):
+        body.append(
+            f'<path d="M{x0:.1f} {y0:.1f}V{y1:.1f}" stroke="{QUIET}" stroke-opacity=".22"/>'
+        )
+    for values, color in ((before, BEFORE), (after, AFTER)):
+        body += [
+            f'<circle cx="{x0:.1f}" cy="{y0:.1f}" r="3.8" fill="{color}"/>'
+            for x0, y0 in zip(x, y_of(values), strict=True)
+        ]
+    ratio = np.median(before) / np.median(after)
+    body.append(_text(left, HEIGHT - 22, f"median {ratio:.0f} times smaller", QUIET, 13))
+    for at, name, color in ((right - 132, "before", BEFORE), (right - 56, "after", AFTER)):
+        body.append(f'<circle cx="{at - 10}" cy="{HEIGHT - 26.5}" r="4" fill="{color}"/>')
+        body.append(_text(at, HEIGHT - 22, name, QUIET, 13))
+    return body
+
+
+def _joined(points: np.ndarray) -> str:
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
+
+
+def _text(
+    x: float, y: float, text: str, color: str, size: int, weight: int = 400, anchor: str = "start"
+) -> str:
+    return (
+        f'<text x="{x:.1f}" y="{y:.1f}" fill="{color}" font-size="{size}" font-weight="{weight}" '
+        f'text-anchor="{anchor}">{text}</text>'
+    )
+
+
+def residuals(found: Reconstruction, frames: FrameSet) -> np.ndarray:
+    """The worst frame's panorama with its residuals, `VECTOR_GAIN` times longer than they are."""
+    f, width, fine = worst_frames(found)[0], 1200, 4  # fine: bits of sub-pixel drawing
+    shown = cv2.resize(load_erp(frames, f), (width, width // 2), interpolation=cv2.INTER_CUBIC)
+    vectors = picture(frames, found, f)["vectors"]
+    starts = vectors[:, :2] * [width, width // 2]
+    ends = starts + VECTOR_GAIN * vectors[:, 2:] * width / 360
+    for start, end in zip(starts, ends, strict=True):
+        a, b = (tuple(int(v) for v in np.round(p * 2**fine)) for p in (start, end))
+        cv2.line(shown, a, b, (255, 255, 255), 4, cv2.LINE_AA, fine)
+        cv2.line(shown, a, b, _rgb(BEFORE), 2, cv2.LINE_AA, fine)
+        cv2.circle(shown, a, 3 * 2**fine, (255, 255, 255), -1, cv2.LINE_AA, fine)
+        cv2.circle(shown, a, 2 * 2**fine, _rgb(AFTER), -1, cv2.LINE_AA, fine)
+    return shown
+
+
+def cloud(found: Reconstruction) -> np.ndarray:
+    """The cloud and the walk from above at an angle, far points first."""
+    width, height, over = 1200, 640, 2
+    axes, _ = viewing_axes(found.world_T_rigs)
+    positions = (found.world_T_rigs[:, :3, 3]) @ axes.T
+    centre, extent = (positions.min(0) + positions.max(0)) / 2, np.ptp(positions, axis=0).max()
+    eye = centre + extent * np.array([0.3, -1.45, 1.25])
+    ahead = (centre - eye) / np.linalg.norm(centre - eye)
+    right = np.cross(ahead, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    camera = np.array([right, np.cross(ahead, right), ahead])
+    focal = 1.05 * width * over
+
+    def seen(points: np.ndarray) -> np.ndarray:
+        local = (points - eye) @ camera.T
+        pixels = local[:, :2] / np.maximum(local[:, 2:], 1e-6) * focal
+        return np.column_stack([pixels + np.array([width, height]) * over / 2, local[:, 2]])
+
+    canvas = np.full((height * over, width * over, 3), _rgb(PAGE), np.uint8)
+    points = seen(found.points_world @ axes.T)
+    ceiling = np.percentile((found.points_world @ axes.T)[:, 2], 80)
+    low = (found.points_world @ axes.T)[:, 2] < ceiling  # look in from above
+    for row in np.argsort(-points[:, 2]):
+        x, y, depth = points[row]
+        if low[row] and depth > 0.05 * extent:
+            radius = max(2, round(0.0042 * extent * focal / depth))
+            color = tuple(int(v) for v in found.point_colors[row])
+            cv2.circle(canvas, (round(x), round(y)), radius, color, -1, cv2.LINE_AA)
+    path = seen(positions)
+    corners = [np.round(path[:, :2]).astype(np.int32)]
+    cv2.polylines(canvas, corners, False, (255, 255, 255), 6 * over, cv2.LINE_AA)
+    cv2.polylines(canvas, corners, False, _rgb(AFTER), 3 * over, cv2.LINE_AA)
+    for x, y, _ in path:
+        cv2.circle(canvas, (round(x), round(y)), 7 * over, (255, 255, 255), -1, cv2.LINE_AA)
+        cv2.circle(canvas, (round(x), round(y)), 5 * over, _rgb(AFTER), -1, cv2.LINE_AA)
+    return cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def splats(path: Path) -> str:
+    """SVG: faces of a held-out frame as captured, and as splats on coarse and refined poses are."""
+    sheet = cv2.imread(str(path))[..., ::-1]  # a row each: captured, refined, coarse
+    size = sheet.shape[1] // 6
+    shown = {"captured": 0, "splat on coarse poses": 2, "splat on refined poses": 1}
+    scores = json.loads((path.parents[1] / "results.json").read_text())
+    print(json.dumps(scores)[:300])
+    wide, gap, head = 286, 12, 52
+    width, height = 3 * wide + 4 * gap, head + 2 * wide + 2 * gap
+    body = []
+    for column, (label, row) in enumerate(shown.items()):
+        faces = [sheet[row * size : (row + 1) * size, c * size : (c + 1) * size] for c in (0, 1)]
+        image = cv2.resize(np.concatenate(faces), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        data = base64.b64encode(jpeg(image, 34_000)).decode()
+        x = gap + column * (wide + gap)
+        body.append(
+            f'<image x="{x}" y="{head}" width="{wide}" height="{2 * wide}" '
+            f'href="data:image/jpeg;base64,{data}"/>'
+        )
+        body.append(_text(x + 2, 33, label, (QUIET, BEFORE, AFTER)[column], 15, 600))
+    return _page(width, height, body)
+
+
+def _rgb(color: str) -> tuple[int, int, int]:
+    return int(color[1:3], 16), int(color[3:5], 16), int(color[5:], 16)
+
+
+def write(path: Path, image: np.ndarray) -> None:
+    path.write_bytes(jpeg(image, 150_000))
+
+
+def jpeg(image: np.ndarray, most: int) -> bytes:
+    """RGB image as JPEG of at most so many bytes, or as small as it gets."""
+    for quality in (90, 85, 80, 75, 70, 62, 54, 46):
+        options = [cv2.IMWRITE_JPEG_QUALITY, quality]
+        encoded = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), options)[1]
+        if len(encoded) <= most:
+            break
+    return encoded.tobytes()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,28 @@
+"""Looking at finished runs: `view`."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gsba.cli.app import command
+
+
+@command
+def view(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
+    port: Annotated[int, typer.Option(help="Of 127.0.0.1; 0: any that is free.")] = 8080,
+) -> None:
+    """Walk around in a run, in the browser: cloud, rigs, pictures, trajectories, splats."""
+    from gsba.view import load_scene, serve
+
+    shown = serve(load_scene(run), port)
+    try:
+        typer.echo(f"http://127.0.0.1:{shown.server.get_port()} shows {run}; Ctrl-C ends it.")
+        while True:
+            time.sleep(3600)
+    except KeyboardInterrupt:
+        typer.echo()  # ends the line of ^C
+    finally:
+        shown.stop()

@@ -1,0 +1,322 @@
+"""Which clock makes a trajectory turn as the images do: a search on a grid, then least squares."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsba.geometry import quaternion_from_rotation
+from gsba.types import Trajectory
+
+_MAX_STEPS = 600  # more are merged into longer ones: people turn slowly
+_MIN_STEP_S = 0.2  # shortest after merging
+_SPACING = 0.25  # of a step, between offsets tried
+_MAX_RATE = 0.03  # largest deviation of the rate that is tried
+_RATE_SIGMA = 0.02  # what is expected of it
+_TRIED = 6  # candidates of the grid
+_ITERATIONS = 40
+_WIDTH = 2.0  # of the loss, standard deviations
+_MIN_SIGMA = np.deg2rad(0.03)  # of a rotation, per axis: images know no better
+_ROUGH_SIGMA = np.deg2rad(1.0)  # least of it on the grid
+_QUIET, _QUIET_LENGTH = 0.4, 1.367  # quantile that noise is read from; of unit Gaussian 3-vectors
+_SCANNED = 49  # shifts within a step of the best, for its uncertainty
+_INFLATION = 3.0  # of standard deviations
+_CERTAIN = 4.0  # standard deviations within which no shift may do as well
+
+
+@dataclass(frozen=True, slots=True)
+class Turns:
+    """Rotations of the camera between pairs of instants, by the images."""
+
+    times: np.ndarray  # (N, 2) float64, seconds on the frames' clock
+    rotvecs: np.ndarray  # (N, 3) float64, radians, first_R_second
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def middle(self) -> float:
+        """Instant that parameters are about."""
+        return float(self.times.mean())
+
+    @property
+    def ends(self) -> np.ndarray:
+        """First and last instant (2,), from the middle."""
+        return np.array([self.times.min(), self.times.max()]) - self.middle
+
+    @property
+    def step(self) -> float:
+        """Median duration in seconds."""
+        return float(np.median(np.diff(self.times, axis=1)))
+
+
+def merged(timestamps: np.ndarray, f_R_nexts: np.ndarray, verified: np.ndarray) -> Turns:
+    """Turns from the steps of frames, short ones put together.
+
+    Args:
+        timestamps: (F,) seconds.
+        f_R_nexts: (F - 1, 3, 3) rotations between frames that follow one another.
+        verified: (F - 1,) bool, which of them are known.
+    """
+    from scipy.spatial.transform import Rotation
+
+    least = max(_MIN_STEP_S, np.ptp(timestamps) / _MAX_STEPS) if len(timestamps) else 0.0
+    times, rotations, last = [], [], -1
+    for f in np.flatnonzero(verified):
+        begin, end = timestamps[f], timestamps[f + 1]
+        if last == f and times[-1][1] - times[-1][0] < least:
+            times[-1][1], rotations[-1] = end, rotations[-1] @ f_R_nexts[f]
+        else:
+            times.append([begin, end])
+            rotations.append(f_R_nexts[f])
+        last = f + 1
+    rotvecs = Rotation.from_matrix(np.reshape(rotations, (-1, 3, 3))).as_rotvec()
+    return Turns(np.reshape(times, (-1, 2)), rotvecs)
+
+
+class ClockFit:
+    """Agreement of turns with a trajectory, as a function of (shift, rate).
+
+    An instant `t` of a frame is at `middle + shift + rate * (t - middle)` on the trajectory's
+    clock, `middle` being that of the turns.
+    """
+
+    def __init__(self, turns: Turns, trajectory: Trajectory) -> None:
+        self.turns, entries = turns, trajectory.timestamps
+        self.span = entries[[0, -1]]
+        self._entries = entries
+        self._at = quaternion_from_rotation(trajectory.world_T_rigs[:, :3, :3])
+        self._onward = _log(_product(_conjugate(self._at[:-1]), self._at[1:]))
+        self._seen = _exp(turns.rotvecs)
+        typical = float(np.quantile(np.linalg.norm(turns.rotvecs, axis=1), 0.75))
+        self._rough_sigma = max(0.5 * typical, _ROUGH_SIGMA)
+
+    def residuals(self, parameters: np.ndarray) -> np.ndarray:
+        """Rotations (N, 3) in radians from what the images say to what the trajectory says.
+
+        Where it has no poses, it says that nothing turns.
+        """
+        times = self.turns.middle + parameters[0] + parameters[1] * self._from_middle()
+        inside = ((times >= self.span[0]) & (times <= self.span[1])).all(axis=1)
+        found = -self.turns.rotvecs
+        first, second = (self._rotations(times[inside, k]) for k in range(2))
+        turned = _product(_conjugate(first), second)
+        found[inside] = _log(_product(_conjugate(self._seen[inside]), turned))
+        return found
+
+    def _rotations(self, times: np.ndarray) -> np.ndarray:
+        """Quaternions (n, 4) of the trajectory within its span, turning evenly between entries."""
+        before = np.clip(np.searchsorted(self._entries, times) - 1, 0, len(self._onward) - 1)
+        span = self._entries[before + 1] - self._entries[before]
+        share = (times - self._entries[before]) / span
+        return _product(self._at[before], _exp(share[:, None] * self._onward[before]))
+
+    def cost(self, parameters: np.ndarray, sigma: float) -> float:
+        """Mean disagreement of a step, from 0 to 1 (Geman and McClure, 1987).
+
+        Args:
+            parameters: (2,) shift and rate.
+            sigma: noise of rotations per axis.
+        """
+        return _bounded(self.residuals(parameters), sigma)
+
+    def refine(
+        self, start: np.ndarray, with_rate: bool = True, widening: float = 3.0
+    ) -> np.ndarray:
+        """Parameters (2,) of the best agreement around a start, under a Cauchy loss.
+
+        Args:
+            start: (2,) where to begin.
+            with_rate: find the rate, too.
+            widening: how much wider than noise the loss is at first.
+        """
+        parameters, free = start.copy(), 1 + with_rate
+        residuals = self.residuals(parameters)
+        sigma, damping = widening * noise(residuals), 1e-3
+        for _ in range(_ITERATIONS):
+            jacobian, prior = self._jacobian(parameters)[..., :free], self._prior(free)
+            weights = 1 / (1 + np.sum(residuals**2, axis=1) / (_WIDTH * sigma) ** 2)
+            normal = np.einsum("n,nij,nik->jk", weights, jacobian, jacobian)
+            slope = np.einsum("n,nij,ni->j", weights, jacobian, residuals)
+            slope[1:] += prior[1:, 1:] @ (parameters[1:free] - 1) * sigma**2
+            normal += prior * sigma**2 + damping * np.diag(np.diag(normal)) + 1e-15 * np.eye(free)
+            step = np.linalg.solve(normal, -slope)
+            step /= max(1.0, float(np.abs(step[0])) / (0.5 * self.turns.step))
+            moved = parameters.copy()
+            moved[:free] += step
+            after = self.residuals(moved)
+            if self._total(after, moved, sigma) < self._total(residuals, parameters, sigma):
+                parameters, residuals, damping = moved, after, damping / 3
+            else:
+                damping *= 10
+            narrowed = max(0.7 * sigma, noise(residuals))
+            if damping > 1e6 or (narrowed == sigma and np.abs(step[0]) < 1e-5):
+                break
+            sigma = narrowed
+        return parameters
+
+    def covariance(self, parameters: np.ndarray, with_rate: bool = True) -> np.ndarray:
+        """Covariance (2, 2) of the parameters; a rate that is held is exact.
+
+        Residuals of steps that follow one another correlate, since trajectories drift smoothly:
+        after Newey and West (Econometrica 55, 1987), but never below what independent ones give,
+        nor below what shifts that do nearly as well say. Inflated as measured on simulated drift.
+        """
+        residuals, free = self.residuals(parameters), 1 + with_rate
+        sigma = noise(residuals)
+        jacobian = self._jacobian(parameters)[..., :free]
+        weights = 1 / (1 + np.sum(residuals**2, axis=1) / (_WIDTH * sigma) ** 2)
+        normal = np.einsum("n,nij,nik->jk", weights, jacobian, jacobian)
+        normal += self._prior(free) * sigma**2 + 1e-15 * np.eye(free)
+        pulls = np.einsum("n,nij,ni->nj", weights, jacobian, residuals)
+        spread = pulls.T @ pulls
+        lags = min(4, len(pulls) - 1)
+        for lag in range(1, lags + 1):
+            along = pulls[:-lag].T @ pulls[lag:]
+            spread += (1 - lag / (lags + 1)) * (along + along.T)
+        inverse, choices = np.linalg.inv(normal), np.zeros((2, 2, 2))
+        choices[:, :free, :free] = sigma**2 * inverse, inverse @ spread @ inverse
+        larger = max(choices, key=self.time_sigma)
+        return larger * max(_INFLATION**2, self._width(parameters) ** 2 / larger[0, 0])
+
+    def settle(self, parameters: np.ndarray, with_rate: bool = True) -> np.ndarray:
+        """The best of the minima within a step: entries make the agreement jagged."""
+        for _ in range(2):
+            shifts, losses, sigma = self._profile(parameters)
+            moved = parameters + np.array([shifts[np.argmin(losses)], 0.0])
+            settled = self.refine(moved, with_rate, 1.0)
+            best = min((parameters, moved, settled), key=lambda p: self.cost(p, sigma))
+            if best is parameters:
+                break
+            parameters = best
+        return parameters
+
+    def _profile(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Shifts (n,) up to a step, the loss under each, and the least noise.
+
+        The loss is bounded: one outlier more or less must not outweigh what all others say.
+        """
+        shifts = self.turns.step * np.linspace(-1, 1, _SCANNED)
+        tried = parameters + np.column_stack([shifts, np.zeros(_SCANNED)])
+        residuals = [self.residuals(p) for p in tried]
+        sigma = min(map(noise, residuals))
+        losses = [_WIDTH**2 * len(r) * _bounded(r, sigma) for r in residuals]
+        return shifts, np.array(losses), sigma
+
+    def _width(self, parameters: np.ndarray) -> float:
+        """Standard deviation of the shift, from how far off one does nearly as well."""
+        shifts, losses, _ = self._profile(parameters)
+        here = losses[len(losses) // 2]
+        as_good = np.abs(shifts[losses < here + _CERTAIN**2])
+        spacing = float(shifts[1] - shifts[0])
+        return max(float(as_good.max(initial=0)) - spacing, 0.0) / _CERTAIN
+
+    def time_sigma(self, covariance: np.ndarray) -> float:
+        """Standard deviation in seconds of an instant's time, at the worse end of the video."""
+        at = np.column_stack([np.ones(2), self.turns.ends])
+        return float(np.sqrt(np.einsum("ki,ij,kj->k", at, covariance, at).max()))
+
+    def apart(self, one: np.ndarray, other: np.ndarray) -> float:
+        """Largest difference of two clocks in seconds during the video."""
+        return float(np.abs((one - other)[0] + (one - other)[1] * self.turns.ends).max())
+
+    def candidates(self, start: np.ndarray, reach_s: float) -> Iterator[np.ndarray]:
+        """Parameters (2,) of the best clocks on a grid around a start, best first.
+
+        Args:
+            start: the clock in the middle of the grid.
+            reach_s: largest offset from it that is tried.
+        """
+        spacing = _SPACING * self.turns.step
+        shifts = spacing * np.arange(-round(reach_s / spacing), round(reach_s / spacing) + 1)
+        rates = max(round(_MAX_RATE * self.turns.ends[1] / spacing), 1)
+        rates = _MAX_RATE * np.arange(-rates, rates + 1) / rates
+        tried = np.stack(np.meshgrid(shifts, rates), axis=-1).reshape(-1, 2) + start
+        lookup = self._angular_velocity(spacing)
+        order = np.argsort([self._rough_cost(p, *lookup) for p in tried], kind="stable")
+        chosen: list[np.ndarray] = []
+        for parameters in tried[order]:
+            if all(self.apart(parameters, other) > 2.5 * spacing for other in chosen):
+                chosen.append(parameters)
+                yield parameters
+            if len(chosen) == _TRIED:
+                return
+
+    def _angular_velocity(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        """Instants (n,) of the trajectory and its mean turn (n, 3) over a step around each."""
+        half = 0.5 * min(self.turns.step, float(np.ptp(self.span)))
+        count = max(int(np.ptp(self.span) / (0.5 * spacing)), 2)
+        times = np.linspace(self.span[0] + half, self.span[1] - half, count)
+        begin, end = self._rotations(times - half), self._rotations(times + half)
+        return times, _log(_product(_conjugate(begin), end)) / (2 * half)
+
+    def _rough_cost(
+        self, parameters: np.ndarray, times: np.ndarray, velocities: np.ndarray
+    ) -> float:
+        """Disagreement of angular velocities, bounded for each step, from 0 to 1."""
+        duration = np.diff(self.turns.times, axis=1)
+        at = self.turns.middle + parameters[0] + parameters[1] * self._from_middle().mean(axis=1)
+        turned = [np.interp(at, times, velocities[:, k], 0, 0) for k in range(3)]
+        squares = np.sum((np.column_stack(turned) * duration - self.turns.rotvecs) ** 2, axis=1)
+        return float(np.mean(squares / (squares + self._rough_sigma**2)))
+
+    def _from_middle(self) -> np.ndarray:
+        return self.turns.times - self.turns.middle
+
+    def _jacobian(self, parameters: np.ndarray) -> np.ndarray:
+        """Derivatives (N, 3, 2) of residuals, over a part of a step: entries make them jagged."""
+        reach = 0.1 * self.turns.step
+        columns = []
+        for step in (np.array([reach, 0]), np.array([0, reach / self.turns.ends[1]])):
+            change = self.residuals(parameters + step) - self.residuals(parameters - step)
+            columns.append(change / (2 * step.sum()))
+        return np.stack(columns, axis=-1)
+
+    @staticmethod
+    def _prior(free: int) -> np.ndarray:
+        """Information (free, free): rates are near one, shifts anything."""
+        return np.diag([0, _RATE_SIGMA**-2])[:free, :free]
+
+    def _total(self, residuals: np.ndarray, parameters: np.ndarray, sigma: float) -> float:
+        """What `refine` makes small."""
+        squares = np.sum(residuals**2, axis=1) / (_WIDTH * sigma) ** 2
+        return float(_WIDTH**2 * np.log1p(squares).sum()) + float(
+            (parameters[1] - 1) ** 2 / _RATE_SIGMA**2
+        )
+
+
+def _bounded(residuals: np.ndarray, sigma: float) -> float:
+    """Mean of r^2 / (r^2 + width^2) over rotations (N, 3)."""
+    squares = np.sum(residuals**2, axis=1)
+    return float(np.mean(squares / (squares + (_WIDTH * sigma) ** 2)))
+
+
+def noise(residuals: np.ndarray) -> float:
+    """Noise per axis of rotations (N, 3), however large most of them are."""
+    lengths = np.linalg.norm(residuals, axis=1)
+    return max(float(np.quantile(lengths, _QUIET)) / _QUIET_LENGTH, _MIN_SIGMA)
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Products (n, 4) of quaternions, wxyz."""
+    real = a[:, 0] * b[:, 0] - np.sum(a[:, 1:] * b[:, 1:], axis=1)
+    imaginary = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])
+    return np.column_stack([real, imaginary])
+
+
+def _conjugate(wxyz: np.ndarray) -> np.ndarray:
+    return wxyz * [1, -1, -1, -1]
+
+
+def _exp(rotvecs: np.ndarray) -> np.ndarray:
+    """Unit quaternions (n, 4), wxyz, of rotation vectors (n, 3)."""
+    half = 0.5 * np.linalg.norm(rotvecs, axis=1, keepdims=True)
+    return np.hstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * rotvecs])
+
+
+def _log(wxyz: np.ndarray) -> np.ndarray:
+    """Rotation vectors (n, 3), at most half a turn, of unit quaternions (n, 4)."""
+    wxyz = np.where(wxyz[:, :1] < 0, -wxyz, wxyz)
+    sine = np.linalg.norm(wxyz[:, 1:], axis=1, keepdims=True)
+    angle = 2 * np.arctan2(sine, wxyz[:, :1])
+    return wxyz[:, 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)

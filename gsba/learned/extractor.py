@@ -1,0 +1,67 @@
+"""One extractor for all learned networks: padding, masks, pixel conventions, selection."""
+
+import functools
+from pathlib import Path
+
+import numpy as np
+
+from gsba.config import FeatureSettings
+from gsba.features import FaceKeypoints
+from gsba.learned.interfaces import Detector
+from gsba.learned.weights import missing_library
+
+SIGMA_PX = 0.5  # per-axis noise of any; what matters is that all keypoints have the same
+_STEP = 32  # pixels; the networks halve the image several times
+
+
+class LearnedExtractor:
+    """ALIKED, DISK, XFeat or SuperPoint on one face, at the face's own size and aspect.
+
+    Args:
+        settings: `extractor` names the network.
+        weights: its file.
+
+    Raises:
+        GsbaError: weights of another network, or a library is not installed.
+    """
+
+    def __init__(self, settings: FeatureSettings, weights: Path) -> None:
+        self._most = settings.max_per_face
+        self._detect = _load(settings.extractor, weights, settings.max_per_face)
+
+    def __call__(self, face_rgb: np.ndarray, mask: np.ndarray | None) -> FaceKeypoints:
+        size = face_rgb.shape[0]
+        side = -(-size // _STEP) * _STEP
+        padded = np.pad(face_rgb, ((0, side - size), (0, side - size), (0, 0)), mode="edge")
+        centred, scores, descriptors = self._detect(padded)
+        pixels = centred.astype(np.float64).reshape(-1, 2) + 0.5  # from the corner
+        allowed = (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
+        columns, rows = np.minimum(np.maximum(pixels, 0), size - 1).astype(int).T
+        if mask is not None:
+            allowed &= mask[rows, columns]
+        kept = np.flatnonzero(allowed)
+        kept = kept[np.argsort(-scores[kept], kind="stable")][: self._most]
+        return FaceKeypoints(
+            pixels[kept],
+            np.full(len(kept), SIGMA_PX),
+            descriptors[kept].astype(np.float32),
+            scores[kept].astype(np.float32),
+        )
+
+
+@functools.lru_cache(maxsize=1)
+def _load(name: str, weights: Path, max_per_face: int) -> Detector:
+    """The network in inference mode; one for all threads. Twice the keypoints that are kept are
+    found, as masks and neighbouring faces take some."""
+    try:
+        if name == "superpoint":
+            from gsba.learned.magicleap import superpoint as load
+        else:
+            from gsba.learned import detectors
+
+            load = {"aliked": detectors.aliked, "disk": detectors.disk, "xfeat": detectors.xfeat}[
+                name
+            ]
+        return load(weights, 2 * max_per_face)
+    except ImportError:
+        raise missing_library(f"features.extractor = {name}") from None

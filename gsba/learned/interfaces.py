@@ -1,0 +1,30 @@
+"""What networks are asked for; `LearnedExtractor` and `FaceMatcher` do the rest."""
+
+from typing import Protocol
+
+import numpy as np
+
+from gsba.features import FaceKeypoints
+
+
+class Detector(Protocol):
+    """A network that finds and describes keypoints on one image."""
+
+    def __call__(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Keypoints of an image (N, N, 3) uint8, N a multiple of 32.
+
+        Returns:
+            pixels (K, 2) (u, v) from the centre of the first pixel, scores (K,), and descriptors
+            (K, D) float32 of length one.
+        """
+        ...
+
+
+class FaceNetwork(Protocol):
+    """A network that matches the keypoints of two images of `size` by `size` pixels."""
+
+    def __call__(
+        self, first: FaceKeypoints, second: FaceKeypoints, size: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Matches (m, 2) and their scores (m,)."""
+        ...

@@ -1,0 +1,58 @@
+"""LightGlue (Lindenberger et al., ICCV 2023) by kornia, on keypoints that are already there."""
+
+from pathlib import Path
+
+import kornia.feature  # pyright: ignore[reportMissingImports]
+import numpy as np
+import torch  # pyright: ignore[reportMissingImports]
+
+from gsba.features import FaceKeypoints
+from gsba.learned.weights import load_into, read_state
+
+_MIN_SCORE = 0.1  # as published
+
+
+class LightGlue:
+    """Matches of two faces; all layers and all keypoints, so that a pair's matches are its own.
+
+    Args:
+        extractor: whose keypoints: aliked, disk, superpoint, or xfeat ("LighterGlue").
+        weights: file in the layout of its authors or of kornia.
+
+    Raises:
+        GsbaError: weights of another network.
+    """
+
+    def __init__(self, extractor: str, weights: Path) -> None:
+        wide = kornia.feature.LightGlue.features[extractor]
+        chosen = {**wide, "depth_confidence": -1, "width_confidence": -1, "weights": None}
+        chosen |= {"flash": False, "filter_threshold": _MIN_SCORE}
+        model = kornia.feature.LightGlue(features=None, **chosen)
+        state = {name.removeprefix("matcher."): v for name, v in read_state(weights).items()}
+        for block in ("self_attn", "cross_attn"):  # self_attn.3.x of the authors' files
+            for layer in range(model.conf.n_layers):
+                old, new = f"{block}.{layer}.", f"transformers.{layer}.{block}."
+                state = {
+                    new + name.removeprefix(old) if name.startswith(old) else name: value
+                    for name, value in state.items()
+                }
+        key = f"{extractor}-lightglue"
+        self._model = load_into(model, state, key, weights, exact=False)
+
+    def __call__(
+        self, first: FaceKeypoints, second: FaceKeypoints, size: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Matches (m, 2) of keypoints of two faces of `size` pixels, and their scores (m,)."""
+        with torch.inference_mode():
+            found = self._model({"image0": _image(first, size), "image1": _image(second, size)})
+        return found["matches"][0].numpy(), found["scores"][0].numpy()
+
+
+def _image(face: FaceKeypoints, size: int) -> dict[str, torch.Tensor]:
+    """A face as LightGlue takes it: pixels count from the centre of the first."""
+    pixels = np.clip(face.pixels - 0.5, 0, size - 1).astype(np.float32)
+    return {
+        "keypoints": torch.from_numpy(pixels)[None],
+        "descriptors": torch.from_numpy(face.descriptors)[None],
+        "image_size": torch.tensor([[size, size]]),
+    }

@@ -1,0 +1,275 @@
+"""Weights of learned networks: which files, whose, under which licence, and where they are.
+
+They are looked for where the settings say (a file, or a folder that holds the file under its
+official name), then where torch and Hugging Face cache what they download, and fetched only if the
+settings allow it. What a licence keeps from commercial use is used only if that is accepted.
+"""
+
+import logging
+import os
+import shutil
+import urllib.request
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsba.config import RefineSettings
+from gsba.log import GsbaError
+from gsba.records import atomic_write
+
+logger = logging.getLogger(__name__)
+
+_TIMEOUT_S = 30.0  # of each read from the network
+_KORNIA = "https://huggingface.co/kornia"
+_CVG = "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv"
+_XFEAT = "https://github.com/verlab/accelerated_features/raw/main/weights"
+_MAGIC_LEAP = "https://github.com/magicleap/SuperGluePretrainedNetwork/raw/master/models/weights"
+_NON_COMMERCIAL = "Magic Leap's licence: non-commercial research only"
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a network's weights come from."""
+
+    network: str
+    files: tuple[str, ...]  # names it is published or cached under, the usual one first
+    licence: str
+    place: str  # for people
+    urls: tuple[str, ...]  # tried in this order
+    hub: tuple[str, ...] = ()  # Hugging Face repositories that hold one of the files
+    free: bool = True  # for commercial use too
+
+
+def _lightglue(extractor: str) -> Source:
+    file = f"{extractor}_lightglue.pth"
+    return Source(
+        f"LightGlue for {extractor}",
+        (file, f"{extractor}_lightglue_v0-1_arxiv.pth", f"{extractor}_lightglue_v0-1_arxiv-pth"),
+        "Apache-2.0",
+        "https://github.com/cvg/LightGlue/releases",
+        (f"{_KORNIA}/lightglue/resolve/main/{file}", f"{_CVG}/{file}"),
+        ("kornia/lightglue",),
+    )
+
+
+SOURCES = {
+    "aliked": Source(
+        "ALIKED",
+        ("aliked-n16.pth",),
+        "BSD-3-Clause",
+        "https://github.com/Shiaoming/ALIKED (models/)",
+        (
+            f"{_KORNIA}/aliked/resolve/main/aliked-n16.pth",
+            "https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-n16.pth",
+        ),
+        ("kornia/aliked",),
+    ),
+    "disk": Source(
+        "DISK",
+        ("depth-save.pth",),
+        "Apache-2.0",
+        "https://github.com/cvlab-epfl/disk",
+        (
+            f"{_KORNIA}/disk/resolve/main/depth-save.pth",
+            "https://raw.githubusercontent.com/cvlab-epfl/disk/master/depth-save.pth",
+        ),
+        ("kornia/disk",),
+    ),
+    "xfeat": Source(
+        "XFeat",
+        ("xfeat.pt",),
+        "Apache-2.0",
+        "https://github.com/verlab/accelerated_features (weights/)",
+        (f"{_XFEAT}/xfeat.pt",),
+    ),
+    "superpoint": Source(
+        "SuperPoint",
+        ("superpoint_v1.pth", "model.safetensors", "pytorch_model.bin"),
+        _NON_COMMERCIAL,
+        "https://github.com/magicleap/SuperPointPretrainedNetwork",
+        (f"{_MAGIC_LEAP}/superpoint_v1.pth",),
+        ("magic-leap-community/superpoint",),
+        free=False,
+    ),
+    "aliked-lightglue": _lightglue("aliked"),
+    "disk-lightglue": _lightglue("disk"),
+    "superpoint-lightglue": _lightglue("superpoint"),
+    "xfeat-lightglue": Source(
+        "LighterGlue for xfeat",
+        ("xfeat-lighterglue.pt",),
+        "Apache-2.0",
+        "https://github.com/verlab/accelerated_features (weights/)",
+        (
+            f"{_KORNIA}/lightglue/resolve/main/xfeat-lighterglue.pt",
+            f"{_XFEAT}/xfeat-lighterglue.pt",
+        ),
+        ("kornia/lightglue",),
+    ),
+    "superpoint-superglue": Source(
+        "SuperGlue",
+        ("superglue_outdoor.pth", "superglue_indoor.pth", "model.safetensors"),
+        _NON_COMMERCIAL,
+        "https://github.com/magicleap/SuperGluePretrainedNetwork (models/weights/)",
+        (f"{_MAGIC_LEAP}/superglue_outdoor.pth",),
+        ("magic-leap-community/superglue_outdoor", "magic-leap-community/superglue_indoor"),
+        free=False,
+    ),
+}
+
+
+def matcher_source(settings: RefineSettings) -> str:
+    """Key in SOURCES of the learned matcher that settings choose."""
+    return f"{settings.features.extractor}-{settings.matching.matcher}"
+
+
+def find_weights(settings: RefineSettings) -> dict[str, Path]:
+    """Files of the learned networks that settings choose, by "features" and "matching".
+
+    Raises:
+        GsbaError: weights that are neither there nor to be downloaded, or whose licence was not
+            accepted; says which file, its licence and where to get it.
+    """
+    chosen, wanted = settings.features, {}
+    if chosen.extractor != "sift":
+        wanted["features"] = (chosen.extractor, chosen.weights)
+    if settings.matching.matcher != "guided":
+        wanted["matching"] = (matcher_source(settings), settings.matching.weights)
+    for key, _ in wanted.values():
+        _check_licence(SOURCES[key], chosen.accept_noncommercial)
+    return {
+        stage: _find(SOURCES[key], given, f"{stage}.weights", chosen.download)
+        for stage, (key, given) in wanted.items()
+    }
+
+
+def _check_licence(source: Source, accepted: bool) -> None:
+    if source.free:
+        return
+    if not accepted:
+        raise GsbaError(
+            f"{source.network}'s weights are under {source.licence} ({source.place}); if that is "
+            "your use, say so: --accept-noncommercial (features.accept_noncommercial = true)"
+        )
+    logger.warning("%s's weights are under %s", source.network, source.licence)
+
+
+def _find(source: Source, given: str | None, setting: str, download: bool) -> Path:
+    how = f"get {source.files[0]} ({source.licence}) from {source.place}"
+    folders = [*_torch_cache(), *_hub_cache(source.hub)]
+    if given is not None:
+        path = Path(given).expanduser()
+        if path.is_file():
+            return path
+        if not path.is_dir():
+            raise GsbaError(f"{path}: no such weights file; {how}")
+        folders.insert(0, path)
+    for folder in folders:
+        for name in source.files:
+            if (folder / name).is_file():
+                return folder / name
+    if download:
+        return _download(source)
+    where = f"{given}: holds no weights of" if given else "no weights of"
+    raise GsbaError(
+        f"{where} {source.network}; {how} and name it with --weights ({setting}), "
+        "or let --download fetch it"
+    )
+
+
+def _torch_cache() -> list[Path]:
+    """Where torch.hub, and with it kornia, keeps files."""
+    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    home = os.environ.get("TORCH_HOME") or f"{cache}/torch"
+    return [Path(home).expanduser() / "hub" / "checkpoints"]
+
+
+def _hub_cache(repositories: tuple[str, ...]) -> list[Path]:
+    """Folders of the latest cached versions of Hugging Face repositories."""
+    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    home = os.environ.get("HF_HOME") or f"{cache}/huggingface"
+    root = Path(os.environ.get("HF_HUB_CACHE") or f"{home}/hub").expanduser()
+    found = []
+    for repository in repositories:
+        folder = root / f"models--{repository.replace('/', '--')}"
+        reference = folder / "refs" / "main"
+        if reference.is_file():
+            found.append(folder / "snapshots" / reference.read_text().strip())
+    return found
+
+
+def _download(source: Source) -> Path:
+    """Fetch weights into torch's cache, where other programs find them too."""
+    path = _torch_cache()[0] / source.files[0]
+    failures = []
+    for url in source.urls:
+        logger.info("downloading %s (%s) from %s", path.name, source.licence, url)
+        try:
+            with urllib.request.urlopen(url, timeout=_TIMEOUT_S) as reply:
+                atomic_write(path, lambda to, reply=reply: _copy(reply, to))
+            return path
+        except (OSError, ValueError) as error:  # no network, no such page, a cut connection
+            failures.append(str(getattr(error, "reason", error)))
+    raise GsbaError(
+        f"could not download {path.name} ({failures[-1]}); get it ({source.licence}) from "
+        f"{source.place} and name it with --weights"
+    )
+
+
+def _copy(reply: Any, to: Path) -> None:
+    with to.open("wb") as file:
+        shutil.copyfileobj(reply, file)
+
+
+def read_state(path: Path) -> dict[str, Any]:
+    """Tensors by name of a file of weights; pickled code in it is not run.
+
+    Raises:
+        GsbaError: not a file of weights.
+    """
+    import torch  # pyright: ignore[reportMissingImports]
+
+    try:
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file  # pyright: ignore[reportMissingImports]
+
+            state = load_file(path)
+        else:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+    except ImportError:
+        raise missing_library("safetensors files") from None
+    except Exception as error:  # of pickle, zipfile, safetensors or torch, each in its own words
+        raise GsbaError(f"{path}: not a file of weights; get it again") from error
+    return dict(state) if isinstance(state, dict) else {}
+
+
+def load_into(model: Any, state: dict[str, Any], key: str, path: Path, exact: bool = True) -> Any:
+    """Give a network its weights and put it into inference mode.
+
+    Args:
+        model: torch module.
+        state: tensors by name.
+        key: of the network in SOURCES.
+        path: of the weights, for the message.
+        exact: whether tensors that the network does not have are a fault too.
+
+    Raises:
+        GsbaError: the weights are another network's.
+    """
+    needed = dict(model.named_parameters()) | {
+        name: value for name, value in model.named_buffers() if "running" in name
+    }
+    known = model.state_dict().keys()
+    fits = all(
+        name in state and getattr(state[name], "shape", None) == value.shape
+        for name, value in needed.items()
+    )
+    if not fits or (exact and state.keys() - known):
+        usual = SOURCES[key].files[0]
+        raise GsbaError(f"{path}: weights of another network than {key} ({usual})")
+    model.load_state_dict({n: v for n, v in state.items() if n in known}, strict=False)
+    return model.eval().requires_grad_(False)
+
+
+def missing_library(what: str) -> GsbaError:
+    """The one line for what is not installed."""
+    return GsbaError(f"{what} needs torch, kornia and transformers: pip install 'gsba[learned]'")

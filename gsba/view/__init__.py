@@ -1,0 +1,7 @@
+"""A finished run to walk around in, in the browser."""
+
+from gsba.view.display import View
+from gsba.view.scene import Scene, Splat, faces_of, load_scene
+from gsba.view.server import serve
+
+__all__ = ["Scene", "Splat", "View", "faces_of", "load_scene", "serve"]

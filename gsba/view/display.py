@@ -1,0 +1,296 @@
+"""What a browser shows of a scene, and the controls that change it."""
+
+import io
+from contextlib import redirect_stdout
+from threading import Lock
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gsba.geometry import quaternion_from_rotation
+from gsba.log import GsbaError
+from gsba.report import frame_quality
+from gsba.rig import RIG_R_FACE
+from gsba.types import FACES, PoseStatus
+from gsba.view.scene import Scene, faces_of
+
+if TYPE_CHECKING:
+    import viser
+
+_BEFORE, _AFTER, _BAD = (217, 130, 43), (23, 105, 170), (192, 57, 43)  # as in report.html
+_SEEN = (46, 125, 79)
+_JPEG_QUALITY = 85
+
+
+class View:
+    """A scene on a running server: what is shown, and the controls that change it.
+
+    Nodes lie in the scene's world times `scale`, so that steps are about 1 where the world has no
+    unit of its own: viewers have fixed ideas of near and far.
+    """
+
+    def __init__(self, server: "viser.ViserServer", scene: Scene) -> None:
+        self.server, self.scene = server, scene
+        self.scale = 1.0 if scene.unit == "m" else 1.0 / scene.step
+        self.size = self.scale * scene.step  # of a rig, as drawn
+        self.frame = -1  # shown one
+        self.nodes: dict[str, Any] = {}  # handles by name of the scene node
+        self.controls: dict[str, Any] = {}  # handles by label
+        self._faces: dict[str, Any] = {}
+        self._masked = False
+        self._lock = Lock()
+        self._quality = frame_quality(scene.reconstruction)
+        with server.atomic():
+            server.scene.set_up_direction(scene.up)
+            self._add_cloud()
+            self._add_paths()
+            self._add_splats()
+            self._add_controls()
+            self._place_camera()
+        self.show(0)
+
+    def show(self, f: int) -> None:
+        """Put the pictures of a frame, and the points it sees, where the frame was."""
+        with self._lock:
+            masked = bool(self.controls["Masks"].value)
+            if (f, masked) == (self.frame, self._masked):
+                return
+            self.frame, self._masked = f, masked
+            try:
+                faces, problem = faces_of(self.scene.frames, f, masked), ""
+            except GsbaError as error:
+                faces, problem = {}, str(error)
+            with self.server.atomic():
+                self._place_frame(f, faces)
+                self.controls["about"].content = self._about(f, problem)
+
+    def stop(self) -> None:
+        """End the server, quietly."""
+        with redirect_stdout(io.StringIO()):  # viser says good-bye
+            self.server.stop()
+
+    def _add_cloud(self) -> None:
+        found = self.scene.reconstruction
+        self.nodes["/cloud"] = self.server.scene.add_point_cloud(
+            "/cloud",
+            (self.scale * found.points_world).astype(np.float32),
+            found.point_colors,
+            point_size=0.02 * self.size,
+            point_shape="circle",
+            point_shading="flat",
+            precision="float32",
+        )
+
+    def _add_paths(self) -> None:
+        """Lines through the poses before and after, and a pyramid that looks ahead in each rig."""
+        world_T_rigs = self.scene.reconstruction.world_T_rigs
+        coarse = self.scene.coarse_T_rigs
+        self._add_line("/refined", world_T_rigs, _AFTER)
+        if coarse is not None:
+            self._add_line("/coarse", coarse, _BEFORE)
+        wxyz = quaternion_from_rotation(world_T_rigs[:, :3, :3]).astype(np.float32)
+        positions = (self.scale * world_T_rigs[:, :3, 3]).astype(np.float32)
+        refined = self.scene.reconstruction.pose_statuses == PoseStatus.REFINED
+        rigs = self.server.scene.add_batched_meshes_simple(
+            "/rigs",
+            *_pyramid(0.22 * self.size),
+            wxyz,
+            positions,
+            batched_colors=np.where(refined[:, None], _AFTER, _BAD).astype(np.uint8),
+            opacity=0.75,
+            flat_shading=True,
+            side="double",
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        rigs.on_click(lambda event: self._select(event.instance_index))
+        self.nodes["/rigs"] = rigs
+        self.nodes["/axes"] = self.server.scene.add_batched_axes(
+            "/axes",
+            wxyz,
+            positions,
+            axes_length=0.3 * self.size,
+            axes_radius=0.012 * self.size,
+            visible=False,
+        )
+
+    def _add_line(self, name: str, world_T_rigs: np.ndarray, color: tuple[int, int, int]) -> None:
+        positions = (self.scale * world_T_rigs[:, :3, 3]).astype(np.float32)
+        segments = np.stack([positions[:-1], positions[1:]], axis=1)
+        self.nodes[name] = self.server.scene.add_line_segments(
+            name, segments, color, thickness=0.03 * self.size
+        )
+
+    def _add_splats(self) -> None:
+        for splat in self.scene.splats:
+            name = f"/splat/{splat.name}"
+            self.nodes[name] = self.server.scene.add_gaussian_splats(
+                name,
+                self.scale * splat.means,
+                self.scale**2 * splat.covariances,
+                splat.colors,
+                splat.opacities,
+                visible=False,
+            )
+
+    def _add_controls(self) -> None:
+        gui, scene = self.server.gui, self.scene
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=_AFTER)
+        num = len(scene.reconstruction.points_world)
+        gui.add_markdown(
+            f"## {scene.name}\n{len(scene.frames)} frames, {num} points, {self._where()}"
+        )
+        with gui.add_folder("Frame"):
+            slider = gui.add_slider("Number", 0, len(scene.frames) - 1, 1, 0)
+            slider.on_update(lambda _: self.show(int(slider.value)))
+            self.controls["Number"] = slider
+            self.controls["about"] = gui.add_markdown("")
+            inside = gui.add_button(
+                "Stand inside", hint="Look out of the frame, into its pictures."
+            )
+            inside.on_click(lambda event: self._stand_inside(event.client))
+            whole = gui.add_button("See the whole run")
+            whole.on_click(lambda event: self._stand_outside(event.client))
+            self._add_switch("Pictures", "/frame")
+            self._add_switch("Points it sees", "/seen")
+            masks = gui.add_checkbox("Masks", False, visible=_has_masks(scene))
+            masks.on_update(lambda _: self.show(self.frame))
+            self.controls["Masks"] = masks
+        with gui.add_folder("Run"):
+            self._add_switch("Refined trajectory", "/refined")
+            self._add_switch("Coarse trajectory", "/coarse")
+            self._add_switch("Rigs", "/rigs")
+            self._add_switch("Rig axes", "/axes")
+            self._add_switch("Cloud", "/cloud")
+            size = gui.add_slider("Point size", 0.1, 5.0, 0.1, 1.0)
+            size.on_update(lambda _: self._resize_points(size.value))
+            for splat in scene.splats:
+                self._add_switch(f"Splat {splat.name}", f"/splat/{splat.name}")
+
+    def _add_switch(self, label: str, name: str) -> None:
+        """A box that shows and hides a node; none where there is no such node."""
+        if name in ("/frame", "/seen"):  # made with the first frame
+            visible = name == "/frame"
+        elif name in self.nodes:
+            visible = self.nodes[name].visible
+        else:
+            return
+        box = self.server.gui.add_checkbox(label, visible)
+        box.on_update(lambda _: setattr(self.nodes[name], "visible", box.value))
+        self.controls[label] = box
+
+    def _place_frame(self, f: int, faces: dict[str, np.ndarray]) -> None:
+        """Six pictures around the rig, and the points that have observations in it."""
+        add, found = self.server.scene, self.scene.reconstruction
+        world_T_rig = found.world_T_rigs[f]
+        position = self.scale * world_T_rig[:3, 3]
+        wxyz = quaternion_from_rotation(world_T_rig[:3, :3])
+        if "/frame" not in self.nodes:
+            self.nodes["/frame"] = add.add_frame("/frame", show_axes=False)
+        self.nodes["/frame"].wxyz, self.nodes["/frame"].position = wxyz, position
+        for name in FACES:
+            if name not in faces:
+                if name in self._faces:
+                    self._faces.pop(name).remove()
+                continue
+            if name in self._faces:
+                self._faces[name].image = faces[name]
+                continue
+            self._faces[name] = add.add_camera_frustum(
+                f"/frame/{name}",
+                np.pi / 2,
+                1.0,
+                scale=0.5 * self.size,
+                thickness=0.006 * self.size,
+                color=_AFTER,
+                image=faces[name],
+                format="jpeg",
+                jpeg_quality=_JPEG_QUALITY,
+                wxyz=quaternion_from_rotation(RIG_R_FACE[FACES.index(name)]),
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+        rows = found.observation_points[found.observation_frames == f]
+        self.nodes["/seen"] = add.add_point_cloud(
+            "/seen",
+            (self.scale * found.points_world[rows]).astype(np.float32),
+            _SEEN,
+            point_size=0.035 * self.size,
+            point_shape="circle",
+            point_shading="flat",
+            precision="float32",
+            visible=bool(self.controls["Points it sees"].value),
+        )
+
+    def _about(self, f: int, problem: str) -> str:
+        scene, quality = self.scene, self._quality
+        status = PoseStatus(scene.reconstruction.pose_statuses[f]).name.lower()
+        time = scene.frames.timestamps[f]
+        rows = [f"**{scene.frames.names[f]}** · {time:.3f} s · {status}"]
+        residual = quality.median_residuals_deg[f]
+        if np.isfinite(residual):
+            rows.append(
+                f"{quality.num_observations[f]} observations, median residual {residual:.4f}°"
+            )
+        if scene.coarse_T_rigs is not None:
+            shift = scene.reconstruction.world_T_rigs[f, :3, 3] - scene.coarse_T_rigs[f, :3, 3]
+            rows.append(f"moved {np.linalg.norm(shift):.3g} {scene.unit} by refining")
+        return "\n\n".join([*rows, *([f"No picture: {problem}"] if problem else [])])
+
+    def _where(self) -> str:
+        return f"{self.scene.grounds} ({self.scene.unit})"
+
+    def _select(self, f: int | None) -> None:
+        if f is not None:
+            self.controls["Number"].value = int(f)  # which shows it
+
+    def _resize_points(self, factor: float) -> None:
+        self.nodes["/cloud"].point_size = 0.02 * self.size * factor
+
+    def _place_camera(self) -> None:
+        camera, (position, centre) = self.server.initial_camera, self._outside()
+        camera.up, camera.position, camera.look_at = tuple(self.scene.up), position, centre
+
+    def _outside(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where to stand to see the whole path, and its middle."""
+        positions = self.scale * self.scene.reconstruction.world_T_rigs[:, :3, 3]
+        centre = (positions.min(axis=0) + positions.max(axis=0)) / 2
+        extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), 2 * self.size)
+        up = self.scene.up
+        level = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+        level /= np.linalg.norm(level)
+        return centre + extent * (0.7 * up + 0.7 * level), centre
+
+    def _stand_inside(self, client: "viser.ClientHandle | None") -> None:
+        if client is None:
+            return
+        world_T_rig = self.scene.reconstruction.world_T_rigs[self.frame]
+        centre, ahead = self.scale * world_T_rig[:3, 3], world_T_rig[:3, 2]
+        with client.atomic():
+            client.camera.position = centre
+            client.camera.look_at = centre + 0.05 * self.size * ahead
+
+    def _stand_outside(self, client: "viser.ClientHandle | None") -> None:
+        if client is None:
+            return
+        position, centre = self._outside()
+        with client.atomic():
+            client.camera.position = position
+            client.camera.look_at = centre
+
+
+def _has_masks(scene: Scene) -> bool:
+    return any(path is not None for path in scene.frames.mask_paths)
+
+
+def _pyramid(length: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (5, 3) and triangles (4, 3) of a pyramid from the origin along z, without a base.
+
+    Who stands in its apex looks right through it.
+    """
+    half = 0.6 * length
+    corners = [[-half, -half, length], [half, -half, length], [half, half, length]]
+    vertices = np.array([[0, 0, 0], *corners, [-half, half, length]], np.float32)
+    sides = [[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4]]
+    return vertices, np.array(sides, np.uint32)

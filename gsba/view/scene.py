@@ -1,0 +1,156 @@
+"""What there is to see of a finished run, as arrays in one world."""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gsba import cubemap, read
+from gsba.geometry import rotation_from_quaternion
+from gsba.log import GsbaError
+from gsba.pipeline import load_run
+from gsba.placement import Placement, read_placement
+from gsba.report_html.views import viewing_axes
+from gsba.rig import CubeRig
+from gsba.splat.gaussians import SH_CONSTANT, Gaussians
+from gsba.splat.ply import read_ply
+from gsba.types import FACES, FrameSet, Reconstruction
+
+logger = logging.getLogger(__name__)
+
+_MAX_FACE = 768  # pixels of a shown cube face
+_MASKED = np.array([192, 57, 43])  # what masks leave out is tinted in this colour
+_TINT = 0.6  # its share there
+
+
+@dataclass(frozen=True, slots=True)
+class Splat:
+    """Gaussians as viewers want them: without harmonics beyond the constant one."""
+
+    name: str
+    means: np.ndarray  # (N, 3) float32, world of the scene
+    covariances: np.ndarray  # (N, 3, 3) float32, squared units of that world
+    colors: np.ndarray  # (N, 3) float32, RGB, 0..1
+    opacities: np.ndarray  # (N, 1) float32, 0..1
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A run and what has been made of it, in one world."""
+
+    name: str
+    frames: FrameSet
+    reconstruction: Reconstruction  # refined poses and cloud
+    coarse_T_rigs: np.ndarray | None  # (F, 4, 4) float64 poses before; None = there were none
+    splats: tuple[Splat, ...]
+    up: np.ndarray  # (3,) float64, unit
+    unit: str  # of the world: "map units", "m", ...
+    grounds: str  # what places the world, for people
+    step: float  # median distance of neighbouring frames, > 0: how large to draw things
+
+
+def load_scene(run: Path) -> Scene:
+    """Everything of a finished run that can be shown.
+
+    The world is that of the run's last export which placed it elsewhere (upright, in metres, by
+    GPS or truth), or else the run's own; splats in RUN/splat are carried along.
+
+    Raises:
+        GsbaError: no finished run, or a splat or transform.json that cannot be read.
+    """
+    reconstruction, frames = load_run(run)
+    placement, grounds = _latest_placement(run)
+    placed = placement.apply(reconstruction)
+    axes, _ = viewing_axes(placed.world_T_rigs)
+    splats = (
+        _placed_splat(path.parent.name, read_ply(path), placement)
+        for path in sorted(run.glob("splat/*/point_cloud.ply"))
+    )
+    steps = np.linalg.norm(np.diff(placed.world_T_rigs[:, :3, 3], axis=0), axis=1)
+    moving = steps[steps > 1e-9 * (1 + steps.max(initial=0))]
+    return Scene(
+        name=run.resolve().name,
+        frames=frames,
+        reconstruction=placed,
+        coarse_T_rigs=_coarse(run, placement, len(frames)),
+        splats=tuple(splats),
+        up=_UPS[placement.up] if placement.up in _UPS else axes[2],
+        unit=placement.unit,
+        grounds=grounds,
+        step=float(np.median(moving)) if len(moving) else 1.0,
+    )
+
+
+_UPS = {"-y": np.array([0.0, -1.0, 0.0]), "z": np.array([0.0, 0.0, 1.0])}
+
+
+def faces_of(frames: FrameSet, f: int, masked: bool) -> dict[str, np.ndarray]:
+    """The cube faces of a frame, face name -> (size, size, 3) uint8 RGB.
+
+    Args:
+        frames: panoramas or cube faces; faces that were never taken are left out.
+        f: the frame.
+        masked: tint what its mask leaves out.
+
+    Raises:
+        GsbaError: pictures that have vanished or changed since the run.
+    """
+    native = frames.width if frames.layout == "cube" else frames.width // 4
+    rig = CubeRig(native if frames.layout == "cube" else min(native, _MAX_FACE), np.pi / 2)
+    images, use = cubemap.load(frames, f, rig)
+    if masked and use is not None and frames.mask_paths[f] is not None:
+        tinted = (1 - _TINT) * images[~use] + _TINT * _MASKED
+        images[~use] = np.round(tinted).astype(np.uint8)
+    names = frames.faces or FACES
+    return {name: _shrunk(images[FACES.index(name)]) for name in names}
+
+
+def _shrunk(image: np.ndarray) -> np.ndarray:
+    if len(image) <= _MAX_FACE:
+        return image
+    return cv2.resize(image, (_MAX_FACE, _MAX_FACE), interpolation=cv2.INTER_AREA)
+
+
+def _latest_placement(run: Path) -> tuple[Placement, str]:
+    """Where the run's latest export that moved it has put the world; else nowhere else."""
+    files = sorted(run.glob("*/transform.json"), key=lambda path: path.stat().st_mtime_ns)
+    for path in reversed(files):
+        placement = read_placement(path)
+        if placement.up is not None or not np.array_equal(placement.matrix, np.eye(4)):
+            return placement, f"placed as in {path.parent.name}"
+    return Placement(), "in the world of the trajectory"
+
+
+def _coarse(run: Path, placement: Placement, num_frames: int) -> np.ndarray | None:
+    """Poses (F, 4, 4) before, where the scene is; None where there were none."""
+    path = run / "coarse.tum"
+    if not path.exists():
+        return None
+    world_T_rigs = read.read_trajectory(path).world_T_rigs.copy()
+    if len(world_T_rigs) != num_frames:
+        logger.warning("%s is of other frames: it is not shown", path)
+        return None
+    world_T_rigs[:, :3, :3] = placement.rotation @ world_T_rigs[:, :3, :3]
+    world_T_rigs[:, :3, 3] = placement.points(world_T_rigs[:, :3, 3])
+    return world_T_rigs
+
+
+def _placed_splat(name: str, gaussians: Gaussians, placement: Placement) -> Splat:
+    """Gaussians moved to their place; colours are those of the constant harmonic."""
+    if not len(gaussians):
+        raise GsbaError(f"the splat {name!r} holds no Gaussians: train it again")
+    unit = gaussians.quaternions / np.linalg.norm(gaussians.quaternions, axis=1, keepdims=True)
+    axes = placement.rotation @ rotation_from_quaternion(unit)
+    factors = axes * (placement.scale * np.exp(gaussians.log_scales.astype(np.float64)))[:, None]
+    covariances = factors @ np.swapaxes(factors, 1, 2)
+    return Splat(
+        name,
+        placement.points(gaussians.means.astype(np.float64)).astype(np.float32),
+        covariances.astype(np.float32),
+        np.clip(0.5 + SH_CONSTANT * gaussians.sh[:, 0], 0, 1).astype(np.float32),
+        (1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64))))[:, None].astype(
+            np.float32
+        ),
+    )

@@ -1,0 +1,75 @@
+"""The server of a scene: viser's, for this machine alone."""
+
+import io
+import logging
+import socket
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from typing import TYPE_CHECKING
+
+from gsba.log import GsbaError
+from gsba.view.display import View
+from gsba.view.scene import Scene
+
+if TYPE_CHECKING:
+    import viser
+
+logger = logging.getLogger(__name__)
+
+HOST = "127.0.0.1"  # nobody else's business
+
+
+def serve(scene: Scene, port: int) -> View:
+    """Show a scene at http://127.0.0.1:PORT until the view is stopped; returns at once.
+
+    Args:
+        scene: see `load_scene`.
+        port: 1 to 65535, or 0 for any that is free (`view.server.get_port()`).
+
+    Raises:
+        GsbaError: viser is missing, or the port is not to be had.
+    """
+    open_server = _server_class()
+    _require_free(port)
+    with redirect_stdout(io.StringIO()):  # its banner would say less than the command line does
+        server = open_server(host=HOST, port=port, label=f"gsba: {scene.name}", verbose=False)
+    if port and server.get_port() != port:  # viser takes the next one rather than fail
+        with redirect_stdout(io.StringIO()):
+            server.stop()
+        raise GsbaError(_IN_USE.format(port=port))
+    return View(server, scene)
+
+
+_IN_USE = "port {port} of 127.0.0.1 is in use: pass another --port, or 0 for any that is free"
+
+
+def _server_class() -> "Callable[..., viser.ViserServer]":
+    """viser's server without its door to the world."""
+    try:
+        import viser
+    except ImportError as error:
+        raise GsbaError(
+            f"gsba view needs {error.name or 'viser'}: pip install 'gsba[view]'"
+        ) from None
+
+    class LocalServer(viser.ViserServer):
+        """Never asks for a public address, whatever page in the browser wants one."""
+
+        def request_share_url(self, verbose: bool = True) -> str | None:
+            logger.warning("a public address was asked for and refused")
+            return None
+
+    return LocalServer
+
+
+def _require_free(port: int) -> None:
+    if not 0 <= port <= 65535:
+        raise GsbaError(f"--port {port} is out of range: use 1 to 65535, or 0 for any")
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except PermissionError:
+            raise GsbaError(f"port {port} is reserved by the system: pass another --port") from None
+        except OSError:
+            raise GsbaError(_IN_USE.format(port=port)) from None

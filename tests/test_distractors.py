@@ -1,0 +1,142 @@
+"""What moves by itself is masked, what stands still is not; a run does it in two passes."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_run import SETTINGS, Case, computed_stages
+
+from gsba import refine
+from gsba.adjust import Adjustment
+from gsba.demo.people import make_people, paste_people
+from gsba.distractors import Distractors, Scene, distractor_mask
+from gsba.evaluate import evaluate
+from gsba.export.images import write_image
+from gsba.geometry import erp_from_bearings
+from gsba.log import GsbaError
+from gsba.masking import choose
+from gsba.read import load_erp, load_mask, read_trajectory
+from gsba.store import load_stage
+from gsba.types import FrameSet
+
+UP = np.array([0.0, -1.0, 0.0])  # of the gallery
+
+
+def _populated(case: Case, folder: Path) -> tuple[FrameSet, np.ndarray]:
+    """The tiny walk with people in front of it, and where they are, (F, H, 2H) bool."""
+    frames, poses = case.result.frames, case.truth.world_T_rigs
+    people = make_people(poses, 2, 1.6, UP, seed=1)
+    folder.mkdir()
+    outlines = []
+    for f, name in enumerate(frames.names):
+        image, outline = paste_people(load_erp(frames, f), poses[f], people, f)
+        write_image(folder / f"{name}.png", image)
+        outlines.append(outline)
+    rows = zip(frames.names, frames.timestamps.tolist(), strict=True)
+    (folder / "timestamps.csv").write_text("\n".join(f"{n}.png,{t!r}" for n, t in rows))
+    paths = tuple((folder / f"{name}.png",) for name in frames.names)
+    return dataclasses.replace(frames, paths=paths), np.stack(outlines)
+
+
+def _scene(case: Case, frames: FrameSet, known=None) -> Scene:
+    solved = load_stage(case.out, "refined1", Adjustment)
+    return Scene(frames, solved.world_T_rigs, solved.landmarks, known)
+
+
+def _overlap(found: np.ndarray, true: np.ndarray) -> float:
+    return float(np.sum(found & true) / np.sum(found | true))
+
+
+def test_people_are_found_and_nothing_else(case: Case, tmp_path: Path) -> None:
+    frames, true = _populated(case, tmp_path / "people")
+    assert 0.01 < true.mean() < 0.1
+    first = _scene(case, frames)
+    once = [distractor_mask(first.find(f)) for f in range(len(frames))]
+    again = _scene(case, frames, lambda f: once[f])
+    found = np.stack([distractor_mask(again.find(f)) for f in range(len(frames))])
+    assert found.shape == true.shape and found.dtype == bool
+    assert _overlap(found, true) >= 0.6 and np.mean(found & ~true) <= 0.01
+    assert _overlap(found, true) > _overlap(np.stack(once), true)
+    clean = _scene(case, case.result.frames)
+    shares = [clean.find(f).share for f in range(len(frames))]
+    assert np.mean(shares) <= 0.01
+
+
+def test_frames_that_cannot_be_judged_are_left_alone(case: Case) -> None:
+    """Too few points in common, or a pose so wrong that hardly anything fits."""
+    frames = case.result.frames
+    solved = load_stage(case.out, "refined1", Adjustment)
+    tracks = solved.landmarks.tracks
+    few = dataclasses.replace(solved.landmarks, points_world=solved.landmarks.points_world[:5])
+    kept = tracks.points < 5
+    few_tracks = dataclasses.replace(
+        tracks,
+        points=tracks.points[kept],
+        frames=tracks.frames[kept],
+        keypoints=tracks.keypoints[kept],
+        num_points=5,
+    )
+    few = dataclasses.replace(few, tracks=few_tracks)
+    alone = Scene(frames, solved.world_T_rigs, few).find(3)
+    assert "too few frames" in alone.reason and not distractor_mask(alone).any()
+    poses = solved.world_T_rigs.copy()
+    poses[3, :3, :3] = poses[3, :3, :3] @ np.diag([1.0, -1.0, -1.0])
+    wrong = Scene(frames, poses, solved.landmarks).find(3)
+    assert "fits no neighbour" in wrong.reason and wrong.share == 0
+
+
+def test_what_is_masked_already_is_not_judged(case: Case, tmp_path: Path) -> None:
+    frames, true = _populated(case, tmp_path / "people")
+    write_image(tmp_path / "own.png", np.where(true[2], 0, 255).astype(np.uint8))
+    masks = [None] * len(frames)
+    masks[2] = tmp_path / "own.png"
+    scene = _scene(case, dataclasses.replace(frames, mask_paths=tuple(masks)))
+    found = distractor_mask(scene.find(2))
+    assert not (found & true[2]).any() and found.mean() < 0.02
+
+
+def test_a_run_masks_people_in_a_second_pass(case: Case, tmp_path: Path) -> None:
+    """The given mask is kept, no observation is masked, and the second call resumes it all."""
+    frames, true = _populated(case, tmp_path / "people")
+    given = np.full(true.shape[1:], 255, np.uint8)
+    given[-20:] = 0
+    write_image(tmp_path / "given.png", given)
+    masks = [tmp_path / "given.png", "distractors"]
+
+    def run():
+        return refine(tmp_path / "people", case.slam, tmp_path / "run", SETTINGS, masks=masks)
+
+    result = run()
+    seen = erp_from_bearings(
+        result.reconstruction.observation_bearings, frames.width, frames.height
+    )
+    columns, rows = np.minimum(seen.astype(int), [frames.width - 1, frames.height - 1]).T
+    used = np.stack([load_mask(result.frames, f) for f in range(len(frames))])
+    assert used[result.reconstruction.observation_frames, rows, columns].all()
+    assert not used[:, -20:].any() and _overlap(~used[:, :-20], true[:, :-20]) >= 0.5
+    assert (tmp_path / "run/masks_check.jpg").exists()
+    assert len(list((tmp_path / "run/colmap/masks").rglob("*.png"))) == 6 * len(frames)
+    wrote = json.loads((tmp_path / "run/gsba.json").read_text())["wrote"]
+    assert f"masks/{frames.names[0]}.png" in wrote
+    stages = [stage["name"] for stage in result.report["stages"]]
+    assert stages.index("first-refined1") < stages.index("distractors") < stages.index("features")
+    errors = evaluate(read_trajectory(tmp_path / "run/trajectory.tum"), case.truth)
+    assert errors.ate.rmse < 1.5 * case.errors().ate.rmse
+    assert computed_stages(run()) == []
+
+
+def test_masks_are_chosen_by_name(tmp_path: Path) -> None:
+    both = choose([tmp_path, "auto"])
+    assert both.given == tmp_path and both.carrier and both.distractors
+    one = choose("carrier")
+    assert one.given is None and one.carrier and not one.distractors
+    assert choose(None) == choose([]) and choose(str(tmp_path)).given == tmp_path
+    with pytest.raises(GsbaError, match="give one file or one folder"):
+        choose([tmp_path, "other.png"])
+
+
+def test_masks_survive_being_packed() -> None:
+    mask = np.random.default_rng(0).random((7, 14)) > 0.5
+    np.testing.assert_array_equal(distractor_mask(Distractors(np.packbits(mask), 14, 0, "")), mask)

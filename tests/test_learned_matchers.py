@@ -1,0 +1,352 @@
+"""Learned matchers: every extractor with every matcher, on geometry that is known."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from learned_networks import (
+    EXTRACTORS,
+    OfficialSuperGlue,
+    lightglue,
+    official_lightglue,
+    save_extractors,
+    save_transparent_matchers,
+    torch,
+)
+from scipy.spatial.transform import Rotation
+from synthetic import features_of, unit
+
+from gsba import features, matching
+from gsba.config import RefineSettings
+from gsba.geometry import pose
+from gsba.learned import FaceMatcher, LearnedExtractor, make_matcher, overlapping_faces
+from gsba.learned.lightglue import LightGlue
+from gsba.learned.magicleap import SuperGlue
+from gsba.log import GsbaError
+from gsba.matching import Gate, SearchableFrames, guided
+from gsba.rig import CubeRig
+from gsba.types import FACES, Features
+
+RIG = CubeRig(96, np.deg2rad(96))
+COMBINATIONS = [
+    *((extractor, matcher) for extractor in EXTRACTORS for matcher in ("guided", "lightglue")),
+    ("superpoint", "superglue"),
+]
+TURN = pose(Rotation.from_rotvec([0, np.pi / 2, 0]).as_matrix(), np.zeros(3))  # a face to the right
+GATE = Gate(np.deg2rad(0.5), 0.01, np.deg2rad(1))
+SEES = {"front": "right", "right": "back", "back": "left", "left": "front"}  # frame 1 -> frame 0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("weights")
+
+
+@pytest.fixture(scope="module")
+def extractors(folder: Path) -> dict[str, Path]:
+    return save_extractors(folder)
+
+
+@pytest.fixture(scope="module")
+def matchers(folder: Path) -> dict[tuple[str, str], Path]:
+    return save_transparent_matchers(folder)
+
+
+@pytest.fixture(scope="module")
+def seen(extractors: dict[str, Path]) -> dict[str, tuple[Features, Features]]:
+    """By extractor, two frames at one place, the second turned to the right by one face."""
+    rng = np.random.default_rng(0)
+    faces = rng.integers(0, 256, (6, RIG.size, RIG.size, 3)).astype(np.uint8)
+    turned = faces.copy()
+    for face, source in SEES.items():
+        turned[FACES.index(face)] = faces[FACES.index(source)]
+    around = np.zeros((6, RIG.size, RIG.size), bool)
+    around[: len(SEES)] = True  # above and below, images turn too, and no network follows that
+    found = {}
+    for name in EXTRACTORS:
+        chosen = _settings(name).features
+        extractor = LearnedExtractor(chosen, extractors[name])
+        found[name] = tuple(
+            features.extract(views, around, RIG, extractor) for views in (faces, turned)
+        )
+    return found
+
+
+def _settings(extractor: str, matcher: str = "guided") -> RefineSettings:
+    chosen = {"extractor": extractor, "max_per_face": 60}
+    return RefineSettings.model_validate({"features": chosen, "matching": {"matcher": matcher}})
+
+
+def _frames(found: tuple[Features, ...], strongest: int | None = None) -> SearchableFrames:
+    return SearchableFrames(found.__getitem__, strongest)
+
+
+@pytest.mark.parametrize(("extractor", "matcher"), COMBINATIONS)
+def test_contract(
+    seen: dict[str, tuple[Features, Features]],
+    matchers: dict[tuple[str, str], Path],
+    extractor: str,
+    matcher: str,
+) -> None:
+    """What both frames see is matched to itself, once each, the same way every time, by threads
+    too; and a prediction that excludes it leaves nothing."""
+    settings, found = _settings(extractor, matcher), seen[extractor]
+    weights = {} if matcher == "guided" else {"matching": matchers[matcher, extractor]}
+    compare = make_matcher(settings, weights, RIG.size)
+    pairs, poses = np.array([[0, 1], [0, 1], [0, 1]]), np.array([np.eye(4), TURN])
+
+    def match(poses: np.ndarray, strongest: int | None, threads: int) -> matching.Matches:
+        frames, gates = _frames(found, strongest), [GATE] * len(pairs)
+        how = settings.matching, threads
+        return matching.run(pairs, poses, gates, frames, *how, matcher=compare)
+
+    matched = match(poses, None, 3)
+    rows = matched.of(0)
+    for p in (1, 2):
+        np.testing.assert_array_equal(rows, matched.of(p))
+    np.testing.assert_array_equal(rows, match(poses, None, 1).of(0))
+    assert rows.dtype == np.int32 and len(rows) > 0.9 * len(found[0])
+    assert all(len(np.unique(column)) == len(rows) for column in rows.T)
+    there = found[1].bearings_rig[rows[:, 1]] @ TURN[:3, :3].T
+    np.testing.assert_allclose(found[0].bearings_rig[rows[:, 0]], there, atol=1e-6)
+    few = match(poses, 10, 1).of(0)
+    assert 30 < len(few) <= 40 and set(map(tuple, few)) <= set(map(tuple, rows))
+    aside = np.array([np.eye(4), pose(Rotation.from_rotvec([0, 1.65, 0]).as_matrix(), [0, 0, 0])])
+    wrong = match(aside, None, 1).of(0)  # 4.5 degrees off, 1.5 allowed
+    assert not np.isin(rows[:, 0] * 10_000 + rows[:, 1], wrong @ [10_000, 1]).any()
+
+
+def _asked(
+    found: tuple[Features, Features], f0_T_f1: np.ndarray
+) -> tuple[list[tuple[str, str]], list[tuple]]:
+    """Pairs of faces that the network was shown, in order, and what it was shown."""
+    shown = []
+
+    def network(first, second, size):
+        shown.append((first, second, size))
+        return np.zeros((0, 2), int), np.zeros(0)
+
+    FaceMatcher(network, RIG.size)(
+        _frames(found), (0, 1), f0_T_f1, GATE, _settings("sift").matching
+    )
+    names = [
+        tuple(
+            FACES[int(view.faces[(view.pixels == side.pixels[0]).all(axis=1)][0])]
+            for view, side in zip(found, call[:2], strict=True)
+        )
+        for call in shown
+    ]
+    return names, shown
+
+
+def _all_around(seed: int, num: int = 1200) -> Features:
+    rng = np.random.default_rng(seed)
+    bearings = unit(rng.normal(size=(num, 3)))
+    found = features_of(bearings, rng.normal(size=(num, 8)).astype(np.float32))
+    order = np.argsort(found.faces, kind="stable")
+    return features_of(bearings[order], found.descriptors[order])
+
+
+def test_only_faces_that_should_overlap_are_compared() -> None:
+    views = _all_around(0), _all_around(1)
+    assert set(_asked(views, TURN)[0]) == {
+        *((there, here) for here, there in SEES.items()),
+        ("up", "up"),
+        ("down", "down"),
+    }
+    half = pose(Rotation.from_rotvec([0, np.pi / 4, 0]).as_matrix(), np.zeros(3))
+    asked = _asked(views, half)[0]
+    assert ("front", "front") in asked and ("right", "front") in asked
+    assert ("back", "front") not in asked and ("front", "right") not in asked
+
+
+def test_near_points_may_cross_to_the_next_face() -> None:
+    """Walking ahead, what is near moves from the front towards the back, never the other way."""
+    ahead = pose(np.eye(3), np.array([0, 0, 0.5]))
+    asked = set(_asked((_all_around(0), _all_around(1)), ahead)[0])
+    assert {(face, face) for face in FACES} <= asked
+    assert {("front", "right"), ("right", "back"), ("front", "down"), ("down", "back")} <= asked
+    assert not {("right", "front"), ("back", "right"), ("front", "back"), ("left", "right")} & asked
+
+
+def test_overlap_asks_either_frame() -> None:
+    """A face with few keypoints in sight of one with many counts by its own."""
+    few = _all_around(3, 60)
+    near = few.bearings_rig[few.bearings_rig[:, 2] > 0.9]
+    found = overlapping_faces(near, _all_around(1).bearings_rig, np.eye(4))
+    assert ("front", "front") in [(FACES[a], FACES[b]) for a, b in found]
+
+
+def test_the_network_sees_keypoints_of_the_face_as_they_are() -> None:
+    views = _all_around(0), _all_around(1)
+    names, shown = _asked(views, TURN)
+    first, second, size = shown[names.index(("right", "front"))]
+    rows = np.flatnonzero(views[0].faces == FACES.index("right"))
+    np.testing.assert_array_equal(first.pixels, views[0].pixels[rows])
+    np.testing.assert_array_equal(first.descriptors, views[0].descriptors[rows])
+    assert len(second.pixels) == (views[1].faces == FACES.index("front")).sum()
+    assert size == RIG.size
+
+
+def _twins(num: int = 60) -> tuple[Features, Features, np.ndarray]:
+    """Points around two places, each with a perfect copy ten degrees off its epipolar line."""
+    rng = np.random.default_rng(5)
+    step = np.array([0.5, 0.1, 0.2])
+    points = rng.uniform(2, 6, (num, 1)) * unit(rng.normal(size=(num, 3)))
+    there = unit(points - step)
+    copies = unit(there + np.tan(np.deg2rad(10)) * unit(np.cross(step, points)))
+    descriptors = np.repeat(np.eye(num, dtype=np.float32), 2, axis=0)[::2]
+    both = np.concatenate([copies, there]), np.concatenate([descriptors, descriptors])
+    return features_of(unit(points), descriptors), features_of(*both), step
+
+
+def test_repeated_structure_is_refused() -> None:
+    """A network that falls for the copies is believed only where the gate lets it."""
+    first, second, step = _twins()
+    num = len(first)
+
+    def fooled(one, other, size):
+        like = one.descriptors @ other.descriptors.T
+        rows, columns = np.nonzero(like > 0.5)
+        scores = np.where(columns < len(other.pixels) / 2, 0.9, 0.6)  # likes the copies better
+        return np.column_stack([rows, columns]), scores
+
+    matcher = FaceMatcher(fooled, 512)
+    views = _frames((first, second))
+    gate = Gate(np.deg2rad(1), 0.01, np.deg2rad(60))
+    settings = _settings("sift").matching
+    rows = matcher(views, (0, 1), pose(np.eye(3), step), gate, settings)
+    assert len(rows) > 0.5 * num and (rows[:, 1] == rows[:, 0] + num).all()
+    blind = matcher(views, (0, 1), pose(np.eye(3), step), Gate(0.5, 1, np.pi), settings)
+    assert (blind[:, 1] < num).mean() > 0.5  # what the gate is for
+
+
+def test_known_points_gate_learned_matches_too() -> None:
+    first, second, step = _twins()
+    num = len(first)
+
+    def fooled(one, other, size):
+        return np.argwhere(one.descriptors @ other.descriptors.T > 0.5), np.ones(10_000)
+
+    def network(one, other, size):
+        rows, scores = fooled(one, other, size)
+        return rows, scores[: len(rows)]
+
+    points = 3 * first.bearings_rig
+    points[::2] = np.nan
+    gate = Gate(np.pi, 1.0, np.pi, np.deg2rad(8))
+    given = _frames((first, second)), (0, 1), pose(np.eye(3), step), gate
+    rows = FaceMatcher(network, 512)(*given, _settings("sift").matching, points)
+    assert len(rows) and (rows[:, 0] % 2 == 1).all()
+    seen_at = unit(points[rows[:, 0]] - step)
+    assert (
+        np.arccos((seen_at * second.bearings_rig[rows[:, 1]]).sum(axis=1)) < gate.point_rad
+    ).all()
+    assert num > len(rows)
+
+
+@pytest.mark.parametrize("extractor", EXTRACTORS)
+def test_lightglue_loads_the_authors_layout(extractor: str, tmp_path: Path) -> None:
+    """The same network as kornia's under kornia's own names, with all that adapts switched off."""
+    torch.manual_seed(1)
+    model = lightglue(extractor)
+    own, official = tmp_path / "own.pth", tmp_path / "official.pth"
+    torch.save(model.state_dict(), own)
+    prefix = "matcher." if extractor == "xfeat" else ""
+    state = official_lightglue(model.state_dict(), model.conf.n_layers, prefix)
+    assert not state.keys() & {name for name in model.state_dict() if "attn" in name}
+    torch.save(state, official)
+    loaded = [LightGlue(extractor, path)._model for path in (own, official)]
+    for name, value in model.state_dict().items():
+        for other in loaded:
+            torch.testing.assert_close(other.state_dict()[name], value)
+    assert not loaded[0].training and not loaded[0].conf.flash
+    assert loaded[0].conf.depth_confidence == loaded[0].conf.width_confidence == -1
+
+
+def _face(seed: int, num: int, size: int, dim: int) -> features.FaceKeypoints:
+    rng = np.random.default_rng(seed)
+    return features.FaceKeypoints(
+        rng.uniform(0, size, (num, 2)),
+        np.full(num, 0.5),
+        unit(rng.normal(size=(num, dim))).astype(np.float32),
+        rng.uniform(0.1, 1, num).astype(np.float32),
+    )
+
+
+def test_lightglue_counts_pixels_from_the_first_centre(
+    matchers: dict[tuple[str, str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    glue, given = LightGlue("aliked", matchers["lightglue", "aliked"]), []
+    answer = {"matches": [torch.tensor([[2, 1]])], "scores": [torch.tensor([0.5])]}
+    monkeypatch.setattr(glue, "_model", lambda data: (given.append(data), answer)[1])
+    face = _face(0, 5, 96, 128)
+    face.pixels[0] = [0.1, 95.9]  # nearer to the border than a centre: LightGlue refuses beyond
+    matched, scores = glue(face, face, 96)
+    np.testing.assert_array_equal(matched, [[2, 1]])
+    sent = given[0]["image0"]
+    np.testing.assert_allclose(sent["keypoints"][0, 1:], face.pixels[1:] - 0.5, atol=1e-5)
+    np.testing.assert_allclose(sent["keypoints"][0, 0], [0, 95])
+    assert sent["image_size"].tolist() == [[96, 96]] and scores.tolist() == [0.5]
+
+
+def test_superglue_is_that_of_the_paper(tmp_path: Path) -> None:
+    """Random weights in the authors' layout give the probabilities of the paper's network, with
+    faces of different numbers of keypoints."""
+    torch.manual_seed(2)
+    model = OfficialSuperGlue().eval()
+    with torch.no_grad():
+        for module in model.modules():  # norms that do something
+            if isinstance(module, torch.nn.BatchNorm1d):
+                module.running_mean.normal_(0, 0.1)
+                module.running_var.uniform_(0.5, 1.5)
+        model.final_proj.weight.mul_(30)  # decided enough to pass the threshold
+    path = tmp_path / "superglue_outdoor.pth"
+    torch.save(model.state_dict(), path)
+    faces = _face(3, 40, 128, 256), _face(4, 25, 128, 256)
+    matched, scores = SuperGlue(path)(*faces, 128)
+    sides = [
+        [
+            torch.from_numpy(np.asarray(x, np.float32))
+            for x in (f.pixels - 0.5, f.descriptors, f.scores)
+        ]
+        for f in faces
+    ]
+    with torch.inference_mode():
+        likely = model(sides, 128).numpy()
+    rows, columns = np.nonzero(
+        (likely == likely.max(axis=1, keepdims=True))
+        & (likely == likely.max(axis=0, keepdims=True))
+        & (likely > 0.2)
+    )
+    assert len(rows) > 3
+    np.testing.assert_array_equal(matched, np.column_stack([rows, columns]))
+    np.testing.assert_allclose(scores, likely[rows, columns], rtol=1e-3)
+    swapped, _ = SuperGlue(path)(*faces[::-1], 128)
+    assert set(map(tuple, swapped[:, ::-1])) == set(map(tuple, matched))
+
+
+def test_wrong_weights_are_one_line(
+    extractors: dict[str, Path], matchers: dict[tuple[str, str], Path]
+) -> None:
+    for extractor, matcher, path, usual in (
+        ("aliked", "lightglue", extractors["aliked"], "aliked_lightglue"),
+        ("disk", "lightglue", matchers["lightglue", "superpoint"], "disk_lightglue"),
+        ("superpoint", "lightglue", matchers["lightglue", "aliked"], "superpoint_lightglue"),
+        ("superpoint", "superglue", matchers["lightglue", "aliked"], "superglue_outdoor"),
+    ):
+        with pytest.raises(
+            GsbaError, match=f"weights of another network than .*{usual}"
+        ) as failure:
+            make_matcher(_settings(extractor, matcher), {"matching": path}, 96)
+        assert "\n" not in str(failure.value)
+
+
+def test_the_default_is_our_own_search() -> None:
+    assert make_matcher(RefineSettings(), {}, 96) is guided
+
+
+@pytest.mark.parametrize(("extractor", "matcher"), [("sift", "lightglue"), ("disk", "superglue")])
+def test_matchers_go_with_their_extractors(extractor: str, matcher: str) -> None:
+    with pytest.raises(ValueError, match=r"needs features\.extractor = "):
+        _settings(extractor, matcher)

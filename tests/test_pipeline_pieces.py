@@ -1,0 +1,152 @@
+"""The command line on trajectories in pieces, on two places at once, and on what cannot be used."""
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tiny_run import NUM_FRAMES, SETTINGS, Case
+from typer.testing import CliRunner, Result
+
+from gsba import load_run
+from gsba.cli import app
+from gsba.demo.gallery import build_gallery
+from gsba.demo.render import render_erp
+from gsba.demo.walk import walk_poses
+from gsba.evaluate import evaluate
+from gsba.geometry import pose, rotation_angle
+from gsba.read import read_trajectory, write_tum
+from gsba.segments import IMAGES, carried
+from gsba.types import PoseStatus, Trajectory
+
+SCALE = 1.7
+MOVE = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -3.0, 8.0]))
+SET = (
+    f"cubemap.oversampling={SETTINGS.cubemap.oversampling}",
+    f"features.max_per_face={SETTINGS.features.max_per_face}",
+    'export.formats=["colmap-flat"]',
+)
+
+
+def _refine(out: Path, frames: Path, *trajectories: Path, options: tuple[str, ...] = ()) -> Result:
+    command = ["--quiet", "refine", frames, *trajectories, "--out", out, *options]
+    for change in SET:
+        command += ["--set", change]
+    return CliRunner().invoke(app, [str(part) for part in command])
+
+
+def _report(out: Path) -> dict:
+    return json.loads((out / "report.json").read_text())
+
+
+def _write(folder: Path, poses: dict[str, Trajectory]) -> list[Path]:
+    for name, trajectory in poses.items():
+        write_tum(folder / name, trajectory)
+    return [folder / name for name in poses]
+
+
+def test_two_files_with_worlds_of_their_own_are_joined(case: Case, tmp_path: Path) -> None:
+    slam = read_trajectory(case.slam)
+    half, times = NUM_FRAMES // 2, slam.timestamps
+    first = Trajectory(times[:half], slam.world_T_rigs[:half])
+    second = Trajectory(times[half:], carried(slam.world_T_rigs[half:], SCALE, MOVE))
+    files = _write(tmp_path, {"a.tum": first, "b.tum": second})
+    out = tmp_path / "run"
+    result = _refine(out, case.frames, *files)
+    assert result.exit_code == 0, result.output
+    (joint,) = _report(out)["trajectory"]["joints"]
+    assert (joint["first"], joint["last"], joint["how"]) == ("000004", "000007", IMAGES)
+    assert joint["scale"] == pytest.approx(1 / SCALE, rel=0.05)  # the walk itself drifts
+    assert any("begins anew at 000004" in note for note in _report(out)["notes"])
+    errors, clean = case.errors(out), case.errors()
+    assert errors.num_matched == NUM_FRAMES and errors.ate.rmse < 1.5 * clean.ate.rmse
+    assert errors.rpe_rotation_deg.median < 2 * clean.rpe_rotation_deg.median
+
+
+def test_of_two_places_the_larger_is_exported_and_the_other_listed(
+    case: Case, tmp_path: Path
+) -> None:
+    """Behind the walk comes its mirror image, which no rigid camera can see there."""
+    frames, others = tmp_path / "frames", NUM_FRAMES - 2
+    frames.mkdir()
+    for path in sorted(case.frames.glob("*.jpg")):
+        (frames / path.name).symlink_to(path)
+        number = int(path.stem) - (NUM_FRAMES - others)
+        if number >= 0:
+            image = cv2.imread(str(path))
+            assert image is not None
+            cv2.imwrite(str(frames / f"{NUM_FRAMES + number:06d}.jpg"), image[:, ::-1])
+    out = tmp_path / "run"
+    result = _refine(out, frames, options=("--no-trajectory", "--fps", "2"))
+    assert result.exit_code == 0, result.output
+    names = [f"{f:06d}" for f in range(NUM_FRAMES + others)]
+    report = _report(out)
+    assert report["trajectory"]["maps"] == [names[:NUM_FRAMES], names[NUM_FRAMES:]]
+    assert report["summary"]["refined"] == len(names)
+    assert any("nothing ties 2 places together" in note for note in report["notes"])
+    errors = evaluate(read_trajectory(out / "trajectory.tum"), case.truth)
+    assert errors.num_matched == NUM_FRAMES and errors.ate.rmse < 1.5 * case.errors().ate.rmse
+    with (out / "poses.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["map"] for row in rows] == ["0"] * NUM_FRAMES + ["1"] * others
+    assert all(int(row["num_observations"]) > 100 for row in rows)
+    images = {path.name[:6] for path in (out / "colmap-flat/images").iterdir()}
+    assert images == set(names[:NUM_FRAMES])
+    reconstruction, shown = load_run(out)
+    assert shown.names == tuple(names[:NUM_FRAMES]) and len(reconstruction.points_world) > 100
+    assert reconstruction.observation_frames.max() == NUM_FRAMES - 1
+
+
+def test_a_tripod_gives_rotations_only(tmp_path: Path) -> None:
+    frames, num = tmp_path / "frames", 5
+    frames.mkdir()
+    turns = [[0.1 * np.sin(f), 0.5 * f, 0.05 * np.cos(f)] for f in range(num)]
+    rotations, place = Rotation.from_rotvec(turns).as_matrix(), np.array([-4.4, -1.5, 0.0])
+    gallery, rng = build_gallery(), np.random.default_rng(0)
+    for f, rotation in enumerate(rotations):
+        image = render_erp(gallery, pose(rotation, place), 512, 256)
+        image = image + 2 * rng.standard_normal(image.shape)
+        cv2.imwrite(str(frames / f"{f}.png"), np.clip(image[..., ::-1], 0, 255).astype(np.uint8))
+    out = tmp_path / "run"
+    result = _refine(out, frames, options=("--no-trajectory", "--fps", "1"))
+    assert result.exit_code == 0, result.output
+    assert "5 of 5 frames refined, rotations only, no points" in result.output
+    assert any("no depth can be had, rotations only" in note for note in _report(out)["notes"])
+    reconstruction, _ = load_run(out)
+    found = reconstruction.world_T_rigs[:, :3, :3]
+    relative, true = found[0].T @ found, rotations[0].T @ rotations
+    off = rotation_angle(np.swapaxes(relative, 1, 2) @ true)
+    assert np.degrees(off).max() < 0.05  # a pixel is 0.7 degrees
+    sigmas = np.sqrt(np.diagonal(reconstruction.pose_covariances, axis1=1, axis2=2))
+    assert (sigmas[1:, :3] > 0).all() and np.degrees(sigmas[1:, :3]).max() < 0.05
+    assert np.isnan(sigmas[:, 3:]).all()
+    assert (reconstruction.pose_statuses == PoseStatus.REFINED).all()
+    assert len(reconstruction.points_world) == 0
+
+
+def test_a_trajectory_of_another_video_is_refused(case: Case, tmp_path: Path) -> None:
+    other = walk_poses("oval", "forward", 3 * NUM_FRAMES, seed=3)
+    times = read_trajectory(case.slam).timestamps
+    (path,) = _write(tmp_path, {"o.tum": Trajectory(times, other.world_T_rigs[:NUM_FRAMES])})
+    result = _refine(tmp_path / "run", case.frames, path)
+    assert result.exit_code == 1 and len(result.stderr.splitlines()) == 1
+    assert "of another recording or on another clock" in result.stderr
+    assert not (tmp_path / "run/trajectory.tum").exists()
+
+
+def test_poses_that_are_all_the_same_are_refused(case: Case, tmp_path: Path) -> None:
+    times = read_trajectory(case.slam).timestamps
+    (path,) = _write(tmp_path, {"s.tum": Trajectory(times, np.tile(np.eye(4), (len(times), 1, 1)))})
+    result = _refine(tmp_path / "run", case.frames, path)
+    assert result.exit_code == 1
+    assert f"all {NUM_FRAMES} poses of the trajectory are identical" in result.stderr
+
+
+def test_keyframes_go_with_one_trajectory(case: Case, tmp_path: Path) -> None:
+    given = (case.slam, case.slam)
+    options = ("--keyframes", str(case.slam))
+    result = _refine(tmp_path / "run", case.frames, *given, options=options)
+    assert result.exit_code == 1 and "keyframes go with one trajectory" in result.stderr

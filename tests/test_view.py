@@ -1,0 +1,299 @@
+"""`gsba view`: what is in the scene, where it is, who can reach it, and how it fails."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tiny_run import NUM_FRAMES, Case
+from typer.testing import CliRunner
+
+from gsba import view
+from gsba.cli import app
+from gsba.geometry import rotation_from_quaternion
+from gsba.log import GsbaError
+from gsba.placement import Placement, read_placement
+from gsba.rig import RIG_R_FACE, CubeRig
+from gsba.splat import Gaussians, write_ply
+from gsba.types import FACES
+
+TURN = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix()
+PLACED = Placement(2.5, TURN, np.array([3.0, -1.0, 7.0]), "m", "z")
+
+
+@pytest.fixture(scope="module")
+def run(case: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run with a splat of three Gaussians."""
+    out = case.copy(tmp_path_factory.mktemp("view") / "walk")
+    rng = np.random.default_rng(0)
+    quaternions = rng.normal(size=(3, 4)).astype(np.float32)
+    scales = np.log(rng.uniform(0.01, 0.3, (3, 3))).astype(np.float32)
+    means, sh = rng.normal(size=(3, 3)), rng.normal(size=(3, 4, 3))
+    splat = Gaussians(
+        means.astype(np.float32),
+        scales,
+        quaternions,
+        np.array([-1, 0, 2], np.float32),
+        sh.astype(np.float32),
+    )
+    (out / "splat" / "refined").mkdir(parents=True)
+    write_ply(out / "splat" / "refined" / "point_cloud.ply", splat)
+    return out
+
+
+@pytest.fixture(scope="module")
+def scene(run: Path) -> view.Scene:
+    return view.load_scene(run)
+
+
+@pytest.fixture
+def shown(scene: view.Scene) -> Iterator[view.View]:
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'gsba[view]'")
+    started = view.serve(scene, 0)
+    yield started
+    started.stop()
+
+
+def test_the_scene_is_the_run(case: Case, scene: view.Scene) -> None:
+    found = case.result.reconstruction
+    assert np.array_equal(scene.reconstruction.world_T_rigs, found.world_T_rigs)
+    assert np.array_equal(scene.reconstruction.points_world, found.points_world)
+    assert scene.coarse_T_rigs is not None
+    assert np.allclose(scene.coarse_T_rigs, case.result.coarse.world_T_rigs, atol=1e-8)
+    assert (scene.unit, scene.name) == ("map units", "walk")
+    assert np.dot(scene.up, -found.world_T_rigs[:, :3, 1].mean(axis=0)) > 0.99
+    steps = np.linalg.norm(np.diff(found.world_T_rigs[:, :3, 3], axis=0), axis=1)
+    assert scene.step == pytest.approx(np.median(steps))
+
+
+def test_the_scene_is_placed_as_the_latest_export(run: Path, scene: view.Scene) -> None:
+    first, second = run / "first", run / "second"
+    first.mkdir()
+    second.mkdir()
+    PLACED.write(first / "transform.json")
+    os.utime(first / "transform.json", ns=(2**61, 2**61))  # after any export so far
+    Placement().write(second / "transform.json")  # moves nothing: does not count
+    os.utime(second / "transform.json", ns=(2**61 + 1, 2**61 + 1))
+    try:
+        placed = view.load_scene(run)
+    finally:
+        shutil.rmtree(first)
+        shutil.rmtree(second)
+    assert (placed.unit, placed.grounds) == ("m", "placed as in first")
+    assert placed.up.tolist() == [0, 0, 1]
+    assert placed.step == pytest.approx(2.5 * scene.step)
+    for before, after in (
+        (scene.reconstruction.points_world, placed.reconstruction.points_world),
+        (scene.splats[0].means, placed.splats[0].means),
+        (_positions(scene.coarse_T_rigs), _positions(placed.coarse_T_rigs)),
+    ):
+        assert np.allclose(after, PLACED.points(before.astype(np.float64)), atol=1e-5)
+    turned = 2.5**2 * TURN @ scene.splats[0].covariances @ TURN.T
+    assert np.allclose(placed.splats[0].covariances, turned, rtol=1e-4, atol=1e-6)
+    assert scene.coarse_T_rigs is not None and placed.coarse_T_rigs is not None
+    assert np.allclose(placed.coarse_T_rigs[:, :3, :3], TURN @ scene.coarse_T_rigs[:, :3, :3])
+
+
+def _positions(poses: np.ndarray | None) -> np.ndarray:
+    assert poses is not None
+    return poses[:, :3, 3]
+
+
+def test_gaussians_are_what_the_file_says(run: Path, scene: view.Scene) -> None:
+    from gsba.splat import read_ply
+
+    stored, (shown_splat,) = read_ply(run / "splat/refined/point_cloud.ply"), scene.splats
+    assert shown_splat.name == "refined"
+    for i in range(3):
+        q = stored.quaternions[i].astype(np.float64)
+        axes = rotation_from_quaternion(q / np.linalg.norm(q))
+        wanted = axes @ np.diag(np.exp(2.0 * stored.log_scales[i])) @ axes.T
+        assert np.allclose(shown_splat.covariances[i], wanted, rtol=1e-4, atol=1e-8)
+    sigmoid = 1 / (1 + np.exp([1.0, 0, -2]))
+    assert np.allclose(shown_splat.opacities[:, 0], sigmoid, atol=1e-6)
+    wanted = np.clip(0.5 + 0.28209479 * stored.sh[:, 0], 0, 1)
+    assert np.allclose(shown_splat.colors, wanted, atol=1e-6)
+
+
+def test_placements_survive_their_file(tmp_path: Path) -> None:
+    placed = replace(PLACED, offset=np.array([5e5, 1, 2]), origin=(48.1, 11.5, 520.0))
+    placed.write(tmp_path / "transform.json")
+    assert read_placement(tmp_path / "transform.json").to_json() == placed.to_json()
+    for content in ("{}", "no json", "[1]", json.dumps({**PLACED.to_json(), "rotation": [1]})):
+        (tmp_path / "transform.json").write_text(content)
+        with pytest.raises(GsbaError, match=r"transform\.json: not a transform\.json of gsba"):
+            read_placement(tmp_path / "transform.json")
+
+
+def test_pictures_are_tinted_where_masks_are(case: Case, tmp_path: Path) -> None:
+    frames = case.result.frames
+    mask = np.full((frames.height, frames.width), 255, np.uint8)
+    mask[5 * frames.height // 8 :] = 0  # 22.5 degrees below the horizon and further down
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    masked = replace(frames, mask_paths=(tmp_path / "mask.png",) * len(frames))
+    plain, tinted = view.faces_of(masked, 0, False), view.faces_of(masked, 0, True)
+    assert tuple(plain) == FACES and plain["front"].shape == (128, 128, 3)
+    pixels = np.stack(np.meshgrid(np.arange(128), np.arange(128)), axis=-1) + 0.5
+    for c, name in enumerate(FACES):
+        below = np.degrees(np.arcsin(CubeRig(128, np.pi / 2).bearings(pixels, c)[..., 1])) - 22.5
+        changed = np.any(plain[name] != tinted[name], axis=-1)
+        sure = np.abs(below) > 1  # degree: more than the mask's pixel
+        assert np.array_equal(changed[sure], below[sure] > 0), name
+    unmasked = view.faces_of(frames, 0, True)
+    assert all(np.array_equal(unmasked[name], plain[name]) for name in FACES)
+
+
+def test_everything_is_on_show(scene: view.Scene, shown: view.View) -> None:
+    nodes = shown.nodes
+    wanted = {"/cloud", "/refined", "/coarse", "/rigs", "/axes", "/frame", "/seen"}
+    assert nodes.keys() == wanted | {"/splat/refined"}
+    assert len(nodes["/cloud"].points) == len(scene.reconstruction.points_world)
+    assert len(nodes["/refined"].points) == len(nodes["/coarse"].points) == NUM_FRAMES - 1
+    assert len(nodes["/rigs"].batched_positions) == NUM_FRAMES
+    assert len(nodes["/axes"].batched_positions) == NUM_FRAMES
+    positions = shown.scale * scene.reconstruction.world_T_rigs[:, :3, 3]
+    assert np.allclose(nodes["/rigs"].batched_positions, positions, atol=1e-5)
+    assert shown.scale * scene.step == pytest.approx(1)
+    switches = {"Refined trajectory", "Coarse trajectory", "Rigs", "Cloud", "Splat refined"}
+    assert switches < shown.controls.keys()
+    assert not shown.controls["Masks"].visible  # there are none
+
+
+def test_switches_show_and_hide(shown: view.View) -> None:
+    for label, name in (("Coarse trajectory", "/coarse"), ("Splat refined", "/splat/refined")):
+        before = shown.nodes[name].visible
+        shown.controls[label].value = not before
+        _wait_for(lambda name=name, before=before: shown.nodes[name].visible == (not before))
+
+
+def test_a_clicked_rig_shows_its_pictures(scene: view.Scene, shown: view.View) -> None:
+    shown._select(3)
+    _wait_for(lambda: shown.frame == 3)
+    world_T_rig = scene.reconstruction.world_T_rigs[3]
+    node = shown.nodes["/frame"]
+    assert np.allclose(node.position, shown.scale * world_T_rig[:3, 3])
+    assert np.allclose(rotation_from_quaternion(node.wxyz), world_T_rig[:3, :3], atol=1e-6)
+    seen = scene.reconstruction.observation_frames == 3
+    assert len(shown.nodes["/seen"].points) == seen.sum() > 0
+    assert f"**{scene.frames.names[3]}**" in shown.controls["about"].content
+    assert shown._faces.keys() == set(FACES)
+    for name, face in shown._faces.items():
+        turn = rotation_from_quaternion(face.wxyz)
+        assert np.allclose(turn, RIG_R_FACE[FACES.index(name)], atol=1e-6)
+
+
+def test_a_frame_whose_picture_is_gone_says_so(scene: view.Scene) -> None:
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'gsba[view]'")
+    gone = (*scene.frames.paths[:-1], (Path("nowhere.jpg"),))
+    shown = view.serve(replace(scene, frames=replace(scene.frames, paths=gone)), 0)
+    try:
+        shown.show(NUM_FRAMES - 1)
+        assert "No picture: nowhere.jpg" in shown.controls["about"].content
+        assert not shown._faces
+        shown.show(0)
+        assert len(shown._faces) == 6
+    finally:
+        shown.stop()
+
+
+def test_only_this_machine_is_served(shown: view.View) -> None:
+    port = shown.server.get_port()
+    assert shown.server.get_host() == "127.0.0.1"
+    assert {address for address, at in _listening() if at == port} == {"127.0.0.1"}
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10) as page:
+        assert page.status == 200
+    assert shown.server.request_share_url() is None  # no tunnel, whoever asks
+
+
+def _listening() -> set[tuple[str, int]]:
+    """Addresses and ports of all listening IPv4 sockets, and of IPv6 ones as ("::", port)."""
+    found = set()
+    for name in ("tcp", "tcp6"):
+        table = Path("/proc/net") / name
+        for row in table.read_text().splitlines()[1:] if table.exists() else ():
+            local, state = row.split()[1], row.split()[3]
+            host, port = local.split(":")
+            if state == "0A":
+                address = "::" if name == "tcp6" else socket.inet_ntoa(bytes.fromhex(host)[::-1])
+                found.add((address, int(port, 16)))
+    return found
+
+
+def _wait_for(happened, seconds: float = 10.0) -> None:
+    """Callbacks run in threads of their own."""
+    end = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.02)
+
+
+def _view_fails(*arguments: object) -> str:
+    result = CliRunner().invoke(app, ["view", *map(str, arguments)])
+    lines = result.stderr.splitlines()
+    assert (result.exit_code, result.stdout, len(lines)) == (1, "", 1), result.stderr
+    return lines[0]
+
+
+def test_a_port_in_use_is_one_line(run: Path) -> None:
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'gsba[view]'")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        line = _view_fails(run, "--port", port)
+    assert line == (
+        f"error: port {port} of 127.0.0.1 is in use: pass another --port, or 0 for any that is free"
+    )
+    assert "out of range" in _view_fails(run, "--port", 70000)
+
+
+def test_without_viser_there_is_a_hint(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert "pip install 'gsba[view]'" in _view_fails(run, "--port", 0)
+
+
+def test_no_run_and_half_a_run_are_one_line(run: Path, tmp_path: Path) -> None:
+    assert "is not a gsba run" in _view_fails(tmp_path / "nothing")
+    half = Path(shutil.copytree(run, tmp_path / "half"))
+    (half / "stages/reconstruction.npz").unlink()
+    assert "to the end" in _view_fails(half)
+    broken = Path(shutil.copytree(run, tmp_path / "broken"))
+    (broken / "splat/refined/point_cloud.ply").write_bytes(b"ply\n")
+    assert "point_cloud.ply" in _view_fails(broken)
+
+
+def test_ctrl_c_ends_it_quietly(run: Path) -> None:
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'gsba[view]'")
+    script = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"from gsba.cli import app; app(['view', {str(run)!r}, '--port', '0'])"
+    )
+    root = Path(view.__file__).parents[2]
+    process = subprocess.Popen(
+        [sys.executable, "-c", script],
+        env={**os.environ, "PYTHONPATH": str(root), "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    try:
+        first = process.stdout.readline()
+        assert first.startswith("http://127.0.0.1:") and "Ctrl-C ends it" in first
+        process.send_signal(signal.SIGINT)
+        rest, errors = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert (process.returncode, rest.strip(), errors) == (0, "", "")
