@@ -54,9 +54,8 @@ def run(
 ) -> Sighted:
     """Observe every point anew, in the frames that should show it.
 
-    The patch around a point is cut from the frame in the middle of its observations, as a plane
-    facing it; poses and depth carry it into others, where shift, a small affine change, gain and
-    offset are found. Images are wanted twice, one per thread at a time.
+    The patch around a point is cut from the middle frame of its views, as a plane facing it; poses
+    and depth carry it into others, where shift, affine part, gain and offset are found.
 
     Args:
         landmarks: points and their observations so far.
