@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba import read, registered, turning, video
+from gsba import read, registered, tripod, video
 from gsba.adjust import Adjustment
 from gsba.carrier import Carrier, find_carrier, write_carrier
 from gsba.components import largest, taken
@@ -130,7 +130,7 @@ def _turned(line: Line, trust: Trust) -> Reconstruction:
     key = [settings.matching, settings.rounds.min_observations]
 
     def compute() -> Reconstruction:
-        return turning.run(line.context, trust.world_T_rigs, line.coarse)
+        return tripod.run(line.context, trust.world_T_rigs, line.coarse)
 
     return line.store.stage("reconstruction", key, compute, Reconstruction, [line.latest])
 

@@ -30,7 +30,7 @@ FLOORS = (
         "photometric",
         "places",
     }
-    | {"meetings", "parts", "registered", "resection", "segments", "turning"}
+    | {"meetings", "parts", "registered", "resection", "segments", "tripod"}
     | {"reconstruction", "recovery", "splat_align", "splatting"},
     {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"}
     | {"alignment", "carrier", "gravity", "placement"},
