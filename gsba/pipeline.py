@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsba import inputs, masking, photometric, read, results, rotation_only, timing, video
+from gsba import inputs, masking, photometric, read, results, timing, tripod, video
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.line import Line
@@ -118,7 +118,7 @@ def _turned(line: Line) -> Reconstruction:
     key = [settings.matching, settings.rounds.min_observations]
 
     def compute() -> Reconstruction:
-        return rotation_only.run(line.context, line.start().world_T_rigs, line.coarse)
+        return tripod.run(line.context, line.start().world_T_rigs, line.coarse)
 
     return line.store.stage("reconstruction", key, compute, Reconstruction, [line.latest])
 

@@ -83,7 +83,7 @@ def describe(
             f"the trajectory begins anew at {names[joint.first]}: joined by {joint.how}, "
             f"scale {joint.scale:.4g}"
         )
-    judgement: dict[str, Any] = {"joints": pieces}
+    judgement: dict[str, Any] = {"joints": pieces} if pieces else {}
     if registered is None:
         return judgement, notes
     alone, lost = names[registered.alone].tolist(), names[registered.lost].tolist()

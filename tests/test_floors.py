@@ -15,7 +15,6 @@ import gsba
 ROOT = Path(__file__).parents[1]
 FLOORS = (
     {"factors"},
-<<<<<<< HEAD
     {"", "config", "config_file", "geometry", "log", "types"},
     {"panorama", "read", "records", "rig", "run_folder", "search", "store", "sweep"}
     | {"turning", "views"},
@@ -23,24 +22,12 @@ FLOORS = (
     | {"patch_grid", "splat", "tracks", "triangulate", "verify"},
     {"adjust", "blame", "clock", "clock_fit", "components", "frontend", "learned"}
     | {"meetings", "misfit", "motion", "parts", "photometric", "places", "pose_graph"}
-    | {"reconstruction", "recovery", "registered", "resection", "rotation_only", "segments"}
-    | {"splat_align", "splat_refine", "splatting", "stitching"},
+    | {"reconstruction", "recovery", "registered", "resection", "segments"}
+    | {"splat_align", "splat_refine", "splatting", "stitching", "tripod"},
     {"alignment", "carrier", "distractors", "evaluate", "evaluate_splat", "export"}
     | {"gravity", "induced", "placement", "report", "report_html", "video"},
     {"demo", "extraction", "inputs", "line", "masking", "matching_stages", "pipeline"}
     | {"results", "segment", "timing", "view"},
-=======
-    {"", "types", "geometry", "config", "config_file", "log"},
-    {"rig", "records", "run_folder", "search", "store", "read", "panorama", "views"}
-    | {"sweep", "turning"},
-    {"cubemap", "features", "pairs", "matching", "verify", "tracks", "triangulate"}
-    | {"graph", "optimize", "filter", "align", "splat", "patch_grid"},
-    {"adjust", "blame", "frontend", "learned", "misfit", "motion", "photometric", "places"}
-    | {"reconstruction", "recovery", "splat_align", "splatting"},
-    {"export", "evaluate", "evaluate_splat", "induced", "report", "report_html", "video"}
-    | {"alignment", "carrier", "distractors", "gravity", "placement"},
-    {"demo", "extraction", "line", "masking", "pipeline", "segment", "view"},
->>>>>>> masks
     {"cli"},
     {"benchmarks"},
 )
