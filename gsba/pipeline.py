@@ -38,16 +38,14 @@ def refine(
 
     Args:
         frames: folder of 2:1 panoramas or of cube faces, or a video, for `out`/frames.
-        trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig. Several are pieces of one run,
-            on one clock, each with a world and scale of its own: the first one's are kept. None =
-            start from the images alone: the first step's length is the unit and the first frame
-            the world.
+        trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig. Several are pieces of one run
+            on one clock, and the first one's world is kept. None = start from the images alone:
+            the first step's length is the unit and the first frame the world.
         out: folder of the run.
         settings: see `gsba.config`.
         keyframes: second trajectory file of the same run, with its keyframes: they lead.
-        masks: one ERP mask for all frames, or a folder of one for each; white = use; "carrier" (or
-            "auto") to find what carries the camera, "distractors" for what moves by itself; or
-            several of these.
+        masks: one ERP mask for all frames, or a folder of one for each, white = use; "carrier" (or
+            "auto") and "distractors" to find what carries the camera or moves; or several of these.
         segment: a command or a callable that masks faces; see `gsba.segment.segmented`.
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
@@ -66,9 +64,8 @@ def refine(
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
     if video.is_video(frames):
         inputs.extract_frames(out, origin, settings, fps, fresh)
-        frame_set, fresh = read.scan(out / "frames", masks=chosen.given), False
-    else:
-        frame_set = read.scan(frames, timestamps, fps, chosen.given)
+        frames, timestamps, fps, fresh = out / "frames", None, None, False
+    frame_set = read.scan(frames, timestamps, fps, chosen.given)
     check(settings.placement, frame_set)
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh) as store:
@@ -78,9 +75,8 @@ def refine(
         line = Line(store, frame_set, coarse, settings, extra_factors)
         line.counts |= counts
         neighbours = _neighbours(line, given)
-        if line.turns_only:
-            return results.write(line, _turned(line))
-        return results.write(line, line.reconstruct(_solve(line, neighbours, settings)))
+        found = _turned(line) if line.turns_only else line.reconstruct(_solve(line, neighbours))
+        return results.write(line, found)
 
 
 def _neighbours(line: Line, given: Sequence[Trajectory]) -> VerifiedPairs:
@@ -88,9 +84,9 @@ def _neighbours(line: Line, given: Sequence[Trajectory]) -> VerifiedPairs:
     return line.judge(timing.match_neighbours(line, given, inputs.coarse_poses))
 
 
-def _solve(line: Line, neighbours: VerifiedPairs, settings: RefineSettings) -> Adjustment:
+def _solve(line: Line, neighbours: VerifiedPairs) -> Adjustment:
     """All stages from verified neighbours to the last solution."""
-    rounds = settings.rounds
+    settings, rounds = line.settings, line.settings.rounds
     solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)
     adjacent = line.match_along_epipolars(solved)
     near = line.match_known_points("near", solved, loops_closed=False)
@@ -140,7 +136,7 @@ def _without_distractors(
         neighbours = _neighbours(line, given)
         if line.turns_only:
             return frames, {}
-        solved = _solve(line, neighbours, plain)
+        solved = _solve(line, neighbours)
     after, threads = f"first-{line.latest}", line.num_threads
     frames, counts = masking.after(store, frames, solved, after, threads)
     return frames, {"distractors": [counts]}

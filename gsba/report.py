@@ -154,26 +154,13 @@ def build_report(
         stitching: the field of directions, see `gsba.stitching.describe`.
     """
     quality = frame_quality(reconstruction)
-    residuals = np.degrees(angular_residuals(reconstruction))
-    lengths = np.bincount(
-        reconstruction.observation_points, minlength=len(reconstruction.points_world)
-    )
-    summary = {
-        "frames": len(frames),
-        "refined": np.count_nonzero(reconstruction.pose_statuses == PoseStatus.REFINED),
-        "points": len(lengths),
-        "observations": len(residuals),
-        "mean_track_length": lengths.mean() if len(lengths) else math.nan,
-        "median_residual_deg": np.median(residuals) if len(residuals) else math.nan,
-        "median_residual_deg_coarse": median_residual_deg(reconstruction, coarse.world_T_rigs),
-    }
     stage_rows = [
         {**dataclasses.asdict(stage), "counts": counts.get(stage.name, ())} for stage in stages
     ]
     report = {
         "gsba": __version__,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-        "summary": summary,
+        "summary": _summary(frames, coarse, reconstruction),
         "gauge": gauge,
         "notes": notes,
         "trajectory": trajectory,
@@ -187,6 +174,25 @@ def build_report(
         "versions": {name: _version(name) for name in _PACKAGES},
     }
     return plain(report)
+
+
+def _summary(
+    frames: FrameSet, coarse: CoarsePoses, reconstruction: Reconstruction
+) -> dict[str, Any]:
+    """What a run comes down to."""
+    residuals = np.degrees(angular_residuals(reconstruction))
+    lengths = np.bincount(
+        reconstruction.observation_points, minlength=len(reconstruction.points_world)
+    )
+    return {
+        "frames": len(frames),
+        "refined": np.count_nonzero(reconstruction.pose_statuses == PoseStatus.REFINED),
+        "points": len(lengths),
+        "observations": len(residuals),
+        "mean_track_length": lengths.mean() if len(lengths) else math.nan,
+        "median_residual_deg": np.median(residuals) if len(residuals) else math.nan,
+        "median_residual_deg_coarse": median_residual_deg(reconstruction, coarse.world_T_rigs),
+    }
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
