@@ -36,8 +36,9 @@ class LightGlue:
                     new + name.removeprefix(old) if name.startswith(old) else name: value
                     for name, value in state.items()
                 }
-        key = f"{extractor}-lightglue"
-        self._model = load_into(model, state, key, weights, exact=False)
+        parts = {name for name, _ in model.named_children()} | {"confidence_thresholds"}
+        state = {name: v for name, v in state.items() if name.partition(".")[0] in parts}
+        self._model = load_into(model, state, f"{extractor}-lightglue", weights)
 
     def __call__(
         self, first: FaceKeypoints, second: FaceKeypoints, size: int
