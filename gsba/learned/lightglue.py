@@ -27,7 +27,7 @@ class LightGlue:
         wide = kornia.feature.LightGlue.features[extractor]
         chosen = {**wide, "depth_confidence": -1, "width_confidence": -1, "weights": None}
         chosen |= {"flash": False, "filter_threshold": _MIN_SCORE}
-        model = kornia.feature.LightGlue(features=None, **chosen)
+        model = kornia.feature.LightGlue(None, **chosen)  # pyright: ignore[reportArgumentType]
         state = {name.removeprefix("matcher."): v for name, v in read_state(weights).items()}
         for block in ("self_attn", "cross_attn"):  # self_attn.3.x of the authors' files
             for layer in range(model.conf.n_layers):
