@@ -117,11 +117,15 @@ def save_extractors(folder: Path) -> dict[str, Path]:
     torch.manual_seed(0)
     xfeat = kornia_feature.XFeat().net
     nn.init.normal_(xfeat.keypoint_head[3].weight, std=3.0)  # or nothing stands out
+    superpoint = OfficialSuperPoint()
+    for layer in superpoint.children():  # or biases drown the image, and all looks alike
+        nn.init.kaiming_normal_(layer.weight)
+        nn.init.zeros_(layer.bias)
     states = {
         "aliked-n16.pth": kornia_feature.ALIKED("aliked-n16").state_dict(),
         "depth-save.pth": {"extractor": kornia_feature.DISK().state_dict()},
         "xfeat.pt": xfeat.state_dict(),
-        "superpoint_v1.pth": OfficialSuperPoint().state_dict(),
+        "superpoint_v1.pth": superpoint.state_dict(),
     }
     for name, state in states.items():
         torch.save(state, folder / name)

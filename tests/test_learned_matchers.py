@@ -291,10 +291,10 @@ def test_lightglue_counts_pixels_from_the_first_centre(
     assert sent["image_size"].tolist() == [[96, 96]] and scores.tolist() == [0.5]
 
 
-@pytest.mark.parametrize(("num", "tolerance"), [(40, 1e-3), (25, 0.02)])
-def test_superglue_is_that_of_the_paper(num: int, tolerance: float, tmp_path: Path) -> None:
-    """Random weights in the authors' layout give the probabilities of the paper's network. The
-    smaller of two faces is filled up, which moves the transport until it has converged."""
+@pytest.mark.parametrize("num", [40, 25])
+def test_superglue_is_that_of_the_paper(num: int, tmp_path: Path) -> None:
+    """Random weights in the authors' layout give the probabilities of the paper's network, also
+    where one face is filled up to the other's number of keypoints."""
     torch.manual_seed(2)
     model = OfficialSuperGlue().eval()
     with torch.no_grad():
@@ -302,7 +302,7 @@ def test_superglue_is_that_of_the_paper(num: int, tolerance: float, tmp_path: Pa
             if isinstance(module, torch.nn.BatchNorm1d):
                 module.running_mean.normal_(0, 0.1)
                 module.running_var.uniform_(0.5, 1.5)
-        model.final_proj.weight.mul_(60)  # decided enough to pass the threshold
+        model.final_proj.weight.mul_(30)  # decided enough to pass the threshold
     path = tmp_path / "superglue_outdoor.pth"
     torch.save(model.state_dict(), path)
     faces = _face(3, 40, 128, 256), _face(4, num, 128, 256)
@@ -317,12 +317,10 @@ def test_superglue_is_that_of_the_paper(num: int, tolerance: float, tmp_path: Pa
     with torch.inference_mode():
         likely = model(sides, 128).numpy()
     best = (likely == likely.max(axis=1, keepdims=True)) & (likely == likely.max(axis=0))
-    sure = np.argwhere(best & (likely > 0.2 + tolerance))
+    sure = np.argwhere(best & (likely > 0.2 + 1e-4))
     assert len(sure) > 3 and set(map(tuple, sure)) <= set(map(tuple, matched))
-    assert (likely[tuple(matched.T)] > 0.2 - tolerance).all()
-    np.testing.assert_allclose(scores, likely[tuple(matched.T)], atol=tolerance)
-    swapped, _ = SuperGlue(path)(*faces[::-1], 128)
-    assert set(map(tuple, swapped[:, ::-1])) == set(map(tuple, matched))
+    assert (likely[tuple(matched.T)] > 0.2 - 1e-4).all()
+    np.testing.assert_allclose(scores, likely[tuple(matched.T)], atol=1e-4)
 
 
 def test_wrong_weights_are_one_line(

@@ -49,6 +49,6 @@ def xfeat(weights: Path, num: int) -> Detector:
     def detect(image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         with torch.inference_mode():
             found = model.detectAndCompute(to_tensor(image))[0]
-        return tuple(found[key].numpy() for key in ("keypoints", "scores", "descriptors"))
+        return found["keypoints"].numpy(), found["scores"].numpy(), found["descriptors"].numpy()
 
     return detect

@@ -27,7 +27,7 @@ class LightGlue:
         wide = kornia.feature.LightGlue.features[extractor]
         chosen = {**wide, "depth_confidence": -1, "width_confidence": -1, "weights": None}
         chosen |= {"flash": False, "filter_threshold": _MIN_SCORE}
-        model = kornia.feature.LightGlue(features=None, **chosen)
+        model = kornia.feature.LightGlue(None, **chosen)  # pyright: ignore[reportArgumentType]
         state = {name.removeprefix("matcher."): v for name, v in read_state(weights).items()}
         for block in ("self_attn", "cross_attn"):  # self_attn.3.x of the authors' files
             for layer in range(model.conf.n_layers):
@@ -36,8 +36,9 @@ class LightGlue:
                     new + name.removeprefix(old) if name.startswith(old) else name: value
                     for name, value in state.items()
                 }
-        key = f"{extractor}-lightglue"
-        self._model = load_into(model, state, key, weights, exact=False)
+        parts = {name for name, _ in model.named_children()} | {"confidence_thresholds"}
+        state = {name: v for name, v in state.items() if name.partition(".")[0] in parts}
+        self._model = load_into(model, state, f"{extractor}-lightglue", weights)
 
     def __call__(
         self, first: FaceKeypoints, second: FaceKeypoints, size: int

@@ -242,7 +242,7 @@ def read_state(path: Path) -> dict[str, Any]:
     return dict(state) if isinstance(state, dict) else {}
 
 
-def load_into(model: Any, state: dict[str, Any], key: str, path: Path, exact: bool = True) -> Any:
+def load_into(model: Any, state: dict[str, Any], key: str, path: Path) -> Any:
     """Give a network its weights and put it into inference mode.
 
     Args:
@@ -250,7 +250,6 @@ def load_into(model: Any, state: dict[str, Any], key: str, path: Path, exact: bo
         state: tensors by name.
         key: of the network in SOURCES.
         path: of the weights, for the message.
-        exact: whether tensors that the network does not have are a fault too.
 
     Raises:
         GsbaError: the weights are another network's.
@@ -263,7 +262,7 @@ def load_into(model: Any, state: dict[str, Any], key: str, path: Path, exact: bo
         name in state and getattr(state[name], "shape", None) == value.shape
         for name, value in needed.items()
     )
-    if not fits or (exact and state.keys() - known):
+    if not fits or state.keys() - known:
         usual = SOURCES[key].files[0]
         raise GsbaError(f"{path}: weights of another network than {key} ({usual})")
     model.load_state_dict({n: v for n, v in state.items() if n in known}, strict=False)
