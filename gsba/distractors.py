@@ -164,7 +164,8 @@ class Scene:
         """Logarithms (h, w) float32 of the least and largest inverse distance to assume."""
         points = np.unique(np.concatenate([self._seen[f] for f in (frame, *near)]))
         width = self.width // _CELL
-        (u, v), distances = (lambda uv, d: (uv.T, d))(*self._pixels(frame, points, width))
+        pixels, distances = self._pixels(frame, points, width)
+        u, v = pixels.T
         logs = -np.log(distances).astype(np.float32)
         high = np.full((width // 2, width), _EMPTY, np.float32)
         low = high.copy()  # of the negative, so that both are maxima
@@ -236,7 +237,7 @@ def _score(
             own, least, most, others, n_T_own, rays, assumed, np.float32(_CAP),
             differences, away, spread,
         )  # fmt: skip
-        smooth = np.stack([_averaged(d) for d in differences])
+        smooth = np.stack([_averaged(differences[n]) for n in range(num)])
         sweep.keep_best(smooth, _averaged(away), _averaged(spread), best, away_best, spread_best)
     contradicted = 0.5 * (away_best - _AGREE * spread_best)
     return np.maximum(best[0], np.minimum(best[1], contradicted))
@@ -250,6 +251,7 @@ def _decide(score: np.ndarray) -> np.ndarray:
         (wide > noise * _WEAK).astype(np.uint8), cv2.MORPH_OPEN, np.ones((_THIN, _THIN), np.uint8)
     )
     num, labels = cv2.connectedComponents(weak, connectivity=4)
+    labels = np.asarray(labels)
     rows = (np.arange(len(wide)) + 0.5) / len(wide)
     areas = np.broadcast_to(np.sin(np.pi * rows)[:, None], wide.shape)
     strong = (weak > 0) & (wide > noise * _STRONG)

@@ -2,7 +2,7 @@
 
 import ctypes
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import cv2
@@ -103,8 +103,8 @@ def extract(
         parts.append(_record(found, bearings, own, face, faces_rgb[face], rig))
         if found.scores is not None:
             scores.append(found.scores[own])
-    columns = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Features(*columns, np.concatenate(scores) if scores else None)
+    features = Features(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return replace(features, scores=np.concatenate(scores)) if scores else features
 
 
 def _record(

@@ -111,7 +111,7 @@ def _over(
 
 
 def _enough(own: np.ndarray) -> bool:
-    return np.count_nonzero(own) >= _REACH or len(own) >= _FURTHEST
+    return int(np.count_nonzero(own)) >= _REACH or len(own) >= _FURTHEST
 
 
 def _laid(

@@ -238,7 +238,8 @@ def mean_score(scores: Iterable[Score]) -> Score:
     columns = ((s.psnr, s.ssim, s.psnr_exposed) for s in scores)
     distances = [s.lpips for s in scores if s.lpips is not None]
     far = float(np.mean(distances)) if distances else None
-    return Score(*(float(np.mean(column)) for column in zip(*columns, strict=True)), far)
+    means = Score(*(float(np.mean(column)) for column in zip(*columns, strict=True)))
+    return replace(means, lpips=far)
 
 
 def near_of(world_T_rigs: np.ndarray, settings: SplatSettings) -> float:
