@@ -250,8 +250,8 @@ def _decide(score: np.ndarray) -> np.ndarray:
     weak = cv2.morphologyEx(
         (wide > noise * _WEAK).astype(np.uint8), cv2.MORPH_OPEN, np.ones((_THIN, _THIN), np.uint8)
     )
-    num, labels = cv2.connectedComponents(weak, connectivity=4)
-    labels = np.asarray(labels)
+    num, parts = cv2.connectedComponents(weak, connectivity=4)
+    labels = np.asarray(parts, np.int32)
     rows = (np.arange(len(wide)) + 0.5) / len(wide)
     areas = np.broadcast_to(np.sin(np.pi * rows)[:, None], wide.shape)
     strong = (weak > 0) & (wide > noise * _STRONG)
