@@ -15,7 +15,7 @@ function element(id) {
   const node = {
     id, dataset: {}, style: {}, listeners: {}, children: [], textContent: id === "data" ? data : "",
     clientWidth: 400, clientHeight: 200, offsetWidth: 50, offsetHeight: 20, width: 0, height: 0,
-    append(...c) { node.children.push(...c); }, setAttribute() {}, setPointerCapture() {},
+    append(...c) { node.children.push(...c); }, setAttribute() {}, remove() {}, setPointerCapture() {},
     addEventListener(kind, f) { (node.listeners[kind] ??= []).push(f); },
     getContext: () => node.context ??= context(),
   };

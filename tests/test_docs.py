@@ -77,9 +77,10 @@ def test_commands_and_options_exist(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=IDS)
 def test_settings_exist(page: Path) -> None:
-    for change in re.findall(r"--set ([a-z_]+\.[a-z_]+=[^\s`|]+)", page.read_text()):
-        if "…" not in change and change != "stage.key=value":
-            load_config(None, [change])
+    for together in re.findall(r"(?:--set [a-z_]+\.[a-z_]+=[^\s`|]+\s*)+", page.read_text()):
+        changes = together.replace("--set", "").split()
+        if "…" not in together and changes != ["stage.key=value"]:
+            load_config(None, changes)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=IDS)

@@ -18,7 +18,7 @@ from gsba.types import Trajectory
 NUM_FRAMES, WIDTH = 8, 512
 SETTINGS = RefineSettings.model_validate(  # lighter than the defaults
     {
-        "cubemap": {"oversampling": 1.0},
+        "cubemap": {"face_size": 256},
         "features": {"max_per_face": 400},
         "solver": {"num_threads": 2},
     }
