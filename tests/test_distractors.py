@@ -120,7 +120,8 @@ def test_a_run_masks_people_in_a_second_pass(case: Case, tmp_path: Path) -> None
     stages = [stage["name"] for stage in result.report["stages"]]
     assert stages.index("first-refined1") < stages.index("distractors") < stages.index("features")
     errors = evaluate(read_trajectory(tmp_path / "run/trajectory.tum"), case.truth)
-    assert errors.ate.rmse < 1.5 * case.errors().ate.rmse
+    start = evaluate(read_trajectory(case.slam), case.truth)
+    assert errors.ate.rmse < 0.1 * start.ate.rmse  # masks are for splats: poses hardly gain
     assert computed_stages(run()) == []
 
 
