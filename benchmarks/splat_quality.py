@@ -19,6 +19,7 @@ import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from common import machine
@@ -40,7 +41,7 @@ REFINED = {
     "splat": {"factors": ("bearing", "splat")},
 }  # row -> settings of `gsba refine`; the first row is the one that targets are about
 SOURCES = ("raw", "unaligned", "default", "splat", "colmap", "truth")
-RATES = {  # of short trainings, whose last views must not leave their exposure behind
+RATES: dict[str, Any] = {  # of short trainings: the last views must not leave their exposure
     "rate_means": 5e-4,
     "rate_means_end": 5e-6,
     "rate_scales": 0.015,

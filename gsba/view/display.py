@@ -15,7 +15,7 @@ from gsba.types import FACES, PoseStatus
 from gsba.view.scene import Scene, faces_of
 
 if TYPE_CHECKING:
-    import viser
+    import viser  # pyright: ignore[reportMissingImports]
 
 _BEFORE, _AFTER, _BAD = (217, 130, 43), (23, 105, 170), (192, 57, 43)  # as in report.html
 _SEEN = (46, 125, 79)

@@ -12,7 +12,7 @@ from gsba.view.display import View
 from gsba.view.scene import Scene
 
 if TYPE_CHECKING:
-    import viser
+    import viser  # pyright: ignore[reportMissingImports]
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +46,7 @@ _IN_USE = "port {port} of 127.0.0.1 is in use: pass another --port, or 0 for any
 def _server_class() -> "Callable[..., viser.ViserServer]":
     """viser's server without its door to the world."""
     try:
-        import viser
+        import viser  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise GsbaError(
             f"gsba view needs {error.name or 'viser'}: pip install 'gsba[view]'"
