@@ -68,5 +68,14 @@ def machine() -> str:
     return f"{model}, {len(os.sched_getaffinity(0))} cores"
 
 
+def write_table(lines: Sequence[str], path: Path | None) -> None:
+    """Write the lines of a Markdown table and the machine they are of, if there is a path."""
+    from gsba.records import atomic_write
+
+    text = "\n".join([*lines, "", f"{machine()}.", ""])
+    if path is not None:
+        atomic_write(path, lambda file: file.write_text(text))
+
+
 if __name__ == "__main__":
     print(json.dumps(_stopwatch(float(sys.argv[1]), sys.argv[2:])))

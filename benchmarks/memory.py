@@ -14,11 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.common import machine, measure, peak_mb
+from benchmarks.common import measure, peak_mb, write_table
 from gsba import align, panorama, read
 from gsba.config import AlignSettings
 from gsba.geometry import pose
-from gsba.records import atomic_write
 from gsba.rig import CubeRig, owner_faces
 from gsba.types import Counts, Keypoints, Landmarks, Tracks
 
@@ -117,9 +116,7 @@ def main() -> None:
             f"| {found['kept']} | {cost.cpu_s:.0f} |"
         )
         print(lines[-1], flush=True)
-    table = "\n".join([*lines, "", f"{machine()}.", ""])
-    if options.markdown is not None:
-        atomic_write(options.markdown, lambda file: file.write_text(table))
+    write_table(lines, options.markdown)
 
 
 if __name__ == "__main__":

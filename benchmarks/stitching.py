@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common import machine
+from benchmarks.common import write_table
 from factors import tangent_basis
 from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
@@ -23,7 +23,6 @@ from gsba import adjust, align, cubemap, graph, panorama, refine, stitching, tri
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
 from gsba.geometry import angular_errors
-from gsba.records import atomic_write
 from gsba.store import load_stage
 from gsba.types import FrameSet, Keypoints, Landmarks, Sighted, Tracks
 
@@ -168,9 +167,7 @@ def main() -> None:
             f"| {np.percentile(angles, 90):.3f} | {np.median(grey):.2f} | {np.mean(grey):.2f} |"
         )
         print(lines[-1], flush=True)
-    table = "\n".join([*lines, "", f"{machine()}.", ""])
-    if options.markdown is not None:
-        atomic_write(options.markdown, lambda file: file.write_text(table))
+    write_table(lines, options.markdown)
 
 
 if __name__ == "__main__":

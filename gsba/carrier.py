@@ -10,11 +10,13 @@ carrier turns below them: how far is found for each frame (`gsba.turning`), and 
 
 import logging
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from gsba import panorama
 from gsba.log import GsbaError, track
 from gsba.read import load_erp, load_mask
 from gsba.records import atomic_write
@@ -30,6 +32,7 @@ _LEAST_TURN = np.deg2rad(2.0)  # less is the noise of finding turns
 _LEAST_GAIN = 1.05  # of how well pixels stay: what turning must bring to be believed
 _LEAST_FOUND = 0.95  # of the carrier found without it
 _WRAP = 64  # pixels over the seam
+_wrapped = partial(panorama.wrapped, columns=_WRAP)
 _SURE = 0.25  # of the world's typical change: below it, a pixel is fixed
 _SURE_LEVELS = (2.0, 5.0)  # bounds on that, grey levels
 _STANDING_LEVELS = 3.0  # typical change of a world that does not move
@@ -218,10 +221,3 @@ def _slope(median: np.ndarray) -> np.ndarray:
     grey = _wrapped(cv2.cvtColor(median, cv2.COLOR_RGB2GRAY)).astype(np.float32)
     slope = np.hypot(cv2.Sobel(grey, -1, 1, 0), cv2.Sobel(grey, -1, 0, 1)) / 8
     return slope[:, _WRAP:-_WRAP]
-
-
-def _wrapped(image: np.ndarray) -> np.ndarray:
-    """The image with `_WRAP` columns from beyond the seam on either side."""
-    return np.ascontiguousarray(
-        np.concatenate([image[:, -_WRAP:], image, image[:, :_WRAP]], axis=1)
-    )

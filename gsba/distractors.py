@@ -10,6 +10,7 @@ neighbours could have seen it.
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import cv2
@@ -40,6 +41,7 @@ _CLOSED = 13  # pixels: gaps up to this are closed
 _GROWN = 3  # pixels: the rim is blurred
 _MOST = 0.35  # of a picture: more is a wrong pose, or light that changed
 _WRAP = 32  # pixels over the seam
+_wrapped = partial(panorama.wrapped, columns=_WRAP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,10 +276,6 @@ def _share(found: np.ndarray) -> float:
     """Part of the sphere."""
     weights = np.sin(np.pi * (np.arange(len(found)) + 0.5) / len(found))
     return float(found.mean(axis=1) @ weights / weights.sum())
-
-
-def _wrapped(image: np.ndarray) -> np.ndarray:
-    return np.concatenate([image[:, -_WRAP:], image, image[:, :_WRAP]], axis=1)
 
 
 def _unwrapped(image: np.ndarray) -> np.ndarray:

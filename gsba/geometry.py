@@ -114,6 +114,13 @@ def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarra
     return scale, rotation, mean_t - scale * rotation @ mean_s
 
 
+def carried(poses: np.ndarray, scale: float, new_T_old: np.ndarray) -> np.ndarray:
+    """Poses (..., 4, 4) under the similarity scale * R @ x + t, R and t of new_T_old (4, 4)."""
+    rotation, translation = new_T_old[:3, :3], new_T_old[:3, 3]
+    positions = scale * poses[..., :3, 3] @ rotation.T + translation
+    return pose(rotation @ poses[..., :3, :3], positions)
+
+
 def pose_similarity(
     source_T_rigs: np.ndarray, target_T_rigs: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray]:

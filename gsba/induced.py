@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba.evaluate import associate
-from gsba.geometry import bearings_from_erp, pose, similarity
+from gsba.geometry import bearings_from_erp, carried, pose, similarity
 from gsba.log import GsbaError
 from gsba.types import Trajectory
 
@@ -56,9 +56,9 @@ def induced_errors(
     if len(rows_t) < 3:
         raise GsbaError(f"only {len(rows_t)} poses associate with the truth; alignment needs 3")
     true_T_rigs = truth.world_T_rigs[rows_t]
-    positions, rotations = estimate.world_T_rigs[rows_e, :3, 3], estimate.world_T_rigs[rows_e]
-    scale, rotation, shift = similarity(positions, true_T_rigs[:, :3, 3])
-    aligned = pose(rotation @ rotations[:, :3, :3], scale * positions @ rotation.T + shift)
+    poses = estimate.world_T_rigs[rows_e]
+    scale, rotation, shift = similarity(poses[:, :3, 3], true_T_rigs[:, :3, 3])
+    aligned = carried(poses, scale, pose(rotation, shift))
     row_of = {int(t): row for row, t in enumerate(rows_t)}
     errors: dict[int, list[np.ndarray]] = {step: [] for step in steps}
     for frame, row in row_of.items():

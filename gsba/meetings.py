@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.geometry import inverse, pose, rotation_angle
+from gsba.geometry import carried, inverse, pose, rotation_angle
 from gsba.places import relative_similarity
-from gsba.segments import carried
 
 _MIN_GROUP, _RIVAL = 3, 1.5  # pairs that must agree, and by how much they outweigh others
 _AGREE_DEG, _AGREE, _AGREE_LOG = 2.0, 0.1, 0.15  # part of the median depth; of scales

@@ -15,12 +15,11 @@ from gsba import places, recovery
 from gsba.adjust import Adjustment
 from gsba.components import by_size
 from gsba.frontend import median_depth, points_by_keypoint
-from gsba.geometry import inverse
+from gsba.geometry import carried, inverse
 from gsba.matching import Gate, MatchContext
 from gsba.meetings import Meeting, agreeing, measure, refined
 from gsba.registered import Registered
 from gsba.resection import resect
-from gsba.segments import carried
 from gsba.types import Counts, Landmarks
 
 _LOOKS = 3  # places compared for each frame of a part; twice as many for a frame alone

@@ -14,6 +14,7 @@ import numpy as np
 
 from gsba import pose_graph, recovery
 from gsba.adjust import Adjustment
+from gsba.components import parted
 from gsba.config import RefineSettings
 from gsba.frontend import median_depth, points_by_keypoint
 from gsba.geometry import inverse, pose, rotation_angle, similarity
@@ -87,11 +88,7 @@ def run(context: MatchContext, solved: Adjustment, unseen: np.ndarray) -> Closed
 
 def connected(unseen: np.ndarray, pairs: np.ndarray) -> bool:
     """Whether loops (P, 2) link what steps (F - 1,) that no images confirm leave apart."""
-    part = np.concatenate([[0], np.cumsum(unseen)])
-    for _ in range(int(part.max())):
-        for f0, f1 in pairs:
-            part[part == max(part[f0], part[f1])] = min(part[f0], part[f1])
-    return bool((part == 0).all())
+    return parted(pairs, ~unseen) is None
 
 
 def describe(frames: SearchableFrames, num_frames: int, seed: int) -> np.ndarray:

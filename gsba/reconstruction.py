@@ -3,7 +3,7 @@
 import numpy as np
 
 from gsba.adjust import Adjustment
-from gsba.geometry import angular_errors, pose, pose_similarity
+from gsba.geometry import angular_errors, carried, pose, pose_similarity
 from gsba.types import CoarsePoses, Keypoints, PoseSource, PoseStatus, Reconstruction
 
 
@@ -85,8 +85,7 @@ def _placed(
         chosen = known & inside if np.count_nonzero(known & inside) > 1 else inside
         move = pose_similarity(poses[chosen], target_T_rigs[chosen])
         scale, rotation, translation = move
-        positions = scale * poses[inside, :3, 3] @ rotation.T + translation
-        placed[inside] = pose(rotation @ poses[inside, :3, :3], positions)
+        placed[inside] = carried(poses[inside], scale, pose(rotation, translation))
         stretch[inside, 3:] = scale
         there = inside[hosts]
         points[there] = scale * landmarks.points_world[there] @ rotation.T + translation

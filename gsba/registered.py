@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 
 from gsba.adjust import Adjustment
+from gsba.geometry import carried
 from gsba.motion import Trust
-from gsba.segments import GUESS, PLACES, Joint, carried
+from gsba.segments import GUESS, PLACES, Joint
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource
 
 

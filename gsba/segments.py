@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.blame import chained
-from gsba.geometry import pose, rotation_angle
+from gsba.geometry import carried, pose, rotation_angle
 from gsba.motion import Steps
 from gsba.types import CoarsePoses, PoseSource
 
@@ -63,13 +63,6 @@ def guessed(joints: tuple[Joint, ...], num_frames: int) -> np.ndarray:
     steps = np.zeros(max(num_frames - 1, 0), bool)
     steps[[joint.first - 1 for joint in joints if joint.how == GUESS]] = True
     return steps
-
-
-def carried(world_T_rigs: np.ndarray, scale: float, new_T_old: np.ndarray) -> np.ndarray:
-    """Poses (..., 4, 4) under the similarity scale * R @ x + t."""
-    rotation, translation = new_T_old[:3, :3], new_T_old[:3, 3]
-    positions = scale * world_T_rigs[..., :3, 3] @ rotation.T + translation
-    return pose(rotation @ world_T_rigs[..., :3, :3], positions)
 
 
 def _over(

@@ -101,6 +101,7 @@ def _run(
     walk: tuple[FrameSet, np.ndarray],
     settings: AlignSettings = SETTINGS,
     sigma_px: float = 0.3,
+    aligned: np.ndarray | None = None,
 ) -> Sighted:
     frames, world_T_rigs = walk
     landmarks, keypoints = _start(world_T_rigs, sigma_px)
@@ -112,7 +113,7 @@ def _run(
         Greys(frames, 4096),
         RIG,
         "align",
-        None,
+        aligned,
         settings,
         2,
     )
@@ -226,22 +227,10 @@ def test_points_at_a_centre_and_behind_walls_do_no_harm(walk) -> None:
 
 
 def test_confirmed_points_are_looked_for_elsewhere(walk) -> None:
-    frames, world_T_rigs = walk
-    landmarks, keypoints = _start(world_T_rigs)
+    _, keypoints = _start(walk[1])
     settings = AlignSettings(patch_size=11, min_track_length=4)  # longer than any here
     short, confirmed = (
-        align.run(
-            landmarks,
-            world_T_rigs,
-            keypoints,
-            1.0,
-            Greys(frames, 4096),
-            RIG,
-            "align",
-            aligned,
-            settings,
-            2,
-        )
+        _run(walk, settings, aligned=aligned)
         for aligned in (None, np.ones(len(keypoints.faces), bool))
     )
     assert short.counts.received == 2 * 400  # all observations but the references

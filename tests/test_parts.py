@@ -10,11 +10,11 @@ from synthetic import bearings_of, features_of, loop_walk, unit, with_noise
 from gsba import components, features, parts
 from gsba.adjust import Adjustment
 from gsba.config import PairSettings, RefineSettings
-from gsba.geometry import inverse, pose, rotation_angle
+from gsba.geometry import carried, inverse, pose, rotation_angle
 from gsba.matching import MatchContext, SearchableFrames
 from gsba.motion import Trust
 from gsba.registered import Registered, follow
-from gsba.segments import GUESS, PLACES, Joint, carried
+from gsba.segments import GUESS, PLACES, Joint
 from gsba.types import CoarsePoses, Counts, Landmarks, PoseSource, Tracks
 
 NUM, POINTS, HALF = 40, 1500, 20

@@ -9,9 +9,9 @@ from synthetic import drifted, loop_walk, unit
 
 from gsba import read, segments
 from gsba.config import ReadSettings
-from gsba.geometry import inverse, pose, rotation_angle
+from gsba.geometry import carried, inverse, pose, rotation_angle
 from gsba.motion import Steps
-from gsba.segments import GUESS, IMAGES, carried
+from gsba.segments import GUESS, IMAGES
 from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
 
 NUM, BREAK = 40, 17
