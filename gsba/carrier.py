@@ -68,7 +68,7 @@ def find_carrier(frames: FrameSet) -> Carrier:
     chosen = np.unique(np.linspace(0, len(frames) - 1, _MAX_FRAMES).astype(int))
     pictures, bands = [], []
     for f in track(range(len(frames)), "looking for the carrier"):
-        picture = _small(load_erp(frames, f))
+        picture = load_erp(frames, f, width=_WIDTH)
         bands.append(band_of(picture))
         if f in chosen:
             pictures.append(picture)
@@ -152,11 +152,6 @@ def write_carrier(carrier: Carrier, frames: FrameSet, out: Path, merge: bool = T
 def _write_png(path: Path, mask: np.ndarray) -> None:
     encoded = cv2.imencode(".png", mask.astype(np.uint8) * 255)[1]
     atomic_write(path, lambda temporary: temporary.write_bytes(encoded.tobytes()))
-
-
-def _small(erp: np.ndarray) -> np.ndarray:
-    width = min(_WIDTH, erp.shape[1])
-    return cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
 
 
 def _median_and_change(pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

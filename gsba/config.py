@@ -42,7 +42,7 @@ class CubemapSettings(_Settings):
     face_size: int | None = Field(default=None, ge=64)  # pixels; None = by oversampling
     oversampling: float = Field(default=0.5, ge=0.25, le=4)  # face pixels per panorama pixel
     min_face_size: int = Field(default=192, ge=64)  # pixels; bounds on the automatic size
-    max_face_size: int = Field(default=768, ge=64)
+    max_face_size: int = Field(default=512, ge=64)
 
 
 class FeatureSettings(_Settings):
@@ -52,7 +52,7 @@ class FeatureSettings(_Settings):
     weights: str | None = None  # of a learned extractor: file, or folder with the official file
     accept_noncommercial: bool = False  # use weights whose licence forbids commercial use
     download: bool = False  # fetch missing weights from their authors
-    max_per_face: int = Field(default=600, ge=16)
+    max_per_face: int = Field(default=450, ge=16)
     contrast_threshold: float = Field(default=0.02, gt=0)
     sigma_px: float = Field(
         default=0.16, gt=0

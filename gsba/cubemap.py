@@ -35,7 +35,8 @@ def load(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.nda
     mask = read.load_mask(frames, frame)
     masks = None if mask is None else cut_mask(mask, rig)
     if frames.layout == "erp":
-        return cut(read.load_erp(frames, frame), rig), masks
+        width = _dense_enough(frames.width, rig)
+        return cut(read.load_erp(frames, frame, width=width), rig), masks
     images = np.zeros((len(FACES), rig.size, rig.size, 3), np.uint8)
     present = [FACES.index(name) for name in frames.faces]
     images[present] = read.load_faces(frames, frame)
@@ -54,11 +55,9 @@ def cut(erp: np.ndarray, rig: CubeRig) -> np.ndarray:
     Returns:
         (6, size, size[, C]) uint8, in FACES order.
     """
-    height, width = erp.shape[:2]
-    density = 2 * np.pi * rig.focal  # panorama width at which pixels are as dense as the face's
-    if width > 1.5 * density:  # low-pass first, or detail beyond the faces' resolution aliases
-        width = 2 * round(density / 2)
-        height = width // 2
+    width = _dense_enough(erp.shape[1], rig)
+    height = width // 2
+    if width < erp.shape[1]:
         erp = cv2.resize(erp, (width, height), interpolation=cv2.INTER_AREA)
     padded = wrapped(erp)
     maps = _face_maps(rig, width, height)
@@ -68,6 +67,12 @@ def cut(erp: np.ndarray, rig: CubeRig) -> np.ndarray:
             for face in range(len(FACES))
         ]
     )
+
+
+def _dense_enough(width: int, rig: CubeRig) -> int:
+    """Width to average a panorama down to: detail beyond the faces' resolution aliases."""
+    density = 2 * np.pi * rig.focal  # panorama width at which pixels are as dense as the face's
+    return 2 * round(density / 2) if width > 1.5 * density else width
 
 
 def cut_mask(mask: np.ndarray, rig: CubeRig) -> np.ndarray:

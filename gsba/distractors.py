@@ -188,7 +188,7 @@ def _load(frames: FrameSet, frame: int, width: int) -> np.ndarray:
     """Small picture (h, w, C + 1) uint8: colours, or grey of cube faces, and where to use it."""
     if frames.layout == "erp":
         size = (width, width // 2)
-        color = cv2.resize(load_erp(frames, frame), size, interpolation=cv2.INTER_AREA)
+        color = load_erp(frames, frame, width=width)
         mask = load_mask(frames, frame)
         use = np.ones(color.shape[:2], np.uint8)
         if mask is not None:

@@ -3,6 +3,7 @@
 import ctypes
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Protocol
 
 import cv2
@@ -94,10 +95,11 @@ def extract(
         rig: geometry of the faces.
         extractor: the detector.
     """
-    usable = [face for face in range(len(FACES)) if masks is None or masks[face].any()]
+    wanted = _owned(rig) if masks is None else _owned(rig) & masks
+    usable = [face for face in range(len(FACES)) if wanted[face].any()]
     parts, scores = [], []
     for face in usable or [0]:  # one at least: the extractor knows the shape of nothing
-        found = extractor(faces_rgb[face], None if masks is None else masks[face])
+        found = extractor(faces_rgb[face], wanted[face])
         bearings = rig.bearings(found.pixels, face)
         own = owner_faces(bearings) == face
         parts.append(_record(found, bearings, own, face, faces_rgb[face], rig))
@@ -105,6 +107,16 @@ def extract(
             scores.append(found.scores[own])
     features = Features(*(np.concatenate(column) for column in zip(*parts, strict=True)))
     return replace(features, scores=np.concatenate(scores)) if scores else features
+
+
+@lru_cache(maxsize=2)
+def _owned(rig: CubeRig) -> np.ndarray:
+    """Pixels (6, N, N) bool that hold something a face owns: no other is worth describing."""
+    centres = np.arange(rig.size) + 0.5
+    grid = np.stack(np.meshgrid(centres, centres), axis=-1)
+    owned = [owner_faces(rig.bearings(grid, face)) == face for face in range(len(FACES))]
+    border = np.ones((3, 3), np.uint8)
+    return np.stack([cv2.dilate(own.astype(np.uint8), border) > 0 for own in owned])
 
 
 def _record(

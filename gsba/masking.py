@@ -202,7 +202,7 @@ def _write_check(path: Path, frames: FrameSet, shares: np.ndarray) -> None:
     for f in np.sort(np.argsort(-shares, kind="stable")[:_SHOWN]):
         size = (_SHOWN_WIDTH, _SHOWN_WIDTH // 2)
         if frames.layout == "erp":
-            shown = cv2.resize(load_erp(frames, int(f)), size, interpolation=cv2.INTER_AREA)
+            shown = cv2.resize(load_erp(frames, int(f), width=_SHOWN_WIDTH), size)
         else:
             shown = np.full((size[1], size[0], 3), 128, np.uint8)
         mask = load_mask(frames, int(f))

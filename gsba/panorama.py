@@ -35,7 +35,7 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
     """
     mask = read.load_mask(frames, frame)
     if frames.layout == "erp":
-        grey = _fit(read.load_erp(frames, frame, gray=True), width)
+        grey = read.load_erp(frames, frame, gray=True, width=width)
         return grey, None if mask is None else _fit_mask(mask, width)
     size = frames.width
     faces = np.zeros((len(FACES), size, size), np.uint8)

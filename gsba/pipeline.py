@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from threadpoolctl import threadpool_limits
+
 from gsba import inputs, masking, photometric, read, results, timing, tripod, video
 from gsba.adjust import Adjustment
 from gsba.config import RefineSettings
@@ -68,7 +70,7 @@ def refine(
     frame_set = read.scan(frames, timestamps, fps, chosen.given)
     check(settings.placement, frame_set)
     coarse = inputs.coarse_poses(frame_set, given, settings)
-    with RunStore(out, origin, fresh) as store:
+    with RunStore(out, origin, fresh) as store, threadpool_limits(1, "blas"):  # frames have threads
         frame_set, counts = masking.before(store, frame_set, chosen), {}
         if chosen.distractors:
             frame_set, counts = _without_distractors(store, frame_set, coarse, given, settings)

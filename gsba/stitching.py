@@ -1,6 +1,7 @@
 """What the camera's calibration and stitching bend: a field fixed to the rig, found by the map."""
 
 import logging
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -171,8 +172,13 @@ def _systems(
     """Models of the cost of each part of the sequence; none where there is too little."""
     landmarks = _drawn(now.adjustment.landmarks, most, settings.seed)
     counts = Counts(len(now.adjustment.landmarks.tracks), len(landmarks.tracks), "observations")
-    parts = _parts(landmarks)
-    return [_system(part, now, max_degree, rig, settings, num_threads) for part in parts], counts
+    there = corrected(now.keypoints, now.field, rig)
+
+    def model(part: Landmarks) -> _System:
+        return _system(part, now, there, max_degree, rig, settings)
+
+    with ThreadPoolExecutor(num_threads) as pool:
+        return list(pool.map(model, _parts(landmarks))), counts
 
 
 def _drawn(landmarks: Landmarks, most: int, seed: int) -> Landmarks:
@@ -213,15 +219,14 @@ def _parts(landmarks: Landmarks) -> list[Landmarks]:
 def _system(
     landmarks: Landmarks,
     now: Stitching,
+    there: Keypoints,
     max_degree: int,
     rig: CubeRig,
     settings: RefineSettings,
-    num_threads: int,
 ) -> _System:
-    """Model of the robust cost of some points over fields."""
+    """Model of the robust cost of some points, keypoints corrected by the field so far."""
     keypoints, solved, field, noise = now.keypoints, now.adjustment, now.field, now.adjustment.noise
-    there = corrected(keypoints, field, rig)
-    block = adjust.landmark_block(landmarks, there, rig, noise, settings, num_threads)
+    block = adjust.landmark_block(landmarks, there, rig, noise, settings, num_threads=1)
     block.polish(adjust.values_of(solved.world_T_rigs))
     tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
     residuals, by_pose, by_point = bearing_residuals(

@@ -27,6 +27,25 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "frames"
 
 
+@pytest.mark.parametrize(("suffix", "width"), [("jpg", 128), ("jpg", 96), ("png", 128)])
+def test_narrower_panoramas_are_averages_of_the_wide_ones(
+    tmp_path: Path, suffix: str, width: int
+) -> None:
+    waves = [np.cos(2 * np.pi * k * np.linspace(0, 1, 512)) for k in (3, 7, 11)]
+    rows = np.linspace(0.2, 1, 256)[:, None, None]
+    pixels = (127 + 100 * rows * np.stack(waves, axis=-1)).astype(np.uint8)
+    for i in range(3):
+        path = tmp_path / f"{i}.{suffix}"
+        assert cv2.imwrite(str(path), pixels, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    frames = scan(tmp_path, fps=1)
+    for gray in (False, True):
+        whole, found = load_erp(frames, 0, gray), load_erp(frames, 0, gray, width=width)
+        mean = cv2.resize(whole, (width, width // 2), interpolation=cv2.INTER_AREA)
+        assert found.shape == mean.shape
+        assert np.abs(found.astype(int) - mean).max() <= 3  # a pixel of 512 aside would be 13
+    assert load_erp(frames, 0, width=1024).shape == (256, 512, 3)
+
+
 def test_erp_folder_in_order_with_other_files_ignored(folder: Path) -> None:
     (folder / "README.md").write_text("hello")
     (folder / ".DS_Store").write_bytes(b"\0")

@@ -138,15 +138,14 @@ def test_model_predicts_the_cost() -> None:
 
     before, cost = solved(SphereField.none())
     now = Stitching(SphereField.none(), before, keypoints, 0, np.zeros(4), Counts(0, 0, "o"))
-    system = stitching._system(landmarks, now, 3, RIG, settings, 1)
+    system = stitching._system(landmarks, now, keypoints, 3, RIG, settings)
     assert system.cost == pytest.approx(cost, rel=0.02)  # poses are at their best already
     field = SphereField(stitching._fitted([system], 3, 1e-2))
     after, least = solved(field)
     assert system.gain(field.coefficients) == pytest.approx(cost - least, rel=0.02)
     assert least < 0.1 * cost
-    again = stitching._system(
-        landmarks, replace(now, field=field, adjustment=after), 3, RIG, settings, 1
-    )
+    later, there = replace(now, field=field, adjustment=after), corrected(keypoints, field, RIG)
+    again = stitching._system(landmarks, later, there, 3, RIG, settings)
     assert again.cost == pytest.approx(cost, rel=0.05)  # extrapolated back to no field
 
 

@@ -67,7 +67,7 @@ def _small_panorama(frames: FrameSet, f: int) -> np.ndarray:
     import cv2
 
     if frames.layout == "erp":
-        erp = load_erp(frames, f)
+        erp = load_erp(frames, f, width=_WIDTH)
         return cv2.resize(erp, (_WIDTH, _WIDTH // 2), interpolation=cv2.INTER_AREA)
     faces, rig = load_faces(frames, f), CubeRig(frames.width, np.pi / 2)
     centres = np.stack(np.meshgrid(np.arange(_WIDTH), np.arange(_WIDTH // 2)), axis=-1) + 0.5
