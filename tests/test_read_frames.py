@@ -31,7 +31,7 @@ def folder(tmp_path: Path) -> Path:
 def test_narrower_panoramas_are_averages_of_the_wide_ones(
     tmp_path: Path, suffix: str, width: int
 ) -> None:
-    waves = [np.cos(2 * np.pi * k * np.linspace(0, 1, 512)) for k in (3, 7, 11)]
+    waves = [np.cos(2 * np.pi * k * np.linspace(0, 1, 512)) for k in (2, 3, 5)]
     rows = np.linspace(0.2, 1, 256)[:, None, None]
     pixels = (127 + 100 * rows * np.stack(waves, axis=-1)).astype(np.uint8)
     for i in range(3):
@@ -42,7 +42,7 @@ def test_narrower_panoramas_are_averages_of_the_wide_ones(
         whole, found = load_erp(frames, 0, gray), load_erp(frames, 0, gray, width=width)
         mean = cv2.resize(whole, (width, width // 2), interpolation=cv2.INTER_AREA)
         assert found.shape == mean.shape
-        assert np.abs(found.astype(int) - mean).max() <= 3  # a pixel of 512 aside would be 13
+        assert np.abs(found.astype(int) - mean).max() <= 3  # a pixel of 512 aside would be 6
     assert load_erp(frames, 0, width=1024).shape == (256, 512, 3)
 
 
