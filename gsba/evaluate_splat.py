@@ -2,6 +2,8 @@
 
 Every source trains on the same frames with the same settings and seed, from the run's tracks
 triangulated under its own poses, and is measured on panoramas it never saw, at its own poses.
+All are carried into the run's world first: a splat's Gaussians begin along the axes of its world,
+and walls along them are worth some 0.1 dB that no pose has earned.
 """
 
 import json
@@ -14,6 +16,7 @@ import numpy as np
 
 from gsba.config import SplatSettings
 from gsba.evaluate import associate
+from gsba.geometry import carried, pose, pose_similarity
 from gsba.log import GsbaError
 from gsba.records import atomic_write
 from gsba.splat.backend import Backend
@@ -88,7 +91,7 @@ def compare(
 
     Args:
         reconstruction, frames: of a finished run; its tracks make the start clouds.
-        sources: name -> world_T_rigs (F, 4, 4), each in a world of its own, NaN = no pose.
+        sources: name -> world_T_rigs (F, 4, 4), each in any world and scale, NaN = no pose.
         settings: of all trainings alike.
         backend: the renderer.
         out: folder to write.
@@ -100,6 +103,8 @@ def compare(
     usable = refined_frames(reconstruction)
     for poses in sources.values():
         usable = usable & np.isfinite(poses).all(axis=(1, 2))
+    own = reconstruction.world_T_rigs[usable]
+    sources = {name: _beside(poses, usable, own) for name, poses in sources.items()}
     split = split_frames(usable, settings.held_out_every)
     faces = [
         load_faces(frames, part, settings.face_size) for part in (split.training, split.held_out)
@@ -130,6 +135,12 @@ def compare(
         out / "pictures", frames, split, faces[1][0], sources, splats, settings, backend
     )
     return results
+
+
+def _beside(poses: np.ndarray, usable: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Poses (F, 4, 4) in the world and scale of the run's `own` ones of the `usable` frames."""
+    scale, rotation, translation = pose_similarity(poses[usable], own)
+    return poses if scale <= 0 else carried(poses, scale, pose(rotation, translation))
 
 
 def _write(

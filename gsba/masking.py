@@ -18,7 +18,7 @@ from gsba.distractors import Distractors, Scene, distractor_mask
 from gsba.log import GsbaError, track
 from gsba.read import load_erp, load_mask
 from gsba.records import atomic_write
-from gsba.segment import Segment, load_segmented, segmented
+from gsba.segmentation import Segment, load_segmented, segmented
 from gsba.store import PerFrame, RunStore, fingerprint
 from gsba.types import Counts, FrameSet
 
@@ -45,7 +45,7 @@ def choose(masks: Masks, segment: Segment | None = None) -> Choice:
 
     Args:
         masks: a file or a folder, "carrier" (or "auto"), "distractors", or several of these.
-        segment: see `gsba.segment`.
+        segment: see `gsba.segmentation`.
 
     Raises:
         GsbaError: two files or folders.

@@ -12,7 +12,7 @@ from gsba.line import Line
 from gsba.matching_stages import ExtraFactors
 from gsba.placement import check
 from gsba.results import RunResult, load_run
-from gsba.segment import Segment
+from gsba.segmentation import Segment
 from gsba.store import RunStore
 from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory, VerifiedPairs
 
@@ -48,7 +48,7 @@ def refine(
         keyframes: second trajectory file of the same run, with its keyframes: they lead.
         masks: one ERP mask for all frames, or a folder of one for each, white = use; "carrier" (or
             "auto") and "distractors" to find what carries the camera or moves; or several of these.
-        segment: a command or a callable that masks faces; see `gsba.segment.segmented`.
+        segment: a command or a callable that masks faces; see `gsba.segmentation.segmented`.
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         fresh: forget an earlier run in `out`.

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from gsba import pose_graph, recovery
 from gsba.adjust import Adjustment
@@ -109,8 +110,7 @@ def _words(sample: np.ndarray, rng: np.random.Generator, rounds: int = 12) -> np
     for _ in range(rounds):
         nearest = _nearest(sample, words)
         counts = np.bincount(nearest, minlength=len(words))
-        sums = np.zeros_like(words)
-        np.add.at(sums, nearest, sample)
+        sums = _sums(sample, nearest, len(words))
         words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], words)
     return words
 
@@ -119,11 +119,16 @@ def _nearest(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
     return np.argmax(descriptors @ words.T - 0.5 * np.sum(words**2, axis=1), axis=1)
 
 
+def _sums(rows: np.ndarray, groups: np.ndarray, num: int) -> np.ndarray:
+    """Sums (num, D) of the rows (K, D) of each group."""
+    ones, starts = np.ones(len(rows), rows.dtype), np.arange(len(rows) + 1)
+    return csr_matrix((ones, groups, starts), shape=(len(rows), num)).T @ rows
+
+
 def _aggregate(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
     """Sums of the differences from the nearest words, each word's of length one."""
     nearest = _nearest(descriptors, words)
-    sums = np.zeros_like(words)
-    np.add.at(sums, nearest, descriptors - words[nearest])
+    sums = _sums(descriptors - words[nearest], nearest, len(words))
     sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
     return sums.ravel() / max(float(np.linalg.norm(sums)), 1e-12)
 

@@ -27,7 +27,7 @@ FLOORS = (
     {"alignment", "carrier", "distractors", "evaluate", "evaluate_splat", "export"}
     | {"gravity", "induced", "placement", "report", "report_html", "video"},
     {"demo", "extraction", "inputs", "line", "masking", "matching_stages", "pipeline"}
-    | {"results", "segment", "timing", "view"},
+    | {"results", "segmentation", "timing", "view"},
     {"cli"},
     {"benchmarks"},
 )

@@ -17,7 +17,7 @@ import pytest
 from gsba.config import RefineSettings
 from gsba.geometry import bearings_from_erp
 from gsba.report import build_report
-from gsba.report_html import pictures, views, write_html
+from gsba.report_html import pictures, residual_sphere, views, write_html
 from gsba.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseStatus, Reconstruction
 
@@ -51,6 +51,7 @@ def _write(folder: Path, frames: FrameSet, result: Reconstruction) -> tuple[Path
         gauge="the world of the trajectory",
         notes=["a note with <b>markup</b> & </script>"],
     )
+    report["residual_sphere"] = residual_sphere(result)
     path = folder / "report.html"
     write_html(path, frames, coarse, result, report)
     return path, coarse

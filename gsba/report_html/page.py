@@ -43,7 +43,7 @@ def write_html(
         "map": views.world_map(coarse, reconstruction),
         "frames": _frames(frames, coarse, reconstruction),
         "matches": views.match_matrix(reconstruction),
-        "sphere": views.residual_sphere(reconstruction),
+        "sphere": report["residual_sphere"],
         "field": views.field_sphere(reconstruction.correction),
         "erp_width": frames.width if frames.layout == "erp" else 4 * frames.width,
         "worst": _worst(frames, reconstruction),

@@ -13,7 +13,7 @@ from gsba.log import GsbaError
 from gsba.masking import before, choose
 from gsba.read import load_mask
 from gsba.read.frames import find_panoramas
-from gsba.segment import Segment, load_segmented, segmented
+from gsba.segmentation import Segment, load_segmented, segmented
 from gsba.store import RunStore
 from gsba.types import FACES, FrameSet
 
