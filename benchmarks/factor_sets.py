@@ -1,9 +1,11 @@
 """What each set of observations is worth: features' bearings alone, and patches aligned on top.
 
+`bearing` are the features that `aligned` starts from, `tuned bearing` the finer ones of
+`configs/bearing.toml`, the best there is without patches.
+
     python benchmarks/factor_sets.py --data DATA --sequences aisle_loop,demo_rectangle --out WORK
 
-Every sequence is refined from several coarse trajectories, one for each seed, with either set; the
-second set goes on from the stages of the first. Sequences are folders of `--data` with `images/`,
+Every sequence is refined from several coarse trajectories, one for each seed, with every set. Sequences are folders of `--data` with `images/`,
 `groundtruth.tum` and, for induced errors, `depth/`; or demo walks, rendered into WORK.
 `--disturb` spoils the images first. Runs are kept in WORK and resumed.
 """
@@ -35,7 +37,7 @@ WALKS = {
     "demo_oval": ("oval", "forward"),
     "demo_open": ("open", "forward"),
 }
-SETS = {"bearing": 0, "aligned": None}  # name -> rounds of alignment, None = as configured
+TUNED = Path(__file__).resolve().parents[1] / "configs/bearing.toml"  # the best without patches
 DISTURBANCES = ("none", "exposure", "blur", "objects")
 
 
@@ -112,14 +114,18 @@ def disturbed(images: Path, how: str, folder: Path, seed: int = 0) -> Path:
 def run_case(
     name: str, walk: Path, images: Path, how: str, start: Path, out: Path, settings: RefineSettings
 ) -> Iterable[Row]:
-    """Refine with either set, the second from the first one's stages."""
+    """Refine with each set, `aligned` from the stages of `bearing`."""
     truth = read_trajectory(walk / "groundtruth.tum")
-    for factors, rounds in SETS.items():
-        changed = settings.align.model_copy(update={} if rounds is None else {"rounds": rounds})
-        export = settings.export.model_copy(update={"formats": ()})
-        chosen = settings.model_copy(update={"align": changed, "export": export})
-        result = refine(images, start, out, chosen)
-        found = read_trajectory(out / "trajectory.tum")
+    plain = settings.align.model_copy(update={"rounds": 0})
+    sets = {
+        "tuned bearing": (load_config(TUNED), out.with_name(f"{out.name}-tuned")),
+        "bearing": (settings.model_copy(update={"align": plain}), out),
+        "aligned": (settings, out),
+    }
+    for factors, (chosen, run) in sets.items():
+        export = chosen.export.model_copy(update={"formats": ()})
+        result = refine(images, start, run, chosen.model_copy(update={"export": export}))
+        found = read_trajectory(run / "trajectory.tum")
         errors = evaluate(found, truth)
         induced = None
         if (walk / "depth").exists():
