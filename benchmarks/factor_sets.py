@@ -5,9 +5,10 @@
 
     python benchmarks/factor_sets.py --data DATA --sequences aisle_loop,demo_rectangle --out WORK
 
-Every sequence is refined from several coarse trajectories, one for each seed, with every set. Sequences are folders of `--data` with `images/`,
-`groundtruth.tum` and, for induced errors, `depth/`; or demo walks, rendered into WORK.
-`--disturb` spoils the images first. Runs are kept in WORK and resumed.
+Every sequence is refined from several coarse trajectories, one for each seed, with every set.
+Sequences are folders of `--data` with `images/`, `groundtruth.tum` and, for induced errors,
+`depth/`; or demo walks, rendered into WORK. `--disturb` spoils the images first. Runs are kept in
+WORK and resumed.
 """
 
 import argparse
