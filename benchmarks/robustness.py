@@ -211,6 +211,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     frames, truth_path = arguments.frames, arguments.truth
+    arguments.work.mkdir(parents=True, exist_ok=True)
     if frames is None:
         walk = make_walk(arguments.work / "walk", num_frames=40, width=768, seed=arguments.seed)
         frames, truth_path = walk.frames_dir, walk.truth_path
