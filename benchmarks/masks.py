@@ -3,7 +3,8 @@
     python benchmarks/masks.py --data DATA --out WORK --json FILE --markdown FILE
 
 `DATA/SCENE` holds `images/`, `slam.tum` and `groundtruth.tum`; without `--data` the gallery of
-`gsba demo` is rendered. Runs are kept in WORK and resumed while code and settings stay the same.
+`gsba demo` is rendered. `--splat STEPS` trains a splat on each run and measures it against clean
+frames that were held out. Runs are kept in WORK and resumed while code and settings stay the same.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from common import machine
 
 from gsba import RefineSettings, refine
 from gsba.carrier import carrier_mask, find_carrier
-from gsba.config import ExportSettings
+from gsba.config import ExportSettings, SplatSettings
 from gsba.demo import make_walk
 from gsba.demo.people import make_people, paste_people
 from gsba.evaluate import evaluate
@@ -27,10 +28,23 @@ from gsba.geometry import bearings_from_erp
 from gsba.read import load_erp, load_mask, read_trajectory, scan
 from gsba.read.frames import find_panoramas
 from gsba.read.images import decode
-from gsba.types import FrameSet
+from gsba.splat.backend import choose_backend
+from gsba.splat.train import train
+from gsba.splatting import (
+    load_faces,
+    make_views,
+    mean_score,
+    measure,
+    near_of,
+    refined_frames,
+    split_frames,
+    start_cloud,
+)
+from gsba.types import FrameSet, Reconstruction
 
 NUM_PEOPLE = 4
-MAX_ATE, MAX_CLEAN, MIN_CARRIER = 1.10, 0.01, 0.9
+MAX_ATE, MAX_CLEAN, MIN_CARRIER, MAX_DB = 1.10, 0.01, 0.9, 0.2
+FACE_SIZE = 128  # pixels, of splats
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +58,10 @@ class Row:
     iou: float | None = None
     recall: float | None = None
     false: float | None = None  # part of all pixels
+    psnr: float | None = None  # dB, of a splat against clean frames held out
 
 
-def people_rows(scene: Path, work: Path, tall: float) -> list[Row]:
+def people_rows(scene: Path, work: Path, tall: float, steps: int) -> list[Row]:
     """Runs of a scene clean and with people, without and with masks."""
     truth = read_trajectory(scene / "groundtruth.tum")
     clean = scan(scene / "images")
@@ -74,8 +89,29 @@ def people_rows(scene: Path, work: Path, tall: float) -> list[Row]:
         errors = evaluate(read_trajectory(out / "trajectory.tum"), truth)
         numbers = _masks(result.frames, crowded if images is crowded else None) if masks else {}
         rotation = errors.rpe_rotation_deg.median
+        if steps:
+            numbers["psnr"] = splat_psnr(result.reconstruction, result.frames, clean, steps)
         rows.append(Row(name, errors.ate.rmse, rotation, **numbers))
     return rows
+
+
+def splat_psnr(
+    reconstruction: Reconstruction, frames: FrameSet, clean: FrameSet, steps: int
+) -> float:
+    """PSNR of a splat trained on a run's frames with their masks, against clean frames held out."""
+    settings = SplatSettings(
+        iterations=steps, face_size=FACE_SIZE, sh_degree=1, max_gaussians=40_000, backend="cpu"
+    )
+    split = split_frames(refined_frames(reconstruction), settings.held_out_every)
+    poses, backend = reconstruction.world_T_rigs, choose_backend("cpu", 2)
+    seen, unseen = (
+        make_views(*load_faces(source, part, FACE_SIZE), poses[part])
+        for source, part in ((frames, split.training), (clean, split.held_out))
+    )
+    start = start_cloud(reconstruction, poses, split.training, settings.sh_degree)
+    splat = train(start, seen, settings, backend)
+    near = near_of(poses[split.training], settings)
+    return mean_score(measure(splat, unseen, settings, near, backend).values()).psnr
 
 
 def _masks(frames: FrameSet, crowded: Path | None) -> dict[str, float]:
@@ -131,8 +167,8 @@ def carrier_rows(frames: FrameSet, work: Path) -> list[Row]:
 def table(rows: Sequence[Row]) -> str:
     """The rows in Markdown."""
     lines = [
-        "| run | ATE rmse, 1e-3 | rel. rot., deg | masked | IoU | recall | false |",
-        "|---|---|---|---|---|---|---|",
+        "| run | ATE rmse, 1e-3 | rel. rot., deg | masked | IoU | recall | false | splat, dB |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         cells = [
@@ -142,6 +178,7 @@ def table(rows: Sequence[Row]) -> str:
             _cell(row.iou, 1, ".3f"),
             _cell(row.recall, 1, ".3f"),
             _cell(row.false, 1, ".2%"),
+            _cell(row.psnr, 1, ".2f"),
         ]
         lines.append(f"| {row.name} | {' | '.join(cells)} |")
     return "\n".join(lines)
@@ -158,6 +195,8 @@ def missed(rows: Sequence[Row]) -> list[str]:
     crowd, clean = named.get("people, distractors masked"), named.get("clean")
     if crowd and clean and crowd.ate and clean.ate and crowd.ate > MAX_ATE * clean.ate:
         out.append(f"with masks the ATE is {crowd.ate / clean.ate:.2f} of the clean run's")
+    if crowd and clean and crowd.psnr and clean.psnr and crowd.psnr < clean.psnr - MAX_DB:
+        out.append(f"a splat with masks is {clean.psnr - crowd.psnr:.2f} dB behind the clean one")
     looked = named.get("clean, distractors looked for")
     if looked and (looked.masked or 0) > MAX_CLEAN:
         out.append(f"{looked.masked:.2%} of clean frames are masked")
@@ -172,6 +211,7 @@ def main() -> int:
     parser.add_argument("--data", type=Path, help="folder of scenes; none: render the gallery")
     parser.add_argument("--scene", default="aisle_loop")
     parser.add_argument("--tall", type=float, default=0.4, help="height of a person, map units")
+    parser.add_argument("--splat", type=int, default=0, metavar="STEPS", help="of each training")
     parser.add_argument("--out", type=Path, default=Path("masks-benchmark"))
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", type=Path)
@@ -183,7 +223,7 @@ def main() -> int:
         scene, tall = work / "gallery", 1.7
         if not (scene / "groundtruth.tum").exists():
             make_walk(scene, "rectangle", "locked")
-    rows = people_rows(scene, work, tall)
+    rows = people_rows(scene, work, tall, arguments.splat)
     rows += carrier_rows(find_panoramas(scene / "images"), work)
     misses = missed(rows)
     verdict = "; ".join(misses) or "all targets hold"
