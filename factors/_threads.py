@@ -1,7 +1,9 @@
 """Runs of landmarks or patches shared out among threads."""
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -22,9 +24,17 @@ def balanced_ranges(offsets: np.ndarray, num_threads: int) -> list[tuple[int, in
 
 
 def run_in_threads(work: Callable[[int], None], num: int) -> None:
-    """Call work(0) to work(num - 1), each in a thread of its own."""
+    """Call work(0) to work(num - 1), each in a thread of its own; work must not do the same."""
     if num == 1:
         work(0)
         return
-    with ThreadPoolExecutor(num) as pool:
-        list(pool.map(work, range(num)))
+    list(_pool(num).map(work, range(num)))
+
+
+@lru_cache(maxsize=4)
+def _pool(num: int) -> ThreadPoolExecutor:
+    """Threads that stay: a solver asks for them hundreds of times."""
+    return ThreadPoolExecutor(num, "factors")
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)  # a child has none of its parent's threads
