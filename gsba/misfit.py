@@ -29,8 +29,8 @@ def refuse_useless(coarse: CoarsePoses) -> None:
         )
 
 
-def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -> None:
-    """Refuse a trajectory that most steps of the images contradict, with the likely reason.
+def refuse_misread(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -> None:
+    """Refuse a trajectory that most steps of the images contradict, but not if read otherwise.
 
     Args:
         coarse: the trajectory.
@@ -38,32 +38,51 @@ def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -
         settings: disagreement that counts as contradiction.
 
     Raises:
-        GsbaError: most steps disagree.
+        GsbaError: it is reversed, mirrored, inverted or in other axes.
     """
-    own = coarse.sources == PoseSource.SLAM
-    judged = found.directed & own[:-1] & own[1:]
-    total = int(judged.sum())
-    if total < _MIN_STEPS:
+    judged = _judged(coarse, found)
+    if judged.sum() < _MIN_STEPS:
         return
     shares = {
         reading: _agreeing(steps, found, judged, settings)
         for reading, steps in _readings(coarse.world_T_rigs).items()
     }
     best = max(shares, key=lambda reading: shares[reading])
-    explained = best and shares[best] >= _EXPLAINS and shares[""] < _DOUBTFUL
-    loose = settings.model_copy(update=_LOOSE)
-    if (
-        not explained
-        and _agreeing(_readings(coarse.world_T_rigs)[""], found, judged, loose) > _FITS
-    ):
-        return
-    text = f"the images contradict {round((1 - shares['']) * total)} of {total} steps"
-    if explained:
+    if best and shares[best] >= _EXPLAINS and shares[""] < _DOUBTFUL:
+        text = _contradicted(shares[""], judged)
         raise GsbaError(f"{text}: the trajectory is {best}, {_WITHOUT}")
+
+
+def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -> None:
+    """Refuse a trajectory that most steps of the images contradict, with the likely reason.
+
+    Args:
+        coarse, found, settings: as for `refuse_misread`.
+
+    Raises:
+        GsbaError: most steps disagree.
+    """
+    refuse_misread(coarse, found, settings)
+    judged, loose = _judged(coarse, found), settings.model_copy(update=_LOOSE)
+    steps = _readings(coarse.world_T_rigs)[""]
+    if judged.sum() < _MIN_STEPS or _agreeing(steps, found, judged, loose) > _FITS:
+        return
+    text = _contradicted(_agreeing(steps, found, judged, settings), judged)
     raise GsbaError(
         f"{text}: the trajectory is of another recording or on another clock; "
         f"give the right one, {_WITHOUT}"
     )
+
+
+def _judged(coarse: CoarsePoses, found: Steps) -> np.ndarray:
+    """Steps (F - 1,) bool between SLAM poses, in a direction that the images tell."""
+    own = coarse.sources == PoseSource.SLAM
+    return found.directed & own[:-1] & own[1:]
+
+
+def _contradicted(share: float, judged: np.ndarray) -> str:
+    total = int(judged.sum())
+    return f"the images contradict {round((1 - share) * total)} of {total} steps"
 
 
 def _readings(world_T_rigs: np.ndarray) -> dict[str, np.ndarray]:

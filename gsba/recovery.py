@@ -98,6 +98,8 @@ def check_clock(
 ) -> ClockEstimate:
     """Whether the trajectory turns when the images do, or at other times.
 
+    One that fits if read otherwise is refused first: it may turn like the images at other times.
+
     Args:
         context: of the run.
         guided: neighbours verified under the trajectory's guidance. Where it lost many, whole
@@ -105,6 +107,9 @@ def check_clock(
         coarse: the trajectory at the frames' times.
         timestamps: (F,) seconds.
         trajectory: all its entries.
+
+    Raises:
+        GsbaError: it is reversed, mirrored, inverted or in other axes.
     """
     settings, intervals = context.settings, np.diff(timestamps)
     close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
@@ -113,6 +118,7 @@ def check_clock(
     if len(lost) > _MANY_LOST * len(chosen):
         guided = _join([guided, match_anywhere(context, lost)])
     steps = motion.steps(guided, context.keypoints, settings.verify)
+    misfit.refuse_misread(coarse, steps, settings.verify)
     reach = settings.read.max_clock_shift_s
     return clock.estimate(timestamps, steps, trajectory, coarse.time_offset, reach)
 

@@ -1,15 +1,18 @@
 """Trajectories that are not of these images are refused, with the reason where there is one."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from synthetic import drifted, loop_walk, unit
 
-from gsba.config import VerifySettings
+from gsba import recovery
+from gsba.config import RefineSettings, VerifySettings
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
-from gsba.misfit import refuse_misfit, refuse_useless
+from gsba.misfit import refuse_misfit, refuse_misread, refuse_useless
 from gsba.motion import Steps
-from gsba.types import CoarsePoses, PoseSource
+from gsba.types import CoarsePoses, PoseSource, Trajectory
 
 NUM = 30
 SLAM = drifted(loop_walk(NUM), np.random.default_rng(0))
@@ -48,6 +51,26 @@ def test_what_does_not_fit_is_refused_with_the_reason(poses: np.ndarray, said: s
     with pytest.raises(GsbaError, match=said) as refused:
         refuse_misfit(_coarse(poses), _found(), VerifySettings())
     assert "\n" not in str(refused.value) and "--no-trajectory" in str(refused.value)
+
+
+def test_a_late_clock_or_another_recording_are_not_misread() -> None:
+    refuse_misread(_coarse(np.roll(SLAM, 9, axis=0)), _found(), VerifySettings())
+    refuse_misread(_coarse(_another()), _found(), VerifySettings())
+    with pytest.raises(GsbaError, match="reversed in time"):
+        refuse_misread(_coarse(SLAM[::-1]), _found(), VerifySettings())
+
+
+def test_a_reversed_trajectory_is_refused_before_another_clock_is_looked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(recovery, "match_anywhere", lambda *_: recovery.nothing_verified())
+    monkeypatch.setattr(recovery.motion, "steps", lambda *_: _found())
+    context = SimpleNamespace(settings=RefineSettings(), keypoints=None)
+    times = np.arange(float(NUM))
+    trajectory = Trajectory(times, SLAM[::-1])
+    given = context, recovery.nothing_verified(), _coarse(SLAM[::-1]), times, trajectory
+    with pytest.raises(GsbaError, match="reversed in time"):
+        recovery.check_clock(*given)  # type: ignore[arg-type]
 
 
 def test_many_outliers_are_no_reason_to_refuse() -> None:
