@@ -3,7 +3,7 @@
 Every source trains on the same frames with the same settings and seed, from the run's tracks
 triangulated under its own poses, and is measured on panoramas it never saw, at its own poses.
 All are carried into the run's world first: a splat's Gaussians begin along the axes of its world,
-and walls along them are worth some 0.1 dB that no pose has earned.
+and walls along them are worth some 0.2 dB that no pose has earned.
 """
 
 import json
