@@ -42,7 +42,7 @@ class CubemapSettings(_Settings):
     face_size: int | None = Field(default=None, ge=64)  # pixels; None = by oversampling
     oversampling: float = Field(default=0.5, ge=0.25, le=4)  # face pixels per panorama pixel
     min_face_size: int = Field(default=192, ge=64)  # pixels; bounds on the automatic size
-    max_face_size: int = Field(default=512, ge=64)
+    max_face_size: int = Field(default=448, ge=64)
 
 
 class FeatureSettings(_Settings):
