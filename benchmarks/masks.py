@@ -65,7 +65,7 @@ def people_rows(scene: Path, work: Path, tall: float, steps: int) -> list[Row]:
     """Runs of a scene clean and with people, without and with masks."""
     truth = read_trajectory(scene / "groundtruth.tum")
     clean = scan(scene / "images")
-    crowded = work / f"{scene.name}-people"
+    crowded = work / f"{scene.name}-with-people"
     up = -truth.world_T_rigs[:, :3, 1].mean(axis=0)
     people = make_people(truth.world_T_rigs, NUM_PEOPLE, tall, up / np.linalg.norm(up))
     for f, name in enumerate(clean.names):
