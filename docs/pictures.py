@@ -3,8 +3,8 @@ r"""Draw the pictures of README and docs from what `gsba demo` leaves.
     gsba demo --frames 24 --width 768
     python docs/pictures.py gsba-demo
     python benchmarks/splat_quality.py --scenes demo_rectangle --out splats \
-        --iterations 1500 --face-size 96 --max-gaussians 40000
-    python docs/pictures.py gsba-demo --splats splats/demo_rectangle/splats
+        --sources raw default --iterations 4000 --face-size 256 --max-gaussians 120000
+    python docs/pictures.py gsba-demo --splats splats/demo_rectangle/splats0
 
 Writes docs/images: trajectory.svg, residuals.jpg, cloud.jpg and, from what either
 benchmarks/splat_quality.py or gsba evaluate --splat left, splats.svg. The colours are those of
@@ -225,11 +225,12 @@ def splats(folder: Path) -> str:
     path = pictures[len(pictures) // 2]
     sheet = cv2.imread(str(path))[..., ::-1]  # a row of faces: as captured, then of each source
     size = sheet.shape[1] // 6
-    coarse = next(name for name in scores if name not in ("refined", "truth"))
+    refined = next(name for name in ("refined", "default") if name in scores)
+    coarse = next(name for name in scores if name not in (refined, "truth"))
     shown = [("captured", 0, QUIET)]
     for name, label, color in (
         (coarse, "on coarse poses", BEFORE),
-        ("refined", "on refined poses", AFTER),
+        (refined, "on refined poses", AFTER),
     ):
         found = scores[name]["frames"][path.stem]["psnr"]
         shown.append((f"{label}, {found:.1f} dB", 1 + list(scores).index(name), color))

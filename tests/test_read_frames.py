@@ -27,6 +27,17 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "frames"
 
 
+def test_frames_are_found_again_from_elsewhere(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_image(folder.parent / "mask.png")
+    monkeypatch.chdir(folder.parent)
+    frames = scan(Path("frames"), fps=1, masks=Path("mask.png"))
+    monkeypatch.chdir("/")
+    assert load_erp(frames, 1).shape == (32, 64, 3)
+    assert load_mask(frames, 1) is not None
+
+
 @pytest.mark.parametrize(("suffix", "width"), [("jpg", 128), ("jpg", 96), ("png", 128)])
 def test_narrower_panoramas_are_averages_of_the_wide_ones(
     tmp_path: Path, suffix: str, width: int

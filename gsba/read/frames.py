@@ -68,13 +68,13 @@ def scan(
     erp_size = (width, height) if layout == "erp" else None
     return FrameSet(
         names=tuple(names),
-        paths=paths,
+        paths=tuple(tuple(path.absolute() for path in group) for group in paths),
         timestamps=times,
         layout=layout,
         faces=faces,
         width=width,
         height=height,
-        mask_paths=find_masks(masks, names, erp_size),
+        mask_paths=find_masks(masks and masks.absolute(), names, erp_size),
     )
 
 
@@ -92,13 +92,13 @@ def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
     width, height = _common_size(paths, layout)
     return FrameSet(
         names=tuple(names),
-        paths=paths,
+        paths=tuple(tuple(path.absolute() for path in group) for group in paths),
         timestamps=np.arange(len(names), dtype=np.float64),
         layout=layout,
         faces=(),
         width=width,
         height=height,
-        mask_paths=find_masks(masks, names, (width, height)),
+        mask_paths=find_masks(masks and masks.absolute(), names, (width, height)),
     )
 
 
