@@ -240,7 +240,7 @@ def splats(folder: Path) -> str:
     for column, (label, row, color) in enumerate(shown):
         faces = [sheet[row * size : (row + 1) * size, c * size : (c + 1) * size] for c in (0, 1)]
         image = cv2.resize(
-            np.concatenate(faces), (2 * wide, 4 * wide), interpolation=cv2.INTER_CUBIC
+            np.concatenate(faces), (3 * wide // 2, 3 * wide), interpolation=cv2.INTER_CUBIC
         )
         data = base64.b64encode(jpeg(image, 34_000)).decode()
         x = gap + column * (wide + gap)
