@@ -80,7 +80,8 @@ def _cells(row: dict, ours: dict | None) -> list[str]:
     if "errors" in row:
         errors = row["errors"]
         cells += [_posed(row), f"{errors['ate']['rmse']:.5f}"]
-        cells += [f"{errors['rpe_rotation_deg']['median']:.4f}"]
+        relative = errors["rpe_rotation_deg"]["median"]  # None: no two consecutive frames posed
+        cells += ["" if relative is None else f"{relative:.4f}"]
         cells += [f"{100 * errors['auc'][angle]:.1f}" for angle in AUC_DEG]
     else:
         cells += [row["reason"].replace("|", "/"), *[""] * (2 + len(AUC_DEG))]
