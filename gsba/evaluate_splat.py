@@ -103,9 +103,9 @@ def compare(
     usable = refined_frames(reconstruction)
     for poses in sources.values():
         usable = usable & np.isfinite(poses).all(axis=(1, 2))
+    split = split_frames(usable, settings.held_out_every)
     own = reconstruction.world_T_rigs[usable]
     sources = {name: _beside(poses, usable, own) for name, poses in sources.items()}
-    split = split_frames(usable, settings.held_out_every)
     faces = [
         load_faces(frames, part, settings.face_size) for part in (split.training, split.held_out)
     ]
