@@ -23,23 +23,15 @@ from gsba.config import ExportSettings, SplatSettings
 from gsba.demo import make_walk
 from gsba.demo.people import make_people, paste_people
 from gsba.evaluate import evaluate
+from gsba.evaluate_splat import train_and_measure
 from gsba.export.images import write_image
 from gsba.geometry import bearings_from_erp
 from gsba.read import load_erp, load_mask, read_trajectory, scan
 from gsba.read.frames import find_panoramas
 from gsba.read.images import decode
 from gsba.splat.backend import choose_backend
-from gsba.splat.train import train
-from gsba.splatting import (
-    load_faces,
-    make_views,
-    mean_score,
-    measure,
-    near_of,
-    refined_frames,
-    split_frames,
-    start_cloud,
-)
+from gsba.splatting import load_faces, make_views, refined_frames, split_frames
+from gsba.store import digest, fingerprint
 from gsba.types import FrameSet, Reconstruction
 
 NUM_PEOPLE = 4
@@ -90,13 +82,19 @@ def people_rows(scene: Path, work: Path, tall: float, steps: int) -> list[Row]:
         numbers = _masks(result.frames, crowded if images is crowded else None) if masks else {}
         rotation = errors.rpe_rotation_deg.median
         if steps:
-            numbers["psnr"] = splat_psnr(result.reconstruction, result.frames, clean, steps)
+            numbers["psnr"] = splat_psnr(
+                result.reconstruction,
+                result.frames,
+                clean,
+                steps,
+                out.with_name(f"{out.name}-splat"),
+            )
         rows.append(Row(name, errors.ate.rmse, rotation, **numbers))
     return rows
 
 
 def splat_psnr(
-    reconstruction: Reconstruction, frames: FrameSet, clean: FrameSet, steps: int
+    reconstruction: Reconstruction, frames: FrameSet, clean: FrameSet, steps: int, out: Path
 ) -> float:
     """PSNR of a splat trained on a run's frames with their masks, against clean frames held out."""
     settings = SplatSettings(
@@ -108,10 +106,12 @@ def splat_psnr(
         make_views(*load_faces(source, part, FACE_SIZE), poses[part])
         for source, part in ((frames, split.training), (clean, split.held_out))
     )
-    start = start_cloud(reconstruction, poses, split.training, settings.sh_degree)
-    splat = train(start, seen, settings, backend)
-    near = near_of(poses[split.training], settings)
-    return mean_score(measure(splat, unseen, settings, near, backend).values()).psnr
+    files = fingerprint([*(p[0] for p in frames.paths), *frames.mask_paths])
+    key = digest(files, poses.tolist(), settings)
+    _, found = train_and_measure(
+        reconstruction, frames, poses, split, seen, unseen, settings, backend, out, key, None
+    )
+    return found.mean.psnr
 
 
 def _masks(frames: FrameSet, crowded: Path | None) -> dict[str, float]:

@@ -10,9 +10,9 @@ from factors._host_factors import host_factors
 from factors._kernels import eliminate_range, polish_range, residuals_range
 from factors._observations import Term, check_term, sort_observations
 from factors._terms import pose_rows
-from factors._threads import balanced_ranges, run_in_threads
 from factors.block import PoseSystem
 from factors.robust import RobustLoss
+from factors.threads import balanced_ranges, run_in_threads
 
 _POLISH_TOLERANCE = 1e-12  # of a landmark's cost
 _PROPOSAL_TOLERANCE = 1e-6  # of a landmark's cost: further steps gain less than the poses do

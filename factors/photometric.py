@@ -12,10 +12,10 @@ from factors._photometric_host import host_factors
 from factors._photometric_kernels import DIMS, PatchData, observe_range
 from factors._photometric_schur import eliminate_range
 from factors._terms import pose_rows
-from factors._threads import balanced_ranges, run_in_threads
 from factors.block import PoseSystem
 from factors.patch_windows import PatchPixels, covisible_frames, patch_axes, poor_views
 from factors.robust import RobustLoss
+from factors.threads import balanced_ranges, run_in_threads
 
 FAMILY = "photometric"
 _LEAST_SHARE = 0.2  # of its inverse depth is what one step leaves a patch at least

@@ -187,13 +187,11 @@ def _rays(width: int) -> np.ndarray:
 def _load(frames: FrameSet, frame: int, width: int) -> np.ndarray:
     """Small picture (h, w, C + 1) uint8: colours, or grey of cube faces, and where to use it."""
     if frames.layout == "erp":
-        size = (width, width // 2)
         color = load_erp(frames, frame, width=width)
         mask = load_mask(frames, frame)
         use = np.ones(color.shape[:2], np.uint8)
         if mask is not None:
-            share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-            use = (share > 0.999).astype(np.uint8)
+            use = panorama.fit_mask(mask, width).astype(np.uint8)
         return np.dstack([color, use])
     grey, mask = panorama.load_grey(frames, frame, width)
     use = np.ones_like(grey) if mask is None else mask.astype(np.uint8)

@@ -117,7 +117,7 @@ def compare(
         key = digest(
             fingerprint([p[0] for p in frames.paths]), poses.tolist(), settings, backend.name
         )
-        splats[name], results[name] = _one(
+        splats[name], results[name] = train_and_measure(
             reconstruction,
             frames,
             poses,
@@ -155,7 +155,7 @@ def _write(
     _write_curves(out / "curves.png", results)
 
 
-def _one(
+def train_and_measure(
     reconstruction: Reconstruction,
     frames: FrameSet,
     poses: np.ndarray,
@@ -168,7 +168,18 @@ def _one(
     key: str,
     lpips: Distance | None,
 ) -> tuple[Gaussians, SourceResult]:
-    """Train on one source, and measure on the way."""
+    """Train on one source of poses, and measure on the way.
+
+    Args:
+        reconstruction, frames: as for `compare`.
+        poses: (F, 4, 4) of the source.
+        split: of the frames.
+        training, held_out: views of either part, from these poses.
+        settings, backend: of the training.
+        out: folder to write, see `compare`.
+        key: what the training depends on; what another one left is not taken up.
+        lpips: see `compare`.
+    """
     near = near_of(poses[split.training], settings)
     curve = _read_curve(out / "curve.json", key)
 

@@ -64,7 +64,7 @@ def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -
     """
     refuse_misread(coarse, found, settings)
     judged, loose = _judged(coarse, found), settings.model_copy(update=_LOOSE)
-    steps = _readings(coarse.world_T_rigs)[""]
+    steps = _steps(coarse.world_T_rigs)
     if judged.sum() < _MIN_STEPS or _agreeing(steps, found, judged, loose) > _FITS:
         return
     text = _contradicted(_agreeing(steps, found, judged, settings), judged)
@@ -85,15 +85,18 @@ def _contradicted(share: float, judged: np.ndarray) -> str:
     return f"the images contradict {round((1 - share) * total)} of {total} steps"
 
 
+def _steps(poses: np.ndarray) -> np.ndarray:
+    """Relative poses (F - 1, 4, 4) of consecutive ones."""
+    return inverse(poses[:-1]) @ poses[1:]
+
+
 def _readings(world_T_rigs: np.ndarray) -> dict[str, np.ndarray]:
     """What a trajectory's steps (F - 1, 4, 4) would be if it had been written otherwise."""
-    steps = inverse(world_T_rigs[:-1]) @ world_T_rigs[1:]
-    backwards = world_T_rigs[::-1]
-    rig_T_worlds = inverse(world_T_rigs)
+    steps = _steps(world_T_rigs)
     readings = {
         "": steps,
-        "reversed in time: check its timestamps": inverse(backwards[:-1]) @ backwards[1:],
-        "camera-from-world: invert its poses": inverse(rig_T_worlds[:-1]) @ rig_T_worlds[1:],
+        "reversed in time: check its timestamps": _steps(world_T_rigs[::-1]),
+        "camera-from-world: invert its poses": _steps(inverse(world_T_rigs)),
         "in axes of y up and z backward: convert it to y down and z forward": _flipped(
             steps, [1, -1, -1]
         ),

@@ -36,7 +36,7 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
     mask = read.load_mask(frames, frame)
     if frames.layout == "erp":
         grey = read.load_erp(frames, frame, gray=True, width=width)
-        return grey, None if mask is None else _fit_mask(mask, width)
+        return grey, None if mask is None else fit_mask(mask, width)
     size = frames.width
     faces = np.zeros((len(FACES), size, size), np.uint8)
     present = [FACES.index(name) for name in frames.faces]
@@ -49,9 +49,9 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
         grey[own] = cv2.remap(padded, maps[0], maps[1], cv2.INTER_CUBIC)[own]
     usable = np.isin(owners, present)
     if mask is not None:
-        usable &= _fit_mask(mask, native)
+        usable &= fit_mask(mask, native)
     whole = bool(usable.all())
-    return _fit(grey, width), None if whole else _fit_mask(usable, width)
+    return _fit(grey, width), None if whole else fit_mask(usable, width)
 
 
 def wrapped(image: np.ndarray, columns: int) -> np.ndarray:
@@ -85,7 +85,7 @@ def _fit(grey: np.ndarray, width: int) -> np.ndarray:
     return cv2.resize(grey, (width, width // 2), interpolation=cv2.INTER_AREA)
 
 
-def _fit_mask(mask: np.ndarray, width: int) -> np.ndarray:
+def fit_mask(mask: np.ndarray, width: int) -> np.ndarray:
     """A mask resized to a width; a pixel is usable where all it covers is."""
     if mask.shape[1] == width:
         return mask

@@ -1,10 +1,9 @@
 """Scene points from bearings and poses, robust to false observations in a track."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numba
 import numpy as np
 
+from factors.threads import run_in_threads
 from gsba.config import TriangulateSettings
 from gsba.types import Counts, Landmarks, Tracks
 
@@ -43,14 +42,13 @@ def run(
     parallaxes = np.zeros(tracks.num_points)
     bounds = np.linspace(0, tracks.num_points, num_threads + 1).astype(np.int64)
 
-    def triangulate(first: int, last: int) -> None:
-        gate = float(max_error_sigmas)
+    def triangulate(part: int) -> None:
+        first, last, gate = bounds[part], bounds[part + 1], float(max_error_sigmas)
         _triangulate(
             starts, first, last, rays, centres, sigmas_rad, gate, points, inliers, parallaxes
         )
 
-    with ThreadPoolExecutor(num_threads) as pool:
-        list(pool.map(triangulate, bounds[:-1], bounds[1:]))
+    run_in_threads(triangulate, num_threads)
     lengths = np.add.reduceat(inliers, starts[:-1]) if len(rays) else np.zeros(0, int)
     short = lengths < settings.min_track_length
     flat = ~short & (parallaxes < np.deg2rad(settings.min_parallax_deg))

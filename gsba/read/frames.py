@@ -68,13 +68,13 @@ def scan(
     erp_size = (width, height) if layout == "erp" else None
     return FrameSet(
         names=tuple(names),
-        paths=tuple(tuple(path.absolute() for path in group) for group in paths),
+        paths=_absolute(paths),
         timestamps=times,
         layout=layout,
         faces=faces,
         width=width,
         height=height,
-        mask_paths=find_masks(masks and masks.absolute(), names, erp_size),
+        mask_paths=find_masks(masks, names, erp_size),
     )
 
 
@@ -92,13 +92,13 @@ def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
     width, height = _common_size(paths, layout)
     return FrameSet(
         names=tuple(names),
-        paths=tuple(tuple(path.absolute() for path in group) for group in paths),
+        paths=_absolute(paths),
         timestamps=np.arange(len(names), dtype=np.float64),
         layout=layout,
         faces=(),
         width=width,
         height=height,
-        mask_paths=find_masks(masks and masks.absolute(), names, (width, height)),
+        mask_paths=find_masks(masks, names, (width, height)),
     )
 
 
@@ -129,6 +129,11 @@ def load_faces(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
         raise ValueError("load_faces needs cube frames")
     size = frames.width, frames.height
     return np.stack([decode(path, size, gray) for path in frames.paths[f]])
+
+
+def _absolute(paths: Sequence[Sequence[Path]]) -> tuple[tuple[Path, ...], ...]:
+    """Paths that hold from any working folder."""
+    return tuple(tuple(path.absolute() for path in group) for group in paths)
 
 
 def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Path, ...]]]:

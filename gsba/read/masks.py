@@ -46,7 +46,7 @@ def find_masks(
             raise GsbaError(f"{path}: mask is {w}x{h}, but frames are {erp_size[0]}x{erp_size[1]}")
         if w != 2 * h:
             raise GsbaError(f"{path}: mask is {w}x{h}; masks are equirectangular, 2:1")
-    return paths
+    return tuple(path.absolute() for path in paths)
 
 
 def load_mask(frames: FrameSet, f: int) -> np.ndarray | None:

@@ -9,12 +9,12 @@ alpha is 1/255 or more (its tiles and rows are bounded by exactly that ellipse),
 import functools
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from factors.threads import pool
 from gsba.splat import _project, _tiles
 from gsba.splat.camera import FaceCamera
 from gsba.splat.gaussians import Gaussians, zeros_like
@@ -154,13 +154,8 @@ def _in_parallel(
         kernel(*given, 0, num)
         return
     running = [
-        _pool(num_threads).submit(kernel, *given, begin, min(begin + grain, num))
+        pool(num_threads).submit(kernel, *given, begin, min(begin + grain, num))
         for begin in range(0, num, grain)
     ]
     for future in running:
         future.result()
-
-
-@functools.cache
-def _pool(num_threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(num_threads, thread_name_prefix="splat")

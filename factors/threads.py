@@ -1,4 +1,4 @@
-"""Runs of landmarks or patches shared out among threads."""
+"""Threads, and runs of landmarks or patches shared out among them."""
 
 import os
 from collections.abc import Callable
@@ -28,13 +28,13 @@ def run_in_threads(work: Callable[[int], None], num: int) -> None:
     if num == 1:
         work(0)
         return
-    list(_pool(num).map(work, range(num)))
+    list(pool(num).map(work, range(num)))
 
 
 @lru_cache(maxsize=4)
-def _pool(num: int) -> ThreadPoolExecutor:
-    """Threads that stay: a solver asks for them hundreds of times."""
+def pool(num: int) -> ThreadPoolExecutor:
+    """Threads that stay: solvers and renderers ask for them hundreds of times."""
     return ThreadPoolExecutor(num, "factors")
 
 
-os.register_at_fork(after_in_child=_pool.cache_clear)  # a child has none of its parent's threads
+os.register_at_fork(after_in_child=pool.cache_clear)  # a child has none of its parent's threads
