@@ -179,9 +179,14 @@ class PhotometricBlock:
         return 1 - 0.5 * self.errors(values) * len(self.table.grid) / scales**2
 
     @property
+    def weights(self) -> np.ndarray:
+        """(O,) weights of observations, 0 where the last `refresh` left one out."""
+        return self._data.weights
+
+    @property
     def counted(self) -> np.ndarray:
         """(O,) bool, observations that the last `refresh` let count."""
-        return self._data.weights > 0
+        return self.weights > 0
 
     def subset(self, rows: np.ndarray) -> "PhotometricBlock":
         """A block of some patches (rows, ascending, all observed) on the frames they touch.

@@ -60,7 +60,7 @@ class SplatBlock:
         self,
         pose_keys: Sequence[int],
         images: Sequence[np.ndarray],
-        use: Sequence[np.ndarray | None],
+        weights: Sequence[np.ndarray | None],
         cameras: FaceCameras,
         render: Render,
         loss: RobustLoss | None = None,
@@ -72,7 +72,8 @@ class SplatBlock:
             pose_keys: (F,) keys of Pose3 variables.
             images: (F,) of (C, H, W) float32 grey values 0..1 of a frame's faces, which should
                 overlap by a few pixels for sampling near their edges.
-            use: (F,) of (C, H, W) bool, pixels that may be sampled, or None.
+            weights: (F,) of (C, H, W) float or bool, how far pixels count, 0..1: 0 is never
+                sampled; or None.
             cameras: of the faces.
             render: the splat from a pose; called by `refresh`.
             loss: robust loss on each whitened residual; None is Cauchy at one sigma.
@@ -82,16 +83,16 @@ class SplatBlock:
         Raises:
             ValueError: as many images and masks as keys are needed.
         """
-        if not len(pose_keys) == len(images) == len(use):
-            raise ValueError("pose_keys, images and use must be equally long")
+        if not len(pose_keys) == len(images) == len(weights):
+            raise ValueError("pose_keys, images and weights must be equally long")
         self.pose_keys = [int(key) for key in pose_keys]
         self.pairs = np.zeros((0, 2), np.int64)
         self.loss = loss or RobustLoss("cauchy", 1.0)
         self.correlation = correlation
         self._cameras, self._render = cameras, render
         self._images = [_spline(image) for image in images]
-        whole = np.ones(self._images[0].shape if len(images) else (0, 0, 0), np.bool_)
-        self._use = [whole if mask is None else np.ascontiguousarray(mask) for mask in use]
+        whole = np.ones(self._images[0].shape if len(images) else (0, 0, 0), np.float32)
+        self._trust = [whole if w is None else np.ascontiguousarray(w, np.float32) for w in weights]
         self._frames: list[_Frame] = []
 
     def refresh(self, values: gtsam.Values) -> None:
@@ -99,7 +100,8 @@ class SplatBlock:
         self._frames = []
         for f, key in enumerate(self.pose_keys):
             view = self._render(f, values.atPose3(key).matrix())
-            found, _, seen = self._sample(f, view, pose_rows(values, [key])[0], False)
+            found, _, trust = self._sample(f, view, pose_rows(values, [key])[0], False)
+            seen = trust > 0
             gain, offset = _exposure(view.grey[seen], found[seen])
             grey = gain * view.grey + offset
             spread = 1.4826 * np.median(np.abs(found - grey)[seen]) if seen.any() else 0.0
@@ -152,36 +154,37 @@ class SplatBlock:
 
     def _frame_system(self, f: int, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """H (6, 6), gradient (6,) and cost of a frame at a pose row (12,)."""
-        residuals, jacobian = self._residuals(f, pose, True)
+        residuals, jacobian, trust = self._residuals(f, pose, True)
         squared = residuals**2
-        share = 1 / self.correlation
-        weights = share * _weights(self.loss, squared)
+        shares = trust / self.correlation
+        weights = shares * _weights(self.loss, squared)
         weighted = jacobian * weights[:, None]
-        cost = share * float(self.loss.rho(squared).sum())
+        cost = float(shares @ self.loss.rho(squared))
         return weighted.T @ jacobian, weighted.T @ residuals, cost
 
     def _frame_cost(self, f: int, pose: np.ndarray) -> float:
-        residuals, _ = self._residuals(f, pose, False)
-        return float(self.loss.rho(residuals**2).sum()) / self.correlation
+        residuals, _, trust = self._residuals(f, pose, False)
+        return float(trust @ self.loss.rho(residuals**2)) / self.correlation
 
     def _residuals(
         self, f: int, pose: np.ndarray, with_jacobian: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Whitened residuals (N,), their Jacobian (N, 6), and weights (N,), 0 where not seen."""
         if not self._frames:
             raise RuntimeError("refresh() comes before anything else")
         frame = self._frames[f]
-        found, jacobian, seen = self._sample(f, frame.view, pose, with_jacobian)
-        if np.count_nonzero(seen) < _MIN_SAMPLES:
-            return np.zeros(len(seen)), np.zeros((len(seen), 6))
-        residuals = np.where(seen, (found - frame.grey) / frame.sigma, 0.0)
-        return residuals, jacobian / frame.sigma
+        found, jacobian, trust = self._sample(f, frame.view, pose, with_jacobian)
+        if np.count_nonzero(trust) < _MIN_SAMPLES:
+            return np.zeros(len(trust)), np.zeros((len(trust), 6)), np.zeros(len(trust))
+        residuals = np.where(trust > 0, (found - frame.grey) / frame.sigma, 0.0)
+        return residuals, jacobian / frame.sigma, trust
 
     def _sample(
         self, f: int, view: RenderedView, pose: np.ndarray, with_jacobian: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Captured grey (N,), its Jacobian by the pose (N, 6), and where a point is seen (N,)."""
+        """Captured grey (N,), its Jacobian by the pose (N, 6), and weights (N,), 0 = not seen."""
         num, cameras = len(view.points_world), self._cameras
-        grey, seen = np.zeros(num), np.zeros(num, np.bool_)
+        grey, trust = np.zeros(num), np.zeros(num)
         jacobian = np.zeros((num if with_jacobian else 0, 6))
         _sample_faces(
             view.points_world,
@@ -190,13 +193,13 @@ class SplatBlock:
             np.asarray(cameras.focals, np.float64),
             np.asarray(cameras.principals, np.float64),
             self._images[f],
-            self._use[f],
+            self._trust[f],
             with_jacobian,
             grey,
             jacobian,
-            seen,
+            trust,
         )
-        return grey, jacobian, seen
+        return grey, jacobian, trust
 
 
 def _spline(image: np.ndarray) -> np.ndarray:
@@ -247,7 +250,17 @@ def _cubic(t, values, slopes):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sample_faces(
-    points, pose, rig_R_faces, focals, principals, image, use, with_jacobian, grey, jacobian, seen
+    points,
+    pose,
+    rig_R_faces,
+    focals,
+    principals,
+    image,
+    weights,
+    with_jacobian,
+    grey,
+    jacobian,
+    trust,
 ):
     """See SplatBlock._sample; a point belongs to the face along which it is furthest out."""
     num_faces, height, width = image.shape
@@ -273,7 +286,8 @@ def _sample_faces(
         column, row = int(np.floor(u)), int(np.floor(v))
         if column < 1 or row < 1 or column > width - 3 or row > height - 3:
             continue
-        if not (use[face, row, column] and use[face, row + 1, column + 1]):
+        weight = min(weights[face, row, column], weights[face, row + 1, column + 1])
+        if weight <= 0:
             continue
         _cubic(u - column, across, d_across)
         _cubic(v - row, down, d_down)
@@ -284,7 +298,7 @@ def _sample_faces(
                 value += down[i] * across[k] * coefficient
                 by_u += down[i] * d_across[k] * coefficient
                 by_v += d_down[i] * across[k] * coefficient
-        grey[n], seen[n] = value, True
+        grey[n], trust[n] = value, weight
         if with_jacobian:
             a, b = focal / depth * by_u, focal / depth * by_v
             c = -(a * right + b * lower)

@@ -76,16 +76,12 @@ def _dense_enough(width: int, rig: CubeRig) -> int:
 
 
 def cut_mask(mask: np.ndarray, rig: CubeRig) -> np.ndarray:
-    """Nearest-neighbour faces (6, size, size) bool of an ERP mask (H, 2H) bool."""
+    """Nearest-neighbour faces (6, size, size) of an ERP mask (H, 2H), bool or float32 weights."""
     height, width = mask.shape
-    padded = wrapped(mask.astype(np.uint8))
+    padded = wrapped(mask.astype(np.uint8) if mask.dtype == bool else mask)
     maps = _face_maps(rig, width, height)
-    return np.stack(
-        [
-            cv2.remap(padded, maps[face, 0], maps[face, 1], cv2.INTER_NEAREST) > 0
-            for face in range(len(FACES))
-        ]
-    )
+    faces = [cv2.remap(padded, *maps[face], cv2.INTER_NEAREST) for face in range(len(FACES))]
+    return np.stack(faces).astype(mask.dtype)
 
 
 @functools.lru_cache(maxsize=2)

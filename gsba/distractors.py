@@ -40,6 +40,7 @@ _LEAST_AREA = 120  # strong pixels at the equator
 _CLOSED = 13  # pixels: gaps up to this are closed
 _GROWN = 3  # pixels: the rim is blurred
 _MOST = 0.35  # of a picture: more is a wrong pose, or light that changed
+_LEVELS = 15  # of a weight that is kept
 _WRAP = 32  # pixels over the seam
 _wrapped = partial(panorama.wrapped, columns=_WRAP)
 
@@ -48,16 +49,19 @@ _wrapped = partial(panorama.wrapped, columns=_WRAP)
 class Distractors:
     """What was found in one frame."""
 
-    bits: np.ndarray  # packed (h, w) bool, True = distractor; see `distractor_mask`
-    width: int  # pixels across
+    weights: np.ndarray  # compressed (h, 2h) 0..1, 0 = distractor; see `distractor_weights`
     share: float  # of the sphere
     reason: str  # why nothing was looked for, or ""
 
 
+def distractor_weights(found: Distractors) -> np.ndarray:
+    """How far pixels can be trusted, (h, 2h) float32, 0..1, 0 = distractor."""
+    return cv2.imdecode(found.weights, cv2.IMREAD_GRAYSCALE).astype(np.float32) / _LEVELS
+
+
 def distractor_mask(found: Distractors) -> np.ndarray:
     """(h, 2h) bool, True = distractor."""
-    height, width = found.width // 2, found.width
-    return np.unpackbits(found.bits, count=height * width).reshape(height, width) > 0
+    return distractor_weights(found) == 0
 
 
 class Scene:
@@ -98,7 +102,7 @@ class Scene:
         shape = (self.width // 2, self.width)
         near = self._neighbours(frame)
         if len(near) < _WITNESSES:
-            return _packed(np.zeros(shape, bool), "too few frames share points with it")
+            return _packed(np.ones(shape), "too few frames share points with it")
         own = self._picture(frame)
         usable = own[..., 0] >= 0
         others = np.stack([self._exposed(n, frame, own) for n in near])
@@ -108,10 +112,11 @@ class Scene:
         seen = sweep.witnesses(others[..., 0] >= 0, n_T_own, self._rays, middle)
         score = _score(own, others, n_T_own, self._rays, lowest, highest)
         score[(seen < min(_WITNESSES, len(near))) | ~usable] = 0
-        found = _decide(score) & usable
+        noise = max(1.0, float(np.median(score)) / _NOISE)
+        found = _decide(score, noise) & usable
         if np.median(score) > _WORST or _share(found) > _MOST:
-            return _packed(np.zeros(shape, bool), "fits no neighbour: its pose or light is off")
-        return _packed(found, "")
+            return _packed(np.ones(shape), "fits no neighbour: its pose or light is off")
+        return _packed(np.where(found, 0, 1 / (1 + (score / (noise * _WEAK)) ** 2)), "")
 
     def _neighbours(self, frame: int) -> np.ndarray:
         """The frames that share most points, most first."""
@@ -243,9 +248,8 @@ def _score(
     return np.maximum(best[0], np.minimum(best[1], contradicted))
 
 
-def _decide(score: np.ndarray) -> np.ndarray:
+def _decide(score: np.ndarray, noise: float) -> np.ndarray:
     """Distractors (h, w) bool: connected, not thin, and strong somewhere."""
-    noise = max(1.0, float(np.median(score)) / _NOISE)
     wide = _wrapped(score)
     weak = cv2.morphologyEx(
         (wide > noise * _WEAK).astype(np.uint8), cv2.MORPH_OPEN, np.ones((_THIN, _THIN), np.uint8)
@@ -266,8 +270,9 @@ def _decide(score: np.ndarray) -> np.ndarray:
     return _unwrapped(grown) > 0
 
 
-def _packed(found: np.ndarray, reason: str) -> Distractors:
-    return Distractors(np.packbits(found), found.shape[1], _share(found), reason)
+def _packed(weights: np.ndarray, reason: str) -> Distractors:
+    levels = np.where(weights > 0, np.maximum(np.rint(_LEVELS * weights), 1), 0).astype(np.uint8)
+    return Distractors(cv2.imencode(".png", levels)[1].ravel(), _share(weights == 0), reason)
 
 
 def _share(found: np.ndarray) -> float:

@@ -14,9 +14,9 @@ import numpy as np
 
 from gsba.adjust import Adjustment
 from gsba.carrier import Carrier, carrier_mask, find_carrier, write_carrier
-from gsba.distractors import Distractors, Scene, distractor_mask
+from gsba.distractors import Distractors, Scene, distractor_mask, distractor_weights
 from gsba.log import GsbaError, track
-from gsba.read import load_erp, load_mask
+from gsba.read import levels_of, load_erp, load_mask, load_weights
 from gsba.records import atomic_write
 from gsba.segmentation import Segment, load_segmented, segmented
 from gsba.store import PerFrame, RunStore, fingerprint
@@ -118,7 +118,7 @@ def after(
 
     found = look("distractors", look("distractors1", None))
     results = [found[name] for name in frames.names]
-    parts = [lambda f: ~distractor_mask(results[f])]
+    parts = [lambda f: distractor_weights(results[f])]
     merged = _merge(store, store.root / _FOLDER, frames, parts, ["distractors"])
     shares = np.array([one.share for one in results])
     check = store.root / "masks_check.jpg"
@@ -152,7 +152,9 @@ def _merge(
     parts: Sequence[Callable[[int], np.ndarray | None]],
     stages: Sequence[str],
 ) -> FrameSet:
-    """Frames with masks `folder`/NAME.png of what they had and all parts, (h, 2h) bool or None.
+    """Frames with masks `folder`/NAME.png of what they had and all parts.
+
+    A part is (h, 2h), bool or weights 0..1, or None.
 
     A file that would not change keeps its time, so that stages which depend on it resume.
     """
@@ -161,15 +163,16 @@ def _merge(
     def compute() -> Counts:
         masked = 0
         for f, path in enumerate(track(paths, "writing masks")):
-            own = load_mask(frames, f)
-            width = frames.width if frames.layout == "erp" else 4 * frames.width
-            use = np.ones((width // 2, width), bool) if own is None else own
+            weights = load_weights(frames, f)
+            if weights is None:
+                width = frames.width if frames.layout == "erp" else 4 * frames.width
+                weights = np.ones((width // 2, width), np.float32)
             for part in parts:
-                mask = part(f)
-                if mask is not None:
-                    use = use & _fit(mask, use.shape[1])
-            _write_if_new(path, use)
-            masked += not use.all()
+                found = part(f)
+                if found is not None:
+                    weights = weights * _fit(found, weights.shape[1])
+            _write_if_new(path, levels_of(weights))
+            masked += not weights.all()
         return Counts(len(paths), masked, "masks", {"nothing masked": len(paths) - masked})
 
     name = "masks" if folder.parent == store.root else "first-masks"
@@ -182,16 +185,18 @@ def _merge(
     return replace(frames, mask_paths=tuple(paths))
 
 
-def _fit(mask: np.ndarray, width: int) -> np.ndarray:
-    """A mask (h, 2h) bool at another width, its outline smooth."""
-    if mask.shape[1] == width:
-        return mask
+def _fit(weights: np.ndarray, width: int) -> np.ndarray:
+    """Weights (h, 2h) 0..1, or bool, at another width, their outline smooth, as float32."""
+    values = weights.astype(np.float32)
+    if values.shape[1] == width:
+        return values
     size = (width, width // 2)
-    return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5
+    values, inside = (cv2.resize(part, size) for part in (values, (values > 0).astype(np.float32)))
+    return np.where(inside > 0.5, values / np.maximum(inside, 0.5), 0)
 
 
-def _write_if_new(path: Path, use: np.ndarray) -> None:
-    encoded = cv2.imencode(".png", use.astype(np.uint8) * 255)[1].tobytes()
+def _write_if_new(path: Path, levels: np.ndarray) -> None:
+    encoded = cv2.imencode(".png", levels)[1].tobytes()
     if not (path.exists() and path.read_bytes() == encoded):
         atomic_write(path, lambda temporary: temporary.write_bytes(encoded))
 
@@ -207,7 +212,7 @@ def _write_check(path: Path, frames: FrameSet, shares: np.ndarray) -> None:
             shown = np.full((size[1], size[0], 3), 128, np.uint8)
         mask = load_mask(frames, int(f))
         assert mask is not None
-        out = ~_fit(mask, _SHOWN_WIDTH)
+        out = _fit(mask, _SHOWN_WIDTH) == 0
         shown[out] = (shown[out] * 0.5 + np.array([128, 0, 60])).astype(np.uint8)
         outlines, _ = cv2.findContours(out.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(shown, outlines, -1, (255, 80, 160), 1)

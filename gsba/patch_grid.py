@@ -207,8 +207,8 @@ def table_of(
     return table, Counts(received, len(plane), "patches", dropped)
 
 
-def usable_at(usable: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Whether the pixels (R,) that vectors (R, 3) point to may be used."""
-    height, width = usable.shape
+def values_at(image: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Values (R,) of the pixels of a panorama (H, 2H) that vectors (R, 3) point to."""
+    height, width = image.shape
     uv = erp_from_bearings(directions, width, height).astype(np.int64)
-    return usable[np.clip(uv[:, 1], 0, height - 1), uv[:, 0] % width]
+    return image[np.clip(uv[:, 1], 0, height - 1), uv[:, 0] % width]

@@ -10,7 +10,7 @@ from factors import LandmarkBlock, RobustLoss
 from factors.patch_windows import PatchPixels, PatchTable, patch_spans, poor_views
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
-from gsba import adjust, graph, patch_grid, triangulate
+from gsba import adjust, graph, patch_grid, read, triangulate
 from gsba.adjust import Adjustment, Round
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.log import GsbaError, track
@@ -75,21 +75,21 @@ def run(
     solved, counts = start, []
     weights, residuals = np.ones(len(frames)), np.full(len(frames), np.nan)
     for level in settings.photometric.levels:
-        pixels, found = _patches(frames, solved, level, settings, num_threads)
+        pixels, trust, found = _patches(frames, solved, level, settings, num_threads)
         counts += found
         if pixels is None:
             logger.warning("no patch is seen twice at level %d: left as it was", level)
             continue
         solved, weights, residuals = _solve(
-            pixels, keypoints, solved, priors, rig, settings, num_threads
+            pixels, trust, keypoints, solved, priors, rig, settings, num_threads
         )
     return PhotometricResult(solved, tuple(counts), weights, residuals)
 
 
 def _patches(
     frames: FrameSet, solved: Adjustment, level: int, settings: RefineSettings, num_threads: int
-) -> tuple[PatchPixels | None, list[Counts]]:
-    """Pixels of the patches and observations that are good enough, if any, and the counts."""
+) -> tuple[PatchPixels | None, np.ndarray, list[Counts]]:
+    """Pixels of the patches and observations that are good enough, if any; weights; the counts."""
     chosen, world_T_rigs = settings.photometric, solved.world_T_rigs
     bearings, width = [], 0
     for f in track(range(len(frames)), "choosing patches"):
@@ -105,18 +105,19 @@ def _patches(
         dropped[reason] = int(np.count_nonzero(flag & left))
         left &= ~flag
     table, _ = table.select(left)
-    kept = np.zeros(len(table.targets), bool)
+    trust = np.zeros(len(table.targets))
     rows = np.cumsum(np.diff(table.offsets)) // _CHUNK
     for chunk in np.unique(rows):
         observations = (rows == chunk)[table.owners]
         part, own = table.select(observations)
         block = _with_depths(frames, part, world_T_rigs, level, settings, num_threads, dropped)
         table.planes[own] = block.planes
-        kept[observations] = block.counted
+        trust[observations] = block.weights
+    kept = trust > 0
     seen = Counts(num, int(np.count_nonzero(kept)), "patch observations", dropped)
     table, _ = table.select(kept)
     gathered, _ = _gather(frames, table, world_T_rigs, level, level, chosen)
-    return next(iter(gathered), None), [counts, seen]
+    return next(iter(gathered), None), trust[kept], [counts, seen]
 
 
 def _with_depths(
@@ -165,9 +166,9 @@ def _gather(
     top: int,
     settings: PhotometricSettings,
 ) -> tuple[list[PatchPixels], np.ndarray]:
-    """Pixels of the patches at the levels from `level` to `top`, and visibility (O,) 0 or 1."""
+    """Pixels of the patches at the levels from `level` to `top`; weights (O,) by both masks."""
     gathered: list[PatchPixels] = []
-    visible = np.ones(len(table.targets))
+    visible, trusted = np.ones(len(table.targets)), np.ones(len(table))
     needed = np.union1d(table.hosts, table.targets)
     for f in track(needed.tolist(), "sampling patches"):
         greys, usable = patch_grid.pyramid(frames, f, settings, top)
@@ -178,12 +179,18 @@ def _gather(
             gathered[k].take(f, SphereImage.of(grey))
         rows = np.flatnonzero(table.targets == f)
         spans = patch_spans(table, world_T_rigs, table.planes, rows)
-        visible[rows] = patch_grid.usable_at(usable, spans[:, 0])
-    return gathered, visible
+        visible[rows] = patch_grid.values_at(usable, spans[:, 0])
+        weights = read.load_weights(frames, f)
+        if weights is not None:
+            visible[rows] *= patch_grid.values_at(weights, spans[:, 0])
+            own = np.flatnonzero(table.hosts == f)
+            trusted[own] = patch_grid.values_at(weights, table.bearings_rig[own])
+    return gathered, visible * trusted[table.owners]
 
 
 def _solve(
     pixels: PatchPixels,
+    trust: np.ndarray,
     keypoints: Keypoints,
     solved: Adjustment,
     priors: gtsam.NonlinearFactorGraph,
@@ -197,11 +204,11 @@ def _solve(
     """
     chosen, values = settings.photometric, adjust.values_of(solved.world_T_rigs)
     solver = settings.solver.model_copy(update={"relative_tolerance": chosen.tolerance})
-    start = make_block(pixels, np.ones(len(pixels.table.targets)), settings, num_threads)
+    start = make_block(pixels, trust, settings, num_threads)
     noise = _noise(start, values) * chosen.inflation
     weights = np.ones(pixels.num_frames)
     for _ in range(2):
-        block = make_block(pixels, start.counted * 1.0, settings, num_threads, noise)
+        block = make_block(pixels, start.counted * trust, settings, num_threads, noise)
         block.weigh(weights)
         landmarks = adjust.landmark_block(
             solved.landmarks, keypoints, rig, solved.noise, settings, num_threads
@@ -234,12 +241,12 @@ def joint(
     if "photometric" not in settings.factors:
         return []
     level = settings.photometric.levels[-1]
-    pixels, _ = _patches(frames, solved, level, settings, num_threads)
+    pixels, trust, _ = _patches(frames, solved, level, settings, num_threads)
     if pixels is None:
         return []
-    start = make_block(pixels, np.ones(len(pixels.table.targets)), settings, num_threads)
+    start = make_block(pixels, trust, settings, num_threads)
     noise = _noise(start, adjust.values_of(solved.world_T_rigs)) * settings.photometric.inflation
-    block = make_block(pixels, start.counted * 1.0, settings, num_threads, noise)
+    block = make_block(pixels, start.counted * trust, settings, num_threads, noise)
     block.weigh(frame_weights)
     return [block]
 

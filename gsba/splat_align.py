@@ -8,7 +8,7 @@ import numpy as np
 
 from factors import BearingTerm, FaceCameras, LandmarkBlock, RobustLoss
 from factors.splat import RenderedView, SplatBlock
-from gsba import graph
+from gsba import cubemap, graph, read
 from gsba.config import SolverSettings
 from gsba.log import track
 from gsba.optimize import optimize
@@ -36,7 +36,7 @@ class Captured:
     size: int  # pixels of a rendered face
     rig: CubeRig  # the captured faces
     images: tuple[np.ndarray, ...]  # (W,) of (6, S, S) float32, 0..1
-    use: tuple[np.ndarray | None, ...]  # (W,) of (6, S, S) bool, pixels that count; None = all
+    weights: tuple[np.ndarray | None, ...]  # (W,) of (6, S, S) float32, 0..1; None = all one
 
 
 def align(
@@ -105,12 +105,14 @@ def bearing_block(
 def capture(frames: FrameSet, which: np.ndarray, size: int) -> Captured:
     """Grey faces of some frames, as dense as rendered ones of `size` pixels."""
     rig = _captured_rig(frames, size)
-    images, use = [], []
+    images, weights = [], []
     for f in track(which, "cutting faces", total=len(which)):
         faces, mask = cut_faces(frames, int(f), rig)
         images.append((faces @ _LUMA / 255).astype(np.float32))
-        use.append(mask)
-    return Captured(which, size, rig, tuple(images), tuple(use))
+        found = read.load_weights(frames, int(f))
+        trust = 1.0 if found is None else cubemap.cut_mask(found, rig)
+        weights.append(None if mask is None else (mask * trust).astype(np.float32))
+    return Captured(which, size, rig, tuple(images), tuple(weights))
 
 
 def splat_block(
@@ -136,7 +138,7 @@ def splat_block(
         return render_view(gaussians, world_T_rig, rendered, near, backend)
 
     keys = [graph.X(int(f)) for f in captured.which]
-    return SplatBlock(keys, captured.images, captured.use, cameras, render, loss)
+    return SplatBlock(keys, captured.images, captured.weights, cameras, render, loss)
 
 
 def render_view(

@@ -11,13 +11,13 @@ from tiny_run import SETTINGS, Case, computed_stages
 from gsba import refine
 from gsba.adjust import Adjustment
 from gsba.demo.people import make_people, paste_people
-from gsba.distractors import Distractors, Scene, distractor_mask
+from gsba.distractors import Scene, distractor_mask, distractor_weights
 from gsba.evaluate import evaluate
 from gsba.export.images import write_image
 from gsba.geometry import erp_from_bearings
 from gsba.log import GsbaError
 from gsba.masking import choose
-from gsba.read import load_erp, load_mask, read_trajectory
+from gsba.read import levels_of, load_erp, load_mask, load_weights, read_trajectory
 from gsba.store import load_stage
 from gsba.types import FrameSet
 
@@ -135,6 +135,30 @@ def test_masks_are_chosen_by_name(tmp_path: Path) -> None:
         choose([tmp_path, "other.png"])
 
 
-def test_masks_survive_being_packed() -> None:
-    mask = np.random.default_rng(0).random((7, 14)) > 0.5
-    np.testing.assert_array_equal(distractor_mask(Distractors(np.packbits(mask), 14, 0, "")), mask)
+def test_weights_are_written_as_grey_levels(tmp_path: Path, case: Case) -> None:
+    """Grey above 127 weighs, the rest is masked; the two ways of reading agree."""
+    frames = case.result.frames
+    weights = np.linspace(0, 1, frames.width)[None] * np.ones((frames.height, 1))
+    write_image(tmp_path / "grey.png", levels_of(weights))
+    masked = dataclasses.replace(frames, mask_paths=(tmp_path / "grey.png",) * len(frames))
+    mask, found = load_mask(masked, 0), load_weights(masked, 0)
+    assert mask is not None and found is not None and found.dtype == np.float32
+    np.testing.assert_array_equal(found > 0, mask)
+    np.testing.assert_array_equal(mask, weights > 0)
+    assert np.abs(found - weights).max() <= 1 / 128
+    assert load_weights(frames, 0) is None
+    np.testing.assert_array_equal(levels_of(mask), np.where(mask, 255, 0))
+
+
+def test_what_fits_badly_weighs_less(case: Case, tmp_path: Path) -> None:
+    """What is left of people beside the mask is trusted less than the rest of the picture."""
+    frames, true = _populated(case, tmp_path / "people")
+    scene = _scene(case, frames)
+    missed, scenery = [], []
+    for f in range(len(frames)):
+        found = scene.find(f)
+        weights, left = distractor_weights(found), ~distractor_mask(found)
+        missed.append(weights[true[f] & left])
+        scenery.append(weights[~true[f] & left])
+    assert np.concatenate(missed).mean() < 0.75 * np.concatenate(scenery).mean()
+    assert np.concatenate(scenery).mean() > 0.8

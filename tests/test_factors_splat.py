@@ -88,7 +88,7 @@ def test_jacobians_of_the_residuals() -> None:
     block = block_at(poses)
     block.refresh(values_of(moved(poses, 0.03)))
     row = np.r_[poses[0].matrix()[:3, :3].ravel(), poses[0].matrix()[:3, 3]]
-    _, analytic = block._residuals(0, row, True)
+    _, analytic, _ = block._residuals(0, row, True)
     numerical = np.empty_like(analytic)
     for i in range(6):
         pair = []
@@ -125,6 +125,29 @@ def test_masked_pixels_are_not_sampled() -> None:
     block = SplatBlock([X(0)], [image], [use], CAMERAS, render)
     result = optimize(gtsam.NonlinearFactorGraph(), [block], values_of(moved(poses, 0.02)))
     assert errors(result.values, poses).max() < 5e-4
+
+
+def test_weights_scale_what_pixels_say() -> None:
+    poses = truth(1)
+    image = look(poses[0].matrix(), BEARINGS)[1].astype(np.float32)
+    at = values_of(moved(poses, 0.02))
+    systems = []
+    for weight in (1.0, 0.25):
+        weights = np.full((6, 48, 48), weight, np.float32)
+        weights[0] = 1.0
+        block = SplatBlock([X(0)], [image], [weights], CAMERAS, render)
+        block.refresh(at)
+        systems.append(block.linearize(at))
+    alone = SplatBlock([X(0)], [image], [weights == 1], CAMERAS, render)
+    alone.refresh(at)
+    alone._frames = block._frames  # the same gain and offset
+    first = alone.linearize(at)
+    np.testing.assert_allclose(
+        systems[1].diagonal, 0.25 * systems[0].diagonal + 0.75 * first.diagonal, rtol=1e-9
+    )
+    assert systems[1].costs["splat"] == pytest.approx(
+        0.25 * systems[0].costs["splat"] + 0.75 * first.costs["splat"]
+    )
 
 
 def test_both_doors_lead_to_the_same_place() -> None:

@@ -1,6 +1,7 @@
 """Patches on the sphere, their depths from the map, and the stage in a run."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -9,12 +10,14 @@ from photometric_world import Texture, render
 from synthetic import unit
 from tiny_run import SETTINGS, Case, computed_stages
 
-from gsba import patch_grid, photometric
+from gsba import adjust, patch_grid, photometric
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.config_file import load_config
+from gsba.export.images import write_image
 from gsba.geometry import erp_from_bearings
 from gsba.line import Line
 from gsba.log import GsbaError
+from gsba.read import levels_of
 from gsba.types import FrameSet
 
 WIDTH = 512
@@ -129,6 +132,35 @@ def test_nothing_to_see_changes_nothing(case: Case) -> None:
     result = photometric.run(frames, keypoints, solved, priors, rig, settings, 1)
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
     assert all(counts.kept == 0 for counts in result.counts)
+
+
+def test_observations_weigh_what_both_masks_say(case: Case, tmp_path: Path) -> None:
+    settings = JOINT.model_copy(
+        update={"photometric": PhotometricSettings(depth_levels=0, spacing_deg=10)}
+    )
+    frames, _, solved, *_ = _start(case, settings)
+    half = np.ones((frames.height, frames.width))
+    half[:, : frames.width // 2] = 0.5
+    write_image(tmp_path / "half.png", levels_of(half))
+    masked = replace(frames, mask_paths=(tmp_path / "half.png",) * len(frames))
+    plain, ones, _ = photometric._patches(frames, solved, 0, settings, 1)
+    pixels, trust, _ = photometric._patches(masked, solved, 0, settings, 1)
+    assert plain is not None and pixels is not None and (ones == 1).all()
+    table = pixels.table
+    points = table.bearings_rig / table.planes[:, :1]  # planes that face their hosts
+    hosts, targets = solved.world_T_rigs[table.hosts], solved.world_T_rigs[table.targets]
+    world = np.einsum("pij,pj->pi", hosts[:, :3, :3], points) + hosts[:, :3, 3]
+    seen = np.einsum("oji,oj->oi", targets[:, :3, :3], world[table.owners] - targets[:, :3, 3])
+    expected = patch_grid.values_at(half, table.bearings_rig)[table.owners]
+    expected *= patch_grid.values_at(half, seen)
+    assert set(expected) == {0.25, 0.5, 1.0}
+    assert np.mean(np.abs(trust - expected) < 0.01) > 0.99  # others are at the border
+    block = photometric.make_block(pixels, trust, settings, 1)
+    whole = photometric.make_block(pixels, np.ones(len(trust)), settings, 1)
+    values = adjust.values_of(solved.world_T_rigs)
+    for one in (block, whole):
+        one.refresh(values)
+    assert block.costs(values)["photometric"] < whole.costs(values)["photometric"]
 
 
 def test_a_solve_against_the_map_is_undone(case: Case) -> None:

@@ -5,7 +5,7 @@ from gsba.read.exif import read_exif_gps
 from gsba.read.frames import load_erp, load_faces, scan
 from gsba.read.gps import GpsFixes, local_from_geodetic, read_gps
 from gsba.read.keyframes import follow_keyframes
-from gsba.read.masks import load_mask
+from gsba.read.masks import levels_of, load_mask, load_weights
 from gsba.read.segments import associate_pieces, split_restarts
 from gsba.read.trajectory import read_trajectory, write_tum
 
@@ -14,9 +14,11 @@ __all__ = [
     "associate",
     "associate_pieces",
     "follow_keyframes",
+    "levels_of",
     "load_erp",
     "load_faces",
     "load_mask",
+    "load_weights",
     "local_from_geodetic",
     "read_exif_gps",
     "read_gps",

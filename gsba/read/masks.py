@@ -1,4 +1,4 @@
-"""Equirectangular masks: white = use."""
+"""Equirectangular masks: white = use, black = do not, light grey = use with less weight."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,6 +9,8 @@ from gsba.log import GsbaError
 from gsba.read.corrected import straightened
 from gsba.read.images import IMAGE_SUFFIXES, decode, image_size, is_image
 from gsba.types import FrameSet
+
+_UNUSED = 127  # grey level up to which pixels are not used
 
 
 def find_masks(
@@ -54,6 +56,36 @@ def load_mask(frames: FrameSet, f: int) -> np.ndarray | None:
 
     Where the frames have a correction, it is applied.
     """
+    levels = _load_levels(frames, f)
+    if levels is None:
+        return None
+    usable = levels > _UNUSED
+    return straightened(usable, frames.correction) if frames.correction else usable
+
+
+def load_weights(frames: FrameSet, f: int) -> np.ndarray | None:
+    """Weights (H, 2H) float32 of the pixels of frame f, 0..1; None if the frame has no mask.
+
+    0 is where `load_mask` is False; above, they grow with the grey level to 1 at white.
+    """
+    levels = _load_levels(frames, f)
+    if levels is None:
+        return None
+    usable = levels > _UNUSED
+    if frames.correction:
+        usable, levels = (straightened(image, frames.correction) for image in (usable, levels))
+    above = np.maximum(levels, _UNUSED + 1) - np.float32(_UNUSED)
+    return np.where(usable, above / (255 - _UNUSED), 0).astype(np.float32)
+
+
+def levels_of(weights: np.ndarray) -> np.ndarray:
+    """Grey levels (H, 2H) uint8 of a mask file with these weights (H, 2H) 0..1, or bool."""
+    above = np.maximum(np.rint((255 - _UNUSED) * weights.astype(np.float32)), 1)
+    return np.where(weights > 0, _UNUSED + above, 0).astype(np.uint8)
+
+
+def _load_levels(frames: FrameSet, f: int) -> np.ndarray | None:
+    """Grey levels (H, 2H) uint8 as they are in the file."""
     path = frames.mask_paths[f]
     if path is None:
         return None
@@ -61,8 +93,7 @@ def load_mask(frames: FrameSet, f: int) -> np.ndarray | None:
     values = decode(path, size, gray=True)
     if values.max() == 1:
         raise GsbaError(f"{path}: mask holds 0 and 1; write 255 where pixels are to be used")
-    usable = values > 127
-    return straightened(usable, frames.correction) if frames.correction else usable
+    return values
 
 
 def _frame_name(path: Path) -> str:
