@@ -44,11 +44,14 @@ REFINED = {
     "splat": {"factors": ("bearing", "splat")},
 }  # row -> settings of `gsba refine`; the first row is the one that targets are about
 SOURCES = ("raw", "unaligned", "default", "splat", "colmap", "truth")
-RATES: dict[str, Any] = {  # of short trainings: the last views must not leave their exposure
-    "rate_means": 5e-4,
-    "rate_means_end": 5e-6,
-    "rate_scales": 0.015,
-    "rate_fade": 0.1,
+RATES: dict[str, dict[str, Any]] = {
+    "short": {  # for some thousand steps: the last views must not leave their exposure
+        "rate_means": 5e-4,
+        "rate_means_end": 5e-6,
+        "rate_scales": 0.015,
+        "rate_fade": 0.1,
+    },
+    "published": {},
 }
 PEER = "spherical-incremental"
 GAIN_DB, GAIN_SSIM = 4.66, 0.073  # of refined over raw poses, at least
@@ -189,6 +192,7 @@ def main() -> None:
     parser.add_argument("--sources", nargs="+", default=list(SOURCES), choices=SOURCES)
     parser.add_argument("--data", type=Path, help="folder of recorded scenes")
     parser.add_argument("--iterations", type=int, default=800)
+    parser.add_argument("--rates", choices=RATES, default="short", help="of learning")
     parser.add_argument("--face-size", type=int, default=128)
     parser.add_argument("--sh-degree", type=int, default=1)
     parser.add_argument("--max-gaussians", type=int, default=40_000)
@@ -204,7 +208,7 @@ def main() -> None:
         sh_degree=options.sh_degree,
         max_gaussians=options.max_gaussians,
         backend="cpu",
-        **RATES,
+        **RATES[options.rates],
     )
     print(machine())
     held, report, text = True, {}, []
@@ -238,7 +242,7 @@ def _write(options: argparse.Namespace, settings: SplatSettings, report: dict, t
         atomic_write(options.json, lambda path: path.write_text(lines))
     if options.markdown:
         head = f"# Splats on raw, refined, COLMAP's and true poses\n\n{machine()}; faces of "
-        head += f"{settings.face_size} px, {settings.iterations} steps.\n"
+        head += f"{settings.face_size} px, {settings.iterations} steps, {options.rates} rates.\n"
         page = "\n".join([head, *text])
         atomic_write(options.markdown, lambda path: path.write_text(page))
 

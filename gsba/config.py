@@ -87,6 +87,7 @@ class PairSettings(_Settings):
     max_parallax_deg: float = Field(default=60.0, gt=0, le=180)
     strongest_per_face: int = Field(default=150, ge=16)  # keypoints that find neighbours' geometry
     scarce_matches: int = Field(default=60, ge=0)  # below, a pair is matched with all keypoints
+    least_agreement: float = Field(default=0.5, ge=0, le=1)  # of a step's matches; the same below
     prior: GateSettings = GateSettings(rotation_deg=4.0, direction=0.4)  # coarse trajectory
     loop_deg: float = Field(default=2.0, gt=0)  # around a known point, besides drift
     refined: GateSettings = GateSettings(rotation_deg=0.4, direction=0.005)  # solved map

@@ -80,7 +80,7 @@ def cut_mask(mask: np.ndarray, rig: CubeRig) -> np.ndarray:
     height, width = mask.shape
     padded = wrapped(mask.astype(np.uint8) if mask.dtype == bool else mask)
     maps = _face_maps(rig, width, height)
-    faces = [cv2.remap(padded, *maps[face], cv2.INTER_NEAREST) for face in range(len(FACES))]
+    faces = [cv2.remap(padded, u, v, cv2.INTER_NEAREST) for u, v in maps]
     return np.stack(faces).astype(mask.dtype)
 
 

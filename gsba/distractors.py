@@ -25,9 +25,10 @@ _WIDTH = 512  # pixels across the panoramas that are compared
 _NEIGHBOURS = 6
 _WITNESSES = 3  # fewer neighbours accuse nobody
 _LEAST_SHARED = 30  # points that a neighbour shares
-_DISTANCES = 12
+_DISTANCES = 18
 _MARGIN = 1.4  # beyond the nearest and furthest points around a direction
 _CELL = 8  # pixels: the grid on which distances are bounded
+_REACH = 3  # cells around a direction whose points bound it
 _EMPTY = np.float32(-1e9)  # a cell of it without points
 _PATCH = 5  # pixels over which differences are averaged
 _CAP = 60.0  # grey levels
@@ -38,7 +39,7 @@ _AGREE = 2.0  # spreads of the neighbours that a pixel must be away from their m
 _THIN = 5  # pixels: narrower is an edge
 _LEAST_AREA = 120  # strong pixels at the equator
 _CLOSED = 13  # pixels: gaps up to this are closed
-_GROWN = 3  # pixels: the rim is blurred
+_GROWN = 5  # pixels: the rim is blurred, and a splat shows what is left of it
 _MOST = 0.35  # of a picture: more is a wrong pose, or light that changed
 _LEVELS = 15  # of a weight that is kept
 _WRAP = 32  # pixels over the seam
@@ -56,7 +57,8 @@ class Distractors:
 
 def distractor_weights(found: Distractors) -> np.ndarray:
     """How far pixels can be trusted, (h, 2h) float32, 0..1, 0 = distractor."""
-    return cv2.imdecode(found.weights, cv2.IMREAD_GRAYSCALE).astype(np.float32) / _LEVELS
+    levels = np.asarray(cv2.imdecode(found.weights, cv2.IMREAD_GRAYSCALE), np.float32)
+    return levels / _LEVELS
 
 
 def distractor_mask(found: Distractors) -> np.ndarray:
@@ -73,7 +75,8 @@ class Scene:
         frames: of any layout; what their masks exclude neither accuses nor is accused.
         world_T_rigs: (F, 4, 4) solved poses.
         landmarks: the solved points.
-        known: distractors (h, w) bool of a frame found before: they explain and accuse nobody.
+        known: distractors (h, w) bool of a frame found before: they explain and accuse nobody, and
+            stay what they are where too few neighbours are left to tell.
         limit_mb: of memory.
     """
 
@@ -111,9 +114,13 @@ class Scene:
         middle = np.exp(0.5 * (lowest + highest)).astype(np.float32)
         seen = sweep.witnesses(others[..., 0] >= 0, n_T_own, self._rays, middle)
         score = _score(own, others, n_T_own, self._rays, lowest, highest)
-        score[(seen < min(_WITNESSES, len(near))) | ~usable] = 0
+        unjudged = seen < min(_WITNESSES, len(near))
+        score[unjudged | ~usable] = 0
         noise = max(1.0, float(np.median(score)) / _NOISE)
-        found = _decide(score, noise) & usable
+        found = _decide(score, noise)
+        if self._known is not None:  # whom the first look accused and none is left to judge
+            found |= self._known(frame) & unjudged
+        found &= usable
         if np.median(score) > _WORST or _share(found) > _MOST:
             return _packed(np.ones(shape), "fits no neighbour: its pose or light is off")
         return _packed(np.where(found, 0, 1 / (1 + (score / (noise * _WEAK)) ** 2)), "")
@@ -204,11 +211,12 @@ def _load(frames: FrameSet, frame: int, width: int) -> np.ndarray:
 
 
 def _spread_out(cells: np.ndarray) -> np.ndarray:
-    """Maxima over neighbouring cells (h, w), then outward until no cell is empty."""
+    """Maxima over the cells around each (h, w), then outward until no cell is empty."""
+    window = np.ones((2 * _REACH + 1, 2 * _REACH + 1), np.uint8)
 
     def widened(a: np.ndarray) -> np.ndarray:
-        ring = np.concatenate([a[:, -1:], a, a[:, :1]], axis=1)
-        return np.maximum(cv2.dilate(ring, np.ones((3, 3), np.uint8))[:, 1:-1], _EMPTY)
+        ring = np.concatenate([a[:, -_REACH:], a, a[:, :_REACH]], axis=1)
+        return np.maximum(cv2.dilate(ring, window)[:, _REACH:-_REACH], _EMPTY)
 
     cells = widened(cells)
     while (cells <= _EMPTY).any():
@@ -236,8 +244,9 @@ def _score(
     away, spread = np.empty(shape, np.float32), np.empty(shape, np.float32)
     best = np.full((2, *shape), _CAP, np.float32)
     away_best, spread_best = np.zeros(shape, np.float32), np.full(shape, 2 * _CAP, np.float32)
-    for step in np.linspace(0, 1, _DISTANCES, dtype=np.float32):
-        assumed = np.exp((1 - step) * lowest + step * highest)
+    nearest, furthest = np.exp(highest), np.exp(lowest)
+    for step in np.linspace(0, 1, _DISTANCES, dtype=np.float32):  # even steps in the pictures
+        assumed = (1 - step) * nearest + step * furthest
         sweep.compare(
             own, least, most, others, n_T_own, rays, assumed, np.float32(_CAP),
             differences, away, spread,

@@ -11,7 +11,11 @@ from gsba.types import Keypoints, Matches, VerifiedPairs
 
 
 def match_neighbours(context: MatchContext, start: Adjustment) -> VerifiedPairs:
-    """Match frames next to one another in time, guided by the coarse poses, and verify them."""
+    """Match frames next to one another in time, guided by the coarse poses, and verify them.
+
+    Where many matches of a step disagree, repeated structure may have won with few: people who walk
+    along hide what would contradict it. Such steps are decided by all keypoints.
+    """
     world_T_rigs, settings = start.world_T_rigs, context.settings
     chosen = pairs.adjacent(len(world_T_rigs))
     prior = settings.pairs.prior
@@ -25,7 +29,14 @@ def match_neighbours(context: MatchContext, start: Adjustment) -> VerifiedPairs:
         found = _replaced(found, scarce, again)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
     exact = np.zeros(len(chosen))
-    return verified(found, f0_T_f1s, exact, context)
+    neighbours = verified(found, f0_T_f1s, exact, context)
+    doubtful = np.flatnonzero(_shares(found, neighbours) < settings.pairs.least_agreement)
+    doubtful = doubtful[np.diff(chosen[doubtful], axis=1)[:, 0] == 1]
+    doubtful = np.setdiff1d(doubtful, scarce)
+    if len(doubtful) == 0:
+        return neighbours
+    again = context.match(chosen[doubtful], world_T_rigs, [gate] * len(doubtful))
+    return verified(_replaced(found, doubtful, again), f0_T_f1s, exact, context)
 
 
 def match_loops(context: MatchContext, solved: Adjustment) -> VerifiedPairs:
@@ -113,6 +124,15 @@ def verified(
     return verify.run(
         found, context.keypoints, f0_T_f1s, sigmas, settings.verify, settings.seed, threads
     )
+
+
+def _shares(found: Matches, kept: VerifiedPairs) -> np.ndarray:
+    """Part (P,) of the matches of each pair that its geometry explains; 0 for pairs dropped."""
+    index = {(int(f0), int(f1)): p for p, (f0, f1) in enumerate(found.pairs)}
+    rows = [index[int(f0), int(f1)] for f0, f1 in kept.matches.pairs]
+    shares = np.zeros(len(found.pairs))
+    shares[rows] = np.diff(kept.matches.offsets)
+    return shares / np.maximum(np.diff(found.offsets), 1)
 
 
 def _replaced(matches: Matches, indices: np.ndarray, others: Matches) -> Matches:

@@ -9,6 +9,7 @@ from gsba.adjust import Adjustment
 from gsba.config import PairSettings, RefineSettings
 from gsba.geometry import pose
 from gsba.matching import MatchContext, SearchableFrames
+from gsba.rig import owner_faces
 from gsba.types import Counts, Keypoints, Landmarks, Tracks, VerifiedPairs
 
 NUM = 300
@@ -60,3 +61,37 @@ def test_look_alikes_at_a_distance_close_no_loop(loop_deg: float, fooled: bool) 
     found, rows = _loops_to_last(shift=-1.5, loop_deg=loop_deg)
     assert (len(rows) > 0) == fooled
     assert len(found.matches.pairs) - len(rows) == 3  # 0-3, 0-4 and 1-4 are what they seem
+
+
+@pytest.mark.parametrize(("least_agreement", "misled"), [(0.5, False), (0.0, True)])
+def test_all_keypoints_decide_where_the_strongest_disagree(
+    least_agreement: float, misled: bool
+) -> None:
+    """The strongest see a pattern that repeats, or nothing in common; the many others are right."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform(2, 4, (600, 1)) * unit(rng.normal(size=(600, 3)))
+    true, wrong = np.array([STRIDE, 0, 0]), STRIDE * unit(np.array([1, 0.28, 0]))
+    repeated, lost = np.arange(600) < 90, (np.arange(600) >= 90) & (np.arange(600) < 240)
+    descriptors = (200 * rng.random((600, 64)) ** 4).astype(np.uint8)
+    frames = []
+    for step in range(2):
+        rig_T = np.eye(4)
+        seen_from = np.where(repeated[:, None], step * wrong, step * true)
+        bearings = with_noise(bearings_of(points - seen_from, rig_T), 3e-4, rng)
+        if step:
+            bearings[lost] = with_noise(bearings[lost], np.deg2rad(1), rng)
+        by_face = np.argsort(owner_faces(bearings), kind="stable")
+        frames.append(features_of(bearings[by_face], descriptors[by_face]))
+    settings = RefineSettings(pairs=PairSettings(window=2, least_agreement=least_agreement))
+    all_, strongest = (SearchableFrames(frames.__getitem__, n) for n in (None, 40))
+    context = MatchContext(all_, strongest, features.gather(frames), settings, 1)
+    world_T_rigs = pose(np.tile(np.eye(3), (2, 1, 1)), np.stack([np.zeros(3), true]))
+    nothing = Landmarks(
+        np.zeros((0, 3)),
+        Tracks(*(np.zeros(0, np.int32) for _ in range(3)), 0),
+        Counts(0, 0, "tracks"),
+    )
+    found = frontend.match_neighbours(context, Adjustment(world_T_rigs, nothing, 1.0, ()))
+    assert found.matches.pairs.tolist() == [[0, 1]]
+    off = np.rad2deg(np.arccos(found.f0_T_f1s[0, :3, 3] @ unit(true)))
+    assert off > 10 if misled else off < 1
