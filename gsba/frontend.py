@@ -23,20 +23,17 @@ def match_neighbours(context: MatchContext, start: Adjustment) -> VerifiedPairs:
 
     # The strongest keypoints are enough to find a pair's geometry, at a tenth of the cost.
     found = context.match(chosen, world_T_rigs, [gate] * len(chosen), strongest=True)
-    scarce = np.flatnonzero(np.diff(found.offsets) < settings.pairs.scarce_matches)
-    if len(scarce):
-        again = context.match(chosen[scarce], world_T_rigs, [gate] * len(scarce))
-        found = _replaced(found, scarce, again)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
     exact = np.zeros(len(chosen))
     neighbours = verified(found, f0_T_f1s, exact, context)
-    doubtful = np.flatnonzero(_shares(found, neighbours) < settings.pairs.least_agreement)
-    doubtful = doubtful[np.diff(chosen[doubtful], axis=1)[:, 0] == 1]
-    doubtful = np.setdiff1d(doubtful, scarce)
-    if len(doubtful) == 0:
+    scarce = np.diff(found.offsets) < settings.pairs.scarce_matches
+    steps = chosen[:, 1] - chosen[:, 0] == 1
+    doubtful = steps & (_shares(found, neighbours) < settings.pairs.least_agreement)
+    rows = np.flatnonzero(scarce | doubtful)
+    if len(rows) == 0:
         return neighbours
-    again = context.match(chosen[doubtful], world_T_rigs, [gate] * len(doubtful))
-    return verified(_replaced(found, doubtful, again), f0_T_f1s, exact, context)
+    again = context.match(chosen[rows], world_T_rigs, [gate] * len(rows))
+    return verified(_replaced(found, rows, again), f0_T_f1s, exact, context)
 
 
 def match_loops(context: MatchContext, solved: Adjustment) -> VerifiedPairs:
