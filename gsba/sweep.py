@@ -6,50 +6,49 @@ import numba
 import numpy as np
 
 _COS_MIN, _RATIO_MAX = 0.6, 2.2  # a view turned or scaled by more does not tell
+_PI, _HALF_PI = np.float32(math.pi), np.float32(0.5 * math.pi)  # float32: twice as many at once
+_A, _B, _C = np.float32(-0.0464964749), np.float32(0.15931422), np.float32(-0.327622764)
+_TINY, _FAR = np.float32(1e-30), np.float32(1e9)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _atan2(y, x):
     """Within 1e-3 rad: a tenth of a pixel on the panoramas that are compared."""
     ax, ay = abs(x), abs(y)
-    a = min(ax, ay) / max(max(ax, ay), 1e-30)
+    a = min(ax, ay) / max(max(ax, ay), _TINY)
     s = a * a
-    angle = ((-0.0464964749 * s + 0.15931422) * s - 0.327622764) * s * a + a
-    if ay > ax:
-        angle = 0.5 * math.pi - angle
-    if x < 0:
-        angle = math.pi - angle
+    angle = ((_A * s + _B) * s + _C) * s * a + a
+    angle = _HALF_PI - angle if ay > ax else angle
+    angle = _PI - angle if x < 0 else angle
     return -angle if y < 0 else angle
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _sample(image, x, y, z, out):
-    """Bilinear colour of a panorama (H, W, C) along (x, y, z) into `out`; False where masked."""
-    height, width, channels = image.shape
-    u = _atan2(x, z) * (width / (2 * math.pi)) + 0.5 * width - 0.5
-    v = _atan2(y, math.sqrt(x * x + z * z)) * (height / math.pi) + 0.5 * height - 0.5
-    left, top = math.floor(u), math.floor(v)
-    fu, fv = u - left, v - top
-    r0, r1 = min(max(int(top), 0), height - 1), min(max(int(top) + 1, 0), height - 1)
-    c0, c1 = int(left) % width, (int(left) + 1) % width
-    for k in range(channels):
-        upper = (1 - fu) * image[r0, c0, k] + fu * image[r0, c1, k]
-        lower = (1 - fu) * image[r1, c0, k] + fu * image[r1, c1, k]
-        out[k] = (1 - fv) * upper + fv * lower
-    return (
-        min(image[r0, c0, 0], image[r0, c1, 0]) >= 0
-        and min(image[r1, c0, 0], image[r1, c1, 0]) >= 0
-    )
+def _project(T, rays, inverse, height, u, v):
+    """Pixels u, v (W,) in a neighbour's panorama, of rays (W, 3) at inverse distances (W,).
+
+    Kept free of branches, so that it is compiled to vector instructions.
+    """
+    scale = np.float32(height / math.pi)
+    across, down = np.float32(height - 0.5), np.float32(0.5 * height - 0.5)
+    for c in range(len(rays)):
+        a, b, d, w = rays[c, 0], rays[c, 1], rays[c, 2], inverse[c]
+        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * d + w * T[0, 3]
+        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * d + w * T[1, 3]
+        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * d + w * T[2, 3]
+        u[c] = _atan2(x, z) * scale + across
+        v[c] = _atan2(y, np.sqrt(x * x + z * z)) * scale + down
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _insert(values, num, value):
-    """Put a value into its place among the first `num`, which are sorted."""
-    j = num
-    while j > 0 and values[j - 1] > value:
-        values[j] = values[j - 1]
-        j -= 1
-    values[j] = value
+def _sort(values):
+    """Sort (M, W) along its first axis, all columns at once and without a branch."""
+    num, width = values.shape
+    for turn in range(num):
+        for m in range(turn % 2, num - 1, 2):
+            for c in range(width):
+                a, b = values[m, c], values[m + 1, c]
+                values[m, c], values[m + 1, c] = min(a, b), max(a, b)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
@@ -70,49 +69,52 @@ def compare(own, least, most, others, n_T_own, rays, inverse, cap, differences, 
         spread: (H, W) float32, out: typical distance of neighbours from that median.
     """
     num, height, width, channels = others.shape
-    levels = np.empty((num, channels), np.float32)
-    ordered, sums = np.empty(num, np.float32), np.empty(num, np.float32)
+    u, v = np.empty(width, np.float32), np.empty(width, np.float32)
+    greys, ordered = np.empty((num, width), np.float32), np.empty((num, width), np.float32)
+    known = np.empty(width, np.int64)
+    part = np.float32(1 / channels)
     for r in range(height):
-        for c in range(width):
-            w = inverse[r, c]
-            x, y, z = rays[r, c, 0], rays[r, c, 1], rays[r, c, 2]
-            known = 0
-            for m in range(num):
-                T = n_T_own[m]
-                clear = _sample(
-                    others[m],
-                    T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + w * T[0, 3],
-                    T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + w * T[1, 3],
-                    T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + w * T[2, 3],
-                    levels[known],
-                )
-                differences[m, r, c] = cap
-                if clear:
-                    d = np.float32(0)
-                    for k in range(channels):
-                        level = levels[known, k]
-                        d += max(np.float32(0), least[r, c, k] - level, level - most[r, c, k])
-                    differences[m, r, c] = min(d / channels, cap)
-                    known += 1
-            away[r, c], spread[r, c] = 0.0, cap
-            if known == 0:
-                continue
-            for m in range(known):
-                sums[m] = 0
+        known[:] = 0
+        for m in range(num):
+            image = others[m]
+            _project(n_T_own[m], rays[r], inverse[r], height, u, v)
+            for c in range(width):
+                greys[m, c], differences[m, r, c] = _FAR, cap
+                left, top = math.floor(u[c]), math.floor(v[c])
+                fu, fv = u[c] - np.float32(left), v[c] - np.float32(top)
+                r0, r1 = max(int(top), 0), min(int(top) + 1, height - 1)
+                c0 = int(left) if left >= 0 else width - 1
+                c1 = c0 + 1 if c0 + 1 < width else 0
+                if min(image[r0, c0, 0], image[r0, c1, 0]) < 0:
+                    continue
+                if min(image[r1, c0, 0], image[r1, c1, 0]) < 0:
+                    continue
+                grey, d = np.float32(0), np.float32(0)
                 for k in range(channels):
-                    sums[m] += levels[m, k] / channels
-                _insert(ordered, m, sums[m])
-            median = 0.5 * (ordered[(known - 1) // 2] + ordered[known // 2])
-            d = -median
+                    upper = image[r0, c0, k] + fu * (image[r0, c1, k] - image[r0, c0, k])
+                    lower = image[r1, c0, k] + fu * (image[r1, c1, k] - image[r1, c0, k])
+                    level = upper + fv * (lower - upper)
+                    grey += level
+                    d += max(least[r, c, k] - level, level - most[r, c, k], np.float32(0))
+                greys[m, c], differences[m, r, c] = part * grey, min(part * d, cap)
+                known[c] += 1
+        ordered[:] = greys
+        _sort(ordered)
+        for c in range(width):
+            n = known[c]
+            median = np.float32(0.5) * (ordered[max(n - 1, 0) // 2, c] + ordered[n // 2, c])
+            grey = np.float32(0)
             for k in range(channels):
-                d += own[r, c, k] / channels
-            away[r, c] = min(abs(d), cap)
-            for m in range(known):
-                _insert(ordered, m, min(abs(sums[m] - median), cap))
-            spread[r, c] = ordered[known // 2]
+                grey += own[r, c, k]
+            away[r, c] = min(abs(part * grey - median), cap) if n > 0 else np.float32(0)
+            for m in range(num):
+                greys[m, c] = min(abs(greys[m, c] - median), cap) if greys[m, c] < _FAR else _FAR
+        _sort(greys)
+        for c in range(width):
+            spread[r, c] = greys[known[c] // 2, c] if known[c] > 0 else cap
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=True)
 def keep_best(differences, away, spread, best, away_best, spread_best):
     """Keep what the best distance so far leaves over.
 
@@ -122,13 +124,14 @@ def keep_best(differences, away, spread, best, away_best, spread_best):
         away_best, spread_best: (H, W) float32, in and out: where neighbours agree best.
     """
     num, height, width = differences.shape
-    ordered = np.empty(num, np.float32)
+    ordered = np.empty((num, width), np.float32)
     for r in range(height):
+        for m in range(num):
+            ordered[m] = differences[m, r]
+        _sort(ordered)
         for c in range(width):
-            for m in range(num):
-                _insert(ordered, m, differences[m, r, c])
-            best[0, r, c] = min(best[0, r, c], ordered[1])
-            best[1, r, c] = min(best[1, r, c], ordered[2])
+            best[0, r, c] = min(best[0, r, c], ordered[1, c])
+            best[1, r, c] = min(best[1, r, c], ordered[2, c])
             if spread[r, c] < spread_best[r, c]:
                 spread_best[r, c], away_best[r, c] = spread[r, c], away[r, c]
 
