@@ -182,9 +182,10 @@ def train_and_measure(
     """
     near = near_of(poses[split.training], settings)
     curve = _read_curve(out / "curve.json", key)
+    every = max(settings.iterations // _CURVE_POINTS, 1)
 
     def watch(step: int, gaussians: Gaussians) -> None:
-        if step % max(settings.iterations // _CURVE_POINTS, 1) == 0:
+        if step // every > max(curve, default=0) // every:
             curve[step] = mean_score(measure(gaussians, held_out, settings, near, backend).values())
             content = {"key": key, "curve": {s: asdict(score) for s, score in curve.items()}}
             atomic_write(out / "curve.json", lambda path: path.write_text(json.dumps(content)))

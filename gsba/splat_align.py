@@ -153,9 +153,9 @@ def render_view(
     centres = np.arange(rig.size) + 0.5
     grid = np.stack(np.meshgrid(centres, centres), axis=-1)
     points, greys = [], []
-    for face in range(len(FACES)):
-        camera = face_camera(world_T_rig, face, rig)
-        image = backend.render(gaussians, camera, None, near)
+    cameras = [face_camera(world_T_rig, face, rig) for face in range(len(FACES))]
+    images = backend.render(gaussians, cameras, None, near)
+    for camera, image in zip(cameras, images, strict=True):
         sure = (image.alpha > MIN_ALPHA) & ~_edges(image.depth)
         depth = image.depth[sure].astype(np.float64)
         offsets = (grid[sure] - rig.principal) / rig.focal

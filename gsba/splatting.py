@@ -216,9 +216,10 @@ def _score(
     lpips: Distance | None,
 ) -> Score:
     found, truth, similarities, distances = [], [], [], []
-    for v in rows:
-        color = backend.render(gaussians, views.cameras[v], settings.sh_degree, near).color
-        image, real = np.clip(color, 0, 1), views.images[v].astype(np.float32) / 255
+    cameras = [views.cameras[v] for v in rows]
+    renderings = backend.render(gaussians, cameras, settings.sh_degree, near)
+    for v, rendering in zip(rows, renderings, strict=True):
+        image, real = np.clip(rendering.color, 0, 1), views.images[v].astype(np.float32) / 255
         use = np.ones(real.shape[:2], bool) if views.use is None else views.use[v]
         similarities.append(ssim(image, real, use))
         if lpips is not None:
@@ -251,8 +252,9 @@ def render_faces(
     gaussians: Gaussians, world_T_rig: np.ndarray, rig: CubeRig, near: float, backend: Backend
 ) -> np.ndarray:
     """The six faces (6, size, size, 3) uint8 RGB of a rig, in FACES order."""
-    cameras = (face_camera(world_T_rig, face, rig) for face in range(len(FACES)))
-    return np.stack([to_uint8(backend.render(gaussians, c, None, near).color) for c in cameras])
+    cameras = [face_camera(world_T_rig, face, rig) for face in range(len(FACES))]
+    renderings = backend.render(gaussians, cameras, None, near)
+    return np.stack([to_uint8(rendering.color) for rendering in renderings])
 
 
 def render_panorama(

@@ -69,6 +69,21 @@ def test_images_are_learned_the_same_way_every_time() -> None:
     assert not same(splat, train(first, views, other, CpuBackend(1)))
 
 
+class Hasty(CpuBackend):
+    """Takes as many steps at a time as gsplat does."""
+
+    stretch = 20
+
+
+def test_stretches_end_where_something_is_due() -> None:
+    truth, views = scene()
+    steps: list[int] = []
+    splat = train(start(truth), views, SETTINGS, Hasty(1), watch=lambda step, _: steps.append(step))
+    assert same(splat, train(start(truth), views, SETTINGS, CpuBackend(1)))
+    assert steps[0] == 20 and steps[-1] == SETTINGS.iterations and max(np.diff(steps)) == 20
+    assert {50, 100, 150, SETTINGS.iterations // 2} <= set(steps)
+
+
 def test_an_interrupted_training_goes_on_to_the_same_result(tmp_path: Path) -> None:
     truth, views = scene()
     often = SETTINGS.model_copy(update={"checkpoint_every_s": 1e-9})

@@ -7,7 +7,7 @@ from numba import njit
 
 from gsba.splat.gaussians import Gaussians, concatenate, zeros_like
 
-_BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
+BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ def step(
         gaussians, gradients, moments: of equal shapes; gaussians and moments are changed.
         count: number of this step, from 1.
     """
-    correction1, correction2 = 1 - _BETA1**count, np.sqrt(1 - _BETA2**count)
+    correction1, correction2 = 1 - BETA1**count, np.sqrt(1 - BETA2**count)
     for entry in fields(Gaussians):
         rate = getattr(rates, entry.name)
         rest = rates.sh_rest if entry.name == "sh" else rate
@@ -77,8 +77,8 @@ def step(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _move(values, slopes, first, second, rates, correction2):
-    keep1, keep2 = np.float32(_BETA1), np.float32(_BETA2)
-    new1, new2, eps = np.float32(1 - _BETA1), np.float32(1 - _BETA2), np.float32(_EPS)
+    keep1, keep2 = np.float32(BETA1), np.float32(BETA2)
+    new1, new2, eps = np.float32(1 - BETA1), np.float32(1 - BETA2), np.float32(EPS)
     for g in range(values.shape[0]):
         for k in range(values.shape[1]):
             slope = slopes[g, k]

@@ -1,66 +1,114 @@
 """The two renderers behind one interface: `cpu`, ours, and `gsplat` on CUDA."""
 
-from collections.abc import Callable
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from gsba.log import GsbaError
+from gsba.splat import adam
 from gsba.splat.camera import FaceCamera
+from gsba.splat.density import Pull
 from gsba.splat.gaussians import Gaussians
+from gsba.splat.metrics import training_loss
 from gsba.splat.rasterise import Gradients, Rendering, differentiate, render
 
-Slope = Callable[[np.ndarray], np.ndarray]  # colours (H, W, 3) -> the loss's derivative by them
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Lesson:
+    """One view, and how far to go to look like it."""
+
+    camera: FaceCamera
+    truth: np.ndarray  # (H, W, 3) uint8, RGB
+    use: np.ndarray | None  # (H, W) bool, pixels that count; None = all
+    sh_degree: int  # of the harmonics, not more than the Gaussians have
+    rates: adam.Rates
+    number: int  # of the step, from 1
 
 
 class Backend(Protocol):
-    """Renders splats, and differentiates losses on their colours."""
+    """Renders splats, and makes them look like images."""
 
     name: str
+    stretch: int  # steps that are best made in one call of `descend`
 
     def render(
-        self, gaussians: Gaussians, camera: FaceCamera, sh_degree: int | None, near: float
-    ) -> Rendering:
-        """An image; see `gsba.splat.rasterise.render`."""
-        ...
-
-    def gradients(
         self,
         gaussians: Gaussians,
-        camera: FaceCamera,
+        cameras: Sequence[FaceCamera],
         sh_degree: int | None,
         near: float,
-        slope: Slope,
-    ) -> Gradients:
-        """Gradients of a loss whose derivative by the rendered colours is `slope(colours)`."""
+    ) -> list[Rendering]:
+        """An image for each camera, all of one size; see `gsba.splat.rasterise.render`."""
+        ...
+
+    def descend(
+        self,
+        gaussians: Gaussians,
+        moments: adam.Moments,
+        pull: Pull | None,
+        lessons: Iterable[Lesson],
+        near: float,
+        ssim_weight: float,
+    ) -> None:
+        """A step of Adam for each lesson, down `gsba.splat.metrics.training_loss`.
+
+        Args:
+            gaussians, moments: changed in place.
+            pull: changed in place: each view is added; None = not wanted.
+            lessons: in this order.
+            near: least z of a Gaussian, map units.
+            ssim_weight: see `training_loss`.
+        """
         ...
 
 
 class CpuBackend:
     """The rasteriser of `gsba.splat.rasterise`: deterministic, any machine."""
 
-    name = "cpu"
+    name, stretch = "cpu", 1
 
     def __init__(self, num_threads: int | None = None) -> None:
         self.num_threads = num_threads
 
     def render(
-        self, gaussians: Gaussians, camera: FaceCamera, sh_degree: int | None, near: float
-    ) -> Rendering:
-        """See `Backend`."""
-        return render(gaussians, camera, sh_degree, near, self.num_threads)[0]
-
-    def gradients(
         self,
         gaussians: Gaussians,
-        camera: FaceCamera,
+        cameras: Sequence[FaceCamera],
         sh_degree: int | None,
         near: float,
-        slope: Slope,
-    ) -> Gradients:
+    ) -> list[Rendering]:
         """See `Backend`."""
-        image, tape = render(gaussians, camera, sh_degree, near, self.num_threads)
-        return differentiate(tape, slope(image.color), num_threads=self.num_threads)
+        return [render(gaussians, c, sh_degree, near, self.num_threads)[0] for c in cameras]
+
+    def descend(
+        self,
+        gaussians: Gaussians,
+        moments: adam.Moments,
+        pull: Pull | None,
+        lessons: Iterable[Lesson],
+        near: float,
+        ssim_weight: float,
+    ) -> None:
+        """See `Backend`."""
+        for lesson in lessons:
+            found = self.gradients(gaussians, lesson, near, ssim_weight)
+            adam.step(gaussians, found.gaussians, moments, lesson.rates, lesson.number)
+            if pull is not None:
+                pull.add(found.centres, found.seen, lesson.camera.size)
+
+    def gradients(
+        self, gaussians: Gaussians, lesson: Lesson, near: float, ssim_weight: float
+    ) -> Gradients:
+        """Of the training loss of one lesson."""
+        image, tape = render(gaussians, lesson.camera, lesson.sh_degree, near, self.num_threads)
+        truth = lesson.truth.astype(np.float32) / 255
+        slope = training_loss(image.color, truth, lesson.use, ssim_weight)[1]
+        return differentiate(tape, slope, num_threads=self.num_threads)
 
 
 def choose_backend(name: str, num_threads: int | None = None) -> Backend:
@@ -79,7 +127,8 @@ def choose_backend(name: str, num_threads: int | None = None) -> Backend:
 
     try:
         return GsplatBackend()
-    except GsbaError:
-        if name == "auto":
-            return CpuBackend(num_threads)
-        raise
+    except GsbaError as error:
+        if name != "auto":
+            raise
+        logger.info("splats on the CPU: %s", error)
+        return CpuBackend(num_threads)

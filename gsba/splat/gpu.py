@@ -1,34 +1,43 @@
 """gsplat on CUDA, classic pinhole path, behind the interface of `gsba.splat.backend`.
 
-Written after gsplat 1.5.3's documentation and not yet run on a GPU by its authors: compare a
-rendering with that of the CPU before relying on it. Parameters travel to the device at every
-call, which costs more than rendering does for splats of millions of Gaussians.
+A stretch of training stays on the device: parameters and moments travel to it and back once.
+The authors of this file have run gsplat 1.5.3's Python side, on its own PyTorch versions of its
+CUDA kernels (tests/test_splat_gsplat.py), but not yet those kernels.
 """
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from gsba.log import GsbaError
+from gsba.splat import metrics
 from gsba.splat._project import DILATION
+from gsba.splat.adam import BETA1, BETA2, EPS, Moments, Rates
 from gsba.splat.camera import FaceCamera
+from gsba.splat.density import Pull
 from gsba.splat.gaussians import Gaussians
-from gsba.splat.rasterise import Gradients, Rendering
+from gsba.splat.rasterise import Rendering
 
 if TYPE_CHECKING:
-    from gsba.splat.backend import Slope
+    from gsba.splat.backend import Lesson
 
 
 class GsplatBackend:
-    """Renders and differentiates by gsplat.
+    """Renders and trains by gsplat and PyTorch.
+
+    Args:
+        device: of PyTorch.
 
     Raises:
         GsbaError: torch or gsplat is not installed, or there is no CUDA device.
     """
 
-    name = "gsplat"
+    name, stretch = "gsplat", 20
 
-    def __init__(self) -> None:
+    def __init__(self, device: str = "cuda") -> None:
         try:
             import gsplat  # type: ignore[import-not-found]
             import torch  # type: ignore[import-not-found]
@@ -37,71 +46,169 @@ class GsplatBackend:
                 f"the gsplat backend needs {error.name or 'gsplat'}: pip install 'gsba[splat]', "
                 "or use --backend cpu"
             ) from None
-        if not torch.cuda.is_available():
-            raise GsbaError("the gsplat backend needs a CUDA device: use --backend cpu")
-        self._torch, self._rasterize = torch, gsplat.rasterization
+        if device == "cuda":
+            _require_kernels(torch)
+        self._torch, self._rasterize, self._device = torch, gsplat.rasterization, device
+        self._window = metrics.window().tolist()
 
     def render(
-        self, gaussians: Gaussians, camera: FaceCamera, sh_degree: int | None, near: float
-    ) -> Rendering:
-        """See `Backend`."""
-        with self._torch.no_grad():
-            parameters = self._upload(gaussians, requires_grad=False)
-            image, alpha, _ = self._run(parameters, camera, sh_degree, near)
-        image, alpha = image[0].cpu().numpy(), alpha[0, ..., 0].cpu().numpy()
-        return Rendering(np.ascontiguousarray(image[..., :3]), image[..., 3].copy(), alpha)
-
-    def gradients(
         self,
         gaussians: Gaussians,
-        camera: FaceCamera,
+        cameras: Sequence[FaceCamera],
         sh_degree: int | None,
         near: float,
-        slope: "Slope",
-    ) -> Gradients:
-        """See `Backend`."""
-        parameters = self._upload(gaussians, requires_grad=True)
-        image, _, meta = self._run(parameters, camera, sh_degree, near)
-        meta["means2d"].retain_grad()
-        d_color = slope(image[0, ..., :3].detach().cpu().numpy())
-        image[0, ..., :3].backward(self._torch.as_tensor(d_color, device=image.device))
-        slopes = Gaussians(*(p.grad.cpu().numpy() for p in parameters))
-        centres = meta["means2d"].grad[0].cpu().numpy()
-        seen = (meta["radii"][0] > 0).reshape(len(gaussians), -1).all(dim=1).cpu().numpy()
-        return Gradients(slopes, centres, seen)
-
-    def _upload(self, gaussians: Gaussians, requires_grad: bool) -> list[Any]:
+    ) -> list[Rendering]:
+        """See `gsba.splat.backend.Backend`; all cameras are one batch."""
+        degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
+        with self._within_memory(gaussians), self._torch.no_grad():
+            found = self._run(self._upload(gaussians), cameras, degree, near, "RGB+ED")
+        images, alphas = (part.cpu().numpy() for part in found[:2])
         return [
-            self._torch.tensor(array, device="cuda", requires_grad=requires_grad)
-            for array in gaussians.arrays()
+            Rendering(image[..., :3].copy(), image[..., 3].copy(), alpha[..., 0].copy())
+            for image, alpha in zip(images, alphas, strict=True)
         ]
 
-    def _run(
-        self, parameters: list[Any], camera: FaceCamera, sh_degree: int | None, near: float
-    ) -> tuple[Any, Any, dict[str, Any]]:
-        """Colour and expected depth (1, H, W, 4), alpha (1, H, W, 1), and gsplat's notes."""
-        means, log_scales, quaternions, logits, sh = parameters
-        face_T_world = np.eye(4)
-        face_T_world[:3, :3] = camera.world_R_face.T
-        face_T_world[:3, 3] = -camera.world_R_face.T @ camera.face_in_world
-        middle = 0.5 * camera.size
-        intrinsics = np.array([[camera.focal, 0, middle], [0, camera.focal, middle], [0, 0, 1]])
+    def descend(
+        self,
+        gaussians: Gaussians,
+        moments: Moments,
+        pull: Pull | None,
+        lessons: Iterable["Lesson"],
+        near: float,
+        ssim_weight: float,
+    ) -> None:
+        """See `gsba.splat.backend.Backend`."""
         torch = self._torch
-        available = round(sh.shape[1] ** 0.5) - 1
+        with self._within_memory(gaussians):
+            values, first, second = (
+                self._upload(part) for part in (gaussians, moments.first, moments.second)
+            )
+            sums, counts = torch.zeros((2, len(gaussians)), device=self._device)
+            for lesson in lessons:
+                for value in values:
+                    value.requires_grad_(True).grad = None
+                image, _, notes = self._run(values, [lesson.camera], lesson.sh_degree, near, "RGB")
+                notes["means2d"].retain_grad()
+                image[0].backward(self._slope(image[0].detach(), lesson, ssim_weight))
+                with torch.no_grad():
+                    self._move(values, first, second, lesson.rates, lesson.number)
+                    slopes = notes["means2d"].grad[0]
+                    sums += 0.5 * lesson.camera.size * torch.hypot(slopes[:, 0], slopes[:, 1])
+                    counts += (notes["radii"][0] > 0).reshape(len(gaussians), -1).all(dim=1)
+        parts = (gaussians, moments.first, moments.second)
+        for part, tensors in zip(parts, (values, first, second), strict=True):
+            for array, tensor in zip(part.arrays(), tensors, strict=True):
+                array[...] = tensor.detach().cpu().numpy()
+        if pull is not None:
+            pull.sums[:] += sums.cpu().numpy()
+            pull.counts[:] += counts.cpu().numpy()
+
+    @contextmanager
+    def _within_memory(self, gaussians: Gaussians) -> Iterator[None]:
+        try:
+            yield
+        except self._torch.cuda.OutOfMemoryError:
+            raise GsbaError(
+                f"the GPU's memory is too small for {len(gaussians)} Gaussians at this size: "
+                "lower --face-size, allow fewer (max_gaussians), or use --backend cpu"
+            ) from None
+
+    def _upload(self, gaussians: Gaussians) -> list[Any]:
+        return [self._torch.tensor(array, device=self._device) for array in gaussians.arrays()]
+
+    def _run(
+        self,
+        parameters: list[Any],
+        cameras: Sequence[FaceCamera],
+        sh_degree: int,
+        near: float,
+        mode: Literal["RGB", "RGB+ED"],
+    ) -> tuple[Any, Any, dict[str, Any]]:
+        """Images (C, H, W, 3 or 4), alphas (C, H, W, 1), and gsplat's notes."""
+        means, log_scales, quaternions, logits, sh = parameters
+        size, middle = cameras[0].size, 0.5 * cameras[0].size
+        faces_T_world = np.tile(np.eye(4), (len(cameras), 1, 1))
+        intrinsics = np.tile(
+            np.array([[0, 0, middle], [0, 0, middle], [0, 0, 1]]), (len(cameras), 1, 1)
+        )
+        for c, camera in enumerate(cameras):
+            faces_T_world[c, :3, :3] = camera.world_R_face.T
+            faces_T_world[c, :3, 3] = -camera.world_R_face.T @ camera.face_in_world
+            intrinsics[c, 0, 0] = intrinsics[c, 1, 1] = camera.focal
+        torch = self._torch
+        viewmats, Ks = (
+            torch.tensor(array, dtype=torch.float32, device=self._device)
+            for array in (faces_T_world, intrinsics)
+        )
         return self._rasterize(
             means=means,
             quats=quaternions,
             scales=torch.exp(log_scales),
             opacities=torch.sigmoid(logits),
             colors=sh,
-            viewmats=torch.tensor(face_T_world[None], dtype=torch.float32, device="cuda"),
-            Ks=torch.tensor(intrinsics[None], dtype=torch.float32, device="cuda"),
-            width=camera.size,
-            height=camera.size,
+            viewmats=viewmats,
+            Ks=Ks,
+            width=size,
+            height=size,
             near_plane=near,
             eps2d=DILATION,
-            sh_degree=available if sh_degree is None else min(sh_degree, available),
+            sh_degree=sh_degree,
             packed=False,
-            render_mode="RGB+ED",
+            render_mode=mode,
             rasterize_mode="classic",
+        )
+
+    def _slope(self, image: Any, lesson: "Lesson", ssim_weight: float) -> Any:
+        """Derivative of `gsba.splat.metrics.training_loss` by an image (H, W, 3)."""
+        truth = self._torch.tensor(lesson.truth, device=self._device).float() / 255
+        use: Any = 1.0
+        if lesson.use is not None:
+            use = self._torch.tensor(lesson.use, device=self._device)[..., None]
+        x, y = image * use, truth * use
+        slope = metrics.similarity(x, y, self._blur)[1]
+        return use * ((1 - ssim_weight) * (x - y).sign() - ssim_weight * slope) / image.numel()
+
+    def _blur(self, image: Any) -> Any:
+        """By the window of SSIM, with black around the image (H, W, C).
+
+        Not by a convolution: where those run in TF32, variances drown in rounding.
+        """
+        half = len(self._window) // 2
+        for axis, edges in enumerate([(0, 0, 0, 0, half, half), (0, 0, half, half)]):
+            wide = self._torch.nn.functional.pad(image, edges)
+            length = image.shape[axis]
+            image = sum(w * wide.narrow(axis, k, length) for k, w in enumerate(self._window))
+        return image
+
+    def _move(
+        self, values: list[Any], first: list[Any], second: list[Any], rates: Rates, number: int
+    ) -> None:
+        """`gsba.splat.adam.step` on the device."""
+        correction1, correction2 = 1 - BETA1**number, (1 - BETA2**number) ** 0.5
+        for entry, value, m, v in zip(fields(Gaussians), values, first, second, strict=True):
+            rate = self._torch.full_like(value[:1], getattr(rates, entry.name) / correction1)
+            if entry.name == "sh":
+                rate[:, 1:] = rates.sh_rest / correction1
+            m.lerp_(value.grad, 1 - BETA1)
+            v.lerp_(value.grad**2, 1 - BETA2)
+            value -= rate * m / (v.sqrt() / correction2 + EPS)
+
+
+def _require_kernels(torch: Any) -> None:
+    """Load gsplat's CUDA kernels, which it builds when they are first wanted.
+
+    Raises:
+        GsbaError: no CUDA device, or no kernels.
+    """
+    if not torch.cuda.is_available():
+        raise GsbaError("the gsplat backend needs a CUDA device: use --backend cpu")
+    try:
+        from gsplat.cuda._backend import _C as kernels  # type: ignore[import-not-found]
+    except (ImportError, OSError, RuntimeError) as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise GsbaError(f"gsplat cannot build its kernels ({reason}): use --backend cpu") from None
+    if kernels is None:
+        raise GsbaError(
+            "gsplat has no kernels and finds no CUDA toolkit to build them with: install the "
+            "toolkit or a gsplat wheel made for this PyTorch and CUDA, or use --backend cpu"
         )

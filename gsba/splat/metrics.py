@@ -4,8 +4,12 @@ SSIM as of Wang et al., Image Quality Assessment: From Error Visibility to Struc
 2004: an 11 x 11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, values 0..1.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
+_Image = Any  # an array of NumPy or PyTorch
 _RADIUS, _SIGMA = 5, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
 
@@ -34,7 +38,7 @@ def ssim(image: np.ndarray, truth: np.ndarray, use: np.ndarray | None = None) ->
     if use is not None:
         x = np.where(use[..., None], x, y)
     inner = (slice(_RADIUS, -_RADIUS), slice(_RADIUS, -_RADIUS))
-    values = _similarity(x, y)[0][inner].mean(axis=-1)
+    values = similarity(x, y, _blur)[0][inner].mean(axis=-1)
     if use is not None:
         values = values[use[inner]]
     return float(values.mean()) if values.size else float("nan")
@@ -55,7 +59,7 @@ def training_loss(
     if use is not None:
         image, truth = image * use[..., None], truth * use[..., None]
     difference = image - truth
-    values, slope = _similarity(image, truth)
+    values, slope = similarity(image, truth, _blur)
     loss = (1 - ssim_weight) * np.abs(difference).mean() + ssim_weight * (1 - values.mean())
     slope = ((1 - ssim_weight) * np.sign(difference) - ssim_weight * slope) / image.size
     if use is not None:
@@ -63,20 +67,31 @@ def training_loss(
     return float(loss), slope.astype(np.float32)
 
 
-def _similarity(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def similarity(x: _Image, y: _Image, blur: Callable[[_Image], _Image]) -> tuple[_Image, _Image]:
     """SSIM (H, W, C) at every pixel, and the derivative (H, W, C) of its sum by x.
 
     The window is its own adjoint, so that the derivative takes three more passes of it.
+
+    Args:
+        x, y: (H, W, C), of NumPy or PyTorch.
+        blur: by `window` along both axes, with black around the image.
     """
-    mean_x, mean_y = _blur(x), _blur(y)
+    mean_x, mean_y = blur(x), blur(y)
     a1, b1 = 2 * mean_x * mean_y + _C1, mean_x**2 + mean_y**2 + _C1
-    a2 = 2 * (_blur(x * y) - mean_x * mean_y) + _C2
-    b2 = _blur(x * x) + _blur(y * y) - mean_x**2 - mean_y**2 + _C2
+    a2 = 2 * (blur(x * y) - mean_x * mean_y) + _C2
+    b2 = blur(x * x) + blur(y * y) - mean_x**2 - mean_y**2 + _C2
     values = a1 * a2 / (b1 * b2)
     by_square, by_product = -values / b2, 2 * a1 / (b1 * b2)
     by_mean = 2 * mean_y * a2 / (b1 * b2) - 2 * mean_x * values / b1
     by_mean -= by_product * mean_y + 2 * by_square * mean_x
-    return values, _blur(by_mean) + 2 * x * _blur(by_square) + y * _blur(by_product)
+    return values, blur(by_mean) + 2 * x * blur(by_square) + y * blur(by_product)
+
+
+def window() -> np.ndarray:
+    """Weights (11,) float64 of the window along one axis."""
+    import cv2
+
+    return cv2.getGaussianKernel(2 * _RADIUS + 1, _SIGMA)[:, 0]
 
 
 def _blur(image: np.ndarray) -> np.ndarray:

@@ -18,16 +18,15 @@ from gsba.config import SplatSettings
 from gsba.log import GsbaError, track
 from gsba.records import RecordError, load_record, read_info, save_record
 from gsba.splat import adam
-from gsba.splat.backend import Backend
+from gsba.splat.backend import Backend, Lesson
 from gsba.splat.camera import FaceCamera
 from gsba.splat.density import Limits, Pull, densify, reset_opacity
 from gsba.splat.gaussians import Gaussians
-from gsba.splat.metrics import training_loss
 
 logger = logging.getLogger(__name__)
 
 _PUBLISHED = 30_000  # steps that the published times are for
-_CHECK_EVERY = 20  # steps between looks for values that are not finite
+_CHECK_EVERY = 20  # steps between looks for values that are not finite; no stretch is longer
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +102,7 @@ def train(
         backend: the renderer.
         checkpoint: file that keeps the training, and that it goes on from; None = none.
         key: what the training depends on; a checkpoint of another key is not taken up.
-        watch: called with the steps made and the splat, after each step.
+        watch: called with the steps made and the splat, after each stretch of the backend's.
 
     Raises:
         GsbaError: all pixels masked, no Gaussian, or parameters that are no longer finite; the
@@ -115,8 +114,10 @@ def train(
     trainer = Trainer(views, settings, backend)
     saved = time.monotonic()
     steps = range(state.step, settings.iterations)
-    for _ in track(steps, "training the splat", total=len(steps)):
-        state = trainer.step(state)
+    for step in track(steps, "training the splat", total=len(steps)):
+        if step < state.step:
+            continue  # made together with an earlier one
+        state = trainer.advance(state, settings.iterations)
         last = state.step == settings.iterations
         if state.step % _CHECK_EVERY == 0 or last:
             _require_finite(state, checkpoint)
@@ -155,8 +156,10 @@ def advance(
         GsbaError: all pixels masked, or parameters that are no longer finite.
     """
     trainer, state = Trainer(views, settings, backend), state.copy()
-    for _ in track(range(steps), "training the splat"):
-        state = trainer.step(state)
+    end = state.step + steps
+    for step in track(range(state.step, end), "training the splat", total=steps):
+        if step >= state.step:
+            state = trainer.advance(state, end)
     _require_finite(state, None)
     return state
 
@@ -198,30 +201,42 @@ class Trainer:
         self.near = settings.near * self.extent
         self.capped = False
 
-    def step(self, state: State) -> State:
-        """One view; arrays of the state may be changed in place."""
-        settings, step = self.settings, state.step + 1
+    def advance(self, state: State, end: int) -> State:
+        """A stretch of steps, not beyond `end`; arrays of the state may be changed in place."""
+        settings, times = self.settings, self.times
         gaussians, moments, pull = state.gaussians, state.moments, state.pull
-        view = self._view(state.step)
-        degree = min(state.step // self.times.degree_every, settings.sh_degree)
-        truth = self.views.images[view].astype(np.float32) / 255
-        use = None if self.views.use is None else self.views.use[view]
-
-        def slope(color: np.ndarray) -> np.ndarray:
-            return training_loss(color, truth, use, settings.ssim_weight)[1]
-
-        camera = self.views.cameras[view]
-        found = self.backend.gradients(gaussians, camera, degree, self.near, slope)
-        adam.step(gaussians, found.gaussians, moments, self._rates(step), step)
-        times = self.times
-        if settings.densify and step <= times.densify_until:
-            pull.add(found.centres, found.seen, camera.size)
+        step = self._stop(state.step, end)
+        lessons = (self._lesson(number) for number in range(state.step + 1, step + 1))
+        wanted = settings.densify and step <= times.densify_until
+        self.backend.descend(
+            gaussians, moments, pull if wanted else None, lessons, self.near, settings.ssim_weight
+        )
+        if wanted:
             if step > times.densify_from and step % times.densify_every == 0:
                 gaussians, moments = self._densify(state, step)
                 pull = Pull.none(len(gaussians))
             if step % times.reset_every == 0 and step < times.densify_until:
                 gaussians, moments = reset_opacity(gaussians, moments)
         return State(step, gaussians, moments, pull)
+
+    def _stop(self, step: int, end: int) -> int:
+        """Where a stretch from some step on ends: where density control may be due, or earlier."""
+        times = self.times
+        rhythms = (self.backend.stretch, times.densify_every, times.reset_every)
+        stops = [end, *(step // every * every + every for every in rhythms)]
+        return min([*stops, times.densify_until] if step < times.densify_until else stops)
+
+    def _lesson(self, number: int) -> Lesson:
+        """What is learned in a step, counted from 1."""
+        views, view = self.views, self._view(number - 1)
+        return Lesson(
+            views.cameras[view],
+            views.images[view],
+            None if views.use is None else views.use[view],
+            min((number - 1) // self.times.degree_every, self.settings.sh_degree),
+            self._rates(number),
+            number,
+        )
 
     def _view(self, step: int) -> int:
         """Index of the view shown at a step."""
