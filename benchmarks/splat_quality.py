@@ -6,11 +6,11 @@
 Every source trains on the same frames with the same settings and seeds, on the CPU, and is measured
 on whole panoramas it never saw, at its own poses. Densification is chaotic: poses that differ by
 nothing to speak of end 0.1 to 0.3 dB apart, so give several `--seeds` and trust means. Scenes named
-demo_… are rendered on the spot, the others are folders of FOLDER with images/, a coarse trajectory,
-groundtruth.tum if there is one, and mask.png if there is one. COLMAP's poses are peer_colmap.tum of
-the folder, or what `benchmarks/peer.py` makes of the frames. Runs, models and splats are kept in
-WORK and taken up again. The lines below a table say whether the targets hold; exit 1 where one is
-missed.
+demo_… are rendered on the spot, the others are folders of FOLDER with images/, a coarse trajectory
+(`--coarse NAME` takes another one, in a WORK of its own), and groundtruth.tum and mask.png if there
+are. COLMAP's poses are peer_colmap.tum of the folder, or what `benchmarks/peer.py` makes of the
+frames. Runs, models and splats are kept in WORK and taken up again. The lines below a table say
+whether the targets hold; exit 1 where one is missed.
 """
 
 import argparse
@@ -19,6 +19,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -76,23 +77,33 @@ def find_scene(name: str, data: Path | None, out: Path) -> Path:
     return folder
 
 
-def find_poses(row: str, folder: Path, out: Path, frames: FrameSet) -> np.ndarray | None:
+def find_poses(
+    row: str, folder: Path, coarse: Path, out: Path, frames: FrameSet
+) -> np.ndarray | None:
     """Poses (F, 4, 4) of one source; None where a scene has none."""
     if row in REFINED:
-        return load_run(_refined(row, folder, out))[0].world_T_rigs
+        return load_run(_refined(row, folder, coarse, out))[0].world_T_rigs
     if row == "raw":
-        return poses_for(frames, read_trajectory(_coarse(folder)))
+        return poses_for(frames, read_trajectory(coarse))
     path = folder / ("groundtruth.tum" if row == "truth" else "peer_colmap.tum")
     if path.is_file():
         return poses_for(frames, read_trajectory(path))
     return None if row == "truth" else _peer(folder, out, frames)
 
 
-def _coarse(folder: Path) -> Path:
-    return next(p for p in (folder / "slam.tum", folder / "coarse.tum") if p.is_file())
+def find_coarse(folder: Path, names: Sequence[str]) -> Path:
+    """The first trajectory of these names that a scene has.
+
+    Raises:
+        GsbaError: it has none.
+    """
+    for name in names:
+        if (folder / name).is_file():
+            return folder / name
+    raise GsbaError(f"{folder} has no {' or '.join(names)}: name its trajectory by --coarse")
 
 
-def _refined(row: str, folder: Path, out: Path) -> Path:
+def _refined(row: str, folder: Path, coarse: Path, out: Path) -> Path:
     """A finished run; what it shares with the first one is taken from there."""
     run, first = out / f"run-{row}", out / f"run-{next(iter(REFINED))}"
     if not run.exists() and first.exists():
@@ -100,7 +111,7 @@ def _refined(row: str, folder: Path, out: Path) -> Path:
     settings = RefineSettings.model_validate({"export": {"formats": []}, **REFINED[row]})
     mask = folder / "mask.png"
     masks = mask if mask.is_file() else None
-    refine(folder / "images", _coarse(folder), run, settings, masks=masks)
+    refine(folder / "images", coarse, run, settings, masks=masks)
     return run
 
 
@@ -121,12 +132,17 @@ def _peer(folder: Path, out: Path, frames: FrameSet) -> np.ndarray:
 
 
 def run_scene(
-    folder: Path, out: Path, rows: list[str], settings: list[SplatSettings], threads: int
+    folder: Path,
+    coarse: Path,
+    out: Path,
+    rows: list[str],
+    settings: list[SplatSettings],
+    threads: int,
 ) -> dict[str, list[SourceResult]]:
     """Refine, then train and measure on all sources of poses, once for each of the settings."""
     first = next(iter(REFINED))
-    reconstruction, frames = load_run(_refined(first, folder, out))
-    found = {row: find_poses(row, folder, out, frames) for row in rows}
+    reconstruction, frames = load_run(_refined(first, folder, coarse, out))
+    found = {row: find_poses(row, folder, coarse, out, frames) for row in rows}
     sources = {row: poses for row, poses in found.items() if poses is not None}
     backend = choose_backend("cpu", threads)
     found = [
@@ -191,6 +207,9 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(WALKS))
     parser.add_argument("--sources", nargs="+", default=list(SOURCES), choices=SOURCES)
     parser.add_argument("--data", type=Path, help="folder of recorded scenes")
+    parser.add_argument(
+        "--coarse", nargs="+", default=["slam.tum", "coarse.tum"], help="the first that is there"
+    )
     parser.add_argument("--iterations", type=int, default=800)
     parser.add_argument("--rates", choices=RATES, default="short", help="of learning")
     parser.add_argument("--face-size", type=int, default=128)
@@ -217,7 +236,8 @@ def main() -> None:
         try:
             folder = find_scene(name, options.data, options.out)
             seeded = [settings.model_copy(update={"seed": seed}) for seed in options.seeds]
-            results = run_scene(folder, out, options.sources, seeded, options.threads)
+            coarse = find_coarse(folder, options.coarse)
+            results = run_scene(folder, coarse, out, options.sources, seeded, options.threads)
         except GsbaError as error:
             print(f"\n{name}: skipped, {error}")
             continue
