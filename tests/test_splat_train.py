@@ -70,7 +70,7 @@ def test_images_are_learned_the_same_way_every_time() -> None:
 
 
 class Hasty(CpuBackend):
-    """Takes as many steps at a time as gsplat does."""
+    """Takes several steps at a time, as the gsplat backend does."""
 
     stretch = 20
 

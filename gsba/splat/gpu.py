@@ -35,7 +35,7 @@ class GsplatBackend:
         GsbaError: torch or gsplat is not installed, or there is no CUDA device.
     """
 
-    name, stretch = "gsplat", 20
+    name, stretch = "gsplat", 100
 
     def __init__(self, device: str = "cuda") -> None:
         try:

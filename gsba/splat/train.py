@@ -26,7 +26,7 @@ from gsba.splat.gaussians import Gaussians
 logger = logging.getLogger(__name__)
 
 _PUBLISHED = 30_000  # steps that the published times are for
-_CHECK_EVERY = 20  # steps between looks for values that are not finite; no stretch is longer
+_CHECK_EVERY = 20  # steps between looks for values that are not finite, at ends of stretches
 
 
 @dataclass(frozen=True, slots=True)
