@@ -36,8 +36,7 @@ def _project(means, _covars, quats, scales, viewmats, Ks, width, height, **optio
 
 
 def _blend(means2d, conics, colors, opacities, width, height, *_tiles, **_options):
-    """All Gaussians at all pixels of each image, near ones first; their depth is the last colour,
-    or with three channels their order."""
+    """All Gaussians at all pixels of each image, near ones first."""
     images, alphas = [], []
     v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     for c in range(len(means2d)):
