@@ -1,5 +1,7 @@
 """From poses to correspondences: neighbours in time, closed loops, and the map itself."""
 
+from functools import partial
+
 import numpy as np
 
 from gsba import pairs, verify
@@ -24,8 +26,15 @@ def match_neighbours(context: MatchContext, start: Adjustment) -> VerifiedPairs:
     # The strongest keypoints are enough to find a pair's geometry, at a tenth of the cost.
     found = context.match(chosen, world_T_rigs, [gate] * len(chosen), strongest=True)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
-    exact = np.zeros(len(chosen))
-    neighbours = verified(found, f0_T_f1s, exact, context)
+    judge = partial(
+        verify.judge,
+        keypoints=context.keypoints,
+        prior_f0_T_f1s=f0_T_f1s,
+        position_sigmas=np.zeros(len(chosen)),
+        settings=settings.verify,
+    )
+    estimates = _estimates(found, context)
+    neighbours = judge(found, estimates)
     scarce = np.diff(found.offsets) < settings.pairs.scarce_matches
     steps = chosen[:, 1] - chosen[:, 0] == 1
     doubtful = steps & (_shares(found, neighbours) < settings.pairs.least_agreement)
@@ -33,7 +42,9 @@ def match_neighbours(context: MatchContext, start: Adjustment) -> VerifiedPairs:
     if len(rows) == 0:
         return neighbours
     again = context.match(chosen[rows], world_T_rigs, [gate] * len(rows))
-    return verified(_replaced(found, rows, again), f0_T_f1s, exact, context)
+    for p, estimate in zip(rows, _estimates(again, context), strict=True):
+        estimates[p] = estimate
+    return judge(_replaced(found, rows, again), estimates)
 
 
 def match_loops(context: MatchContext, solved: Adjustment) -> VerifiedPairs:
@@ -121,6 +132,12 @@ def verified(
     return verify.run(
         found, context.keypoints, f0_T_f1s, sigmas, settings.verify, settings.seed, threads
     )
+
+
+def _estimates(found: Matches, context: MatchContext) -> list[verify.Estimate | None]:
+    """The geometry of each pair, whatever the trajectory says."""
+    settings, threads = context.settings, context.num_threads
+    return verify.estimate(found, context.keypoints, settings.verify, settings.seed, threads)
 
 
 def _shares(found: Matches, kept: VerifiedPairs) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Two-view verification on bearings, and agreement with the trajectory."""
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -7,6 +8,8 @@ import numpy as np
 from gsba.config import VerifySettings
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
+
+Estimate = tuple[np.ndarray, np.ndarray]  # f0_T_f1 (4, 4), inlier mask (m,); see `relative_pose`
 
 
 def run(
@@ -31,7 +34,24 @@ def run(
         seed: of the sampling.
         num_threads: pairs verified at a time.
     """
-    estimates = _estimates(matches, keypoints, settings, seed, num_threads)
+    estimates = estimate(matches, keypoints, settings, seed, num_threads)
+    return judge(matches, estimates, keypoints, prior_f0_T_f1s, position_sigmas, settings)
+
+
+def judge(
+    matches: Matches,
+    estimates: Sequence[Estimate | None],
+    keypoints: Keypoints,
+    prior_f0_T_f1s: np.ndarray | None,
+    position_sigmas: np.ndarray | None,
+    settings: VerifySettings,
+) -> VerifiedPairs:
+    """Keep pairs that agree with the prior.
+
+    Args:
+        estimates: of `estimate`, for each pair.
+        matches, keypoints, prior_f0_T_f1s, position_sigmas, settings: as for `run`.
+    """
     kept = []
     dropped = {"too few matches": 0, "rotation contradicts": 0, "direction contradicts": 0}
     for p, found in enumerate(estimates):
@@ -67,17 +87,17 @@ def run(
     return VerifiedPairs(verified, poses, Counts(len(matches.pairs), len(kept), "pairs", dropped))
 
 
-def _estimates(
+def estimate(
     matches: Matches, keypoints: Keypoints, settings: VerifySettings, seed: int, num_threads: int
-) -> list[tuple[np.ndarray, np.ndarray] | None]:
-    """`relative_pose` of every pair."""
+) -> list[Estimate | None]:
+    """`relative_pose` of every pair, whatever the prior says."""
 
-    def estimate(p: int) -> tuple[np.ndarray, np.ndarray] | None:
+    def one(p: int) -> Estimate | None:
         bearings0, bearings1 = _bearings(matches, keypoints, p, matches.of(p))
         return relative_pose(bearings0, bearings1, settings, seed)
 
     with ThreadPoolExecutor(num_threads) as pool:
-        return list(pool.map(estimate, range(len(matches.pairs))))
+        return list(pool.map(one, range(len(matches.pairs))))
 
 
 def _bearings(
@@ -90,7 +110,7 @@ def _bearings(
 
 def relative_pose(
     bearings0: np.ndarray, bearings1: np.ndarray, settings: VerifySettings, seed: int
-) -> tuple[np.ndarray, np.ndarray] | None:
+) -> Estimate | None:
     """f0_T_f1 (4, 4) with unit translation and inlier mask (m,), or None if too few agree."""
     import pycolmap
 
