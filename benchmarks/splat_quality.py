@@ -5,7 +5,7 @@
 
 Every source trains on the same frames with the same settings and seeds, on the CPU, and is measured
 on whole panoramas it never saw, at its own poses. Densification is chaotic: poses that differ by
-nothing to speak of end 0.1 to 0.3 dB apart, so give several `--seeds` and trust means. Scenes named
+nothing to speak of end tenths of a dB apart: give several `--seeds` and trust means. Scenes named
 demo_… are rendered on the spot, the others are folders of FOLDER with images/, a coarse trajectory
 (`--coarse NAME` takes another one, in a WORK of its own), and groundtruth.tum and mask.png if there
 are. COLMAP's poses are peer_colmap.tum of the folder, or what `benchmarks/peer.py` makes of the

@@ -14,7 +14,7 @@ from gsba.log import track
 from gsba.optimize import optimize
 from gsba.rig import RIG_R_FACE, CubeRig
 from gsba.splat.backend import Backend
-from gsba.splat.camera import face_camera
+from gsba.splat.camera import rig_cameras
 from gsba.splat.gaussians import Gaussians
 from gsba.splatting import cut_faces, place_points
 from gsba.types import FACES, FrameSet, Reconstruction
@@ -153,7 +153,7 @@ def render_view(
     centres = np.arange(rig.size) + 0.5
     grid = np.stack(np.meshgrid(centres, centres), axis=-1)
     points, greys = [], []
-    cameras = [face_camera(world_T_rig, face, rig) for face in range(len(FACES))]
+    cameras = rig_cameras(world_T_rig, rig)
     images = backend.render(gaussians, cameras, None, near)
     for camera, image in zip(cameras, images, strict=True):
         sure = (image.alpha > MIN_ALPHA) & ~_edges(image.depth)

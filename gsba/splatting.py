@@ -11,7 +11,7 @@ from gsba.geometry import bearings_from_erp
 from gsba.log import GsbaError, track
 from gsba.rig import CubeRig, owner_faces
 from gsba.splat.backend import Backend
-from gsba.splat.camera import face_camera
+from gsba.splat.camera import face_camera, rig_cameras
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.metrics import psnr, ssim
 from gsba.splat.train import Views, extent_of
@@ -252,8 +252,7 @@ def render_faces(
     gaussians: Gaussians, world_T_rig: np.ndarray, rig: CubeRig, near: float, backend: Backend
 ) -> np.ndarray:
     """The six faces (6, size, size, 3) uint8 RGB of a rig, in FACES order."""
-    cameras = [face_camera(world_T_rig, face, rig) for face in range(len(FACES))]
-    renderings = backend.render(gaussians, cameras, None, near)
+    renderings = backend.render(gaussians, rig_cameras(world_T_rig, rig), None, near)
     return np.stack([to_uint8(rendering.color) for rendering in renderings])
 
 

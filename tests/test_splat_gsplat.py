@@ -161,6 +161,14 @@ def test_density_control_is_at_its_time(backend: Backend) -> None:
     assert after.step == 160 and after.pull.counts.any() and after.gaussians.is_finite()
 
 
+def test_harmonics_that_are_not_there_are_not_asked_for(backend: Backend) -> None:
+    settings, plain = SplatSettings(iterations=3000, sh_degree=3, seed=2), _gaussians(12, 7)
+    first = begin(dataclasses.replace(plain, sh=plain.sh[:, :1].copy()), settings)
+    trainer = Trainer(_views(_gaussians(20, 1), False), settings, backend)
+    after = trainer.advance(dataclasses.replace(first, step=140), 142)
+    assert after.gaussians.is_finite() and not np.array_equal(after.gaussians.sh, plain.sh[:, :1])
+
+
 @pytest.mark.parametrize("device", [False, True])
 def test_what_is_missing_is_one_line(monkeypatch: pytest.MonkeyPatch, device: bool) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: device)

@@ -25,7 +25,7 @@ class Lesson:
     camera: FaceCamera
     truth: np.ndarray  # (H, W, 3) uint8, RGB
     use: np.ndarray | None  # (H, W) bool, pixels that count; None = all
-    sh_degree: int  # of the harmonics, not more than the Gaussians have
+    sh_degree: int  # of the harmonics, at most
     rates: adam.Rates
     number: int  # of the step, from 1
 

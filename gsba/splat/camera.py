@@ -22,6 +22,11 @@ class FaceCamera:
         return np.concatenate([self.world_R_face.T.ravel(), self.face_in_world, tail])
 
 
+def rig_cameras(world_T_rig: np.ndarray, rig: CubeRig) -> list[FaceCamera]:
+    """Cameras of all faces of a rig, in FACES order; see `face_camera`."""
+    return [face_camera(world_T_rig, face, rig) for face in range(len(RIG_R_FACE))]
+
+
 def face_camera(world_T_rig: np.ndarray, face: int, rig: CubeRig) -> FaceCamera:
     """Camera of one face of a rig.
 

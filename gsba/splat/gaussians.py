@@ -31,6 +31,10 @@ class Gaussians:
         """Highest degree that there are coefficients for."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
+    def usable_degree(self, wanted: int | None) -> int:
+        """The degree to render with where one is wanted; None = all there are."""
+        return self.sh_degree if wanted is None else min(wanted, self.sh_degree)
+
     def arrays(self) -> tuple[np.ndarray, ...]:
         """The five parameter arrays, in the order of the fields."""
         return tuple(getattr(self, entry.name) for entry in fields(self))

@@ -32,7 +32,8 @@ class GsplatBackend:
         device: of PyTorch.
 
     Raises:
-        GsbaError: torch or gsplat is not installed, or there is no CUDA device.
+        GsbaError: torch or gsplat is not installed, or there is no CUDA device, or no kernels
+            for it.
     """
 
     name, stretch = "gsplat", 100
@@ -59,7 +60,7 @@ class GsplatBackend:
         near: float,
     ) -> list[Rendering]:
         """See `gsba.splat.backend.Backend`; all cameras are one batch."""
-        degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
+        degree = gaussians.usable_degree(sh_degree)
         with self._within_memory(gaussians), self._torch.no_grad():
             found = self._run(self._upload(gaussians), cameras, degree, near, "RGB+ED")
         images, alphas = (part.cpu().numpy() for part in found[:2])
@@ -87,7 +88,8 @@ class GsplatBackend:
             for lesson in lessons:
                 for value in values:
                     value.requires_grad_(True).grad = None
-                image, _, notes = self._run(values, [lesson.camera], lesson.sh_degree, near, "RGB")
+                degree = gaussians.usable_degree(lesson.sh_degree)
+                image, _, notes = self._run(values, [lesson.camera], degree, near, "RGB")
                 notes["means2d"].retain_grad()
                 image[0].backward(self._slope(image[0].detach(), lesson, ssim_weight))
                 with torch.no_grad():

@@ -74,7 +74,7 @@ def render(
     Returns:
         The image, and what `differentiate` needs.
     """
-    degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
+    degree = gaussians.usable_degree(sh_degree)
     num, across = len(gaussians), -(-camera.size // _tiles.TILE)
     splats, reach2 = np.empty((num, 10), np.float32), np.empty(num, np.float32)
     given = (camera.packed(), camera.size, near, *gaussians.arrays(), degree)
