@@ -4,6 +4,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+_MAX_FACE = 16_384  # pixels: remapping ends at 32,767
+_MAX_SEED = 2**31 - 1
+
 
 class _Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -17,7 +20,9 @@ class ReadSettings(_Settings):
     )  # longer gaps are still filled, but reported
     clock_offset_s: float | None = None  # s to add to frame times; None = clocks agree or one fits
     clock: Literal["auto", "given"] = "auto"  # auto: corrected by how the camera turns, where sure
-    max_clock_shift_s: float = Field(default=10.0, gt=0)  # furthest that the correction may go
+    max_clock_shift_s: float = Field(
+        default=10.0, gt=0, le=600
+    )  # furthest that the correction may go
 
 
 class VideoSettings(_Settings):
@@ -25,7 +30,9 @@ class VideoSettings(_Settings):
 
     fps: float = Field(default=1.0, gt=0)  # frames kept per second
     every: int | None = Field(default=None, ge=1)  # keep one of so many frames instead
-    at: str | None = None  # trajectory file: keep the frames at its times instead
+    at: str | None = Field(
+        default=None, min_length=1
+    )  # trajectory file: keep the frames at its times instead
     sharpest: bool = False  # of the frames that one is kept of; else the first
     from_s: float | None = Field(default=None, ge=0)  # seconds after the first frame
     to_s: float | None = Field(default=None, gt=0)
@@ -39,10 +46,14 @@ class CubemapSettings(_Settings):
     """Faces cut from a panorama for detection."""
 
     hfov_deg: float = Field(default=96.0, ge=90, le=120)
-    face_size: int | None = Field(default=None, ge=64)  # pixels; None = by oversampling
+    face_size: int | None = Field(
+        default=None, ge=64, le=_MAX_FACE
+    )  # pixels; None = by oversampling
     oversampling: float = Field(default=0.5, ge=0.25, le=4)  # face pixels per panorama pixel
-    min_face_size: int = Field(default=192, ge=64)  # pixels; bounds on the automatic size
-    max_face_size: int = Field(default=448, ge=64)
+    min_face_size: int = Field(
+        default=192, ge=64, le=_MAX_FACE
+    )  # pixels; bounds on the automatic size
+    max_face_size: int = Field(default=448, ge=64, le=_MAX_FACE)
 
 
 class FeatureSettings(_Settings):
@@ -234,7 +245,7 @@ class PhotometricSettings(_Settings):
 class SplatFactorSettings(_Settings):
     """Poses refined against a splat of their own frames; see also `SplatSettings`."""
 
-    sizes: tuple[Annotated[int, Field(ge=16)], ...] = Field(
+    sizes: tuple[Annotated[int, Field(ge=16, le=_MAX_FACE)], ...] = Field(
         default=(48, 96), min_length=1
     )  # pixels of a face, in order
     first_steps: int = Field(default=200, ge=1)  # of training, before poses move at each size
@@ -260,7 +271,7 @@ class ExportSettings(_Settings):
         Literal["colmap", "colmap-flat", "colmap-erp", "nerfstudio", "ply", "tum"], ...
     ] = ("colmap",)
     face_size: int | None = Field(
-        default=None, ge=16
+        default=None, ge=16, le=_MAX_FACE
     )  # pixels; None = a quarter of the panorama's width
 
 
@@ -268,7 +279,7 @@ class SplatSettings(_Settings):
     """Training of a Gaussian splat: the rates of Kerbl et al., 2023, times scaled to the length."""
 
     iterations: int = Field(default=7000, ge=1)  # views shown, one at a time
-    face_size: int = Field(default=256, ge=16)  # pixels
+    face_size: int = Field(default=256, ge=16, le=_MAX_FACE)  # pixels
     backend: Literal["auto", "gsplat", "cpu"] = "auto"
     held_out_every: int = Field(default=8, ge=2)  # whole panoramas kept for evaluation
     sh_degree: int = Field(default=3, ge=0, le=3)
@@ -288,7 +299,7 @@ class SplatSettings(_Settings):
     min_opacity: float = Field(default=5e-3, gt=0, lt=1)
     max_scale: float = Field(default=0.1, gt=0)  # of extent
     checkpoint_every_s: float = Field(default=60.0, gt=0)
-    seed: int = 0
+    seed: int = Field(default=0, ge=0, le=_MAX_SEED)
 
 
 class PlacementSettings(_Settings):
@@ -297,8 +308,12 @@ class PlacementSettings(_Settings):
     up: Literal["auto", "none"] = "none"  # auto: gravity from rigs and vertical edges
     length: float | None = Field(default=None, gt=0)  # metres between the two of `between`
     between: tuple[str, str] | None = None  # frames by name, or points "x,y,z" of the run's world
-    gps: str | None = None  # file of positions, or "exif": metres, east-north-up
-    align: str | None = None  # TUM file of true poses: its world and unit
+    gps: str | None = Field(
+        default=None, min_length=1
+    )  # file of positions, or "exif": metres, east-north-up
+    align: str | None = Field(
+        default=None, min_length=1
+    )  # TUM file of true poses: its world and unit
 
 
 class RefineSettings(_Settings):
@@ -324,7 +339,7 @@ class RefineSettings(_Settings):
     splat: SplatFactorSettings = SplatFactorSettings()
     export: ExportSettings = ExportSettings()
     placement: PlacementSettings = PlacementSettings()
-    seed: int = 0
+    seed: int = Field(default=0, ge=0, le=_MAX_SEED)
 
     @model_validator(mode="after")
     def _geometry_first(self) -> "RefineSettings":

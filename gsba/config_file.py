@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from gsba.config import RefineSettings
-from gsba.log import GsbaError
+from gsba.log import GsbaError, brief
 
 _NONE = "none"
 
@@ -49,18 +49,22 @@ def _read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise GsbaError(f"cannot read settings {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # of syntax, encoding, digits, nesting
         raise GsbaError(f"{path} is not valid TOML: {error}") from error
 
 
 def _parse_override(text: str) -> tuple[tuple[str, ...], Any]:
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
-        raise GsbaError(f"--set {text}: write stage.key=value, e.g. features.max_per_face=600")
+        raise GsbaError(
+            f"--set {brief(text)}: write stage.key=value, e.g. features.max_per_face=600"
+        )
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
         parsed = value.strip()
+    except (ValueError, RecursionError) as error:  # thousands of digits or brackets
+        raise GsbaError(f"--set {brief(text)}: not a value that can be read ({error})") from None
     return tuple(part.strip() for part in name.split(".")), parsed
 
 
@@ -75,9 +79,9 @@ def _check_keys(
 ) -> None:
     """GsbaError for a key the model does not have, or a value where a table belongs."""
     for key, value in tree.items():
-        name = ".".join((*place, key))
+        name = brief(".".join((*place, key)))
         if key not in model.model_fields:
-            near = get_close_matches(key, model.model_fields, n=1)
+            near = get_close_matches(key[:60], model.model_fields, n=1)
             hint = f"did you mean {near[0]}?" if near else "known: " + ", ".join(model.model_fields)
             raise GsbaError(f"{source}: unknown setting {name}; {hint}")
         nested = _nested_model(model, key)
@@ -107,6 +111,7 @@ def _with_none(tree: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any
 
 def validated(tree: Mapping[str, Any]) -> RefineSettings:
     """Settings from a tree of values with known keys; GsbaError says which is out of range."""
+    tree = _completed(tree, RefineSettings)
     try:
         return RefineSettings.model_validate(tree)
     except ValidationError as error:
@@ -119,9 +124,23 @@ def validated(tree: Mapping[str, Any]) -> RefineSettings:
         name, value = f"{name}.{key}".lstrip("."), value[key]
         allowed = _allowed(_schema(model, key))
         model = _nested_model(model, key)
+    said = first["msg"].removeprefix("Value error, ")
     if model is not None:  # a check across several settings
-        raise GsbaError(f"settings {name}: {first['msg'].removeprefix('Value error, ')}")
-    raise GsbaError(f"setting {name} = {_toml_value(value)} is not allowed: use {allowed}")
+        raise GsbaError(f"settings {name}: {said}" if name else said)
+    use = said if first["type"] == "value_error" else f"use {allowed}"
+    raise GsbaError(f"setting {name} = {brief(_toml_value(value))} is not allowed: {use}")
+
+
+def _completed(tree: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:
+    """The tree with what its tables leave unsaid as it is by default in their place."""
+    out: dict[str, Any] = {}
+    for key, value in tree.items():
+        nested = _nested_model(model, key)
+        default = model.model_fields[key].default
+        if nested is not None and isinstance(default, BaseModel) and isinstance(value, Mapping):
+            value = default.model_dump() | _completed(value, nested)
+        out[key] = value
+    return out
 
 
 def _nested_model(model: type[BaseModel], key: str) -> type[BaseModel] | None:
@@ -167,7 +186,10 @@ def _allowed(schema: Mapping[str, Any]) -> str:
         words = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
         bounds = [f"{sign} {schema[key]:g}" for key, sign in words.items() if key in schema]
         noun = "an integer" if kind == "integer" else "a number"
+        noun = "an even integer" if schema.get("multipleOf") == 2 else noun
         return f"{noun} {' and '.join(bounds)}".rstrip()
+    if schema.get("minLength"):
+        return "a text that is not empty"
     names = {"null": f'"{_NONE}"', "boolean": "true or false", "string": "a text"}
     return names.get(str(kind), "another value")
 

@@ -36,9 +36,15 @@ def show_log(level: int = logging.INFO) -> None:
     logger.propagate = False
 
 
+def brief(text: str, most: int = 60) -> str:
+    """A text of at most so many characters, its middle left out where it is longer."""
+    kept = most // 2 - 1
+    return text if len(text) <= most else f"{text[:kept]}...{text[-kept + 1 :]}"
+
+
 def track(items: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
-    """Yield `items` behind a progress bar on stderr; silent where stderr is no terminal."""
-    if not sys.stderr.isatty():
+    """Yield `items` behind a progress bar on stderr; silent in a quiet run or without terminal."""
+    if not (sys.stderr.isatty() and logging.getLogger("gsba").isEnabledFor(logging.INFO)):
         yield from items
         return
     from rich.progress import track as rich_track

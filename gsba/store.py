@@ -103,7 +103,8 @@ class RunStore:
             self._note(replace(record, resumed=True))
             return value
         wall, cpu = time.perf_counter(), time.process_time()
-        value = compute()
+        with _named_in_memory_errors(name):
+            value = compute()
         record = _measured(name, key, wall, cpu)
         save_record(path, value, dataclasses.asdict(record))
         self._note(record)
@@ -138,7 +139,7 @@ class RunStore:
         spent = _read_cost(folder / "cost.json", base) if len(missing) < len(keys) else None
         wall, cpu = time.perf_counter(), time.process_time()
         try:
-            with ThreadPoolExecutor(num_threads) as pool:
+            with _named_in_memory_errors(name), ThreadPoolExecutor(num_threads) as pool:
                 running = [pool.submit(frames.__getitem__, item) for item in missing]
                 try:
                     for future in track(running, name):
@@ -253,6 +254,15 @@ def _jsonable(value: object) -> object:
     if isinstance(value, Path):
         return str(value)
     raise TypeError(f"a {type(value).__name__} cannot be part of a stage's key")
+
+
+@contextmanager
+def _named_in_memory_errors(stage: str) -> Iterator[None]:
+    try:
+        yield
+    except MemoryError as error:
+        error.add_note(stage)
+        raise
 
 
 def _stage_path(root: Path, name: str) -> Path:

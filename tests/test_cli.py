@@ -1,7 +1,9 @@
 """The command line: what it answers, how fast it may not think, and how it fails."""
 
 import errno
+import io
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -11,9 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer.main
 from typer.testing import CliRunner, Result
 
 import gsba
+from gsba import log
 from gsba.cli import app
 from gsba.config import RefineSettings
 from gsba.config_file import load_config
@@ -80,6 +84,11 @@ def test_show_config_prints_what_load_config_reads(tmp_path: Path) -> None:
 def test_wrong_settings_name_the_key() -> None:
     _fails(_gsba("show-config", "--set", "features.max_per_fce=1"), "did you mean max_per_face?")
     _fails(_gsba("show-config", "--set", "seed=x"), "use an integer")
+    _fails(_gsba("show-config", "--set", "seed=-1"), "use an integer >= 0")
+    _fails(_gsba("show-config", "--set", "seed=" + "9" * 9999), "seed=999")
+    _fails(_gsba("show-config", "--set", "seed=" + "[" * 3000), "not a value that can be read")
+    _fails(_gsba("show-config", "--set", "video.width=99999"), "use an even integer >= 64")
+    _fails(_gsba("show-config", "--set", "align.patch_size=8"), "not allowed: must be odd")
     _fails(_gsba("show-config", "--config", "nowhere.toml"), "cannot read settings nowhere.toml")
     _fails(_gsba("refine", "a", "b", "--out", "c", "--set", "x=1"), "unknown setting x")
     assert not Path("c").exists()
@@ -91,6 +100,7 @@ def test_factors_are_a_setting() -> None:
     out = _gsba("show-config", "--factors", "bearing,reprojection").stdout
     assert 'factors = ["bearing", "reprojection"]' in out
     _fails(_gsba("show-config", "--factors", "nonsense"), '"bearing"')
+    _fails(_gsba("show-config", "--factors", "splat"), "error: factors: splat starts from")
 
 
 @pytest.mark.parametrize(
@@ -111,15 +121,45 @@ def test_expected_failures_are_one_line(
     _fails(_gsba("export", "run", "--to", "colmap"), message, code)
 
 
-def test_unexpected_failures_show_themselves(pipeline: Callable[[BaseException], None]) -> None:
-    pipeline(ZeroDivisionError())
-    result = _gsba("refine", "frames", "slam.tum", "--out", "run")
-    assert isinstance(result.exception, ZeroDivisionError)
+def test_what_nobody_foresaw_is_one_line_that_can_be_reported(
+    pipeline: Callable[[BaseException], None],
+) -> None:
+    pipeline(ZeroDivisionError("no\nway"))
+    call = ["refine", "frames", "slam.tum", "--out", "run"]
+    _fails(_gsba(*call), "unforeseen ZeroDivisionError at test_cli.py:")
+    _fails(_gsba(*call), "(no way): a fault of gsba")
+    assert isinstance(_gsba("--debug", *call).exception, ZeroDivisionError)
+
+
+def test_memory_errors_name_the_stage_and_its_settings(
+    pipeline: Callable[[BaseException], None],
+) -> None:
+    error = MemoryError("Unable to allocate 4.50 GiB")
+    pipeline(error)
+    _fails(_gsba("export", "run", "--to", "ply"), "(Unable to allocate 4.50 GiB): give smaller")
+    error.add_note("align1")
+    _fails(_gsba("export", "run", "--to", "ply"), "(stage align1; Unable")
+    _fails(_gsba("export", "run", "--to", "ply"), "lower align.max_width or solver.num_threads")
+
+
+def test_messages_are_short_and_printable(pipeline: Callable[[BaseException], None]) -> None:
+    pipeline(GsbaError("9" * 10_000 + "\udcff\nend"))
+    line = _gsba("refine", "frames", "slam.tum", "--out", "run").stderr
+    assert len(line) < 1100 and line.startswith("error: 999") and line.endswith("end\n")
+    assert "\\udcff" in line
+
+
+def test_help_says_nothing_of_python() -> None:
+    for command in typer.main.get_command(app).commands:  # type: ignore[attr-defined]
+        assert "[Path]" not in _gsba(command, "--help").stdout
 
 
 def test_export_checks_its_options(tmp_path: Path) -> None:
     _fails(_gsba("export", tmp_path, "--to", "obj"), "use one of colmap, colmap-flat, colmap-erp")
-    _fails(_gsba("export", tmp_path, "--to", "ply", "--face-size", 0), "--face-size 0")
+    for size in (0, 15):
+        result = _gsba("export", tmp_path, "--to", "ply", "--face-size", size)
+        _fails(result, f"export.face_size = {size} is not allowed: use an integer >= 16")
+    _fails(_gsba("export", tmp_path, "--to", "ply", "--gps", ""), 'gps = "" is not allowed')
 
 
 def test_evaluate_compares_a_file_or_a_run(tmp_path: Path) -> None:
@@ -158,3 +198,21 @@ def test_script_ends_quietly_in_a_closed_pipe() -> None:
     )
     os.close(writer)
     assert done.stderr == b""
+
+
+@pytest.mark.parametrize(("level", "shown"), [(logging.WARNING, False), (logging.INFO, True)])
+def test_a_quiet_run_shows_no_bars(
+    monkeypatch: pytest.MonkeyPatch, level: int, shown: bool
+) -> None:
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    monkeypatch.setattr(sys, "stderr", terminal)
+    log._console.cache_clear()
+    logger = logging.getLogger("gsba")
+    monkeypatch.setattr(logger, "level", logger.level)
+    logger.setLevel(level)
+    try:
+        assert list(log.track(range(3), "counting")) == [0, 1, 2]
+    finally:
+        log._console.cache_clear()
+    assert ("counting" in terminal.getvalue()) is shown

@@ -61,6 +61,13 @@ def everything(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(config_file, "RefineSettings", _Everything)
 
 
+def test_a_table_keeps_what_an_override_leaves_unsaid(tmp_path: Path) -> None:
+    expected = RefineSettings().pairs.refined.model_copy(update={"direction": 0.01})
+    assert load_config(None, ["pairs.refined.direction=0.01"]).pairs.refined == expected
+    path = _written(tmp_path, "[pairs.refined]\ndirection = 0.01\n")
+    assert load_config(path).pairs.refined == expected
+
+
 def _written(folder: Path, text: str) -> Path:
     path = folder / "settings.toml"
     path.write_text(text, encoding="utf-8")

@@ -3,17 +3,31 @@
 import logging
 import os
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
+from pathlib import Path
 from typing import Annotated, NoReturn, ParamSpec
 
 import typer
+from typer.core import TyperCommand
 
 from gsba import __version__
-from gsba.log import GsbaError, show_log
+from gsba.log import GsbaError, brief, show_log
 
 P = ParamSpec("P")
+
+_SOURCE = Path(__file__).parents[2]
+_MOST_SHOWN = 1000  # characters of a message
+_MEMORY_OF = {  # settings that the memory of a stage follows, by the beginning of its name
+    "features": "cubemap.max_face_size, features.max_per_face or solver.num_threads",
+    "align": "align.max_width or solver.num_threads",
+    "photometric": "photometric.max_width or photometric.targets",
+    "splat": "splat.sizes or splat.max_gaussians",
+    "export": "export.face_size",
+}
+_FEWER_POINTS = "features.max_per_face"  # what all other stages follow
 
 app = typer.Typer(
     help="Pixel-true camera poses for 360-degree video, from frames and a SLAM trajectory.",
@@ -39,13 +53,56 @@ def _expected_failures() -> Iterator[None]:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         _fail(f"{where}{error.strerror or error}")
-    except MemoryError:
-        _fail("out of memory: lower cubemap.max_face_size or features.max_per_face")
+    except MemoryError as error:
+        _fail(_out_of_memory(error))
+    except (typer.Exit, typer.Abort):
+        raise
+    except Exception as error:
+        if _Call.debug:
+            raise
+        _fail(_unforeseen(error))
+
+
+class _Call:
+    """Options of the running call that commands do not see."""
+
+    debug = False
+
+
+def _out_of_memory(error: MemoryError) -> str:
+    """What ran out of memory, and which settings lower it."""
+    stage = next(iter(getattr(error, "__notes__", ())), "")
+    told = "; ".join(filter(None, (stage and f"stage {stage}", str(error))))
+    kind = stage.removeprefix("first-")
+    lower = next((s for name, s in _MEMORY_OF.items() if kind.startswith(name)), _FEWER_POINTS)
+    advice = f"lower {lower}" if stage else "give smaller input"
+    return f"out of memory{f' ({told})' if told else ''}: {advice}, or use a machine with more"
+
+
+def _unforeseen(error: Exception) -> str:
+    """One line on what nobody foresaw: what, where in our code, and how to report it."""
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [f for f in frames if Path(f.filename).is_relative_to(_SOURCE)] or frames
+    where = f"{Path(ours[-1].filename).name}:{ours[-1].lineno}"
+    return (
+        f"unforeseen {type(error).__name__} at {where} ({brief(str(error), 200)}): a fault of gsba "
+        f"{__version__}; please report this line, and what `gsba --debug` before the same command "
+        "shows"
+    )
 
 
 def _fail(message: str, code: int = 1) -> NoReturn:
-    typer.echo(f"error: {message}", err=True)
+    """End with one line that any terminal can show, of a length that people read."""
+    line = " ".join(message.splitlines()).encode("utf-8", "backslashreplace").decode()
+    typer.echo(f"error: {brief(line, _MOST_SHOWN)}", err=True)
     raise typer.Exit(code)
+
+
+class _Command(TyperCommand):
+    def get_help(self, ctx: typer.Context) -> str:  # type: ignore[override]
+        """The help without Python's notation for an argument that may be repeated."""
+        shown = "<list[Path]>"
+        return super().get_help(ctx).replace(shown, "<path>".ljust(len(shown)))
 
 
 def command(function: Callable[P, None]) -> Callable[P, None]:
@@ -57,7 +114,7 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
             function(*args, **kwargs)
 
     name = function.__name__.replace("_", "-")
-    return app.command(name)(run)
+    return app.command(name, cls=_Command)(run)
 
 
 def _print_version(wanted: bool) -> None:
@@ -70,6 +127,9 @@ def _print_version(wanted: bool) -> None:
 def _options(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show warnings only.")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show every detail.")] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of a failure nobody foresaw.")
+    ] = False,
     version: Annotated[
         bool,
         typer.Option(
@@ -77,4 +137,5 @@ def _options(
         ),
     ] = False,
 ) -> None:
+    _Call.debug = debug
     show_log(logging.WARNING if quiet else logging.DEBUG if verbose else logging.INFO)

@@ -43,7 +43,8 @@ Masks = Annotated[
     list[Path] | None,
     typer.Option(
         help="One mask for all frames, or a folder; white = use. carrier (or auto), "
-        "distractors: find them. Repeatable."
+        "distractors: find them. Repeatable.",
+        metavar="PATH",
     ),
 ]
 Segment = Annotated[

@@ -41,11 +41,13 @@ def export(
         typer.Option(help="Two frames, or points x,y,z of the run's world.", metavar="A B"),
     ] = None,
     gps: Annotated[
-        Path | None,
-        typer.Option(help="CSV, GPX, or exif (of the frames): metres east, north, up."),
+        str | None,
+        typer.Option(
+            help="CSV, GPX, or exif (of the frames): metres east, north, up.", metavar="FILE"
+        ),
     ] = None,
     align: Annotated[
-        Path | None, typer.Option(help="True poses: their world and unit.", metavar="TRUTH.tum")
+        str | None, typer.Option(help="True poses: their world and unit.", metavar="TRUTH.tum")
     ] = None,
 ) -> None:
     """Write a finished run as a dataset for another program, placed where you want it."""
@@ -56,11 +58,8 @@ def export(
 
     if to not in list(ExportFormat):
         raise GsbaError(f"--to {to} is not known: use one of {', '.join(ExportFormat)}")
-    if face_size is not None and face_size < 1:
-        raise GsbaError(f"--face-size {face_size} is out of range: use 1 or more pixels")
-    asked = {"up": up, "length": scale, "between": between}
-    asked |= {key: str(path) for key, path in (("gps", gps), ("align", align)) if path is not None}
-    settings = validated({"placement": asked}).placement
+    asked = {"up": up, "length": scale, "between": between, "gps": gps, "align": align}
+    settings = validated({"placement": asked, "export": {"face_size": face_size}}).placement
     from gsba.pipeline import load_run
     from gsba.placement import place
 
@@ -88,7 +87,8 @@ def evaluate(
         bool, typer.Option("--splat", help="Train splats on poses, and measure held-out frames.")
     ] = False,
     against: Annotated[
-        list[Path] | None, typer.Option(help="With --splat: other poses; repeatable.")
+        list[Path] | None,
+        typer.Option(help="With --splat: other poses; repeatable.", metavar="FILE"),
     ] = None,
     iterations: Iterations = None,
     face_size: FaceSize = None,
