@@ -54,8 +54,24 @@ class BlockCholesky:
         out[self.order] = x
         return out
 
-    def inverse_diagonal(self) -> np.ndarray:
-        """Diagonal blocks (N, 6, 6) of the inverse of H (Takahashi's selected inversion)."""
+    def draw(self, normals: np.ndarray) -> np.ndarray:
+        """Vectors (D, N, 6) of covariance H^-1 from as many independent unit normals."""
+        x = np.ascontiguousarray(normals[:, self.order])
+        for one in x:
+            _solve_upper(self._starts, self._rows, self._diagonal, self._below, one)
+        out = np.empty_like(x)
+        out[:, self.order] = x
+        return out
+
+    def inverse_blocks(self, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Blocks of the inverse of H (Takahashi's selected inversion).
+
+        Args:
+            pairs: (Q, 2) int, of the pattern, either index first.
+
+        Returns:
+            (N, 6, 6) those on the diagonal, (Q, 6, 6) those [i, j] of the pairs.
+        """
         inverse = np.zeros_like(self._diagonal)
         inverse_below = np.zeros_like(self._below)
         _selected_inverse(
@@ -63,7 +79,11 @@ class BlockCholesky:
         )
         out = np.empty_like(inverse)
         out[self.order] = inverse
-        return out
+        placed = self._place[np.asarray(pairs, dtype=np.int64).reshape(-1, 2)]
+        between = inverse_below[_find(self._starts, self._rows, np.sort(placed, axis=1))]
+        flip = placed[:, 0] < placed[:, 1]
+        between[flip] = np.swapaxes(between[flip], 1, 2)
+        return out, between
 
 
 def _minimum_degree(num: int, pairs: np.ndarray) -> np.ndarray:
@@ -172,7 +192,13 @@ def _solve(starts, rows, diagonal, below, x):
             for i in range(DIM):
                 for c in range(DIM):
                     x[rows[s], i] -= below[s, i, c] * x[k, c]
-    for k in range(num - 1, -1, -1):
+    _solve_upper(starts, rows, diagonal, below, x)
+
+
+@njit(cache=True, nogil=True)
+def _solve_upper(starts, rows, diagonal, below, x):
+    """Back substitution in place: x <- L^-T x."""
+    for k in range(len(diagonal) - 1, -1, -1):
         for s in range(starts[k], starts[k + 1]):
             for c in range(DIM):
                 for i in range(DIM):

@@ -22,9 +22,19 @@ class ReducedSystem:
     """
 
     def __init__(
-        self, graph: gtsam.NonlinearFactorGraph, blocks: Sequence[Block], values: gtsam.Values
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        blocks: Sequence[Block],
+        values: gtsam.Values,
+        pairs: Sequence[tuple[int, int]] = (),
     ) -> None:
         """Fix the pattern.
+
+        Args:
+            graph: native and user factors.
+            blocks: batched ones.
+            values: of all variables.
+            pairs: keys of two variables each, whose common block `covariances` is to give.
 
         Raises:
             ValueError: a variable has no value.
@@ -33,7 +43,8 @@ class ReducedSystem:
         factor_keys = [graph.at(i).keys() for i in range(graph.size()) if graph.exists(i)]
         self._graph_keys = sorted({key for keys in factor_keys for key in keys})
         block_keys = [key for block in self._blocks for key in block.pose_keys]
-        self.keys = list(dict.fromkeys([*block_keys, *self._graph_keys]))
+        paired = [key for pair in pairs for key in pair]
+        self.keys = list(dict.fromkeys([*block_keys, *self._graph_keys, *paired]))
         all_dims = values.dims()
         for key in self.keys:
             if key not in all_dims:
@@ -48,7 +59,10 @@ class ReducedSystem:
             for block in self._blocks
         ]
         self._padding = self._padded_entries(counts)
-        self._set_pairs(factor_keys, dict(zip(self.keys, counts, strict=True)))
+        self._asked = np.array([self.first_block[key] for key in paired], np.int64).reshape(-1, 2)
+        self._set_pairs(
+            [*factor_keys, *map(list, pairs)], dict(zip(self.keys, counts, strict=True))
+        )
         self._set_columns(all_dims)
         self._cholesky = BlockCholesky(self._num, self._pairs)
 
@@ -118,18 +132,26 @@ class ReducedSystem:
             _add_costs(costs, {GRAPH: self._graph.error(values)})
         return costs
 
-    def inverse_diagonal(self) -> np.ndarray | None:
-        """Diagonal blocks (N, 6, 6) of H^-1 at the linearization point; None if singular.
+    def covariances(
+        self, num_draws: int, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Blocks of H^-1 at the linearization point, and draws from it; None if singular.
 
         A block that nothing constrains is NaN and does not count.
+
+        Returns:
+            (N, 6, 6) those on the diagonal, (P, 6, 6) those between the first blocks of `pairs`,
+            and vectors (D, N, 6) of covariance H^-1.
         """
         idle = np.logical_not(np.any(self._diagonal, axis=(1, 2)))
         diagonal = np.where(idle[:, None, None], np.eye(DIM), self._diagonal)
         if not self._cholesky.factorize(diagonal, self._off_diagonal):
             return None
-        inverse = self._cholesky.inverse_diagonal()
-        inverse[idle] = np.nan
-        return inverse
+        inverse, between = self._cholesky.inverse_blocks(self._asked)
+        drawn = self._cholesky.draw(rng.normal(size=(num_draws, self._num, DIM)))
+        inverse[idle], drawn[:, idle] = np.nan, np.nan
+        between[idle[self._asked].any(axis=1)] = np.nan
+        return inverse, between, drawn
 
     def _padded_entries(self, counts: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """(block, coordinate) of the entries that belong to no variable."""

@@ -20,12 +20,13 @@ from gsba import graph, triangulate
 from gsba.config import RefineSettings, SolverSettings
 from gsba.optimize import Iteration, marginal_covariances, optimize
 from gsba.rig import RIG_R_FACE, CubeRig
-from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
+from gsba.types import Counts, JointErrors, Keypoints, Landmarks, Sighted, Tracks
 
 logger = logging.getLogger(__name__)
 
 _LEAST = 1e-3  # times its claimed sigma: no observation is better than that
 _WIDE = 20.0  # gate in sigmas for observations whose noise is not known yet
+_DRAWS = 500  # errors of all poses, that tell how those of different ones belong together
 _REDUNDANT = 0.1  # least share of residual dimensions left over by the unknowns
 
 
@@ -226,7 +227,7 @@ def pose_covariances(
     settings: RefineSettings,
     num_threads: int,
     components: np.ndarray | None = None,
-) -> np.ndarray:
+) -> tuple[np.ndarray, JointErrors]:
     """Marginal covariances (F, 6, 6) with the first pose and the extent of each map held fixed."""
     block = landmark_block(
         adjustment.landmarks, keypoints, rig, adjustment.noise, settings, num_threads
@@ -234,7 +235,8 @@ def pose_covariances(
     held = gtsam.NonlinearFactorGraph(priors)
     held.push_back(graph.fixed_scale(adjustment.world_T_rigs, components))
     keys = [graph.X(f) for f in range(len(adjustment.world_T_rigs))]
-    return marginal_covariances(held, [block], values_of(adjustment.world_T_rigs), keys)
+    values = values_of(adjustment.world_T_rigs)
+    return marginal_covariances(held, [block], values, keys, _DRAWS, settings.seed)
 
 
 def _noise(

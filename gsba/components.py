@@ -82,6 +82,7 @@ def taken(
     number[rows] = np.arange(len(rows))
     seen = number[reconstruction.observation_frames] >= 0
     points, which = np.unique(reconstruction.observation_points[seen], return_inverse=True)
+    joint = reconstruction.joint_errors
     part = replace(
         reconstruction,
         world_T_rigs=reconstruction.world_T_rigs[rows],
@@ -95,6 +96,7 @@ def taken(
         observation_bearings=reconstruction.observation_bearings[seen],
         observation_sigmas=reconstruction.observation_sigmas[seen],
         components=None,
+        joint_errors=joint and joint.taken(rows),
     )
     kept = replace(
         frames,

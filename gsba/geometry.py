@@ -114,6 +114,13 @@ def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarra
     return scale, rotation, mean_t - scale * rotation @ mean_s
 
 
+def furthest(positions: np.ndarray) -> tuple[int, float]:
+    """Row of the position (N, 3) that is furthest from the first, and its distance."""
+    distances = np.linalg.norm(positions - positions[0], axis=1)
+    far = int(np.argmax(distances))
+    return far, float(distances[far])
+
+
 def carried(poses: np.ndarray, scale: float, new_T_old: np.ndarray) -> np.ndarray:
     """Poses (..., 4, 4) under the similarity scale * R @ x + t, R and t of new_T_old (4, 4)."""
     rotation, translation = new_T_old[:3, :3], new_T_old[:3, 3]

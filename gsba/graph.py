@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 
 from gsba.config import PriorSettings
-from gsba.geometry import inverse
+from gsba.geometry import furthest, inverse
 
 X = gtsam.symbol_shorthand.X
 
@@ -73,12 +73,10 @@ def fixed_scale(
     for component in np.unique(components):
         rows = np.flatnonzero(components == component)
         first = int(rows[0])
-        offsets = world_T_rigs[rows, :3, 3] - world_T_rigs[first, :3, 3]
-        distances = np.linalg.norm(offsets, axis=1)
-        far, distance = int(rows[np.argmax(distances)]), float(distances.max())
+        far, distance = furthest(world_T_rigs[rows, :3, 3])
         if distance > 0:
             noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-6 * distance)
-            held.add(gtsam.RangeFactorPose3(X(first), X(far), distance, noise))
+            held.add(gtsam.RangeFactorPose3(X(first), X(int(rows[far])), distance, noise))
         if first > 0:
             sigmas = np.array([1e-6] * 3 + [1e-6 * max(distance, 1e-12)] * 3)
             fixed = gtsam.Pose3(world_T_rigs[first])

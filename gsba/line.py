@@ -196,9 +196,9 @@ class Line(MatchingStages):
         def compute() -> Reconstruction:
             observed, least = self._corrected(self.observed), self.settings.rounds.min_observations
             given = self.priors, observed, self.rig, self.settings, self.num_threads
-            covariances = adjust.pose_covariances(solved, *given, self.parts)
+            covariances, joint = adjust.pose_covariances(solved, *given, self.parts)
             false = None if self.trust is None else self.trust.false_frames
-            last = self.corrected.correction, self.parts
+            last = self.corrected.correction, self.parts, joint
             return assemble(solved, covariances, observed, self.coarse, least, false, *last)
 
         return self._stage("reconstruction", self._solving(), compute, Reconstruction)

@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -12,6 +13,7 @@ from factors import Block
 from factors.reduced import ReducedSystem
 from gsba.config import SolverSettings
 from gsba.log import GsbaError
+from gsba.types import JointErrors
 
 logger = logging.getLogger(__name__)
 
@@ -173,24 +175,29 @@ def marginal_covariances(
     blocks: Sequence[Block],
     values: gtsam.Values,
     keys: Sequence[int],
-) -> np.ndarray:
-    """Marginal covariances of Pose3 variables from the reduced system at `values`.
+    num_draws: int = 0,
+    seed: int = 0,
+) -> tuple[np.ndarray, JointErrors]:
+    """Marginal covariances of Pose3 variables, and what their errors have in common.
 
     Args:
-        keys: (F,) keys of Pose3 variables of the graph or a block.
+        graph, blocks: what constrains them, linearized at `values`.
+        values: of all variables.
+        keys: (F,) keys of Pose3 variables, in the order of the path.
+        num_draws: errors drawn of all poses at once.
+        seed: of these.
 
     Returns:
-        (F, 6, 6) float64, [rotation rad, translation], rig frame. NaN for a pose that nothing
-        constrains, and for all where the rest is singular (the gauge is not fixed).
+        (F, 6, 6) float64, [rotation rad, translation], rig frame, and joint errors. NaN for a pose
+        that nothing constrains, and for all where the rest is singular (the gauge is not fixed).
     """
-    system = ReducedSystem(graph, blocks, values)
+    num = len(keys)
+    system = ReducedSystem(graph, blocks, values, list(pairwise(keys)))
     system.linearize(values)
-    out = np.full((len(keys), 6, 6), np.nan)
-    inverse = system.inverse_diagonal()
-    if inverse is None:
-        return out
-    for covariance, key in zip(out, keys, strict=True):
-        block = system.first_block.get(key)
-        if block is not None:
-            covariance[:] = inverse[block]
-    return out
+    found = system.covariances(num_draws, np.random.default_rng(seed))
+    if found is None:
+        nothing = np.full((num_draws, num, 6), np.nan, np.float32)
+        return np.full((num, 6, 6), np.nan), JointErrors(np.full((num - 1, 6, 6), np.nan), nothing)
+    inverse, between, drawn = found
+    rows = [system.first_block[key] for key in keys]
+    return inverse[rows], JointErrors(between, drawn[:, rows].astype(np.float32))

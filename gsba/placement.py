@@ -62,11 +62,13 @@ class Placement:
         """A reconstruction in its place; angles, and what the images say, stay as they are."""
         poses = reconstruction.world_T_rigs
         stretch = np.array([1.0, 1, 1, self.scale, self.scale, self.scale])  # rig axes do not turn
+        joint = reconstruction.joint_errors
         return dataclasses.replace(
             reconstruction,
             world_T_rigs=pose(self.rotation @ poses[:, :3, :3], self.points(poses[:, :3, 3])),
             points_world=self.points(reconstruction.points_world),
             pose_covariances=reconstruction.pose_covariances * stretch[:, None] * stretch,
+            joint_errors=joint and joint.scaled(np.tile(stretch, (len(poses), 1))),
         )
 
     def to_json(self) -> dict[str, Any]:

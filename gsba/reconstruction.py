@@ -4,7 +4,14 @@ import numpy as np
 
 from gsba.adjust import Adjustment
 from gsba.geometry import angular_errors, carried, pose, pose_similarity
-from gsba.types import CoarsePoses, Keypoints, PoseSource, PoseStatus, Reconstruction
+from gsba.types import (
+    CoarsePoses,
+    JointErrors,
+    Keypoints,
+    PoseSource,
+    PoseStatus,
+    Reconstruction,
+)
 
 
 def assemble(
@@ -16,6 +23,7 @@ def assemble(
     false_frames: np.ndarray | None = None,
     correction: tuple[float, ...] = (),
     components: np.ndarray | None = None,
+    joint_errors: JointErrors | None = None,
 ) -> Reconstruction:
     """Carry the solution back to the trajectory's world and gather what exports need.
 
@@ -28,6 +36,7 @@ def assemble(
         false_frames: (F,) bool, frames whose coarse pose has no say either.
         correction: of the frames, which the keypoints have.
         components: (F,) map of each frame, each carried to its own coarse poses; None = one map.
+        joint_errors: of the poses; None = not known.
     """
     world_T_rigs, landmarks = adjustment.world_T_rigs, adjustment.landmarks
     seen = np.bincount(landmarks.tracks.frames, minlength=len(world_T_rigs))
@@ -62,6 +71,7 @@ def assemble(
         adjustment.noise * keypoints.sigmas_rad[rows],
         correction,
         components,
+        joint_errors and joint_errors.scaled(stretch),
     )
 
 

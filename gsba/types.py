@@ -167,6 +167,25 @@ class Sighted:
 
 
 @dataclass(frozen=True, slots=True)
+class JointErrors:
+    """What errors of several poses have in common; tangents as those of their covariances."""
+
+    neighbours: np.ndarray  # (F - 1, 6, 6) float64, E[x_f x_(f+1)^T], NaN = none
+    draws: np.ndarray  # (D, F, 6) float32, drawn from the joint distribution of all, NaN = none
+
+    def scaled(self, factors: np.ndarray) -> "JointErrors":
+        """With each pose's errors times its factors (F, 6)."""
+        neighbours = factors[:-1, :, None] * self.neighbours * factors[1:, None, :]
+        return JointErrors(neighbours, (self.draws * factors).astype(np.float32))
+
+    def taken(self, rows: np.ndarray) -> "JointErrors":
+        """Of some poses (F',), ascending; those between which others are left out are no more."""
+        near = (np.diff(rows) == 1)[:, None, None]
+        neighbours = np.where(near, self.neighbours[rows[:-1]], np.nan)
+        return JointErrors(neighbours, self.draws[:, rows])
+
+
+@dataclass(frozen=True, slots=True)
 class Reconstruction:
     """Refined poses and cloud: what exports and reports are made from."""
 
@@ -183,3 +202,4 @@ class Reconstruction:
     correction: tuple[float, ...] = ()  # of the frames, which these bearings have: see FrameSet
     components: np.ndarray | None = None  # (F,) int32, map that each frame is in, 0 = the largest:
     # nothing ties one map to another, each has a world of its own; None = there is one
+    joint_errors: JointErrors | None = None  # those whose own covariances are above; None = none

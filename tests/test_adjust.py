@@ -45,7 +45,7 @@ def _covariances(
     solved: Adjustment, world: World, coarse: np.ndarray, settings: RefineSettings
 ) -> np.ndarray:
     priors = graph.build(coarse, settings.priors)
-    return adjust.pose_covariances(solved, priors, world.keypoints, RIG, settings, 1)
+    return adjust.pose_covariances(solved, priors, world.keypoints, RIG, settings, 1)[0]
 
 
 @cache

@@ -169,6 +169,7 @@ def test_evaluate_compares_a_file_or_a_run(tmp_path: Path) -> None:
     numbers = tmp_path / "numbers.json"
     result = _gsba("evaluate", tmp_path / "run", "--truth", truth, "--json", numbers)
     assert result.exit_code == 0 and "5/5" in result.stdout
+    assert "covariances cannot be judged" in result.stdout
     assert json.loads(numbers.read_text())["scale"] == pytest.approx(1 / 3)
     assert _gsba("evaluate", truth, "--truth", truth).exit_code == 0
 

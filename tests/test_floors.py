@@ -24,7 +24,7 @@ FLOORS = (
     | {"meetings", "misfit", "motion", "parts", "photometric", "places", "pose_graph"}
     | {"reconstruction", "recovery", "registered", "resection", "segments"}
     | {"splat_align", "splat_refine", "splatting", "stitching", "tripod"},
-    {"alignment", "carrier", "distractors", "evaluate", "evaluate_splat", "export"}
+    {"alignment", "carrier", "consistency", "distractors", "evaluate", "evaluate_splat", "export"}
     | {"gravity", "induced", "placement", "report", "report_html", "video"},
     {"demo", "extraction", "inputs", "line", "masking", "matching_stages", "pipeline"}
     | {"results", "segmentation", "timing", "view"},

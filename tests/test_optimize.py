@@ -187,9 +187,14 @@ def test_covariances_agree_with_marginals(world, solved):
     for j, point in enumerate(block.points_world):
         values.update(L(j), point)
     marginals = gtsam.Marginals(graph, values)
-    covariances = marginal_covariances(world.graph, [block], result.values, world.keys)
+    covariances, joint = marginal_covariances(world.graph, [block], result.values, world.keys)
     for key, covariance in zip(world.keys, covariances, strict=True):
         expected = marginals.marginalCovariance(key)
+        assert np.abs(covariance - expected).max() < 1e-5 * np.abs(expected).max()
+    for first, second, covariance in zip(
+        world.keys, world.keys[1:], joint.neighbours, strict=False
+    ):
+        expected = marginals.jointMarginalCovariance([first, second]).at(first, second)
         assert np.abs(covariance - expected).max() < 1e-5 * np.abs(expected).max()
 
 
@@ -260,7 +265,8 @@ def test_degenerate_landmarks_and_idle_frames_stay_finite(world):
     block = LandmarkBlock(world.keys, points, [BearingTerm(frames, owners, bearings, 0.01)])
     result = optimize(world.graph, [block], world.values)
     assert np.isfinite(result.cost) and np.isfinite(block.points_world).all()
-    assert np.isfinite(marginal_covariances(world.graph, [block], result.values, world.keys)).all()
+    covariances, _ = marginal_covariances(world.graph, [block], result.values, world.keys)
+    assert np.isfinite(covariances).all()
     assert np.array_equal(block.points_world[2], points[2])
 
 
@@ -272,10 +278,27 @@ def test_covariance_of_an_idle_pose_is_nan_and_spoils_no_other(world):
     block = LandmarkBlock(world.keys, world.start_points, [term], LOSS)
     result = optimize(graph, [block], world.values)
     assert result.values.atPose3(X(7)).equals(world.values.atPose3(X(7)), 1e-12)
-    covariances = marginal_covariances(graph, [block], result.values, world.keys)
+    covariances, joint = marginal_covariances(graph, [block], result.values, world.keys, 3)
     assert np.isnan(covariances[7]).all() and np.isfinite(covariances[:7]).all()
-    free = marginal_covariances(gtsam.NonlinearFactorGraph(), [block], result.values, world.keys)
+    assert np.isnan(joint.neighbours[6]).all() and np.isfinite(joint.neighbours[:6]).all()
+    assert np.isnan(joint.draws[:, 7]).all() and np.isfinite(joint.draws[:, :7]).all()
+    free, joint = marginal_covariances(
+        gtsam.NonlinearFactorGraph(), [block], result.values, world.keys, 3
+    )
     assert free.shape == (8, 6, 6)  # nothing fixes the gauge: no exception
+    assert joint.neighbours.shape == (7, 6, 6) and joint.draws.shape == (3, 8, 6)
+
+
+def test_covariances_of_poses_that_nothing_ties(world):
+    """Between such poses they are zero, and asking for them changes no other."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
+    for key in world.keys[:3]:
+        graph.add(gtsam.PriorFactorPose3(key, gtsam.Pose3(), noise))
+        values.insert(key, gtsam.Pose3())
+    covariances, joint = marginal_covariances(graph, [], values, world.keys[:3])
+    np.testing.assert_allclose(covariances, np.tile(0.01 * np.eye(6), (3, 1, 1)))
+    np.testing.assert_array_equal(joint.neighbours, np.zeros((2, 6, 6)))
 
 
 def test_variables_of_other_types_join(world):
@@ -371,7 +394,12 @@ def test_block_cholesky_solves_and_inverts():
     assert np.allclose(matrix @ cholesky.solve(right).ravel(), right.ravel(), atol=1e-12)
     inverse = np.linalg.inv(matrix).reshape(num, 6, num, 6)
     expected = inverse[np.arange(num), :, np.arange(num), :]
-    assert np.allclose(cholesky.inverse_diagonal(), expected, atol=1e-14)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    on_diagonal, between = cholesky.inverse_blocks(both)
+    assert np.allclose(on_diagonal, expected, atol=1e-14)
+    assert np.allclose(between, inverse[both[:, 0], :, both[:, 1], :], atol=1e-14)
+    roots = cholesky.draw(np.eye(6 * num).reshape(-1, num, 6)).reshape(6 * num, -1)
+    assert np.allclose(roots.T @ roots, inverse.reshape(6 * num, -1), atol=1e-14)
     assert not cholesky.factorize(-diagonal, off)
 
 

@@ -127,6 +127,21 @@ def test_a_tripod_gives_rotations_only(tmp_path: Path) -> None:
     assert len(reconstruction.points_world) == 0
 
 
+def test_covariances_are_judged_by_the_truth(case: Case, tmp_path: Path) -> None:
+    numbers = tmp_path / "numbers.json"
+    write_tum(tmp_path / "truth.tum", case.truth)
+    command = ["evaluate", case.out, "--truth", tmp_path / "truth.tum", "--json", numbers]
+    result = CliRunner().invoke(app, [str(part) for part in command])
+    assert result.exit_code == 0 and "\nabsolute " in result.output
+    assert "with the pose of 000000 and its distance to 000007 held" in result.output
+    claims = json.loads(numbers.read_text())["consistency"]
+    for kind in ("absolute", "consecutive"):
+        assert claims[kind]["num"] == NUM_FRAMES - 1
+        # What they are worth is the benchmarks' business; a wrong gauge is off by far more.
+        assert 0.1 < claims[kind]["rotation"]["value"] < 10
+        assert 0.1 < claims[kind]["position"]["value"] < 10
+
+
 def test_a_trajectory_of_another_video_is_refused(case: Case, tmp_path: Path) -> None:
     other = walk_poses("oval", "forward", 3 * NUM_FRAMES, seed=3)
     times = read_trajectory(case.slam).timestamps

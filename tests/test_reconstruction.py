@@ -10,7 +10,15 @@ from synthetic import World, make_world
 from gsba.adjust import Adjustment
 from gsba.geometry import inverse, pose
 from gsba.reconstruction import assemble
-from gsba.types import CoarsePoses, Counts, Landmarks, PoseSource, PoseStatus, Reconstruction
+from gsba.types import (
+    CoarsePoses,
+    Counts,
+    JointErrors,
+    Landmarks,
+    PoseSource,
+    PoseStatus,
+    Reconstruction,
+)
 
 SCALE = 0.25
 SLAM_R_WORLD = Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix()
@@ -41,6 +49,7 @@ def _assemble(
     coarse: np.ndarray | None = None,
     sources: np.ndarray | None = None,
     covariances: np.ndarray | None = None,
+    joint: JointErrors | None = None,
 ) -> Reconstruction:
     num = len(world.world_T_rigs)
     poses = CoarsePoses(
@@ -49,7 +58,8 @@ def _assemble(
         0.0,
     )
     covariances = np.zeros((num, 6, 6)) if covariances is None else covariances
-    return assemble(_adjustment(world), covariances, world.keypoints, poses, 12)
+    given = _adjustment(world), covariances, world.keypoints, poses, 12
+    return assemble(*given, joint_errors=joint)
 
 
 def test_the_result_sits_in_the_slam_world_and_scale(world: World) -> None:
@@ -75,10 +85,16 @@ def test_covariances_scale_with_the_map(world: World) -> None:
     rng = np.random.default_rng(0)
     roots = rng.normal(size=(10, 6, 6))
     covariances = roots @ np.swapaxes(roots, 1, 2)
-    found = _assemble(world, covariances=covariances).pose_covariances
+    draws = rng.normal(size=(7, 10, 6)).astype(np.float32)
+    joint = JointErrors(covariances[:-1], draws)
+    result = _assemble(world, covariances=covariances, joint=joint)
+    found, joint = result.pose_covariances, result.joint_errors
     np.testing.assert_allclose(found[:, :3, :3], covariances[:, :3, :3])  # rig axes: no turning
     np.testing.assert_allclose(found[:, :3, 3:], SCALE * covariances[:, :3, 3:])
     np.testing.assert_allclose(found[:, 3:, 3:], SCALE**2 * covariances[:, 3:, 3:])
+    assert joint is not None
+    np.testing.assert_allclose(joint.neighbours, found[:-1])
+    np.testing.assert_allclose(joint.draws, draws * ([1.0] * 3 + [SCALE] * 3), rtol=1e-6)
 
 
 def test_interpolated_poses_have_no_say(world: World) -> None:

@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +17,10 @@ from gsba.cli.splat import (
     splat_settings,
 )
 from gsba.log import GsbaError
+
+if TYPE_CHECKING:
+    from gsba.consistency import Consistency
+    from gsba.types import Trajectory
 
 
 @command
@@ -115,8 +119,12 @@ def evaluate(
     if depth is not None:
         ranges = depth_maps(depth)
         induced = induced_errors(found, true, ranges, 4 * ranges(0).shape[1])
+    claims, judged = None, ""
+    if estimate.is_dir():
+        claims, judged = _consistency(estimate, true)
     if json_file is not None:
         content = errors.to_json() | ({"induced": asdict(induced)} if induced else {})
+        content |= {"consistency": claims.to_json()} if claims else {}
         text = json.dumps(content, indent=1) + "\n"
         atomic_write(json_file, lambda temporary: temporary.write_text(text))
     typer.echo(format_table({estimate.name: errors}))
@@ -125,3 +133,18 @@ def evaluate(
             f"induced error, in pixels of a panorama four times as wide as the depth maps: median "
             f"{induced.median_px:.4f}, 95th percentile {induced.percentile95_px:.4f}"
         )
+    if judged:
+        typer.echo(judged)
+
+
+def _consistency(run: Path, truth: "Trajectory") -> "tuple[Consistency | None, str]":
+    """How the covariances of a run compare with its errors, and that or why not in words."""
+    from gsba.consistency import format_consistency, judge
+    from gsba.results import load_run
+
+    try:
+        reconstruction, frames = load_run(run)
+        found = judge(reconstruction, frames.timestamps, truth)
+    except GsbaError as error:
+        return None, f"covariances cannot be judged: {error}"
+    return found, "\ncovariances\n" + format_consistency(found, frames.names.__getitem__)

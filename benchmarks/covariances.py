@@ -1,0 +1,154 @@
+"""Can the covariances of poses be believed: errors over sigma and NEES where there is a truth.
+
+    python benchmarks/covariances.py --out WORK --markdown benchmarks/results/covariances.md
+
+Refines each sequence (a finished run in WORK is used again) and prints what `gsba evaluate` says
+of its covariances: `gsba.consistency`. Open walks are closed ones cut short, and the demo's.
+Recorded sequences are read from `--data` and skipped if absent.
+"""
+
+import argparse
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from common import write_table
+
+from gsba import refine
+from gsba.config import RefineSettings
+from gsba.consistency import Consistency, Statistic, judge
+from gsba.demo import make_walk
+from gsba.demo.walk import Heading, WalkPath
+from gsba.evaluate import evaluate
+from gsba.log import GsbaError
+from gsba.read import read_trajectory
+from gsba.results import load_run
+from gsba.types import Trajectory
+
+DATA = Path(__file__).resolve().parents[2] / "shared/data"
+WANTED = 0.7, 1.5  # error over sigma
+
+
+class Recorded(NamedTuple):
+    """A sequence of the data folder, whole or its first frames."""
+
+    folder: str
+    trajectory: str = "slam.tum"
+    num_frames: int | None = None
+
+
+RECORDED = {
+    "aisle_loop": Recorded("aisle_loop"),
+    "gallery_forward": Recorded("gallery_forward"),
+    "aisle_slam, real SLAM": Recorded("aisle_slam", "frame_trajectory.txt"),
+    "aisle_loop, 40 frames": Recorded("aisle_loop", num_frames=40),
+    "gallery_forward, 32 frames": Recorded("gallery_forward", num_frames=32),
+}
+DEMOS: dict[str, tuple[WalkPath, Heading]] = {
+    "demo rectangle": ("rectangle", "locked"),
+    "demo oval": ("oval", "forward"),
+    "demo open": ("open", "forward"),
+}
+
+
+class Case(NamedTuple):
+    """Frames, their coarse trajectory and the truth."""
+
+    images: Path
+    trajectory: Path
+    truth: Path
+
+
+def find(name: str, data: Path, out: Path) -> Case:
+    """Inputs of a sequence; GsbaError where it is not on this machine."""
+    if name in DEMOS:
+        folder = out / "walk"
+        if not (folder / "groundtruth.tum").exists():
+            make_walk(folder, *DEMOS[name])
+        return Case(folder / "images", folder / "slam.tum", folder / "groundtruth.tum")
+    chosen = RECORDED[name]
+    folder = data / chosen.folder
+    if not folder.is_dir():
+        raise GsbaError(f"{folder} is absent")
+    images = folder / "images"
+    if chosen.num_frames is not None:
+        images = _first(images, out / "images", chosen.num_frames)
+    return Case(images, folder / chosen.trajectory, folder / "groundtruth.tum")
+
+
+def _first(images: Path, folder: Path, num_frames: int) -> Path:
+    """A folder of links to the first frames, with their times."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    header, *rows = (images / "timestamps.csv").read_text().splitlines()
+    for row in rows[:num_frames]:
+        name = row.partition(",")[0]
+        (folder / name).symlink_to(images / name)
+    (folder / "timestamps.csv").write_text("\n".join([header, *rows[:num_frames]]) + "\n")
+    return folder
+
+
+def measured(case: Case, out: Path, options: dict) -> tuple[Consistency, float]:
+    """What the covariances of a run are worth, and its ATE in units of the truth."""
+    settings = RefineSettings.model_validate({"export": {"formats": []}, **options})
+    refine(case.images, case.trajectory, out, settings)
+    reconstruction, frames = load_run(out)
+    truth = read_trajectory(case.truth)
+    found = judge(reconstruction, frames.timestamps, truth)
+    whole = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
+    # Frames that were cut off are no frames that were missed.
+    kept = truth.timestamps <= frames.timestamps[-1] + 0.01
+    errors = evaluate(whole, Trajectory(truth.timestamps[kept], truth.world_T_rigs[kept]))
+    return found, errors.ate.rmse
+
+
+def table(names: list[str], data: Path, out: Path) -> Iterator[str]:
+    """Lines of the table."""
+    yield "| sequence | ATE e-3 | poses | rotation error/σ | position error/σ | NEES |"
+    yield "|---|---|---|---|---|---|"
+    for name in names:
+        folder = out / name.replace(", ", "_").replace(" ", "_")
+        try:
+            found, ate = measured(find(name, data, folder), folder / "run", {})
+        except GsbaError as error:
+            yield f"| {name} | | | | | {error} |"
+            continue
+        head = f"{name} | {1e3 * ate:.2f}"
+        for kind, claims in (("absolute", found.absolute), ("consecutive", found.consecutive)):
+            cells = [_cell(claims.rotation), _cell(claims.position), _cell(claims.nees, False)]
+            yield f"| {head} | {claims.num} {kind} | {' | '.join(cells)} |"
+            head = " | "
+
+
+def _cell(one: Statistic, wanted: bool = True) -> str:
+    """A figure with its interval; bold where it is not what is wanted."""
+    right = WANTED[0] <= one.value <= WANTED[1] if wanted else one.expected
+    value = f"{one.value:.2f}" if right else f"**{one.value:.2f}**"
+    return f"{value} ({one.low:.2f} to {one.high:.2f})"
+
+
+def main() -> None:
+    """Parse, run, print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    every = [*RECORDED, *DEMOS]
+    parser.add_argument("--data", type=Path, default=DATA, help="recorded sequences")
+    parser.add_argument("--only", action="append", choices=every, help="repeatable")
+    parser.add_argument("--out", type=Path, default=Path("build/covariances"))
+    parser.add_argument("--markdown", type=Path)
+    options = parser.parse_args()
+    lines = []
+    for line in table(options.only or every, options.data, options.out):
+        print(line, flush=True)
+        lines.append(line)
+    head = ["# Errors over what covariances claim", ""]
+    foot = [
+        "",
+        f"Bold: outside {WANTED[0]} to {WANTED[1]}, or NEES outside its interval. In brackets what",
+        "95 % of errors drawn from the joint covariance of all poses would give.",
+    ]
+    write_table([*head, *lines, *foot], options.markdown)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,194 @@
+"""Covariances against errors that are exactly as modelled, and against errors that are not."""
+
+from dataclasses import replace
+from functools import cache
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from synthetic import RIG, make_world
+
+from gsba import adjust, graph
+from gsba.config import RefineSettings
+from gsba.consistency import EXPECTED, Consistency, Statistic, format_consistency, judge
+from gsba.geometry import carried, pose
+from gsba.log import GsbaError
+from gsba.types import JointErrors, Reconstruction, Trajectory
+
+FRAMES = 16
+TIMES = 0.1 * np.arange(FRAMES)
+SEEDS = range(20)
+LEAST_EXPECTED = 16  # of 20 draws from a 95 % interval: fewer in one case of 400
+
+
+@cache
+def _solved(seed: int) -> tuple[Reconstruction, Trajectory]:
+    """A map of bearings with the noise that keypoints claim, of least squares, and its truth."""
+    world = make_world(seed, num_frames=FRAMES, num_points=200, false_share=0)
+    settings = RefineSettings.model_validate({"factors": ("bearing",), "solver": {"loss": "none"}})
+    true = world.world_T_rigs
+    held = gtsam.NonlinearFactorGraph()
+    gauge = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    held.add(gtsam.PriorFactorPose3(graph.X(0), gtsam.Pose3(true[0]), gauge))
+    priors = gtsam.NonlinearFactorGraph(held)
+    priors.push_back(graph.fixed_scale(true))
+    given = world.tracks, world.keypoints, adjust.start(true), priors, RIG, (8.0,), settings, 1
+    solved = replace(adjust.run(*given), noise=1.0)
+    covariances, joint = adjust.pose_covariances(solved, held, *given[1:2], RIG, settings, 1)
+    return _result(solved.world_T_rigs, covariances, joint), Trajectory(TIMES, true)
+
+
+def _result(poses: np.ndarray, covariances: np.ndarray, joint: JointErrors) -> Reconstruction:
+    """Poses and what is known of their errors, without points."""
+    none, nothing = np.zeros(0, np.int32), np.zeros((0, 3))
+    return Reconstruction(
+        world_T_rigs=poses,
+        pose_covariances=covariances,
+        pose_statuses=np.zeros(len(poses), np.uint8),
+        points_world=nothing,
+        point_colors=nothing,
+        point_errors=none,
+        observation_points=none,
+        observation_frames=none,
+        observation_bearings=nothing,
+        observation_sigmas=none,
+        joint_errors=joint,
+    )
+
+
+def _statistics(found: Consistency) -> list[Statistic]:
+    both = found.absolute, found.consecutive
+    return [one for c in both for one in (c.rotation, c.position, c.nees)]
+
+
+def _claiming(result: Reconstruction, factor: float) -> Reconstruction:
+    """The same errors, said to be larger by a factor."""
+    joint = result.joint_errors
+    assert joint is not None
+    return replace(
+        result,
+        pose_covariances=factor**2 * result.pose_covariances,
+        joint_errors=joint.scaled(np.full((len(result.world_T_rigs), 6), factor)),
+    )
+
+
+def test_errors_as_modelled_are_within_their_intervals() -> None:
+    inside = np.zeros(6, int)
+    for seed in SEEDS:
+        result, truth = _solved(seed)
+        inside += [one.expected for one in _statistics(judge(result, TIMES, truth))]
+    assert inside.min() >= LEAST_EXPECTED
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_sigmas_that_are_off_by_two_are_found(factor: float) -> None:
+    outside = np.zeros(6, int)
+    for seed in SEEDS:
+        result, truth = _solved(seed)
+        right = _statistics(judge(result, TIMES, truth))
+        wrong = _statistics(judge(_claiming(result, factor), TIMES, truth))
+        powers = [1, 1, 2] * 2
+        for one, other, power in zip(right, wrong, powers, strict=True):
+            assert other.value == pytest.approx(one.value / factor**power, rel=1e-4)
+            assert other.low == pytest.approx(one.low, rel=1e-3)
+        outside += [not one.expected for one in wrong]
+    assert outside[:3].min() >= 14 and outside[3:].min() == len(SEEDS)
+
+
+def test_the_world_and_scale_of_the_truth_do_not_matter() -> None:
+    result, truth = _solved(0)
+    turn = pose(Rotation.from_rotvec([0.4, -2.0, 1.0]).as_matrix(), np.array([3.0, -40.0, 8.0]))
+    moved = Trajectory(TIMES, carried(truth.world_T_rigs, 7.3, turn))
+    here, there = (_statistics(judge(result, TIMES, one)) for one in (truth, moved))
+    assert [one.value for one in there] == pytest.approx([one.value for one in here], rel=1e-6)
+
+
+def test_the_world_and_scale_of_the_run_do_not_matter() -> None:
+    result, truth = _solved(0)
+    stretch = np.tile([1.0] * 3 + [250.0] * 3, (FRAMES, 1))
+    joint, poses = result.joint_errors, result.world_T_rigs
+    assert joint is not None
+    moved = _result(
+        carried(poses, 250.0, pose(Rotation.from_rotvec([1, 1, 0]).as_matrix(), np.full(3, 90.0))),
+        stretch[:, :, None] * result.pose_covariances * stretch[:, None, :],
+        joint.scaled(stretch),
+    )
+    here, there = (_statistics(judge(one, TIMES, truth)) for one in (result, moved))
+    for one, other in zip(here, there, strict=True):
+        assert [other.value, other.low] == pytest.approx([one.value, one.low], rel=1e-4)
+
+
+def _independent(num: int, seed: int) -> tuple[Reconstruction, Trajectory]:
+    """A straight walk whose poses err independently, but for what the gauge holds."""
+    rng = np.random.default_rng(seed)
+    sigmas = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.03])
+    draws = sigmas * rng.normal(size=(4000, num, 6))
+    draws[:, 0] = 0
+    draws[:, -1, 3] = 0  # along the walk
+    covariances = np.tile(np.diag(sigmas**2), (num, 1, 1))
+    covariances[0] = 1e-18 * np.eye(6)
+    covariances[-1, 3, 3] = 1e-18
+    poses = np.tile(np.eye(4), (num, 1, 1))
+    poses[:, 0, 3] = np.arange(num)
+    errors = draws[0]
+    turns = Rotation.from_rotvec(errors[:, :3]).as_matrix()
+    truth = Trajectory(np.arange(num, dtype=float), poses @ pose(turns, errors[:, 3:]))
+    joint = JointErrors(np.zeros((num - 1, 6, 6)), draws.astype(np.float32))
+    return _result(poses, covariances, joint), truth
+
+
+def test_the_interval_of_independent_errors_is_that_of_chi_square() -> None:
+    num = 40
+    result, truth = _independent(num, 0)
+    claims = judge(result, truth.timestamps, truth).absolute
+    assert claims.num == num - 1
+    degrees, tail = 6 * (num - 1) - 1, (1 - EXPECTED) / 2
+    interval = chi2.ppf([tail, 1 - tail], degrees) / (num - 1)
+    assert [claims.nees.low, claims.nees.high] == pytest.approx(interval, rel=0.02)
+    for one, axes in ((claims.rotation, 3 * (num - 1)), (claims.position, 3 * (num - 1) - 1)):
+        expected = np.sqrt(chi2.ppf([tail, 1 - tail], axes) / axes)
+        assert [one.low, one.high] == pytest.approx(expected, rel=0.02)
+
+
+def test_steps_are_judged_by_what_neighbours_share() -> None:
+    """Errors that all frames share leave the steps as they are: sigmas of steps must say so."""
+    result, truth = _solved(0)
+    found = judge(result, TIMES, truth)
+    joint = result.joint_errors
+    assert joint is not None
+    apart = JointErrors(np.zeros_like(joint.neighbours), joint.draws)
+    without = judge(replace(result, joint_errors=apart), TIMES, truth)
+    assert without.consecutive.nees.value < 0.7 * found.consecutive.nees.value
+    assert without.absolute == found.absolute
+
+
+def test_frames_without_truth_or_covariance_are_left_out() -> None:
+    result, truth = _solved(0)
+    covariances = result.pose_covariances.copy()
+    covariances[5] = np.nan
+    kept = np.arange(FRAMES) != 3
+    part = Trajectory(TIMES[kept], truth.world_T_rigs[kept])
+    found = judge(replace(result, pose_covariances=covariances), TIMES, part)
+    assert found.absolute.num == FRAMES - 3 and found.consecutive.num == FRAMES - 5
+    assert all(np.isfinite(one.value) for one in _statistics(found))
+
+
+def test_what_cannot_be_judged_is_said() -> None:
+    result, truth = _solved(0)
+    with pytest.raises(GsbaError, match="no covariances"):
+        judge(replace(result, joint_errors=None), TIMES, truth)
+    late = Trajectory(TIMES[1:], truth.world_T_rigs[1:])
+    with pytest.raises(GsbaError, match=r"no true pose within 0.01 s of 0.000 s"):
+        judge(result, TIMES, late)
+    still = Trajectory(TIMES, np.tile(np.eye(4), (FRAMES, 1, 1)))
+    with pytest.raises(GsbaError, match="does not move"):
+        judge(result, TIMES, still)
+
+
+def test_the_table_names_what_is_held() -> None:
+    result, truth = _solved(0)
+    text = format_consistency(judge(result, TIMES, truth), "frame{}".format)
+    assert "frame0 " in text and "frame8 " in text
+    assert [line.split()[0] for line in text.splitlines()[1:3]] == ["absolute", "consecutive"]
