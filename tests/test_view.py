@@ -10,6 +10,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -212,9 +213,70 @@ def test_only_this_machine_is_served(shown: view.View) -> None:
     port = shown.server.get_port()
     assert shown.server.get_host() == "127.0.0.1"
     assert {address for address, at in _listening() if at == port} == {"127.0.0.1"}
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10) as page:
+    with urllib.request.urlopen(shown.address, timeout=10) as page:
         assert page.status == 200
     assert shown.server.request_share_url() is None  # no tunnel, whoever asks
+
+
+def _head(shown: view.View, path: str, *lines: str) -> str:
+    """First line of the answer to a request."""
+    port = shown.server.get_port()
+    request = [f"GET {path} HTTP/1.1", *(line.format(port=port) for line in lines), "", ""]
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+        connection.sendall("\r\n".join(request).encode())
+        return connection.recv(4096).decode(errors="replace").splitlines()[0]
+
+
+LOCAL, UPGRADE = (
+    "Host: 127.0.0.1:{port}",
+    (
+        "Connection: Upgrade",
+        "Upgrade: websocket",
+        "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+    ),
+)
+
+
+def test_other_pages_of_the_browser_get_nothing(shown: view.View) -> None:
+    """Neither by the address of this machine, nor by a name of theirs that points to it."""
+    path = "/" + shown.address.split("/", 3)[3]
+    own = "Origin: http://127.0.0.1:{port}"
+    for kind, good in (((), "200"), (UPGRADE, "101")):
+        assert good in _head(shown, path, LOCAL, *kind)
+        assert good in _head(shown, path.rstrip("/"), LOCAL, own, *kind)
+        assert good in _head(
+            shown, path, "Host: localhost:9000", "Origin: http://localhost:9000", *kind
+        )
+        for refused in (
+            ("Host: evil.example:{port}", "Origin: http://evil.example:{port}"),
+            ("Host: evil.example:{port}",),
+            ("Host: 127.0.0.1.evil.example",),
+            ("Host: evil.example@127.0.0.1:{port}",),
+            (LOCAL, "Origin: http://evil.example"),
+            (LOCAL, "Origin: null"),
+            (LOCAL, "Origin: http://127.0.0.1:1"),
+            (LOCAL, "Host: evil.example"),
+        ):
+            assert "403" in _head(shown, path, *refused, *kind), refused
+        for other in ("/", "/index.html", path[:-2] + "/", path[:-1] + "x/", "/x" + path):
+            assert "403" in _head(shown, other, LOCAL, own, *kind), other
+    assert len(path) > 20
+
+
+def test_the_token_is_another_each_time(scene: view.Scene, shown: view.View) -> None:
+    second = view.serve(scene, 0)
+    second.stop()
+    assert second.address.split("/")[3] != shown.address.split("/")[3]
+
+
+def test_a_viser_that_cannot_be_guarded_is_refused(
+    scene: view.Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'gsba[view]'")
+    monkeypatch.setattr("gsba.view.server.guarded", lambda token: nullcontext([]))
+    with pytest.raises(GsbaError, match="cannot be kept from other web pages"):
+        view.serve(scene, 0)
 
 
 def _listening() -> set[tuple[str, int]]:

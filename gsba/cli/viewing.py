@@ -19,7 +19,7 @@ def view(
 
     shown = serve(load_scene(run), port)
     try:
-        typer.echo(f"http://127.0.0.1:{shown.server.get_port()} shows {run}; Ctrl-C ends it.")
+        typer.echo(f"{shown.address} shows {run}; Ctrl-C ends it.")
         while True:
             time.sleep(3600)
     except KeyboardInterrupt:

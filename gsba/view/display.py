@@ -29,8 +29,8 @@ class View:
     unit of its own: viewers have fixed ideas of near and far.
     """
 
-    def __init__(self, server: "viser.ViserServer", scene: Scene) -> None:
-        self.server, self.scene = server, scene
+    def __init__(self, server: "viser.ViserServer", scene: Scene, address: str) -> None:
+        self.server, self.scene, self.address = server, scene, address
         self.scale = 1.0 if scene.unit == "m" else 1.0 / scene.step
         self.size = self.scale * scene.step  # of a rig, as drawn
         self.frame = -1  # shown one

@@ -1,7 +1,8 @@
-"""The server of a scene: viser's, for this machine alone."""
+"""The server of a scene: viser's, for this machine and one browser alone."""
 
 import io
 import logging
+import secrets
 import socket
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from gsba.log import GsbaError
 from gsba.view.display import View
+from gsba.view.guard import guarded
 from gsba.view.scene import Scene
 
 if TYPE_CHECKING:
@@ -20,7 +22,9 @@ HOST = "127.0.0.1"  # nobody else's business
 
 
 def serve(scene: Scene, port: int) -> View:
-    """Show a scene at http://127.0.0.1:PORT until the view is stopped; returns at once.
+    """Show a scene at an address of this machine until the view is stopped; returns at once.
+
+    Only who knows the address, `view.address`, gets anything: see `gsba.view.guard`.
 
     Args:
         scene: see `load_scene`.
@@ -31,13 +35,17 @@ def serve(scene: Scene, port: int) -> View:
     """
     open_server = _server_class()
     _require_free(port)
-    with redirect_stdout(io.StringIO()):  # its banner would say less than the command line does
+    token = secrets.token_urlsafe(16)
+    with redirect_stdout(io.StringIO()), guarded(token) as started:  # its banner: less than ours
         server = open_server(host=HOST, port=port, label=f"gsba: {scene.name}", verbose=False)
+    if not started:
+        server.stop()
+        raise GsbaError("this viser cannot be kept from other web pages: pip install 'viser<1.2'")
     if port and server.get_port() != port:  # viser takes the next one rather than fail
         with redirect_stdout(io.StringIO()):
             server.stop()
         raise GsbaError(_IN_USE.format(port=port))
-    return View(server, scene)
+    return View(server, scene, f"http://{HOST}:{server.get_port()}/{token}/")
 
 
 _IN_USE = "port {port} of 127.0.0.1 is in use: pass another --port, or 0 for any that is free"
