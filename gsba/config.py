@@ -248,15 +248,15 @@ class SplatFactorSettings(_Settings):
     sizes: tuple[Annotated[int, Field(ge=16, le=_MAX_FACE)], ...] = Field(
         default=(48, 96), min_length=1
     )  # pixels of a face, in order
-    first_steps: int = Field(default=200, ge=1)  # of training, before poses move at each size
+    first_steps: int = Field(default=400, ge=1)  # of training, before poses move at each size
     steps: int = Field(
-        default=200, ge=1
+        default=150, ge=1
     )  # of training after each move: a splat that has yet to follow speaks against it
     moves: int = Field(default=3, ge=1)  # of the poses, at most, at each size
     solver_steps: int = Field(default=2, ge=1)  # of Levenberg-Marquardt in a move
-    min_gain_db: float = Field(
-        default=0.05, ge=0
-    )  # of held-out frames, or a move is undone: chance alone gives 0.03
+    min_sigmas: float = Field(
+        default=2.0, ge=0
+    )  # of evidence for a move in standard errors, or it is undone
     max_growth: float = Field(default=1.05, gt=0)  # of all geometric cost, or a move is undone
     held_out_every: int = Field(default=8, ge=2)  # panoramas that judge: no splat sees them
     max_gaussians: int = Field(default=30_000, ge=1)

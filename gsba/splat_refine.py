@@ -2,9 +2,18 @@
 
 Splat and poses take turns. The poses move by a few joint steps against the splat as it is, the
 map's own observations, the patches if there are any, and the priors, which hold the gauge. Then
-training goes on, once with the poses as they were and once as they moved. The move is taken where
-whole panoramas that are neither trained on nor aligned to the splat look better after it, and the
-map's observations fit as well as before; otherwise it is undone, and finer faces have their turn.
+training goes on, once with the poses as they were and once as they moved, and evidence whose noise
+is known judges the move:
+
+- Faces of whole panoramas that are neither trained on nor aligned to the splat: how much better
+  each of them looks. Both trainings have the same Gaussians, views and order. Density control
+  rests, because what it clones and prunes sends two trainings tenths of a dB apart, when a
+  twentieth of a pixel is worth hundredths.
+- Points of the map: by how much the cost of each one's observations falls. The poses may have been
+  fitted to them before, so a change that fitting six numbers per pose gains by chance says nothing.
+
+A move is taken where both together are clearly for it; otherwise it is undone, and finer faces have
+their turn.
 """
 
 import logging
@@ -15,10 +24,11 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from factors import Block
+from factors import Block, LandmarkBlock
 from gsba import adjust, triangulate
 from gsba.adjust import Adjustment, Round
 from gsba.config import RefineSettings, SplatSettings
+from gsba.evidence import score, standard_error, together
 from gsba.optimize import OptimizeResult, optimize
 from gsba.records import RecordError, load_record, read_info, save_record
 from gsba.rig import CubeRig
@@ -28,10 +38,9 @@ from gsba.splat.train import State, Views, advance, begin
 from gsba.splat_align import Captured, capture, splat_block
 from gsba.splatting import (
     Split,
+    face_psnrs,
     load_faces,
     make_views,
-    mean_score,
-    measure,
     near_of,
     split_frames,
 )
@@ -45,9 +54,12 @@ class Move:
     """One joint move of all poses, and what held-out frames say of it."""
 
     size: int  # pixels of a face
-    psnr_stayed: float  # dB of held-out frames, exposure aside, trained on with poses as they were
-    psnr_moved: float  # the same with the moved poses
+    psnr_stayed: float  # dB, mean of held-out faces, exposure aside, poses as they were
+    psnr_moved: float  # the same, trained and measured with the moved poses
+    psnr_sigma: float  # standard error of the difference of both, from face to face
     growth: float  # cost of the map's own observations after the move, over that before
+    growth_sigma: float  # its standard error, from point to point
+    evidence: float  # of both together for the move, in standard errors
     turned_deg: float  # median turn of a pose
     shifted: float  # median shift of a pose, map units
     accepted: bool
@@ -203,20 +215,26 @@ class _Turns:
         if before.turns < 0:
             trained = self._trained(before.state, poses, settings, chosen.first_steps)
             return replace(before, turns=0, state=trained)
-        moved, growth, result = self._moved(before.state.gaussians, poses)
-        stayed = self._trained(before.state, poses, settings, chosen.steps)
-        went = self._trained(before.state, moved, settings, chosen.steps)
-        before_db = self._judged(stayed.gaussians, poses, settings)
-        after_db = self._judged(went.gaussians, moved, settings)
+        moved, result = self._moved(before.state.gaussians, poses)
+        fixed = settings.model_copy(update={"densify": False})
+        stayed = self._trained(before.state, poses, fixed, chosen.steps)
+        went = self._trained(before.state, moved, fixed, chosen.steps)
+        looks = [self._looks(stayed, poses, settings), self._looks(went, moved, settings)]
+        costs = [self._point_costs(poses), self._point_costs(moved)]
+        gains, savings = looks[1] - looks[0], costs[0] - costs[1]
+        total, later = max(float(costs[0].sum()), 1e-12), float(costs[1].sum())
+        growth, chance = later / total, self._chance(min(total, later))
+        evidence = together(score(gains), score(savings, chance))
         after = self._placed(moved)
-        accepted = after_db >= before_db + chosen.min_gain_db and growth <= chosen.max_growth
+        accepted = evidence > chosen.min_sigmas and growth <= chosen.max_growth
         least = self.settings.rounds.min_observations
         accepted &= adjust.carries(replace(self.solved, landmarks=after), self.solved, least)
-        turned, shifted = _way(poses, moved)
-        size = settings.face_size
-        move = Move(size, before_db, after_db, growth, turned, shifted, accepted)
-        taken = "taken" if accepted else "undone"
-        logger.info("faces of %d px: held out %.2f, %.2f dB, %s", size, before_db, after_db, taken)
+        move = Move(
+            settings.face_size, float(looks[0].mean()), float(looks[1].mean()),
+            standard_error(gains), growth, len(savings) * standard_error(savings) / total,
+            evidence, *_way(poses, moved), accepted,
+        )  # fmt: skip
+        _log(move)
         tracks = self.solved.landmarks.tracks
         note = Round(
             self._gate(), self.solved.noise, len(tracks), tracks.num_points, len(after.tracks),
@@ -243,21 +261,39 @@ class _Turns:
 
     def _moved(
         self, gaussians: Gaussians, world_T_rigs: np.ndarray
-    ) -> tuple[np.ndarray, float, OptimizeResult]:
-        """Poses after a few joint steps, the growth of the geometric cost, and the solver's way."""
+    ) -> tuple[np.ndarray, OptimizeResult]:
+        """Poses after a few joint steps, and the solver's way."""
         settings, values = self.settings, adjust.values_of(world_T_rigs)
-        landmarks = adjust.landmark_block(
-            self.solved.landmarks, self.keypoints, self.rig, self.solved.noise, settings,
-            self.num_threads,
-        )  # fmt: skip
+        landmarks = self._block()
         landmarks.polish(values)
-        before = landmarks.error(values)
         near = near_of(world_T_rigs[self.split.training], SplatSettings())
         pixels = splat_block(gaussians, self.captured, near, self.backend)
         solver = settings.solver.model_copy(update={"max_iterations": settings.splat.solver_steps})
         result = optimize(self.priors, [landmarks, *self.further, pixels], values, solver)
-        growth = landmarks.error(result.values) / max(before, 1e-12)
-        return adjust.poses_of(result.values, len(world_T_rigs)), growth, result
+        return adjust.poses_of(result.values, len(world_T_rigs)), result
+
+    def _block(self) -> LandmarkBlock:
+        return adjust.landmark_block(
+            self.solved.landmarks, self.keypoints, self.rig, self.solved.noise, self.settings,
+            self.num_threads,
+        )  # fmt: skip
+
+    def _point_costs(self, world_T_rigs: np.ndarray) -> np.ndarray:
+        """Robust cost (J,) of each point's observations, the point at its best under the poses."""
+        block, values = self._block(), adjust.values_of(world_T_rigs)
+        block.polish(values)
+        costs = np.zeros(len(block.points_world))
+        for term, residuals in zip(block.terms, block.residuals(values)[0], strict=True):
+            losses = block.loss.rho(np.einsum("oi,oi->o", residuals, residuals))
+            costs += np.bincount(term.points, losses, len(costs))
+        return costs
+
+    def _chance(self, cost: float) -> float:
+        """What of a total cost of observations fitting all poses to their noise gains."""
+        tracks = self.solved.landmarks.tracks
+        unknowns = 6 * len(np.unique(tracks.frames))
+        redundancy = 2 * len(tracks) - 3 * tracks.num_points - unknowns
+        return unknowns * cost / redundancy if redundancy > 0 else np.inf
 
     def _trained(
         self, state: State, world_T_rigs: np.ndarray, settings: SplatSettings, steps: int
@@ -265,14 +301,11 @@ class _Turns:
         views = self._views(self.faces, world_T_rigs, self.split.training)
         return advance(state, views, settings, self.backend, steps)
 
-    def _judged(
-        self, gaussians: Gaussians, world_T_rigs: np.ndarray, settings: SplatSettings
-    ) -> float:
-        """PSNR of held-out frames in dB, exposure aside."""
+    def _looks(self, state: State, world_T_rigs: np.ndarray, settings: SplatSettings) -> np.ndarray:
+        """PSNR (V,) of each held-out face in dB, exposure aside."""
         views = self._views(self.held_out, world_T_rigs, self.split.held_out)
         near = near_of(world_T_rigs[self.split.training], settings)
-        scores = measure(gaussians, views, settings, near, self.backend)
-        return mean_score(scores.values()).psnr_exposed
+        return face_psnrs(state.gaussians, views, settings, near, self.backend)
 
     @staticmethod
     def _views(
@@ -297,6 +330,15 @@ class _Turns:
     def _gate(self) -> float:
         rounds = self.solved.rounds
         return rounds[-1].gate_sigmas if rounds else np.inf
+
+
+def _log(move: Move) -> None:
+    gain, verdict = move.psnr_moved - move.psnr_stayed, "taken" if move.accepted else "undone"
+    logger.info(
+        "faces of %d px: held out %+.3f dB (standard error %.3f), cost of observations times %.3f "
+        "(%.3f): evidence %+.1f, %s",
+        move.size, gain, move.psnr_sigma, move.growth, move.growth_sigma, move.evidence, verdict,
+    )  # fmt: skip
 
 
 def _way(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:

@@ -1,6 +1,6 @@
 """From a run to splats: posed faces, start clouds, training, and metrics of held-out frames."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from gsba.types import FACES, FrameSet, Landmarks, PoseStatus, Reconstruction, T
 
 _GATE = np.deg2rad(3.0)  # of an observation under poses that may have drifted
 _MAX_TIMES = 8  # samples of a panorama along a pixel of a face, at most
+_ROUNDED_DB = 60.0  # of a face at most: rounding to 8 bits alone leaves 59
 _PANORAMA_HFOV_DEG = 94.0  # of the faces a panorama is sampled from
 
 
@@ -196,14 +197,70 @@ def measure(
     Raises:
         GsbaError: no panorama has a pixel to measure.
     """
+    return {
+        int(views.panoramas[rows[0]]): _score(
+            gaussians, views, rows, settings, near, backend, lpips
+        )
+        for rows in _panoramas(views)
+    }
+
+
+def face_psnrs(
+    gaussians: Gaussians, views: Views, settings: SplatSettings, near: float, backend: Backend
+) -> np.ndarray:
+    """PSNR of each view (V,) in dB, after the gain of each channel that fits its panorama best.
+
+    Args:
+        gaussians, views, settings, near, backend: see `measure`.
+
+    Raises:
+        GsbaError: no panorama has a pixel to measure.
+    """
+    found = np.zeros(len(views.cameras))
+    for rows in _panoramas(views):
+        pairs = _pairs(gaussians, views, rows, settings, near, backend)
+        gains = _gains(
+            [image[use] for image, _, use in pairs], [real[use] for _, real, use in pairs]
+        )
+        for v, (image, real, use) in zip(rows, pairs, strict=True):
+            found[v] = min(psnr(np.clip(gains * image, 0, 1), real, use), _ROUNDED_DB)
+    return found
+
+
+def _panoramas(views: Views) -> list[np.ndarray]:
+    """Rows of the views of each panorama.
+
+    Raises:
+        GsbaError: there is none.
+    """
     if len(views.cameras) == 0:
         raise GsbaError("no pixel to measure a splat on: all held-out frames are masked")
-    return {
-        int(i): _score(
-            gaussians, views, np.flatnonzero(views.panoramas == i), settings, near, backend, lpips
-        )
-        for i in np.unique(views.panoramas)
-    }
+    return [np.flatnonzero(views.panoramas == i) for i in np.unique(views.panoramas)]
+
+
+def _pairs(
+    gaussians: Gaussians,
+    views: Views,
+    rows: np.ndarray,
+    settings: SplatSettings,
+    near: float,
+    backend: Backend,
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of each view: rendering and truth (H, W, 3) float32, 0..1, and where they count, bool."""
+    cameras = [views.cameras[v] for v in rows]
+    renderings = backend.render(gaussians, cameras, settings.sh_degree, near)
+    pairs = []
+    for v, rendering in zip(rows, renderings, strict=True):
+        image, real = np.clip(rendering.color, 0, 1), views.images[v].astype(np.float32) / 255
+        use = np.ones(real.shape[:2], bool) if views.use is None else views.use[v]
+        pairs.append((image, real, use))
+    return pairs
+
+
+def _gains(images: Sequence[np.ndarray], truths: Sequence[np.ndarray]) -> np.ndarray:
+    """Gain of each channel (3,) that carries pixels (N, 3) closest to what they should be."""
+    image, real = np.concatenate(images), np.concatenate(truths)
+    return np.sum(image * real, axis=0) / np.maximum(np.sum(image * image, axis=0), 1e-9)
 
 
 def _score(
@@ -216,18 +273,14 @@ def _score(
     lpips: Distance | None,
 ) -> Score:
     found, truth, similarities, distances = [], [], [], []
-    cameras = [views.cameras[v] for v in rows]
-    renderings = backend.render(gaussians, cameras, settings.sh_degree, near)
-    for v, rendering in zip(rows, renderings, strict=True):
-        image, real = np.clip(rendering.color, 0, 1), views.images[v].astype(np.float32) / 255
-        use = np.ones(real.shape[:2], bool) if views.use is None else views.use[v]
+    for image, real, use in _pairs(gaussians, views, rows, settings, near, backend):
         similarities.append(ssim(image, real, use))
         if lpips is not None:
             distances.append(lpips(image, real, use))
         found.append(image[use])
         truth.append(real[use])
+    gains = _gains(found, truth)
     image, real = np.concatenate(found), np.concatenate(truth)
-    gains = np.sum(image * real, axis=0) / np.maximum(np.sum(image * image, axis=0), 1e-9)
     exposed = psnr(np.clip(gains * image, 0, 1), real)
     far = float(np.mean(distances)) if distances else None
     return Score(psnr(image, real), float(np.nanmean(similarities)), exposed, far)

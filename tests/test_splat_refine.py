@@ -1,53 +1,18 @@
 """Poses and a splat of their frames in turns: moves that help are taken, others undone."""
 
-from dataclasses import replace
+import logging
 from pathlib import Path
 
-import gtsam
 import numpy as np
 import pytest
-from tiny_run import NUM_FRAMES, SETTINGS, Case, computed_stages
+from splat_moves import HARMS, harmed, run, settings_for, spoiled
+from tiny_run import NUM_FRAMES, Case, computed_stages
 
-from gsba import cubemap, graph, splat_refine
-from gsba.adjust import Adjustment
-from gsba.config import RefineSettings
+from gsba import splat_refine
 from gsba.config_file import load_config
 from gsba.evaluate import evaluate
 from gsba.log import GsbaError
-from gsba.splat_refine import SplatResult
-from gsba.store import load_stage
-from gsba.types import Keypoints, Trajectory
-
-
-def settings_for(factors: tuple[str, ...] = ("bearing", "splat"), **splat) -> RefineSettings:
-    """Small faces, few steps, a held-out frame in four."""
-    small = {
-        "sizes": (24,),
-        "first_steps": 60,
-        "steps": 20,
-        "moves": 1,
-        "held_out_every": 4,
-        "min_gain_db": 0.01,
-    }
-    chosen = {"factors": factors, "splat": {**small, "backend": "cpu", **splat}}
-    return RefineSettings.model_validate({**SETTINGS.model_dump(), **chosen})
-
-
-def spoiled(case: Case, degrees: float, distance: float, noise: float) -> tuple:
-    """Frames, keypoints and a solution whose poses are off and whose observations are doubted."""
-    solved, keypoints = load_stage(case.out, "aligned2", tuple[Adjustment, Keypoints])
-    rng, poses = np.random.default_rng(0), solved.world_T_rigs.copy()
-    sigmas = np.repeat([np.deg2rad(degrees), distance], 3)
-    for f in range(1, len(poses)):
-        poses[f] = gtsam.Pose3(poses[f]).retract(rng.normal(0, sigmas)).matrix()
-    start = replace(solved, world_T_rigs=poses, noise=noise * solved.noise)
-    return case.result.frames, keypoints, start
-
-
-def run(case: Case, given: tuple, settings: RefineSettings, **options) -> SplatResult:
-    priors = graph.build(case.result.coarse.world_T_rigs, settings.priors)
-    rig = cubemap.rig_for(case.result.frames, settings.cubemap)
-    return splat_refine.run(*given, priors, rig, settings, 2, **options)
+from gsba.types import Trajectory
 
 
 def errors(case: Case, world_T_rigs: np.ndarray):
@@ -58,7 +23,10 @@ def test_a_splat_corrects_poses_that_observations_hardly_hold(case: Case) -> Non
     given = spoiled(case, 0.1, 0.003, 50.0)
     settings = settings_for(sizes=(48,), first_steps=80, steps=120, moves=2)
     result = run(case, given, settings)
-    assert result.moves[0].accepted and result.moves[0].psnr_moved > result.moves[0].psnr_stayed
+    move = result.moves[0]
+    assert move.accepted and move.evidence > 10 and move.growth + 10 * move.growth_sigma < 1
+    # A pose is off by a twentieth of a pixel: two trainings must not differ by more than that does.
+    assert abs(move.psnr_moved - move.psnr_stayed) < 0.05 and move.psnr_sigma < 0.03
     before, after = (
         errors(case, poses) for poses in (given[2].world_T_rigs, result.adjustment.world_T_rigs)
     )
@@ -67,9 +35,36 @@ def test_a_splat_corrects_poses_that_observations_hardly_hold(case: Case) -> Non
     assert (result.counts[0].kept, result.counts[0].dropped["held out"]) == (6, 2)
 
 
+@pytest.mark.parametrize("harm", HARMS)
+def test_a_harmful_move_is_undone(
+    case: Case, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, harm: str
+) -> None:
+    given = spoiled(case, 0.1, 0.003, 50.0)
+    settings = settings_for(sizes=(48,), first_steps=80, steps=40, max_growth=100.0)
+    worse = harmed(splat_refine._Turns._moved, HARMS[harm], 0)
+    monkeypatch.setattr(splat_refine._Turns, "_moved", worse)
+    with caplog.at_level(logging.INFO, "gsba"):
+        result = run(case, given, settings)
+    (move,) = result.moves
+    assert not move.accepted and move.evidence < -5
+    np.testing.assert_array_equal(result.adjustment.world_T_rigs, given[2].world_T_rigs)
+    assert "standard error" in caplog.text and "undone" in caplog.text
+
+
+def test_a_move_that_nothing_speaks_for_is_undone(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thousandth of the helpful move, away from poses that fit their observations."""
+    given = spoiled(case, 0.0, 0.0, 1.0)
+    tiny = harmed(splat_refine._Turns._moved, lambda steps, rng: rng.normal(0, 1e-6, (8, 6)), 0)
+    monkeypatch.setattr(splat_refine._Turns, "_moved", tiny)
+    (move,) = run(case, given, settings_for(sizes=(48,))).moves
+    assert not move.accepted and abs(move.evidence) < 2
+
+
 def test_a_move_that_observations_contradict_is_undone(case: Case) -> None:
     given = spoiled(case, 0.0, 0.0, 1.0)
-    result = run(case, given, settings_for(max_growth=1e-6, min_gain_db=0))
+    result = run(case, given, settings_for(max_growth=1e-6))
     assert [move.accepted for move in result.moves] == [False]
     np.testing.assert_array_equal(result.adjustment.world_T_rigs, given[2].world_T_rigs)
     assert not result.adjustment.rounds[-1].accepted
@@ -115,7 +110,7 @@ def test_a_run_with_all_families(case: Case, tmp_path: Path) -> None:
     result = case.refine(out, settings)
     assert computed_stages(result)[:2] == ["photometric", "splat"]
     (move,) = result.report["splat"]
-    assert move["size"] == 24 and move["psnr_stayed"] > 12
+    assert move["size"] == 24 and move["psnr_stayed"] > 12 and move["psnr_sigma"] > 0
     costs = result.report["solver"][-1]["rounds"][-1]["iterations"][0]["costs"]
     assert set(costs) == {"graph", "bearing", "photometric", "splat"}
     stage = next(s for s in result.report["stages"] if s["name"] == "splat")

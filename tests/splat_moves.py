@@ -1,0 +1,79 @@
+"""Poses that a splat is to correct, and moves of them that help or harm."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from tiny_run import SETTINGS, Case
+
+from gsba import cubemap, graph, splat_refine
+from gsba.adjust import Adjustment
+from gsba.config import RefineSettings
+from gsba.splat_refine import SplatResult
+from gsba.store import load_stage
+from gsba.types import FrameSet, Keypoints
+
+Given = tuple[FrameSet, Keypoints, Adjustment]
+
+
+def settings_for(factors: tuple[str, ...] = ("bearing", "splat"), **splat) -> RefineSettings:
+    """Small faces, few steps, a held-out frame in four."""
+    small = {"sizes": (24,), "first_steps": 60, "steps": 20, "moves": 1, "held_out_every": 4}
+    chosen = {"factors": factors, "splat": {**small, "backend": "cpu", **splat}}
+    return RefineSettings.model_validate({**SETTINGS.model_dump(), **chosen})
+
+
+def spoiled(case: Case, degrees: float, distance: float, noise: float, seed: int = 0) -> Given:
+    """Frames, keypoints and a solution whose poses are off and whose observations are doubted."""
+    solved, keypoints = load_stage(case.out, "aligned2", tuple[Adjustment, Keypoints])
+    rng, poses = np.random.default_rng(seed), solved.world_T_rigs.copy()
+    sigmas = np.repeat([np.deg2rad(degrees), distance], 3)
+    for f in range(1, len(poses)):
+        poses[f] = gtsam.Pose3(poses[f]).retract(rng.normal(0, sigmas)).matrix()
+    start = replace(solved, world_T_rigs=poses, noise=noise * solved.noise)
+    return case.result.frames, keypoints, start
+
+
+def run(case: Case, given: Given, settings: RefineSettings, **options) -> SplatResult:
+    priors = graph.build(case.result.coarse.world_T_rigs, settings.priors)
+    rig = cubemap.rig_for(case.result.frames, settings.cubemap)
+    return splat_refine.run(*given, priors, rig, settings, 2, **options)
+
+
+Harm = Callable[[np.ndarray, np.random.Generator], np.ndarray]  # of steps (F, 6), tangents
+
+
+def _half(steps: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    signs = np.ones(len(steps))
+    signs[rng.permutation(len(steps))[: len(steps) // 2]] = -1
+    return signs[:, None] * steps
+
+
+def _noise(steps: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    kinds = steps.reshape(-1, 2, 3)
+    sizes = np.sqrt(np.mean(kinds**2, axis=(0, 2), keepdims=True))
+    return (sizes * rng.standard_normal(kinds.shape)).reshape(steps.shape)
+
+
+HARMS: dict[str, Harm] = {
+    "reversed": lambda steps, _: -steps,
+    "2.5 times too far": lambda steps, _: 2.5 * steps,
+    "half of the frames reversed": _half,
+    "noise of its size": _noise,
+}
+
+
+def harmed(real: Callable, harm: Harm, seed: int) -> Callable:
+    """A joint move, `splat_refine._Turns._moved`, made harmful."""
+
+    def moved(self, gaussians, world_T_rigs: np.ndarray):
+        found, result = real(self, gaussians, world_T_rigs)
+        before = [gtsam.Pose3(pose) for pose in world_T_rigs]
+        pairs = zip(before, found, strict=True)
+        steps = np.stack([pose.localCoordinates(gtsam.Pose3(after)) for pose, after in pairs])
+        steps = harm(steps, np.random.default_rng(seed))
+        pairs = zip(before, steps, strict=True)
+        return np.stack([pose.retract(step).matrix() for pose, step in pairs]), result
+
+    return moved
