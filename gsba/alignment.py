@@ -1,12 +1,18 @@
 """Similarities between point sets of which some are wrong."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
+
+from gsba.geometry import NoSimilarityError, turned_similarity
+from gsba.log import GsbaError
 
 Similarity = tuple[float, np.ndarray, np.ndarray]  # target = scale * rotation @ source + shift
 
 _DRAWS, _SEED = 500, 0
+_ALIKE = 0.5  # least correlation of the points and where the similarity carries them
 _MEDIAN_LENGTH = 1.538  # of a 3-vector of independent unit normals
 _OUTLIER_SIGMAS = 4.6  # 99.99% of such vectors are shorter
 
@@ -29,16 +35,22 @@ def robust_similarity(
 
     Returns:
         the similarity, (N,) bool what it rests on, and their RMS residual in target units.
+
+    Raises:
+        NoSimilarityError: the points of both have little in common.
     """
     rng = np.random.default_rng(_SEED)
-    best, fit = np.inf, solve(source, target)
-    if len(source) > num_needed:
-        for _ in range(_DRAWS):
-            draw = rng.choice(len(source), num_needed, replace=False)
+    best, fit = np.inf, None
+    draws = (rng.choice(len(source), num_needed, replace=False) for _ in range(_DRAWS))
+    for draw in draws if len(source) > num_needed else [np.arange(len(source))]:
+        try:
             candidate = solve(source[draw], target[draw])
-            median = float(np.median(residuals_of(candidate, source, target)))
-            if median < best:
-                best, fit = median, candidate
+        except NoSimilarityError:
+            continue
+        median = float(np.median(residuals_of(candidate, source, target)))
+        if median < best:
+            best, fit = median, candidate
+    fit = fit or solve(source, target)
     extent = float(np.linalg.norm(np.ptp(target, axis=0)))
     used = np.ones(len(source), bool)
     for _ in range(20):
@@ -48,24 +60,37 @@ def robust_similarity(
         fit = solve(source[used], target[used])
         if np.array_equal(before, used):
             break
+    turned_similarity(source[used], target[used], fit[1], _ALIKE)
     rms = float(np.sqrt(np.mean(residuals_of(fit, source, target)[used] ** 2)))
     return fit, used, rms
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Say that it is this file's positions which no similarity fits."""
+    try:
+        yield
+    except NoSimilarityError:
+        raise GsbaError(
+            f"{path}: its positions and the frames' have nothing in common: check that they are "
+            "of this recording and on the frames' clock"
+        ) from None
 
 
 def level_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     """Least-squares similarity that turns around z only: scale, heading and shift.
 
     Closed form of the plane (Umeyama's with complex numbers); heights only help the scale.
+
+    Raises:
+        NoSimilarityError: see `gsba.geometry.turned_similarity`.
     """
     mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
     s, t = source - mean_s, target - mean_t
     cross = np.sum((t[:, 0] + 1j * t[:, 1]) * (s[:, 0] - 1j * s[:, 1]))
     turn = cross / max(abs(cross), 1e-300)
     rotation = np.array([[turn.real, -turn.imag, 0], [turn.imag, turn.real, 0], [0, 0, 1.0]])
-    spread = float(np.sum(s * s))
-    scale = float(np.sum(t * (s @ rotation.T))) / spread if spread > 0 else 1.0
-    scale = scale if scale > 0 else 1e-12
-    return scale, rotation, mean_t - scale * rotation @ mean_s
+    return turned_similarity(source, target, rotation)
 
 
 def residuals_of(fit: Similarity, source: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -4,8 +4,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-_MAX_FACE = 16_384  # pixels: remapping ends at 32,767
-_MAX_SEED = 2**31 - 1
+_MAX_FACE, _MAX_SEED = 16_384, 2**31 - 1  # pixels: remapping ends at 32,767
+_CutSize = Annotated[int, Field(ge=64, le=_MAX_FACE)]
+_Text = Annotated[str, Field(min_length=1)]
 
 
 class _Settings(BaseModel):
@@ -20,19 +21,15 @@ class ReadSettings(_Settings):
     )  # longer gaps are still filled, but reported
     clock_offset_s: float | None = None  # s to add to frame times; None = clocks agree or one fits
     clock: Literal["auto", "given"] = "auto"  # auto: corrected by how the camera turns, where sure
-    max_clock_shift_s: float = Field(
-        default=10.0, gt=0, le=600
-    )  # furthest that the correction may go
+    max_clock_shift_s: float = Field(default=10.0, gt=0, le=600)  # most that is corrected
 
 
 class VideoSettings(_Settings):
     """Frames taken from a video, where one is given in their place."""
 
-    fps: float = Field(default=1.0, gt=0)  # frames kept per second
-    every: int | None = Field(default=None, ge=1)  # keep one of so many frames instead
-    at: str | None = Field(
-        default=None, min_length=1
-    )  # trajectory file: keep the frames at its times instead
+    fps: float = Field(default=1.0, ge=1e-6, le=1e6)  # frames kept per second
+    every: int | None = Field(default=None, ge=1, le=10**9)  # keep one of so many frames instead
+    at: _Text | None = None  # trajectory file: keep the frames at its times instead
     sharpest: bool = False  # of the frames that one is kept of; else the first
     from_s: float | None = Field(default=None, ge=0)  # seconds after the first frame
     to_s: float | None = Field(default=None, gt=0)
@@ -46,14 +43,10 @@ class CubemapSettings(_Settings):
     """Faces cut from a panorama for detection."""
 
     hfov_deg: float = Field(default=96.0, ge=90, le=120)
-    face_size: int | None = Field(
-        default=None, ge=64, le=_MAX_FACE
-    )  # pixels; None = by oversampling
+    face_size: _CutSize | None = None  # pixels; None = by oversampling
     oversampling: float = Field(default=0.5, ge=0.25, le=4)  # face pixels per panorama pixel
-    min_face_size: int = Field(
-        default=192, ge=64, le=_MAX_FACE
-    )  # pixels; bounds on the automatic size
-    max_face_size: int = Field(default=448, ge=64, le=_MAX_FACE)
+    min_face_size: _CutSize = 192  # pixels; bounds on the automatic size
+    max_face_size: _CutSize = 448
 
 
 class FeatureSettings(_Settings):
@@ -308,12 +301,8 @@ class PlacementSettings(_Settings):
     up: Literal["auto", "none"] = "none"  # auto: gravity from rigs and vertical edges
     length: float | None = Field(default=None, gt=0)  # metres between the two of `between`
     between: tuple[str, str] | None = None  # frames by name, or points "x,y,z" of the run's world
-    gps: str | None = Field(
-        default=None, min_length=1
-    )  # file of positions, or "exif": metres, east-north-up
-    align: str | None = Field(
-        default=None, min_length=1
-    )  # TUM file of true poses: its world and unit
+    gps: _Text | None = None  # file of positions, or "exif": metres, east-north-up
+    align: _Text | None = None  # TUM file of true poses: its world and unit
 
 
 class RefineSettings(_Settings):

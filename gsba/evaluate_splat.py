@@ -16,7 +16,7 @@ import numpy as np
 
 from gsba.config import SplatSettings
 from gsba.evaluate import associate
-from gsba.geometry import carried, pose, pose_similarity
+from gsba.geometry import NoSimilarityError, carried, pose, pose_similarity
 from gsba.log import GsbaError
 from gsba.records import atomic_write
 from gsba.splat.backend import Backend
@@ -139,8 +139,11 @@ def compare(
 
 def _beside(poses: np.ndarray, usable: np.ndarray, own: np.ndarray) -> np.ndarray:
     """Poses (F, 4, 4) in the world and scale of the run's `own` ones of the `usable` frames."""
-    scale, rotation, translation = pose_similarity(poses[usable], own)
-    return poses if scale <= 0 else carried(poses, scale, pose(rotation, translation))
+    try:
+        scale, rotation, translation = pose_similarity(poses[usable], own)
+    except NoSimilarityError:
+        return poses  # nothing to lay them by: they are measured as they are
+    return carried(poses, scale, pose(rotation, translation))
 
 
 def _write(

@@ -2,6 +2,14 @@
 
 import numpy as np
 
+from gsba.log import GsbaError
+
+_LEAST_ALIKE = 1e-6  # correlation of positions: below, the scale that carries them vanishes
+
+
+class NoSimilarityError(GsbaError):
+    """No positive scale carries one set of positions onto the other."""
+
 
 def bearings_from_erp(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
     """Unit bearings of equirectangular pixels.
@@ -95,23 +103,56 @@ def angular_errors(
 def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Least-squares Sim(3) with target = scale * rotation @ source + translation.
 
-    Closed form of Umeyama, PAMI 13(4), 1991.
-
     Args:
         source, target: (N, 3) float64, N >= 3, not all on one point.
 
     Returns:
         scale, rotation (3, 3), translation (3,).
+
+    Raises:
+        NoSimilarityError: the targets are all on one point, or not where any turn has the sources.
     """
-    mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
-    s, t = source - mean_s, target - mean_t
-    u, singular, vt = np.linalg.svd(t.T @ s / len(s))
-    sign = np.ones(3)
-    sign[2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
-    rotation = u @ np.diag(sign) @ vt
-    variance = np.einsum("ij,ij->", s, s) / len(s)
-    scale = float(singular @ sign / variance) if variance > 0 else 1.0
-    return scale, rotation, mean_t - scale * rotation @ mean_s
+    s, t = source - source.mean(axis=0), target - target.mean(axis=0)
+    return turned_similarity(source, target, _turn(t.T @ s / len(s)))
+
+
+def turned_similarity(
+    source: np.ndarray, target: np.ndarray, rotation: np.ndarray, least_alike: float = _LEAST_ALIKE
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """The similarity with a given rotation, scale and translation being least squares.
+
+    Every similarity of gsba ends here: an inverted or vanishing world is none.
+
+    Args:
+        source, target: (N, 3) float64, N >= 1; sources on one point leave the scale at 1.
+        rotation: (3, 3).
+        least_alike: correlation of both, once turned, from 0 to 1, that there must be.
+
+    Returns:
+        scale > 0, rotation, translation (3,).
+
+    Raises:
+        NoSimilarityError: positions correlate less, so that their scale would be nothing's.
+    """
+    turned = source @ rotation.T
+    s, t = turned - turned.mean(axis=0), target - target.mean(axis=0)
+    spread, across, wanted = (float(np.sum(a * b)) for a, b in ((s, s), (s, t), (t, t)))
+    if spread <= 1e-24 * float(np.sum(source * source)):  # on one point, but for rounding
+        scale = 1.0
+    elif across > least_alike * np.sqrt(spread * wanted) > 0:
+        scale = across / spread
+    else:
+        raise NoSimilarityError(
+            "no positive scale carries one set of positions onto the other: they have nothing in "
+            "common"
+        )
+    return scale, rotation, target.mean(axis=0) - scale * turned.mean(axis=0)
+
+
+def _turn(covariance: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) nearest to a matrix (3, 3) in the sense of Umeyama, PAMI 13(4), 1991."""
+    u, _, vt = np.linalg.svd(covariance)
+    return u @ np.diag([1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))]) @ vt
 
 
 def furthest(positions: np.ndarray) -> tuple[int, float]:
@@ -129,7 +170,7 @@ def carried(poses: np.ndarray, scale: float, new_T_old: np.ndarray) -> np.ndarra
 
 
 def pose_similarity(
-    source_T_rigs: np.ndarray, target_T_rigs: np.ndarray
+    source_T_rigs: np.ndarray, target_T_rigs: np.ndarray, least_alike: float = _LEAST_ALIKE
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Sim(3) that carries one set of poses onto another of the same rigs.
 
@@ -138,17 +179,14 @@ def pose_similarity(
 
     Args:
         source_T_rigs, target_T_rigs: (N, 4, 4) poses of the same rigs in two worlds.
+        least_alike: see `turned_similarity`.
 
     Returns:
         scale, rotation (3, 3), translation (3,): target = scale * rotation @ source + translation.
+
+    Raises:
+        NoSimilarityError: the rigs are not where the targets have them, at no positive scale.
     """
     between = np.einsum("nij,nkj->ik", target_T_rigs[:, :3, :3], source_T_rigs[:, :3, :3])
-    u, _, vt = np.linalg.svd(between)
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    source = source_T_rigs[:, :3, 3] @ rotation.T
-    target = target_T_rigs[:, :3, 3]
-    s, t = source - source.mean(axis=0), target - target.mean(axis=0)
-    spread = float(np.sum(s * s))
-    at_one_place = spread <= 1e-24 * float(np.sum(source * source))  # but for rounding
-    scale = 1.0 if at_one_place else float(np.sum(s * t)) / spread
-    return scale, rotation, target.mean(axis=0) - scale * source.mean(axis=0)
+    source, target = source_T_rigs[:, :3, 3], target_T_rigs[:, :3, 3]
+    return turned_similarity(source, target, _turn(between), least_alike)

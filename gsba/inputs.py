@@ -64,9 +64,7 @@ def extract_frames(
     if settings.placement.gps == EXIF:
         raise GsbaError("--gps exif: a video's frames have no tags; give positions as a file")
     if fps is not None:
-        if not fps > 0:
-            raise GsbaError(f"--fps {fps}: must be a positive number of frames per second")
-        chosen = chosen.model_copy(update={"fps": fps, "every": None, "at": None})
+        chosen = chosen.model_copy(update={"fps": read.check_fps(fps), "every": None, "at": None})
     with RunStore(out, dict(origin), fresh) as store:
         video.extract(origin["frames"], out / "frames", chosen, replace=True)
         store.claim(out / "frames")

@@ -83,7 +83,7 @@ class MatchingStages:
         self.latest = "keypoints"  # the stage that the next one builds on
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
         start = coarse.world_T_rigs.tolist(), settings.read
-        inputs = [fingerprint(paths), frames.timestamps.tolist(), *start]
+        inputs = [fingerprint(paths), frames.timestamps.tolist(), frames.timed, *start]
         store.stage("frames", inputs, lambda: frames, FrameSet)
         weights = learned.find_weights(settings)
         found = extraction.run(store, frames, self.rig, settings, self.num_threads, weights)

@@ -67,7 +67,7 @@ def refine(
     if video.is_video(frames):
         inputs.extract_frames(out, origin, settings, fps, fresh)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
-    frame_set = read.scan(frames, timestamps, fps, chosen.given)
+    frame_set = read.scan(frames, timestamps, fps, chosen.given, order_suffices=not given)
     check(settings.placement, frame_set)
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh) as store, threadpool_limits(1, "blas"):  # frames have threads

@@ -14,11 +14,17 @@ from typing import Any
 import numpy as np
 
 from gsba import __version__, read
-from gsba.alignment import extents, level_similarity, residuals_of, robust_similarity
+from gsba.alignment import (
+    extents,
+    level_similarity,
+    naming,
+    residuals_of,
+    robust_similarity,
+)
 from gsba.config import PlacementSettings
 from gsba.evaluate import associate
 from gsba.geometry import pose, pose_similarity, similarity
-from gsba.log import GsbaError
+from gsba.log import GsbaError, brief
 from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -26,7 +32,10 @@ logger = logging.getLogger(__name__)
 EXIF = "exif"  # in place of a file of positions: those in the pictures
 _UP_WORLD = np.array([0.0, -1.0, 0.0])  # of an upright world: y down, as cameras have it
 _TOLERANCE_S = 0.02  # of true poses around a frame
+_SCALES = (1e-12, 1e12)  # that a run may be placed at; others are slips
+_FURTHEST = 1e12  # from the origin, in the placed unit
 _FAR = 1e4  # coordinates beyond lose digits as float32: an offset is kept apart
+_STUCK_M = 1e-3  # extent of positions, metres: a receiver that works scatters by more
 _LEVEL_SPREAD = 0.02  # of a path's second extent to its first: below, positions leave a roll open
 
 
@@ -119,7 +128,7 @@ def read_placement(path: Path) -> Placement:
         )
     except OSError as error:
         raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
         raise GsbaError(f"{path}: not a transform.json of gsba: export again") from None
 
 
@@ -140,6 +149,21 @@ def place(
         GsbaError: settings that exclude one another, or data that do not suffice.
     """
     check(settings)
+    placement = _placement(reconstruction, frames, settings)
+    placed = placement.points(reconstruction.world_T_rigs[:, :3, 3])
+    far = np.abs(placed).max(initial=0)
+    if not (_SCALES[0] <= placement.scale <= _SCALES[1] and far <= _FURTHEST):
+        raise GsbaError(
+            f"the run would be placed at a scale of {placement.scale:g}, up to {far:g} from the "
+            "origin: check what --scale, --between, --gps or --align say"
+        )
+    return placement
+
+
+def _placement(
+    reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings
+) -> Placement:
+    """What the settings ask for, however odd."""
     if settings.align is not None:
         return _aligned(reconstruction, frames, Path(settings.align))
     placement = Placement()
@@ -218,9 +242,10 @@ def _point(text: str, reconstruction: Reconstruction, frames: FrameSet) -> np.nd
         point = np.array([float(part) for part in text.split(",")])
     except ValueError:
         point = np.zeros(0)
-    if len(point) != 3 or not np.isfinite(point).all():
+    if len(point) != 3 or not (np.abs(point) <= _FURTHEST).all():
         raise GsbaError(
-            f"--between {text}: is neither a frame (such as {frames.names[0]}) nor a point x,y,z"
+            f"--between {brief(text)}: is neither a frame (such as {frames.names[0]}) nor a point "
+            "x,y,z"
         )
     return point
 
@@ -240,14 +265,18 @@ def _on_earth(
         )
     origin = np.median(geodetic, axis=0)
     target = read.local_from_geodetic(geodetic, origin)
+    if np.ptp(target, axis=0).max() < _STUCK_M:
+        raise GsbaError(f"{path}: all {len(rows)} positions are the same: the receiver was stuck")
     positions = reconstruction.world_T_rigs[rows, :3, 3]
-    if upright.up is None:
-        _require_extent(positions, f"{path}: the frames lie on a line: add --up auto")
-        fit, used, sigma = robust_similarity(positions, target, similarity, 3)
-    else:
-        level = _least_turn(_UP_WORLD, np.array([0.0, 0, 1])) @ upright.rotation
-        fit, used, sigma = robust_similarity(positions @ level.T, target, level_similarity, 2)
-        fit = (fit[0], fit[1] @ level, fit[2])
+    with naming(path):
+        if upright.up is None:
+            if extents(positions)[1] <= _LEVEL_SPREAD:
+                raise GsbaError(f"{path}: the frames lie on a line: add --up auto")
+            fit, used, sigma = robust_similarity(positions, target, similarity, 3)
+        else:
+            level = _least_turn(_UP_WORLD, np.array([0.0, 0, 1])) @ upright.rotation
+            fit, used, sigma = robust_similarity(positions @ level.T, target, level_similarity, 2)
+            fit = (fit[0], fit[1] @ level, fit[2])
     grounds = {
         **upright.grounds,
         "gps": {
@@ -273,6 +302,7 @@ def _fixes_of_frames(
         return np.array(rows, np.int64), found
     times, entries = frames.timestamps, fixes.timestamps
     assert entries is not None
+    _require_times(path, frames)
     inside = np.flatnonzero((times >= entries[0]) & (times <= entries[-1]))
     if not len(inside):
         raise GsbaError(
@@ -286,6 +316,7 @@ def _fixes_of_frames(
 def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Placement:
     """The world of true poses; large coordinates are kept apart."""
     truth = read.read_trajectory(path)
+    _require_times(path, frames)
     run = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
     rows, of_truth = associate(run, truth, _TOLERANCE_S)
     good = reconstruction.pose_statuses[rows] == PoseStatus.REFINED
@@ -301,17 +332,18 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
     true_T_rigs[:, :3, 3] -= offset
     world_T_rigs = reconstruction.world_T_rigs[rows]
     source, target = world_T_rigs[:, :3, 3], true_T_rigs[:, :3, 3]
-    if extents(source)[1] > _LEVEL_SPREAD:
-        fit, used, sigma = robust_similarity(source, target, similarity, 3)
-    else:  # a straight path leaves a roll open that orientations know
-        fit = pose_similarity(world_T_rigs, true_T_rigs)
-        residuals = residuals_of(fit, source, target)
-        used, sigma = np.ones(len(rows), bool), float(np.sqrt(np.mean(residuals**2)))
+    with naming(path):
+        if extents(source)[1] > _LEVEL_SPREAD:
+            fit, used, sigma = robust_similarity(source, target, similarity, 3)
+        else:  # a straight path leaves a roll open that orientations know
+            fit = pose_similarity(world_T_rigs, true_T_rigs)
+            residuals = residuals_of(fit, source, target)
+            used, sigma = np.ones(len(rows), bool), float(np.sqrt(np.mean(residuals**2)))
     grounds = {"file": str(path), "poses": len(rows), "outliers": int(np.sum(~used)), "rmse": sigma}
     unit = "units of the true poses"
     return Placement(*fit, unit=unit, offset=offset, grounds={"align": grounds})
 
 
-def _require_extent(positions: np.ndarray, message: str) -> None:
-    if extents(positions)[1] <= _LEVEL_SPREAD:
-        raise GsbaError(message)
+def _require_times(path: Path, frames: FrameSet) -> None:
+    if not frames.timed:
+        raise GsbaError(f"{path}: nothing says when frames were taken: refine with --timestamps")

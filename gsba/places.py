@@ -18,7 +18,7 @@ from gsba.adjust import Adjustment
 from gsba.components import parted
 from gsba.config import RefineSettings
 from gsba.frontend import median_depth, points_by_keypoint
-from gsba.geometry import inverse, pose, rotation_angle, similarity
+from gsba.geometry import NoSimilarityError, inverse, pose, rotation_angle, similarity
 from gsba.graph import X
 from gsba.matching import MatchContext, SearchableFrames
 from gsba.types import Counts, Keypoints, Landmarks, VerifiedPairs
@@ -219,8 +219,9 @@ def relative_similarity(
 
 def _agree(points0: np.ndarray, points1: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Which points (m,) are seen alike from both frames under the fit to some of them."""
-    scale, rotation, translation = similarity(points1[chosen], points0[chosen])
-    if scale <= 0:
+    try:
+        scale, rotation, translation = similarity(points1[chosen], points0[chosen])
+    except NoSimilarityError:
         return np.zeros(len(points0), bool)
     in0 = scale * points1 @ rotation.T + translation
     in1 = (points0 - translation) @ rotation / scale

@@ -3,7 +3,8 @@
 import numpy as np
 
 from gsba.adjust import Adjustment
-from gsba.geometry import angular_errors, carried, pose, pose_similarity
+from gsba.geometry import NoSimilarityError, angular_errors, carried, pose, pose_similarity
+from gsba.log import GsbaError
 from gsba.types import (
     CoarsePoses,
     JointErrors,
@@ -12,6 +13,9 @@ from gsba.types import (
     PoseStatus,
     Reconstruction,
 )
+
+_ALIKE = 0.1  # least correlation of refined and coarse positions: a walk and its drift have .8
+_MOST_RESIDUAL_DEG = 10.0  # median: gates leave a tenth of a degree, a failure anything
 
 
 def assemble(
@@ -37,6 +41,9 @@ def assemble(
         correction: of the frames, which the keypoints have.
         components: (F,) map of each frame, each carried to its own coarse poses; None = one map.
         joint_errors: of the poses; None = not known.
+
+    Raises:
+        GsbaError: not where the trajectory has its frames, or residuals that no solution leaves.
     """
     world_T_rigs, landmarks = adjustment.world_T_rigs, adjustment.landmarks
     seen = np.bincount(landmarks.tracks.frames, minlength=len(world_T_rigs))
@@ -52,18 +59,15 @@ def assemble(
     bearings = keypoints.bearings_rig[rows]
     poses = world_T_rigs[landmarks.tracks.frames]
     errors = angular_errors(poses, landmarks.points_world[points], bearings)
-    colors = np.column_stack(
-        [
-            np.bincount(points, keypoints.colors[rows, channel], len(lengths)) / lengths
-            for channel in range(3)
-        ]
-    )
+    _require_small(errors)
+    channels = keypoints.colors[rows].T
+    colors = [np.bincount(points, channel, len(lengths)) / lengths for channel in channels]
     return Reconstruction(
         placed,
         covariances * stretch[:, :, None] * stretch[:, None, :],
         np.where(refined, PoseStatus.REFINED, PoseStatus.UNREFINED).astype(np.uint8),
         points_world,
-        np.rint(colors).astype(np.uint8),
+        np.rint(np.stack(colors, axis=1)).astype(np.uint8),
         np.bincount(points, errors, len(lengths)) / lengths,
         points,
         landmarks.tracks.frames,
@@ -75,6 +79,17 @@ def assemble(
     )
 
 
+def _require_small(errors: np.ndarray) -> None:
+    """GsbaError for residuals (O,) in radians that cannot be those of a solution."""
+    median = float(np.degrees(np.median(errors))) if len(errors) else 0.0
+    if not median <= _MOST_RESIDUAL_DEG:
+        raise GsbaError(
+            f"the solution fell apart (median residual {median:.1f} deg): nothing is written; "
+            "check that frames and trajectory belong together, or refine without it "
+            "(--no-trajectory)"
+        )
+
+
 def _placed(
     adjustment: Adjustment, target_T_rigs: np.ndarray, known: np.ndarray, groups: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -84,7 +99,11 @@ def _placed(
         adjustment: the last solution.
         target_T_rigs: (F, 4, 4) poses that define the worlds.
         known: (F,) bool, frames that say where their map goes; all, where fewer than two do.
-        groups: (F,) map of each frame.
+        groups: (F,) map of each frame, 0 = the largest; a smaller one that does not lie as its
+            coarse poses, at no scale, stays as it was solved.
+
+    Raises:
+        GsbaError: the largest does not.
     """
     poses, landmarks = adjustment.world_T_rigs, adjustment.landmarks
     placed, stretch = np.empty_like(poses), np.ones((len(poses), 6))
@@ -93,7 +112,16 @@ def _placed(
     for group in np.unique(groups):
         inside = groups == group
         chosen = known & inside if np.count_nonzero(known & inside) > 1 else inside
-        move = pose_similarity(poses[chosen], target_T_rigs[chosen])
+        try:
+            move = pose_similarity(poses[chosen], target_T_rigs[chosen], _ALIKE)
+        except NoSimilarityError as error:
+            if group == 0:
+                raise GsbaError(
+                    f"the {np.count_nonzero(chosen)} frames that could place the result do not "
+                    f"lie as the trajectory has them ({error}): check its times and --fps, or "
+                    "refine without it (--no-trajectory)"
+                ) from None
+            move = 1.0, np.eye(3), np.zeros(3)
         scale, rotation, translation = move
         placed[inside] = carried(poses[inside], scale, pose(rotation, translation))
         stretch[inside, 3:] = scale

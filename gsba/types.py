@@ -50,6 +50,9 @@ class FrameSet:
     mask_paths: tuple[Path | None, ...]  # (F,) ERP masks, white = use; None = use all
     correction: tuple[float, ...] = ()  # of what stitching bends: coefficients of a
     # factors.SphereField, radians; panoramas and masks are read as straightened by it
+    timed: bool = (
+        True  # whether timestamps are times; else nothing gave them, and only order counts
+    )
 
     def __len__(self) -> int:
         return len(self.names)

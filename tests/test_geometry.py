@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gsba.geometry import (
+    NoSimilarityError,
     bearings_from_erp,
     erp_from_bearings,
     inverse,
@@ -153,10 +154,29 @@ def test_pose_similarity_recovers_a_known_one(path: str) -> None:
 
 def test_pose_similarity_never_mirrors() -> None:
     source, target = _poses(3, np.random.default_rng(3)), _poses(3, np.random.default_rng(4))
+    inverted = []
     for shift in range(20):
         target[:, :3, :3] = Rotation.random(3, np.random.default_rng(shift)).as_matrix()
-        _, rotation, _ = pose_similarity(source, target)
-        assert np.linalg.det(rotation) == pytest.approx(1)
+        try:
+            scale, rotation, _ = pose_similarity(source, target)
+        except NoSimilarityError:  # turned so, no positive scale lays one over the other
+            inverted.append(shift)
+            continue
+        assert scale > 0 and np.linalg.det(rotation) == pytest.approx(1)
+    assert 0 < len(inverted) < 20
+
+
+def test_a_similarity_never_inverts_or_vanishes() -> None:
+    rng = np.random.default_rng(5)
+    source = _poses(6, rng)
+    inverted = source.copy()
+    inverted[:, :3, 3] *= -1
+    for target in (inverted, np.tile(np.eye(4), (6, 1, 1))):
+        with pytest.raises(NoSimilarityError, match="no positive scale"):
+            pose_similarity(source, target)
+    with pytest.raises(NoSimilarityError):
+        similarity(source[:, :3, 3], np.ones((6, 3)))
+    assert similarity(np.ones((6, 3)), source[:, :3, 3])[0] == 1  # no motion tells no scale
 
 
 def test_faces_come_in_order_and_look_along_their_axes() -> None:

@@ -245,6 +245,62 @@ def test_truth_of_a_straight_walk_takes_the_roll_from_orientations(tmp_path: Pat
     np.testing.assert_allclose(placed.apply(result).world_T_rigs, true, atol=1e-9)
 
 
+@pytest.mark.parametrize("up", ["none", "auto"])
+def test_a_stuck_receiver_is_refused(
+    tmp_path: Path, up: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    upright = Placement(up="-y")
+    monkeypatch.setattr("gsba.placement._upright", lambda *_: upright)
+    result, frames = _result(), _frames(40)
+    path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, np.tile(ORIGIN, (40, 1)))
+    settings = PlacementSettings(gps=str(path), up=up)  # type: ignore[arg-type]
+    with pytest.raises(GsbaError, match="all 40 positions are the same: the receiver was stuck"):
+        place(result, frames, settings)
+    rng = np.random.default_rng(11)
+    path = _gps_csv(path, frames.timestamps, _geodetic(rng.normal(0, 2, (40, 3))))
+    with pytest.raises(GsbaError, match=r"gps.csv: its positions and the frames' have nothing"):
+        place(result, frames, settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"length": 1e-320, "between": ("0,0,0", "1,0,0")}, "at a scale of 9.99989e-321"),
+        ({"length": 1e300, "between": ("0,0,0", "1,0,0")}, "at a scale of 1e"),
+        ({"length": 1.0, "between": ("1e200,0,0", "0,0,0")}, "is neither a frame"),
+        ({"length": 1.0, "between": ("9" * 5000, "0,0,0")}, r"--between 999+\.\.\.9+: is neither"),
+    ],
+)
+def test_extreme_placements_are_refused(settings: dict, message: str) -> None:
+    with pytest.raises(GsbaError, match=message):
+        place(_result(), _frames(40), PlacementSettings(**settings))
+
+
+def test_times_that_are_only_an_order_place_nothing(tmp_path: Path) -> None:
+    result, frames = _result(), dataclasses.replace(_frames(40), timed=False)
+    read.write_tum(tmp_path / "t.tum", Trajectory(frames.timestamps, result.world_T_rigs))
+    with pytest.raises(GsbaError, match="nothing says when frames were taken"):
+        place(result, frames, PlacementSettings(align=str(tmp_path / "t.tum")))
+    path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, _geodetic(_level(result)))
+    with pytest.raises(GsbaError, match="nothing says when frames were taken"):
+        place(result, frames, PlacementSettings(gps=str(path)))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('<?xml version="1.0" encoding="utf-32"?><gpx/>', "neither a CSV table nor a GPX track"),
+        ('<?xml version="1.0" encoding="x-none"?><gpx/>', "neither a CSV table nor a GPX track"),
+        ("name,lat,lon\n" + "a" * 140_000 + ",1,2", "gps:2: not a row of a CSV table"),
+        ("time,lat,lon\n" + "9" * 5000 + ",1,2", r"gps:2: time '9+\.\.\.9+' is not a number"),
+    ],
+)
+def test_damaged_positions_are_named(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "gps").write_text(text)
+    with pytest.raises(GsbaError, match=message):
+        read_gps(tmp_path / "gps")
+
+
 def _posts(folder: Path, tilt: np.ndarray, num: int = 6) -> tuple[FrameSet, np.ndarray]:
     """Panoramas of a room of vertical posts, and the rotations world_R_rig they were taken with."""
     rng = np.random.default_rng(9)

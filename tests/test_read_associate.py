@@ -168,3 +168,40 @@ def test_real_frames_with_mask() -> None:
     assert (len(frames), frames.width, frames.height) == (11, 5376, 2688)
     result = associate(frames, read_trajectory(folder / "coarse.tum"), ReadSettings())
     assert (result.sources == SLAM).all()
+
+
+@pytest.mark.parametrize("unit", ["milliseconds", "microseconds", "nanoseconds"])
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+def test_times_in_another_unit_are_named(unit: str, start: float) -> None:
+    factor = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}[unit]
+    times, denser = start + np.arange(60) / 2, start + np.arange(900) / 30
+    with pytest.raises(GsbaError, match=f"trajectory's times look like {unit} .* by 1e"):
+        coarse(times, factor * denser)
+    with pytest.raises(GsbaError, match=f"frames' times look like {unit} .* check --fps, or"):
+        coarse(factor * times, denser)
+
+
+def test_a_unit_is_seen_where_many_poses_fall_into_the_frames_time() -> None:
+    """Ten minutes, in which 18 of the poses seem to be: not so few that they would tell."""
+    with pytest.raises(GsbaError, match="trajectory's times look like milliseconds"):
+        coarse(np.arange(1200) / 2, 1e3 * np.arange(18_000) / 30)
+
+
+def test_a_clip_of_a_long_trajectory_is_no_other_unit() -> None:
+    clip = 200 + np.arange(12) / 25
+    assert (coarse(clip, np.arange(4400) / 10).sources != EXTRAPOLATED).all()
+    few = coarse(np.arange(1000) / 2, np.array([0.0, 0.5]))  # lost after two frames
+    assert np.sum(few.sources == SLAM) == 2
+
+
+@pytest.mark.parametrize("fps", [0.002, 0.01, 0.1, 200.0])
+def test_a_rate_that_leaves_next_to_no_poses_is_refused(fps: float) -> None:
+    with pytest.raises(GsbaError, match=r"check\s+--fps"):
+        coarse(np.arange(12) / fps, np.arange(12) / 2)
+
+
+def test_times_closer_than_a_clock_tells_are_refused() -> None:
+    with pytest.raises(GsbaError, match=r"two frames are less than 1e-09 s apart, at 0\.0 s"):
+        coarse([0, 1e-300, 1, 2], GRID)
+    with pytest.raises(GsbaError, match="two poses are less"):
+        coarse(GRID, [0, 1e-310, 1, 2])

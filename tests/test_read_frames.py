@@ -1,5 +1,6 @@
 """Frames and masks: layouts, order, times, and every input that must be refused."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -278,7 +279,7 @@ def test_refused_ways_to_give_times(folder: Path, tmp_path: Path) -> None:
         scan(folder, timestamps=tmp_path / "none.csv")
     with pytest.raises(GsbaError, match=r"pass one"):
         scan(folder, timestamps=_list(folder, 4), fps=1)
-    for fps in (0.0, -1.0, float("nan"), float("inf")):
+    for fps in (0.0, -1.0, float("nan"), float("inf"), 1e-300, 1e300):
         with pytest.raises(GsbaError, match=r"positive"):
             scan(folder, fps=fps)
     with pytest.raises(GsbaError, match=r"nothing says when .* --fps"):
@@ -292,6 +293,28 @@ def test_fps_refuses_skipped_numbers_but_not_even_steps(tmp_path: Path) -> None:
     write_image(tmp_path / "032.jpg")
     with pytest.raises(GsbaError, match=r"skip between '016' and '032'"):
         scan(tmp_path, fps=2)
+
+
+def test_the_order_of_names_suffices_without_a_trajectory(tmp_path: Path) -> None:
+    for name in ("f1", "f2", "f10", "f11"):
+        write_image(tmp_path / f"{name}.jpg")
+    frames = scan(tmp_path, order_suffices=True)
+    assert frames.names == ("f1", "f2", "f10", "f11") and not frames.timed
+    np.testing.assert_array_equal(frames.timestamps, [0, 1, 2, 3])
+    frames = scan(tmp_path, fps=2, order_suffices=True)
+    assert not frames.timed
+    np.testing.assert_array_equal(frames.timestamps, [0, 0.5, 1, 1.5])
+    (tmp_path / "timestamps.csv").write_text("f1,5\nf2,6\nf10,9\nf11,7\n")
+    frames = scan(tmp_path, order_suffices=True)
+    assert frames.timed and frames.names == ("f1", "f2", "f11", "f10")
+
+
+@pytest.mark.parametrize("name", [b"a\xff.jpg", b"a\n.jpg"])
+def test_names_that_no_table_holds_are_refused(folder: Path, name: bytes) -> None:
+    source = folder / "0000.jpg"
+    Path(os.fsdecode(os.fsencode(folder) + b"/" + name)).write_bytes(source.read_bytes())
+    with pytest.raises(GsbaError, match=r"the file name 'a\\(udcff|n)' holds .*: rename it"):
+        scan(folder, fps=1)
 
 
 @pytest.mark.parametrize(

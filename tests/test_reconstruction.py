@@ -9,6 +9,7 @@ from synthetic import World, make_world
 
 from gsba.adjust import Adjustment
 from gsba.geometry import inverse, pose
+from gsba.log import GsbaError
 from gsba.reconstruction import assemble
 from gsba.types import (
     CoarsePoses,
@@ -139,3 +140,33 @@ def test_colours_are_the_means_of_their_observations(world: World) -> None:
     for j in (0, 50, world.tracks.num_points - 1):
         mean = seen[world.tracks.points == j].mean(axis=0)
         np.testing.assert_allclose(found.point_colors[j], mean, atol=0.5)
+
+
+def test_an_inverted_world_is_refused(world: World) -> None:
+    """One pose of the trajectory and guesses that go the other way ask for a negative scale."""
+    coarse = _in_slam(world.world_T_rigs)
+    coarse[:, :3, 3] = 2 * coarse[0, :3, 3] - coarse[:, :3, 3]
+    sources = np.full(10, PoseSource.EXTRAPOLATED, np.uint8)
+    sources[0] = PoseSource.SLAM
+    with pytest.raises(GsbaError, match=r"10 frames that could place the result .* --fps"):
+        _assemble(world, coarse, sources)
+    coarse[:, :3, 3] = coarse[0, :3, 3]
+    with pytest.raises(GsbaError, match="no positive scale"):
+        _assemble(world, coarse)
+
+
+def test_residuals_that_cannot_be_right_are_refused(world: World) -> None:
+    behind = replace(world, points_world=2 * world.world_T_rigs[0, :3, 3] - world.points_world)
+    with pytest.raises(GsbaError, match=r"fell apart \(median residual 1[0-9]+\.. deg\)"):
+        _assemble(behind)
+
+
+def test_a_small_map_that_fits_no_trajectory_stays_as_it_was_solved(world: World) -> None:
+    coarse = _in_slam(world.world_T_rigs)
+    coarse[7:, :3, 3] *= -1
+    poses = CoarsePoses(coarse, np.full(10, PoseSource.SLAM, np.uint8), 0.0)
+    groups = np.repeat([0, 1], [7, 3]).astype(np.int32)
+    found = assemble(
+        _adjustment(world), np.zeros((10, 6, 6)), world.keypoints, poses, 12, components=groups
+    )
+    np.testing.assert_array_equal(found.world_T_rigs[7:], world.world_T_rigs[7:])

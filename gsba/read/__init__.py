@@ -7,12 +7,14 @@ from gsba.read.gps import GpsFixes, local_from_geodetic, read_gps
 from gsba.read.keyframes import follow_keyframes
 from gsba.read.masks import levels_of, load_mask, load_weights
 from gsba.read.segments import associate_pieces, split_restarts
+from gsba.read.times import check_fps
 from gsba.read.trajectory import read_trajectory, write_tum
 
 __all__ = [
     "GpsFixes",
     "associate",
     "associate_pieces",
+    "check_fps",
     "follow_keyframes",
     "levels_of",
     "load_erp",

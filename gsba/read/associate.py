@@ -7,6 +7,7 @@ import numpy as np
 from gsba.config import ReadSettings
 from gsba.geometry import pose
 from gsba.log import GsbaError
+from gsba.read.units import refuse_apart, refuse_intervals, refuse_other_unit, span
 from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
 
 _log = logging.getLogger(__name__)
@@ -35,11 +36,15 @@ def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) 
             exactly one offset must make all times meet; that one is then used, with a warning.
 
     Raises:
-        GsbaError: no overlap in time, and no single offset that explains it.
+        GsbaError: no overlap in time, and no single offset that explains it; times in another
+            unit; next to no pose in the frames' time.
     """
-    offset = _clock_offset(frames.timestamps, trajectory.timestamps, settings.clock_offset_s)
-    times = frames.timestamps + offset
     entries = trajectory.timestamps
+    refuse_intervals(frames.timestamps, entries)
+    refuse_other_unit(frames.timestamps, entries)
+    offset = _clock_offset(frames.timestamps, entries, settings.clock_offset_s)
+    times = frames.timestamps + offset
+    refuse_apart(times, entries, _half_interval(times, entries))
     away = np.abs(entries[nearest(entries, times)] - times)
     seen = away <= _half_interval(frames.timestamps, entries)
     outside = (times < entries[0]) | (times > entries[-1])
@@ -92,7 +97,7 @@ def _clock_offset(frame_times: np.ndarray, entries: np.ndarray, stated: float | 
     if shared >= _SHARED or (stated is not None and shared > 0):
         return stated or 0.0
     ranges = (
-        f"frames span {_span(frame_times + (stated or 0.0))} s, the trajectory {_span(entries)} s"
+        f"frames span {span(frame_times + (stated or 0.0))} s, the trajectory {span(entries)} s"
     )
     if stated is not None:
         raise GsbaError(f"no overlap in time with read.clock_offset_s = {stated}: {ranges}")
@@ -107,6 +112,7 @@ def _clock_offset(frame_times: np.ndarray, entries: np.ndarray, stated: float | 
             candidates[0],
         )
         return candidates[0]
+    refuse_other_unit(frame_times, entries, senseless=True)
     why = "no offset makes all times meet"
     if candidates:
         why = f"several offsets fit, such as {candidates[0]:.6f} and {candidates[1]:.6f}"
@@ -186,7 +192,3 @@ def nearest(sorted_values: np.ndarray, queries: np.ndarray) -> np.ndarray:
 
 def _half_interval(times: np.ndarray, entries: np.ndarray) -> float:
     return 0.5 * float(min(np.median(np.diff(times)), np.median(np.diff(entries))))
-
-
-def _span(times: np.ndarray) -> str:
-    return f"{times[0]:.6f} to {times[-1]:.6f}"

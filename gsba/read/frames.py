@@ -2,6 +2,7 @@
 
 import logging
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -27,6 +28,7 @@ def scan(
     timestamps: Path | None = None,
     fps: float | None = None,
     masks: Path | None = None,
+    order_suffices: bool = False,
 ) -> FrameSet:
     """Frames of a folder, in time order, checked by their headers; no pixel is decoded.
 
@@ -39,6 +41,7 @@ def scan(
             `fps` is given; else the file names, if they are times.
         fps: frames per second of these files in name order.
         masks: one ERP mask for all frames, or a folder with one for each; white = use.
+        order_suffices: where nothing gives times, name order stands in for them.
 
     Raises:
         GsbaError: naming the first file or frame that cannot be used.
@@ -49,6 +52,7 @@ def scan(
     if len(found) < MIN_FRAMES:
         raise GsbaError(f"{folder}: {len(found)} frames; at least {MIN_FRAMES} are needed")
     names = sorted(found, key=_natural)
+    _check_names(Path(folder), names)
     if names != sorted(names):
         _log.warning("frames are taken in numeric order (%s before %s)", *_first_swap(names))
     table = timestamps
@@ -56,7 +60,7 @@ def scan(
         table = Path(folder) / _TIMES_FILE
     if fps is not None:
         _warn_of_slots(Path(folder), max(path.name for path in found[names[-1]]))
-    times = frame_times(names, table, fps)
+    times, timed = frame_times(names, table, fps, order_suffices)
     order = np.argsort(times, kind="stable")
     names, times = [names[i] for i in order], times[order]
     same = np.flatnonzero(np.diff(times) <= 0)
@@ -75,6 +79,7 @@ def scan(
         width=width,
         height=height,
         mask_paths=find_masks(masks, names, erp_size),
+        timed=timed,
     )
 
 
@@ -88,6 +93,7 @@ def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
     if layout != "erp":
         raise GsbaError(f"{folder}: holds cube faces; panoramas are wanted here")
     names = sorted(found, key=_natural)
+    _check_names(Path(folder), names)
     paths = tuple(found[name] for name in names)
     width, height = _common_size(paths, layout)
     return FrameSet(
@@ -99,6 +105,7 @@ def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
         width=width,
         height=height,
         mask_paths=find_masks(masks, names, (width, height)),
+        timed=False,
     )
 
 
@@ -129,6 +136,16 @@ def load_faces(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
         raise ValueError("load_faces needs cube frames")
     size = frames.width, frames.height
     return np.stack([decode(path, size, gray) for path in frames.paths[f]])
+
+
+def _check_names(folder: Path, names: Sequence[str]) -> None:
+    """Refuse names that no table and no dataset could hold."""
+    for name in names:
+        if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in name):
+            raise GsbaError(
+                f"{folder}: the file name {name!r} holds control characters or is not UTF-8: "
+                "rename it"
+            )
 
 
 def _absolute(paths: Sequence[Sequence[Path]]) -> tuple[tuple[Path, ...], ...]:

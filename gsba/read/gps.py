@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from gsba.log import GsbaError
+from gsba.log import GsbaError, brief
 from gsba.read.times import read_lines, seconds, stem_of
 
 _A, _F = 6_378_137.0, 1 / 298.257223563  # WGS 84: half axis in metres, flattening
@@ -49,7 +49,7 @@ def read_gps(path: Path) -> GpsFixes:
         raise GsbaError(f"{path}: holds no positions")
     if lines[0][1].startswith("<"):
         return _read_gpx(path)
-    header = [cell.strip().lower() for cell in next(csv.reader([lines[0][1]]))]
+    header = [cell.lower() for cell in _cells(path, *lines[0])]
     where = {
         key: next(header.index(name) for name in names if name in header)
         for key, names in _COLUMNS.items()
@@ -61,7 +61,7 @@ def read_gps(path: Path) -> GpsFixes:
         raise GsbaError(f"{path}: says neither frame nor time of its positions; {_WANT}")
     names, times, fixes = [], [], []
     for number, line in lines[1:]:
-        cells = [cell.strip() for cell in next(csv.reader([line]))]
+        cells = _cells(path, number, line)
         if len(cells) != len(header):
             raise GsbaError(f"{path}:{number}: {len(cells)} cells under {len(header)} columns")
         place = f"{path}:{number}"
@@ -79,6 +79,13 @@ def read_gps(path: Path) -> GpsFixes:
     if "name" in where:
         return GpsFixes(tuple(names), None, np.array(fixes))
     return _in_order(path, np.array(times), np.array(fixes))
+
+
+def _cells(path: Path, number: int, line: str) -> list[str]:
+    try:
+        return [cell.strip() for cell in next(csv.reader([line]))]
+    except csv.Error as error:
+        raise GsbaError(f"{path}:{number}: not a row of a CSV table ({error})") from None
 
 
 def local_from_geodetic(geodetic: np.ndarray, origin: np.ndarray) -> np.ndarray:
@@ -105,7 +112,7 @@ def _earth_centred(geodetic: np.ndarray) -> np.ndarray:
 def _read_gpx(path: Path) -> GpsFixes:
     try:
         root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # syntax, encoding
         raise GsbaError(f"{path}: neither a CSV table nor a GPX track ({error})") from None
     times, fixes = [], []
     for number, point in enumerate(root.iterfind(".//{*}trkpt"), 1):
@@ -115,9 +122,9 @@ def _read_gpx(path: Path) -> GpsFixes:
             raise GsbaError(f"{place} has no time")
         try:
             stamp = datetime.fromisoformat(time.strip())
-        except ValueError:
-            raise GsbaError(f"{place}: '{time}' is not a time") from None
-        times.append((stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp())
+            times.append((stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp())
+        except (ValueError, OverflowError):
+            raise GsbaError(f"{place}: '{brief(time)}' is not a time") from None
         values = [_number(point.get(key, ""), key, place) for key in ("lat", "lon")]
         values.append(0.0 if elevation is None else _number(elevation, "ele", place))
         fixes.append(_checked(values, place))
@@ -141,7 +148,7 @@ def _number(text: str, what: str, place: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise GsbaError(f"{place}: {what} '{text}' is not a number")
+        raise GsbaError(f"{place}: {what} '{brief(text)}' is not a number")
     return value
 
 

@@ -1,7 +1,6 @@
 """Times of frames and poses: tables on disk, frame rates, file names."""
 
 import logging
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.log import GsbaError
+from gsba.log import GsbaError, brief
 from gsba.read.images import IMAGE_SUFFIXES
 
 _log = logging.getLogger(__name__)
@@ -18,8 +17,14 @@ _log = logging.getLogger(__name__)
 _UNIX_RANGE_S = (1_000_000_000, 4_102_444_800)
 _TICKS = {"seconds": 1, "milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}
 
+_LATEST_S = 1e20  # even nanoseconds since 1970 taken for seconds are earlier
+_RATES = (1e-6, 1e6)  # frames per second that --fps may be
 _MIN_INTERVAL_S = 1e-3  # frame intervals shorter than this are not times but numbering
 _HOW = "pass --timestamps FILE or --fps F, or put a timestamps.csv (name,timestamp) beside them"
+
+
+class NoTimesError(GsbaError):
+    """Nothing says when frames were taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +43,8 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
         GsbaError: missing, unreadable or not text.
     """
     try:
+        if path.is_dir() or path.is_char_device() or path.is_block_device():
+            raise GsbaError(f"{path}: is a folder or a device; give a text file")
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
@@ -51,11 +58,11 @@ def seconds(text: str) -> float:
     """Seconds written as a decimal number, or as Unix time in whole ms, us or ns.
 
     Raises:
-        ValueError: not a finite number.
+        ValueError: not a finite number, or none that a clock could show.
     """
     unit = unix_unit(text)
     value = int(text) / _TICKS[unit] if unit else float(text)
-    if not math.isfinite(value):
+    if not abs(value) <= _LATEST_S:
         raise ValueError(text)
     return value
 
@@ -98,7 +105,7 @@ def read_times(path: Path) -> list[TimeRow]:
             raise GsbaError(f"{path}:{number}: {len(cells)} columns where others have {columns}")
         name, time = (cells[-1], cells[0]) if time_first else (cells[0], cells[-1])
         if not _is_seconds(time):
-            raise GsbaError(f"{path}:{number}: '{time}' is not a time in seconds")
+            raise GsbaError(f"{path}:{number}: '{brief(time)}' is not a time in seconds")
         table.append(TimeRow(number, name if columns == 2 else None, seconds(time)))
     return table
 
@@ -111,16 +118,19 @@ def _is_seconds(text: str) -> bool:
     return True
 
 
-def frame_times(names: Sequence[str], table: Path | None, fps: float | None) -> np.ndarray:
+def frame_times(
+    names: Sequence[str], table: Path | None, fps: float | None, order_suffices: bool = False
+) -> tuple[np.ndarray, bool]:
     """Time of each frame from a table, a rate, or the names themselves.
 
     Args:
         names: (F,) frame names without extension, in name order.
         table: file that `read_times` understands; a plain list is in name order.
         fps: frames per second of these very frames: frame i is at i / fps.
+        order_suffices: where nothing gives times, name order stands in for them.
 
     Returns:
-        (F,) float64 seconds, not necessarily sorted.
+        (F,) float64 seconds, not necessarily sorted, and whether they are times.
 
     Raises:
         GsbaError: a frame without a time, or times that would have to be guessed.
@@ -128,11 +138,30 @@ def frame_times(names: Sequence[str], table: Path | None, fps: float | None) -> 
     if table is not None:
         rows = read_times(table)
         if rows[0].name is None:
-            return _times_from_list(names, table, rows)
-        return _times_by_name(names, table, rows)
-    if fps is not None:
-        return _times_at_rate(names, fps)
-    return _times_from_names(names)
+            return _times_from_list(names, table, rows), True
+        return _times_by_name(names, table, rows), True
+    try:
+        given = _times_from_names(names) if fps is None else _times_at_rate(names, check_fps(fps))
+    except NoTimesError as error:
+        if not order_suffices:
+            raise
+        _log.info("frames are taken in the order of their names (%s)", error)
+        return np.arange(len(names)) / (fps or 1.0), False
+    return given, True
+
+
+def check_fps(fps: float) -> float:
+    """A rate that was asked for, if it is one.
+
+    Raises:
+        GsbaError: not positive, or so small or large that no camera has it.
+    """
+    if not _RATES[0] <= fps <= _RATES[1]:
+        raise GsbaError(
+            f"--fps {fps}: must be a positive number of frames per second, from {_RATES[0]:g} to "
+            f"{_RATES[1]:g}"
+        )
+    return fps
 
 
 def _times_from_list(names: Sequence[str], path: Path, rows: list[TimeRow]) -> np.ndarray:
@@ -168,14 +197,12 @@ def stem_of(name: str) -> str:
 
 
 def _times_at_rate(names: Sequence[str], fps: float) -> np.ndarray:
-    if not (math.isfinite(fps) and fps > 0):
-        raise GsbaError(f"--fps {fps}: must be a positive number of frames per second")
     counters = [int(m[0]) for name in names if (m := re.search(r"[0-9]{1,18}$", name))]
     steps = np.diff(counters)
     skips = np.flatnonzero(steps != np.median(steps)) if len(counters) == len(names) else []
     if 0 < len(skips) <= len(steps) / 2:  # mostly even: counters with holes
         before, after = names[skips[0]], names[skips[0] + 1]
-        raise GsbaError(
+        raise NoTimesError(
             f"frame numbers skip between '{before}' and '{after}', so --fps alone does not say "
             "when frames were taken; pass --timestamps FILE"
         )
@@ -187,7 +214,7 @@ def _times_from_names(names: Sequence[str]) -> np.ndarray:
     if all(re.fullmatch(r"[0-9]+\.[0-9]+", name) for name in names):
         times = np.array([float(name) for name in names])
         if np.median(np.diff(np.sort(times))) < _MIN_INTERVAL_S:
-            raise GsbaError(f"names like '{names[0]}' are too close to be seconds; {_HOW}")
+            raise NoTimesError(f"names like '{names[0]}' are too close to be seconds; {_HOW}")
         _log.info("frame times are the file names, in seconds")
         return times
     split = [re.fullmatch(r"(.*?)([0-9]+)", name) for name in names]
@@ -197,4 +224,4 @@ def _times_from_names(names: Sequence[str]) -> np.ndarray:
     if len(found) == len(names) and len(prefixes) == 1 and len(units) == 1 and None not in units:
         _log.info("frame times are the file names, Unix time in %s", units.pop())
         return np.array([seconds(digits) for _, digits in found])
-    raise GsbaError(f"nothing says when the frames ('{names[0]}', ...) were taken; {_HOW}")
+    raise NoTimesError(f"nothing says when the frames ('{names[0]}', ...) were taken; {_HOW}")

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsba.geometry import inverse, pose, quaternion_from_rotation, rotation_from_quaternion
-from gsba.log import GsbaError
+from gsba.log import GsbaError, brief
 from gsba.read.times import read_lines, read_times, seconds
 from gsba.types import Trajectory
 
 if TYPE_CHECKING:
     import msgpack
 
+_FURTHEST = 1e12  # from the origin, in any unit: beyond, differences are lost
 _UNIT_TOLERANCE = 1e-3  # how far a quaternion or rotation may be from unit before it is refused
 
 
@@ -173,7 +174,7 @@ def _number(text: str, where: str, parse: Callable[[str], float] = float) -> flo
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise GsbaError(f"{where}: '{text}' is not a finite number")
+        raise GsbaError(f"{where}: '{brief(text)}' is not a finite number")
     return value
 
 
@@ -193,6 +194,9 @@ def _trajectory(
 ) -> Trajectory:
     if len(times) < 2:
         raise GsbaError(f"{path}: {len(times)} poses; at least 2 are needed")
+    far = np.flatnonzero(np.abs(world_T_rigs[:, :3, 3]).max(axis=1) > _FURTHEST)
+    if len(far):
+        raise GsbaError(f"{where[far[0]]}: a position further than {_FURTHEST:g} from the origin")
     late = np.flatnonzero(np.diff(times) <= 0)
     if len(late):
         before, after = float(times[late[0]]), float(times[late[0] + 1])

@@ -67,6 +67,8 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
     trajectory = None if settings.at is None else Path(settings.at)
     if settings.at is not None and settings.sharpest:
         raise GsbaError("--at names the very frames to keep: leave out --sharpest")
+    if video.is_dir():
+        raise GsbaError(f"{video}: is a folder; give a video (frames need no extraction)")
     if not video.is_file():
         raise GsbaError(f"{video}: no such file")
     key = digest(__version__, settings, fingerprint([video, trajectory]))
