@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from gsba.log import GsbaError
 from gsba.read import load_erp, load_faces, load_mask, scan
@@ -222,7 +223,7 @@ def test_frame_that_vanishes_or_breaks_after_the_scan(folder: Path) -> None:
     with pytest.raises(GsbaError, match=r"0000.jpg: cannot be read"):
         load_erp(frames, 0)
     (folder / "0001.jpg").write_bytes(b"\xff\xd8 nothing \xff\xd9")
-    with pytest.raises(GsbaError, match=r"0001.jpg: cannot be decoded"):
+    with pytest.raises(GsbaError, match=r"0001.jpg: truncated or damaged"):
         load_erp(frames, 1)
     write_image(folder / "0002.jpg", 128, 64)
     with pytest.raises(GsbaError, match=r"0002.jpg: is 128x64, was 64x32"):
@@ -401,3 +402,90 @@ def test_masks_of_cube_frames_are_panoramas_of_any_size(tmp_path: Path) -> None:
     square = write_mask(tmp_path / "square.png", 32, 32)
     with pytest.raises(GsbaError, match=r"equirectangular, 2:1"):
         scan(tmp_path / "cube", fps=1, masks=square)
+
+
+def _textured(path: Path) -> bytes:
+    """A JPEG whose pixels take some kilobytes."""
+    pixels = np.random.default_rng(0).integers(0, 255, (64, 128, 3)).astype(np.uint8)
+    assert cv2.imwrite(str(path), pixels)
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("damage", ["zeros", "noise", "cut"])
+@pytest.mark.parametrize("width", [None, 64])
+def test_a_jpeg_destroyed_in_its_middle_is_named(
+    tmp_path: Path, damage: str, width: int | None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for i in range(3):
+        whole = _textured(tmp_path / f"{i}.jpg")
+    middle = len(whole) // 2
+    instead = {"zeros": bytes(500), "noise": np.random.default_rng(1).bytes(500), "cut": b""}
+    (tmp_path / "1.jpg").write_bytes(whole[:middle] + instead[damage] + whole[middle + 500 :])
+    frames = scan(tmp_path, fps=1)
+    assert load_erp(frames, 0, width=width).std() > 20
+    for gray in (False, True):
+        with pytest.raises(GsbaError, match=r"1\.jpg: damaged \(.+\); copy or extract it again"):
+            load_erp(frames, 1, gray, width)
+    assert capfd.readouterr().err == ""  # no word of the decoder's without a name
+
+
+@pytest.mark.parametrize("fill", [b"\0", b"\xff"])
+def test_bytes_that_fill_a_jpeg_up_are_no_damage(tmp_path: Path, fill: bytes) -> None:
+    for i in range(3):
+        whole = _textured(tmp_path / f"{i}.jpg")
+    (tmp_path / "1.jpg").write_bytes(whole[:-2] + 40 * fill + whole[-2:])
+    frames = scan(tmp_path, fps=1)
+    np.testing.assert_array_equal(load_erp(frames, 1), load_erp(frames, 0))
+
+
+def test_jpegs_of_printing_inks_and_of_one_channel(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 255, (64, 128, 3)).astype(np.uint8)
+    for i, mode in enumerate(("RGB", "CMYK", "L")):
+        Image.fromarray(pixels // 8 + 100).convert(mode).save(tmp_path / f"{i}.jpg", quality=95)
+    frames = scan(tmp_path, fps=1)
+    first, *others = (load_erp(frames, f) for f in range(3))
+    for other in others:
+        assert other.shape == first.shape
+        assert abs(other.mean() - first.mean()) < 10
+
+
+def test_too_many_pixels_are_refused_by_the_header(tmp_path: Path) -> None:
+    header = b"\0\0\0\rIHDR" + (40000).to_bytes(4, "big") + (20000).to_bytes(4, "big")
+    png = b"\x89PNG\r\n\x1a\n" + header + b"\x08\x02\0\0\0" + bytes(30) + b"\0\0\0\0IEND\xaeB`\x82"
+    for i in range(3):
+        (tmp_path / f"{i}.png").write_bytes(png)
+    with pytest.raises(GsbaError, match=r"0\.png: is 40000x20000, 800 megapixels; 268 are read"):
+        scan(tmp_path, fps=1)
+
+
+def test_a_picture_that_grew_is_refused_before_it_is_decoded(folder: Path) -> None:
+    frames = scan(folder, fps=1)
+    write_image(folder / "0001.jpg", 128, 64)
+    with pytest.raises(GsbaError, match=r"0001\.jpg: is 128x64, was 64x32 when the run began"):
+        load_erp(frames, 1)
+
+
+def test_pictures_of_other_kinds_are_counted(folder: Path, caplog) -> None:
+    for name in ("a.webp", "b.WebP", "c.tiff", "d.tif", "e.heic", "notes.txt"):
+        (folder / name).write_bytes(b"x")
+    assert len(scan(folder, fps=10)) == 4
+    (record,) = [
+        one for one in caplog.records if one.levelname == "WARNING" and "WebP" in one.message
+    ]
+    assert "1 HEIC, 2 TIFF and 2 WebP images" in record.message
+
+
+def test_pictures_of_other_kinds_alone_are_named(tmp_path: Path) -> None:
+    for name in ("a.webp", "b.webp", "notes.txt"):
+        (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(GsbaError, match=r"no JPEG or PNG images, but 2 WebP images: convert them"):
+        scan(tmp_path, fps=1)
+    for face in FACES:
+        (tmp_path / "faces" / face).mkdir(parents=True)
+        (tmp_path / "faces" / face / "a.tif").write_bytes(b"x")
+    with pytest.raises(GsbaError, match=r"but 6 TIFF images"):
+        scan(tmp_path / "faces", fps=1)
+    (tmp_path / "videos").mkdir()
+    (tmp_path / "videos" / "walk.mp4").write_bytes(b"x")
+    with pytest.raises(GsbaError, match=r"no JPEG or PNG images \(it holds 1 \.mp4\); extract"):
+        scan(tmp_path / "videos", fps=1)

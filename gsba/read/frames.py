@@ -3,7 +3,8 @@
 import logging
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,6 +22,20 @@ _log = logging.getLogger(__name__)
 MIN_FRAMES = 3
 _SIDES = ("front", "right", "back", "left")
 _TIMES_FILE = "timestamps.csv"
+_FOREIGN = {  # images that are not read, by suffix
+    ".avif": "AVIF",
+    ".bmp": "BMP",
+    ".dng": "DNG",
+    ".exr": "EXR",
+    ".heic": "HEIC",
+    ".heif": "HEIF",
+    ".insp": "INSP",
+    ".jp2": "JPEG 2000",
+    ".jxl": "JPEG XL",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".webp": "WebP",
+}
 
 
 def scan(
@@ -171,6 +186,10 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
     others = [name for name in others if name != _TIMES_FILE]
     if others:
         _log.info("%s: ignored %d other entries: %s", folder, len(others), ", ".join(others[:5]))
+    places = [folder, *(path for path in entries if path.name.lower() in FACES and path.is_dir())]
+    foreign = _foreign(path for place in places for path in _entries(place))
+    if foreign and (subfolders or images):
+        _log.warning("%s: left out %s: convert them to JPEG or PNG", folder, foreign)
     if subfolders:
         by_face = {
             face: _by_name(folder, filter(is_image, _entries(subfolders[face])))
@@ -178,8 +197,15 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
             if face in subfolders
         }
         return "cube", *_cube_frames(folder, by_face)
+    if not images and foreign:
+        raise GsbaError(f"{folder}: no JPEG or PNG images, but {foreign}: convert them first")
     if not images:
-        raise GsbaError(f"{folder}: no JPEG or PNG images; extract the video's frames there first")
+        counts = Counter(Path(name).suffix.lower() or Path(name).name for name in others)
+        held = ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items())[:5]) or "nothing"
+        raise GsbaError(
+            f"{folder}: no JPEG or PNG images (it holds {held}); extract the video's frames there "
+            "first"
+        )
     tagged = {path: m for path in images if (m := re.fullmatch(_TAGGED, path.stem))}
     tags = {match["face"].lower() for match in tagged.values()}
     if not tags.issuperset(_SIDES) and len(tagged) < len(images):
@@ -197,6 +223,15 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
 
 
 _TAGGED = re.compile(rf"(?P<name>.+)_(?P<face>{'|'.join(FACES)})", re.IGNORECASE)
+
+
+def _foreign(paths: Iterable[Path]) -> str:
+    """How many images of which formats that are not read: "2 TIFF and 1 WebP images", or ""."""
+    kinds = [_FOREIGN.get(path.suffix.lower()) for path in paths if path.name[0] != "."]
+    counts = sorted(Counter(kind for kind in kinds if kind).items())
+    *front, last = [f"{n} {kind}" for kind, n in counts] or [""]
+    text = f"{', '.join(front)} and {last}" if front else last
+    return text and f"{text} image{'s' if sum(n for _, n in counts) > 1 else ''}"
 
 
 def _entries(folder: Path) -> list[Path]:
