@@ -8,7 +8,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from export_scene import COLORS, NUM_FRAMES, POINTS, panoramas, reconstruction
+from export_scene import COLORS, NUM_FRAMES, POINTS, cube_frames, panoramas, reconstruction
 from plyfile import PlyData
 
 from gsba.export import ExportFormat, export, write_points
@@ -64,12 +64,38 @@ def test_jpeg_frames_give_jpeg_faces_and_panoramas_are_not_encoded_again(tmp_pat
     assert not (tmp_path / "faces" / "masks").exists()
 
 
+def test_who_edits_an_export_does_not_edit_the_frames(tmp_path, frames):
+    before = [path.read_bytes() for (path,) in frames.paths]
+    export(reconstruction(), frames, tmp_path / "out", ExportFormat.COLMAP_ERP)
+    for (path,), content in zip(frames.paths, before, strict=True):
+        copied = tmp_path / "out" / "images" / path.name
+        assert copied.read_bytes() == content and not copied.samefile(path)
+        with copied.open("r+b") as file:
+            file.write(b"edited")
+        assert path.read_bytes() == content
+
+
+def test_faces_that_leave_unchanged_are_copies(tmp_path):
+    images = cube_frames(tmp_path / "frames")
+    export(reconstruction(), images, tmp_path / "out", ExportFormat.COLMAP)
+    faces = [*(tmp_path / "out" / "images").rglob("*.png")]
+    assert len(faces) == sum(map(len, images.paths)) and all(
+        path.stat().st_nlink == 1 for path in faces
+    )
+
+
+def test_links_are_made_on_request(tmp_path, frames):
+    export(reconstruction(), frames, tmp_path / "out", ExportFormat.COLMAP_ERP, link=True)
+    for (path,) in frames.paths:
+        assert (tmp_path / "out" / "images" / path.name).samefile(path)
+
+
 def test_panoramas_are_copied_where_they_cannot_be_linked(tmp_path, frames, monkeypatch):
     def refuse(*_):
         raise OSError(errno.EXDEV, "other file system")
 
     monkeypatch.setattr(os, "link", refuse)
-    export(reconstruction(), frames, tmp_path / "out", ExportFormat.COLMAP_ERP)
+    export(reconstruction(), frames, tmp_path / "out", ExportFormat.COLMAP_ERP, link=True)
     for (path,) in frames.paths:
         copied = tmp_path / "out" / "images" / path.name
         assert copied.read_bytes() == path.read_bytes() and not copied.is_symlink()

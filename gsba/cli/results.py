@@ -53,6 +53,9 @@ def export(
     align: Annotated[
         str | None, typer.Option(help="True poses: their world and unit.", metavar="TRUTH.tum")
     ] = None,
+    link: Annotated[
+        bool, typer.Option("--link", help="Hard links to unchanged frames, not copies.")
+    ] = False,
 ) -> None:
     """Write a finished run as a dataset for another program, placed where you want it."""
     from gsba.config_file import validated
@@ -70,7 +73,7 @@ def export(
     reconstruction, frames, *_ = load_run(run)
     folder = out or run / to
     placement = place(reconstruction, frames, settings)
-    write(reconstruction, frames, folder, ExportFormat(to), face_size, placement)
+    write(reconstruction, frames, folder, ExportFormat(to), face_size, placement, link)
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
     typer.echo(f"{to}: {folder}")

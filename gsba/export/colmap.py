@@ -41,7 +41,11 @@ class Sensors:
 
 
 def write_colmap(
-    partial: Path, reconstruction: Reconstruction, frames: FrameSet, face_size: int | None
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    face_size: int | None,
+    link: bool = False,
 ) -> None:
     """Write the rig layout into `partial`."""
     size, faces = face_size_for(frames, face_size), frames.faces or FACES
@@ -50,11 +54,15 @@ def write_colmap(
     write_model(partial / "sparse" / "0", reconstruction, sensors, names)
     text = json.dumps(_rig_config(sensors, faces), indent=1) + "\n"
     (partial / "rig_config.json").write_text(text)
-    _write_named_faces(partial, frames, size, names)
+    _write_named_faces(partial, frames, size, names, link)
 
 
 def write_colmap_flat(
-    partial: Path, reconstruction: Reconstruction, frames: FrameSet, face_size: int | None
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    face_size: int | None,
+    link: bool = False,
 ) -> None:
     """Write the layout with unique base names into `partial`."""
     size, faces = face_size_for(frames, face_size), frames.faces or FACES
@@ -69,10 +77,12 @@ def write_colmap_flat(
     )
     held_out = [name for of_frame in names[::TEST_EVERY] for name in of_frame]
     (model / "test.txt").write_text("\n".join(held_out) + "\n")
-    _write_named_faces(partial, frames, size, names)
+    _write_named_faces(partial, frames, size, names, link)
 
 
-def write_colmap_erp(partial: Path, reconstruction: Reconstruction, frames: FrameSet) -> None:
+def write_colmap_erp(
+    partial: Path, reconstruction: Reconstruction, frames: FrameSet, link: bool = False
+) -> None:
     """Write the equirectangular layout into `partial`."""
     if frames.layout != "erp":
         raise GsbaError("colmap-erp needs panoramas, these frames are cube faces: use colmap")
@@ -84,6 +94,7 @@ def write_colmap_erp(partial: Path, reconstruction: Reconstruction, frames: Fram
         frames,
         lambda f: partial / "images" / names[f],
         lambda f: partial / "masks" / f"{names[f]}.png",
+        link,
     )
 
 
@@ -212,11 +223,14 @@ def _file(frames: FrameSet, f: int) -> str:
     return f"{frames.names[f]}{suffix_of(frames, f)}"
 
 
-def _write_named_faces(partial: Path, frames: FrameSet, size: int, names: list[list[str]]) -> None:
+def _write_named_faces(
+    partial: Path, frames: FrameSet, size: int, names: list[list[str]], link: bool
+) -> None:
     faces = frames.faces or FACES
     write_faces(
         frames,
         size,
         lambda f, face: partial / "images" / names[f][faces.index(face)],
         lambda f, face: partial / "masks" / f"{names[f][faces.index(face)]}.png",
+        link,
     )

@@ -31,6 +31,7 @@ def export(
     to: ExportFormat,
     face_size: int | None = None,
     placement: Placement | None = None,
+    link: bool = False,
 ) -> None:
     """Write a reconstruction in another program's format, all frames of it.
 
@@ -42,6 +43,8 @@ def export(
         to: the format.
         face_size: pixels of a cube face; None = see `gsba.export.images.face_size_for`.
         placement: where to put the world; None = where the run has it. `transform.json` states it.
+        link: hard links to the frames where these leave unchanged, not copies: who edits one edits
+            the other.
 
     Raises:
         GsbaError: `out` is in use, the format does not fit the frames, or the disk refuses;
@@ -57,7 +60,7 @@ def export(
     placement = placement or Placement()
     reconstruction = placement.apply(reconstruction)
     with output_folder(out, to.value) as partial:
-        _write(partial, reconstruction, frames, to, face_size, placement.up == "z")
+        _write(partial, reconstruction, frames, to, face_size, placement.up == "z", link)
         placement.write(partial / "transform.json")
     logger.info(
         "%s: %d frames, %d points, in %s", to, len(frames), len(reconstruction.points_world), out
@@ -71,18 +74,19 @@ def _write(
     to: ExportFormat,
     face_size: int | None,
     z_up: bool,
+    link: bool,
 ) -> None:
     from gsba.export import colmap, nerfstudio, ply
 
     match to:
         case ExportFormat.COLMAP:
-            colmap.write_colmap(partial, reconstruction, frames, face_size)
+            colmap.write_colmap(partial, reconstruction, frames, face_size, link)
         case ExportFormat.COLMAP_FLAT:
-            colmap.write_colmap_flat(partial, reconstruction, frames, face_size)
+            colmap.write_colmap_flat(partial, reconstruction, frames, face_size, link)
         case ExportFormat.COLMAP_ERP:
-            colmap.write_colmap_erp(partial, reconstruction, frames)
+            colmap.write_colmap_erp(partial, reconstruction, frames, link)
         case ExportFormat.NERFSTUDIO:
-            nerfstudio.write_nerfstudio(partial, reconstruction, frames, face_size, z_up)
+            nerfstudio.write_nerfstudio(partial, reconstruction, frames, face_size, z_up, link)
         case ExportFormat.PLY:
             ply.write_splat_points(
                 partial / "points3D.ply", reconstruction.points_world, reconstruction.point_colors

@@ -2,14 +2,17 @@
 
 Faces are cut with bicubic sampling, low-passed first where they are much coarser than the
 panorama. They are written as PNG where the frame is PNG, else as JPEG of quality 95. Images that
-leave unchanged (panoramas; faces that came as faces of the same size) are hard links where the
-file system allows it, else copies, so that an export stays whole when it is moved.
+leave unchanged (panoramas; faces that came as faces of the same size) are copies, which share their
+place on disk with the original where the file system can (reflinks): an export may be moved and
+edited. On request they are hard links: then an edit of one is an edit of the other.
 """
 
+import fcntl
 import os
 import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +24,7 @@ from gsba.types import FACES, FrameSet
 
 JPEG_QUALITY = 95
 MIN_FACE_SIZE = 16  # pixels
+_FICLONE = 0x40049409  # of Linux: a file that shares another's blocks until one is written to
 _AT_ONCE = 4  # frames at most: an 8K panorama and its faces take 250 MB
 
 
@@ -54,6 +58,7 @@ def write_faces(
     size: int,
     image_path: Callable[[int, str], Path],
     mask_path: Callable[[int, str], Path],
+    link: bool = False,
 ) -> None:
     """Write every face of every frame, and its mask where the frames have masks.
 
@@ -62,6 +67,7 @@ def write_faces(
         size: pixels of a face; its field of view is 90 degrees.
         image_path: file of the image, by frame index and face name.
         mask_path: file of the mask (PNG, 0 = ignore, 255 = use).
+        link: hard links to images that leave unchanged.
     """
     rig, faces = CubeRig(size, np.pi / 2), frames.faces or FACES
 
@@ -76,7 +82,7 @@ def write_faces(
             for source, path in zip(frames.paths[f], paths, strict=True)
         ):
             for source, path in zip(frames.paths[f], paths, strict=True):
-                link_or_copy(source, path)
+                _pass_on(source, path, link)
         else:
             _write_all(paths, _resized(load_faces(frames, f), size))
         if has_masks(frames):
@@ -92,9 +98,12 @@ def write_faces(
 
 
 def write_panoramas(
-    frames: FrameSet, image_path: Callable[[int], Path], mask_path: Callable[[int], Path]
+    frames: FrameSet,
+    image_path: Callable[[int], Path],
+    mask_path: Callable[[int], Path],
+    link: bool = False,
 ) -> None:
-    """Link or copy every panorama, and write its mask where the frames have masks.
+    """Copy every panorama, and write its mask where the frames have masks.
 
     Panoramas that are corrected are written anew.
 
@@ -102,12 +111,13 @@ def write_panoramas(
         frames: panoramas.
         image_path: file of the image, by frame index.
         mask_path: file of the mask (PNG, 0 = ignore, 255 = use).
+        link: hard links instead of copies.
     """
     for f in track(range(len(frames)), "copying panoramas"):
         if frames.correction:
             write_image(image_path(f), load_erp(frames, f))
         else:
-            link_or_copy(frames.paths[f][0], image_path(f))
+            _pass_on(frames.paths[f][0], image_path(f), link)
         if has_masks(frames):
             mask = load_mask(frames, f)
             if mask is None:
@@ -115,19 +125,19 @@ def write_panoramas(
             write_image(mask_path(f), mask.astype(np.uint8) * 255)
 
 
-def link_or_copy(source: Path, path: Path) -> None:
-    """Give `path` the content of `source`, without a second copy on disk where that is possible.
-
-    Raises:
-        GsbaError: `source` is gone.
-    """
+def _pass_on(source: Path, path: Path, link: bool) -> None:
+    """Give `path` the content of `source`; without a second one on disk where that can be."""
     if not source.is_file():
         raise GsbaError(f"{source}: is gone; it was there when the run began")
     path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(source.resolve(), path)
-    except OSError:
-        shutil.copyfile(source, path)
+    if link:
+        with suppress(OSError):  # another file system
+            os.link(source.resolve(), path)
+            return
+    with suppress(OSError), source.open("rb") as original, path.open("wb") as clone:
+        fcntl.ioctl(clone, _FICLONE, original.fileno())
+        return
+    shutil.copyfile(source, path)
 
 
 def write_image(path: Path, image: np.ndarray) -> None:

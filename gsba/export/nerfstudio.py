@@ -37,6 +37,7 @@ def write_nerfstudio(
     frames: FrameSet,
     face_size: int | None,
     z_up: bool = False,
+    link: bool = False,
 ) -> None:
     """Write faces, cloud and transforms.json into `partial`; for panoramas the ERP variant too.
 
@@ -46,9 +47,9 @@ def write_nerfstudio(
     points = reconstruction.points_world @ out_R_world.T
     write_splat_points(partial / _CLOUD, points, reconstruction.point_colors)
     size = face_size_for(frames, face_size)
-    _write_face_dataset(partial, reconstruction, frames, size, out_R_world)
+    _write_face_dataset(partial, reconstruction, frames, size, out_R_world, link)
     if frames.layout == "erp":
-        _write_erp_dataset(partial, reconstruction, frames, out_R_world)
+        _write_erp_dataset(partial, reconstruction, frames, out_R_world, link)
 
 
 def _write_face_dataset(
@@ -57,6 +58,7 @@ def _write_face_dataset(
     frames: FrameSet,
     size: int,
     out_R_world: np.ndarray,
+    link: bool,
 ) -> None:
     def image(f: int, face: str) -> str:
         return f"images/{frames.names[f]}_{face}{suffix_of(frames, f)}"
@@ -81,11 +83,16 @@ def _write_face_dataset(
         size,
         lambda f, face: partial / image(f, face),
         lambda f, face: partial / mask(f, face),
+        link,
     )
 
 
 def _write_erp_dataset(
-    partial: Path, reconstruction: Reconstruction, frames: FrameSet, out_R_world: np.ndarray
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    out_R_world: np.ndarray,
+    link: bool,
 ) -> None:
     def image(f: int) -> str:
         return f"images_erp/{frames.names[f]}{frames.paths[f][0].suffix}"
@@ -103,7 +110,7 @@ def _write_erp_dataset(
             entry["mask_path"] = mask(f)
         entries.append(entry)
     _write_transforms(partial / "transforms_erp.json", camera, entries, len(entries), out_R_world)
-    write_panoramas(frames, lambda f: partial / image(f), lambda f: partial / mask(f))
+    write_panoramas(frames, lambda f: partial / image(f), lambda f: partial / mask(f), link)
 
 
 def _entry(
