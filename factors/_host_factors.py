@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
-from numba import njit
 
 from factors._kernels import eliminate_range, polish_range
 from factors._terms import pose_rows
+from factors.compiled import kernel_and_part
 
 if TYPE_CHECKING:
     from factors.landmarks import LandmarkBlock
 
+_kernel, _ = kernel_and_part()
 _POLISH_TOLERANCE = 1e-12  # of a landmark's cost
 _POLISH_STEPS = 50  # at each evaluation, so that the error is a function of the poses alone
 
@@ -89,7 +90,7 @@ def _host_factor(block: LandmarkBlock, first: int, last: int) -> gtsam.CustomFac
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6 * num + 1), keys, error)
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def _square_root(H, gradient):
     """Upper R with R^T R = H in place, from H's upper triangle, and e with R^T e = gradient.
 

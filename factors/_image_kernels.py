@@ -6,12 +6,13 @@ function it calls from another file does. Images are spline coefficients (H, 2H)
 """
 
 import numpy as np
-from numba import njit
+
+from factors.compiled import kernel_and_part
 
 _POLE = np.sqrt(3.0) - 2.0  # of the cubic B-spline's inverse filter
 _TERMS = 16  # of its geometric series: the rest is below float32's resolution
 
-_kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 
 
 @_kernel
@@ -62,7 +63,7 @@ def filter_columns(image):
             image[k, c] = pole * (image[k + 1, c] - image[k, c])
 
 
-@_kernel
+@_part
 def erp_pixel(x, y, z, width, height):
     """Pixel (u, v) of a vector, u in [0, width]."""
     u = width * (np.arctan2(x, z) / (2 * np.pi) + 0.5)
@@ -70,7 +71,7 @@ def erp_pixel(x, y, z, width, height):
     return u, v
 
 
-@_kernel
+@_part
 def _weights(t):
     """Cubic B-spline weights of the four samples around a place t in [0, 1) after the second."""
     s = np.float32(1.0) - t
@@ -80,7 +81,7 @@ def _weights(t):
     return w0, w1, np.float32(1.0) - w0 - w1 - w3, w3
 
 
-@_kernel
+@_part
 def _slopes(t):
     """Derivatives of `_weights` by t."""
     s = np.float32(1.0) - t
@@ -89,7 +90,7 @@ def _slopes(t):
     return -half * s * s, d1, half * s * s - d1 - half * t * t, half * t * t
 
 
-@_kernel
+@_part
 def _tap(coefficients, row, column):
     """Coefficient at any row and column: round the seam, and over the poles."""
     height, width = coefficients.shape
@@ -100,7 +101,7 @@ def _tap(coefficients, row, column):
     return coefficients[row, column % width]
 
 
-@_kernel
+@_part
 def sample_gradient(coefficients, u, v):
     """Value at pixel (u, v) and its derivatives by u and v."""
     u, v = u - 0.5, v - 0.5

@@ -7,16 +7,16 @@ changes, not when a function it calls from another file does.
 """
 
 import numpy as np
-from numba import njit
 
 from factors._observations import BEARING, MIN_DEPTH
+from factors.compiled import kernel_and_part
 
 _EPS = 1e-300  # guards divisions by a squared norm
 
-_kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
 
 
-@_kernel
+@_part
 def rho_and_weight(code, scale, squared):
     """Loss rho(s), near zero s / 2 as in GTSAM, and weight 2 rho'(s) of s = |residual|^2."""
     c2 = scale * scale
@@ -31,7 +31,7 @@ def rho_and_weight(code, scale, squared):
     return 0.5 * squared, 1.0
 
 
-@_kernel
+@_part
 def tangent_axes(mx, my, mz):
     """Rows of factors.bearing.tangent_basis at a unit vector."""
     sign = 1.0 if mz >= 0 else -1.0
@@ -40,7 +40,7 @@ def tangent_axes(mx, my, mz):
     return 1.0 + sign * mx * mx * a, sign * b, -sign * mx, b, sign + my * my * a, -my
 
 
-@_kernel
+@_part
 def _log_map(x, y, z):
     """Tangent vector at +z pointing to (x, y, z), its length the angle, and its Jacobian.
 
@@ -65,7 +65,7 @@ def _log_map(x, y, z):
     return f * x, f * y, f + k * x * x, k * x * y, -x / n2, k * x * y, f + k * y * y, -y / n2
 
 
-@_kernel
+@_part
 def whitened_residual(obs, o, dx, dy, dz):
     """Whitened residual and Jacobian of observation o, its point being at d in the rig frame.
 
@@ -110,7 +110,7 @@ def whitened_residual(obs, o, dx, dy, dz):
     )  # fmt: skip
 
 
-@_kernel
+@_part
 def rig_vector(pose, point):
     """Components of a world point seen from the rig, in the rig frame: world_R_rig^T (X - t)."""
     x, y, z = point[0] - pose[9], point[1] - pose[10], point[2] - pose[11]
@@ -121,7 +121,7 @@ def rig_vector(pose, point):
     )
 
 
-@_kernel
+@_part
 def invert_symmetric(v, damping):
     """Inverse (6 values 00 01 02 11 12 22) of a symmetric 3x3 given so, damped by its trace.
 
@@ -145,7 +145,7 @@ def invert_symmetric(v, damping):
     )  # fmt: skip
 
 
-@_kernel
+@_part
 def times_symmetric(v, x, y, z):
     """Product of a symmetric 3x3 (6 values) with a vector."""
     return (
@@ -155,7 +155,7 @@ def times_symmetric(v, x, y, z):
     )
 
 
-@_kernel
+@_part
 def _add_normal(normal, pose, a0, a1, a2, b0, b1, b2, r0, r1, w):
     """Add to a landmark's Hessian (6) and gradient (3) in `normal`; returns d r / d X by rows."""
     p0 = a0 * pose[0] + a1 * pose[1] + a2 * pose[2]
@@ -176,7 +176,7 @@ def _add_normal(normal, pose, a0, a1, a2, b0, b1, b2, r0, r1, w):
     return p0, p1, p2, q0, q1, q2
 
 
-@_kernel
+@_part
 def _point_normal(obs, j, point, poses, normal):
     """Cost of landmark j at `point`; its Hessian and gradient go into `normal (9,)`."""
     normal[:] = 0.0
@@ -192,7 +192,7 @@ def _point_normal(obs, j, point, poses, normal):
     return cost
 
 
-@_kernel
+@_part
 def _pose_row(j0, j1, j2, dx, dy, dz, out):
     """Row of d r / d pose from a row of d r / d d: d = world_R_rig^T (X - t), right perturbed."""
     out[0] = j1 * dz - j2 * dy
@@ -203,7 +203,7 @@ def _pose_row(j0, j1, j2, dx, dy, dz, out):
     out[5] = -j2
 
 
-@_kernel
+@_part
 def _reduce(num, seen, W, Y, normal, row_starts, columns, diagonal, off_diagonal, gradient):
     """Take a landmark's Schur complement from the frames that see it; Y is scratch."""
     inverse = invert_symmetric(normal, 0.0)
@@ -277,7 +277,7 @@ def eliminate_range(
         _reduce(num, seen, W, Y, normal, row_starts, columns, diagonal, off_diagonal, gradient)
 
 
-@_kernel
+@_part
 def _substituted_step(obs, j, point, poses, steps, normal):
     """Gauss-Newton step of landmark j, negated, that goes with the pose steps (F, 6)."""
     normal[:] = 0.0

@@ -2,24 +2,23 @@
 
 A patch is a plane piece of scene: the rays origin + spread @ (x, y) of an n x n grid of unit
 spacing, row-major in (x, y), x and y from -reach to reach. Images are spline coefficients
-(H, 2H) float32. All of it is one file, the sampler included, because numba renews a cached kernel
-when its file changes, not when a function it calls from another file does.
+(H, 2H) float32. All of it is one file, the sampler included: see `factors.compiled`.
 """
 
 import numpy as np
-from numba import njit
 
 from factors._patch_records import ALIGNED, FAR, FLAT, MASKED, UNLIKE, UNSTEADY
+from factors.compiled import kernel_and_part
 
 _TRIAL_STEPS = 4  # after which a patch must look somewhat alike to go on
 _NEAR_POLE = 8.0  # half patches from a pole, within which each ray needs its own pixel
 _LEAST_CORNER = 1e-4  # determinant of the shift's information over its trace squared: no edge
 _LEAST_GREY = 1e-3  # variance in grey values squared, below which there is nothing
 
-_kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 
 
-@_kernel
+@_part
 def _ray_pixel(origin, spread, x, y, width, height):
     """Pixel (u, v) of the ray through (x, y) of a plane patch, u in [0, width]."""
     a = origin[0] + spread[0, 0] * x + spread[0, 1] * y
@@ -29,7 +28,7 @@ def _ray_pixel(origin, spread, x, y, width, height):
     return u, height * (0.5 + np.arctan2(b, np.sqrt(a * a + c * c)) / np.pi)
 
 
-@_kernel
+@_part
 def _weights(t):
     """Cubic B-spline weights of the four samples around a place t in [0, 1) after the second."""
     s = np.float32(1.0) - t
@@ -39,7 +38,7 @@ def _weights(t):
     return w0, w1, np.float32(1.0) - w0 - w1 - w3, w3
 
 
-@_kernel
+@_part
 def _tap(coefficients, row, column):
     """Coefficient at any row and column: round the seam, and over the poles."""
     height, width = coefficients.shape
@@ -50,7 +49,7 @@ def _tap(coefficients, row, column):
     return coefficients[row, column % width]
 
 
-@_kernel
+@_part
 def _sample(coefficients, u, v):
     """Value at pixel (u, v); u may lie any number of turns off, v up to a patch off the image."""
     height, width = coefficients.shape
@@ -73,7 +72,7 @@ def _sample(coefficients, u, v):
     return value
 
 
-@_kernel
+@_part
 def _pixel_map(origin, spread, half, width, height, nodes, quadratics):
     """Pixels of the rays origin + spread @ (x, y), |x|, |y| <= half, as biquadratics.
 
@@ -102,11 +101,13 @@ def _pixel_map(origin, spread, half, width, height, nodes, quadratics):
         for i in range(3):
             before, at, after = q[i, 0], q[i, 1], q[i, 2]
             q[i, 0], q[i, 1], q[i, 2] = at, 0.5 * (after - before), 0.5 * (after + before) - at
-    size2 = np.sum(spread * spread)  # two squared steps, at least the square of the longest
+    size2 = 0.0  # two squared steps, at least the square of the longest
+    for i in range(3):
+        size2 += spread[i, 0] ** 2 + spread[i, 1] ** 2
     return origin[0] ** 2 + origin[2] ** 2 > size2 * (_NEAR_POLE * half) ** 2
 
 
-@_kernel
+@_part
 def _sample_grid(coefficients, origin, spread, reach, shift_x, shift_y, nodes, quadratics, out):
     """Values (n * n,) of an n x n grid of unit spacing on the plane patch, off by a shift.
 
@@ -132,7 +133,7 @@ def _sample_grid(coefficients, origin, spread, reach, shift_x, shift_y, nodes, q
             out[i * n + j] = _sample(coefficients, u0 + y * (u1 + y * u2), v0 + y * (v1 + y * v2))
 
 
-@_kernel
+@_part
 def _is_usable(mask, nodes):
     """Whether all nodes of the last patch lie where the mask (H, W) allows; an empty one does."""
     height, width = mask.shape
@@ -144,7 +145,7 @@ def _is_usable(mask, nodes):
     return usable
 
 
-@_kernel
+@_part
 def _statistics(window, values):
     """Weighted mass, mean and sum of squares about the mean."""
     mass = mean = square = 0.0
@@ -157,7 +158,7 @@ def _statistics(window, values):
     return mass, mean, square
 
 
-@_kernel
+@_part
 def _normal_matrix(templates, t, reach, normal):
     """Write the normal matrix (8, 8) of a template; False where a shift is not determined."""
     n = 2 * reach + 1
@@ -221,7 +222,7 @@ def cut_templates(coefficients, mask, rows, origins, spreads, least_contrast, te
             templates.states[t] = FLAT
 
 
-@_kernel
+@_part
 def _gradient(templates, t, reach, values, gain, offset, b):
     """Write the normal equations' right side (8,); returns the residual's weighted square."""
     n = 2 * reach + 1
@@ -246,7 +247,7 @@ def _gradient(templates, t, reach, values, gain, offset, b):
     return cost
 
 
-@_kernel
+@_part
 def _judge(templates, t, values, mean, square, power, mass):
     """ZNCC, and the residual's variance after gain and offset, in the template's grey values."""
     cross = 0.0
@@ -311,7 +312,7 @@ def align_templates(coefficients, mask, rows, sightings, max_shift, steps, toler
         sightings.states[o] = state
 
 
-@_kernel
+@_part
 def _place(sightings, o, origin, spread):
     """Write the plane patch (3,), (3, 2) of a sighting under its warp."""
     warp = sightings.warps[o]
@@ -322,7 +323,7 @@ def _place(sightings, o, origin, spread):
         spread[i, 1] = p * warp[4] + q * (1.0 + warp[5])
 
 
-@_kernel
+@_part
 def _solve(templates, t, warp, b, step):
     """Write the Gauss-Newton step (8,), the affine part being drawn to none."""
     b[2:6] += templates.prior * warp[2:6]
@@ -333,7 +334,7 @@ def _solve(templates, t, warp, b, step):
         step[r] = total
 
 
-@_kernel
+@_part
 def _compose(warp, step):
     """warp := warp after the inverse of the step's warp; False where that has none."""
     a, c, b, d = 1.0 + step[2], step[3], step[4], 1.0 + step[5]

@@ -18,10 +18,11 @@ kernel when its own file changes only.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-_kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-_sums = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+from factors.compiled import kernel_and_part
+
+_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
+_, _sums = kernel_and_part(error_model="numpy", fastmath={"contract", "reassoc"})
 
 CODE_SCALE = 28.0  # steps per grey value: spline coefficients of 8-bit images fit int16
 CODE_ZERO = 127.5  # grey value of code 0
@@ -48,7 +49,7 @@ class PatchData(NamedTuple):
     loss_scale: float  # root mean square of a patch's whitened residuals where it lets go
 
 
-@_kernel
+@_part
 def rho_and_weight(code, scale, squared):
     """Loss rho(s), near zero s / 2 as in GTSAM, and weight 2 rho'(s)."""
     c2 = scale * scale
@@ -63,7 +64,7 @@ def rho_and_weight(code, scale, squared):
     return 0.5 * squared, 1.0
 
 
-@_kernel
+@_part
 def _spline(f):
     """Weights of four cubic B-spline coefficients at fraction f, and their derivatives."""
     g = 1.0 - f
@@ -74,7 +75,7 @@ def _spline(f):
     )  # fmt: skip
 
 
-@_kernel
+@_part
 def sample(pixels, start, column, row, columns, rows, width, x, y, z):
     """Grey value in a window of a sphere image along (x, y, z), and its gradient by that vector.
 
@@ -133,7 +134,7 @@ def sample_many(pixels, window, width, directions, values, gradients):
         gradients[i, 0], gradients[i, 1], gradients[i, 2] = x, y, z
 
 
-@_kernel
+@_part
 def _relative(host, target, A, c):
     """A = target_R_host and c = host_in_target."""
     for i in range(3):
@@ -148,7 +149,7 @@ def _relative(host, target, A, c):
         )
 
 
-@_kernel
+@_part
 def _look(data, p, o, plane, A, c, dims, Z):
     """Rows of Z (10, N): derivatives by the tangent (the first `dims`), grey values (row 9).
 

@@ -1,12 +1,13 @@
 """Compiled elimination of patches' planes from the models of their observations."""
 
 import numpy as np
-from numba import njit
 
-_kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+from factors.compiled import kernel_and_part
+
+_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
 
 
-@_kernel
+@_part
 def _to_poses(host, target, by_host, by_target):
     """Rows (6, 6) that carry right steps of both poses into the tangent (phi, tau).
 
@@ -30,7 +31,7 @@ def _to_poses(host, target, by_host, by_target):
     by_target[5, 0], by_target[5, 1] = -cy, cx
 
 
-@_kernel
+@_part
 def _invert(V, out):
     """Inverse of a symmetric positive definite 3x3, damped by 1e-12 of its trace."""
     eps = 1e-12 * (V[0, 0] + V[1, 1] + V[2, 2]) + 1e-200
@@ -52,7 +53,7 @@ def _invert(V, out):
     out[2, 2] = i22 * i22
 
 
-@_kernel
+@_part
 def _add_product(P, G, Q, out):
     """out += P^T G Q for 6x6 P, Q and the pose part of a (9, 9) Hessian."""
     GQ = np.zeros((6, 6))
@@ -68,7 +69,7 @@ def _add_product(P, G, Q, out):
                 out[i, j] += factor * GQ[k, j]
 
 
-@_kernel
+@_part
 def _add_coupling(P, G, g, W, gradient):
     """W (3, 6) += plane-by-pose part of G through P; the pose's gradient (6) likewise."""
     for k in range(6):
@@ -78,7 +79,7 @@ def _add_coupling(P, G, g, W, gradient):
                 W[i, j] += G[i, 3 + k] * P[k, j]
 
 
-@_kernel
+@_part
 def _add_pair(f, g, block, row_starts, columns, off_diagonal):
     """Add H[f, g] to the pairs, which hold the upper half."""
     low, high = min(f, g), max(f, g)
@@ -95,7 +96,7 @@ def _add_pair(f, g, block, row_starts, columns, off_diagonal):
             out[i, j] += block[i, j] if f < g else block[j, i]
 
 
-@_kernel
+@_part
 def _reduce(
     host, targets, W, inverse, down, row_starts, columns, diagonal, off_diagonal, gradient
 ):  # fmt: skip

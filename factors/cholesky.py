@@ -1,9 +1,12 @@
 """Sparse Cholesky of symmetric systems of 6x6 blocks: pose graphs after elimination."""
 
 import numpy as np
-from numba import njit
+
+from factors.compiled import kernel_and_part
 
 DIM = 6
+
+_kernel, _part = kernel_and_part()
 
 
 class BlockCholesky:
@@ -124,7 +127,7 @@ def _find(starts: np.ndarray, rows: np.ndarray, placed: np.ndarray) -> np.ndarra
     return np.searchsorted(keys, placed[:, 0] * num + placed[:, 1])
 
 
-@njit(cache=True, nogil=True)
+@_part
 def _factorize_block(a):
     """Lower Cholesky factor in place; False if not positive definite."""
     for j in range(DIM):
@@ -141,7 +144,7 @@ def _factorize_block(a):
     return True
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def _factorize(starts, rows, diagonal, below):
     """Right-looking block Cholesky in place: each column updates those that its rows name."""
     for k in range(len(diagonal)):
@@ -168,7 +171,7 @@ def _factorize(starts, rows, diagonal, below):
     return True
 
 
-@njit(cache=True, nogil=True)
+@_part
 def _subtract_product(target, a, b):
     """target -= a b^T."""
     for i in range(DIM):
@@ -179,7 +182,7 @@ def _subtract_product(target, a, b):
             target[i, j] -= x
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def _solve(starts, rows, diagonal, below, x):
     """Forward and back substitution in place."""
     num = len(diagonal)
@@ -195,7 +198,7 @@ def _solve(starts, rows, diagonal, below, x):
     _solve_upper(starts, rows, diagonal, below, x)
 
 
-@njit(cache=True, nogil=True)
+@_part
 def _solve_upper(starts, rows, diagonal, below, x):
     """Back substitution in place: x <- L^-T x."""
     for k in range(len(diagonal) - 1, -1, -1):
@@ -209,7 +212,7 @@ def _solve_upper(starts, rows, diagonal, below, x):
             x[k, i] /= diagonal[k, i, i]
 
 
-@njit(cache=True, nogil=True)
+@_kernel
 def _selected_inverse(starts, rows, diagonal, below, inverse, inverse_below):
     """Entries of H^-1 on the pattern of the factor, last column first.
 

@@ -12,7 +12,7 @@ from factors._observations import Term, check_term, sort_observations
 from factors._terms import pose_rows
 from factors.block import PoseSystem
 from factors.robust import RobustLoss
-from factors.threads import balanced_ranges, run_in_threads
+from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 
 _POLISH_TOLERANCE = 1e-12  # of a landmark's cost
 _PROPOSAL_TOLERANCE = 1e-6  # of a landmark's cost: further steps gain less than the poses do
@@ -88,28 +88,26 @@ class LandmarkBlock:
         """Reduced pose system at `values`: robust weights, landmarks eliminated."""
         poses = pose_rows(values, self.pose_keys)
         num_f, num_p = len(self.pose_keys), len(self._columns)
-        ranges = balanced_ranges(self._obs.offsets, self.num_threads)
-        sums = [
-            (
+        ranges = balanced_ranges(self._obs.offsets)
+
+        def work(i: int) -> tuple[np.ndarray, ...]:
+            sums = (
                 np.zeros((num_f, 6, 6)),
                 np.zeros((num_p, 6, 6)),
                 np.zeros((num_f, 6)),
                 np.zeros(len(self.families)),
             )
-            for _ in ranges
-        ]
-
-        def work(i: int) -> None:
             eliminate_range(
                 *ranges[i], self._obs, self._points, poses, self._row_starts, self._columns,
-                *sums[i], self._point_costs,
+                *sums, self._point_costs,
             )  # fmt: skip
+            return sums
 
-        run_in_threads(work, len(ranges))
-        total = sums[0]
-        for other in sums[1:]:
-            for target, part in zip(total, other, strict=True):
-                target += part
+        parts = map_in_threads(work, len(ranges), self.num_threads)
+        total = next(parts)
+        for part in parts:
+            for target, more in zip(total, part, strict=True):
+                target += more
         self._poses = poses
         diagonal, off_diagonal, gradient, costs = total
         return PoseSystem(diagonal, off_diagonal, gradient, self._named(costs))
@@ -167,12 +165,12 @@ class LandmarkBlock:
         poses = pose_rows(values, self.pose_keys)
         residuals = np.empty((len(self._order), 2))
         valid = np.empty(len(self._order), dtype=np.bool_)
-        ranges = balanced_ranges(self._obs.offsets, self.num_threads)
+        ranges = balanced_ranges(self._obs.offsets)
 
         def work(i: int) -> None:
             residuals_range(*ranges[i], self._obs, self._points, poses, residuals, valid)
 
-        run_in_threads(work, len(ranges))
+        run_in_threads(work, len(ranges), self.num_threads)
         return residuals, valid
 
     def _move(
@@ -184,7 +182,7 @@ class LandmarkBlock:
         tolerance: float,
     ) -> float:
         points, costs = np.empty_like(self._points), np.empty_like(self._point_costs)
-        ranges = balanced_ranges(self._obs.offsets, self.num_threads)
+        ranges = balanced_ranges(self._obs.offsets)
         substitute = steps is not None
 
         def work(i: int) -> None:
@@ -195,7 +193,7 @@ class LandmarkBlock:
                 substitute, num_steps, tolerance, self._point_costs, points, costs,
             )  # fmt: skip
 
-        run_in_threads(work, len(ranges))
+        run_in_threads(work, len(ranges), self.num_threads)
         self._trial = points, costs
         return float(costs.sum())
 

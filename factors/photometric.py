@@ -19,6 +19,7 @@ from factors.threads import balanced_ranges, run_in_threads
 
 FAMILY = "photometric"
 _LEAST_SHARE = 0.2  # of its inverse depth is what one step leaves a patch at least
+_LEAST_RUN = 128  # observations that are worth a thread
 _LEAST_CONTRAST = 1.0  # grey values, standard deviation over a template
 
 
@@ -243,12 +244,12 @@ class PhotometricBlock:
         size = num_o if dims else 0
         hessians, gradients = np.empty((size, DIMS, DIMS)), np.empty((size, DIMS))
         errors = np.empty(num_o)
-        ranges = balanced_ranges(self.table.offsets, self.num_threads)
+        ranges = balanced_ranges(self.table.offsets, _LEAST_RUN)
 
         def work(i: int) -> None:
             observe_range(*ranges[i], self._data, planes, poses, dims, hessians, gradients, errors)
 
-        run_in_threads(work, len(ranges))
+        run_in_threads(work, len(ranges), self.num_threads)
         return (hessians, gradients), errors
 
     def _patch_costs(self, planes: np.ndarray, errors: np.ndarray) -> np.ndarray:

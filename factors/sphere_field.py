@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from math import factorial
 
 import numpy as np
-from numba import njit
 
 from factors.bearing import tangent_basis
+from factors.compiled import kernel_and_part
 
 _SETTLE = 6  # fixed-point steps that undo a field; each gains the field's slope as a factor
 
-_kernel = njit(cache=True, nogil=True, error_model="numpy")
+_kernel, _part = kernel_and_part(error_model="numpy")
 
 
 def num_harmonics(degree: int) -> int:
@@ -157,13 +157,13 @@ def _norms(degree: int) -> np.ndarray:
     return out
 
 
-@_kernel
+@_part
 def _start_of(n):
     """First coefficient of a degree."""
     return 0 if n == 1 else 2 * n * n - 5
 
 
-@_kernel
+@_part
 def _put(n, column, norm, value, gx, gy, gz, x, y, z, out):
     """Write a harmonic's gradient, tangent part of the solid one's, and its curl."""
     gx, gy, gz = (
@@ -178,7 +178,7 @@ def _put(n, column, norm, value, gx, gy, gz, x, y, z, out):
         out[0, k], out[1, k], out[2, k] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
 
 
-@_kernel
+@_part
 def _harmonics_at(x, y, z, norms, solid, out):
     """Write the harmonics (3, K) at one direction; solid (2, 3, 4) is scratch.
 

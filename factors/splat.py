@@ -12,15 +12,16 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numba import njit
 
 from factors._host_factors import _square_root
 from factors._terms import pose_rows
 from factors.block import PoseSystem
+from factors.compiled import kernel_and_part
 from factors.reprojection import FaceCameras
 from factors.robust import RobustLoss
 
 NAME = "splat"
+_kernel, _part = kernel_and_part(error_model="numpy")
 _MIN_SAMPLES = 50  # fewer say nothing about a pose
 _MIN_SPREAD = 1e-3  # floor of the residuals' spread, grey values 0..1
 
@@ -236,7 +237,7 @@ def _weights(loss: RobustLoss, squared: np.ndarray) -> np.ndarray:
     return np.ones_like(squared)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@_part
 def _cubic(t, values, slopes):
     """Weights (4,) of a cubic B-spline at a fraction t, and their derivatives."""
     s = 1 - t
@@ -248,7 +249,7 @@ def _cubic(t, values, slopes):
     slopes[2] = -s * (1.5 * s - 2)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@_kernel
 def _sample_faces(
     points,
     pose,

@@ -1,34 +1,50 @@
-"""Threads, and runs of landmarks or patches shared out among them."""
+"""Threads, and runs of landmarks or patches shared out among them.
+
+Work is cut by its size alone, never by the number of threads, and what runs add up is added in
+their order: results are the same to the last bit however many threads there are.
+"""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
+T = TypeVar("T")
 
-def balanced_ranges(offsets: np.ndarray, num_threads: int) -> list[tuple[int, int]]:
-    """Runs of owners with about the same number of observations, one per thread.
+_MOST_RUNS = 24  # each has sums of its own
+
+
+def balanced_ranges(offsets: np.ndarray, least: int = 8192) -> list[tuple[int, int]]:
+    """Runs of owners with about the same number of observations; at least one.
 
     Args:
         offsets: (N + 1,) owner n holds observations offsets[n] to offsets[n + 1] - 1.
-        num_threads: most runs; at least one is returned, (0, 0) where there are no owners.
+        least: observations of a run; fewer are not worth a thread.
     """
-    targets = np.linspace(0, offsets[-1], num_threads + 1)[1:-1]
+    total = int(offsets[-1])
+    num = min(max(total // least, 1), _MOST_RUNS)
+    targets = np.linspace(0, total, num + 1)[1:-1]
     bounds = np.unique([0, *np.searchsorted(offsets, targets), len(offsets) - 1])
     if len(bounds) < 2:
         return [(0, 0)]
     return [(int(a), int(b)) for a, b in pairwise(bounds)]
 
 
-def run_in_threads(work: Callable[[int], None], num: int) -> None:
-    """Call work(0) to work(num - 1), each in a thread of its own; work must not do the same."""
-    if num == 1:
-        work(0)
-        return
-    list(pool(num).map(work, range(num)))
+def map_in_threads(work: Callable[[int], T], num: int, num_threads: int) -> Iterator[T]:
+    """Results of work(0) to work(num - 1) in this order; work must not use threads itself."""
+    if num == 1 or num_threads == 1:
+        return map(work, range(num))
+    return pool(num_threads).map(work, range(num))
+
+
+def run_in_threads(work: Callable[[int], None], num: int, num_threads: int) -> None:
+    """Call work(0) to work(num - 1), so many at a time; work must not use threads itself."""
+    for _ in map_in_threads(work, num, num_threads):
+        pass
 
 
 @lru_cache(maxsize=4)

@@ -2,13 +2,14 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
+
+from factors.compiled import kernel_and_part
 
 HEAD = 24  # axes of a descriptor compared before the rest
 _ZERO = np.float32(0)
 _LEAST_SINE = np.float32(0.05)  # of the angle to the motion; nearer to it, planes mean nothing
-_kernel = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
+_kernel, _part = kernel_and_part(fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 
 class Limits(NamedTuple):
@@ -123,13 +124,13 @@ def passes(bearings0, bearings1, targets, only_targets, direction, limits):
     return passed
 
 
-@_kernel
+@_part
 def _nothing(n):
     """Best candidate of n rows, its similarity, and that of the best elsewhere: none yet."""
     return np.full(n, -1, np.int32), np.full(n, -1, np.float32), np.full(n, -1, np.float32)
 
 
-@_kernel
+@_part
 def _keep_mutual(best0, top0, next0, best1, next1, limits):
     """Undo, in place, what is not the best both ways and by a margin."""
     for i in range(len(best0)):
@@ -140,7 +141,7 @@ def _keep_mutual(best0, top0, next0, best1, next1, limits):
             best0[i] = -1
 
 
-@_kernel
+@_part
 def _great_circle(bearing, direction, limits):
     """Normal of the plane of a bearing and the motion, largest cosine to the motion of a bearing
     that is not displaced towards it, and how far off the plane an error of the motion's direction
@@ -155,7 +156,7 @@ def _great_circle(bearing, direction, limits):
     return (nx, ny, nz), tx * ax + ty * ay + tz * az + slack, spread
 
 
-@_kernel
+@_part
 def _in_band(ball, radius, bearing, direction, circle, limits):
     """Whether a bearing within `radius` of the centre of a ball can be of the same point.
 
@@ -172,7 +173,7 @@ def _in_band(ball, radius, bearing, direction, circle, limits):
     )
 
 
-@_kernel
+@_part
 def _mark_in_band(members, bearing, direction, circle, limits, marks):
     """Flags of the bearings (3, m) that pass; without branches, so that it runs in vectors."""
     for m in range(members.shape[1]):
@@ -180,14 +181,14 @@ def _mark_in_band(members, bearing, direction, circle, limits, marks):
         marks[m] = _in_band(ball, _ZERO, bearing, direction, circle, limits)
 
 
-@_kernel
+@_part
 def _mark_near(members, target, radius, marks):
     """Flags of the bearings (3, m) near a target."""
     for m in range(members.shape[1]):
         marks[m] = _distance(target, (members[0, m], members[1, m], members[2, m])) <= radius
 
 
-@_kernel
+@_part
 def _offer(best, top, second, row, candidate, similarity, bearings):
     """Note a candidate that beats a row's second best, which must lie elsewhere than the best."""
     elsewhere = best[row] < 0 or not _one_place(bearings, best[row], candidate)
@@ -199,14 +200,14 @@ def _offer(best, top, second, row, candidate, similarity, bearings):
         second[row] = similarity
 
 
-@_kernel
+@_part
 def _distinctive(similarity, second, limits):
     """Ratio test on descriptor distances: half their squares are 1 - similarity."""
     ratio = limits.ratio * limits.ratio
     return similarity >= limits.similarity and 1 - similarity <= ratio * (1 - second)
 
 
-@_kernel
+@_part
 def _one_place(bearings, a, b):
     """Whether two rows are one feature found twice: closer than 0.18 degrees."""
     x = bearings[a, 0] - bearings[b, 0]
@@ -215,11 +216,11 @@ def _one_place(bearings, a, b):
     return x * x + y * y + z * z <= 1e-5
 
 
-@_kernel
+@_part
 def _distance(a, b):
     return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
-@_kernel
+@_part
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -2,16 +2,19 @@
 
 import math
 
-import numba
 import numpy as np
+
+from factors.compiled import kernel_and_part
 
 _COS_MIN, _RATIO_MAX = 0.6, 2.2  # a view turned or scaled by more does not tell
 _PI, _HALF_PI = np.float32(math.pi), np.float32(0.5 * math.pi)  # float32: twice as many at once
 _A, _B, _C = np.float32(-0.0464964749), np.float32(0.15931422), np.float32(-0.327622764)
+_kernel, _part = kernel_and_part(fastmath=True)
+_exact, _ = kernel_and_part()
 _TINY, _FAR = np.float32(1e-30), np.float32(1e9)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@_part
 def _atan2(y, x):
     """Within 1e-3 rad: a tenth of a pixel on the panoramas that are compared."""
     ax, ay = abs(x), abs(y)
@@ -23,7 +26,7 @@ def _atan2(y, x):
     return -angle if y < 0 else angle
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@_part
 def _project(T, rays, inverse, height, u, v):
     """Pixels u, v (W,) in a neighbour's panorama, of rays (W, 3) at inverse distances (W,).
 
@@ -40,7 +43,7 @@ def _project(T, rays, inverse, height, u, v):
         v[c] = _atan2(y, np.sqrt(x * x + z * z)) * scale + down
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@_part
 def _sort(values):
     """Sort (M, W) along its first axis, all columns at once and without a branch."""
     num, width = values.shape
@@ -51,7 +54,7 @@ def _sort(values):
                 values[m, c], values[m + 1, c] = min(a, b), max(a, b)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@_kernel
 def compare(own, least, most, others, n_T_own, rays, inverse, cap, differences, away, spread):
     """Compare a panorama with its neighbours at assumed distances.
 
@@ -114,7 +117,7 @@ def compare(own, least, most, others, n_T_own, rays, inverse, cap, differences, 
             spread[r, c] = greys[known[c] // 2, c] if known[c] > 0 else cap
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@_kernel
 def keep_best(differences, away, spread, best, away_best, spread_best):
     """Keep what the best distance so far leaves over.
 
@@ -136,7 +139,7 @@ def keep_best(differences, away, spread, best, away_best, spread_best):
                 spread_best[r, c], away_best[r, c] = spread[r, c], away[r, c]
 
 
-@numba.njit(cache=True, nogil=True)
+@_exact
 def witnesses(usable, n_T_own, rays, inverse):
     """How many neighbours see what is at some distance, unmasked and from where it looks alike.
 

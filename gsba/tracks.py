@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 
+from factors.compiled import kernel_and_part
 from gsba.types import Matches, Tracks
+
+_kernel, _ = kernel_and_part()
 
 
 def run(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
@@ -42,7 +44,7 @@ def run(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@_kernel
 def _merge(edges, frame_of_node):
     """Root node of every node after merging edges that keep frames unique in a component.
 

@@ -1,12 +1,13 @@
 """Scene points from bearings and poses, robust to false observations in a track."""
 
-import numba
 import numpy as np
 
-from factors.threads import run_in_threads
+from factors.compiled import kernel_and_part
+from factors.threads import balanced_ranges, run_in_threads
 from gsba.config import TriangulateSettings
 from gsba.types import Counts, Landmarks, Tracks
 
+_kernel, _part = kernel_and_part()
 _MAX_HYPOTHESES = 12  # pairs of observations tried per track
 
 
@@ -40,15 +41,15 @@ def run(
     points = np.zeros((tracks.num_points, 3))
     inliers = np.zeros(len(rays), np.int64)
     parallaxes = np.zeros(tracks.num_points)
-    bounds = np.linspace(0, tracks.num_points, num_threads + 1).astype(np.int64)
+    ranges = balanced_ranges(starts)
 
     def triangulate(part: int) -> None:
-        first, last, gate = bounds[part], bounds[part + 1], float(max_error_sigmas)
+        gate = float(max_error_sigmas)
         _triangulate(
-            starts, first, last, rays, centres, sigmas_rad, gate, points, inliers, parallaxes
+            starts, *ranges[part], rays, centres, sigmas_rad, gate, points, inliers, parallaxes
         )
 
-    run_in_threads(triangulate, num_threads)
+    run_in_threads(triangulate, len(ranges), num_threads)
     lengths = np.add.reduceat(inliers, starts[:-1]) if len(rays) else np.zeros(0, int)
     short = lengths < settings.min_track_length
     flat = ~short & (parallaxes < np.deg2rad(settings.min_parallax_deg))
@@ -70,7 +71,7 @@ def run(
     return Landmarks(points[kept], survivors, counts)
 
 
-@numba.njit(cache=True, nogil=True)
+@_kernel
 def _triangulate(starts, first, last, rays, centres, sigmas, gate, points, inliers, parallaxes):
     """Points, inlier flags and largest parallax (radians) of tracks first to last - 1.
 
@@ -114,7 +115,7 @@ def _triangulate(starts, first, last, rays, centres, sigmas, gate, points, inlie
         parallaxes[j] = np.arccos(max(cosine, -1.0))
 
 
-@numba.njit(cache=True, nogil=True)
+@_part
 def _squared_error(rays, centres, o, x, y, z):
     """Squared tangent of the angle between ray o and the way to a point; inf behind."""
     x, y, z = x - centres[o, 0], y - centres[o, 1], z - centres[o, 2]
@@ -126,7 +127,7 @@ def _squared_error(rays, centres, o, x, y, z):
     return (a * a + b * b + c * c) / (along * along)
 
 
-@numba.njit(cache=True, nogil=True)
+@_part
 def _cosine(centres, o, p, x, y, z):
     """Cosine of the angle at a point between the ways to two centres."""
     a, b, c = x - centres[o, 0], y - centres[o, 1], z - centres[o, 2]
@@ -135,7 +136,7 @@ def _cosine(centres, o, p, x, y, z):
     return (a * d + b * e + c * f) / np.sqrt(max(squares, 1e-300))
 
 
-@numba.njit(cache=True, nogil=True)
+@_part
 def _midpoint(rays, centres, a, b):
     """Point halfway between two rays where they come closest; False if parallel or behind."""
     ux, uy, uz = rays[a, 0], rays[a, 1], rays[a, 2]
@@ -154,7 +155,7 @@ def _midpoint(rays, centres, a, b):
     return x, y, z, s > 0 and t > 0
 
 
-@numba.njit(cache=True, nogil=True)
+@_part
 def _gauss_newton_step(rays, centres, sigmas, lo, hi, point, gate):
     """Move a point by one step on the sines of the angles of the observations within the gate."""
     xx = xy = xz = yy = yz = zz = gx = gy = gz = 0.0

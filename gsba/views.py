@@ -1,11 +1,12 @@
 """Which frames are to show a point: the one it is taken from, and those it is looked for in."""
 
-import numba
 import numpy as np
 
+from factors.compiled import kernel_and_part
 from gsba.config import AlignSettings
 from gsba.types import Landmarks
 
+_kernel, _part = kernel_and_part()
 _SCALE_WEIGHT = 0.25  # of a squared log ratio of distances, against a squared angle
 
 
@@ -65,7 +66,7 @@ def _starts(landmarks: Landmarks) -> np.ndarray:
     return np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
 
 
-@numba.njit(cache=True, nogil=True)
+@_part
 def _difference(ax, ay, az, bx, by, bz):
     """Cosine of the angle, ratio of lengths, and how unlike two views of a point are."""
     aa, bb = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz
@@ -76,7 +77,7 @@ def _difference(ax, ay, az, bx, by, bz):
     return cosine, ratio, 2.0 * (1.0 - cosine) + _SCALE_WEIGHT * np.log(ratio) ** 2
 
 
-@numba.njit(cache=True, nogil=True)
+@_kernel
 def _references(starts, frames, centres, points, out):
     for j in range(len(points)):
         best = np.inf
@@ -90,7 +91,7 @@ def _references(starts, frames, centres, points, out):
                 best, out[j] = cost, a
 
 
-@numba.njit(cache=True, nogil=True)
+@_kernel
 def _views(
     starts, frames, centres, points, rows, near, min_cosine, max_ratio, max_views, extended, out
 ):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsba.demo.raycast import Scene, coordinates, in_bands, jit, nearest
+from gsba.demo.raycast import Scene, coordinates, in_bands, kernel, nearest
 from gsba.demo.sampling import light_at
 
 OFFSET = 0.06  # units in front of a surface where its light is gathered
@@ -60,7 +60,7 @@ def _lamps(scene: Scene) -> np.ndarray:
     return np.concatenate(lamps)
 
 
-@jit
+@kernel
 def _gather_direct(start, stop, scene, points, normals, lamps, out):
     """Add the light of lamps (P, 7) that reaches points (M, 3) to out (M, 3)."""
     for m in range(start, stop):
@@ -77,7 +77,7 @@ def _gather_direct(start, stop, scene, points, normals, lamps, out):
                 out[m, 2] += light
 
 
-@jit
+@kernel
 def _gather_bounce(start, stop, scene, points, normals, directions, light, out):
     """Add the light that lit faces send to points (M, 3); directions (D, 3) lie about +z."""
     for m in range(start, stop):

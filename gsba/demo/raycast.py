@@ -8,7 +8,10 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-jit = numba.njit(cache=True, nogil=True, error_model="numpy")
+from factors.compiled import kernel_and_part
+
+kernel, part = kernel_and_part(error_model="numpy")
+_BANDS = 64  # whatever the number of threads
 
 
 class Scene(NamedTuple):
@@ -37,7 +40,7 @@ class Scene(NamedTuple):
     light: np.ndarray  # (M, 3) float64, irradiance / pi
 
 
-@jit
+@part
 def face_distance(scene, q, o, d, limit):
     """Distance along the ray to face q, or `limit` where it is not hit before."""
     n, c, w = scene.normals, scene.corners, scene.duals
@@ -55,7 +58,7 @@ def face_distance(scene, q, o, d, limit):
     return t
 
 
-@jit
+@part
 def nearest(scene, o, d, limit):
     """Distance and index of the first face on the ray o + t d; (limit, -1) if there is none.
 
@@ -85,7 +88,7 @@ def nearest(scene, o, d, limit):
     return best, found
 
 
-@jit
+@part
 def coordinates(scene, q, o, d, t):
     """Face coordinates a, b of the point o + t d."""
     c, w = scene.corners, scene.duals
@@ -101,13 +104,12 @@ def in_bands(kernel: Callable[..., None], count: int, *args: object) -> None:
 
     The kernels release the GIL; plain threads spare them the compile time of parallel=True.
     """
-    workers = numba.get_num_threads()
-    bounds = np.unique(np.linspace(0, count, 4 * workers + 1).astype(np.int64))
-    with ThreadPoolExecutor(workers) as pool:
+    bounds = np.unique(np.linspace(0, count, _BANDS + 1).astype(np.int64))
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
         list(pool.map(lambda band: kernel(*band, *args), pairwise(bounds.tolist())))
 
 
-@jit
+@kernel
 def _trace(start, stop, scene, origin, directions, out):
     o = (origin[0], origin[1], origin[2])
     for i in range(start, stop):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsba.demo.raycast import Scene, coordinates, face_distance, in_bands, jit, nearest
+from gsba.demo.raycast import Scene, coordinates, face_distance, in_bands, kernel, nearest, part
 from gsba.demo.sampling import albedo_at, light_at
 
 # Offsets from the pixel's centre, in pixels, of the rays where faces meet: a rotated grid, which
@@ -33,7 +33,7 @@ def render_erp(scene: Scene, world_T_rig: np.ndarray, width: int, height: int) -
     return image
 
 
-@jit
+@kernel
 def _find_faces(start, stop, scene, R, o, faces):
     """Face at each pixel's centre, -1 for none, into rows of faces (H, W)."""
     height, width = faces.shape
@@ -45,7 +45,7 @@ def _find_faces(start, stop, scene, R, o, faces):
             faces[row, column] = nearest(scene, o, _rotate(R, x, y, z), np.inf)[1]
 
 
-@jit
+@kernel
 def _shade(start, stop, scene, R, o, faces, image):
     """Colours of rows of image (H, W, 3)."""
     height, width = faces.shape
@@ -69,7 +69,7 @@ def _shade(start, stop, scene, R, o, faces, image):
             image[row, column, 2] = blue
 
 
-@jit
+@part
 def _uniform(faces, row, column):
     """Whether a pixel and its eight neighbours (wrapping around the seam) see one face."""
     height, width = faces.shape
@@ -80,7 +80,7 @@ def _uniform(faces, row, column):
     return True
 
 
-@jit
+@part
 def _rotate(R, x, y, z):
     return (
         R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
@@ -89,13 +89,13 @@ def _rotate(R, x, y, z):
     )
 
 
-@jit
+@part
 def _direction(longitude, latitude):
     c = np.cos(latitude)
     return c * np.sin(longitude), -np.sin(latitude), c * np.cos(longitude)
 
 
-@jit
+@part
 def _color(scene, R, o, longitude, latitude, step, known):
     """Colour (3), 0..255, of the square of angle `step` at this ray, on face `known` if >= 0."""
     cy, sy = np.cos(longitude), np.sin(longitude)

@@ -6,12 +6,12 @@ exact ray differentials (Igehy, SIGGRAPH 1999).
 
 import numpy as np
 
-from gsba.demo.raycast import jit
+from gsba.demo.raycast import part
 
 MAX_TAPS = 8  # texture samples along the longer axis of a stretched footprint
 
 
-@jit
+@part
 def bilinear(values, offset, width, height, x, y):
     """Value (3) at (x, y), in cells with centres at whole numbers, clamped to the border."""
     x = min(max(x, 0.0), width - 1.0)
@@ -30,7 +30,7 @@ def bilinear(values, offset, width, height, x, y):
     )
 
 
-@jit
+@part
 def _texture(scene, texture, s, t, ds, dt, size, taps):
     """Mean albedo (3), 0..255, of `taps` spots of `size` texels along (ds, dt) about (s, t)."""
     top = scene.levels.shape[1] - 1
@@ -52,7 +52,7 @@ def _texture(scene, texture, s, t, ds, dt, size, taps):
     return r / taps, g / taps, b / taps
 
 
-@jit
+@part
 def _slide(scene, q, d, t, e):
     """Change of the texture coordinates s, t at the hit when the direction d changes by e."""
     n, w = scene.normals, scene.duals
@@ -65,7 +65,7 @@ def _slide(scene, q, d, t, e):
     )
 
 
-@jit
+@part
 def albedo_at(scene, q, a, b, d, t, du, dv):
     """Filtered albedo (3), 0..255, for a ray of distance t whose direction varies by du and dv."""
     u, v = _slide(scene, q, d, t, du), _slide(scene, q, d, t, dv)
@@ -79,7 +79,7 @@ def albedo_at(scene, q, a, b, d, t, du, dv):
     return _texture(scene, scene.textures[q], x, y, u[0], u[1], size, max(taps, 1))
 
 
-@jit
+@part
 def light_at(scene, light, q, a, b):
     """Baked light (3) at face coordinates a, b."""
     columns, rows = scene.light_grids[q, 1], scene.light_grids[q, 2]

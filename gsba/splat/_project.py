@@ -6,7 +6,8 @@ one file because numba renews a cached kernel only when its own file changes.
 """
 
 import numpy as np
-from numba import njit
+
+from factors.compiled import kernel_and_part
 
 DILATION = 0.3  # pixels^2 added to both variances: a splat is never thinner than a pixel
 GUARD = 1.3  # slopes x / z beyond this multiple of the image's are clamped in the affine map
@@ -23,10 +24,10 @@ _C3 = (
     1.445305721320277,
 )
 
-_kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
 
 
-@_kernel
+@_part
 def _harmonics(x, y, z, num, basis, slopes):
     """First `num` real spherical harmonics at a unit vector, signs as 3DGS has them.
 
@@ -66,7 +67,7 @@ def _harmonics(x, y, z, num, basis, slopes):
         slopes[15, 0], slopes[15, 1] = -3 * p * (xx - yy), 6 * p * x * y
 
 
-@_kernel
+@_part
 def _rotation(q, out):
     """Rotation matrix (3, 3) of a quaternion wxyz of any length; returns that length."""
     length = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
@@ -89,7 +90,7 @@ def _rotation(q, out):
     return length
 
 
-@_kernel
+@_part
 def _flatten(camera, mean, log_scale, rotation, half, scales, at, slope, flat):
     """A Gaussian in the image.
 
@@ -128,7 +129,7 @@ def _flatten(camera, mean, log_scale, rotation, half, scales, at, slope, flat):
     return uu, uv, vv
 
 
-@_kernel
+@_part
 def _color(offset, sh, num, basis, slopes, splat):
     """Colour of a splat (10,) that lies at an offset (3,) from the camera, not below black."""
     distance = np.sqrt(offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2)
@@ -201,7 +202,7 @@ def project(
         reach2[g] = reach
 
 
-@_kernel
+@_part
 def _through_shape(
     camera, d_splat, splat, at, slope, flat, rotation, scales, d_rotation, d_scale, d_at
 ):
@@ -243,7 +244,7 @@ def _through_shape(
     d_at[2] += d_z
 
 
-@_kernel
+@_part
 def _through_rotation(q, d_rotation, out):
     """Gradient (4,) with respect to a quaternion wxyz of any length."""
     length = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
@@ -261,7 +262,7 @@ def _through_rotation(q, d_rotation, out):
     out[2], out[3] = (d_y - along * y) / length, (d_z - along * z) / length
 
 
-@_kernel
+@_part
 def _through_color(d_splat, splat, sh, offset, num, basis, slopes, d_sh, d_offset):
     """From a splat's colour to its harmonics (K, 3) and the offset (3,) from the camera."""
     distance = np.sqrt(offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2)

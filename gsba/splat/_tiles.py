@@ -10,8 +10,10 @@ All of it is one file because numba renews a cached kernel only when its own fil
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
+
+from factors.compiled import kernel_and_part
 
 TILE = 16  # pixels
 CHANNELS = 5  # red, green, blue, sum of weight * z, alpha
@@ -30,8 +32,8 @@ _LEAST_POWER = np.float32(-80.0)
 _EXP2 = tuple(np.float32(np.log(2) ** k / f) for k, f in enumerate((1, 1, 2, 6, 24, 120, 720)))
 _E1, _E2, _E3, _E4, _E5, _E6 = _EXP2[1:]
 
-_kernel = njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"}
+_kernel, _part = kernel_and_part(
+    error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"}
 )
 
 
@@ -59,7 +61,7 @@ def _power_of_two(typing_context, value):
     return types.float32(types.float32), emit
 
 
-@_kernel
+@_part
 def _exp(x):
     """Exponential of a float32 <= 0, to a relative 1.2e-7 (2 - x); e^-80 for anything less."""
     t = max(min(x, _ZERO), _LEAST_POWER) * _LOG2E
@@ -78,7 +80,7 @@ def exp_of(values):
     return out
 
 
-@_kernel
+@_part
 def _span(splat, reach2, low, high):
     """Columns (first, last) that an ellipse of squared radius reach2 touches in rows low..high."""
     a, b, c = float(splat[2]), float(splat[3]), float(splat[4])
@@ -95,7 +97,7 @@ def _span(splat, reach2, low, high):
     return splat[0] + first, splat[0] + last
 
 
-@_kernel
+@_part
 def _tile_columns(splat, reach2, row, num_columns):
     """Tile columns first..last - 1 whose pixel centres in a tile row may lie in the ellipse."""
     low = row * TILE + 0.5
@@ -107,7 +109,7 @@ def _tile_columns(splat, reach2, row, num_columns):
     return int(max(first, 0.0)), int(min(last, float(num_columns)))
 
 
-@_kernel
+@_part
 def _tile_rows(splat, reach2, num_rows):
     a, b, c = float(splat[2]), float(splat[3]), float(splat[4])
     tall = np.sqrt(reach2 * a / (a * c - b * b))
@@ -160,7 +162,7 @@ def fill_tiles(splats, reach2, order, offsets, num_rows, num_columns, starts, ow
             cursor[tiles[e]] += 1
 
 
-@_kernel
+@_part
 def _pixel_rows(splat, reach2, top):
     """Pixels of a tile, first..last - 1 of its buffer, in the rows that a splat reaches."""
     a, b, c = float(splat[2]), float(splat[3]), float(splat[4])
@@ -170,7 +172,7 @@ def _pixel_rows(splat, reach2, top):
     return np.uint64(max(int(first), 0) * TILE), np.uint64(max(int(last), 0) * TILE)
 
 
-@_kernel
+@_part
 def _start_tile(buffer, tile, num_columns):
     """Pixel centres and full transmittance; returns the tile's first pixel row and column."""
     top, left = tile // num_columns * TILE, tile % num_columns * TILE
@@ -181,7 +183,7 @@ def _start_tile(buffer, tile, num_columns):
     return top, left
 
 
-@_kernel
+@_part
 def _is_full(buffer):
     most = _ZERO
     for i in range(2 * _PIXELS, 3 * _PIXELS):
@@ -189,7 +191,7 @@ def _is_full(buffer):
     return most < MIN_TRANSMITTANCE
 
 
-@_kernel
+@_part
 def _blend(buffer, splat, first, last):
     """Add a splat to the pixels first..last - 1 of a tile."""
     u, v, a, b, c = splat[0], splat[1], -_HALF * splat[2], splat[3], -_HALF * splat[4]
@@ -235,7 +237,7 @@ def blend_tiles(splats, reach2, starts, owners, num_columns, image, used, first,
                 image[channel, top + i // TILE, left + i % TILE] = value
 
 
-@_kernel
+@_part
 def _differentiate(buffer, splat, first, last, out):
     """Gradient of the loss with respect to a splat, over the pixels first..last - 1 of a tile.
 

@@ -3,10 +3,11 @@
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numba import njit
 
+from factors.compiled import kernel_and_part
 from gsba.splat.gaussians import Gaussians, concatenate, zeros_like
 
+_kernel, _ = kernel_and_part(error_model="numpy", fastmath={"contract"})
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
 
 
@@ -75,7 +76,7 @@ def step(
         _move(values, slopes, first, second, scales, np.float32(correction2))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@_kernel
 def _move(values, slopes, first, second, rates, correction2):
     keep1, keep2 = np.float32(BETA1), np.float32(BETA2)
     new1, new2, eps = np.float32(1 - BETA1), np.float32(1 - BETA2), np.float32(EPS)

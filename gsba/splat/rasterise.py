@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from factors.threads import pool
+from factors.threads import run_in_threads
 from gsba.splat import _project, _tiles
 from gsba.splat.camera import FaceCamera
 from gsba.splat.gaussians import Gaussians, zeros_like
@@ -150,12 +150,8 @@ def _in_parallel(
     num_threads: int, num: int, grain: int, kernel: Callable[..., object], *given: Any
 ) -> None:
     """Call kernel(*given, begin, end) on ranges of `grain` items that cover 0..num - 1."""
-    if num_threads == 1 or num <= grain:
-        kernel(*given, 0, num)
-        return
-    running = [
-        pool(num_threads).submit(kernel, *given, begin, min(begin + grain, num))
-        for begin in range(0, num, grain)
-    ]
-    for future in running:
-        future.result()
+
+    def work(i: int) -> None:
+        kernel(*given, grain * i, min(grain * (i + 1), num))
+
+    run_in_threads(work, -(-num // grain), num_threads)
