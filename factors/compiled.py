@@ -5,12 +5,23 @@ loaded first: the function's own while kernels are being compiled, the kernel's,
 kernel, once they come from the cache. Each copy is optimised where it stands, so they may round
 differently. Parts are therefore inlined, and kernels leave no sums or products of arrays to numpy.
 `tests/test_compiled.py` holds both.
+
+Compiling takes half a minute in all, in which nothing else seems to happen: the log says so.
 """
 
+import logging
+import math
+import time
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 from numba import njit
+from numba.core import event
+
+logger = logging.getLogger(__name__)
+
+_PAUSE_S = 10.0  # between compilations that are announced apart
 
 
 def kernel_and_part(**options: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
@@ -22,5 +33,25 @@ def kernel_and_part(**options: Any) -> tuple[Callable[..., Any], Callable[..., A
     Args:
         options: of `numba.njit`, such as fastmath.
     """
+    _announce()
     options |= {"cache": True, "nogil": True}
     return njit(**options), njit(**options, forceinline=True)
+
+
+class _Announcer(event.Listener):
+    """Logs compilations, those close to one another once; kernels found on disk are none."""
+
+    latest = -math.inf  # seconds
+
+    def on_start(self, event: Any) -> None:
+        before, self.latest = self.latest, time.monotonic()
+        if self.latest - before > _PAUSE_S:
+            logger.info("compiling kernels, once per machine: this takes a while")
+
+    def on_end(self, event: Any) -> None:
+        self.latest = time.monotonic()
+
+
+@cache
+def _announce() -> None:
+    event.register("numba:compile", _Announcer())

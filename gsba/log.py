@@ -17,12 +17,13 @@ class GsbaError(Exception):
 
 
 def show_log(level: int = logging.INFO) -> None:
-    """Send gsba's log to stderr, below the progress bar on a terminal; for the command line.
+    """Send the log of gsba and its factors to stderr, below the progress bar on a terminal.
+
+    For the command line.
 
     Args:
         level: least level shown, e.g. `logging.WARNING` for a quiet run.
     """
-    logger = logging.getLogger("gsba")
     if sys.stderr.isatty():
         from rich.logging import RichHandler
 
@@ -31,9 +32,11 @@ def show_log(level: int = logging.INFO) -> None:
     else:
         handler = logging.StreamHandler()
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%X"))
-    logger.handlers[:] = [handler]
-    logger.setLevel(level)
-    logger.propagate = False
+    for name in ("gsba", "factors"):
+        logger = logging.getLogger(name)
+        logger.handlers[:] = [handler]
+        logger.setLevel(level)
+        logger.propagate = False
 
 
 def brief(text: str, most: int = 60) -> str:

@@ -3,7 +3,10 @@
 import ast
 import importlib
 import inspect
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from textwrap import dedent
@@ -18,6 +21,15 @@ MODULES = sorted(
     for path in (ROOT / folder).rglob("*.py")
     if re.search(r"^@_?(kernel|part)$", path.read_text(), re.MULTILINE)
 )
+PROGRAM = """
+import numpy as np
+from gsba.log import show_log
+show_log()
+from gsba.tracks import _merge
+for kind in (np.int32, np.int64):
+    _merge(np.zeros((1, 2), np.int64), np.zeros(2, kind))
+"""
+
 ROUNDED_ELSEWHERE = {"sum", "mean", "dot", "cross", "std", "var", "prod", "trace", "outer", "norm"}
 
 
@@ -51,3 +63,13 @@ def test_a_kernel_leaves_no_sums_to_numpy(name: str) -> None:
     used = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
     assert not used & ROUNDED_ELSEWHERE
     assert not any(isinstance(node, ast.MatMult) for node in ast.walk(tree))
+
+
+def test_compilation_is_announced_once_per_machine(tmp_path: Path) -> None:
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}
+    environment.pop("NUMBA_DISABLE_JIT", None)
+    command = [sys.executable, "-c", PROGRAM]
+    given = {"env": environment, "capture_output": True, "text": True, "check": True}
+    first, second = (subprocess.run(command, **given).stderr for _ in range(2))
+    assert first.count("compiling kernels, once per machine") == 1
+    assert second == ""
