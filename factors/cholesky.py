@@ -60,8 +60,7 @@ class BlockCholesky:
     def draw(self, normals: np.ndarray) -> np.ndarray:
         """Vectors (D, N, 6) of covariance H^-1 from as many independent unit normals."""
         x = np.ascontiguousarray(normals[:, self.order])
-        for one in x:
-            _solve_upper(self._starts, self._rows, self._diagonal, self._below, one)
+        _solve_each_upper(self._starts, self._rows, self._diagonal, self._below, x)
         out = np.empty_like(x)
         out[:, self.order] = x
         return out
@@ -196,6 +195,13 @@ def _solve(starts, rows, diagonal, below, x):
                 for c in range(DIM):
                     x[rows[s], i] -= below[s, i, c] * x[k, c]
     _solve_upper(starts, rows, diagonal, below, x)
+
+
+@_kernel
+def _solve_each_upper(starts, rows, diagonal, below, many):
+    """Back substitution of vectors (D, N, 6) in place."""
+    for d in range(len(many)):
+        _solve_upper(starts, rows, diagonal, below, many[d])
 
 
 @_part
