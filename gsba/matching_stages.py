@@ -51,6 +51,8 @@ from gsba.types import (
 ExtraFactors = Callable[[CoarsePoses], Iterable[gtsam.NonlinearFactor]]
 T = TypeVar("T")
 
+_DARK = 32  # of 255
+
 
 class MatchingStages:
     """One run's inputs, its features, and a method for each stage that matches them."""
@@ -115,6 +117,16 @@ class MatchingStages:
         self.coarse, self.extra = coarse, list(self._make_extra(coarse))
         self._set_priors()
 
+    def _hindrance(self) -> str:
+        """What keeps frames from matching, as far as their pixels tell."""
+        level = panorama.bright_level(self.greys)
+        if level < _DARK:
+            return (
+                f"they are very dark (99 % of their pixels at or below {level} of 255): make them "
+                "brighter; 12 bits in a 16-bit PNG must be scaled up to 16"
+            )
+        return "frames must follow one another closely and show texture"
+
     def _set_priors(self) -> None:
         """What the trajectory says, as far as it is trusted, and the caller's own factors."""
         coarse, priors, trust = self.coarse.world_T_rigs, self.settings.priors, self.trust
@@ -164,7 +176,7 @@ class MatchingStages:
         if len(pairs.matches.pairs) == 0:
             raise GsbaError(
                 f"no two neighbouring frames match ({pairs.counts.received} pairs, with and "
-                "without the trajectory): frames must follow one another closely and show texture"
+                f"without the trajectory): {self._hindrance()}"
             )
         self.trust, self.coarse, self.joints = recovered.trust, recovered.coarse, recovered.joints
         self.parts = components.parted(pairs.matches.pairs, self.trust.held_steps)

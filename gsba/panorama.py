@@ -10,6 +10,7 @@ from gsba.geometry import bearings_from_erp
 from gsba.rig import CubeRig, owner_faces
 from gsba.types import FACES, FrameSet
 
+_LOOKS = 5  # frames whose brightness stands for all
 _PAD = 3  # pixels of a face's neighbours around it: the support of bicubic sampling, and one
 
 
@@ -76,6 +77,15 @@ class Greys:
             if len(self._kept) < self._room:
                 self._kept[frame] = found
         return found
+
+
+def bright_level(greys: Greys) -> int:
+    """Grey value that 99 % of the usable pixels of some frames do not exceed; 255 without any."""
+    chosen = np.unique(np.linspace(0, greys.num_frames - 1, _LOOKS).astype(int))
+    found = [greys[int(f)] for f in chosen]
+    used = [(grey if mask is None else grey[mask]).ravel() for grey, mask in found]
+    values = np.concatenate(used)
+    return int(np.percentile(values, 99)) if len(values) else 255
 
 
 def _fit(grey: np.ndarray, width: int) -> np.ndarray:

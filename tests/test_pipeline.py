@@ -132,6 +132,18 @@ def test_frames_that_match_nothing_are_refused(case: Case, tmp_path: Path) -> No
     assert sorted(path.name for path in out.iterdir()) == ["gsba.json", "stages"]
 
 
+def test_dark_frames_are_said_to_be_dark(case: Case, tmp_path: Path) -> None:
+    """A camera of 12 bits, written as they are into 16."""
+    (tmp_path / "frames").mkdir()
+    for path in sorted(case.frames.glob("*.jpg"))[:4]:
+        image = cv2.imread(str(path))
+        assert image is not None
+        twelve = image.astype(np.uint16) * 16
+        assert cv2.imwrite(str(tmp_path / "frames" / f"{path.stem}.png"), twelve)
+    with pytest.raises(GsbaError, match=r"no two .* very dark \(99 % of their pixels at or below"):
+        refine(tmp_path / "frames", case.slam, tmp_path / "run", SETTINGS, fps=2)
+
+
 @pytest.mark.parametrize("missing", [(), ("up", "down")])
 def test_cube_faces_serve_as_well(case: Case, tmp_path: Path, missing: tuple[str, ...]) -> None:
     rig = CubeRig(WIDTH // 3, np.pi / 2)  # the panorama's own density
