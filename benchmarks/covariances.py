@@ -4,10 +4,13 @@
 
 Refines each sequence (a finished run in WORK is used again) and prints what `gsba evaluate` says
 of its covariances: `gsba.consistency`. Open walks are closed ones cut short, and the demo's.
-Recorded sequences are read from `--data` and skipped if absent.
+Recorded sequences are read from `--data` and skipped if absent; `--walk FILE.tum` is a trajectory of your
+own, beside `images/` and `groundtruth.tum`.
 """
 
 import argparse
+import os
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -67,7 +70,8 @@ def find(name: str, data: Path, out: Path) -> Case:
         if not (folder / "groundtruth.tum").exists():
             make_walk(folder, *DEMOS[name])
         return Case(folder / "images", folder / "slam.tum", folder / "groundtruth.tum")
-    chosen = RECORDED[name]
+    own = Recorded(*os.path.split(name))  # data / an absolute path is that path
+    chosen = RECORDED.get(name, own)
     folder = data / chosen.folder
     if not folder.is_dir():
         raise GsbaError(f"{folder} is absent")
@@ -89,9 +93,9 @@ def _first(images: Path, folder: Path, num_frames: int) -> Path:
     return folder
 
 
-def measured(case: Case, out: Path, options: dict) -> tuple[Consistency, float]:
+def measured(case: Case, out: Path) -> tuple[Consistency, float]:
     """What the covariances of a run are worth, and its ATE in units of the truth."""
-    settings = RefineSettings.model_validate({"export": {"formats": []}, **options})
+    settings = RefineSettings.model_validate({"export": {"formats": []}})
     refine(case.images, case.trajectory, out, settings)
     reconstruction, frames = load_run(out)
     truth = read_trajectory(case.truth)
@@ -107,10 +111,11 @@ def table(names: list[str], data: Path, out: Path) -> Iterator[str]:
     """Lines of the table."""
     yield "| sequence | ATE e-3 | poses | rotation error/σ | position error/σ | NEES |"
     yield "|---|---|---|---|---|---|"
-    for name in names:
-        folder = out / name.replace(", ", "_").replace(" ", "_")
+    for asked in names:
+        name = "/".join(Path(asked).parts[-2:])
+        folder = out / re.sub(r"\W+", "_", name)
         try:
-            found, ate = measured(find(name, data, folder), folder / "run", {})
+            found, ate = measured(find(asked, data, folder), folder / "run")
         except GsbaError as error:
             yield f"| {name} | | | | | {error} |"
             continue
@@ -134,11 +139,13 @@ def main() -> None:
     every = [*RECORDED, *DEMOS]
     parser.add_argument("--data", type=Path, default=DATA, help="recorded sequences")
     parser.add_argument("--only", action="append", choices=every, help="repeatable")
+    parser.add_argument("--walk", action="append", default=[], type=os.path.abspath)
     parser.add_argument("--out", type=Path, default=Path("build/covariances"))
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
+    names = [*(options.only or ([] if options.walk else every)), *options.walk]
     lines = []
-    for line in table(options.only or every, options.data, options.out):
+    for line in table(names, options.data, options.out):
         print(line, flush=True)
         lines.append(line)
     head = ["# Errors over what covariances claim", ""]

@@ -132,6 +132,22 @@ def test_frames_that_match_nothing_are_refused(case: Case, tmp_path: Path) -> No
     assert sorted(path.name for path in out.iterdir()) == ["gsba.json", "stages"]
 
 
+def test_a_destroyed_picture_ends_the_run_by_name(case: Case, tmp_path: Path) -> None:
+    """And the run goes on where it stopped once the picture is whole or gone."""
+    frames, out = tmp_path / "frames", tmp_path / "run"
+    shutil.copytree(case.frames, frames)
+    whole = (frames / "000003.jpg").read_bytes()
+    (frames / "000003.jpg").write_bytes(whole[:-9000] + bytes(3000) + whole[-6000:])
+    with pytest.raises(GsbaError, match=r"000003\.jpg: damaged \("):
+        refine(frames, case.slam, out, SETTINGS)
+    assert not (out / "trajectory.tum").exists() and not (out / "colmap").exists()
+    (frames / "000003.jpg").write_bytes(whole)
+    kept = {path.stem for path in (out / "stages" / "features").glob("*.npz")}
+    assert kept and "000003" not in kept
+    result = refine(frames, case.slam, out, SETTINGS)
+    assert (result.reconstruction.pose_statuses == PoseStatus.REFINED).all()
+
+
 def test_dark_frames_are_said_to_be_dark(case: Case, tmp_path: Path) -> None:
     """A camera of 12 bits, written as they are into 16."""
     (tmp_path / "frames").mkdir()
