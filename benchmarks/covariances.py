@@ -4,8 +4,8 @@
 
 Refines each sequence (a finished run in WORK is used again) and prints what `gsba evaluate` says
 of its covariances: `gsba.consistency`. Open walks are closed ones cut short, and the demo's.
-Recorded sequences are read from `--data` and skipped if absent; `--walk FILE.tum` is a trajectory of your
-own, beside `images/` and `groundtruth.tum`.
+Recorded sequences are read from `--data` and skipped if absent; `--walk FILE.tum` is a trajectory
+of your own, beside `images/` and `groundtruth.tum`.
 """
 
 import argparse
