@@ -121,6 +121,8 @@ def table(names: list[str], data: Path, out: Path) -> Iterator[str]:
             continue
         head = f"{name} | {1e3 * ate:.2f}"
         for kind, claims in (("absolute", found.absolute), ("consecutive", found.consecutive)):
+            if claims is None:
+                continue
             cells = [_cell(claims.rotation), _cell(claims.position), _cell(claims.nees, False)]
             yield f"| {head} | {claims.num} {kind} | {' | '.join(cells)} |"
             head = " | "

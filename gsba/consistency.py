@@ -59,7 +59,8 @@ class Consistency:
     first: int  # frame whose pose is held
     furthest: int  # frame whose distance from it is held
     absolute: Claims  # of each pose
-    consecutive: Claims  # of each frame in the axes of the one before
+    consecutive: Claims | None  # of each frame in the axes of the one before; None = no two
+    # neighbours have a true pose
 
     def to_json(self) -> dict:
         """Plain dict for json.dump."""
@@ -103,7 +104,7 @@ class _Judge:
         return np.stack([*rms, np.sum(whitened**2, axis=(-2, -1)) / len(self.rows)], axis=-1)
 
     def claims(self, errors: np.ndarray, drawn: np.ndarray) -> Claims:
-        """Errors (N, 6) beside drawn ones (D, N, 6)."""
+        """What errors (N, 6) make of them, beside drawn ones (D, N, 6)."""
         tails = (1 - EXPECTED) / 2
         found, spread = self.measures(errors), self.measures(drawn)
         lows, highs = np.quantile(spread, [tails, 1 - tails], axis=0)
@@ -149,7 +150,6 @@ def judge(
     held = np.zeros((len(poses), 3))
     held[far] = toward / np.linalg.norm(toward)
     judged = np.intersect1d(rows[rows > 0], known)
-    absolute = _Judge.of(judged, covariances[judged], held[judged])
     errors = _errors(poses, true_T_rigs)
 
     steps, true_steps = (inverse(some[:-1]) @ some[1:] for some in (poses, true_T_rigs))
@@ -162,15 +162,14 @@ def judge(
     chosen = np.flatnonzero(sure)
     only = held[1:].copy()
     only[1:] = 0  # a distance is held between neighbours only where the first step reaches there
-    consecutive = _Judge.of(chosen, of_steps[chosen], only[chosen])
     drawn = joint.draws.astype(np.float64)
-    drawn_steps = drawn[:, 1:] + np.einsum("fij,dfj->dfi", before, drawn[:, :-1])
-    return Consistency(
-        0,
-        far,
-        absolute.claims(errors[judged], drawn[:, judged]),
-        consecutive.claims(step_errors[chosen], drawn_steps[:, chosen]),
-    )
+    found = _Judge.of(judged, covariances[judged], held[judged])
+    absolute, consecutive = found.claims(errors[judged], drawn[:, judged]), None
+    if len(chosen):
+        found = _Judge.of(chosen, of_steps[chosen], only[chosen])
+        drawn = drawn[:, 1:] + np.einsum("fij,dfj->dfi", before, drawn[:, :-1])
+        consecutive = found.claims(step_errors[chosen], drawn[:, chosen])
+    return Consistency(0, far, absolute, consecutive)
 
 
 def format_consistency(found: Consistency, name: Callable[[int], str] = str) -> str:
@@ -178,6 +177,8 @@ def format_consistency(found: Consistency, name: Callable[[int], str] = str) -> 
     header = ["", "poses", "rotation error/σ", "position error/σ", "NEES"]
     rows = [header]
     for title, claims in (("absolute", found.absolute), ("consecutive", found.consecutive)):
+        if claims is None:
+            continue
         cells = [
             f"{one.value:.2f} ({one.low:.2f} to {one.high:.2f})"
             for one in (claims.rotation, claims.position, claims.nees)

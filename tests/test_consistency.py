@@ -60,7 +60,7 @@ def _result(poses: np.ndarray, covariances: np.ndarray, joint: JointErrors) -> R
 
 def _statistics(found: Consistency) -> list[Statistic]:
     both = found.absolute, found.consecutive
-    return [one for c in both for one in (c.rotation, c.position, c.nees)]
+    return [one for c in both if c is not None for one in (c.rotation, c.position, c.nees)]
 
 
 def _claiming(result: Reconstruction, factor: float) -> Reconstruction:
@@ -160,6 +160,7 @@ def test_steps_are_judged_by_what_neighbours_share() -> None:
     assert joint is not None
     apart = JointErrors(np.zeros_like(joint.neighbours), joint.draws)
     without = judge(replace(result, joint_errors=apart), TIMES, truth)
+    assert without.consecutive is not None and found.consecutive is not None
     assert without.consecutive.nees.value < 0.7 * found.consecutive.nees.value
     assert without.absolute == found.absolute
 
@@ -171,8 +172,17 @@ def test_frames_without_truth_or_covariance_are_left_out() -> None:
     kept = np.arange(FRAMES) != 3
     part = Trajectory(TIMES[kept], truth.world_T_rigs[kept])
     found = judge(replace(result, pose_covariances=covariances), TIMES, part)
+    assert found.consecutive is not None
     assert found.absolute.num == FRAMES - 3 and found.consecutive.num == FRAMES - 5
     assert all(np.isfinite(one.value) for one in _statistics(found))
+
+
+def test_every_other_true_pose_judges_no_steps() -> None:
+    result, truth = _solved(0)
+    found = judge(result, TIMES, Trajectory(TIMES[::2], truth.world_T_rigs[::2]))
+    assert found.consecutive is None and found.absolute.num == FRAMES // 2 - 1
+    assert "consecutive" not in format_consistency(found)
+    assert found.to_json()["consecutive"] is None
 
 
 def test_what_cannot_be_judged_is_said() -> None:
