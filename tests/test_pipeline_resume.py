@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 from tiny_run import NUM_FRAMES, SETTINGS, Case, computed_stages
 
@@ -92,11 +91,7 @@ def test_a_killed_run_goes_on_where_it_was(case: Case, tmp_path: Path) -> None:
     assert not any((out / name).exists() for name in ("trajectory.tum", "colmap", "report.json"))
     result = case.refine(out)
     assert computed_stages(result)[0] == "loops"
-    np.testing.assert_allclose(
-        result.reconstruction.world_T_rigs,
-        case.result.reconstruction.world_T_rigs,
-        atol=1e-9,  # nothing is random: the last digits of sums at most
-    )
+    assert (out / "trajectory.tum").read_bytes() == (case.out / "trajectory.tum").read_bytes()
     assert not list(out.rglob("*.partial*")) and not list(out.rglob(".*"))
 
 
