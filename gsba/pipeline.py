@@ -19,6 +19,7 @@ from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
 __all__ = ["RunResult", "load_run", "refine"]
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")  # frames have threads; sums keep their order
 def refine(
     frames: Path | str,
     trajectory: Path | str | Sequence[Path | str] | None,
@@ -70,7 +71,7 @@ def refine(
     frame_set = read.scan(frames, timestamps, fps, chosen.given, order_suffices=not given)
     check(settings.placement, frame_set)
     coarse = inputs.coarse_poses(frame_set, given, settings)
-    with RunStore(out, origin, fresh) as store, threadpool_limits(1, "blas"):  # frames have threads
+    with RunStore(out, origin, fresh) as store:
         frame_set, counts = masking.before(store, frame_set, chosen), {}
         if chosen.distractors:
             frame_set, counts = _without_distractors(store, frame_set, coarse, given, settings)
