@@ -14,6 +14,8 @@ _SPACING = 0.25  # of a step, between offsets tried
 _MAX_RATE = 0.03  # largest deviation of the rate that is tried
 _RATE_SIGMA = 0.02  # what is expected of it
 _TRIED = 5  # candidates of the grid
+_MOST_TRIED, _MOST_RATES = 60_000, 100  # clocks on the grid, and rates among them
+_MOST_INSTANTS = 200_000  # at which angular velocities are had
 _ITERATIONS = 20
 _WIDTH = 2.0  # of the loss, standard deviations
 _MIN_SIGMA = np.deg2rad(0.03)  # of a rotation, per axis: images know no better
@@ -231,14 +233,16 @@ class ClockFit:
 
         Args:
             start: the clock in the middle of the grid.
-            reach_s: largest offset from it that is tried.
+            reach_s: largest offset from it that is tried. Steps of a fraction of a second are not
+                searched as far: the grid has a bounded size, whatever the times are.
         """
         spacing = _SPACING * self.turns.step
-        shifts = spacing * np.arange(-round(reach_s / spacing), round(reach_s / spacing) + 1)
-        rates = max(round(_MAX_RATE * self.turns.ends[1] / spacing), 1)
+        rates = max(round(min(_MAX_RATE * self.turns.ends[1] / spacing, _MOST_RATES / 2)), 1)
         rates = _MAX_RATE * np.arange(-rates, rates + 1) / rates
+        most = round(min(reach_s / spacing, _MOST_TRIED / len(rates) / 2))
+        shifts = spacing * np.arange(-most, most + 1)
         tried = np.stack(np.meshgrid(shifts, rates), axis=-1).reshape(-1, 2) + start
-        lookup = self._angular_velocity(spacing)
+        lookup = self._angular_velocity(spacing, self.turns.middle + start[0], shifts[-1])
         order = np.argsort([self._rough_cost(p, *lookup) for p in tried], kind="stable")
         chosen: list[np.ndarray] = []
         for parameters in tried[order]:
@@ -248,11 +252,19 @@ class ClockFit:
             if len(chosen) == _TRIED:
                 return
 
-    def _angular_velocity(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-        """Instants (n,) of the trajectory and its mean turn (n, 3) over a step around each."""
+    def _angular_velocity(
+        self, spacing: float, middle: float, reach: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Instants (n,) of the trajectory and its mean turn (n, 3) over a step around each.
+
+        Those that turns can be shifted to: the trajectory may be of days, or in another unit.
+        """
         half = 0.5 * min(self.turns.step, float(np.ptp(self.span)))
-        count = max(int(np.ptp(self.span) / (0.5 * spacing)), 2)
-        times = np.linspace(self.span[0] + half, self.span[1] - half, count)
+        far = reach + (1 + _MAX_RATE) * np.abs(self.turns.ends).max() + half
+        begin, end = self.span + [half, -half]
+        begin, end = max(begin, min(middle - far, end)), min(end, max(middle + far, begin))
+        count = int(np.clip((end - begin) / (0.5 * spacing), 2, _MOST_INSTANTS))
+        times = np.linspace(begin, end, count)
         begin, end = self._rotations(times - half), self._rotations(times + half)
         return times, _log(_product(_conjugate(begin), end)) / (2 * half)
 

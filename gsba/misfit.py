@@ -48,9 +48,15 @@ def refuse_misread(coarse: CoarsePoses, found: Steps, settings: VerifySettings) 
         for reading, steps in _readings(coarse.world_T_rigs).items()
     }
     best = max(shares, key=lambda reading: shares[reading])
-    if best and shares[best] >= _EXPLAINS and shares[""] < _DOUBTFUL:
-        text = _contradicted(shares[""], judged)
-        raise GsbaError(f"{text}: the trajectory is {best}, {_WITHOUT}")
+    if not best or shares[best] < _EXPLAINS or shares[""] >= _DOUBTFUL:
+        return
+    late, explained = _lateness(coarse, found, judged, settings)
+    if explained >= shares[best] * judged.sum():
+        return  # on a loop, the other side looks reversed
+    text, other = _contradicted(shares[""], judged), ""
+    if late:
+        other = f" or on another clock, by about {abs(late)} frames"
+    raise GsbaError(f"{text}: the trajectory is {best}{other}, {_WITHOUT}")
 
 
 def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -> None:
@@ -68,10 +74,39 @@ def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -
     if judged.sum() < _MIN_STEPS or _agreeing(steps, found, judged, loose) > _FITS:
         return
     text = _contradicted(_agreeing(steps, found, judged, settings), judged)
+    late, _ = _lateness(coarse, found, judged, settings)
+    if late:
+        raise GsbaError(
+            f"{text}: the trajectory is on another clock, by about {abs(late)} frames: correct "
+            f"the times or read.clock_offset_s, {_WITHOUT}"
+        )
     raise GsbaError(
         f"{text}: the trajectory is of another recording or on another clock; "
         f"give the right one, {_WITHOUT}"
     )
+
+
+def _lateness(
+    coarse: CoarsePoses, found: Steps, judged: np.ndarray, settings: VerifySettings
+) -> tuple[int, float]:
+    """By how many frames the trajectory's steps are late, and how many steps that explains.
+
+    0 where no shift in time explains what a reading has to.
+    """
+    steps, best = _steps(coarse.world_T_rigs), (0, 0.0)
+    own = coarse.sources[:-1] == PoseSource.SLAM
+    own &= coarse.sources[1:] == PoseSource.SLAM
+    for late in range(1 - len(steps), len(steps)):
+        theirs = slice(max(late, 0), len(steps) + min(late, 0))
+        ours = slice(max(-late, 0), len(steps) - max(late, 0))
+        seen = Steps(found.f_T_nexts[ours], found.verified[ours], found.directed[ours])
+        both = seen.directed & own[theirs]
+        if late == 0 or both.sum() < max(_MIN_STEPS, 0.5 * judged.sum()):
+            continue
+        share = _agreeing(steps[theirs], seen, both, settings)
+        if share >= _EXPLAINS and share * both.sum() > best[1]:
+            best = late, share * float(both.sum())
+    return best
 
 
 def _judged(coarse: CoarsePoses, found: Steps) -> np.ndarray:

@@ -168,3 +168,25 @@ def test_short_steps_are_put_together() -> None:
     np.testing.assert_allclose(rates, 0.01 / 0.03, rtol=1e-9)
     angles = rotation_angle(Rotation.from_rotvec(turns.rotvecs).as_matrix())
     assert angles.sum() == pytest.approx(98 * 0.01)
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e9])
+def test_the_grid_is_bounded_whatever_the_times_are(
+    unit: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A trajectory in another unit, and steps so short that a fixed reach holds millions."""
+    steps, trajectory = _case(Clock(TIMES[0], 0.0, 1.0))
+    wide = Trajectory(unit * trajectory.timestamps, trajectory.world_T_rigs)
+    turns = clock_fit.merged(TIMES, steps.f_T_nexts[:, :3, :3], steps.verified)
+    short = clock_fit.Turns(turns.times / unit, turns.rotvecs)
+    tried: list[int] = []
+
+    def count(self: ClockFit, parameters: np.ndarray, times: np.ndarray, _: np.ndarray) -> float:
+        tried.append(len(times))
+        return float(len(tried) % 97)
+
+    monkeypatch.setattr(ClockFit, "_rough_cost", count)
+    for fit, start in ((ClockFit(turns, wide), 0.0), (ClockFit(short, trajectory), 3.0)):
+        tried.clear()
+        assert len(list(fit.candidates(np.array([start, 1.0]), 10.0))) == 5
+        assert 0 < len(tried) <= 61_000 and max(tried) <= 200_000

@@ -60,6 +60,24 @@ def test_a_late_clock_or_another_recording_are_not_misread() -> None:
         refuse_misread(_coarse(SLAM[::-1]), _found(), VerifySettings())
 
 
+@pytest.mark.parametrize("late", [12, -13])
+def test_the_other_side_of_a_loop_is_another_clock(late: int) -> None:
+    """Without turning, half a loop away every step goes the other way, as in inverted poses."""
+    truth = loop_walk(NUM)
+    truth[:, :3, :3] = np.eye(3)
+    steps = inverse(truth[:-1]) @ truth[1:]
+    steps[:, :3, 3] = unit(steps[:, :3, 3])
+    every = np.ones(NUM - 1, bool)
+    found, ahead = Steps(steps, every, every), np.arange(NUM) + late
+    sources = np.where((ahead >= 0) & (ahead < NUM), PoseSource.SLAM, PoseSource.EXTRAPOLATED)
+    poses = CoarsePoses(truth[ahead.clip(0, NUM - 1)], sources.astype(np.uint8), 0.0)
+    refuse_misread(poses, found, VerifySettings())
+    with pytest.raises(GsbaError, match=r"on another clock, by about [0-9]+ frames") as refused:
+        refuse_misfit(poses, found, VerifySettings())
+    said = int(str(refused.value).split("about ")[1].split()[0])
+    assert abs(said - abs(late)) <= 1  # a step turns by 12 degrees, and 20 are no contradiction
+
+
 def test_a_reversed_trajectory_is_refused_before_another_clock_is_looked_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
