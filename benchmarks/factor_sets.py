@@ -130,7 +130,7 @@ def run_case(
         errors = evaluate(found, truth)
         induced = None
         if (walk / "depth").exists():
-            ranges = depth_maps(walk / "depth")
+            ranges = depth_maps(walk / "depth", len(truth.timestamps))
             induced = induced_errors(found, truth, ranges, result.frames.width)
         stages = result.report["stages"]
         patches = [s["cpu_seconds"] for s in stages if s["name"].startswith("align")]

@@ -261,7 +261,7 @@ class ClockFit:
         """
         half = 0.5 * min(self.turns.step, float(np.ptp(self.span)))
         far = reach + (1 + _MAX_RATE) * np.abs(self.turns.ends).max() + half
-        begin, end = self.span + [half, -half]
+        begin, end = self.span[0] + half, self.span[1] - half
         begin, end = max(begin, min(middle - far, end)), min(end, max(middle + far, begin))
         count = int(np.clip((end - begin) / (0.5 * spacing), 2, _MOST_INSTANTS))
         times = np.linspace(begin, end, count)

@@ -1,5 +1,7 @@
 """Induced pixel error: how far pose errors move what a frame shows in its neighbours' images."""
 
+import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +14,7 @@ from gsba.log import GsbaError
 from gsba.types import Trajectory
 
 STEPS = (1, 4)  # frames between a frame and the neighbours that look at its pixels
+_FURTHEST = 1e12  # truth units: beyond, nothing was measured
 _SPACING = 4  # pixels of a depth map between samples
 
 
@@ -70,9 +73,13 @@ def induced_errors(
                     shown = _seen(aligned[row], aligned[other], points)
                     errors[step].append(_angles(seen, shown) * width / (2 * np.pi))
     found = {step: np.concatenate(parts) for step, parts in errors.items() if parts}
+    found = {step: part for step, part in found.items() if len(part)}
     pooled = np.concatenate(list(found.values())) if found else np.zeros(0)
     if len(pooled) == 0:
-        raise GsbaError("no frame with depth has a neighbour: induced errors need two at least")
+        raise GsbaError(
+            "no frame with depth has a neighbour: induced errors need two frames one or four "
+            "apart, and maps that hold a distance somewhere"
+        )
     return InducedErrors(
         float(np.median(pooled)),
         float(np.percentile(pooled, 95)),
@@ -82,19 +89,37 @@ def induced_errors(
     )
 
 
-def depth_maps(folder: Path) -> Callable[[int], np.ndarray]:
-    """Reader of the depth maps `NAME.npz` with a `range` array, in name order.
+def depth_maps(folder: Path, num: int) -> Callable[[int], np.ndarray]:
+    """Reader of the depth maps `NAME.npz` with a `range` array (h, 2h), in name order.
+
+    Args:
+        folder: of the maps.
+        num: poses of the truth, each of which has one.
 
     Raises:
-        GsbaError: the folder holds none.
+        GsbaError: the folder holds another number; and from the reader, a map that is none.
     """
     files = sorted(folder.glob("*.npz"))
-    if not files:
-        raise GsbaError(f"{folder} holds no depth maps (NAME.npz with an array `range`)")
+    if len(files) != num:
+        raise GsbaError(
+            f"{folder}: {len(files)} depth maps for {num} true poses (NAME.npz with an array "
+            "`range`, one for each in name order)"
+        )
 
     def read(frame: int) -> np.ndarray:
-        with np.load(files[frame], allow_pickle=False) as archive:
-            return archive["range"]
+        path = files[frame]
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                ranges = archive["range"]
+        except (OSError, EOFError, ValueError, KeyError, TypeError, IndexError) as error:
+            raise GsbaError(f"{path}: no depth map with an array `range` ({error})") from None
+        except (zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+            raise GsbaError(f"{path}: damaged depth map ({error})") from None
+        if ranges.ndim != 2 or ranges.dtype.kind not in "fiu":
+            raise GsbaError(f"{path}: `range` is no image of numbers, but {ranges.shape}")
+        if not 0 < 2 * ranges.shape[0] == ranges.shape[1]:
+            raise GsbaError(f"{path}: {ranges.shape[1]}x{ranges.shape[0]}, but a map is 2:1")
+        return ranges
 
     return read
 
@@ -106,7 +131,7 @@ def _points(ranges: np.ndarray) -> np.ndarray:
     columns = np.arange(_SPACING // 2, width, _SPACING)
     pixels = np.stack(np.meshgrid(columns + 0.5, rows + 0.5), axis=-1)
     depths = ranges[np.ix_(rows, columns)].astype(np.float64)
-    hit = np.isfinite(depths) & (depths > 0)
+    hit = (depths > 0) & (depths < _FURTHEST)
     return depths[hit][:, None] * bearings_from_erp(pixels[hit], width, height)
 
 

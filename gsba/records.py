@@ -98,7 +98,9 @@ def save_record(path: Path, value: object, info: Mapping[str, Any]) -> None:
 def read_info(path: Path) -> dict[str, Any]:
     """The `info` a record was saved with; RecordError where there is no readable one."""
     with _reading(path) as archive:
-        return _manifest(archive)["info"]
+        info = _manifest(archive)["info"]
+        _require(isinstance(info, dict), info, dict)
+        return info
 
 
 def load_record(path: Path, returns: type[T]) -> T:
@@ -119,10 +121,10 @@ def _reading(path: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(path) as archive:
             yield archive
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        raise RecordError(f"{path}: {error}") from error
-    except NotImplementedError as error:  # zipfile's word for damaged headers
-        raise RecordError(f"{path}: {error}") from error
+    except (OSError, EOFError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise RecordError(f"{path}: {error}") from error  # trees and arrays of another shape
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RecursionError) as error:
+        raise RecordError(f"{path}: {error}") from error  # damaged archives
 
 
 def _manifest(archive: zipfile.ZipFile) -> dict[str, Any]:
@@ -163,12 +165,26 @@ def _join(place: str, name: str) -> str:
     return f"{place}/{name}" if place else name
 
 
-def _decode(tree: Any, hint: Any, archive: zipfile.ZipFile) -> Any:
+def typed(tree: Any, returns: type[T]) -> T:
+    """A record without arrays from its JSON tree.
+
+    Raises:
+        RecordError: it is of another type.
+    """
+    try:
+        return _decode(tree, returns, None)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise RecordError(str(error)) from error
+
+
+def _decode(tree: Any, hint: Any, archive: zipfile.ZipFile | None) -> Any:
     """Value of type `hint` from its JSON tree; RecordError where both disagree."""
     origin = get_origin(hint)
-    if hint is np.ndarray or origin is np.ndarray:
+    if archive is not None and (hint is np.ndarray or origin is np.ndarray):
         with archive.open(tree) as member:
-            return np.lib.format.read_array(member, allow_pickle=False)
+            array = np.lib.format.read_array(member, allow_pickle=False)
+        _require(array.dtype.kind in "biuf", array.dtype, hint)
+        return array
     if origin in (Union, types.UnionType):
         return _decode_union(tree, get_args(hint), archive)
     if origin in (tuple, list):
@@ -203,7 +219,7 @@ def _decode_scalar(tree: Any, hint: Any) -> Any:
     raise TypeError(f"records cannot hold {hint}")
 
 
-def _decode_union(tree: Any, hints: tuple[Any, ...], archive: zipfile.ZipFile) -> Any:
+def _decode_union(tree: Any, hints: tuple[Any, ...], archive: zipfile.ZipFile | None) -> Any:
     if tree is None and type(None) in hints:
         return None
     for hint in hints:
@@ -215,7 +231,7 @@ def _decode_union(tree: Any, hints: tuple[Any, ...], archive: zipfile.ZipFile) -
     raise RecordError(f"{tree!r:.60} is none of {hints}")
 
 
-def _decode_sequence(tree: Any, hint: Any, archive: zipfile.ZipFile) -> Any:
+def _decode_sequence(tree: Any, hint: Any, archive: zipfile.ZipFile | None) -> Any:
     _require(isinstance(tree, list), tree, hint)
     items = get_args(hint)
     if get_origin(hint) is list:
@@ -226,10 +242,11 @@ def _decode_sequence(tree: Any, hint: Any, archive: zipfile.ZipFile) -> Any:
     return tuple(_decode(value, item, archive) for value, item in zip(tree, items, strict=True))
 
 
-def _decode_dataclass(tree: Any, cls: type[T], archive: zipfile.ZipFile) -> T:
+def _decode_dataclass(tree: Any, cls: type[T], archive: zipfile.ZipFile | None) -> T:
     names = {entry.name for entry in fields(cls)}  # type: ignore[arg-type]
     if not isinstance(tree, dict) or set(tree) != names:
-        raise RecordError(f"{archive.filename}: not a {cls.__name__} of this version")
+        where = f"{archive.filename}: " if archive is not None else ""
+        raise RecordError(f"{where}not a {cls.__name__} of this version")
     hints = typing.get_type_hints(cls)
     return cls(**{name: _decode(tree[name], hints[name], archive) for name in names})
 

@@ -4,11 +4,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gsba import read, registered, timing
 from gsba.components import largest, taken
 from gsba.config_file import to_toml
 from gsba.export import ExportFormat, export, write_points
 from gsba.line import Line
+from gsba.log import GsbaError
 from gsba.motion import describe
 from gsba.placement import Placement, place
 from gsba.report import build_report, plain, take_notes, write_poses, write_report
@@ -51,12 +54,42 @@ def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:
     """Result of a finished run and the frames it was made from: the largest of its maps.
 
     Raises:
-        GsbaError: `out` is no finished run.
+        GsbaError: `out` is no finished run, or was edited.
     """
     reconstruction = load_stage(out, "reconstruction", Reconstruction)
     frames = load_stage(out, "frames", FrameSet)
+    if not _fit_together(reconstruction, frames):
+        raise GsbaError(f"{out}: its results do not fit together: refine again with --fresh")
     frames = replace(frames, correction=reconstruction.correction)
-    return taken(reconstruction, frames, largest(reconstruction))
+    main, shown = taken(reconstruction, frames, largest(reconstruction))
+    if not (np.isfinite(main.world_T_rigs).all() and np.isfinite(main.points_world).all()):
+        raise GsbaError(f"{out}: its poses or points are no numbers: refine again with --fresh")
+    return main, shown
+
+
+def _fit_together(reconstruction: Reconstruction, frames: FrameSet) -> bool:
+    """Whether arrays have the lengths that others speak of."""
+    result, num = reconstruction, len(frames.names)
+    points, seen = len(result.points_world), len(result.observation_points)
+    shapes = (
+        (result.world_T_rigs, (num, 4, 4)),
+        (result.pose_covariances, (num, 6, 6)),
+        (result.pose_statuses, (num,)),
+        (result.points_world, (points, 3)),
+        (result.point_colors, (points, 3)),
+        (result.point_errors, (points,)),
+        (result.observation_frames, (seen,)),
+        (result.observation_bearings, (seen, 3)),
+        (result.observation_sigmas, (seen,)),
+        (frames.timestamps, (num,)),
+    )
+    indices = ((result.observation_points, points), (result.observation_frames, num))
+    return (
+        all(array.shape == shape for array, shape in shapes)
+        and len(frames.paths) == len(frames.mask_paths) == num > 0
+        and (result.components is None or result.components.shape == (num,))
+        and all(len(i) == 0 or (i.min() >= 0 and i.max() < most) for i, most in indices)
+    )
 
 
 def write(line: Line, reconstruction: Reconstruction) -> RunResult:

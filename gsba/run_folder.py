@@ -16,7 +16,7 @@ from typing import Any
 
 from gsba import __version__
 from gsba.log import GsbaError
-from gsba.records import atomic_write, disk_errors, remove_temporaries
+from gsba.records import RecordError, atomic_write, disk_errors, remove_temporaries, typed
 
 logger = logging.getLogger(__name__)
 
@@ -79,11 +79,14 @@ def read_marker(root: Path) -> dict[str, Any]:
         marker = json.loads(path.read_text())
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise GsbaError(f"{path} is unreadable: choose another --out") from error
-    if not isinstance(marker, dict) or not {"origin", "wrote"} <= marker.keys():
-        raise GsbaError(f"{path} was not written by gsba: choose another --out")
-    return marker
+    try:
+        origin = typed(marker["origin"], dict[str, str])
+        wrote = typed(marker["wrote"], list[str])
+    except (RecordError, TypeError, KeyError):
+        raise GsbaError(f"{path} was not written by gsba: choose another --out") from None
+    return marker | {"origin": origin, "wrote": wrote}
 
 
 def _write_marker(root: Path, origin: Mapping[str, str], wrote: Any) -> None:

@@ -25,7 +25,15 @@ from pydantic import BaseModel
 
 from gsba import __version__
 from gsba.log import GsbaError, track
-from gsba.records import FORMAT, RecordError, atomic_write, load_record, read_info, save_record
+from gsba.records import (
+    FORMAT,
+    RecordError,
+    atomic_write,
+    load_record,
+    read_info,
+    save_record,
+    typed,
+)
 from gsba.run_folder import MARKER, STAGES, claim, is_run_folder, open_run_folder
 
 logger = logging.getLogger(__name__)
@@ -278,7 +286,7 @@ def _load_if_current(path: Path, key: str, returns: type[T]) -> tuple[T, StageRe
         if info.get("key") != key:
             logger.info("%s: settings or inputs changed, computing again", path.stem)
             return None
-        return load_record(path, returns), StageRecord(**info)
+        return load_record(path, returns), typed(info, StageRecord)
     except RecordError as error:
         logger.warning("%s: stored result is unusable, computing again (%s)", path.stem, error)
         return None
@@ -300,7 +308,7 @@ def _measured(
 
 def _read_cost(path: Path, key: str) -> StageRecord | None:
     try:
-        record = StageRecord(**json.loads(path.read_text()))
-    except (OSError, ValueError, TypeError):
+        record = typed(json.loads(path.read_text()), StageRecord)
+    except (OSError, ValueError, RecursionError, RecordError):
         return None
     return record if record.key == key else None

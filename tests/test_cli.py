@@ -185,6 +185,7 @@ def test_evaluate_fails_in_one_line(tmp_path: Path) -> None:
 def test_demo_checks_its_options(tmp_path: Path) -> None:
     _fails(_gsba("demo", "--path", "spiral", "--out", tmp_path), "'spiral'")
     _fails(_gsba("demo", "--frames", 2, "--out", tmp_path), "2 frames")
+    _fails(_gsba("demo", "--seed", -1, "--out", tmp_path), "seed -1")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,5 +1,6 @@
 """Induced pixel error: closed forms for a turned and for a shifted camera."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -70,12 +71,40 @@ def test_nothing_to_compare_is_one_clear_line(tmp_path: Path) -> None:
         induced_errors(two, TRUTH, _flat, WIDTH)
     with pytest.raises(GsbaError, match="no frame with depth"):
         induced_errors(TRUTH, TRUTH, lambda _: np.zeros((64, 128)), WIDTH)
-    with pytest.raises(GsbaError, match="no depth maps"):
-        depth_maps(tmp_path)
+    for many in (np.full((64, 128), np.nan), np.full((64, 128), 1e300)):
+        with pytest.raises(GsbaError, match="hold a distance somewhere"):
+            induced_errors(TRUTH, TRUTH, lambda _, many=many: many, WIDTH)
+    with pytest.raises(GsbaError, match="0 depth maps for 3 true poses"):
+        depth_maps(tmp_path, 3)
 
 
 def test_depth_maps_are_read_in_name_order(tmp_path: Path) -> None:
     for k in (2, 0, 1):
         np.savez(tmp_path / f"{k:06d}.npz", range=np.full((2, 4), k))
-    read = depth_maps(tmp_path)
+    read = depth_maps(tmp_path, 3)
     assert [read(k)[0, 0] for k in range(3)] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda path: path.write_bytes(path.read_bytes()[:-40]), "(no|damaged) depth map"),
+        (lambda path: path.write_bytes(path.read_bytes()[:60] + b"x" * 90), "depth map"),
+        (lambda path: path.write_bytes(b""), "no depth map with an array"),
+        (lambda path: path.write_text("range"), "no depth map with an array"),
+        (lambda path: np.save(path.open("wb"), np.ones((2, 4))), "no depth map with an array"),
+        (lambda path: np.savez(path, depth=np.ones((2, 4))), "no depth map with an array"),
+        (lambda path: np.savez(path, range=np.array([{}, None])), "no depth map with an array"),
+        (lambda path: np.savez(path, range=np.array([["a"]])), "no image of numbers"),
+        (lambda path: np.savez(path, range=np.ones(8)), "no image of numbers"),
+        (lambda path: np.savez(path, range=np.ones((0, 0))), "0x0, but a map is 2:1"),
+        (lambda path: np.savez(path, range=np.ones((4, 4))), "4x4, but a map is 2:1"),
+    ],
+)
+def test_damaged_depth_maps_are_named(
+    tmp_path: Path, spoil: Callable[[Path], object], message: str
+) -> None:
+    np.savez(tmp_path / "0.npz", range=np.ones((2, 4)))
+    spoil(tmp_path / "0.npz")
+    with pytest.raises(GsbaError, match=rf"0\.npz: .*{message}|0\.npz: {message}"):
+        depth_maps(tmp_path, 1)(0)

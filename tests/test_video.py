@@ -212,6 +212,33 @@ def test_frames_of_two_extractions_do_not_mix(film: Path, tmp_path: Path) -> Non
         extract(film, tmp_path / "photos", VideoSettings(), replace=True)
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("extract.json", "[]", "no extraction"),
+        ("extract.json", '{"counts": {"received": []}, "key": 1}', "no extraction"),
+        ("extract.json", '{"counts": [3], "key": 1}', "no extraction"),
+        ("extract.json", "[" * 99_999, "no extraction"),
+        ("extract.json", '{"counts": null, "key": 1}', "another extraction"),
+        ("extract.partial.csv", "000000.jpg\n", "damaged"),
+        ("extract.partial.csv", "000000.jpg,x,y,z\n", "damaged"),
+        ("timestamps.csv", "000000.jpg,x\n", "holds no times"),
+    ],
+)
+def test_edited_extractions_are_refused(
+    film: Path, tmp_path: Path, name: str, content: str, message: str
+) -> None:
+    out = tmp_path / "frames"
+    settings = VideoSettings(every=30)
+    extract(film, out, settings)
+    if name == "extract.partial.csv":  # as if it had been interrupted
+        marker = json.loads((out / "extract.json").read_text()) | {"counts": None}
+        (out / "extract.json").write_text(json.dumps(marker))
+    (out / name).write_text(content)
+    with pytest.raises(GsbaError, match=message):
+        extract(film, out, settings)
+
+
 def test_colours_survive(tmp_path: Path) -> None:
     """What names no colour matrix is taken for BT.709; flat colours come back within JPEG's."""
     flat = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
@@ -255,6 +282,8 @@ def test_bad_options(film: Path, tmp_path: Path) -> None:
     _fails(_gsba("extract", film, *out, "--fps", 1, "--every", 2), "pass one")
     _fails(_gsba("extract", film, *out, "--fps", -1), "video.fps = -1.0 is not allowed")
     _fails(_gsba("extract", film, *out, "--width", 999), "video.width")
+    _fails(_gsba("extract", film, *out, "--width", 99999), "use an even integer >= 64")
+    _fails(_gsba("extract", tmp_path, *out), "is a folder; give a video")
     _fails(_gsba("extract", film, *out, "--width", 512), "has only 256 pixels")
     _fails(_gsba("extract", film, *out, "--from", 2, "--to", 1), "later than --from")
     _fails(_gsba("extract", film, *out, "--from", 20), "no frame between 20 and inf s")

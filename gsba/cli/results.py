@@ -120,7 +120,7 @@ def evaluate(
     found, true = read_trajectory(path), read_trajectory(truth)
     errors, induced = compare(found, true), None
     if depth is not None:
-        ranges = depth_maps(depth)
+        ranges = depth_maps(depth, len(true.timestamps))
         induced = induced_errors(found, true, ranges, 4 * ranges(0).shape[1])
     claims, judged = None, ""
     if estimate.is_dir():

@@ -65,7 +65,7 @@ def make_walk(
     """
     from gsba.demo.gallery import build_gallery
 
-    _check(out, path, heading, num_frames, width)
+    _check(out, path, heading, num_frames, width, seed)
     partial = out.with_name(f".{out.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     (partial / "images").mkdir(parents=True)
@@ -199,10 +199,12 @@ def _write_depth(folder: Path, scene, truth: Trajectory, width: int) -> None:
         np.savez_compressed(folder / f"{f:06d}.npz", range=depth)
 
 
-def _check(out: Path, path: str, heading: str, num_frames: int, width: int) -> None:
+def _check(out: Path, path: str, heading: str, num_frames: int, width: int, seed: int) -> None:
     for value, allowed, what in ((path, WalkPath, "path"), (heading, Heading, "heading")):
         if value not in get_args(allowed):
             raise GsbaError(f"{what} {value!r} is none of {', '.join(get_args(allowed))}")
+    if seed < 0:
+        raise GsbaError(f"seed {seed}: must be 0 or more")
     if num_frames < 3:
         raise GsbaError(f"a walk of {num_frames} frames: at least 3 are needed")
     if width < 64 or width % 2:

@@ -21,7 +21,7 @@ from gsba.config import VideoSettings
 from gsba.log import GsbaError, track
 from gsba.read import read_trajectory
 from gsba.read.times import read_times
-from gsba.records import atomic_write, disk_errors, remove_temporaries
+from gsba.records import RecordError, atomic_write, disk_errors, remove_temporaries, typed
 from gsba.store import digest, fingerprint
 from gsba.types import Counts
 from gsba.video.likeness import apparent_motion_deg, miniature, sharpness
@@ -225,16 +225,16 @@ def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
         return None
     try:
         marker = json.loads((out / MARKER).read_text(encoding="utf-8"))
-        counts = None if marker["counts"] is None else Counts(**marker["counts"])
+        counts = typed(marker["counts"], Counts | None)  # type: ignore[arg-type]
         same = marker["key"] == key
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError, RecursionError, RecordError):
         raise GsbaError(f"{out} is not empty and no extraction: choose another --out") from None
     written = _read_times(out)
     if same and (counts is None or all((out / n).is_file() for n in written)):
         return counts
     if not same and not replace:
         raise GsbaError(
-            f"{out} holds another extraction (of {marker['video']}): choose another --out, or "
+            f"{out} holds another extraction (of {marker.get('video')}): choose another --out, or "
             "--fresh to replace it"
         )
     with disk_errors(out):
@@ -262,11 +262,14 @@ def _read_journal(out: Path) -> list[_Kept]:
     except FileNotFoundError:
         return []
     kept = []
-    for row in csv.reader(text[: text.rfind("\n") + 1].splitlines()):
-        entry = _Kept(row[0], float(row[1]), int(row[2]), int(row[3]))
-        if not (out / entry.name).is_file():
-            break
-        kept.append(entry)
+    try:
+        for row in csv.reader(text[: text.rfind("\n") + 1].splitlines()):
+            entry = _Kept(row[0], float(row[1]), int(row[2]), int(row[3]))
+            if not (out / entry.name).is_file():
+                break
+            kept.append(entry)
+    except (ValueError, IndexError, csv.Error) as error:
+        raise GsbaError(f"{out / _JOURNAL} is damaged ({error}): remove {out}") from None
     return kept
 
 

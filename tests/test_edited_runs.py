@@ -1,0 +1,130 @@
+"""Run folders that were edited: one line that says so, or the stage is computed again."""
+
+import dataclasses
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import export_scene as scene
+import numpy as np
+import pytest
+
+from gsba import load_run
+from gsba.log import GsbaError
+from gsba.placement import read_placement
+from gsba.records import RecordError, load_record, save_record, typed
+from gsba.run_folder import open_run_folder
+from gsba.store import RunStore, StageRecord
+from gsba.types import Counts, Reconstruction
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """What `load_run` needs of a finished run."""
+    root = tmp_path / "run"
+    (root / "stages").mkdir(parents=True)
+    (root / "gsba.json").write_text('{"origin": {}, "wrote": []}')
+    save_record(root / "stages/reconstruction.npz", scene.reconstruction(), {})
+    save_record(root / "stages/frames.npz", scene.panoramas(tmp_path / "frames"), {})
+    load_run(root)
+    return root
+
+
+def _edit(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    """Change the JSON tree of a record, as with an editor."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    tree = json.loads(members["manifest.json"])
+    members["manifest.json"] = json.dumps(change(tree) or tree).encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda tree: [tree],
+        lambda tree: {"format": tree["format"], "value": 3},
+        lambda tree: tree["value"].update(world_T_rigs=7),
+        lambda tree: tree["value"].update(world_T_rigs="nothing.npy"),
+        lambda tree: tree["value"].update(world_T_rigs=["point_errors.npy"]),
+        lambda tree: tree["value"].update(correction=7),
+        lambda tree: tree["value"].update(correction=["x"]),
+        lambda tree: tree["value"].pop("points_world"),
+    ],
+)
+def test_an_edited_record_is_no_result(run: Path, change: Callable[[dict], Any]) -> None:
+    _edit(run / "stages/reconstruction.npz", change)
+    with pytest.raises(RecordError):
+        load_record(run / "stages/reconstruction.npz", Reconstruction)
+    with pytest.raises(GsbaError, match="has no usable 'reconstruction' result"):
+        load_run(run)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("world_T_rigs", np.eye(4), "do not fit together"),
+        ("pose_statuses", np.zeros(99, np.uint8), "do not fit together"),
+        ("observation_frames", np.zeros(1, np.int32), "do not fit together"),
+        ("components", np.zeros(1, np.int32), "do not fit together"),
+        ("world_T_rigs", np.full((scene.NUM_FRAMES, 4, 4), np.nan), "are no numbers"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(
+    run: Path, field: str, value: np.ndarray, message: str
+) -> None:
+    edited = dataclasses.replace(scene.reconstruction(), **{field: value})
+    save_record(run / "stages/reconstruction.npz", edited, {})
+    with pytest.raises(GsbaError, match=f"{message}.* --fresh"):
+        load_run(run)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        '{"origin": null, "wrote": []}',
+        '{"origin": {"frames": 3}, "wrote": []}',
+        '{"origin": {}, "wrote": 3}',
+        '{"origin": {}, "wrote": [3]}',
+        '["origin", "wrote"]',
+        "3",
+        "[" * 99_999,
+        "",
+    ],
+)
+def test_an_edited_marker_is_not_ours(tmp_path: Path, content: str) -> None:
+    (tmp_path / "gsba.json").write_text(content)
+    with pytest.raises(GsbaError, match=r"gsba.json .*: choose another --out"):
+        open_run_folder(tmp_path, {}, fresh=True)
+    assert (tmp_path / "gsba.json").read_text() == content
+
+
+@pytest.mark.parametrize("change", [{"seconds": "long"}, {"name": 3}, {"key": None}])
+def test_a_stage_whose_cost_was_edited_is_computed_again(
+    tmp_path: Path, change: dict[str, Any]
+) -> None:
+    counts = Counts(3, 2, "frames", {"dark": 1})
+    for expected in (counts, dataclasses.replace(counts, kept=1)):
+        with RunStore(tmp_path / "run", {}) as store:
+            assert store.stage("some", None, lambda e=expected: e, Counts) == expected
+        path = tmp_path / "run/stages/some.npz"
+        _edit(path, lambda tree: tree["info"].update(change))
+
+
+@pytest.mark.parametrize("tree", [3, None, [], {"name": "x"}, {"name": [], "key": ""}])
+def test_trees_of_another_type_are_no_records(tree: object) -> None:
+    with pytest.raises(RecordError):
+        typed(tree, StageRecord)
+
+
+@pytest.mark.parametrize(
+    "content", ["[]", "3", '{"scale": 1e999}', '{"scale": 1%s}' % ("0" * 400), "[" * 99_999]
+)
+def test_an_edited_placement_is_none(tmp_path: Path, content: str) -> None:
+    (tmp_path / "transform.json").write_text(content)
+    with pytest.raises(GsbaError, match=r"not a transform.json of gsba: export again"):
+        read_placement(tmp_path / "transform.json")
