@@ -276,7 +276,7 @@ class SplatSettings(_Settings):
     backend: Literal["auto", "gsplat", "cpu"] = "auto"
     held_out_every: int = Field(default=8, ge=2)  # whole panoramas kept for evaluation
     sh_degree: int = Field(default=3, ge=0, le=3)
-    max_gaussians: int = Field(default=1_000_000, ge=1)
+    max_gaussians: int | None = Field(default=None, ge=1)  # None = as pixels and memory allow
     ssim_weight: float = Field(default=0.2, ge=0, le=1)
     near: float = Field(default=0.01, gt=0)  # Gaussians nearer are not seen, part of the extent
     rate_means: float = Field(default=1.6e-4, gt=0)  # at the start, part of the extent

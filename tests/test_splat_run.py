@@ -72,7 +72,7 @@ def test_evaluate_compares_sources_and_resumes(case: Case, run: Path, tmp_path: 
     table = call(*arguments)
     content = json.loads((run / "splat-evaluation/results.json").read_text())["sources"]
     psnrs = [content[name]["mean"]["psnr"] for name in ("refined", "moved")]
-    assert abs(psnrs[0] - psnrs[1]) < 0.3  # rounding sends the trainings apart
+    assert abs(psnrs[0] - psnrs[1]) < 0.01  # thirty steps: density control has yet to begin
     assert "moved" in table and len(list((run / "splat-evaluation/pictures").iterdir())) == 1
     again = call(*arguments)
     assert again == table
@@ -84,7 +84,8 @@ def test_evaluate_needs_something_to_compare_with(run: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "option", [("--iterations", "0"), ("--face-size", "3"), ("--backend", "x")]
+    "option",
+    [("--iterations", "0"), ("--face-size", "3"), ("--backend", "x"), ("--max-gaussians", "0")],
 )
 def test_bad_options_are_one_line(run: Path, option: tuple[str, str]) -> None:
     failed = CliRunner().invoke(app, ["train", str(run), *option])

@@ -18,7 +18,15 @@ from gsba.splat.density import Limits, Pull, densify, reset_opacity
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.metrics import psnr
 from gsba.splat.rasterise import render
-from gsba.splat.train import Views, advance, begin, extent_of, times_for, train
+from gsba.splat.train import (
+    Views,
+    advance,
+    begin,
+    extent_of,
+    most_gaussians,
+    times_for,
+    train,
+)
 
 SIZE = 32
 RIG = CubeRig(SIZE, np.pi / 2)
@@ -160,6 +168,26 @@ def test_the_cap_is_kept_and_said(caplog: pytest.LogCaptureFixture) -> None:
     assert max(sizes) <= 155 and "155 Gaussians are the most allowed" in caplog.text
     tiny = SETTINGS.model_copy(update={"max_gaussians": 100, "iterations": 2})
     assert len(train(start(truth), views, tiny, CpuBackend(1))) == 100
+
+
+def test_a_cap_follows_from_pixels_and_memory(caplog: pytest.LogCaptureFixture) -> None:
+    """23 numbers a Gaussian; 6 views of 32 x 32 pixels have 18,432 values."""
+    truth, views = scene()
+    eager = SETTINGS.model_copy(update={"densify_pull": 1e-9, "iterations": 600})
+    backend = CpuBackend(1)
+    splat = train(start(truth), views, eager, backend)
+    assert 500 < len(splat) <= 18_432 // 23
+    assert "801 Gaussians are the most that 6144 pixels determine" in caplog.text
+    half = np.zeros(views.images.shape[:3], bool)
+    half[:, :16] = True
+    masked = dataclasses.replace(views, use=half)
+    assert most_gaussians(masked, eager, backend)[0] == 18_432 // 2 // 23
+    backend.memory_bytes = 2 * 8 * 4 * 23 * 300
+    assert most_gaussians(views, eager, backend) == (300, "that half of 0.0 GB of memory holds")
+    assert 150 < len(train(start(truth), views, eager, backend)) <= 300
+    backend.memory_bytes //= 3
+    assert len(begin(start(truth), eager).gaussians) == 150  # points are kept, but not added to
+    assert len(train(start(truth), views, eager, backend)) <= 150
 
 
 def test_nothing_to_train_on_is_refused() -> None:

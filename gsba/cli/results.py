@@ -13,6 +13,7 @@ from gsba.cli.splat import (
     FaceSize,
     Iterations,
     LpipsWeights,
+    MaxGaussians,
     evaluate_splat,
     splat_settings,
 )
@@ -99,12 +100,13 @@ def evaluate(
     ] = None,
     iterations: Iterations = None,
     face_size: FaceSize = None,
+    max_gaussians: MaxGaussians = None,
     backend: BackendName = "auto",
     lpips: LpipsWeights = None,
 ) -> None:
     """Compare a run or a trajectory with the truth, or what its poses are worth to a splat."""
     if splat:
-        settings = splat_settings(iterations, face_size, backend)
+        settings = splat_settings(iterations, face_size, backend, max_gaussians)
         evaluate_splat(estimate, against or [], settings, lpips or [])
     if truth is None:
         if not splat:

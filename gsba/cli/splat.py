@@ -18,6 +18,9 @@ FaceSize = Annotated[int | None, typer.Option(help="Pixels of a cube face.")]
 LpipsWeights = Annotated[
     list[Path] | None, typer.Option("--lpips", help="Weights of LPIPS; repeatable.", metavar="FILE")
 ]
+MaxGaussians = Annotated[
+    int | None, typer.Option(help="At most; by default as pixels and memory allow.", metavar="N")
+]
 BackendName = Annotated[str, typer.Option(help="auto, gsplat or cpu.")]
 
 
@@ -26,11 +29,12 @@ def train(
     run: Run,
     iterations: Iterations = None,
     face_size: FaceSize = None,
+    max_gaussians: MaxGaussians = None,
     backend: BackendName = "auto",
     lpips: LpipsWeights = None,
 ) -> None:
     """Train a splat on a run's refined poses; the same call again resumes."""
-    settings = splat_settings(iterations, face_size, backend)
+    settings = splat_settings(iterations, face_size, backend, max_gaussians)
     results = _compare(run, {}, settings, run / "splat", lpips or [])
     mean = results["refined"].mean
     typer.echo(
@@ -118,7 +122,9 @@ def _compare(
     return results
 
 
-def splat_settings(iterations: int | None, face_size: int | None, backend: str) -> "SplatSettings":
+def splat_settings(
+    iterations: int | None, face_size: int | None, backend: str, max_gaussians: int | None = None
+) -> "SplatSettings":
     """Settings with what the command line asks for.
 
     Raises:
@@ -129,6 +135,7 @@ def splat_settings(iterations: int | None, face_size: int | None, backend: str) 
     from gsba.config import SplatSettings
 
     asked = {"iterations": iterations, "face_size": face_size, "backend": backend}
+    asked["max_gaussians"] = max_gaussians
     try:
         return SplatSettings.model_validate({k: v for k, v in asked.items() if v is not None})
     except ValidationError as error:

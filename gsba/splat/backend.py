@@ -1,6 +1,7 @@
 """The two renderers behind one interface: `cpu`, ours, and `gsplat` on CUDA."""
 
 import logging
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -35,6 +36,7 @@ class Backend(Protocol):
 
     name: str
     stretch: int  # steps that are best made in one call of `descend`
+    memory_bytes: int  # of the device, all of it
 
     def render(
         self,
@@ -74,6 +76,7 @@ class CpuBackend:
 
     def __init__(self, num_threads: int | None = None) -> None:
         self.num_threads = num_threads
+        self.memory_bytes = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
     def render(
         self,

@@ -48,6 +48,11 @@ class Gaussians:
         return all(bool(np.isfinite(array).all()) for array in self.arrays())
 
 
+def num_parameters(sh_degree: int) -> int:
+    """Numbers that make a Gaussian."""
+    return 3 + 3 + 4 + 1 + 3 * (sh_degree + 1) ** 2
+
+
 def concatenate(parts: "list[Gaussians]") -> Gaussians:
     """Several sets as one."""
     columns = zip(*(part.arrays() for part in parts), strict=True)

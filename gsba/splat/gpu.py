@@ -5,6 +5,7 @@ The authors of this file have run gsplat 1.5.3's Python side, on its own PyTorch
 CUDA kernels (tests/test_splat_gsplat.py), but not yet those kernels.
 """
 
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
@@ -50,6 +51,11 @@ class GsplatBackend:
         if device == "cuda":
             _require_kernels(torch)
         self._torch, self._rasterize, self._device = torch, gsplat.rasterization, device
+        self.memory_bytes = (
+            torch.cuda.get_device_properties(device).total_memory
+            if device == "cuda"
+            else os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        )
         self._window = metrics.window().tolist()
 
     def render(

@@ -21,11 +21,12 @@ from gsba.splat import adam
 from gsba.splat.backend import Backend, Lesson
 from gsba.splat.camera import FaceCamera
 from gsba.splat.density import Limits, Pull, densify, reset_opacity
-from gsba.splat.gaussians import Gaussians
+from gsba.splat.gaussians import Gaussians, num_parameters
 
 logger = logging.getLogger(__name__)
 
 _PUBLISHED = 30_000  # steps that the published times are for
+_COPIES = 8  # of all parameters at once: gradients, two moments, and what density control makes
 _CHECK_EVERY = 20  # steps between looks for values that are not finite, at ends of stretches
 
 
@@ -133,13 +134,17 @@ def train(
 def begin(start: Gaussians, settings: SplatSettings) -> State:
     """A training that has not made a step; where there are too many Gaussians, a part of them.
 
+    Args:
+        start: e.g. of `from_cloud`.
+        settings: seed and the most Gaussians; None = all of them.
+
     Raises:
         GsbaError: no Gaussian.
     """
     if len(start) == 0:
         raise GsbaError("no Gaussian to start from")
     rows = np.arange(len(start))
-    if len(start) > settings.max_gaussians:
+    if settings.max_gaussians is not None and len(start) > settings.max_gaussians:
         logger.warning("the cloud has %d points, %d are used", len(start), settings.max_gaussians)
         draw = np.random.default_rng(settings.seed)
         rows = np.sort(draw.permutation(len(start))[: settings.max_gaussians])
@@ -185,6 +190,24 @@ def _resume(checkpoint: Path | None, key: str) -> State | None:
     return state
 
 
+def most_gaussians(views: Views, settings: SplatSettings, backend: Backend) -> tuple[int, str]:
+    """How many Gaussians a training may have, and what allows no more.
+
+    As many as settings say. Else they have at most as many parameters as pixels have values, for
+    more could show anything between the views; and they fill at most half of the memory. A start
+    that has more stays as it is.
+    """
+    if settings.max_gaussians is not None:
+        return settings.max_gaussians, "allowed"
+    num = num_parameters(settings.sh_degree)
+    pixels = int(np.prod(views.images.shape[:3]) if views.use is None else views.use.sum())
+    determined = max(3 * pixels // num, 1)
+    held = max(backend.memory_bytes // 2 // (_COPIES * np.dtype(np.float32).itemsize * num), 1)
+    if determined <= held:
+        return determined, f"that {pixels} pixels determine"
+    return held, f"that half of {backend.memory_bytes / 1e9:.1f} GB of memory holds"
+
+
 class Trainer:
     """What does not change between steps.
 
@@ -195,6 +218,7 @@ class Trainer:
     def __init__(self, views: Views, settings: SplatSettings, backend: Backend) -> None:
         if len(views.images) == 0 or (views.use is not None and not views.use.any()):
             raise GsbaError("no pixel to train a splat on: all frames are masked or held out")
+        self.most, self.limit = most_gaussians(views, settings, backend)
         self.views, self.settings, self.backend = views, settings, backend
         self.times = times_for(settings.iterations)
         self.extent = extent_of(np.array([camera.face_in_world for camera in views.cameras]))
@@ -265,7 +289,7 @@ class Trainer:
             clone_scale=settings.densify_scale * self.extent,
             max_scale=settings.max_scale * self.extent if step > self.times.reset_every else None,
             min_opacity=settings.min_opacity,
-            max_gaussians=settings.max_gaussians,
+            max_gaussians=self.most,
         )
         draw = np.random.default_rng([settings.seed, step, 1])
         gaussians, moments, capped = densify(
@@ -273,5 +297,5 @@ class Trainer:
         )
         if capped and not self.capped:
             self.capped = True
-            logger.warning("%d Gaussians are the most allowed", settings.max_gaussians)
+            logger.warning("%d Gaussians are the most %s", self.most, self.limit)
         return gaussians, moments
