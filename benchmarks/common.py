@@ -1,19 +1,23 @@
-"""What the benchmarks share: a stopwatch for child processes, and the machine they ran on.
+"""What the benchmarks share: child processes and the rows kept of them, cut walks, the machine.
 
 The kernel counts the peak of the process that forks into its child's `ru_maxrss`. So `measure`
-starts commands from this file, run as a process of its own that is too small to blur them.
+starts commands from this file, run as a process of its own that is too small to blur them:
+heavy imports go in the functions that need them.
 """
 
+import hashlib
 import json
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +58,103 @@ def _stopwatch(timeout_s: float, command: Sequence[str]) -> dict[str, float | bo
     }
 
 
+def kept_row(folder: Path, key: dict, timeout_s: float) -> dict | None:
+    """The row of a folder, if it is of this key and running it again would not end otherwise."""
+    kept = folder / "row.json"
+    if not kept.exists():
+        return None
+    row = json.loads(kept.read_text())
+    ended = "errors" in row or (row["timed_out"] and row["wall_s"] >= timeout_s)
+    return row if row["key"] == key and ended else None
+
+
+def run_row(
+    command: Sequence[str], folder: Path, row: dict, finish: Callable[[], dict], timeout_s: float
+) -> dict[str, Any]:
+    """Run a command; keep and return the row with its cost and outcome.
+
+    Args:
+        folder: where `row.json` and `log.txt` go.
+        row: what is known before; its `key` says what `kept_row` may use it for.
+        finish: judges what the command left, into `errors` among others.
+    """
+    cost = measure(command, folder / "log.txt", timeout_s)
+    row = row | asdict(cost)
+    if cost.timed_out:
+        row["reason"] = f"stopped after {timeout_s / 60:g} minutes"
+    elif cost.exit_code != 0:
+        row["reason"] = last_line(folder / "log.txt")
+    else:
+        row |= outcome(finish)
+    _write(folder / "row.json", json.dumps(row, indent=1))
+    return row
+
+
+def outcome(finish: Callable[[], dict]) -> dict[str, Any]:
+    """What a row is judged to be worth, or why it cannot be judged."""
+    from gsba.log import GsbaError
+
+    try:
+        return finish()
+    except GsbaError as error:
+        return {"reason": str(error)}
+
+
+def refine_command(frames: Path, run: Path, options: Sequence[str]) -> list[str]:
+    """A whole run in a process of its own, without a dataset."""
+    command = [sys.executable, "-c", "from gsba.cli import main; main()", "refine", str(frames)]
+    return [*command, *options, "--out", str(run), "--fresh", "--set", "export.formats=[]"]
+
+
+def last_line(log: Path) -> str:
+    """What a command said last."""
+    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    return lines[-1] if lines else "failed without a word"
+
+
+def digest(paths: Iterable[Path]) -> str:
+    """Fingerprint of files' contents."""
+    total = hashlib.sha256()
+    for path in paths:
+        total.update(hashlib.sha256(path.read_bytes()).digest())
+    return total.hexdigest()[:16]
+
+
+def code_digest() -> str:
+    """Fingerprint of the code that a run executes."""
+    import factors
+    import gsba
+
+    homes = [Path(str(package.__file__)).parent for package in (gsba, factors)]
+    return digest(path for home in homes for path in sorted(home.rglob("*.py")))
+
+
+class Case(NamedTuple):
+    """Frames, their coarse trajectory and the truth."""
+
+    images: Path  # with timestamps.csv
+    trajectory: Path | None  # TUM
+    truth: Path  # TUM
+
+
+def cut_short(case: Case, num_frames: int, folder: Path) -> Case:
+    """The first frames of a case, as links in `folder`, and the poses up to the last of them."""
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "images").mkdir(parents=True)
+    header, *rows = (case.images / "timestamps.csv").read_text().splitlines()
+    for row in rows[:num_frames]:
+        name = row.partition(",")[0]
+        (folder / "images" / name).symlink_to((case.images / name).resolve())
+    _write(folder / "images/timestamps.csv", "\n".join([header, *rows[:num_frames], ""]))
+    last = float(rows[:num_frames][-1].partition(",")[2])
+    for path in filter(None, (case.trajectory, case.truth)):
+        poses = path.read_text().splitlines(keepends=True)
+        kept = [one for one in poses if one[0] == "#" or float(one.split()[0]) <= last + 1e-6]
+        _write(folder / path.name, "".join(kept))
+    trajectory = case.trajectory and folder / case.trajectory.name
+    return Case(folder / "images", trajectory, folder / case.truth.name)
+
+
 def peak_mb() -> float:
     """Peak resident memory of this process since its program started, without its parent's."""
     status = Path("/proc/self/status").read_text()
@@ -70,11 +171,14 @@ def machine() -> str:
 
 def write_table(lines: Sequence[str], path: Path | None) -> None:
     """Write the lines of a Markdown table and the machine they are of, if there is a path."""
+    if path is not None:
+        _write(path, "\n".join([*lines, "", f"{machine()}.", ""]))
+
+
+def _write(path: Path, text: str) -> None:
     from gsba.records import atomic_write
 
-    text = "\n".join([*lines, "", f"{machine()}.", ""])
-    if path is not None:
-        atomic_write(path, lambda file: file.write_text(text))
+    atomic_write(path, lambda file: file.write_text(text))
 
 
 if __name__ == "__main__":

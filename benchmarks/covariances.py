@@ -11,12 +11,11 @@ of your own, beside `images/` and `groundtruth.tum`.
 import argparse
 import os
 import re
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from common import write_table
+from common import Case, cut_short, write_table
 
 from gsba import refine
 from gsba.config import RefineSettings
@@ -55,14 +54,6 @@ DEMOS: dict[str, tuple[WalkPath, Heading]] = {
 }
 
 
-class Case(NamedTuple):
-    """Frames, their coarse trajectory and the truth."""
-
-    images: Path
-    trajectory: Path
-    truth: Path
-
-
 def find(name: str, data: Path, out: Path) -> Case:
     """Inputs of a sequence; GsbaError where it is not on this machine."""
     if name in DEMOS:
@@ -75,22 +66,8 @@ def find(name: str, data: Path, out: Path) -> Case:
     folder = data / chosen.folder
     if not folder.is_dir():
         raise GsbaError(f"{folder} is absent")
-    images = folder / "images"
-    if chosen.num_frames is not None:
-        images = _first(images, out / "images", chosen.num_frames)
-    return Case(images, folder / chosen.trajectory, folder / "groundtruth.tum")
-
-
-def _first(images: Path, folder: Path, num_frames: int) -> Path:
-    """A folder of links to the first frames, with their times."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    header, *rows = (images / "timestamps.csv").read_text().splitlines()
-    for row in rows[:num_frames]:
-        name = row.partition(",")[0]
-        (folder / name).symlink_to(images / name)
-    (folder / "timestamps.csv").write_text("\n".join([header, *rows[:num_frames]]) + "\n")
-    return folder
+    case = Case(folder / "images", folder / chosen.trajectory, folder / "groundtruth.tum")
+    return case if chosen.num_frames is None else cut_short(case, chosen.num_frames, out / "cut")
 
 
 def measured(case: Case, out: Path) -> tuple[Consistency, float]:
@@ -101,10 +78,7 @@ def measured(case: Case, out: Path) -> tuple[Consistency, float]:
     truth = read_trajectory(case.truth)
     found = judge(reconstruction, frames.timestamps, truth)
     whole = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
-    # Frames that were cut off are no frames that were missed.
-    kept = truth.timestamps <= frames.timestamps[-1] + 0.01
-    errors = evaluate(whole, Trajectory(truth.timestamps[kept], truth.world_T_rigs[kept]))
-    return found, errors.ate.rmse
+    return found, evaluate(whole, truth).ate.rmse
 
 
 def table(names: list[str], data: Path, out: Path) -> Iterator[str]:

@@ -8,24 +8,31 @@ table can be filled in over several calls. The last lines say whether the target
 """
 
 import argparse
-import hashlib
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import machine, measure
+from common import (
+    code_digest,
+    digest,
+    kept_row,
+    last_line,
+    machine,
+    measure,
+    outcome,
+    refine_command,
+    run_row,
+)
 from peer import MODES
 from pipeline_table import DEFAULT, to_markdown, verdicts
 
-import factors
-import gsba
 from gsba.config import ReadSettings
 from gsba.evaluate import evaluate
 from gsba.log import GsbaError
@@ -99,8 +106,7 @@ class Bench:
 
     def __init__(self, out: Path, timeout_s: float, fresh: bool) -> None:
         self.out, self.timeout_s, self.fresh = out, timeout_s, fresh
-        homes = [Path(str(package.__file__)).parent for package in (gsba, factors)]
-        self.code = _digest(path for home in homes for path in sorted(home.rglob("*.py")))
+        self.code = code_digest()
         self.warm = False
 
     def rows(self, walk: Walk, sets: Sequence[str], peers: Sequence[str]) -> Iterator[dict]:
@@ -122,18 +128,18 @@ class Bench:
             coarse = associate(frames, read_trajectory(walk.folder / trajectory), ReadSettings())
             return _errors(walk, Trajectory(frames.timestamps, coarse.world_T_rigs))
 
-        return {**_head(walk, "slam", trajectory), **_outcome(finish)}
+        return {**_head(walk, "slam", trajectory), **outcome(finish)}
 
     def refine(self, walk: Walk, frames: FrameSet, trajectory: str, factor_set: str) -> dict:
         """A whole run with one factor set, without a dataset: the peer writes none either."""
         head = _head(walk, factor_set, None if factor_set == "no-trajectory" else trajectory)
         folder = self.out / walk.name / f"{factor_set}-{Path(trajectory).stem}"
         inputs = [walk.folder / trajectory, *([walk.mask] if walk.mask else [])]
-        key = {"code": self.code, "input": _digest([*_images(frames), *inputs])}
+        key = {"code": self.code, "input": digest([*_images(frames), *inputs])}
         given = [] if factor_set == "no-trajectory" else [str(walk.folder / trajectory)]
         given += ["--masks", str(walk.mask)] if walk.mask else []
         images, run = walk.folder / "images", folder / "run"
-        command = _refine_command(images, run, [*given, *FACTOR_SETS[factor_set]])
+        command = refine_command(images, run, [*given, *FACTOR_SETS[factor_set]])
 
         def finish() -> dict:
             report = json.loads((folder / "run/report.json").read_text())
@@ -146,7 +152,7 @@ class Bench:
         """One of the peer's modes, which take neither trajectory nor mask."""
         head = {**_head(walk, mode, None), "peer": True}
         folder = self.out / walk.name / mode
-        key = {"pycolmap": version("pycolmap"), "input": _digest(_images(frames))}
+        key = {"pycolmap": version("pycolmap"), "input": digest(_images(frames))}
         links = self.out / walk.name / "images"  # nothing but the frames
         links.mkdir(parents=True, exist_ok=True)
         for path in _images(frames):
@@ -166,28 +172,15 @@ class Bench:
         self, head: dict, folder: Path, key: dict, command: list[str], finish: Callable[[], dict]
     ) -> dict:
         """The kept row, or the outcome of running the command."""
-        kept = folder / "row.json"
-        if kept.exists() and not self.fresh:
-            row = json.loads(kept.read_text())
-            ended = "errors" in row or (row["timed_out"] and row["wall_s"] >= self.timeout_s)
-            if row["key"] == key and ended:
-                return {**row, **head}
+        if not self.fresh and (row := kept_row(folder, key, self.timeout_s)):
+            return {**row, **head}
         if "peer" not in head and not self.warm:
             _compile_kernels(self.out / "warm-up")
             self.warm = True
         print(f"{head['sequence']}: running {folder.name}", file=sys.stderr, flush=True)
         row = {**head, "key": key, "machine": machine(), "load": os.getloadavg()[0]}
         row["date"] = datetime.now(UTC).isoformat(timespec="seconds")
-        cost = measure(command, folder / "log.txt", self.timeout_s)
-        row |= asdict(cost)
-        if cost.timed_out:
-            row["reason"] = f"stopped after {self.timeout_s / 60:g} minutes"
-        elif cost.exit_code != 0:
-            row["reason"] = _last_line(folder / "log.txt")
-        else:
-            row |= _outcome(finish)
-        atomic_write(kept, lambda path: path.write_text(json.dumps(row, indent=1)))
-        return row
+        return run_row(command, folder, row, finish, self.timeout_s)
 
 
 def _head(walk: Walk, row: str, trajectory: str | None) -> dict[str, Any]:
@@ -202,26 +195,13 @@ def _errors(walk: Walk, estimate: Trajectory) -> dict[str, Any]:
     return {"errors": evaluate(estimate, reference).to_json(), "path": path}
 
 
-def _outcome(finish: Callable[[], dict]) -> dict[str, Any]:
-    """What a row is judged to be worth, or why it cannot be judged."""
-    try:
-        return finish()
-    except GsbaError as error:
-        return {"reason": str(error)}
-
-
-def _refine_command(frames: Path, run: Path, options: list[str]) -> list[str]:
-    command = [sys.executable, "-c", "from gsba.cli import main; main()", "refine", str(frames)]
-    return [*command, *options, "--out", str(run), "--fresh", "--set", "export.formats=[]"]
-
-
 def _compile_kernels(out: Path) -> None:
     """Fill numba's cache by a small run, so that no measured one pays for it."""
     folder = out / "walk"
     _make_walk(folder, "'open', num_frames=8, width=512")
     images, trajectory = folder / "images", folder / "slam.tum"
     options = [str(trajectory), *FACTOR_SETS["bearing+reprojection"]]
-    _require(_refine_command(images, out / "run", options), out)
+    _require(refine_command(images, out / "run", options), out)
 
 
 def _make_walk(folder: Path, arguments: str) -> None:
@@ -234,24 +214,11 @@ def _require(command: list[str], folder: Path) -> None:
     """Run a preparation that must not fail."""
     log = folder / "preparation.txt"
     if measure(command, log, timeout_s=1200).exit_code != 0:
-        raise GsbaError(f"preparation failed, see {log}: {_last_line(log)}")
-
-
-def _last_line(log: Path) -> str:
-    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    return lines[-1] if lines else "failed without a word"
+        raise GsbaError(f"preparation failed, see {log}: {last_line(log)}")
 
 
 def _images(frames: FrameSet) -> list[Path]:
     return [path for group in frames.paths for path in group]
-
-
-def _digest(paths: Iterable[Path]) -> str:
-    """Fingerprint of files' contents."""
-    total = hashlib.sha256()
-    for path in paths:
-        total.update(hashlib.sha256(path.read_bytes()).digest())
-    return total.hexdigest()[:16]
 
 
 def _split(text: str) -> list[str]:
