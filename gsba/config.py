@@ -116,6 +116,9 @@ class VerifySettings(_Settings):
     max_direction_deg: float = Field(default=20.0, gt=0)  # disagreement with the trajectory
     min_parallax_deg: float = Field(default=1.0, gt=0)  # median; below it a direction is not judged
     max_length_ratio: float = Field(default=1.5, gt=1)  # disagreement with the trajectory
+    max_triplet_deg: float = Field(
+        default=3.0, gt=0
+    )  # of a pair over two steps off what these allow: true ones are within 1, look-alikes 10 off
 
 
 class TriangulateSettings(_Settings):

@@ -74,17 +74,63 @@ def steps(pairs: VerifiedPairs, keypoints: Keypoints, settings: VerifySettings) 
     for p, (f0, f1) in enumerate(pairs.matches.pairs):
         if f1 - f0 != 1:
             continue
-        rows, f0_T_f1 = pairs.matches.of(p), pairs.f0_T_f1s[p]
-        rays0 = keypoints.bearings_of(f0)[rows[:, 0]]
-        bearings1 = keypoints.bearings_of(f1)[rows[:, 1]]
-        rays1 = bearings1 @ f0_T_f1[:3, :3].T
-        chord = np.median(np.linalg.norm(rays0 - rays1, axis=1))
+        f0_T_f1 = pairs.f0_T_f1s[p]
+        rays0, bearings1 = _bearings(pairs, p, keypoints)
         f_T_nexts[f0], verified[f0] = f0_T_f1, True
         turn = _turn(rays0, bearings1)
         if np.median(np.linalg.norm(rays0 - bearings1 @ turn.T, axis=1)) < _STILL:
             f_T_nexts[f0, :3, :3] = turn  # an essential matrix knows it less well
-        directed[f0] = 2 * np.arcsin(chord / 2) > np.deg2rad(settings.min_parallax_deg)
+        directed[f0] = _parallax(rays0, bearings1, f0_T_f1) > np.deg2rad(settings.min_parallax_deg)
     return Steps(f_T_nexts, verified, directed)
+
+
+def _bearings(
+    pairs: VerifiedPairs, p: int, keypoints: Keypoints
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bearings (m, 3) of the matches of pair p in either frame."""
+    (f0, f1), rows = pairs.matches.pairs[p], pairs.matches.of(p)
+    return keypoints.bearings_of(f0)[rows[:, 0]], keypoints.bearings_of(f1)[rows[:, 1]]
+
+
+def _parallax(rays0: np.ndarray, bearings1: np.ndarray, f0_T_f1: np.ndarray) -> float:
+    """Median angle in radians between both bearings in one orientation."""
+    chords = np.linalg.norm(rays0 - bearings1 @ f0_T_f1[:3, :3].T, axis=1)
+    return float(2 * np.arcsin(np.median(chords) / 2))
+
+
+def off_steps(
+    pairs: VerifiedPairs, found: Steps, keypoints: Keypoints, settings: VerifySettings
+) -> np.ndarray:
+    """How far pairs over two steps are from what those steps, whatever their lengths, allow.
+
+    Frame f + 2 lies, as f sees it, between the directions of both steps. A pair that repeated
+    structure made up agrees with neither, though it may be within what the trajectory allows.
+
+    Returns:
+        (P,) radians; 0 for other pairs, and where a direction is not known.
+    """
+    out = np.zeros(len(pairs.matches.pairs))
+    for p, (f0, f2) in enumerate(pairs.matches.pairs):
+        if f2 - f0 != 2 or not found.directed[f0 : f0 + 2].all():
+            continue
+        f0_T_f2 = pairs.f0_T_f1s[p]
+        if _parallax(*_bearings(pairs, p, keypoints), f0_T_f2) > np.deg2rad(
+            settings.min_parallax_deg
+        ):
+            first = found.f_T_nexts[f0]
+            second = first[:3, :3] @ found.f_T_nexts[f0 + 1, :3, 3]
+            out[p] = _angle_to_arc(f0_T_f2[:3, 3], first[:3, 3], second)
+    return out
+
+
+def _angle_to_arc(direction: np.ndarray, start: np.ndarray, end: np.ndarray) -> float:
+    """Angle in radians from a unit vector to the great arc between two others."""
+    normal = np.cross(start, end)
+    beside = np.cross(normal, start) @ direction >= 0 and np.cross(end, normal) @ direction >= 0
+    length = np.linalg.norm(normal)
+    if beside and length > 1e-9:
+        return float(np.arcsin(min(abs(normal @ direction) / length, 1.0)))
+    return float(np.arccos(np.clip(max(direction @ start, direction @ end), -1, 1)))
 
 
 def _turn(rays0: np.ndarray, rays1: np.ndarray) -> np.ndarray:

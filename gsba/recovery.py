@@ -54,6 +54,7 @@ def run(
     lost = _missing(np.column_stack([close, close + 1]), guided)
     alone = _join([guided, match_anywhere(context, lost)])
     steps = motion.steps(alone, keypoints, settings.verify)
+    alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
     coarse, joints = _joined(coarse, alone, steps, keypoints)
     misfit.refuse_misfit(coarse, steps, settings.verify)
     trust = _judge(alone, keypoints, coarse, settings)
@@ -62,7 +63,7 @@ def run(
     again = _missing(chosen, alone)
     again = again[again[:, 1] - again[:, 0] == 2]
     over = _match_along(context, trust.world_T_rigs, again)
-    neighbours = _join([alone, over])
+    neighbours = _join([alone, _consistent(over, steps, keypoints, settings)])
     doubtful = [p for p in _index(lost) if not _supported(p, neighbours, keypoints, settings)]
     if doubtful:
         neighbours = _without(neighbours, doubtful)
@@ -197,6 +198,15 @@ def _supported(
         return True  # a turn on the spot: whole panoramas agree on one rotation
     sigmas = motion.length_ratios(found, steps, keypoints)[1]
     return bool(np.isfinite(sigmas[max(f - 1, 0) : f + 1]).any()) or len(steps.verified) == 1
+
+
+def _consistent(
+    found: VerifiedPairs, steps: motion.Steps, keypoints: Keypoints, settings: RefineSettings
+) -> VerifiedPairs:
+    """Pairs without those over two steps that a repeated structure made up: see `off_steps`."""
+    off = motion.off_steps(found, steps, keypoints, settings.verify)
+    false = off > np.deg2rad(settings.verify.max_triplet_deg)
+    return _taken(found, np.flatnonzero(~false).tolist()) if false.any() else found
 
 
 def _index(some: np.ndarray) -> set[tuple[int, int]]:
