@@ -201,3 +201,43 @@ def test_a_turn_on_the_spot_is_seen_as_one() -> None:
     assert trust.turning_only and trust.false_steps.all()
     between = trust.world_T_rigs[0, :3, :3].T @ trust.world_T_rigs[1, :3, :3]
     assert np.degrees(rotation_angle(between.T @ turn)) < 0.01
+
+
+def _over_two_steps(f0: int, direction: np.ndarray) -> tuple[VerifiedPairs, Keypoints]:
+    """Steps as seen, and a pair over two of them in a direction of its own."""
+    pairs, keypoints = _seen()
+    f0_T_f2 = inverse(TRUTH[f0]) @ TRUTH[f0 + 2]
+    f0_T_f2[:3, 3] = direction
+    rows = np.tile(np.arange(NUM_POINTS, dtype=np.int32)[:, None], (1, 2))
+    matches = Matches(
+        np.concatenate([pairs.matches.pairs, [[f0, f0 + 2]]]).astype(np.int32),
+        np.append(pairs.matches.offsets, pairs.matches.offsets[-1] + NUM_POINTS),
+        np.concatenate([pairs.matches.keypoints, rows]),
+    )
+    poses = np.concatenate([pairs.f0_T_f1s, f0_T_f2[None]])
+    return VerifiedPairs(matches, poses, pairs.counts), keypoints
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0, 4.0])
+def test_a_pair_over_two_steps_lies_between_them_whatever_their_lengths(share: float) -> None:
+    first, second = (inverse(TRUTH[7:9]) @ TRUTH[8:10])[:, :3, 3]
+    turned = inverse(TRUTH[7]) @ TRUTH[8]
+    between = unit(unit(first) + share * unit(turned[:3, :3] @ second))
+    pairs, keypoints = _over_two_steps(7, between)
+    found = motion.steps(pairs, keypoints, VERIFY)
+    assert motion.off_steps(pairs, found, keypoints, VERIFY).max() < np.deg2rad(0.01)
+
+
+@pytest.mark.parametrize("degrees", [1.0, 5.0, 20.0, 120.0])
+def test_a_pair_over_two_steps_that_leaves_them_is_as_far_off(degrees: float) -> None:
+    first, second = (inverse(TRUTH[7:9]) @ TRUTH[8:10])[:, :3, 3]
+    second = (inverse(TRUTH[7]) @ TRUTH[8])[:3, :3] @ second
+    middle, normal = unit(unit(first) + unit(second)), unit(np.cross(first, second))
+    angle = np.deg2rad(degrees)
+    pairs, keypoints = _over_two_steps(7, np.cos(angle) * middle + np.sin(angle) * normal)
+    found = motion.steps(pairs, keypoints, VERIFY)
+    off = motion.off_steps(pairs, found, keypoints, VERIFY)
+    assert off[:-1].max() == 0
+    wanted = min(angle, np.arccos(np.cos(angle) * (middle @ unit(first))))
+    assert off[-1] == pytest.approx(wanted if degrees < 90 else off[-1], abs=1e-6)
+    assert off[-1] > 0.9 * min(angle, np.pi / 2)
