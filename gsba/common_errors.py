@@ -1,0 +1,66 @@
+"""Errors that neighbouring frames have in common, which no residual shows.
+
+Covariances follow from residuals, as if every observation erred by itself. On sequences with known
+truth they then hold for steps from frame to frame, but poses far along the path are off by twice
+what they claim: sampling and surfaces mislead the patches of some frames alike, and poses take that
+up. It remains where images have neither noise nor compression. What is added here is as large as
+the errors that residuals do show, and smooth along the path; both numbers are measured
+(`benchmarks/covariances.py`), not derived.
+"""
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from gsba.geometry import furthest
+from gsba.types import JointErrors
+
+_SHARE = 1.7  # standard deviation of the errors in common, of that of the others
+_REACH = 3.0  # frames, standard deviation of their smoothing
+
+
+def added(
+    covariances: np.ndarray,
+    joint: JointErrors,
+    world_T_rigs: np.ndarray,
+    components: np.ndarray | None = None,
+) -> tuple[np.ndarray, JointErrors]:
+    """Covariances with the errors in common, in the same gauge.
+
+    Args:
+        covariances: (F, 6, 6) of poses, [rotation rad, translation], rig frames; NaN = none.
+        joint: what their errors have in common so far.
+        world_T_rigs: (F, 4, 4).
+        components: (F,) map of each frame, in which the first pose and its distance to the
+            furthest position are held; None = there is one.
+    """
+    groups = np.zeros(len(world_T_rigs), int) if components is None else components
+    known = np.isfinite(joint.draws).all(axis=(0, 2))
+    rotations, errors = world_T_rigs[:, :3, :3], np.zeros(joint.draws.shape)
+    for group in np.unique(groups):
+        rows = np.flatnonzero(known & (groups == group))
+        if len(rows) > 1:
+            turned = [rotations[rows] @ joint.draws[:, rows, part, None] for part in _PARTS]
+            smooth = gaussian_filter1d(np.concatenate(turned, axis=2)[..., 0], _REACH, axis=1)
+            held = _in_gauge(smooth, world_T_rigs[rows, :3, 3])
+            back = np.swapaxes(rotations[rows], 1, 2)
+            turned = [back @ held[:, :, part, None] for part in _PARTS]
+            errors[:, rows] = _SHARE * np.concatenate(turned, axis=2)[..., 0]
+    errors = np.roll(errors, 1, axis=0)  # of other draws than those they are added to
+    each = np.einsum("dfi,dfj->fij", errors, errors) / len(errors)
+    between = np.einsum("dfi,dfj->fij", errors[:, :-1], errors[:, 1:]) / len(errors)
+    draws = (joint.draws + errors).astype(np.float32)
+    return covariances + each, JointErrors(joint.neighbours + between, draws)
+
+
+_PARTS = slice(3), slice(3, 6)  # rotation, translation
+
+
+def _in_gauge(errors: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """World-frame errors (D, N, 6) with the first pose and its distance to the furthest held."""
+    offsets = positions - positions[0]
+    far, distance = furthest(positions)
+    turns, shifts = errors[..., :3], errors[..., 3:]
+    shifts = shifts - shifts[:, :1] - np.cross(turns[:, :1], offsets)
+    stretch = shifts[:, far] @ offsets[far] / max(distance, 1e-300) ** 2
+    shifts = shifts - stretch[:, None, None] * offsets
+    return np.concatenate([turns - turns[:, :1], shifts], axis=-1)
