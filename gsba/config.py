@@ -66,6 +66,19 @@ class FeatureSettings(_Settings):
     )  # further noise, as a part of the keypoint's size
 
 
+class CloserSettings(_Settings):
+    """Frames that get more keypoints, because the first of them hold the map poorly."""
+
+    mode: Literal["auto", "off"] = "auto"  # off: all frames alike
+    max_scale_sigma: float = Field(
+        default=0.0012, gt=0
+    )  # of a step's length over the one before, relative; above, a place is weak, and from two
+    # thirds of it on where it stands out
+    reach: int = Field(default=2, ge=0)  # frames before and after such a place
+    max_per_face: int = Field(default=1200, ge=16)
+    contrast_threshold: float = Field(default=0.01, gt=0)
+
+
 class MatchingSettings(_Settings):
     """Descriptor matching, guided by predicted poses."""
 
@@ -194,6 +207,11 @@ class PriorSettings(_Settings):
     absolute_position: float = Field(default=0.3, gt=0)  # part of the trajectory's extent
     loss_sigmas: float = Field(default=2.0, gt=0)  # Cauchy scale: steps further off let go
 
+    def faint(self) -> "PriorSettings":
+        """The same of steps that have next to no say, but keep unseen ones in place."""
+        looser = {"rotation_deg": 10 * self.rotation_deg, "translation": 10 * self.translation}
+        return self.model_copy(update=looser)
+
 
 class SolverSettings(_Settings):
     """Levenberg-Marquardt."""
@@ -315,6 +333,7 @@ class RefineSettings(_Settings):
     read: ReadSettings = ReadSettings()
     cubemap: CubemapSettings = CubemapSettings()
     features: FeatureSettings = FeatureSettings()
+    closer: CloserSettings = CloserSettings()
     matching: MatchingSettings = MatchingSettings()
     pairs: PairSettings = PairSettings()
     verify: VerifySettings = VerifySettings()

@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from gsba.evaluate import associate
-from gsba.geometry import carried, furthest, inverse
+from gsba.geometry import adjoint, carried, furthest, inverse, step_covariances
 from gsba.log import GsbaError
 from gsba.types import Reconstruction, Trajectory
 
@@ -153,10 +153,8 @@ def judge(
     errors = _errors(poses, true_T_rigs)
 
     steps, true_steps = (inverse(some[:-1]) @ some[1:] for some in (poses, true_T_rigs))
-    before = -_adjoint(inverse(steps))  # step error = error + before @ error of the frame before
-    of_steps = covariances[1:] + before @ covariances[:-1] @ np.swapaxes(before, 1, 2)
-    shared = before @ joint.neighbours
-    of_steps += shared + np.swapaxes(shared, 1, 2)
+    before = -adjoint(inverse(steps))  # step error = error + before @ error of the frame before
+    of_steps = step_covariances(poses, covariances, joint.neighbours)
     step_errors = _errors(steps, true_steps)
     sure = np.isfinite(of_steps).all(axis=(1, 2)) & np.isfinite(step_errors).all(axis=1)
     chosen = np.flatnonzero(sure)
@@ -218,15 +216,4 @@ def _errors(estimates: np.ndarray, truths: np.ndarray) -> np.ndarray:
     out, known = np.full((len(off), 6), np.nan), np.isfinite(off).all(axis=(1, 2))
     out[known, :3] = Rotation.from_matrix(off[known, :3, :3]).as_rotvec()
     out[known, 3:] = off[known, :3, 3]
-    return out
-
-
-def _adjoint(a_T_b: np.ndarray) -> np.ndarray:
-    """Adjoints (N, 6, 6) of poses (N, 4, 4): tangents of b in a."""
-    rotation, (x, y, z) = a_T_b[:, :3, :3], a_T_b[:, :3, 3].T
-    zero = np.zeros_like(x)
-    skew = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-    out = np.zeros((len(a_T_b), 6, 6))
-    out[:, :3, :3] = out[:, 3:, 3:] = rotation
-    out[:, 3:, :3] = skew @ rotation
     return out

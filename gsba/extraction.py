@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from gsba import cubemap, features
 from gsba.config import RefineSettings
 from gsba.learned import LearnedExtractor
@@ -19,6 +21,8 @@ def run(
     settings: RefineSettings,
     num_threads: int,
     weights: Mapping[str, Path],
+    name: str = "features",
+    chosen_frames: np.ndarray | None = None,
 ) -> PerFrame[Features]:
     """Features by frame name; image and mask are read, cut and released one at a time.
 
@@ -26,23 +30,29 @@ def run(
         store, frames, rig, settings: of the run.
         num_threads: frames treated at a time.
         weights: files of learned networks (`learned.find_weights`).
+        name: of the stage.
+        chosen_frames: (F,) bool, frames treated; None = all.
     """
     features.keep_freed_memory()
-    index = {name: f for f, name in enumerate(frames.names)}
+    index = {
+        frame: f
+        for f, frame in enumerate(frames.names)
+        if chosen_frames is None or chosen_frames[f]
+    }
     chosen = settings.features
     if chosen.extractor == "sift":
         make_extractor = partial(features.SiftExtractor, chosen)
     else:
         make_extractor = partial(LearnedExtractor, chosen, weights["features"])
 
-    def compute(name: str) -> Features:
-        images, masks = cubemap.load(frames, index[name], rig)
+    def compute(frame: str) -> Features:
+        images, masks = cubemap.load(frames, index[frame], rig)
         return features.extract(images, masks, rig, make_extractor())
 
     inputs = {
-        name: fingerprint([*frames.paths[f], frames.mask_paths[f]]) for name, f in index.items()
+        frame: fingerprint([*frames.paths[f], frames.mask_paths[f]]) for frame, f in index.items()
     }
     relevant = chosen.model_dump(exclude={"weights", "accept_noncommercial", "download"})
     files = fingerprint(path for stage, path in weights.items() if stage == "features")
     key = [settings.cubemap, relevant, files]
-    return store.per_frame("features", key, inputs, compute, Features, num_threads=num_threads)
+    return store.per_frame(name, key, inputs, compute, Features, num_threads=num_threads)

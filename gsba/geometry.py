@@ -190,3 +190,30 @@ def pose_similarity(
     between = np.einsum("nij,nkj->ik", target_T_rigs[:, :3, :3], source_T_rigs[:, :3, :3])
     source, target = source_T_rigs[:, :3, 3], target_T_rigs[:, :3, 3]
     return turned_similarity(source, target, _turn(between), least_alike)
+
+
+def adjoint(a_T_b: np.ndarray) -> np.ndarray:
+    """Adjoints (N, 6, 6) of poses (N, 4, 4): tangents of b in a."""
+    rotation, (x, y, z) = a_T_b[:, :3, :3], a_T_b[:, :3, 3].T
+    zero = np.zeros_like(x)
+    skew = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    out = np.zeros((len(a_T_b), 6, 6))
+    out[:, :3, :3] = out[:, 3:, 3:] = rotation
+    out[:, 3:, :3] = skew @ rotation
+    return out
+
+
+def step_covariances(
+    world_T_rigs: np.ndarray, covariances: np.ndarray, neighbours: np.ndarray
+) -> np.ndarray:
+    """Covariances (F - 1, 6, 6) of the steps f_T_next, perturbed on the right.
+
+    Args:
+        world_T_rigs: (F, 4, 4).
+        covariances: (F, 6, 6) of their tangents [rotation rad, translation].
+        neighbours: (F - 1, 6, 6) E[x_f x_(f+1)^T].
+    """
+    before = -adjoint(inverse(world_T_rigs[1:]) @ world_T_rigs[:-1])
+    shared = before @ neighbours
+    own = covariances[1:] + before @ covariances[:-1] @ np.swapaxes(before, 1, 2)
+    return own + shared + np.swapaxes(shared, 1, 2)

@@ -5,6 +5,7 @@ import numpy as np
 
 from gsba.config import PriorSettings
 from gsba.geometry import furthest, inverse
+from gsba.types import StepNoise
 
 X = gtsam.symbol_shorthand.X
 
@@ -15,6 +16,7 @@ def build(
     false_steps: np.ndarray | None = None,
     false_frames: np.ndarray | None = None,
     first: np.ndarray | None = None,
+    noise: StepNoise | None = None,
 ) -> gtsam.NonlinearFactorGraph:
     """Relative priors between neighbours, a weak absolute one, and a fixed first pose.
 
@@ -24,6 +26,7 @@ def build(
         false_steps: (F - 1,) bool, steps that get no prior; None = all do.
         false_frames: (F,) bool, frames that get no absolute prior; None = all do.
         first: (4, 4) where to fix the first pose; None = where the trajectory has it.
+        noise: of the steps that keep their prior, as others showed it; None = as in the settings.
     """
     graph = gtsam.NonlinearFactorGraph()
     steps = inverse(coarse_world_T_rigs[:-1]) @ coarse_world_T_rigs[1:]
@@ -37,15 +40,17 @@ def build(
         sigmas = np.array([rotation] * 3 + [translation] * 3)
         return gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
-    for f, step in enumerate(steps):
-        if false_steps is not None and false_steps[f]:
-            continue
-        sigma = settings.translation * max(float(lengths[f]), typical)
-        graph.add(
-            gtsam.BetweenFactorPose3(
-                X(f), X(f + 1), gtsam.Pose3(step), robust(np.deg2rad(settings.rotation_deg), sigma)
-            )
-        )
+    kept = np.ones(len(steps), bool) if false_steps is None else ~false_steps
+    in_a_row = _in_a_row(kept)
+    for f in np.flatnonzero(kept).tolist():
+        length = max(float(lengths[f]), typical)
+        if noise is None:
+            model = robust(np.deg2rad(settings.rotation_deg), settings.translation * length)
+        else:
+            covariance = in_a_row[f] * _step_covariance(steps[f], length, noise)
+            gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
+            model = gtsam.noiseModel.Robust.Create(loss, gaussian)
+        graph.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), gtsam.Pose3(steps[f]), model))
     weak = robust(np.deg2rad(settings.absolute_rotation_deg), settings.absolute_position * extent)
     for f, world_T_rig in enumerate(coarse_world_T_rigs):
         if false_frames is not None and false_frames[f]:
@@ -55,6 +60,24 @@ def build(
     fixed = gtsam.Pose3(coarse_world_T_rigs[0] if first is None else first)
     graph.add(gtsam.PriorFactorPose3(X(0), fixed, gauge))
     return graph
+
+
+def _in_a_row(kept: np.ndarray) -> np.ndarray:
+    """For each step (N,) how many kept ones it is among, without a gap: they drift alike."""
+    runs = np.cumsum(np.diff(kept.astype(int), prepend=0) != 0)
+    return np.bincount(runs, minlength=1)[runs] if len(kept) else runs
+
+
+def _step_covariance(f_T_next: np.ndarray, length: float, noise: StepNoise) -> np.ndarray:
+    """Covariance (6, 6) of a step perturbed on the right; `length` in map units."""
+    ahead = f_T_next[:3, :3].T @ f_T_next[:3, 3]
+    along = np.outer(ahead, ahead) / max(float(ahead @ ahead), 1e-300)
+    covariance = np.diag([noise.rotation**2] * 6)
+    across = noise.direction**2 * (np.eye(3) - along)
+    covariance[3:, 3:] = length**2 * (noise.length**2 * along + across)
+    if not ahead.any():
+        covariance[3:, 3:] = (length * noise.length) ** 2 * np.eye(3)
+    return covariance
 
 
 def fixed_scale(

@@ -10,7 +10,9 @@ from factors.sphere_field import SphereField
 from gsba import (
     adjust,
     align,
+    common_errors,
     components,
+    map_strength,
     parts,
     photometric,
     splat_refine,
@@ -18,6 +20,7 @@ from gsba import (
     tracks,
 )
 from gsba.adjust import Adjustment
+from gsba.map_strength import MapStrength
 from gsba.matching_stages import MatchingStages
 from gsba.photometric import PhotometricResult
 from gsba.reconstruction import assemble
@@ -58,6 +61,34 @@ class Line(MatchingStages):
         self._set_priors()
         adjacent = self.match_along_epipolars(found.solved, "adjacent2")
         return found.solved, [adjacent, *(components.within(m, tied) for m in matches[1:])]
+
+    def look_closer(
+        self, solved: Adjustment, matches: list[Matches]
+    ) -> tuple[Adjustment, list[Matches]]:
+        """What images hold well goes without priors; more keypoints where they hold it poorly."""
+        closer, rounds, trust = self.settings.closer, self.settings.rounds, self.trust
+        if trust is None:
+            return solved, matches
+        seen = ~(trust.unseen_steps | trust.false_steps)
+        faint = self.settings.priors.faint()
+
+        def compute() -> MapStrength:
+            given = self._priors(faint), self.keypoints, self.rig, self.settings, self.num_threads
+            known = adjust.pose_covariances(solved, *given, self.parts)
+            coarse, how = self.coarse.world_T_rigs, (closer, self.settings.priors)
+            return map_strength.measure(solved.world_T_rigs, *known, coarse, seen, *how)
+
+        found = self._stage("strength", [self._solving(), closer], compute, MapStrength)
+        self.counts["strength"], self.strength = [found.counts], found
+        self._set_priors()
+        if closer.mode == "off" or not found.weak.any():
+            return solved, matches
+        self.extract_more(found.weak)
+        adjacent = self.match_along_epipolars(solved, "adjacent_closer")
+        start = adjust.start(solved.world_T_rigs)
+        solved = self.solve("chain_closer", [adjacent], start, rounds.chain[-1:])
+        near = self.match_known_points("near_closer", solved, loops_closed=False)
+        return self.solve("dense_closer", [adjacent, near], solved, rounds.dense), [adjacent, near]
 
     def solve(
         self,
@@ -196,7 +227,8 @@ class Line(MatchingStages):
         def compute() -> Reconstruction:
             observed, least = self._corrected(self.observed), self.settings.rounds.min_observations
             given = self.priors, observed, self.rig, self.settings, self.num_threads
-            covariances, joint = adjust.pose_covariances(solved, *given, self.parts)
+            claimed = adjust.pose_covariances(solved, *given, self.parts)
+            covariances, joint = common_errors.added(*claimed, solved.world_T_rigs, self.parts)
             false = None if self.trust is None else self.trust.false_frames
             last = self.corrected.correction, self.parts, joint
             return assemble(solved, covariances, observed, self.coarse, least, false, *last)

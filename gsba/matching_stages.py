@@ -26,8 +26,9 @@ from gsba import (
 )
 from gsba.adjust import Adjustment
 from gsba.clock import ClockEstimate
-from gsba.config import RefineSettings
+from gsba.config import PriorSettings, RefineSettings
 from gsba.log import GsbaError
+from gsba.map_strength import MapStrength
 from gsba.matching import MatchContext, SearchableFrames
 from gsba.motion import Trust
 from gsba.places import Closed, connected
@@ -36,7 +37,7 @@ from gsba.registered import Registered, side_by_side
 from gsba.segments import Joint
 from gsba.splat_refine import Move
 from gsba.stitching import Stitching
-from gsba.store import RunStore, fingerprint
+from gsba.store import PerFrame, RunStore, fingerprint
 from gsba.types import (
     CoarsePoses,
     Counts,
@@ -75,6 +76,7 @@ class MatchingStages:
         self.parts: np.ndarray | None = None  # (F,) that nothing ties together yet
         self.registered: Registered | None = None
         self.clock: ClockEstimate | None = None
+        self.strength: MapStrength | None = None  # of the map, by images alone
         self._make_extra = extra_factors or (lambda _: ())
         self.follow(coarse)
         self.counts: dict[str, list[Counts]] = {}
@@ -82,35 +84,53 @@ class MatchingStages:
         self.undone: list[str] = []  # solutions that were not taken
         self.frame_weights = np.ones(len(frames))  # of each frame's pixels
         self.moves: tuple[Move, ...] = ()  # of the poses against a splat
-        self.latest = "keypoints"  # the stage that the next one builds on
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
         start = coarse.world_T_rigs.tolist(), settings.read
         inputs = [fingerprint(paths), frames.timestamps.tolist(), frames.timed, *start]
         store.stage("frames", inputs, lambda: frames, FrameSet)
-        weights = learned.find_weights(settings)
-        found = extraction.run(store, frames, self.rig, settings, self.num_threads, weights)
+        self._weights = learned.find_weights(settings)
+        self._features = extraction.run(
+            store, frames, self.rig, settings, self.num_threads, self._weights
+        )
+        self._see("keypoints", [self._features] * len(frames), ["frames", "features"])
+        self.stitching: Stitching | None = None  # with the field that corrects them, if any
+        self.aligned: np.ndarray | None = None  # which of them patches have confirmed
+        self.greys = panorama.Greys(frames, settings.align.max_width)
+        matchers = (path for stage, path in self._weights.items() if stage == "matching")
+        self.compared = fingerprint(matchers)
+
+    def _see(self, name: str, found: list[PerFrame[Features]], before: list[str]) -> None:
+        """Match the features of these stages, one a frame, from now on; `before`: their names."""
+        frames, settings = self.frames, self.settings
 
         def load(frame: int) -> Features:
-            return found[frames.names[frame]]
+            return found[frame][frames.names[frame]]
 
         def gather() -> Keypoints:
             return features.gather(map(load, range(len(frames))))
 
-        before = ["frames", "features"]
-        self.keypoints = store.stage("keypoints", None, gather, Keypoints, before)
+        self.keypoints = self.store.stage(name, None, gather, Keypoints, before)
+        self.latest = name
         self.observed = self.keypoints  # those that the latest solution is made of, as observed
-        self.stitching: Stitching | None = None  # with the field that corrects them, if any
-        self.aligned: np.ndarray | None = None  # which of them patches have confirmed
-        self.greys = panorama.Greys(frames, settings.align.max_width)
         self.context = MatchContext(
             SearchableFrames(load),
             SearchableFrames(load, settings.pairs.strongest_per_face),
             self.keypoints,
             settings,
             self.num_threads,
-            learned.make_matcher(settings, weights, self.rig.size),
+            learned.make_matcher(settings, self._weights, self.rig.size),
         )
-        self.compared = fingerprint(path for stage, path in weights.items() if stage == "matching")
+
+    def extract_more(self, weak: np.ndarray) -> None:
+        """More keypoints at some frames (F,) bool, and those of the others as they were."""
+        closer, name = self.settings.closer, "features_closer"
+        more = closer.model_dump(include={"max_per_face", "contrast_threshold"})
+        enlarged = self.settings.features.model_copy(update=more)
+        settings = self.settings.model_copy(update={"features": enlarged})
+        given = self.store, self.frames, self.rig, settings, self.num_threads, self._weights
+        found = extraction.run(*given, name, weak)
+        sources = [found if more else self._features for more in weak]
+        self._see("keypoints_closer", sources, [self.latest, name])
 
     def follow(self, coarse: CoarsePoses) -> None:
         """Start from these poses, and hold to them."""
@@ -129,16 +149,24 @@ class MatchingStages:
 
     def _set_priors(self) -> None:
         """What the trajectory says, as far as it is trusted, and the caller's own factors."""
-        coarse, priors, trust = self.coarse.world_T_rigs, self.settings.priors, self.trust
+        self.priors = self._priors(self.settings.priors)
+
+    def _priors(self, settings: PriorSettings) -> gtsam.NonlinearFactorGraph:
+        """See `_set_priors`; with this noise of the trajectory, unless images told it."""
+        coarse, trust, strength = self.coarse.world_T_rigs, self.trust, self.strength
         if trust is None:
-            self.priors = graph.build(coarse, priors)
+            priors = graph.build(coarse, settings)
         else:
             start = trust.world_T_rigs
             believed = start if trust.false_steps.all() else side_by_side(coarse, self.registered)
-            false = trust.false_steps, trust.false_frames
-            self.priors = graph.build(believed, priors, *false, start[0])
+            false = (
+                trust.false_steps if strength is None else trust.false_steps | strength.held_steps
+            )
+            noise = None if strength is None else strength.noise
+            priors = graph.build(believed, settings, false, trust.false_frames, start[0], noise)
         for factor in self.extra:
-            self.priors.add(factor)
+            priors.add(factor)
+        return priors
 
     @property
     def turns_only(self) -> bool:

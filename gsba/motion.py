@@ -84,9 +84,7 @@ def steps(pairs: VerifiedPairs, keypoints: Keypoints, settings: VerifySettings) 
     return Steps(f_T_nexts, verified, directed)
 
 
-def _bearings(
-    pairs: VerifiedPairs, p: int, keypoints: Keypoints
-) -> tuple[np.ndarray, np.ndarray]:
+def _bearings(pairs: VerifiedPairs, p: int, keypoints: Keypoints) -> tuple[np.ndarray, np.ndarray]:
     """Bearings (m, 3) of the matches of pair p in either frame."""
     (f0, f1), rows = pairs.matches.pairs[p], pairs.matches.of(p)
     return keypoints.bearings_of(f0)[rows[:, 0]], keypoints.bearings_of(f1)[rows[:, 1]]

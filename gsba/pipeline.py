@@ -94,7 +94,8 @@ def _solve(line: Line, neighbours: VerifiedPairs) -> Adjustment:
     adjacent = line.match_along_epipolars(solved)
     near = line.match_known_points("near", solved, loops_closed=False)
     solved = line.solve("dense", [adjacent, near], solved, rounds.dense)
-    solved, matches = line.register(neighbours, solved, [adjacent, near])
+    solved, matches = line.look_closer(solved, [adjacent, near])
+    solved, matches = line.register(neighbours, solved, matches)
     loops, solved = line.close_loops(solved)
     solved = line.solve("closed", [*matches, loops.matches], solved, rounds.loops)
     for number in range(1, rounds.map_passes + 1):

@@ -78,6 +78,15 @@ class CoarsePoses:
 
 
 @dataclass(frozen=True, slots=True)
+class StepNoise:
+    """Standard deviations of the trajectory's steps from frame to frame."""
+
+    rotation: float  # radians, per axis
+    direction: float  # of motion, radians, per axis
+    length: float  # relative
+
+
+@dataclass(frozen=True, slots=True)
 class Features:
     """Keypoints of one frame, face after face, the strongest of a face first."""
 

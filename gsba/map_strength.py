@@ -1,0 +1,113 @@
+"""How well the images hold a map: where to look closer, and what is left for the trajectory to say.
+
+Along a path the scale is handed on from step to step by the points that three frames see. Where
+these are few, or far, all that lies behind may be larger or smaller, and turned: a walk that does
+not return has nothing else to hold it. Priors on the trajectory's steps are no help: drift is
+smooth, so that they all err the same way, and together bend a place that is held a little less than
+others. So a step that the images hold well goes without one, and those that are left are worth what
+the others show of the trajectory's noise.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsba.config import CloserSettings, PriorSettings
+from gsba.geometry import inverse, rotation_angle, step_covariances
+from gsba.types import Counts, JointErrors, StepNoise
+
+_HELD = 0.25  # of a prior's standard deviation, in any direction: it then has a say of 6 %
+_LEAST_STEPS = 8  # held ones, to estimate a noise from
+_LEAST_NOISE = 0.1  # of the settings' noise
+_STANDING_OUT = 1.5  # times the median of a run
+_FROM = 2 / 3  # of the limit on, what stands out is weak, too
+
+
+@dataclass(frozen=True, slots=True)
+class MapStrength:
+    """What the images hold of a map, and how well."""
+
+    scale_sigmas: np.ndarray  # (F - 2,) float64, of the logarithm of a step's length over that of
+    # the step before it, at the frame between them; NaN = not known
+    weak: np.ndarray  # (F,) bool, frames at or near places that hand the scale on poorly
+    held_steps: np.ndarray  # (F - 1,) bool, known far better than the trajectory knows them
+    noise: StepNoise | None  # of the trajectory's steps; None = too few are held to tell
+    counts: Counts  # of frames
+
+
+def measure(
+    world_T_rigs: np.ndarray,
+    covariances: np.ndarray,
+    joint: JointErrors,
+    coarse_world_T_rigs: np.ndarray,
+    seen: np.ndarray,
+    closer: CloserSettings,
+    priors: PriorSettings,
+) -> MapStrength:
+    """Judge a solution by the joint covariance of its poses under priors next to nothing.
+
+    Args:
+        world_T_rigs: (F, 4, 4).
+        covariances: (F, 6, 6) [rotation rad, translation], rig frames.
+        joint: what errors of poses have in common.
+        coarse_world_T_rigs: (F, 4, 4) the trajectory.
+        seen: (F - 1,) bool, steps that images show and do not contradict.
+        closer: limits, and how far around a weak place frames count as near.
+        priors: noise of the trajectory's steps, as far as the images do not know it.
+    """
+    num = len(world_T_rigs)
+    sigmas = scale_sigmas(world_T_rigs, joint.draws)
+    between = seen[:-1] & seen[1:] & np.isfinite(sigmas)
+    median = float(np.median(sigmas[between])) if between.any() else 0.0
+    limit = closer.max_scale_sigma
+    limit = np.clip(_STANDING_OUT * median, _FROM * limit, limit)
+    poor = np.zeros(num, bool)
+    poor[1:-1] = between & (np.nan_to_num(sigmas) > limit)
+    reach = np.ones(2 * closer.reach + 1)
+    weak = np.convolve(poor, reach)[closer.reach : closer.reach + num] > 0
+    held = seen & _held(world_T_rigs, covariances, joint, priors)
+    noise = _noise(world_T_rigs, coarse_world_T_rigs, held, priors)
+    counts = Counts(num, int(weak.sum()), "frames", {"held well": int((~weak).sum())})
+    return MapStrength(sigmas, weak, held, noise, counts)
+
+
+def scale_sigmas(world_T_rigs: np.ndarray, draws: np.ndarray) -> np.ndarray:
+    """See `MapStrength.scale_sigmas`; to first order in the errors `draws (D, F, 6)`."""
+    steps = np.diff(world_T_rigs[:, :3, 3], axis=0)
+    squares = np.maximum(np.einsum("fi,fi->f", steps, steps), 1e-300)
+    moved = np.einsum("fij,dfj->dfi", world_T_rigs[:, :3, :3], draws[:, :, 3:])
+    stretches = np.einsum("fi,dfi->df", steps / squares[:, None], np.diff(moved, axis=1))
+    return np.diff(stretches, axis=1).std(axis=0)
+
+
+def _held(
+    world_T_rigs: np.ndarray, covariances: np.ndarray, joint: JointErrors, priors: PriorSettings
+) -> np.ndarray:
+    """Steps (F - 1,) bool whose covariance is far below that of a prior in every direction."""
+    lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
+    typical = float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
+    allowed = np.full((len(lengths), 6), np.deg2rad(priors.rotation_deg))
+    allowed[:, 3:] = priors.translation * np.maximum(lengths, typical)[:, None]
+    found = step_covariances(world_T_rigs, covariances, joint.neighbours)
+    found = found / allowed[:, :, None] / allowed[:, None, :]
+    known = np.isfinite(found).all(axis=(1, 2))
+    found[~known] = np.eye(6)
+    return known & (np.linalg.eigvalsh(found)[:, -1] < _HELD**2)
+
+
+def _noise(
+    world_T_rigs: np.ndarray, coarse: np.ndarray, held: np.ndarray, priors: PriorSettings
+) -> StepNoise | None:
+    """Robust spread of the trajectory's steps about those that the images hold."""
+    if np.count_nonzero(held) < _LEAST_STEPS:
+        return None
+    found, given = (inverse(some[:-1])[held] @ some[1:][held] for some in (world_T_rigs, coarse))
+    turned = rotation_angle(np.swapaxes(given[:, :3, :3], 1, 2) @ found[:, :3, :3])
+    moves = found[:, :3, 3], given[:, :3, 3]
+    across = np.linalg.norm(np.cross(*moves), axis=1)
+    off = np.arctan2(across, np.einsum("fi,fi->f", *moves))
+    logs = np.diff([np.log(np.maximum(np.linalg.norm(m, axis=1), 1e-12)) for m in moves], axis=0)[0]
+    medians = np.median(turned), np.median(off), np.median(np.abs(logs - np.median(logs)))
+    spreads = np.array(medians) / (1.5382, 1.1774, 0.6745)  # of normal errors in 3, 2 and 1 axes
+    least = np.array([np.deg2rad(priors.rotation_deg), priors.translation, priors.translation])
+    return StepNoise(*np.maximum(spreads, _LEAST_NOISE * least).tolist())
