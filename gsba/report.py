@@ -19,6 +19,7 @@ from pydantic import BaseModel
 
 from gsba import __version__
 from gsba.geometry import angular_errors, quaternion_from_rotation
+from gsba.map_strength import scale_sigmas
 from gsba.store import StageRecord, atomic_write
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
 
@@ -91,12 +92,14 @@ def take_notes(
     reconstruction: Reconstruction,
     undone: Sequence[str],
     frame_weights: np.ndarray,
+    max_scale_sigma: float,
 ) -> list[str]:
     """What the user should know about a run, also logged as warnings.
 
     Args:
         undone: stages in which a round of bundle adjustment was undone.
         frame_weights: (F,) of each frame's pixels, below 1 where they contradict the others.
+        max_scale_sigma: of a step's length over the one before it; above, a place is named.
     """
     absent = coarse.sources == PoseSource.NONE
     filled = np.flatnonzero((coarse.sources != PoseSource.SLAM) & ~absent)
@@ -114,9 +117,22 @@ def take_notes(
         notes.append(f"rounds were undone in {', '.join(undone)}: they explained less")
     if len(doubted := np.flatnonzero(frame_weights < 1)):
         notes.append(f"pixels fit badly and were weighted down: {_names(frames, doubted)}")
+    if len(weak := _weak_places(reconstruction, max_scale_sigma)):
+        notes.append(
+            f"the scale may change here by more than {max_scale_sigma:.2%}, as few points hold it: "
+            f"{_names(frames, weak)}"
+        )
     for note in notes:
         logger.warning(note)
     return notes
+
+
+def _weak_places(reconstruction: Reconstruction, max_scale_sigma: float) -> np.ndarray:
+    """Frames at which images hand the scale on poorly, even after a closer look."""
+    poses, joint = reconstruction.world_T_rigs, reconstruction.joint_errors
+    if joint is None or len(poses) < 3:
+        return np.zeros(0, np.intp)
+    return 1 + np.flatnonzero(scale_sigmas(poses, joint.draws) > max_scale_sigma)
 
 
 def _names(frames: FrameSet, chosen: np.ndarray) -> str:

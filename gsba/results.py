@@ -125,7 +125,8 @@ def _report(line: Line, reconstruction: Reconstruction) -> dict[str, Any]:
     judgement, findings = describe(line.trust, frames) if line.trust else ({}, [])
     judgement, findings = timing.describe(line.clock, judgement, findings)
     joined, more = registered.describe(line.registered, line.joints, frames)
-    notes = take_notes(frames, coarse, reconstruction, undone, line.frame_weights)
+    told = undone, line.frame_weights, line.settings.closer.max_scale_sigma
+    notes = take_notes(frames, coarse, reconstruction, *told)
     report = build_report(
         settings=line.settings,
         frames=frames,
