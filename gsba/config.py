@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 _MAX_FACE, _MAX_SEED = 16_384, 2**31 - 1  # pixels: remapping ends at 32,767
 _CutSize = Annotated[int, Field(ge=64, le=_MAX_FACE)]
-_Text = Annotated[str, Field(min_length=1)]
+_Text = Annotated[str, Field(min_length=1, pattern=r"^[^\x00]*$")]
 
 
 class _Settings(BaseModel):
@@ -53,7 +53,7 @@ class FeatureSettings(_Settings):
     """Keypoints on faces."""
 
     extractor: Literal["sift", "aliked", "disk", "xfeat", "superpoint"] = "sift"
-    weights: str | None = None  # of a learned extractor: file, or folder with the official file
+    weights: _Text | None = None  # of a learned extractor: file, or folder with the official file
     accept_noncommercial: bool = False  # use weights whose licence forbids commercial use
     download: bool = False  # fetch missing weights from their authors
     max_per_face: int = Field(default=450, ge=16)
@@ -83,7 +83,7 @@ class MatchingSettings(_Settings):
     """Descriptor matching, guided by predicted poses."""
 
     matcher: Literal["guided", "lightglue", "superglue"] = "guided"
-    weights: str | None = None  # of a learned matcher: file, or folder with the official file
+    weights: _Text | None = None  # of a learned matcher: file, or folder with the official file
     min_similarity: float = Field(default=0.8, ge=-1, le=1)  # cosine of both descriptors
     max_ratio: float = Field(default=0.9, gt=0, le=1)  # distance to the best over that to the next
 

@@ -11,6 +11,7 @@ import numpy as np
 from gsba.evaluate import associate
 from gsba.geometry import bearings_from_erp, carried, pose, similarity
 from gsba.log import GsbaError
+from gsba.records import HEADER_ERRORS
 from gsba.types import Trajectory
 
 STEPS = (1, 4)  # frames between a frame and the neighbours that look at its pixels
@@ -113,7 +114,7 @@ def depth_maps(folder: Path, num: int) -> Callable[[int], np.ndarray]:
                 ranges = archive["range"]
         except (OSError, EOFError, ValueError, KeyError, TypeError, IndexError) as error:
             raise GsbaError(f"{path}: no depth map with an array `range` ({error})") from None
-        except (zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+        except (zipfile.BadZipFile, zlib.error, NotImplementedError, *HEADER_ERRORS) as error:
             raise GsbaError(f"{path}: damaged depth map ({error})") from None
         if ranges.ndim != 2 or ranges.dtype.kind not in "fiu":
             raise GsbaError(f"{path}: `range` is no image of numbers, but {ranges.shape}")

@@ -16,6 +16,8 @@ from gsba.types import CoarsePoses, FrameSet, Trajectory
 
 logger = logging.getLogger(__name__)
 
+_NO_MOTION = 1e-9  # extent in map units that is rounding alone
+
 
 def trajectory_files(
     trajectory: Path | str | Sequence[Path | str] | None, keyframes: Path | None
@@ -46,7 +48,7 @@ def coarse_poses(
         return read.without_trajectory(frames)
     coarse = read.associate_pieces(frames, given, settings.read)
     refuse_useless(coarse)
-    if np.ptp(coarse.world_T_rigs[:, :3, 3], axis=0).max() == 0:
+    if np.ptp(coarse.world_T_rigs[:, :3, 3], axis=0).max() < _NO_MOTION:
         logger.warning("the trajectory only turns: positions come from the images alone")
         return read.without_trajectory(frames)
     return coarse

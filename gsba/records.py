@@ -10,6 +10,7 @@ checksums reveal truncated or flipped bytes.
 import errno
 import json
 import os
+import tokenize
 import types
 import typing
 import zipfile
@@ -28,6 +29,7 @@ from gsba.log import GsbaError
 T = TypeVar("T")
 
 FORMAT = 1  # raised whenever the layout below changes
+HEADER_ERRORS = (SyntaxError, tokenize.TokenError, RecursionError)  # of a damaged .npy or JSON
 _MANIFEST = "manifest.json"
 _TEMPORARY = ".gsba-tmp-"  # prefix of files still being written
 
@@ -123,7 +125,7 @@ def _reading(path: Path) -> Iterator[zipfile.ZipFile]:
             yield archive
     except (OSError, EOFError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise RecordError(f"{path}: {error}") from error  # trees and arrays of another shape
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RecursionError) as error:
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, *HEADER_ERRORS) as error:
         raise RecordError(f"{path}: {error}") from error  # damaged archives
 
 

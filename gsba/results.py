@@ -64,13 +64,15 @@ def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:
     main, shown = taken(reconstruction, frames, largest(reconstruction))
     if not (np.isfinite(main.world_T_rigs).all() and np.isfinite(main.points_world).all()):
         raise GsbaError(f"{out}: its poses or points are no numbers: refine again with --fresh")
+    if not (np.isfinite(shown.timestamps).all() and (np.diff(shown.timestamps) > 0).all()):
+        raise GsbaError(f"{out}: its frames are in no order of time: refine again with --fresh")
     return main, shown
 
 
 def _fit_together(reconstruction: Reconstruction, frames: FrameSet) -> bool:
     """Whether arrays have the lengths that others speak of."""
     result, num = reconstruction, len(frames.names)
-    points, seen = len(result.points_world), len(result.observation_points)
+    points, seen = (sum(a.shape[:1]) for a in (result.points_world, result.observation_points))
     shapes = (
         (result.world_T_rigs, (num, 4, 4)),
         (result.pose_covariances, (num, 6, 6)),
@@ -78,17 +80,21 @@ def _fit_together(reconstruction: Reconstruction, frames: FrameSet) -> bool:
         (result.points_world, (points, 3)),
         (result.point_colors, (points, 3)),
         (result.point_errors, (points,)),
+        (result.observation_points, (seen,)),
         (result.observation_frames, (seen,)),
         (result.observation_bearings, (seen, 3)),
         (result.observation_sigmas, (seen,)),
         (frames.timestamps, (num,)),
     )
+    if (joint := result.joint_errors) is not None:
+        drawn = (*joint.draws.shape[:1], num, 6)
+        shapes += ((joint.neighbours, (num - 1, 6, 6)), (joint.draws, drawn))
     indices = ((result.observation_points, points), (result.observation_frames, num))
     return (
         all(array.shape == shape for array, shape in shapes)
         and len(frames.paths) == len(frames.mask_paths) == num > 0
         and (result.components is None or result.components.shape == (num,))
-        and all(len(i) == 0 or (i.min() >= 0 and i.max() < most) for i, most in indices)
+        and all(i.size == 0 or (i.min() >= 0 and i.max() < most) for i, most in indices)
     )
 
 

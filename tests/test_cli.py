@@ -87,6 +87,7 @@ def test_wrong_settings_name_the_key() -> None:
     _fails(_gsba("show-config", "--set", "seed=-1"), "use an integer >= 0")
     _fails(_gsba("show-config", "--set", "seed=" + "9" * 9999), "seed=999")
     _fails(_gsba("show-config", "--set", "seed=" + "[" * 3000), "not a value that can be read")
+    _fails(_gsba("show-config", "--set", 'placement.gps="a\\u0000"'), "placement.gps = ")
     _fails(_gsba("show-config", "--set", "video.width=99999"), "use an even integer >= 64")
     _fails(_gsba("show-config", "--set", "align.patch_size=8"), "not allowed: must be odd")
     _fails(_gsba("show-config", "--config", "nowhere.toml"), "cannot read settings nowhere.toml")

@@ -17,7 +17,7 @@ from gsba.placement import read_placement
 from gsba.records import RecordError, load_record, save_record, typed
 from gsba.run_folder import open_run_folder
 from gsba.store import RunStore, StageRecord
-from gsba.types import Counts, Reconstruction
+from gsba.types import Counts, JointErrors, Reconstruction
 
 
 @pytest.fixture
@@ -70,16 +70,27 @@ def test_an_edited_record_is_no_result(run: Path, change: Callable[[dict], Any])
         ("world_T_rigs", np.eye(4), "do not fit together"),
         ("pose_statuses", np.zeros(99, np.uint8), "do not fit together"),
         ("observation_frames", np.zeros(1, np.int32), "do not fit together"),
+        ("points_world", np.array(1.0), "do not fit together"),
         ("components", np.zeros(1, np.int32), "do not fit together"),
+        ("joint_errors", JointErrors(np.zeros((0, 0)), np.zeros((0, 0))), "do not fit together"),
         ("world_T_rigs", np.full((scene.NUM_FRAMES, 4, 4), np.nan), "are no numbers"),
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(
-    run: Path, field: str, value: np.ndarray, message: str
+    run: Path, field: str, value: np.ndarray | JointErrors, message: str
 ) -> None:
     edited = dataclasses.replace(scene.reconstruction(), **{field: value})
     save_record(run / "stages/reconstruction.npz", edited, {})
     with pytest.raises(GsbaError, match=f"{message}.* --fresh"):
+        load_run(run)
+
+
+@pytest.mark.parametrize("time", [np.inf, np.nan, 0.0])
+def test_frames_in_no_order_of_time_are_refused(run: Path, time: float) -> None:
+    frames = load_run(run)[1]
+    frames.timestamps[1] = time
+    save_record(run / "stages/frames.npz", frames, {})
+    with pytest.raises(GsbaError, match=r"no order of time.* --fresh"):
         load_run(run)
 
 

@@ -1,5 +1,6 @@
 """Induced pixel error: closed forms for a turned and for a shifted camera."""
 
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -85,6 +86,13 @@ def test_depth_maps_are_read_in_name_order(tmp_path: Path) -> None:
     assert [read(k)[0, 0] for k in range(3)] == [0, 1, 2]
 
 
+def _savez_text(path: Path, header: str) -> None:
+    """An archive whose array has a header like this."""
+    text = header.encode().ljust(117) + b"\n"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("range.npy", b"\x93NUMPY\x01\x00" + bytes([len(text), 0]) + text)
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -95,6 +103,7 @@ def test_depth_maps_are_read_in_name_order(tmp_path: Path) -> None:
         (lambda path: np.save(path.open("wb"), np.ones((2, 4))), "no depth map with an array"),
         (lambda path: np.savez(path, depth=np.ones((2, 4))), "no depth map with an array"),
         (lambda path: np.savez(path, range=np.array([{}, None])), "no depth map with an array"),
+        (lambda path: _savez_text(path, "{'descr': '<f8', 'shape': (2, 4"), "damaged depth map"),
         (lambda path: np.savez(path, range=np.array([["a"]])), "no image of numbers"),
         (lambda path: np.savez(path, range=np.ones(8)), "no image of numbers"),
         (lambda path: np.savez(path, range=np.ones((0, 0))), "0x0, but a map is 2:1"),

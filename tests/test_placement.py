@@ -291,6 +291,7 @@ def test_times_that_are_only_an_order_place_nothing(tmp_path: Path) -> None:
     [
         ('<?xml version="1.0" encoding="utf-32"?><gpx/>', "neither a CSV table nor a GPX track"),
         ('<?xml version="1.0" encoding="x-none"?><gpx/>', "neither a CSV table nor a GPX track"),
+        ("name,lat,lon,alt\na,1,2,1e300", "gps:2: 1e\\+300 is no altitude"),
         ("name,lat,lon\n" + "a" * 140_000 + ",1,2", "gps:2: not a row of a CSV table"),
         ("time,lat,lon\n" + "9" * 5000 + ",1,2", r"gps:2: time '9+\.\.\.9+' is not a number"),
     ],

@@ -489,3 +489,16 @@ def test_pictures_of_other_kinds_alone_are_named(tmp_path: Path) -> None:
     (tmp_path / "videos" / "walk.mp4").write_bytes(b"x")
     with pytest.raises(GsbaError, match=r"no JPEG or PNG images \(it holds 1 \.mp4\); extract"):
         scan(tmp_path / "videos", fps=1)
+
+
+def test_a_jpeg_of_unknown_colours_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The decoder looks such colours up where there are none."""
+    for i in range(3):
+        write_image(tmp_path / f"{i}.jpg")
+    frames = scan(tmp_path, fps=1)
+    colours: dict[int, str] = {}
+    monkeypatch.setattr("simplejpeg.decode_jpeg_header", lambda *_, **__: colours[-1])
+    with pytest.raises(GsbaError, match=r"1\.jpg: damaged \(-1\)"):
+        load_erp(frames, 1)

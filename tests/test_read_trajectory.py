@@ -69,10 +69,12 @@ def test_tum_whole_nanoseconds(tmp_path: Path) -> None:
         ("0.5 1 2 3 0 0 NaN 1", "'NaN' is not a finite number"),
         ("0.5 1 2 3 0 0 0 0", "quaternion is zero"),
         ("0.5 1 2 3 0 0 0 1.01", "quaternion has norm 1.01, not 1"),
+        ("0.5 1 2 3 0 0 0 1e300", "quaternion has norm inf, not 1"),
         ("0 1 2 3 0 0 0 1", "timestamp 0.0 occurs twice"),
         ("-1 1 2 3 0 0 0 1", "timestamp -1.0 comes after 0.0; sort"),
     ],
 )
+@pytest.mark.filterwarnings("error")
 def test_refused_tum_lines(tmp_path: Path, line: str, message: str) -> None:
     path = saved(tmp_path, f"# header\n{TUM[0]}\n{line}\n{TUM[2]}\n")
     with pytest.raises(GsbaError, match=rf"traj\.txt:3: {message}"):

@@ -14,6 +14,7 @@ from gsba.read.times import read_lines, seconds, stem_of
 
 _A, _F = 6_378_137.0, 1 / 298.257223563  # WGS 84: half axis in metres, flattening
 _E2 = _F * (2 - _F)
+_HIGHEST_M = 1e6  # no receiver works higher up
 _COLUMNS = {
     "name": ("name", "frame", "image", "file", "filename"),
     "time": ("time", "timestamp", "t", "seconds"),
@@ -155,4 +156,6 @@ def _number(text: str, what: str, place: str) -> float:
 def _checked(values: list[float], place: str) -> list[float]:
     if not (abs(values[0]) <= 90 and abs(values[1]) <= 360):
         raise GsbaError(f"{place}: {values[0]}, {values[1]} is no latitude and longitude")
+    if not abs(values[2]) <= _HIGHEST_M:
+        raise GsbaError(f"{place}: {values[2]:g} is no altitude in metres")
     return values

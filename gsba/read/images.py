@@ -167,7 +167,7 @@ def _decoded_jpeg(
             if not _is_padding(str(error), encoded):
                 raise
             pixels = wanted(strict=False)
-    except ValueError as error:
+    except (ValueError, KeyError) as error:  # KeyError: of a colour space that there is not
         raise GsbaError(
             f"{path}: damaged ({error}); copy or extract it again, or remove it"
         ) from None

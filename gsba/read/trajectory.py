@@ -180,7 +180,8 @@ def _number(text: str, where: str, parse: Callable[[str], float] = float) -> flo
 
 def _rotations(wxyz: np.ndarray, where: Sequence[str]) -> np.ndarray:
     """Rotations (N, 3, 3) of quaternions (N, 4) that are unit to within the tolerance."""
-    norms = np.linalg.norm(wxyz, axis=1)
+    with np.errstate(over="ignore"):  # infinite ones are refused
+        norms = np.linalg.norm(wxyz, axis=1)
     bad = np.flatnonzero(np.abs(norms - 1) > _UNIT_TOLERANCE)
     if len(bad):
         norm = norms[bad[0]]
