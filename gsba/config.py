@@ -70,6 +70,9 @@ class CloserSettings(_Settings):
     """Frames that get more keypoints, because the first of them hold the map poorly."""
 
     mode: Literal["auto", "off"] = "auto"  # off: all frames alike
+    max_drift: float = Field(
+        default=1.1e-4, gt=0
+    )  # predicted error of positions, part of the path; a map below it is left alone
     max_scale_sigma: float = Field(
         default=0.0012, gt=0
     )  # of a step's length over the one before, relative; above, a place is weak, and from two

@@ -18,6 +18,7 @@ from gsba import (
     splat_refine,
     stitching,
     tracks,
+    triangulate,
 )
 from gsba.adjust import Adjustment
 from gsba.map_strength import MapStrength
@@ -34,6 +35,7 @@ from gsba.types import (
     Matches,
     Reconstruction,
     Sighted,
+    Tracks,
     VerifiedPairs,
 )
 
@@ -62,33 +64,51 @@ class Line(MatchingStages):
         adjacent = self.match_along_epipolars(found.solved, "adjacent2")
         return found.solved, [adjacent, *(components.within(m, tied) for m in matches[1:])]
 
-    def look_closer(
-        self, solved: Adjustment, matches: list[Matches]
-    ) -> tuple[Adjustment, list[Matches]]:
+    def look_closer(self, solved: Adjustment, adjacent: Matches) -> tuple[Adjustment, Matches]:
         """What images hold well goes without priors; more keypoints where they hold it poorly."""
-        closer, rounds, trust = self.settings.closer, self.settings.rounds, self.trust
+        closer, trust = self.settings.closer, self.trust
         if trust is None:
-            return solved, matches
+            return solved, adjacent
         seen = ~(trust.unseen_steps | trust.false_steps)
         faint = self.settings.priors.faint()
 
         def compute() -> MapStrength:
             given = self._priors(faint), self.keypoints, self.rig, self.settings, self.num_threads
             known = adjust.pose_covariances(solved, *given, self.parts)
-            coarse, how = self.coarse.world_T_rigs, (closer, self.settings.priors)
+            coarse, how = self.coarse.world_T_rigs, (closer, self.settings.priors, self.parts)
             return map_strength.measure(solved.world_T_rigs, *known, coarse, seen, *how)
 
         found = self._stage("strength", [self._solving(), closer], compute, MapStrength)
         self.counts["strength"], self.strength = [found.counts], found
         self._set_priors()
         if closer.mode == "off" or not found.weak.any():
-            return solved, matches
+            return solved, adjacent
         self.extract_more(found.weak)
         adjacent = self.match_along_epipolars(solved, "adjacent_closer")
-        start = adjust.start(solved.world_T_rigs)
-        solved = self.solve("chain_closer", [adjacent], start, rounds.chain[-1:])
-        near = self.match_known_points("near_closer", solved, loops_closed=False)
-        return self.solve("dense_closer", [adjacent, near], solved, rounds.dense), [adjacent, near]
+        placed = self._place("placed_closer", [adjacent], solved)
+        wide = self.match_known_points("wide_closer", placed, loops_closed=True)
+        gates = self.settings.rounds.dense
+        return self.solve("dense_closer", [adjacent, wide], placed, gates), adjacent
+
+    def _place(self, name: str, matches: Sequence[Matches], solved: Adjustment) -> Adjustment:
+        """Points of these matches under poses as they are."""
+        settings = self.settings
+
+        def compute() -> Adjustment:
+            found = self._tracks(matches)
+            rows, gate = self.keypoints.rows(found), settings.rounds.dense[-1] * solved.noise
+            seen = self.keypoints.bearings_rig[rows], self.keypoints.sigmas_rad[rows]
+            how = gate, settings.triangulate, self.num_threads
+            return replace(
+                solved, landmarks=triangulate.run(found, *seen, solved.world_T_rigs, *how)
+            )
+
+        return self._stage(name, [self._solving()], compute, Adjustment)
+
+    def _tracks(self, matches: Sequence[Matches]) -> Tracks:
+        """Tracks that matches make, within parts that nothing ties together yet."""
+        tied = [components.within(some, self.parts) for some in matches]
+        return tracks.run(tied, np.diff(self.keypoints.starts))
 
     def solve(
         self,
@@ -101,9 +121,7 @@ class Line(MatchingStages):
         """Bundle adjustment in rounds over the tracks that matches make."""
 
         def compute() -> Adjustment:
-            tied = [components.within(some, self.parts) for some in matches]
-            chained = tracks.run(tied, np.diff(self.keypoints.starts))
-            given = chained, self.keypoints, start, self.priors, self.rig
+            given = self._tracks(matches), self.keypoints, start, self.priors, self.rig
             return adjust.run(*given, gates, self.settings, self.num_threads, final)
 
         solved = self._stage(name, [self._solving(), gates, final], compute, Adjustment)

@@ -2,10 +2,10 @@
 
 Along a path the scale is handed on from step to step by the points that three frames see. Where
 these are few, or far, all that lies behind may be larger or smaller, and turned: a walk that does
-not return has nothing else to hold it. Priors on the trajectory's steps are no help: drift is
-smooth, so that they all err the same way, and together bend a place that is held a little less than
-others. So a step that the images hold well goes without one, and those that are left are worth what
-the others show of the trajectory's noise.
+not return has nothing else to hold it; where it returns, loops do. Priors on the trajectory's steps
+are no help: drift is smooth, so that they all err the same way, and together bend a place that is
+held a little less than others. So a step that the images hold well goes without one, and those that
+are left are worth what the others show of the trajectory's noise.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,10 @@ class MapStrength:
 
     scale_sigmas: np.ndarray  # (F - 2,) float64, of the logarithm of a step's length over that of
     # the step before it, at the frame between them; NaN = not known
-    weak: np.ndarray  # (F,) bool, frames at or near places that hand the scale on poorly
+    drift: np.ndarray  # (C,) float64, rms error of positions to be expected of each map after the
+    # best similarity, part of its path
+    weak: np.ndarray  # (F,) bool, frames at or near places that hand the scale on poorly, in maps
+    # that drift
     held_steps: np.ndarray  # (F - 1,) bool, known far better than the trajectory knows them
     noise: StepNoise | None  # of the trajectory's steps; None = too few are held to tell
     counts: Counts  # of frames
@@ -43,6 +46,7 @@ def measure(
     seen: np.ndarray,
     closer: CloserSettings,
     priors: PriorSettings,
+    components: np.ndarray | None = None,
 ) -> MapStrength:
     """Judge a solution by the joint covariance of its poses under priors next to nothing.
 
@@ -54,21 +58,27 @@ def measure(
         seen: (F - 1,) bool, steps that images show and do not contradict.
         closer: limits, and how far around a weak place frames count as near.
         priors: noise of the trajectory's steps, as far as the images do not know it.
+        components: (F,) map of each frame, from 0; None = there is one.
     """
     num = len(world_T_rigs)
+    maps = np.zeros(num, np.int32) if components is None else components
+    drift = np.array(
+        [_drift(world_T_rigs[maps == m], joint.draws[:, maps == m]) for m in range(maps.max() + 1)]
+    )
+    drifting = drift[maps] > closer.max_drift
     sigmas = scale_sigmas(world_T_rigs, joint.draws)
     between = seen[:-1] & seen[1:] & np.isfinite(sigmas)
     median = float(np.median(sigmas[between])) if between.any() else 0.0
     limit = closer.max_scale_sigma
     limit = np.clip(_STANDING_OUT * median, _FROM * limit, limit)
     poor = np.zeros(num, bool)
-    poor[1:-1] = between & (np.nan_to_num(sigmas) > limit)
+    poor[1:-1] = drifting[1:-1] & between & (np.nan_to_num(sigmas) > limit)
     reach = np.ones(2 * closer.reach + 1)
     weak = np.convolve(poor, reach)[closer.reach : closer.reach + num] > 0
     held = seen & _held(world_T_rigs, covariances, joint, priors)
     noise = _noise(world_T_rigs, coarse_world_T_rigs, held, priors)
     counts = Counts(num, int(weak.sum()), "frames", {"held well": int((~weak).sum())})
-    return MapStrength(sigmas, weak, held, noise, counts)
+    return MapStrength(sigmas, drift, weak, held, noise, counts)
 
 
 def scale_sigmas(world_T_rigs: np.ndarray, draws: np.ndarray) -> np.ndarray:
@@ -78,6 +88,22 @@ def scale_sigmas(world_T_rigs: np.ndarray, draws: np.ndarray) -> np.ndarray:
     moved = np.einsum("fij,dfj->dfi", world_T_rigs[:, :3, :3], draws[:, :, 3:])
     stretches = np.einsum("fi,dfi->df", steps / squares[:, None], np.diff(moved, axis=1))
     return np.diff(stretches, axis=1).std(axis=0)
+
+
+def _drift(world_T_rigs: np.ndarray, draws: np.ndarray) -> float:
+    """See `MapStrength.drift`; 0 where fewer than three poses are known."""
+    known = np.isfinite(draws).all(axis=(0, 2))
+    if np.count_nonzero(known) < 3:
+        return 0.0
+    poses, errors = world_T_rigs[known], draws[:, known, 3:]
+    errors = np.einsum("fij,dfj->dfi", poses[:, :3, :3], errors).reshape(len(draws), -1)
+    offsets = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
+    turns = [np.cross(axis, offsets) for axis in np.eye(3)]
+    shifts = [np.tile(axis, (len(poses), 1)) for axis in np.eye(3)]
+    basis = np.linalg.qr(np.array([*shifts, *turns, offsets]).reshape(7, -1).T)[0]
+    left = errors - errors @ basis @ basis.T
+    path = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
+    return float(np.sqrt(np.mean(left**2) * 3) / max(path, 1e-300))
 
 
 def _held(

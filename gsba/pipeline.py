@@ -94,14 +94,14 @@ def _solve(line: Line, neighbours: VerifiedPairs) -> Adjustment:
     adjacent = line.match_along_epipolars(solved)
     near = line.match_known_points("near", solved, loops_closed=False)
     solved = line.solve("dense", [adjacent, near], solved, rounds.dense)
-    solved, matches = line.look_closer(solved, [adjacent, near])
-    solved, matches = line.register(neighbours, solved, matches)
+    solved, matches = line.register(neighbours, solved, [adjacent, near])
     loops, solved = line.close_loops(solved)
     solved = line.solve("closed", [*matches, loops.matches], solved, rounds.loops)
+    solved, adjacent = line.look_closer(solved, matches[0])
     for number in range(1, rounds.map_passes + 1):
         wide = line.match_known_points(f"everywhere{number}", solved, loops_closed=True)
         final = number == rounds.map_passes and settings.align.rounds == 0
-        solved = line.solve(f"refined{number}", [matches[0], wide], solved, rounds.refined, final)
+        solved = line.solve(f"refined{number}", [adjacent, wide], solved, rounds.refined, final)
     for number in range(1, settings.align.rounds + 1):
         sighted = line.align(number, solved)
         solved = line.straighten(number, sighted, line.solve_aligned(number, sighted, solved))

@@ -34,6 +34,30 @@ def _measured(scale_sigma: np.ndarray, coarse: np.ndarray = POSES) -> MapStrengt
     return map_strength.measure(POSES, *_chained(scale_sigma), coarse, seen, CLOSER, PRIORS)
 
 
+def test_a_map_that_hardly_drifts_is_left_alone() -> None:
+    covariances, joint = _chained(np.full(NUM - 2, 2e-3))
+    given = POSES, np.ones(NUM - 1, bool), CLOSER, PRIORS
+    loose = map_strength.measure(POSES, covariances, joint, *given)
+    assert loose.drift[0] > CLOSER.max_drift and loose.weak.any()
+    calm = CLOSER.model_copy(update={"max_drift": 2 * loose.drift[0]})
+    found = map_strength.measure(POSES, covariances, joint, *given[:2], calm, PRIORS)
+    assert not found.weak.any() and found.held_steps.all()
+
+
+def test_drift_is_what_is_left_after_the_best_similarity() -> None:
+    from gsba.geometry import similarity
+
+    _, joint = _chained(np.full(NUM - 2, 2e-3), 200)
+    draws = joint.draws
+    moved = POSES[:, :3, 3] + np.einsum("fij,dfj->dfi", POSES[:, :3, :3], draws[..., 3:])
+    squares = []
+    for positions in moved:
+        scale, rotation, shift = similarity(positions, POSES[:, :3, 3])
+        squares.append((scale * positions @ rotation.T + shift - POSES[:, :3, 3]) ** 2)
+    wanted = np.sqrt(3 * np.mean(squares)) / LENGTHS.sum()
+    assert map_strength._drift(POSES, draws) == pytest.approx(wanted, rel=0.01)
+
+
 def test_changes_of_scale_are_as_uncertain_as_they_were_made() -> None:
     made = np.linspace(2e-4, 1e-3, NUM - 2)
     assert _measured(made).scale_sigmas == pytest.approx(made, rel=0.1)  # of 2000 draws: 1.6 %

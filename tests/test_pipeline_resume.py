@@ -12,6 +12,7 @@ from tiny_run import NUM_FRAMES, SETTINGS, Case, computed_stages
 
 import gsba
 from gsba import frontend
+from gsba.config import CloserSettings
 
 
 def test_a_second_call_takes_everything_up(case: Case, tmp_path: Path) -> None:
@@ -107,3 +108,17 @@ def test_an_interrupt_leaves_what_is_finished(
         patch.setattr(frontend, "match_loops", interrupt)
         case.refine(out)
     assert computed_stages(case.refine(out)) == ["loops"]
+
+
+def test_a_weak_map_gets_more_keypoints_and_resumes(case: Case, tmp_path: Path) -> None:
+    closer = {"max_drift": 1e-12, "max_scale_sigma": 1e-12, "max_per_face": 600}
+    settings = SETTINGS.model_copy(update={"closer": CloserSettings(**closer)})
+    out = case.copy(tmp_path / "run")
+    result = case.refine(out, settings)
+    stages = {stage["name"]: stage for stage in result.report["stages"]}
+    assert stages["strength"]["counts"][0]["kept"] == NUM_FRAMES
+    assert stages["features"]["resumed"] and not stages["dense_closer"]["resumed"]
+    points = [len(run.reconstruction.points_world) for run in (case.result, result)]
+    assert points[1] > 1.2 * points[0]
+    assert case.errors(out).rpe_rotation_deg.max < 0.1  # ten times what chance leaves
+    assert computed_stages(case.refine(out, settings)) == []
