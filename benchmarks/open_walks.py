@@ -120,8 +120,8 @@ class Judged(NamedTuple):
 
 HEAD = [
     "| sequence | frames | path | ATE without | other seeds | trajectories | ATE with "
-    f"| worst ratio | chance | AUC@{AUC_DEG}° without | with | targets |",
-    "|---|---:|---:|---:|---|---|---|---:|---:|---:|---|---|",
+    f"| worst ratio | of medians | chance | AUC@{AUC_DEG}° without | with | targets |",
+    "|---|---:|---:|---:|---|---|---|---:|---:|---:|---:|---|---|",
 ]
 
 
@@ -137,7 +137,8 @@ def judge(name: str, without: list[dict], with_one: list[dict]) -> Judged:
     none, some = [_ate(row) for row in without], [_ate(row) for row in with_one]
     ratio = max(some) / none[0]
     missed = [f"**ratio above {MAX_RATIO}**"] if ratio > MAX_RATIO else []
-    missed += [f"**above {1e3 * MAX_ATE:g}**"] if max(*none, *some) > MAX_ATE else []
+    missed += [f"**with one above {1e3 * MAX_ATE:g}**"] if max(some) > MAX_ATE else []
+    missed += [f"**without above {1e3 * MAX_ATE:g}**"] if max(none) > MAX_ATE else []
     cells = [
         name,
         str(without[0]["errors"]["num_truth"]),
@@ -147,6 +148,7 @@ def judge(name: str, without: list[dict], with_one: list[dict]) -> Judged:
         ", ".join(row["start"] for row in with_one),
         ", ".join(map(_ate_cell, with_one)),
         f"{ratio:.2f}",
+        f"{np.median(some) / np.median(none):.2f}",
         f"{max(none) / min(none):.2f}" if len(none) > 1 else "",
         _auc_cell(without[0]),
         ", ".join(map(_auc_cell, with_one)),
@@ -201,7 +203,7 @@ def table(bench: Bench, names: list[str], data: Path) -> Iterator[Judged]:
 
 
 def _reason(label: str, why: str) -> str:
-    return f"| {label} {'|' * 11} {why} |"
+    return f"| {label} {'|' * 12} {why} |"
 
 
 def _slug(text: str) -> str:
@@ -238,9 +240,10 @@ def main() -> None:
         summary(judged),
         "",
         "ATE in 1e-3 units of the truth, after Sim(3). Targets: every ATE with a trajectory at "
-        f"most {MAX_RATIO} times that without (worst ratio), none above {1e3 * MAX_ATE:g}. Chance: "
-        "largest over smallest ATE without a trajectory of the seeds; a ratio no larger than that "
-        "says little. Numbers under trajectories are seeds of degradations of the truth.",
+        f"most {MAX_RATIO} times that without (worst ratio), none above {1e3 * MAX_ATE:g}. Of "
+        "medians: median over trajectories by median over seeds. Chance: largest over smallest "
+        "ATE without a trajectory of the seeds; a ratio no larger than that says little. Numbers "
+        "under trajectories are seeds of degradations of the truth.",
         *(["", options.note] if options.note else []),
         *(["", f"With {', '.join(options.sets)}."] if options.sets else []),
     ]
