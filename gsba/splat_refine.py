@@ -335,8 +335,8 @@ class _Turns:
 def _log(move: Move) -> None:
     gain, verdict = move.psnr_moved - move.psnr_stayed, "taken" if move.accepted else "undone"
     logger.info(
-        "faces of %d px: held out %+.3f dB (standard error %.3f), cost of observations times %.3f "
-        "(%.3f): evidence %+.1f, %s",
+        "faces of %d px: held out %+.4f dB (standard error %.4f), cost of observations times %.4f "
+        "(%.4f): evidence %+.1f, %s",
         move.size, gain, move.psnr_sigma, move.growth, move.growth_sigma, move.evidence, verdict,
     )  # fmt: skip
 

@@ -44,22 +44,26 @@ def run(case: Case, given: Given, settings: RefineSettings, **options) -> SplatR
 Harm = Callable[[np.ndarray, np.random.Generator], np.ndarray]  # of steps (F, 6), tangents
 
 
-def _half(steps: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _sizes(steps: np.ndarray) -> np.ndarray:
+    """Root mean square (6,) of the turns, then of the shifts."""
+    return np.repeat(np.sqrt(np.mean(steps.reshape(-1, 2, 3) ** 2, axis=(0, 2))), 3)
+
+
+def _half(steps: np.ndarray, _: np.random.Generator) -> np.ndarray:
+    order = np.argsort(np.linalg.norm(steps / _sizes(steps), axis=1))
     signs = np.ones(len(steps))
-    signs[rng.permutation(len(steps))[: len(steps) // 2]] = -1
+    signs[order[len(steps) // 2 :]] = -1
     return signs[:, None] * steps
 
 
 def _noise(steps: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    kinds = steps.reshape(-1, 2, 3)
-    sizes = np.sqrt(np.mean(kinds**2, axis=(0, 2), keepdims=True))
-    return (sizes * rng.standard_normal(kinds.shape)).reshape(steps.shape)
+    return _sizes(steps) * rng.standard_normal(steps.shape)
 
 
 HARMS: dict[str, Harm] = {
     "reversed": lambda steps, _: -steps,
     "2.5 times too far": lambda steps, _: 2.5 * steps,
-    "half of the frames reversed": _half,
+    "the further half reversed": _half,
     "noise of its size": _noise,
 }
 
@@ -72,7 +76,7 @@ def harmed(real: Callable, harm: Harm, seed: int) -> Callable:
         before = [gtsam.Pose3(pose) for pose in world_T_rigs]
         pairs = zip(before, found, strict=True)
         steps = np.stack([pose.localCoordinates(gtsam.Pose3(after)) for pose, after in pairs])
-        steps = harm(steps, np.random.default_rng(seed))
+        steps = harm(steps, np.random.default_rng([seed, 1]))  # not the errors that it is to mend
         pairs = zip(before, steps, strict=True)
         return np.stack([pose.retract(step).matrix() for pose, step in pairs]), result
 
