@@ -301,7 +301,7 @@ def _videos(draft: _Draft) -> Spoiled:
             draft.said.append(f"{option} {value[:30]}")
 
     def check(here: Path, _: Any) -> str | None:
-        rows = list(csv.reader((here / "out/timestamps.csv").open()))[1:]
+        rows = list(csv.reader(_lines_of(here / "out/timestamps.csv")))[1:]
         times = np.array([float(row[1]) for row in rows])
         if not len(rows) or (np.diff(times) <= 0).any():
             return "times"
@@ -371,7 +371,7 @@ def _runs(draft: _Draft) -> Spoiled:
         found = read_trajectory(here / "out/trajectory.tum").world_T_rigs
         if len(found) < 3:
             return f"{len(found)} poses"
-        names = [row["frame"] for row in csv.DictReader((here / "out/poses.csv").open())]
+        names = [row["frame"] for row in csv.DictReader(_lines_of(here / "out/poses.csv"))]
         if len(found) == len(names) == NUM and how != 3:
             order = [int(name) for name in names]
             scale, rotation, shift = pose_similarity(found, _TRUTH.world_T_rigs[order])
@@ -664,6 +664,10 @@ def _not_finite(tree: Any) -> str | None:
         parts = tree.values() if isinstance(tree, dict) else tree
         return next((wrong for part in parts if (wrong := _not_finite(part))), None)
     return None if isinstance(tree, int | float) and np.isfinite(tree) else f"{tree!r:.40}"
+
+
+def _lines_of(path: Path) -> list[str]:
+    return path.read_text(encoding="utf-8").splitlines()
 
 
 def _copied(source: Path, target: Path) -> None:

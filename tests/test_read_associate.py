@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsba.config import ReadSettings
+from gsba.config import ReadSettings, RefineSettings
 from gsba.geometry import inverse, pose, rotation_angle
+from gsba.inputs import coarse_poses
 from gsba.log import GsbaError
 from gsba.read import associate, read_trajectory, scan
 from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
@@ -205,3 +206,11 @@ def test_times_closer_than_a_clock_tells_are_refused() -> None:
         coarse([0, 1e-300, 1, 2], GRID)
     with pytest.raises(GsbaError, match="two poses are less"):
         coarse(GRID, [0, 1e-310, 1, 2])
+
+
+@pytest.mark.parametrize("extent", [0.0, 1e-150])
+def test_a_trajectory_that_hardly_moves_gives_no_positions(extent: float) -> None:
+    poses = motion(GRID)
+    poses[:, :3, 3] *= extent
+    found = coarse_poses(frames_at(GRID), [Trajectory(GRID, poses)], RefineSettings())
+    assert (found.sources == PoseSource.NONE).all()
