@@ -134,7 +134,8 @@ def run(number: int, options: argparse.Namespace) -> Outcome:
 
     soft = int(MEMORY_GB * 2**30)
     resource.setrlimit(resource.RLIMIT_AS, (soft, soft))
-    warnings.simplefilter("always")
+    for shown, kind in (("always", RuntimeWarning), ("ignore", ResourceWarning)):
+        warnings.simplefilter(shown, kind)  # type: ignore[arg-type]
     case = spoil(number, options.seed, options.family)
     with tempfile.TemporaryDirectory(prefix="gsba-fuzz-") as name, _inside(Path(name)) as folder:
         case.make(options.out, folder)

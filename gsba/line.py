@@ -21,6 +21,7 @@ from gsba import (
     triangulate,
 )
 from gsba.adjust import Adjustment
+from gsba.log import GsbaError
 from gsba.map_strength import MapStrength
 from gsba.matching_stages import MatchingStages
 from gsba.photometric import PhotometricResult
@@ -46,7 +47,17 @@ class Line(MatchingStages):
     def register(
         self, neighbours: VerifiedPairs, solved: Adjustment, matches: list[Matches]
     ) -> tuple[Adjustment, list[Matches]]:
-        """Parts of the map joined where they meet, frames in none of them registered."""
+        """Parts of the map joined where they meet, frames in none of them registered.
+
+        Raises:
+            GsbaError: there is no map at all, so that nothing could be registered against it.
+        """
+        if not len(solved.landmarks.points_world):
+            raise GsbaError(
+                "no scene point is seen from enough frames, with enough parallax: frames must "
+                "follow one another closely (or lower triangulate.min_track_length or "
+                "triangulate.min_parallax_deg)"
+            )
         least, trust = self.settings.rounds.min_observations, self.trust
         if trust is None:
             return solved, matches

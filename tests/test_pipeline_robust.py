@@ -73,3 +73,11 @@ def test_the_truth_needs_no_repair(case: Case, tmp_path: Path) -> None:
     assert not any(judgement[name] for name in ("false_frames", "false_steps", "unseen_steps"))
     assert judgement["clock"]["verdict"] != "corrected" and judgement["clock"]["offset_s"] == 0
     assert evaluate(read_trajectory(tmp_path / "run/trajectory.tum"), case.truth).ate.rmse < 0.02
+
+
+def test_a_map_without_points_is_refused_at_once(case: Case, tmp_path: Path) -> None:
+    """Nothing can be registered against it, and trying takes minutes."""
+    long = SETTINGS.triangulate.model_copy(update={"min_track_length": 200})
+    settings = SETTINGS.model_copy(update={"triangulate": long})
+    with pytest.raises(GsbaError, match=r"no scene point .* triangulate\.min_track_length"):
+        refine(case.frames, case.slam, tmp_path / "run", settings)
