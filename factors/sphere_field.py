@@ -13,7 +13,8 @@ import numpy as np
 from factors.bearing import tangent_basis
 from factors.compiled import kernel_and_part
 
-_SETTLE = 6  # fixed-point steps that undo a field; each gains the field's slope as a factor
+_MOST_STEPS = 20  # fixed-point steps that undo a field; each gains the field's slope as a factor
+_SETTLED = 1e-12  # of a direction: a step this short is the last
 
 _kernel, _part = kernel_and_part(error_model="numpy")
 
@@ -98,10 +99,12 @@ class SphereField:
         if not self:
             return directions
         found = directions
-        for _ in range(_SETTLE):
+        for _ in range(_MOST_STEPS):
             off = directions - self.corrected(found)
             found = found + off
             found = found / np.linalg.norm(found, axis=-1, keepdims=True)
+            if np.abs(off).max(initial=0.0) < _SETTLED:
+                break
         return found
 
     def corrected_roots(self, bearings: np.ndarray, roots: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ from gsba.types import Counts, Keypoints, Landmarks, VerifiedPairs
 
 _WORDS = 64  # of the vocabulary
 _SAMPLES = 20_000  # descriptors it is made from
+_ROUNDING = 1e-5  # of descriptors, float32 and of length one: a shorter sum has no direction
 _LOOKS = 3  # places compared for each frame
 _TRIALS = 200  # of three points each
 _POINT_DEG = 1.0  # a point of one frame's map seen in the other
@@ -129,7 +130,8 @@ def _aggregate(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
     """Sums of the differences from the nearest words, each word's of length one."""
     nearest = _nearest(descriptors, words)
     sums = _sums(descriptors - words[nearest], nearest, len(words))
-    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    sums = np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > _ROUNDING)
     return sums.ravel() / max(float(np.linalg.norm(sums)), 1e-12)
 
 

@@ -36,6 +36,7 @@ def _drifting(rotations: np.ndarray) -> np.ndarray:
     rng = np.random.default_rng(1)
     drift = np.cumsum(rng.normal(0, 0.003, (NUM, 3)), axis=0)
     drift -= drift[0]
+    drift *= 0.03 / np.linalg.norm(drift, axis=1).max()
     return rotations @ Rotation.from_rotvec(drift).as_matrix()
 
 
