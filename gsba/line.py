@@ -80,14 +80,14 @@ class Line(MatchingStages):
         closer, trust = self.settings.closer, self.trust
         if trust is None:
             return solved, adjacent
-        seen = ~(trust.unseen_steps | trust.false_steps)
+        steps = ~trust.unseen_steps, ~trust.false_steps
         faint = self.settings.priors.faint()
 
         def compute() -> MapStrength:
             given = self._priors(faint), self.keypoints, self.rig, self.settings, self.num_threads
             known = adjust.pose_covariances(solved, *given, self.parts)
             coarse, how = self.coarse.world_T_rigs, (closer, self.settings.priors, self.parts)
-            return map_strength.measure(solved.world_T_rigs, *known, coarse, seen, *how)
+            return map_strength.measure(solved.world_T_rigs, *known, coarse, *steps, *how)
 
         found = self._stage("strength", [self._solving(), closer], compute, MapStrength)
         self.counts["strength"], self.strength = [found.counts], found

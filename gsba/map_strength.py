@@ -44,6 +44,7 @@ def measure(
     joint: JointErrors,
     coarse_world_T_rigs: np.ndarray,
     seen: np.ndarray,
+    believed: np.ndarray,
     closer: CloserSettings,
     priors: PriorSettings,
     components: np.ndarray | None = None,
@@ -55,7 +56,8 @@ def measure(
         covariances: (F, 6, 6) [rotation rad, translation], rig frames.
         joint: what errors of poses have in common.
         coarse_world_T_rigs: (F, 4, 4) the trajectory.
-        seen: (F - 1,) bool, steps that images show and do not contradict.
+        seen: (F - 1,) bool, steps that images show.
+        believed: (F - 1,) bool, steps of the trajectory that they do not contradict.
         closer: limits, and how far around a weak place frames count as near.
         priors: noise of the trajectory's steps, as far as the images do not know it.
         components: (F,) map of each frame, from 0; None = there is one.
@@ -76,7 +78,7 @@ def measure(
     reach = np.ones(2 * closer.reach + 1)
     weak = np.convolve(poor, reach)[closer.reach : closer.reach + num] > 0
     held = seen & _held(world_T_rigs, covariances, joint, priors)
-    noise = _noise(world_T_rigs, coarse_world_T_rigs, held, priors)
+    noise = _noise(world_T_rigs, coarse_world_T_rigs, held & believed, priors)
     counts = Counts(num, int(weak.sum()), "frames", {"held well": int((~weak).sum())})
     return MapStrength(sigmas, drift, weak, held, noise, counts)
 

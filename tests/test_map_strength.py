@@ -14,6 +14,7 @@ NUM = 24
 POSES = loop_walk(NUM)
 LENGTHS = np.linalg.norm(np.diff(POSES[:, :3, 3], axis=0), axis=1)
 CLOSER, PRIORS = CloserSettings(), PriorSettings()
+ALL = np.ones(NUM - 1, bool)
 
 
 def _chained(scale_sigma: np.ndarray, num_draws: int = 2000) -> tuple[np.ndarray, JointErrors]:
@@ -30,17 +31,16 @@ def _chained(scale_sigma: np.ndarray, num_draws: int = 2000) -> tuple[np.ndarray
 
 
 def _measured(scale_sigma: np.ndarray, coarse: np.ndarray = POSES) -> MapStrength:
-    seen = np.ones(NUM - 1, bool)
-    return map_strength.measure(POSES, *_chained(scale_sigma), coarse, seen, CLOSER, PRIORS)
+    return map_strength.measure(POSES, *_chained(scale_sigma), coarse, ALL, ALL, CLOSER, PRIORS)
 
 
 def test_a_map_that_hardly_drifts_is_left_alone() -> None:
     covariances, joint = _chained(np.full(NUM - 2, 2e-3))
-    given = POSES, np.ones(NUM - 1, bool), CLOSER, PRIORS
+    given = POSES, ALL, ALL, CLOSER, PRIORS
     loose = map_strength.measure(POSES, covariances, joint, *given)
     assert loose.drift[0] > CLOSER.max_drift and loose.weak.any()
     calm = CLOSER.model_copy(update={"max_drift": 2 * loose.drift[0]})
-    found = map_strength.measure(POSES, covariances, joint, *given[:2], calm, PRIORS)
+    found = map_strength.measure(POSES, covariances, joint, *given[:3], calm, PRIORS)
     assert not found.weak.any() and found.held_steps.all()
 
 
@@ -79,10 +79,17 @@ def test_a_place_that_stands_out_is_weak_below_the_limit_already() -> None:
 def test_nothing_is_looked_for_where_no_image_shows_a_step() -> None:
     made = np.full(NUM - 2, 4e-4)
     made[9] = 2e-3
-    seen = np.ones(NUM - 1, bool)
+    seen = ALL.copy()
     seen[10] = False
-    found = map_strength.measure(POSES, *_chained(made), POSES, seen, CLOSER, PRIORS)
+    found = map_strength.measure(POSES, *_chained(made), POSES, seen, ALL, CLOSER, PRIORS)
     assert not found.weak.any() and not found.held_steps[10]
+
+
+def test_a_trajectory_that_is_not_believed_leaves_weak_places_to_be_found() -> None:
+    made = np.full(NUM - 2, 4e-4)
+    made[9] = 2e-3
+    found = map_strength.measure(POSES, *_chained(made), POSES, ALL, ~ALL, CLOSER, PRIORS)
+    assert found.weak.any() and found.noise is None
 
 
 def test_steps_that_images_hold_far_better_than_priors_go_without() -> None:
