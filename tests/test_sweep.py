@@ -54,16 +54,23 @@ def test_comparison_is_that_of_numpy() -> None:
     masked = np.isnan(beyond)
     assert masked.all(axis=0).any() and masked.mean() < 0.3
     tolerance = 0.3  # grey levels over 1e-3 rad
+    # Within that of a pixel that is masked, either answer is right.
+    aside = [1e-3 * HEIGHT / np.pi * np.array(way) for way in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
+    near = np.stack([[_bilinear(others[m], uv[m] + by) for m in range(NUM)] for by in aside])
+    sure = np.all(np.isnan(near[..., 0]) == masked, axis=0)
+    assert sure.mean() > 0.99
     expected = np.where(masked, CAP, np.minimum(beyond, CAP))
-    np.testing.assert_allclose(differences, expected, atol=tolerance)
+    np.testing.assert_allclose(differences[sure], expected[sure], atol=tolerance)
+    sure = sure.all(axis=0)
     greys = np.ma.masked_invalid(levels.mean(axis=-1))
     median = np.ma.median(greys, axis=0)
     off = np.minimum(np.abs(own.mean(axis=-1) - median), CAP).filled(0)
-    np.testing.assert_allclose(away, off, atol=tolerance)
+    np.testing.assert_allclose(away[sure], off[sure], atol=tolerance)
     ordered = np.sort(np.minimum(np.abs(greys - median), CAP).filled(np.inf), axis=0)
     half = (~masked).sum(axis=0) // 2
     typical = np.take_along_axis(ordered, half[None], axis=0)[0]
-    np.testing.assert_allclose(spread, np.where(np.isinf(typical), CAP, typical), atol=tolerance)
+    typical = np.where(np.isinf(typical), CAP, typical)
+    np.testing.assert_allclose(spread[sure], typical[sure], atol=tolerance)
 
 
 def test_best_distances_are_kept() -> None:
