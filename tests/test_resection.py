@@ -16,8 +16,10 @@ OTHER = pose(Rotation.from_rotvec([0.0, 0.4, 0.0]).as_matrix(), np.array([-1.5, 
 
 def _points(rng: np.random.Generator, num: int, cone_deg: float = 180.0) -> np.ndarray:
     """Points (num, 3) between 2 and 5 away from the frame, around its z axis."""
-    rays = unit(rng.normal(size=(100 * num, 3)))
+    share = 0.5 - 0.5 * np.cos(np.deg2rad(cone_deg))  # of the sphere
+    rays = unit(rng.normal(size=(max(100 * num, int(2 * num / share)), 3)))
     rays = rays[rays[:, 2] > np.cos(np.deg2rad(cone_deg))][:num]
+    assert len(rays) == num
     return (rng.uniform(2, 5, (len(rays), 1)) * rays) @ POSE[:3, :3].T + POSE[:3, 3]
 
 
