@@ -74,9 +74,8 @@ class CloserSettings(_Settings):
         default=1.1e-4, gt=0
     )  # predicted error of positions, part of the path; a map below it is left alone
     max_scale_sigma: float = Field(
-        default=0.0012, gt=0
-    )  # of a step's length over the one before, relative; above, a place is weak, and from two
-    # thirds of it on where it stands out
+        default=8e-4, gt=0
+    )  # of a step's length over the one before, relative; above, a place is weak
     reach: int = Field(default=2, ge=0)  # frames before and after such a place
     max_per_face: int = Field(default=1200, ge=16)
     contrast_threshold: float = Field(default=0.01, gt=0)

@@ -19,8 +19,6 @@ from gsba.types import Counts, JointErrors, StepNoise
 _HELD = 0.25  # of a prior's standard deviation, in any direction: it then has a say of 6 %
 _LEAST_STEPS = 8  # held ones, to estimate a noise from
 _LEAST_NOISE = 0.1  # of the settings' noise
-_STANDING_OUT = 1.5  # times the median of a run
-_FROM = 2 / 3  # of the limit on, what stands out is weak, too
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +68,8 @@ def measure(
     drifting = drift[maps] > closer.max_drift
     sigmas = scale_sigmas(world_T_rigs, joint.draws)
     between = seen[:-1] & seen[1:] & np.isfinite(sigmas)
-    median = float(np.median(sigmas[between])) if between.any() else 0.0
-    limit = closer.max_scale_sigma
-    limit = np.clip(_STANDING_OUT * median, _FROM * limit, limit)
     poor = np.zeros(num, bool)
-    poor[1:-1] = drifting[1:-1] & between & (np.nan_to_num(sigmas) > limit)
+    poor[1:-1] = drifting[1:-1] & between & (np.nan_to_num(sigmas) > closer.max_scale_sigma)
     reach = np.ones(2 * closer.reach + 1)
     weak = np.convolve(poor, reach)[closer.reach : closer.reach + num] > 0
     held = seen & _held(world_T_rigs, covariances, joint, priors)
