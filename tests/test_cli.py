@@ -127,7 +127,7 @@ def test_what_nobody_foresaw_is_one_line_that_can_be_reported(
 ) -> None:
     pipeline(ZeroDivisionError("no\nway"))
     call = ["refine", "frames", "slam.tum", "--out", "run"]
-    _fails(_gsba(*call), "unforeseen ZeroDivisionError at test_cli.py:")
+    _fails(_gsba(*call), "unforeseen ZeroDivisionError at refining.py:")
     _fails(_gsba(*call), "(no way): a fault of gsba")
     assert isinstance(_gsba("--debug", *call).exception, ZeroDivisionError)
 

@@ -18,7 +18,7 @@ from gsba.log import GsbaError, brief, show_log
 
 P = ParamSpec("P")
 
-_SOURCE = Path(__file__).parents[2]
+_SOURCE = Path(__file__).parents[1]  # not what lies beside it where packages are installed
 _MOST_SHOWN = 1000  # characters of a message
 _MEMORY_OF = {  # settings that the memory of a stage follows, by the beginning of its name
     "features": "cubemap.max_face_size, features.max_per_face or solver.num_threads",
