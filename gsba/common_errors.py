@@ -3,8 +3,8 @@
 Covariances follow from residuals, as if every observation erred by itself. On sequences with known
 truth they then hold for steps from frame to frame, but poses far along the path are off by twice
 what they claim: sampling and surfaces mislead the patches of some frames alike, and poses take that
-up. It remains where images have neither noise nor compression. What is added here is as large as
-the errors that residuals do show, and smooth along the path; both numbers are measured
+up. It remains where images have neither noise nor compression. What is added here are errors as
+residuals show them, enlarged and smoothed along the path; both numbers are measured
 (`benchmarks/covariances.py`), not derived.
 """
 

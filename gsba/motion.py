@@ -16,6 +16,7 @@ from gsba.blame import chained, false_frames, limits
 from gsba.config import PriorSettings, VerifySettings
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.types import CoarsePoses, FrameSet, Keypoints, PoseSource, VerifiedPairs
+from gsba.verify import bearings, parallax
 
 logger = logging.getLogger(__name__)
 
@@ -75,25 +76,13 @@ def steps(pairs: VerifiedPairs, keypoints: Keypoints, settings: VerifySettings) 
         if f1 - f0 != 1:
             continue
         f0_T_f1 = pairs.f0_T_f1s[p]
-        rays0, bearings1 = _bearings(pairs, p, keypoints)
+        rays0, bearings1 = bearings(pairs.matches, keypoints, p, pairs.matches.of(p))
         f_T_nexts[f0], verified[f0] = f0_T_f1, True
         turn = _turn(rays0, bearings1)
         if np.median(np.linalg.norm(rays0 - bearings1 @ turn.T, axis=1)) < _STILL:
             f_T_nexts[f0, :3, :3] = turn  # an essential matrix knows it less well
-        directed[f0] = _parallax(rays0, bearings1, f0_T_f1) > np.deg2rad(settings.min_parallax_deg)
+        directed[f0] = parallax(f0_T_f1, rays0, bearings1) > np.deg2rad(settings.min_parallax_deg)
     return Steps(f_T_nexts, verified, directed)
-
-
-def _bearings(pairs: VerifiedPairs, p: int, keypoints: Keypoints) -> tuple[np.ndarray, np.ndarray]:
-    """Bearings (m, 3) of the matches of pair p in either frame."""
-    (f0, f1), rows = pairs.matches.pairs[p], pairs.matches.of(p)
-    return keypoints.bearings_of(f0)[rows[:, 0]], keypoints.bearings_of(f1)[rows[:, 1]]
-
-
-def _parallax(rays0: np.ndarray, bearings1: np.ndarray, f0_T_f1: np.ndarray) -> float:
-    """Median angle in radians between both bearings in one orientation."""
-    chords = np.linalg.norm(rays0 - bearings1 @ f0_T_f1[:3, :3].T, axis=1)
-    return float(2 * np.arcsin(np.median(chords) / 2))
 
 
 def off_steps(
@@ -112,9 +101,8 @@ def off_steps(
         if f2 - f0 != 2 or not found.directed[f0 : f0 + 2].all():
             continue
         f0_T_f2 = pairs.f0_T_f1s[p]
-        if _parallax(*_bearings(pairs, p, keypoints), f0_T_f2) > np.deg2rad(
-            settings.min_parallax_deg
-        ):
+        both = bearings(pairs.matches, keypoints, p, pairs.matches.of(p))
+        if parallax(f0_T_f2, *both) > np.deg2rad(settings.min_parallax_deg):
             first = found.f_T_nexts[f0]
             second = first[:3, :3] @ found.f_T_nexts[f0 + 1, :3, 3]
             out[p] = _angle_to_arc(f0_T_f2[:3, 3], first[:3, 3], second)

@@ -70,7 +70,7 @@ def judge(
         turn = rotation_angle(prior[:3, :3].T @ f0_T_f1[:3, :3])
         if turn > np.deg2rad(settings.max_rotation_deg):
             dropped["rotation contradicts"] += 1
-        elif _parallax(f0_T_f1, *_bearings(matches, keypoints, p, rows)) > np.deg2rad(
+        elif parallax(f0_T_f1, *bearings(matches, keypoints, p, rows)) > np.deg2rad(
             settings.min_parallax_deg
         ) and not _direction_agrees(prior[:3, 3], f0_T_f1[:3, 3], position_sigmas[p], settings):
             dropped["direction contradicts"] += 1
@@ -93,14 +93,14 @@ def estimate(
     """`relative_pose` of every pair, whatever the prior says."""
 
     def one(p: int) -> Estimate | None:
-        bearings0, bearings1 = _bearings(matches, keypoints, p, matches.of(p))
-        return relative_pose(bearings0, bearings1, settings, seed)
+        rays0, rays1 = bearings(matches, keypoints, p, matches.of(p))
+        return relative_pose(rays0, rays1, settings, seed)
 
     with ThreadPoolExecutor(num_threads) as pool:
         return list(pool.map(one, range(len(matches.pairs))))
 
 
-def _bearings(
+def bearings(
     matches: Matches, keypoints: Keypoints, p: int, rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bearings (m, 3) of matched keypoints (m, 2) of pair p in either frame."""
@@ -129,7 +129,7 @@ def relative_pose(
     return f0_T_f1, np.asarray(found["inlier_mask"], bool)
 
 
-def _parallax(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.ndarray) -> float:
+def parallax(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.ndarray) -> float:
     """Median angle in radians between both bearings in one orientation."""
     chords = np.linalg.norm(bearings0 - bearings1 @ f0_T_f1[:3, :3].T, axis=1)
     return float(2 * np.arcsin(np.median(chords) / 2))
