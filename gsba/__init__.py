@@ -10,13 +10,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gsba.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from gsba.config import RefineSettings
     from gsba.config_file import load_config
     from gsba.log import GsbaError
     from gsba.pipeline import RunResult, load_run, refine
 
-__version__ = "0.1.0"
 __all__ = ["GsbaError", "RefineSettings", "RunResult", "load_config", "load_run", "refine"]
 
 _HOMES = {

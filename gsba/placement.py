@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba import __version__, read
+from gsba import read
 from gsba.alignment import (
     extents,
     level_similarity,
@@ -26,6 +26,7 @@ from gsba.evaluate import associate
 from gsba.geometry import pose, pose_similarity, similarity
 from gsba.log import GsbaError, brief
 from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
+from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
 

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from gsba import __version__
 from gsba.geometry import angular_errors, quaternion_from_rotation
 from gsba.map_strength import scale_sigmas
 from gsba.store import StageRecord, atomic_write
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
+from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
 

@@ -14,9 +14,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gsba import __version__
 from gsba.log import GsbaError
 from gsba.records import RecordError, atomic_write, disk_errors, remove_temporaries, typed
+from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
 

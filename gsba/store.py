@@ -23,7 +23,6 @@ from typing import Generic, TypeVar
 
 from pydantic import BaseModel
 
-from gsba import __version__
 from gsba.log import GsbaError, track
 from gsba.records import (
     FORMAT,
@@ -35,6 +34,7 @@ from gsba.records import (
     typed,
 )
 from gsba.run_folder import MARKER, STAGES, claim, is_run_folder, open_run_folder
+from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")

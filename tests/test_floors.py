@@ -15,7 +15,7 @@ import gsba
 ROOT = Path(__file__).parents[1]
 FLOORS = (
     {"factors"},
-    {"", "config", "config_file", "evidence", "geometry", "log", "types"},
+    {"", "config", "config_file", "evidence", "geometry", "log", "types"} | {"version"},
     {"panorama", "read", "records", "rig", "run_folder", "search", "store", "sweep"}
     | {"turning", "views"},
     {"align", "cubemap", "features", "filter", "graph", "matching", "optimize", "pairs"}

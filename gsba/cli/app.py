@@ -13,8 +13,8 @@ from typing import Annotated, NoReturn, ParamSpec
 import typer
 from typer.core import TyperCommand
 
-from gsba import __version__
 from gsba.log import GsbaError, brief, show_log
+from gsba.version import __version__
 
 P = ParamSpec("P")
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gsba import __version__
 from gsba.log import GsbaError
 from gsba.records import disk_errors
+from gsba.version import __version__
 
 MARKER = "export.json"  # {"gsba": version, "format": name, "wrote": top-level entries}
 

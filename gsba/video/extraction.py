@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from gsba import __version__
 from gsba.config import VideoSettings
 from gsba.log import GsbaError, track
 from gsba.read import read_trajectory
@@ -24,6 +23,7 @@ from gsba.read.times import read_times
 from gsba.records import RecordError, atomic_write, disk_errors, remove_temporaries, typed
 from gsba.store import digest, fingerprint
 from gsba.types import Counts
+from gsba.version import __version__
 from gsba.video.likeness import apparent_motion_deg, miniature, sharpness
 from gsba.video.timeline import Timeline, bgr, decode, luma, read_timeline
 
