@@ -3,7 +3,8 @@
     python benchmarks/covariances.py --out WORK --markdown benchmarks/results/covariances.md
 
 Refines each sequence (a finished run in WORK is used again) and prints what `gsba evaluate` says
-of its covariances: `gsba.consistency`. Open walks are closed ones cut short, and the demo's.
+of its covariances: `gsba.evaluate.consistency`. Open walks are closed ones cut short, and the
+demo's.
 Recorded sequences are read from `--data` and skipped if absent; `--walk FILE.tum` is a trajectory
 of your own, beside `images/` and `groundtruth.tum`.
 """
@@ -19,13 +20,13 @@ from common import Case, cut_short, write_table
 
 from gsba import refine
 from gsba.config import RefineSettings
-from gsba.consistency import Consistency, Statistic, judge
 from gsba.demo import make_walk
 from gsba.demo.walk import Heading, WalkPath
-from gsba.evaluate import evaluate
+from gsba.evaluate.consistency import Consistency, Statistic, judge
+from gsba.evaluate.trajectory import evaluate
 from gsba.log import GsbaError
-from gsba.read import read_trajectory
-from gsba.results import load_run
+from gsba.pipeline.outputs import load_run
+from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory
 
 DATA = Path(__file__).resolve().parents[2] / "shared/data"

@@ -27,11 +27,11 @@ from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.demo import make_walk
 from gsba.demo.degrade import degrade
-from gsba.evaluate import evaluate
-from gsba.induced import depth_maps, induced_errors
+from gsba.evaluate.pixels import depth_maps, induced_errors
+from gsba.evaluate.trajectory import evaluate
 from gsba.log import GsbaError
-from gsba.read import read_trajectory, write_tum
-from gsba.records import atomic_write
+from gsba.store.records import atomic_write
+from gsba.trajectory.files import read_trajectory, write_tum
 
 WALKS = {
     "demo_rectangle": ("rectangle", "locked"),

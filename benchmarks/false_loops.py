@@ -7,10 +7,10 @@ from unittest.mock import patch
 import numpy as np
 from scipy.spatial import cKDTree  # type: ignore[attr-defined]
 
-from gsba import frontend
-from gsba.adjust import Adjustment
+from gsba.bundle.adjustment import Adjustment
 from gsba.geometry import inverse
-from gsba.matching import MatchContext
+from gsba.matching import correspondences
+from gsba.matching.guided_search import MatchContext
 from gsba.types import Counts, Matches, VerifiedPairs
 
 MAX_DEG = 0.5  # between a keypoint and where the forged pose would see the other frame's point
@@ -22,7 +22,7 @@ def forge(context: MatchContext, solved: Adjustment, pairs: list[tuple[int, int]
     The second frame of a pair is given the pose of the first one's successor; keypoints that
     happen to lie where points of the map would then be seen are its matches.
     """
-    known = frontend.points_by_keypoint(solved, context.keypoints)
+    known = correspondences.points_by_keypoint(solved, context.keypoints)
     rows, poses = [], []
     for f0, f1 in pairs:
         f0_T_f1 = inverse(solved.world_T_rigs[f0]) @ solved.world_T_rigs[f0 + 1]
@@ -48,7 +48,7 @@ def forged_loops(first: int, far: int, count: int) -> Iterator[list[int]]:
     Yields:
         Matches of each forged pair, once a run has come past its loops.
     """
-    honest, sizes = frontend.match_loops, []
+    honest, sizes = correspondences.match_loops, []
 
     def match_loops(context: MatchContext, solved: Adjustment) -> VerifiedPairs:
         found = honest(context, solved)
@@ -64,5 +64,5 @@ def forged_loops(first: int, far: int, count: int) -> Iterator[list[int]]:
         poses = np.concatenate([found.f0_T_f1s, false.f0_T_f1s])
         return VerifiedPairs(both, poses, found.counts)
 
-    with patch.object(frontend, "match_loops", match_loops):
+    with patch.object(correspondences, "match_loops", match_loops):
         yield sizes

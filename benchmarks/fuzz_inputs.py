@@ -20,7 +20,7 @@ from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.geometry import pose_similarity
-from gsba.read import read_trajectory, write_tum
+from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
 NUM, WIDTH = 8, 512  # frames of the walk

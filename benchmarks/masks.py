@@ -24,20 +24,21 @@ import numpy as np
 from common import machine
 
 from gsba import RefineSettings, refine
-from gsba.carrier import carrier_mask, find_carrier
 from gsba.config import ExportSettings, SplatSettings
 from gsba.demo import make_walk
 from gsba.demo.people import make_people, paste_people
-from gsba.evaluate import evaluate
-from gsba.evaluate_splat import train_and_measure
+from gsba.evaluate.splats import train_and_measure
+from gsba.evaluate.trajectory import evaluate
 from gsba.export.images import write_image
+from gsba.frames.files import decode
+from gsba.frames.masks import load_mask
+from gsba.frames.scan import find_panoramas, load_erp, scan
 from gsba.geometry import bearings_from_erp
-from gsba.read import load_erp, load_mask, read_trajectory, scan
-from gsba.read.frames import find_panoramas
-from gsba.read.images import decode
+from gsba.masks.carrier import carrier_mask, find_carrier
 from gsba.splat.backend import choose_backend
-from gsba.splatting import load_faces, make_views, refined_frames, split_frames
-from gsba.store import digest, fingerprint
+from gsba.splat.scene import load_faces, make_views, refined_frames, split_frames
+from gsba.store.store import digest, fingerprint
+from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet, Reconstruction
 
 NUM_PEOPLE = 4

@@ -15,10 +15,12 @@ import cv2
 import numpy as np
 
 from benchmarks.common import measure, peak_mb, write_table
-from gsba import align, panorama, read
+from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import AlignSettings
+from gsba.frames import panorama
+from gsba.frames.scan import scan
 from gsba.geometry import pose
-from gsba.rig import CubeRig, owner_faces
+from gsba.photometric import alignment
 from gsba.types import Counts, Keypoints, Landmarks, Tracks
 
 POINTS, DISTANCE = 60, 1e4  # of each frame, and how far they are: no parallax, so no shift is wrong
@@ -73,12 +75,12 @@ def make_map(num: int, width: int) -> tuple[Landmarks, np.ndarray, Keypoints, Cu
 
 def run(folder: Path, num_threads: int) -> dict[str, float]:
     """Align all points of the frames in a folder."""
-    frames = read.scan(folder, None, None, None)
+    frames = scan(folder, None, None, None)
     landmarks, poses, keypoints, rig = make_map(len(frames), frames.width)
     settings = AlignSettings()
     greys = panorama.Greys(frames, settings.max_width)
     before = peak_mb()
-    sighted = align.run(
+    sighted = alignment.run(
         landmarks, poses, keypoints, 1.0, greys, rig, "align", None, settings, num_threads
     )
     kept, received = sighted.counts.kept, sighted.counts.received

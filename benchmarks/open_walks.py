@@ -32,9 +32,9 @@ from common import (
 
 from gsba.demo import degrade, make_walk
 from gsba.demo.walk import Heading
-from gsba.evaluate import evaluate
+from gsba.evaluate.trajectory import evaluate
 from gsba.log import GsbaError
-from gsba.read import read_trajectory, write_tum
+from gsba.trajectory.files import read_trajectory, write_tum
 
 DATA = Path(__file__).resolve().parents[2] / "shared/data"
 CUT = {"aisle_loop": 40, "gallery_forward": 32}  # frames left

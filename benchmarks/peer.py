@@ -27,7 +27,7 @@ def reconstruct(mode: str, frames: Path, out: Path) -> None:
     import pycolmap
     from pycolmap import panorama
 
-    from gsba.read import write_tum
+    from gsba.trajectory.files import write_tum
 
     render, mapper = mode.split("-")
     spherical = render == "spherical"

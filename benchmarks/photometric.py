@@ -18,7 +18,7 @@ from factors import RobustLoss
 from factors.patch_windows import PatchPixels, PatchTable, pixel_grid, planes_from
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
-from gsba.patch_grid import halved
+from gsba.photometric.patches import halved
 
 RADIUS = 4.0  # of the ball, units
 

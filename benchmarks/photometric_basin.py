@@ -17,11 +17,13 @@ from factors import RobustLoss
 from factors.patch_windows import PatchPixels, PatchTable, patch_spans, pixel_grid, pixels_of
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
-from gsba import patch_grid, read
+from gsba.bundle.optimizer import optimize
 from gsba.config import PhotometricSettings, SolverSettings
 from gsba.demo import make_walk
+from gsba.frames.scan import scan
 from gsba.geometry import bearings_from_erp
-from gsba.optimize import optimize
+from gsba.photometric import patches
+from gsba.trajectory.files import read_trajectory
 
 NUM_FRAMES, HELD = 6, 2
 ERRORS_PX = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
@@ -37,8 +39,8 @@ def exact_table(folder: Path, truth: np.ndarray, pyramids: list, settings: Photo
         u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         rays = bearings_from_erp(np.stack([u, v], axis=-1), width, height)
         hit = depth > 0
-        found = patch_grid.candidates(greys[0], usable, settings)
-        laid, clear = patch_grid.lay_planes(found, rays[hit] * depth[hit][:, None], settings)
+        found = patches.candidates(greys[0], usable, settings)
+        laid, clear = patches.lay_planes(found, rays[hit] * depth[hit][:, None], settings)
         hosts.append(np.full(np.count_nonzero(clear), f))
         bearings.append(found[clear])
         planes.append(laid[clear])
@@ -115,10 +117,10 @@ def main() -> None:
     options = parser.parse_args()
     if not options.folder.exists():
         make_walk(options.folder, "oval", "forward", 40, options.width, depth=True)
-    frames = read.scan(options.folder / "images", None, None, None)
-    truth = read.read_trajectory(options.folder / "groundtruth.tum").world_T_rigs[:NUM_FRAMES]
+    frames = scan(options.folder / "images", None, None, None)
+    truth = read_trajectory(options.folder / "groundtruth.tum").world_T_rigs[:NUM_FRAMES]
     settings = PhotometricSettings(spacing_deg=10, depth_reach_deg=4)
-    pyramids = [patch_grid.pyramid(frames, f, settings, 2) for f in range(NUM_FRAMES)]
+    pyramids = [patches.pyramid(frames, f, settings, 2) for f in range(NUM_FRAMES)]
     table = exact_table(options.folder, truth, pyramids, settings)
     print(f"{len(table)} patches, {len(table.targets)} observations, {frames.width} px wide")
     print("start px | " + " | ".join(f"{name}: converged, median px" for name in STRATEGIES))

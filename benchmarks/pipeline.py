@@ -34,10 +34,12 @@ from peer import MODES
 from pipeline_table import DEFAULT, to_markdown, verdicts
 
 from gsba.config import ReadSettings
-from gsba.evaluate import evaluate
+from gsba.evaluate.trajectory import evaluate
+from gsba.frames.scan import scan
 from gsba.log import GsbaError
-from gsba.read import associate, read_trajectory, scan
-from gsba.records import atomic_write
+from gsba.store.records import atomic_write
+from gsba.trajectory.association import associate
+from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet, Trajectory
 
 DATA = Path(__file__).resolve().parents[2] / "shared/data"

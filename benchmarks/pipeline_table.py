@@ -1,7 +1,7 @@
 """Tables of `benchmarks/pipeline.py`: rows as Markdown, and whether they reach the targets.
 
 A row is the dictionary that the benchmark keeps: `sequence`, `row`, `trajectory`, and as far as
-it got there `errors` (gsba.evaluate), `wall_s`, `cpu_s`, `peak_mb`, `load`, or `reason`.
+it got there `errors` (gsba.evaluate.trajectory), `wall_s`, `cpu_s`, `peak_mb`, `load`, or `reason`.
 """
 
 from collections.abc import Iterator, Sequence

@@ -25,10 +25,10 @@ from gsba import refine
 from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.demo import degrade, make_walk
-from gsba.evaluate import evaluate
+from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import inverse
 from gsba.log import GsbaError
-from gsba.read import read_trajectory, write_tum
+from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
 RESULTS = Path(__file__).parent / "results"

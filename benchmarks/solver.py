@@ -90,8 +90,8 @@ def solve_ours(problem: Problem, num_threads: int) -> tuple[Result, np.ndarray, 
     import gtsam
     from gtsam.symbol_shorthand import X
 
+    from gsba.bundle.optimizer import optimize
     from gsba.config import SolverSettings
-    from gsba.optimize import optimize
 
     _warm_up(problem)
     wall, cpu = time.perf_counter(), time.process_time()
@@ -225,7 +225,7 @@ def _warm_up(problem: Problem) -> None:
     """Load or compile the kernels on the first frames, so that no run pays for it."""
     import gtsam
 
-    from gsba.optimize import optimize
+    from gsba.bundle.optimizer import optimize
 
     few = problem.frames < 12
     part = replace(

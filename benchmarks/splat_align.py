@@ -16,14 +16,14 @@ import gtsam
 import numpy as np
 
 from gsba.config import SplatSettings
-from gsba.evaluate import evaluate, format_table
+from gsba.evaluate.trajectory import evaluate, format_table
 from gsba.log import show_log
-from gsba.pipeline import load_run
-from gsba.read import read_trajectory
+from gsba.pipeline.refine import load_run
 from gsba.splat import read_ply
+from gsba.splat.alignment import align
 from gsba.splat.backend import choose_backend
-from gsba.splat_align import align
-from gsba.splatting import near_of
+from gsba.splat.scene import near_of
+from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory
 
 MAX_FACTOR = 2.0  # of the error from unperturbed poses

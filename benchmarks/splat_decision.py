@@ -23,11 +23,12 @@ from unittest import mock
 
 import numpy as np
 
-from gsba import adjust, graph, splat_refine
-from gsba.adjust import Adjustment
-from gsba.evaluate import evaluate
-from gsba.optimize import optimize
-from gsba.store import load_stage
+from gsba.bundle import adjustment, prior_factors
+from gsba.bundle.adjustment import Adjustment
+from gsba.bundle.optimizer import optimize
+from gsba.evaluate.trajectory import evaluate
+from gsba.splat import refinement
+from gsba.store.store import load_stage
 from gsba.types import Keypoints, Tracks, Trajectory
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -94,13 +95,13 @@ def poor_frames(case: Case, seed: int) -> Given:
         sigmas_rad=np.where(weak, noise, solved.noise * keypoints.sigmas_rad),
         sqrt_infos=None,
     )
-    rig = splat_refine.CubeRig(SETTINGS.cubemap.face_size, np.pi / 2)  # bearings ask no face
-    block = adjust.landmark_block(landmarks, keypoints, rig, 1.0, SETTINGS, 2)
-    values = adjust.values_of(solved.world_T_rigs)
+    rig = refinement.CubeRig(SETTINGS.cubemap.face_size, np.pi / 2)  # bearings ask no face
+    block = adjustment.landmark_block(landmarks, keypoints, rig, 1.0, SETTINGS, 2)
+    values = adjustment.values_of(solved.world_T_rigs)
     block.polish(values)
-    priors = graph.build(case.result.coarse.world_T_rigs, SETTINGS.priors)
+    priors = prior_factors.build(case.result.coarse.world_T_rigs, SETTINGS.priors)
     values = optimize(priors, [block], values, SETTINGS.solver).values
-    poses = adjust.poses_of(values, len(solved.world_T_rigs))
+    poses = adjustment.poses_of(values, len(solved.world_T_rigs))
     landmarks = replace(landmarks, points_world=block.points_world)
     start = replace(solved, world_T_rigs=poses, landmarks=landmarks, noise=1.0)
     return case.result.frames, keypoints, start
@@ -116,7 +117,7 @@ def decide(case: Case, kind: str, scene: str, move: str, seed: int) -> Decision:
         settings = settings_for(sizes=(96,), first_steps=600, steps=150)
     settings = settings.model_copy(update={"seed": seed})
     made: list[np.ndarray] = []
-    real = splat_refine._Turns._moved
+    real = refinement._Turns._moved
     chosen = real if move == FOUND else harmed(real, HARMS[move], seed)
 
     def noted(*arguments):
@@ -124,7 +125,7 @@ def decide(case: Case, kind: str, scene: str, move: str, seed: int) -> Decision:
         made.append(found[0])
         return found
 
-    with mock.patch.object(splat_refine._Turns, "_moved", noted):
+    with mock.patch.object(refinement._Turns, "_moved", noted):
         result = run(case, given, settings).moves[0]
     times = case.result.frames.timestamps
     before, after = (

@@ -29,13 +29,13 @@ from common import machine
 
 from gsba.config import RefineSettings, SplatSettings
 from gsba.demo import make_walk
-from gsba.evaluate_splat import SourceResult, compare, poses_for
+from gsba.evaluate.splats import SourceResult, compare, poses_for
 from gsba.log import GsbaError, show_log
-from gsba.pipeline import load_run, refine
-from gsba.read import read_trajectory
-from gsba.records import atomic_write
+from gsba.pipeline.refine import load_run, refine
 from gsba.splat.backend import choose_backend
-from gsba.splatting import Score, mean_score
+from gsba.splat.scene import Score, mean_score
+from gsba.store.records import atomic_write
+from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet
 
 WALKS = {"demo_rectangle": ("rectangle", "locked"), "demo_oval": ("oval", "forward")}

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from common import machine
 
-from gsba.rig import CubeRig
+from gsba.camera.rig import CubeRig
 from gsba.splat.camera import face_camera
 from gsba.splat.gaussians import Gaussians
 from gsba.splat.rasterise import differentiate, render

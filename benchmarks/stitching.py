@@ -21,11 +21,14 @@ from benchmarks.common import write_table
 from factors import tangent_basis
 from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
-from gsba import adjust, align, cubemap, graph, panorama, refine, stitching, triangulate
-from gsba.adjust import Adjustment
+from gsba import refine
+from gsba.bundle import adjustment, prior_factors, stitching, triangulation
+from gsba.bundle.adjustment import Adjustment
 from gsba.config import RefineSettings
+from gsba.frames import cubemap, panorama
 from gsba.geometry import angular_errors
-from gsba.store import load_stage
+from gsba.photometric import alignment
+from gsba.store.store import load_stage
 from gsba.types import FrameSet, Keypoints, Landmarks, Sighted, Tracks
 
 SHARE = 0.2  # of points held out
@@ -53,24 +56,24 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
     keypoints = load_stage(run, "keypoints", Keypoints)
     start, rig = load_stage(run, "refined1", Adjustment), cubemap.rig_for(frames, settings.cubemap)
     greys = panorama.Greys(frames, settings.align.max_width)
-    priors = graph.build(start.world_T_rigs, settings.priors)
+    priors = prior_factors.build(start.world_T_rigs, settings.priors)
     used, held = split(start.landmarks, settings.seed)
     none, threads = SphereField.none(), 2
     common = priors, rig, settings.rounds.aligned, settings, threads
 
-    bearing = adjust.run(
+    bearing = adjustment.run(
         used.tracks, keypoints, start, priors, rig, settings.rounds.refined[-1:], settings, threads
     )
     variants = [Variant("bearing", bearing, none)]
     for name, uses_field in (("aligned", False), ("aligned, field", True)):
         solved, observed, aligned, field = bearing, keypoints, None, none
         for number in (1, 2):
-            sighted = align.run(
+            sighted = alignment.run(
                 solved.landmarks, solved.world_T_rigs, observed, solved.noise, greys, rig,
                 f"{name} {number}", aligned, settings.align, threads, field,
             )  # fmt: skip
             there = replace(sighted, keypoints=stitching.corrected(sighted.keypoints, field, rig))
-            solved, found = adjust.run_sighted(there, solved, *common)
+            solved, found = adjustment.run_sighted(there, solved, *common)
             observed = stitching.with_noise_of(sighted.keypoints, found)
             aligned = sighted.aligned
             if uses_field:
@@ -84,7 +87,7 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
         variants.append(Variant(name, solved, field))
     last = variants[-1]
     placed = place(last, held.tracks, keypoints, settings)
-    sighted = align.run(
+    sighted = alignment.run(
         placed, last.solved.world_T_rigs, keypoints, start.noise, greys, rig, "held out", None,
         settings.align, threads, last.field,
     )  # fmt: skip
@@ -98,7 +101,7 @@ def place(
     rows = keypoints.rows(tracks)
     bearings = variant.field.corrected(keypoints.bearings_rig[rows])
     given = keypoints.sigmas_rad[rows], variant.solved.world_T_rigs, GATE, settings.triangulate
-    return triangulate.run(tracks, bearings, *given, 2)
+    return triangulation.run(tracks, bearings, *given, 2)
 
 
 def reprojections(variant: Variant, landmarks: Landmarks, keypoints: Keypoints) -> np.ndarray:

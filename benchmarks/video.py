@@ -25,9 +25,9 @@ from gsba.demo.degrade import degrade
 from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
-from gsba.evaluate import evaluate
+from gsba.evaluate.trajectory import evaluate
 from gsba.log import track
-from gsba.read import read_trajectory, write_tum
+from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
 TICK = Fraction(1, 90_000)  # seconds, of the container's clock

@@ -19,11 +19,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from gsba.frames.scan import load_erp
 from gsba.geometry import similarity
-from gsba.pipeline import load_run
-from gsba.read import load_erp, read_trajectory
-from gsba.report_html.pictures import picture, worst_frames
-from gsba.report_html.views import viewing_axes
+from gsba.pipeline.refine import load_run
+from gsba.report.html.pictures import picture, worst_frames
+from gsba.report.html.views import viewing_axes
+from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet, Reconstruction, Trajectory
 
 PAGE, LINE, INK, QUIET = "#f6f6f3", "#e3e3dd", "#1b1c1e", "#6b6e73"

@@ -2,7 +2,7 @@
 
 The public names below are imported when first used, so that `import gsba` stays light. Exporters
 and trajectory errors are modules of their own: `from gsba.export import export`,
-`from gsba.evaluate import evaluate`.
+`from gsba.evaluate.trajectory import evaluate`.
 """
 
 from importlib import import_module
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     from gsba.config import RefineSettings
     from gsba.config_file import load_config
     from gsba.log import GsbaError
-    from gsba.pipeline import RunResult, load_run, refine
+    from gsba.pipeline.refine import RunResult, load_run, refine
 
 __all__ = ["GsbaError", "RefineSettings", "RunResult", "load_config", "load_run", "refine"]
 
 _HOMES = {
     "GsbaError": "gsba.log",
     "RefineSettings": "gsba.config",
-    "RunResult": "gsba.pipeline",
+    "RunResult": "gsba.pipeline.refine",
     "load_config": "gsba.config_file",
-    "load_run": "gsba.pipeline",
-    "refine": "gsba.pipeline",
+    "load_run": "gsba.pipeline.refine",
+    "refine": "gsba.pipeline.refine",
 }
 
 

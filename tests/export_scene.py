@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gsba.camera.rig import RIG_R_FACE
 from gsba.export.images import write_image
 from gsba.geometry import bearings_from_erp, inverse, pose
-from gsba.rig import RIG_R_FACE
 from gsba.types import FACES, FrameSet, PoseStatus, Reconstruction
 
 NUM_FRAMES = 9

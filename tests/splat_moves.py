@@ -7,11 +7,13 @@ import gtsam
 import numpy as np
 from tiny_run import SETTINGS, Case
 
-from gsba import cubemap, graph, splat_refine
-from gsba.adjust import Adjustment
+from gsba.bundle import prior_factors
+from gsba.bundle.adjustment import Adjustment
 from gsba.config import RefineSettings
-from gsba.splat_refine import SplatResult
-from gsba.store import load_stage
+from gsba.frames import cubemap
+from gsba.splat import refinement
+from gsba.splat.refinement import SplatResult
+from gsba.store.store import load_stage
 from gsba.types import FrameSet, Keypoints
 
 Given = tuple[FrameSet, Keypoints, Adjustment]
@@ -36,9 +38,9 @@ def spoiled(case: Case, degrees: float, distance: float, noise: float, seed: int
 
 
 def run(case: Case, given: Given, settings: RefineSettings, **options) -> SplatResult:
-    priors = graph.build(case.result.coarse.world_T_rigs, settings.priors)
+    priors = prior_factors.build(case.result.coarse.world_T_rigs, settings.priors)
     rig = cubemap.rig_for(case.result.frames, settings.cubemap)
-    return splat_refine.run(*given, priors, rig, settings, 2, **options)
+    return refinement.run(*given, priors, rig, settings, 2, **options)
 
 
 Harm = Callable[[np.ndarray, np.random.Generator], np.ndarray]  # of steps (F, 6), tangents

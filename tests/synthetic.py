@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gsba.camera.rig import CubeRig, owner_faces
 from gsba.geometry import inverse, pose
-from gsba.rig import CubeRig, owner_faces
 from gsba.types import Features, Keypoints, Tracks
 
 RIG = CubeRig(512, np.pi / 2)

@@ -9,11 +9,11 @@ import pytest
 from scipy.stats import chi2
 from synthetic import RIG, World, drifted, make_world
 
-from gsba import adjust, graph
-from gsba.adjust import Adjustment
+from gsba.bundle import adjustment, prior_factors
+from gsba.bundle.adjustment import Adjustment
+from gsba.bundle.optimizer import OptimizeResult
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, pose_similarity, rotation_angle
-from gsba.optimize import OptimizeResult
 
 SIGMA, CLAIMED = 5e-4, 3e-4  # radians: true noise of bearings, and what keypoints say of it
 GATES = (200.0, 60.0, 20.0, 8.0, 8.0)  # in claimed sigmas: the start is some 5 degrees off
@@ -36,16 +36,16 @@ def _world(seed: int = 0) -> tuple[World, np.ndarray]:
 def _run(
     world: World, coarse: np.ndarray, settings: RefineSettings, gates: tuple[float, ...] = GATES
 ) -> Adjustment:
-    priors = graph.build(coarse, settings.priors)
-    start = adjust.start(coarse)
-    return adjust.run(world.tracks, world.keypoints, start, priors, RIG, gates, settings, 1)
+    priors = prior_factors.build(coarse, settings.priors)
+    start = adjustment.start(coarse)
+    return adjustment.run(world.tracks, world.keypoints, start, priors, RIG, gates, settings, 1)
 
 
 def _covariances(
     solved: Adjustment, world: World, coarse: np.ndarray, settings: RefineSettings
 ) -> np.ndarray:
-    priors = graph.build(coarse, settings.priors)
-    return adjust.pose_covariances(solved, priors, world.keypoints, RIG, settings, 1)[0]
+    priors = prior_factors.build(coarse, settings.priors)
+    return adjustment.pose_covariances(solved, priors, world.keypoints, RIG, settings, 1)[0]
 
 
 @cache
@@ -182,7 +182,7 @@ def test_a_round_that_explains_less_is_undone(monkeypatch: pytest.MonkeyPatch) -
     world, coarse = _world()
     settings = _settings()
     good = _run(world, coarse, settings)
-    real, calls = adjust.optimize, []
+    real, calls = adjustment.optimize, []
 
     def sabotage(*arguments: object) -> OptimizeResult:
         """From the third round on, poses that no image supports."""
@@ -191,15 +191,15 @@ def test_a_round_that_explains_less_is_undone(monkeypatch: pytest.MonkeyPatch) -
         if len(calls) < 3:
             return result
         off = drifted(world.world_T_rigs, np.random.default_rng(9), amount=5)
-        return replace(result, values=adjust.values_of(off))
+        return replace(result, values=adjustment.values_of(off))
 
-    monkeypatch.setattr(adjust, "optimize", sabotage)
+    monkeypatch.setattr(adjustment, "optimize", sabotage)
     solved = _run(world, coarse, settings)
     assert [attempt.accepted for attempt in solved.rounds] == [True, True, False, False, False]
     two = _position_rmse(solved.world_T_rigs, world.world_T_rigs)
     assert two < 3 * _position_rmse(good.world_T_rigs, world.world_T_rigs)
     # What is kept fits the second round: its poses, its noise, and points that agree with both.
-    np.testing.assert_array_equal(solved.world_T_rigs, adjust.poses_of(calls[1].values, 20))
+    np.testing.assert_array_equal(solved.world_T_rigs, adjustment.poses_of(calls[1].values, 20))
     assert solved.noise == solved.rounds[1].noise == solved.rounds[-1].noise
     assert len(solved.landmarks.tracks) > 0.9 * len(good.landmarks.tracks)
     assert all(r.support < solved.rounds[1].support for r in solved.rounds[2:])

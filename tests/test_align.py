@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from synthetic import bearings_of
 
-from gsba import adjust, align, graph
-from gsba.adjust import Adjustment
+from gsba.bundle import adjustment, prior_factors
+from gsba.bundle.adjustment import Adjustment
+from gsba.camera.rig import CubeRig
 from gsba.config import AlignSettings, RefineSettings
+from gsba.frames.panorama import Greys
 from gsba.geometry import inverse, pose
-from gsba.panorama import Greys
-from gsba.rig import CubeRig
+from gsba.photometric import alignment
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Sighted, Tracks
 
 NUM, WIDTH = 6, 512
@@ -105,7 +106,7 @@ def _run(
 ) -> Sighted:
     frames, world_T_rigs = walk
     landmarks, keypoints = _start(world_T_rigs, sigma_px)
-    return align.run(
+    return alignment.run(
         landmarks,
         world_T_rigs,
         keypoints,
@@ -163,21 +164,21 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
     frames, world_T_rigs = walk
     landmarks, keypoints = _start(world_T_rigs)
     settings = RefineSettings(align=SETTINGS)
-    priors = graph.build(world_T_rigs, settings.priors)
+    priors = prior_factors.build(world_T_rigs, settings.priors)
 
     def rotation_errors(solved: Adjustment) -> np.ndarray:
         true = inverse(world_T_rigs[:-1]) @ world_T_rigs[1:]
         found = inverse(solved.world_T_rigs[:-1]) @ solved.world_T_rigs[1:]
         return np.linalg.norm(found[:, :3, :3] - true[:, :3, :3], axis=(1, 2))
 
-    start = replace(adjust.start(world_T_rigs), landmarks=landmarks)
+    start = replace(adjustment.start(world_T_rigs), landmarks=landmarks)
     common = priors, RIG, (6.0, 3.0), settings, 2
-    before = adjust.run(landmarks.tracks, keypoints, start, *common)
-    sighted = align.run(
+    before = adjustment.run(landmarks.tracks, keypoints, start, *common)
+    sighted = alignment.run(
         before.landmarks, before.world_T_rigs, keypoints, before.noise, Greys(frames, 4096), RIG,
         "align", None, SETTINGS, 2,
     )  # fmt: skip
-    after, known = adjust.run_sighted(sighted, before, *common)
+    after, known = adjustment.run_sighted(sighted, before, *common)
     assert np.median(rotation_errors(after)) < 0.5 * np.median(rotation_errors(before))
     assert 0.5 <= after.noise < 2 and all(step.accepted for step in after.rounds)
     aligned = sighted.aligned
@@ -219,7 +220,7 @@ def test_points_at_a_centre_and_behind_walls_do_no_harm(walk) -> None:
     points[50:100] *= 50
     points[100] = world_T_rigs[landmarks.tracks.frames[300], :3, 3]
     moved = replace(landmarks, points_world=points)
-    sighted = align.run(
+    sighted = alignment.run(
         moved, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None, SETTINGS, 2
     )
     assert np.isfinite(sighted.keypoints.bearings_rig).all()
@@ -240,20 +241,20 @@ def test_confirmed_points_are_looked_for_elsewhere(walk) -> None:
 def test_a_solution_that_loses_a_frame_is_told_apart(walk) -> None:
     _, world_T_rigs = walk
     landmarks, _ = _start(world_T_rigs)
-    before = replace(adjust.start(world_T_rigs), landmarks=landmarks)
+    before = replace(adjustment.start(world_T_rigs), landmarks=landmarks)
     tracks = landmarks.tracks
     rows = tracks.frames != 3
     fewer = Tracks(tracks.points[rows], tracks.frames[rows], tracks.keypoints[rows], 400)
     without = replace(before, landmarks=replace(landmarks, tracks=fewer))
-    assert adjust.carries(before, before, 12) and adjust.carries(before, without, 12)
-    assert not adjust.carries(without, before, 12)
+    assert adjustment.carries(before, before, 12) and adjustment.carries(before, without, 12)
+    assert not adjustment.carries(without, before, 12)
 
 
 def test_no_points_are_no_observations(walk) -> None:
     frames, world_T_rigs = walk
-    none = adjust.start(world_T_rigs).landmarks
+    none = adjustment.start(world_T_rigs).landmarks
     _, keypoints = _start(world_T_rigs)
-    sighted = align.run(
+    sighted = alignment.run(
         none, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None, SETTINGS, 2
     )
     assert len(sighted.tracks) == 0 and sighted.counts.received == 0

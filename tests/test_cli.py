@@ -45,9 +45,9 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]
         def fail(*_: object, **__: object) -> None:
             raise error
 
-        stub = types.ModuleType("gsba.pipeline")
+        stub = types.ModuleType("gsba.pipeline.refine")
         stub.refine = stub.load_run = fail  # type: ignore[attr-defined]
-        monkeypatch.setitem(sys.modules, "gsba.pipeline", stub)
+        monkeypatch.setitem(sys.modules, "gsba.pipeline.refine", stub)
         monkeypatch.setattr(gsba, "pipeline", stub, raising=False)
 
     return install

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from gsba import clock, clock_fit
-from gsba.clock import Clock, ClockEstimate
-from gsba.clock_fit import ClockFit
 from gsba.demo import degrade
 from gsba.geometry import inverse, pose, rotation_angle
-from gsba.motion import Steps
+from gsba.trajectory import clock, clock_search
+from gsba.trajectory.clock import Clock, ClockEstimate
+from gsba.trajectory.clock_search import ClockFit
+from gsba.trajectory.judgement import Steps
 from gsba.types import Trajectory
 
 NUM_FRAMES, INTERVAL_S, PER_FRAME = 40, 0.5, 4
@@ -141,7 +141,7 @@ def test_residuals_are_rotations_between_instants() -> None:
 
     steps, trajectory = _case(Clock(TIMES[0], 0.0, 1.0))
     every = np.ones(NUM_FRAMES - 1, bool)
-    turns = clock_fit.merged(TIMES, steps.f_T_nexts[:, :3, :3], every)
+    turns = clock_search.merged(TIMES, steps.f_T_nexts[:, :3, :3], every)
     fit = ClockFit(turns, trajectory)
     parameters = np.array([0.4, 1.002])
     found = fit.residuals(parameters)
@@ -161,7 +161,7 @@ def test_short_steps_are_put_together() -> None:
     turn = Rotation.from_rotvec([0, 0.01, 0]).as_matrix()
     known = np.ones(99, bool)
     known[50] = False
-    turns = clock_fit.merged(times, np.tile(turn, (99, 1, 1)), known)
+    turns = clock_search.merged(times, np.tile(turn, (99, 1, 1)), known)
     assert len(turns) < 20 and turns.step >= 0.2
     assert not ((turns.times[:, 0] <= times[50]) & (turns.times[:, 1] >= times[51])).any()
     rates = np.linalg.norm(turns.rotvecs, axis=1) / np.diff(turns.times, axis=1)[:, 0]
@@ -177,8 +177,8 @@ def test_the_grid_is_bounded_whatever_the_times_are(
     """A trajectory in another unit, and steps so short that a fixed reach holds millions."""
     steps, trajectory = _case(Clock(TIMES[0], 0.0, 1.0))
     wide = Trajectory(unit * trajectory.timestamps, trajectory.world_T_rigs)
-    turns = clock_fit.merged(TIMES, steps.f_T_nexts[:, :3, :3], steps.verified)
-    short = clock_fit.Turns(turns.times / unit, turns.rotvecs)
+    turns = clock_search.merged(TIMES, steps.f_T_nexts[:, :3, :3], steps.verified)
+    short = clock_search.Turns(turns.times / unit, turns.rotvecs)
     tried: list[int] = []
 
     def count(self: ClockFit, parameters: np.ndarray, times: np.ndarray, _: np.ndarray) -> float:

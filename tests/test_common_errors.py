@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from synthetic import loop_walk
 
-from gsba import common_errors
+from gsba.bundle import common_errors
 from gsba.geometry import furthest, step_covariances
 from gsba.types import JointErrors
 

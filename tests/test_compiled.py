@@ -25,7 +25,7 @@ PROGRAM = """
 import numpy as np
 from gsba.log import show_log
 show_log()
-from gsba.tracks import _merge
+from gsba.bundle.tracks import _merge
 for kind in (np.int32, np.int64):
     _merge(np.zeros((1, 2), np.int64), np.zeros(2, kind))
 """

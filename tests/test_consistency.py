@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from synthetic import RIG, make_world
 
-from gsba import adjust, graph
+from gsba.bundle import adjustment, prior_factors
 from gsba.config import RefineSettings
-from gsba.consistency import EXPECTED, Consistency, Statistic, format_consistency, judge
+from gsba.evaluate.consistency import EXPECTED, Consistency, Statistic, format_consistency, judge
 from gsba.geometry import carried, pose
 from gsba.log import GsbaError
 from gsba.types import JointErrors, Reconstruction, Trajectory
@@ -31,12 +31,12 @@ def _solved(seed: int) -> tuple[Reconstruction, Trajectory]:
     true = world.world_T_rigs
     held = gtsam.NonlinearFactorGraph()
     gauge = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
-    held.add(gtsam.PriorFactorPose3(graph.X(0), gtsam.Pose3(true[0]), gauge))
+    held.add(gtsam.PriorFactorPose3(prior_factors.X(0), gtsam.Pose3(true[0]), gauge))
     priors = gtsam.NonlinearFactorGraph(held)
-    priors.push_back(graph.fixed_scale(true))
-    given = world.tracks, world.keypoints, adjust.start(true), priors, RIG, (8.0,), settings, 1
-    solved = replace(adjust.run(*given), noise=1.0)
-    covariances, joint = adjust.pose_covariances(solved, held, *given[1:2], RIG, settings, 1)
+    priors.push_back(prior_factors.fixed_scale(true))
+    given = world.tracks, world.keypoints, adjustment.start(true), priors, RIG, (8.0,), settings, 1
+    solved = replace(adjustment.run(*given), noise=1.0)
+    covariances, joint = adjustment.pose_covariances(solved, held, *given[1:2], RIG, settings, 1)
     return _result(solved.world_T_rigs, covariances, joint), Trajectory(TIMES, true)
 
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsba import cubemap
+from gsba.camera.rig import CubeRig
 from gsba.config import CubemapSettings
+from gsba.frames import cubemap
 from gsba.geometry import bearings_from_erp
-from gsba.rig import CubeRig
 from gsba.types import FrameSet
 
 

@@ -9,16 +9,18 @@ import pytest
 from tiny_run import SETTINGS, Case, computed_stages
 
 from gsba import refine
-from gsba.adjust import Adjustment
+from gsba.bundle.adjustment import Adjustment
 from gsba.demo.people import make_people, paste_people
-from gsba.distractors import Scene, distractor_mask, distractor_weights
-from gsba.evaluate import evaluate
+from gsba.evaluate.trajectory import evaluate
 from gsba.export.images import write_image
+from gsba.frames.masks import levels_of, load_mask, load_weights
+from gsba.frames.scan import load_erp
 from gsba.geometry import erp_from_bearings
 from gsba.log import GsbaError
-from gsba.masking import choose
-from gsba.read import levels_of, load_erp, load_mask, load_weights, read_trajectory
-from gsba.store import load_stage
+from gsba.masks.distractors import Scene, distractor_mask, distractor_weights
+from gsba.masks.merging import choose
+from gsba.store.store import load_stage
+from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet
 
 UP = np.array([0.0, -1.0, 0.0])  # of the gallery

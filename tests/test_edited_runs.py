@@ -13,10 +13,10 @@ import pytest
 
 from gsba import load_run
 from gsba.log import GsbaError
-from gsba.placement import read_placement
-from gsba.records import RecordError, load_record, save_record, typed
-from gsba.run_folder import open_run_folder
-from gsba.store import RunStore, StageRecord
+from gsba.placement.placement import read_placement
+from gsba.store.folder import open_run_folder
+from gsba.store.records import RecordError, load_record, save_record, typed
+from gsba.store.store import RunStore, StageRecord
 from gsba.types import Counts, JointErrors, Reconstruction
 
 

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsba.evaluate import AUC_THRESHOLDS_DEG, area_under_recall, associate, evaluate, format_table
+from gsba.evaluate.trajectory import (
+    AUC_THRESHOLDS_DEG,
+    area_under_recall,
+    associate,
+    evaluate,
+    format_table,
+)
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
 from gsba.types import Trajectory
@@ -87,7 +93,7 @@ def test_auc_is_that_of_the_pairs_one_by_one(monkeypatch):
     estimate = _disturbed(truth)
     reference = _reference_auc(estimate, truth)
     assert evaluate(estimate, truth).auc == pytest.approx(reference, rel=1e-9)
-    monkeypatch.setattr("gsba.evaluate._BLOCK_PAIRS", 70)  # several uneven blocks
+    monkeypatch.setattr("gsba.evaluate.trajectory._BLOCK_PAIRS", 70)  # several uneven blocks
     assert evaluate(estimate, truth).auc == pytest.approx(reference, rel=1e-9)
 
 

@@ -14,7 +14,7 @@ from plyfile import PlyData
 from gsba.export import ExportFormat, export, write_points
 from gsba.export.images import face_size_for
 from gsba.log import GsbaError
-from gsba.read import read_trajectory
+from gsba.trajectory.files import read_trajectory
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from factors.photometric import _LEAST_RUN, FAMILY, PhotometricBlock
 from factors.photometric_factor import PhotometricFactor, photometric_residuals
 from factors.sphere_image import SphereImage
 from factors.threads import balanced_ranges
+from gsba.bundle.optimizer import optimize
 from gsba.config import SolverSettings
-from gsba.optimize import optimize
 
 SIGMA = 2.0
 LOSS = RobustLoss("cauchy", 2.0)

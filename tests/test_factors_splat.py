@@ -6,9 +6,9 @@ import pytest
 
 from factors import FaceCameras, RobustLoss
 from factors.splat import RenderedView, SplatBlock
-from gsba.graph import X
-from gsba.optimize import optimize
-from gsba.rig import RIG_R_FACE, CubeRig
+from gsba.bundle.optimizer import optimize
+from gsba.bundle.prior_factors import X
+from gsba.camera.rig import RIG_R_FACE, CubeRig
 
 RIG = CubeRig(48, np.deg2rad(100))
 CAMERAS = FaceCameras(RIG_R_FACE, np.full(6, RIG.focal), np.full((6, 2), RIG.principal))

@@ -5,11 +5,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from gsba import cubemap, features
+from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import FeatureSettings
-from gsba.features import Extractor, FaceKeypoints, SiftExtractor
+from gsba.features import detection
+from gsba.features.detection import Extractor, FaceKeypoints, SiftExtractor
+from gsba.frames import cubemap
 from gsba.geometry import bearings_from_erp
-from gsba.rig import CubeRig, owner_faces
 from gsba.types import Features
 
 SIZE = 256
@@ -109,7 +110,7 @@ def test_sift_trusts_large_keypoints_less() -> None:
 
 
 def _extract(faces: np.ndarray, masks: np.ndarray | None = None) -> Features:
-    return features.extract(faces, masks, RIG, SiftExtractor(FeatureSettings()))
+    return detection.extract(faces, masks, RIG, SiftExtractor(FeatureSettings()))
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +140,7 @@ def test_sigmas_follow_the_area_that_a_pixel_covers() -> None:
     def stub(image: np.ndarray, mask: np.ndarray | None) -> FaceKeypoints:
         return FaceKeypoints(spots, np.full(3, 0.5), np.zeros((3, 4), np.float32))
 
-    found = features.extract(np.zeros((6, SIZE, SIZE, 3), np.uint8), None, RIG, stub)
+    found = detection.extract(np.zeros((6, SIZE, SIZE, 3), np.uint8), None, RIG, stub)
     h = 1e-4
     shifted = [RIG.bearings(found.pixels + h * np.eye(2)[[axis]], found.faces) for axis in (0, 1)]
     du, dv = ((bearings - found.bearings_rig) / h for bearings in shifted)
@@ -182,7 +183,7 @@ def test_a_masked_face_is_left_out_and_others_stay(textured: tuple) -> None:
 def test_gather_lines_frames_up(textured: tuple) -> None:
     _, found = textured
     nothing = _extract(np.full((6, SIZE, SIZE, 3), 90, np.uint8))
-    together = features.gather([found, nothing, found])
+    together = detection.gather([found, nothing, found])
     num = len(found)
     np.testing.assert_array_equal(together.starts, [0, num, num, 2 * num])
     np.testing.assert_array_equal(together.bearings_of(2), found.bearings_rig)

@@ -1,4 +1,4 @@
-"""The floors of the package: who may import whom, and how long files and functions may be."""
+"""Who may import whom, and how long files and functions may be."""
 
 import ast
 import os
@@ -13,34 +13,6 @@ import pytest
 import gsba
 
 ROOT = Path(__file__).parents[1]
-FLOORS = (
-    {"factors"},
-    {"", "config", "config_file", "evidence", "geometry", "log", "types"} | {"version"},
-    {"panorama", "read", "records", "rig", "run_folder", "search", "store", "sweep"}
-    | {"turning", "views"},
-    {"align", "cubemap", "features", "filter", "graph", "matching", "optimize", "pairs"}
-    | {"patch_grid", "splat", "tracks", "triangulate", "verify"},
-    {"adjust", "blame", "clock", "clock_fit", "common_errors", "components", "frontend", "learned"}
-    | {
-        "map_strength",
-        "meetings",
-        "misfit",
-        "motion",
-        "parts",
-        "photometric",
-        "places",
-        "pose_graph",
-    }
-    | {"reconstruction", "recovery", "registered", "resection", "segments"}
-    | {"splat_align", "splat_refine", "splatting", "stitching", "tripod"},
-    {"alignment", "carrier", "consistency", "distractors", "evaluate", "evaluate_splat", "export"}
-    | {"gravity", "induced", "placement", "report", "report_html", "video"},
-    {"demo", "extraction", "inputs", "line", "masking", "matching_stages", "pipeline"}
-    | {"results", "segmentation", "timing", "view"},
-    {"cli"},
-    {"benchmarks"},
-)
-STAGES = 3  # the floor whose modules must not import one another
 FACTORS_MAY_USE = {"factors", "gtsam", "numba", "numpy", "scipy"}
 HEAVY = {
     "av",
@@ -67,13 +39,6 @@ def _package(module: str) -> str:
     """The part of a module's name that has a floor: `export` of `gsba.export.colmap`."""
     top, _, rest = module.partition(".")
     return rest.partition(".")[0] if top == "gsba" else top
-
-
-def _floor(module: str) -> int:
-    package = _package(module)
-    floors = [level for level, packages in enumerate(FLOORS) if package in packages]
-    assert floors, f"{module} has no floor: give it one here"
-    return floors[0]
 
 
 def _statements(node: ast.AST) -> Iterator[ast.AST]:
@@ -103,16 +68,6 @@ def _imports(module: str) -> set[str]:
 
 IMPORTS = {module: _imports(module) for module in FILES}
 OURS = {module: names & FILES.keys() - {module} for module, names in IMPORTS.items()}
-
-
-@pytest.mark.parametrize("module", FILES)
-def test_imports_go_down_only(module: str) -> None:
-    for name in OURS[module]:
-        if _package(name) == _package(module):
-            continue
-        assert _floor(name) <= _floor(module), f"{module} imports {name} from a floor above"
-        same_stage_floor = _floor(name) == _floor(module) == STAGES
-        assert not same_stage_floor, f"stages never import one another: {module} imports {name}"
 
 
 def test_factors_stand_alone() -> None:

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from synthetic import bearings_of, features_of, unit, with_noise
 
-from gsba import features, frontend
-from gsba.adjust import Adjustment
+from gsba.bundle.adjustment import Adjustment
+from gsba.camera.rig import owner_faces
 from gsba.config import PairSettings, RefineSettings
+from gsba.features import detection
 from gsba.geometry import pose
-from gsba.matching import MatchContext, SearchableFrames
-from gsba.rig import owner_faces
+from gsba.matching import correspondences
+from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.types import Counts, Keypoints, Landmarks, Tracks, VerifiedPairs
 
 NUM = 300
@@ -35,7 +36,7 @@ def _scene(shift: float) -> tuple[SearchableFrames, Keypoints, Adjustment]:
     which, seen_from = which[order].astype(np.int32), seen_from[order].astype(np.int32)
     landmarks = Landmarks(points, Tracks(which, seen_from, which, NUM), Counts(NUM, NUM, "tracks"))
     solved = Adjustment(world_T_rigs, landmarks, 1.0, ())
-    return SearchableFrames(frames.__getitem__), features.gather(frames), solved
+    return SearchableFrames(frames.__getitem__), detection.gather(frames), solved
 
 
 def _loops_to_last(shift: float, loop_deg: float = 2.0) -> tuple[VerifiedPairs, np.ndarray]:
@@ -43,7 +44,7 @@ def _loops_to_last(shift: float, loop_deg: float = 2.0) -> tuple[VerifiedPairs, 
     settings = RefineSettings(pairs=PairSettings(window=2, loop_deg=loop_deg))
     frames, keypoints, solved = _scene(shift)
     context = MatchContext(frames, frames, keypoints, settings, 1)
-    found = frontend.match_loops(context, solved)
+    found = correspondences.match_loops(context, solved)
     return found, np.flatnonzero(found.matches.pairs[:, 1] == LAST)
 
 
@@ -84,14 +85,14 @@ def test_all_keypoints_decide_where_the_strongest_disagree(
         frames.append(features_of(bearings[by_face], descriptors[by_face]))
     settings = RefineSettings(pairs=PairSettings(window=2, least_agreement=least_agreement))
     all_, strongest = (SearchableFrames(frames.__getitem__, n) for n in (None, 40))
-    context = MatchContext(all_, strongest, features.gather(frames), settings, 1)
+    context = MatchContext(all_, strongest, detection.gather(frames), settings, 1)
     world_T_rigs = pose(np.tile(np.eye(3), (2, 1, 1)), np.stack([np.zeros(3), true]))
     nothing = Landmarks(
         np.zeros((0, 3)),
         Tracks(*(np.zeros(0, np.int32) for _ in range(3)), 0),
         Counts(0, 0, "tracks"),
     )
-    found = frontend.match_neighbours(context, Adjustment(world_T_rigs, nothing, 1.0, ()))
+    found = correspondences.match_neighbours(context, Adjustment(world_T_rigs, nothing, 1.0, ()))
     assert found.matches.pairs.tolist() == [[0, 1]]
     off = np.rad2deg(np.arccos(found.f0_T_f1s[0, :3, 3] @ unit(true)))
     assert off > 10 if misled else off < 1

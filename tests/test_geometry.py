@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from gsba.camera.rig import RIG_R_FACE, CubeRig, owner_faces
 from gsba.geometry import (
     NoSimilarityError,
     bearings_from_erp,
@@ -18,7 +19,6 @@ from gsba.geometry import (
     rotation_from_quaternion,
     similarity,
 )
-from gsba.rig import RIG_R_FACE, CubeRig, owner_faces
 from gsba.types import FACES
 
 RNG = np.random.default_rng(0)

@@ -6,10 +6,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import loop_walk
 
-from gsba import graph
+from gsba.bundle import prior_factors
+from gsba.bundle.prior_factors import X
 from gsba.config import PriorSettings
 from gsba.geometry import inverse, rotation_angle
-from gsba.graph import X
 
 SETTINGS = PriorSettings()
 
@@ -40,7 +40,7 @@ def _shaken(world_T_rigs: np.ndarray, seed: int = 0) -> np.ndarray:
 
 def test_alone_the_priors_give_the_trajectory_back() -> None:
     coarse = loop_walk(12)
-    factors = graph.build(coarse, SETTINGS)
+    factors = prior_factors.build(coarse, SETTINGS)
     assert factors.error(_values(coarse)) == pytest.approx(0, abs=1e-12)
     np.testing.assert_allclose(_solve(factors, _shaken(coarse)), coarse, atol=1e-4)
 
@@ -48,7 +48,7 @@ def test_alone_the_priors_give_the_trajectory_back() -> None:
 def test_the_first_pose_is_fixed() -> None:
     """However hard another factor pulls at it."""
     coarse = loop_walk(6)
-    factors = graph.build(coarse, SETTINGS)
+    factors = prior_factors.build(coarse, SETTINGS)
     pulled = gtsam.Pose3(coarse[0]).compose(gtsam.Pose3.Expmap(np.full(6, 0.3)))
     factors.add(gtsam.PriorFactorPose3(X(0), pulled, gtsam.noiseModel.Isotropic.Sigma(6, 1e-2)))
     solved = _solve(factors, coarse)
@@ -57,7 +57,7 @@ def test_the_first_pose_is_fixed() -> None:
 
 def test_every_pose_is_constrained() -> None:
     coarse = loop_walk(8)
-    marginals = gtsam.Marginals(graph.build(coarse, SETTINGS), _values(coarse))
+    marginals = gtsam.Marginals(prior_factors.build(coarse, SETTINGS), _values(coarse))
     for f in range(8):
         eigenvalues = np.linalg.eigvalsh(marginals.marginalCovariance(X(f)))
         assert eigenvalues.min() > 0 and np.isfinite(eigenvalues).all()
@@ -65,7 +65,7 @@ def test_every_pose_is_constrained() -> None:
 
 def _with_truth(coarse: np.ndarray, true: np.ndarray, gap: int) -> np.ndarray:
     """Solve the priors with images replaced by exact steps of the truth, none across `gap`."""
-    factors = graph.build(coarse, SETTINGS)
+    factors = prior_factors.build(coarse, SETTINGS)
     tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)
     steps = inverse(true[:-1]) @ true[1:]
     for f, step in enumerate(steps):
@@ -96,7 +96,7 @@ def test_a_standing_camera_gives_no_nan(still: str) -> None:
         coarse[:] = coarse[0]
     else:
         coarse[3:8] = coarse[3]
-    factors = graph.build(coarse, SETTINGS)
+    factors = prior_factors.build(coarse, SETTINGS)
     error = factors.error(_values(_shaken(coarse)))
     assert np.isfinite(error) and error > 0
     np.testing.assert_allclose(_solve(factors, _shaken(coarse)), coarse, atol=1e-4)
@@ -106,7 +106,7 @@ def test_a_standing_camera_gives_no_nan(still: str) -> None:
 
 def test_images_may_move_a_camera_that_slam_thought_still() -> None:
     coarse = np.stack([np.eye(4)] * 5)
-    factors = graph.build(coarse, SETTINGS)
+    factors = prior_factors.build(coarse, SETTINGS)
     moved = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 0.1]))
     tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)
     for f in range(4):
@@ -126,15 +126,15 @@ def test_step_noise_scales_with_the_map() -> None:
         bigger[:, :3, 3] *= scale
         bigger_off[:, :3, 3] *= scale
         bigger_off[0] = bigger[0]  # the gauge is not at issue
-        errors.append(graph.build(bigger, SETTINGS).error(_values(bigger_off)))
+        errors.append(prior_factors.build(bigger, SETTINGS).error(_values(bigger_off)))
     assert errors[1] == pytest.approx(errors[0], rel=1e-9)
 
 
 def test_fixed_scale_holds_the_extent() -> None:
     coarse = loop_walk(10)
-    held = graph.fixed_scale(coarse)
+    held = prior_factors.fixed_scale(coarse)
     bigger = coarse.copy()
     bigger[:, :3, 3] = coarse[0, :3, 3] + 1.01 * (coarse[:, :3, 3] - coarse[0, :3, 3])
     assert held.error(_values(coarse)) == pytest.approx(0, abs=1e-9)
     assert held.error(_values(bigger)) == pytest.approx(0.5 * 1e4**2, rel=1e-6)
-    assert graph.fixed_scale(np.stack([np.eye(4)] * 3)).size() == 0
+    assert prior_factors.fixed_scale(np.stack([np.eye(4)] * 3)).size() == 0

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from gsba.evaluate.pixels import depth_maps, induced_errors
 from gsba.geometry import pose
-from gsba.induced import depth_maps, induced_errors
 from gsba.log import GsbaError
 from gsba.types import Trajectory
 

@@ -18,15 +18,16 @@ from learned_networks import (
 from scipy.spatial.transform import Rotation
 from synthetic import features_of, unit
 
-from gsba import features, matching
+from gsba.camera.rig import CubeRig
 from gsba.config import RefineSettings
+from gsba.features import detection
 from gsba.geometry import pose
 from gsba.learned import FaceMatcher, LearnedExtractor, make_matcher, overlapping_faces
 from gsba.learned.lightglue import LightGlue
 from gsba.learned.magicleap import SuperGlue
 from gsba.log import GsbaError
-from gsba.matching import Gate, SearchableFrames, guided
-from gsba.rig import CubeRig
+from gsba.matching import guided_search
+from gsba.matching.guided_search import Gate, SearchableFrames, guided
 from gsba.types import FACES, Features
 
 RIG = CubeRig(96, np.deg2rad(96))
@@ -69,7 +70,7 @@ def seen(extractors: dict[str, Path]) -> Callable[[str], tuple[Features, ...]]:
     def see(name: str) -> tuple[Features, ...]:
         extractor = LearnedExtractor(_settings(name).features, extractors[name])
         views = (faces, turned)
-        return tuple(features.extract(view, around, RIG, extractor) for view in views)
+        return tuple(detection.extract(view, around, RIG, extractor) for view in views)
 
     return cache(see)
 
@@ -97,10 +98,12 @@ def test_contract(
     compare = make_matcher(settings, weights, RIG.size)
     poses = np.array([np.eye(4), TURN])
 
-    def match(poses: np.ndarray, strongest: int | None = None, num: int = 1) -> matching.Matches:
+    def match(
+        poses: np.ndarray, strongest: int | None = None, num: int = 1
+    ) -> guided_search.Matches:
         pairs, frames = np.array([[0, 1]] * num), _frames(found, strongest)
         how = settings.matching, num
-        return matching.run(pairs, poses, [GATE] * num, frames, *how, matcher=compare)
+        return guided_search.run(pairs, poses, [GATE] * num, frames, *how, matcher=compare)
 
     matched = match(poses, num=2)
     rows = matched.of(0)
@@ -265,9 +268,9 @@ def test_lightglue_loads_the_authors_layout(extractor: str, tmp_path: Path) -> N
     assert loaded[0].conf.depth_confidence == loaded[0].conf.width_confidence == -1
 
 
-def _face(seed: int, num: int, size: int, dim: int) -> features.FaceKeypoints:
+def _face(seed: int, num: int, size: int, dim: int) -> detection.FaceKeypoints:
     rng = np.random.default_rng(seed)
-    return features.FaceKeypoints(
+    return detection.FaceKeypoints(
         rng.uniform(0, size, (num, 2)),
         np.full(num, 0.5),
         unit(rng.normal(size=(num, dim))).astype(np.float32),

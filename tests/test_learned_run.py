@@ -10,9 +10,9 @@ import pytest
 from tiny_run import SETTINGS, Case, computed_stages
 
 from gsba.config import FeatureSettings, RefineSettings
-from gsba.evaluate import evaluate
-from gsba.features import FaceKeypoints, SiftExtractor
-from gsba.read import read_trajectory
+from gsba.evaluate.trajectory import evaluate
+from gsba.features.detection import FaceKeypoints, SiftExtractor
+from gsba.trajectory.files import read_trajectory
 
 
 class Keypoints:
@@ -58,7 +58,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RefineSettings:
     stub = types.ModuleType("gsba.learned.lightglue")
     stub.LightGlue = Nearest  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "gsba.learned.lightglue", stub)
-    monkeypatch.setattr("gsba.extraction.LearnedExtractor", Keypoints)
+    monkeypatch.setattr("gsba.features.extraction.LearnedExtractor", Keypoints)
     for name in ("aliked-n16.pth", "aliked_lightglue.pth"):
         (tmp_path / name).write_bytes(b"weights")
     changes = {

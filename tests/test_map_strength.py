@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from synthetic import drifted, loop_walk, unit
 
-from gsba import graph, map_strength
+from gsba.bundle import map_strength, prior_factors
+from gsba.bundle.map_strength import MapStrength
 from gsba.config import CloserSettings, PriorSettings
 from gsba.geometry import inverse, rotation_angle, step_covariances
-from gsba.map_strength import MapStrength
 from gsba.types import JointErrors, StepNoise
 
 NUM = 24
@@ -148,7 +148,7 @@ def test_priors_of_steps_in_a_row_count_as_one_that_drifts() -> None:
     """The length of k steps is known as badly as one is: their drift has one sign."""
     noise, kept = StepNoise(0.01, 0.02, 0.03), np.zeros(NUM - 1, bool)
     kept[[3, 4, 5, 9]] = True
-    built = graph.build(POSES, PRIORS, ~kept, np.ones(NUM, bool), noise=noise)
+    built = prior_factors.build(POSES, PRIORS, ~kept, np.ones(NUM, bool), noise=noise)
     steps = [built.at(i) for i in range(built.size()) if len(built.at(i).keys()) == 2]
     assert len(steps) == 4
     for factor, (f, times) in zip(steps, {3: 3, 4: 3, 5: 3, 9: 1}.items(), strict=True):

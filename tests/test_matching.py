@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import bearings_of, features_of, unit, with_noise
 
-from gsba import matching
 from gsba.config import MatchingSettings
 from gsba.geometry import pose
-from gsba.matching import Gate, SearchableFrames, match_pair, searchable, within_gate
+from gsba.matching import guided_search
+from gsba.matching.guided_search import Gate, SearchableFrames, match_pair, searchable, within_gate
 from gsba.types import Features
 
 NUM = 400
@@ -301,7 +301,7 @@ def test_pairs_are_matched_in_order_whatever_the_threads(scene: Scene) -> None:
     world_T_rigs = np.stack([np.eye(4), F0_T_F1, np.eye(4)])
     pairs = np.array([[0, 1], [1, 2], [0, 2]])
     single, threaded = (
-        matching.run(
+        guided_search.run(
             pairs, world_T_rigs, [BAND] * 3, SearchableFrames(_reader(frames)), SETTINGS, threads
         )
         for threads in (1, 3)
@@ -315,7 +315,7 @@ def test_pairs_are_matched_in_order_whatever_the_threads(scene: Scene) -> None:
 def test_no_pairs_are_no_error(scene: Scene) -> None:
     none = np.zeros((0, 2), np.int32)
     frames = SearchableFrames(_reader([scene.first()]))
-    found = matching.run(none, np.eye(4)[None], [], frames, SETTINGS, 2)
+    found = guided_search.run(none, np.eye(4)[None], [], frames, SETTINGS, 2)
     assert found.keypoints.shape == (0, 2) and found.pairs.shape == (0, 2)
 
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from synthetic import drifted, loop_walk, unit
 
-from gsba import recovery
 from gsba.config import RefineSettings, VerifySettings
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
-from gsba.misfit import refuse_misfit, refuse_misread, refuse_useless
-from gsba.motion import Steps
+from gsba.matching import recovery
+from gsba.trajectory.judgement import Steps
+from gsba.trajectory.misread import refuse_misfit, refuse_misread, refuse_useless
 from gsba.types import CoarsePoses, PoseSource, Trajectory
 
 NUM = 30

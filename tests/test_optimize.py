@@ -17,9 +17,9 @@ from factors import (
     RobustLoss,
 )
 from factors.cholesky import BlockCholesky
+from gsba.bundle.optimizer import marginal_covariances, optimize
 from gsba.config import SolverSettings
 from gsba.log import GsbaError
-from gsba.optimize import marginal_covariances, optimize
 
 SIGMA_RAD, SIGMA_PX = 1e-3, 0.5
 LOSS = RobustLoss("cauchy", 2.0)
@@ -404,6 +404,6 @@ def test_block_cholesky_solves_and_inverts():
 
 
 def test_history_is_logged(world, caplog):
-    with caplog.at_level(logging.DEBUG, logger="gsba.optimize"):
+    with caplog.at_level(logging.DEBUG, logger="gsba.bundle.optimizer"):
         optimize(world.graph, [world.block()], world.values)
     assert "step 0" in caplog.text

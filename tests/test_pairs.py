@@ -3,8 +3,8 @@
 import numpy as np
 from synthetic import loop_walk
 
-from gsba import pairs
 from gsba.config import PairSettings
+from gsba.matching import pairs
 
 SETTINGS = PairSettings(window=8, max_baseline_depths=1.0, max_loop_neighbours=3)
 

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from gsba.camera.rig import CubeRig
+from gsba.frames.panorama import load_grey, width_for
 from gsba.geometry import bearings_from_erp
-from gsba.panorama import load_grey, width_for
-from gsba.rig import CubeRig
 from gsba.types import FACES, FrameSet
 
 SIZE = 64

@@ -10,14 +10,15 @@ from photometric_world import Texture, render
 from synthetic import unit
 from tiny_run import SETTINGS, Case, computed_stages
 
-from gsba import adjust, patch_grid, photometric
+from gsba.bundle import adjustment
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.config_file import load_config
 from gsba.export.images import write_image
+from gsba.frames.masks import levels_of
 from gsba.geometry import erp_from_bearings
-from gsba.line import Line
 from gsba.log import GsbaError
-from gsba.read import levels_of
+from gsba.photometric import direct, patches
+from gsba.pipeline.backend import Line
 from gsba.types import FrameSet
 
 WIDTH = 512
@@ -30,7 +31,7 @@ JOINT = RefineSettings.model_validate(
 
 def test_patches_are_spread_over_the_sphere() -> None:
     settings = PhotometricSettings(spacing_deg=10)
-    bearings = patch_grid.candidates(GREY, ALL, settings)
+    bearings = patches.candidates(GREY, ALL, settings)
     assert np.allclose(np.linalg.norm(bearings, axis=1), 1)
     # 4 pi / (10 deg)^2 cells, those beyond 80 degrees of latitude left empty
     assert 370 < len(bearings) < 430
@@ -42,18 +43,18 @@ def test_masked_flat_and_saturated_places_have_no_patch() -> None:
     settings = PhotometricSettings()
     usable = ALL.copy()
     usable[:, :200] = False
-    bearings = patch_grid.candidates(GREY, usable, settings)
+    bearings = patches.candidates(GREY, usable, settings)
     u = erp_from_bearings(bearings, WIDTH, WIDTH // 2)[:, 0]
     reach = settings.size // 2
     assert len(bearings) and (u > 200 + reach).all() and (u < WIDTH - reach).all()
-    assert len(patch_grid.candidates(np.full_like(GREY, 90), ALL, settings)) == 0
-    assert len(patch_grid.candidates(GREY, ~ALL, settings)) == 0
+    assert len(patches.candidates(np.full_like(GREY, 90), ALL, settings)) == 0
+    assert len(patches.candidates(GREY, ~ALL, settings)) == 0
 
 
 def test_coarser_masks_want_all_pixels() -> None:
     usable = np.ones((4, 8), bool)
     usable[3, 5] = False
-    assert np.array_equal(patch_grid.coarser(usable, 2), [[1, 1, 1, 1], [1, 1, 0, 1]])
+    assert np.array_equal(patches.coarser(usable, 2), [[1, 1, 1, 1], [1, 1, 0, 1]])
 
 
 def test_planes_pass_through_the_map() -> None:
@@ -64,7 +65,7 @@ def test_planes_pass_through_the_map() -> None:
     points[::15] *= 1.5  # of another surface
     bearings = unit(np.array([0, 0, 1.0]) + 0.05 * rng.normal(size=(50, 3)))
     settings = PhotometricSettings(slope_sigma=10.0)
-    planes, clear = patch_grid.lay_planes(bearings, points, settings)
+    planes, clear = patches.lay_planes(bearings, points, settings)
     assert np.count_nonzero(clear) > 40
     expected = bearings @ normal / offset
     assert np.abs(planes[clear, 0] / expected[clear] - 1).max() < 0.01
@@ -74,11 +75,11 @@ def test_a_map_without_points_near_gives_no_depth() -> None:
     rng = np.random.default_rng(2)
     bearings = unit(np.array([0, 0, -1.0]) + 0.05 * rng.normal(size=(5, 3)))
     points = 3 * unit(np.array([0, 0, 1.0]) + 0.05 * rng.normal(size=(100, 3)))
-    assert not patch_grid.lay_planes(bearings, points, PhotometricSettings())[1].any()
-    assert not patch_grid.lay_planes(bearings, points[:3], PhotometricSettings())[1].any()
+    assert not patches.lay_planes(bearings, points, PhotometricSettings())[1].any()
+    assert not patches.lay_planes(bearings, points[:3], PhotometricSettings())[1].any()
     scattered = unit(rng.normal(size=(200, 3))) * rng.uniform(1, 30, (200, 1))
     anywhere = unit(rng.normal(size=(50, 3)))
-    clear = patch_grid.lay_planes(anywhere, scattered, PhotometricSettings())[1]
+    clear = patches.lay_planes(anywhere, scattered, PhotometricSettings())[1]
     assert np.count_nonzero(clear) < 10
 
 
@@ -112,15 +113,16 @@ def test_the_report_tells_of_patches(joint) -> None:
 
 
 def _start(case: Case, settings: RefineSettings):
-    from gsba import cubemap, graph
-    from gsba.adjust import Adjustment
-    from gsba.store import load_stage
+    from gsba.bundle import prior_factors
+    from gsba.bundle.adjustment import Adjustment
+    from gsba.frames import cubemap
+    from gsba.store.store import load_stage
     from gsba.types import Keypoints
 
     frames = load_stage(case.out, "frames", FrameSet)
     solved = load_stage(case.out, "refined1", Adjustment)
     keypoints = load_stage(case.out, "keypoints", Keypoints)
-    priors = graph.build(case.result.coarse.world_T_rigs, settings.priors)
+    priors = prior_factors.build(case.result.coarse.world_T_rigs, settings.priors)
     return frames, keypoints, solved, priors, cubemap.rig_for(frames, settings.cubemap)
 
 
@@ -129,7 +131,7 @@ def test_nothing_to_see_changes_nothing(case: Case) -> None:
         update={"photometric": PhotometricSettings(min_gradient=1e3, depth_levels=0)}
     )
     frames, keypoints, solved, priors, rig = _start(case, settings)
-    result = photometric.run(frames, keypoints, solved, priors, rig, settings, 1)
+    result = direct.run(frames, keypoints, solved, priors, rig, settings, 1)
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
     assert all(counts.kept == 0 for counts in result.counts)
 
@@ -143,21 +145,21 @@ def test_observations_weigh_what_both_masks_say(case: Case, tmp_path: Path) -> N
     half[:, : frames.width // 2] = 0.5
     write_image(tmp_path / "half.png", levels_of(half))
     masked = replace(frames, mask_paths=(tmp_path / "half.png",) * len(frames))
-    plain, ones, _ = photometric._patches(frames, solved, 0, settings, 1)
-    pixels, trust, _ = photometric._patches(masked, solved, 0, settings, 1)
+    plain, ones, _ = direct._patches(frames, solved, 0, settings, 1)
+    pixels, trust, _ = direct._patches(masked, solved, 0, settings, 1)
     assert plain is not None and pixels is not None and (ones == 1).all()
     table = pixels.table
     points = table.bearings_rig / table.planes[:, :1]  # planes that face their hosts
     hosts, targets = solved.world_T_rigs[table.hosts], solved.world_T_rigs[table.targets]
     world = np.einsum("pij,pj->pi", hosts[:, :3, :3], points) + hosts[:, :3, 3]
     seen = np.einsum("oji,oj->oi", targets[:, :3, :3], world[table.owners] - targets[:, :3, 3])
-    expected = patch_grid.values_at(half, table.bearings_rig)[table.owners]
-    expected *= patch_grid.values_at(half, seen)
+    expected = patches.values_at(half, table.bearings_rig)[table.owners]
+    expected *= patches.values_at(half, seen)
     assert set(expected) == {0.25, 0.5, 1.0}
     assert np.mean(np.abs(trust - expected) < 0.01) > 0.99  # others are at the border
-    block = photometric.make_block(pixels, trust, settings, 1)
-    whole = photometric.make_block(pixels, np.ones(len(trust)), settings, 1)
-    values = adjust.values_of(solved.world_T_rigs)
+    block = direct.make_block(pixels, trust, settings, 1)
+    whole = direct.make_block(pixels, np.ones(len(trust)), settings, 1)
+    values = adjustment.values_of(solved.world_T_rigs)
     for one in (block, whole):
         one.refresh(values)
     assert block.costs(values)["photometric"] < whole.costs(values)["photometric"]
@@ -168,7 +170,7 @@ def test_a_solve_against_the_map_is_undone(case: Case) -> None:
         update={"photometric": PhotometricSettings(max_growth=1e-3, depth_levels=0, spacing_deg=20)}
     )
     frames, keypoints, solved, priors, rig = _start(case, settings)
-    result = photometric.run(frames, keypoints, solved, priors, rig, settings, 1)
+    result = direct.run(frames, keypoints, solved, priors, rig, settings, 1)
     assert not result.adjustment.rounds[-1].accepted
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
 
@@ -182,7 +184,7 @@ def test_a_solve_against_the_map_is_undone(case: Case) -> None:
 )
 def test_other_frames_are_refused_before_any_work(case: Case, change: dict, message: str) -> None:
     frames, *_ = _start(case, JOINT)
-    photometric.check(frames, JOINT)
+    direct.check(frames, JOINT)
     with pytest.raises(GsbaError, match=message):
         Line(None, replace(frames, **change), None, JOINT, None)  # type: ignore[arg-type]
 
@@ -192,7 +194,7 @@ def test_a_small_panorama_has_fewer_levels(case: Case) -> None:
         update={"photometric": PhotometricSettings(levels=(9,), spacing_deg=20, size=5)}
     )
     frames, keypoints, solved, priors, rig = _start(case, settings)
-    result = photometric.run(frames, keypoints, solved, priors, rig, settings, 1)
+    result = direct.run(frames, keypoints, solved, priors, rig, settings, 1)
     assert np.isfinite(result.adjustment.world_T_rigs).all() and len(result.counts) == 2
 
 
@@ -203,7 +205,7 @@ def test_the_family_needs_another() -> None:
 
 def test_wide_panoramas_are_halved(case: Case) -> None:
     frames, *_ = _start(case, JOINT)
-    levels, usable = patch_grid.pyramid(frames, 0, PhotometricSettings(max_width=256), 2)
+    levels, usable = patches.pyramid(frames, 0, PhotometricSettings(max_width=256), 2)
     assert [level.shape for level in levels] == [(128, 256), (64, 128), (32, 64)]
     assert usable.shape == (128, 256)
 
@@ -224,7 +226,7 @@ def test_a_doubted_frame_loses_weight() -> None:
             return np.repeat([1.0, 1.0, 36.0], 20)
 
     settings, values = PhotometricSettings(), gtsam.Values()
-    rule = photometric._frame_weights
+    rule = direct._frame_weights
     weights, residuals = rule(Block(), values, np.ones(3), settings)  # type: ignore[arg-type]
     assert np.allclose(residuals, [1, 1, 6]) and np.allclose(weights, [1, 1, 1 / 9])
     pulled = rule(Block(), values, np.array([2.4, 1.0, 1.0]), settings)[0]  # type: ignore[arg-type]

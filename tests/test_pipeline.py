@@ -14,14 +14,15 @@ import pycolmap
 import pytest
 from tiny_run import NUM_FRAMES, SETTINGS, WIDTH, Case, computed_stages
 
-from gsba import cubemap, load_run, refine
+from gsba import load_run, refine
+from gsba.bundle.prior_factors import X
+from gsba.camera.rig import CubeRig
 from gsba.config_file import load_config
-from gsba.evaluate import evaluate
-from gsba.graph import X
+from gsba.evaluate.trajectory import evaluate
+from gsba.frames import cubemap
 from gsba.log import GsbaError
-from gsba.read import read_trajectory
-from gsba.rig import CubeRig
-from gsba.store import load_stage
+from gsba.store.store import load_stage
+from gsba.trajectory.files import read_trajectory
 from gsba.types import FACES, CoarsePoses, Keypoints, PoseStatus, Trajectory
 
 

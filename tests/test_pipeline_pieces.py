@@ -17,8 +17,8 @@ from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.geometry import pose, rotation_angle
-from gsba.read import read_trajectory, write_tum
-from gsba.segments import IMAGES, carried
+from gsba.trajectory.files import read_trajectory, write_tum
+from gsba.trajectory.joining import IMAGES, carried
 from gsba.types import PoseStatus, Trajectory
 
 SCALE = 1.7

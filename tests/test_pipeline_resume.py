@@ -11,8 +11,8 @@ import pytest
 from tiny_run import NUM_FRAMES, SETTINGS, Case, computed_stages
 
 import gsba
-from gsba import frontend
 from gsba.config import CloserSettings
+from gsba.matching import correspondences
 
 
 def test_a_second_call_takes_everything_up(case: Case, tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_an_interrupt_leaves_what_is_finished(
     out = case.copy(tmp_path / "run")
     (out / "stages/loops.npz").unlink()
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(frontend, "match_loops", interrupt)
+        patch.setattr(correspondences, "match_loops", interrupt)
         case.refine(out)
     assert computed_stages(case.refine(out)) == ["loops"]
 

@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 from tiny_run import SETTINGS, Case
 
 from gsba import refine
-from gsba.evaluate import evaluate
+from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import pose
 from gsba.log import GsbaError
-from gsba.pipeline import RunResult
-from gsba.read import read_trajectory, write_tum
+from gsba.pipeline.refine import RunResult
+from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import PoseStatus, Trajectory
 
 

@@ -12,15 +12,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
-from gsba import gravity, read
-from gsba.alignment import level_similarity, robust_similarity
 from gsba.cli import app
 from gsba.config import PlacementSettings
 from gsba.export import ExportFormat, export
 from gsba.geometry import angular_errors, bearings_from_erp, pose, similarity
 from gsba.log import GsbaError
-from gsba.placement import Placement, place
-from gsba.read import local_from_geodetic, read_gps
+from gsba.placement import gravity
+from gsba.placement.gps import local_from_geodetic, read_gps
+from gsba.placement.placement import Placement, place
+from gsba.similarity import level_similarity, robust_similarity
+from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import FrameSet, Reconstruction, Trajectory
 
 ORIGIN = np.array([48.137, 11.575, 520.0])
@@ -120,7 +121,7 @@ def test_every_export_says_what_was_done(tmp_path: Path) -> None:
     turn = Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix()
     placement = Placement(3.0, turn, np.array([1.0, 2, 3]), unit="m", up="z")
     export(base, frames, tmp_path / "tum", ExportFormat.TUM, placement=placement)
-    placed = read.read_trajectory(tmp_path / "tum/trajectory.tum").world_T_rigs
+    placed = read_trajectory(tmp_path / "tum/trajectory.tum").world_T_rigs
     said = json.loads((tmp_path / "tum/transform.json").read_text())
     assert (said["scale"], said["unit"], said["up"]) == (3.0, "m", "z")
     for matrix, source, target in (
@@ -229,7 +230,7 @@ def test_truth_with_large_coordinates(tmp_path: Path) -> None:
     result, frames = _result(), _frames(40)
     far = np.array([691_234.5, 5_334_567.25, 540.0])
     true = Placement(1 / 0.21, np.eye(3), far).apply(result).world_T_rigs
-    read.write_tum(tmp_path / "truth.tum", Trajectory(frames.timestamps + 0.004, true))
+    write_tum(tmp_path / "truth.tum", Trajectory(frames.timestamps + 0.004, true))
     placed = place(result, frames, PlacementSettings(align=str(tmp_path / "truth.tum")))
     assert np.abs(placed.translation).max() < 200 and placed.offset[1] == 5_334_600
     positions = placed.points(result.world_T_rigs[:, :3, 3]) + placed.offset
@@ -240,7 +241,7 @@ def test_truth_of_a_straight_walk_takes_the_roll_from_orientations(tmp_path: Pat
     result, frames = _result(straight=True), _frames(40)
     turn = Rotation.from_rotvec([1.0, 0.3, -0.4]).as_matrix()
     true = Placement(7.0, turn, np.ones(3)).apply(result).world_T_rigs
-    read.write_tum(tmp_path / "truth.tum", Trajectory(frames.timestamps, true))
+    write_tum(tmp_path / "truth.tum", Trajectory(frames.timestamps, true))
     placed = place(result, frames, PlacementSettings(align=str(tmp_path / "truth.tum")))
     np.testing.assert_allclose(placed.apply(result).world_T_rigs, true, atol=1e-9)
 
@@ -250,7 +251,7 @@ def test_a_stuck_receiver_is_refused(
     tmp_path: Path, up: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     upright = Placement(up="-y")
-    monkeypatch.setattr("gsba.placement._upright", lambda *_: upright)
+    monkeypatch.setattr("gsba.placement.placement._upright", lambda *_: upright)
     result, frames = _result(), _frames(40)
     path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, np.tile(ORIGIN, (40, 1)))
     settings = PlacementSettings(gps=str(path), up=up)  # type: ignore[arg-type]
@@ -278,7 +279,7 @@ def test_extreme_placements_are_refused(settings: dict, message: str) -> None:
 
 def test_times_that_are_only_an_order_place_nothing(tmp_path: Path) -> None:
     result, frames = _result(), dataclasses.replace(_frames(40), timed=False)
-    read.write_tum(tmp_path / "t.tum", Trajectory(frames.timestamps, result.world_T_rigs))
+    write_tum(tmp_path / "t.tum", Trajectory(frames.timestamps, result.world_T_rigs))
     with pytest.raises(GsbaError, match="nothing says when frames were taken"):
         place(result, frames, PlacementSettings(align=str(tmp_path / "t.tum")))
     path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, _geodetic(_level(result)))
@@ -395,7 +396,7 @@ def _gsba(*arguments: object) -> Result:
 def test_bad_options(tmp_path: Path) -> None:
     result, frames = _result(), _frames(40)
     truth = tmp_path / "t.tum"
-    read.write_tum(truth, Trajectory(frames.timestamps + 100, result.world_T_rigs))
+    write_tum(truth, Trajectory(frames.timestamps + 100, result.world_T_rigs))
     for settings, message in (
         (PlacementSettings(length=2.0), "need one another"),
         (PlacementSettings(length=2.0, between=("a", "b"), gps="g"), "pass one"),

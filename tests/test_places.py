@@ -7,12 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import bearings_of, features_of, loop_walk, unit, with_noise
 
-from gsba import features, places
-from gsba.adjust import Adjustment
+from gsba.bundle.adjustment import Adjustment
 from gsba.config import PairSettings, RefineSettings
+from gsba.features import detection
 from gsba.geometry import inverse, pose, rotation_angle
-from gsba.matching import MatchContext, SearchableFrames
-from gsba.places import Loop
+from gsba.loop_closure import loops
+from gsba.loop_closure.loops import Loop
+from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.types import Counts, Keypoints, Landmarks, Tracks
 
 NUM_FRAMES, NUM_POINTS = 40, 1500
@@ -44,7 +45,7 @@ def _scene(heading: float = 0.0) -> tuple[SearchableFrames, Keypoints, Adjustmen
     own = Tracks(renumbered.astype(np.int32), rows[:, 1], rows[:, 2], len(kept))
     landmarks = Landmarks(points[kept], own, Counts(len(kept), len(kept), "tracks"))
     solved = Adjustment(turned, landmarks, 1.0, ())
-    return SearchableFrames(frames.__getitem__), features.gather(frames), solved
+    return SearchableFrames(frames.__getitem__), detection.gather(frames), solved
 
 
 def _split(solved: Adjustment) -> Adjustment:
@@ -79,7 +80,7 @@ def test_looks_do_not_depend_on_heading() -> None:
     words = straight[0].descriptors[:64]
     for f in range(NUM_FRAMES):
         one, other = (
-            places._aggregate(frames[f].descriptors, words) for frames in (straight, turned)
+            loops._aggregate(frames[f].descriptors, words) for frames in (straight, turned)
         )
         np.testing.assert_allclose(one, other, atol=1e-5)
 
@@ -89,7 +90,7 @@ def _context(frames: SearchableFrames, keypoints: Keypoints) -> MatchContext:
 
 
 def test_the_same_place_looks_most_alike() -> None:
-    looks = places.describe(_scene()[0], NUM_FRAMES, 0)
+    looks = loops.describe(_scene()[0], NUM_FRAMES, 0)
     far = [f for f in range(NUM_FRAMES) if 4 < f < NUM_FRAMES - 4]
     alike = looks @ looks.T
     assert alike[0, NUM_FRAMES - 1] > max(alike[0, f] for f in far)
@@ -102,7 +103,7 @@ def test_a_map_torn_in_two_is_joined_where_it_meets(heading: float) -> None:
     torn = _moved(_split(whole), by)
     unseen = SEEN.copy()
     unseen[NUM_FRAMES // 2 - 1] = True
-    closed = places.run(_context(strongest, keypoints), torn, unseen)
+    closed = loops.run(_context(strongest, keypoints), torn, unseen)
     assert len(closed.pairs) >= 3
     relative = inverse(closed.solved.world_T_rigs[0]) @ closed.solved.world_T_rigs
     true = inverse(whole.world_T_rigs[0]) @ whole.world_T_rigs
@@ -125,7 +126,7 @@ def test_a_confirmed_path_is_not_bent_further_than_it_drifts() -> None:
     """The same torn map, but every step was confirmed by images: then the loops are the error."""
     strongest, keypoints, whole = _scene()
     torn = _moved(_split(whole), pose(np.eye(3), np.array([3.0, 0, 0])))
-    closed = places.run(_context(strongest, keypoints), torn, SEEN)
+    closed = loops.run(_context(strongest, keypoints), torn, SEEN)
     assert len(closed.pairs) == 0 and closed.solved is torn
 
 
@@ -139,9 +140,9 @@ def _loops(shift: float, count: int, support: int, last: int = NUM_FRAMES - 1) -
     return found
 
 
-def _consistent(loops: list[Loop]) -> list[Loop]:
+def _consistent(found: list[Loop]) -> list[Loop]:
     solved = _scene()[2]
-    return places.consistent(loops, solved, SETTINGS.pairs.window)
+    return loops.consistent(found, solved, SETTINGS.pairs.window)
 
 
 def test_a_lone_loop_is_not_believed() -> None:
@@ -169,14 +170,14 @@ def test_what_two_frames_see_fixes_pose_and_scale() -> None:
     true = pose(Rotation.from_rotvec([0.3, 2.0, -0.2]).as_matrix(), np.array([0.4, -0.2, 0.1]))
     points1 = 1.7 * (points0 - true[:3, 3]) @ true[:3, :3]
     points1[:20] = rng.normal(size=(20, 3))
-    found = places.relative_map(points0, points1, 0)
+    found = loops.relative_map(points0, points1, 0)
     assert found is not None and 40 <= found[1] <= 42
     np.testing.assert_allclose(found[0], true, atol=0.05)
-    assert places.relative_map(points0[:20], points1[:20], 0) is None
+    assert loops.relative_map(points0[:20], points1[:20], 0) is None
 
 
 def test_links_between_parts() -> None:
     unseen = np.array([False, True, False, True, False])
-    assert places.connected(np.zeros(5, bool), np.zeros((0, 2), int))
-    assert not places.connected(unseen, np.array([[0, 5]]))
-    assert places.connected(unseen, np.array([[0, 5], [3, 4]]))
+    assert loops.connected(np.zeros(5, bool), np.zeros((0, 2), int))
+    assert not loops.connected(unseen, np.array([[0, 5]]))
+    assert loops.connected(unseen, np.array([[0, 5], [3, 4]]))

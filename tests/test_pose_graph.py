@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from synthetic import drifted, loop_walk
 
-from gsba import pose_graph
 from gsba.geometry import inverse
+from gsba.loop_closure import pose_graph
 
 NUM_FRAMES = 40
 TRUTH = loop_walk(NUM_FRAMES)

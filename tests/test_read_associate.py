@@ -7,10 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gsba.config import ReadSettings, RefineSettings
+from gsba.frames.scan import scan
 from gsba.geometry import inverse, pose, rotation_angle
-from gsba.inputs import coarse_poses
 from gsba.log import GsbaError
-from gsba.read import associate, read_trajectory, scan
+from gsba.pipeline.inputs import coarse_poses
+from gsba.trajectory.association import associate
+from gsba.trajectory.files import read_trajectory
 from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"

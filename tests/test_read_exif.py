@@ -13,12 +13,12 @@ from PIL import Image
 from test_placement import ORIGIN, _frames, _geodetic, _level, _result
 from typer.testing import CliRunner
 
-from gsba import pipeline
 from gsba.cli import app
 from gsba.config import PlacementSettings, RefineSettings
 from gsba.log import GsbaError
-from gsba.placement import check, place
-from gsba.read.exif import gps_of, read_exif_gps
+from gsba.pipeline import refine
+from gsba.placement.exif import gps_of, read_exif_gps
+from gsba.placement.placement import check, place
 from gsba.types import FrameSet
 
 MUNICH = (48.137154, 11.576124, 519.25)
@@ -196,10 +196,10 @@ def test_a_run_is_refused_before_it_begins(tmp_path: Path) -> None:
     slam = tmp_path / "slam.tum"
     slam.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(4)))
     with pytest.raises(GsbaError, match="--gps exif: 0 of 4 frames"):
-        pipeline.refine(folder, slam, tmp_path / "run", settings, fps=1)
+        refine.refine(folder, slam, tmp_path / "run", settings, fps=1)
     (tmp_path / "walk.mp4").write_bytes(b"")
     with pytest.raises(GsbaError, match="a video's frames have no tags"):
-        pipeline.refine(tmp_path / "walk.mp4", slam, tmp_path / "run", settings)
+        refine.refine(tmp_path / "walk.mp4", slam, tmp_path / "run", settings)
     arguments = [
         "refine",
         folder,

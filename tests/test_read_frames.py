@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsba.frames.masks import load_mask
+from gsba.frames.scan import load_erp, load_faces, scan
 from gsba.log import GsbaError
-from gsba.read import load_erp, load_faces, load_mask, scan
 from gsba.types import FACES
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from gsba.geometry import pose
 from gsba.log import GsbaError
-from gsba.read import read_trajectory, write_tum
+from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"

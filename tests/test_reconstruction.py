@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import World, make_world
 
-from gsba.adjust import Adjustment
+from gsba.bundle.adjustment import Adjustment
+from gsba.bundle.reconstruction import assemble
 from gsba.geometry import angular_errors, inverse, pose
 from gsba.log import GsbaError
-from gsba.reconstruction import assemble
 from gsba.types import (
     CoarsePoses,
     Counts,

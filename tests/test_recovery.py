@@ -6,11 +6,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from synthetic import bearings_of, features_of, unit, with_noise
 
-from gsba import adjust, features, frontend, recovery
+from gsba.bundle import adjustment
 from gsba.config import RefineSettings
+from gsba.features import detection
 from gsba.geometry import inverse, pose, rotation_angle
-from gsba.matching import MatchContext, SearchableFrames
-from gsba.recovery import Recovered
+from gsba.matching import correspondences, recovery
+from gsba.matching.guided_search import MatchContext, SearchableFrames
+from gsba.matching.recovery import Recovered
 from gsba.types import CoarsePoses, Keypoints, PoseSource
 
 NUM, NUM_FRAMES = 250, 8
@@ -32,7 +34,7 @@ def _scene(cut: int | None = None) -> tuple[SearchableFrames, Keypoints]:
             if (cut is not None and f >= cut) == bool(place):
                 bearings = with_noise(bearings_of(points, TRUTH[f]), 3e-4, rng)
                 frames.append(features_of(bearings, descriptors))
-    return SearchableFrames(frames.__getitem__), features.gather(frames)
+    return SearchableFrames(frames.__getitem__), detection.gather(frames)
 
 
 def _context(cut: int | None = None) -> MatchContext:
@@ -42,7 +44,7 @@ def _context(cut: int | None = None) -> MatchContext:
 
 def _run(slam: np.ndarray, cut: int | None = None, times: np.ndarray = TIMES) -> Recovered:
     context = _context(cut)
-    guided = frontend.match_neighbours(context, adjust.start(slam))
+    guided = correspondences.match_neighbours(context, adjustment.start(slam))
     coarse = CoarsePoses(slam, np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8), 0.0)
     return recovery.run(context, guided, coarse, times)
 

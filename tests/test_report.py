@@ -10,8 +10,14 @@ import pytest
 
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, pose, rotation_from_quaternion
-from gsba.report import build_report, frame_quality, median_residual_deg, write_poses, write_report
-from gsba.store import StageRecord
+from gsba.report.report import (
+    build_report,
+    frame_quality,
+    median_residual_deg,
+    write_poses,
+    write_report,
+)
+from gsba.store.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
 
 NUM_FRAMES, NUM_POINTS, ERROR_DEG = 4, 20, 0.25

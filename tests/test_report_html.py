@@ -16,9 +16,9 @@ import pytest
 
 from gsba.config import RefineSettings
 from gsba.geometry import bearings_from_erp
-from gsba.report import build_report
-from gsba.report_html import pictures, residual_sphere, views, write_html
-from gsba.store import StageRecord
+from gsba.report.html import pictures, residual_sphere, views, write_html
+from gsba.report.report import build_report
+from gsba.store.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseStatus, Reconstruction
 
 ROUND = {

@@ -7,7 +7,7 @@ from synthetic import bearings_of, unit, with_noise
 
 from gsba.config import VerifySettings
 from gsba.geometry import inverse, pose, rotation_angle
-from gsba.resection import resect
+from gsba.loop_closure.registration import resect
 
 SETTINGS = VerifySettings()
 POSE = pose(Rotation.from_rotvec([0.3, 2.5, -0.4]).as_matrix(), np.array([0.5, -0.2, 0.3]))

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
+from gsba.frames.masks import load_mask
+from gsba.frames.scan import find_panoramas
 from gsba.log import GsbaError
-from gsba.masking import before, choose
-from gsba.read import load_mask
-from gsba.read.frames import find_panoramas
-from gsba.segmentation import Segment, load_segmented, segmented
-from gsba.store import RunStore
+from gsba.masks.merging import before, choose
+from gsba.masks.segmentation import Segment, load_segmented, segmented
+from gsba.store.store import RunStore
 from gsba.types import FACES, FrameSet
 
 WIDTH, NUM = 128, 3

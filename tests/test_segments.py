@@ -7,11 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import drifted, loop_walk, unit
 
-from gsba import read, segments
 from gsba.config import ReadSettings
 from gsba.geometry import carried, inverse, pose, rotation_angle
-from gsba.motion import Steps
-from gsba.segments import GUESS, IMAGES
+from gsba.trajectory import joining
+from gsba.trajectory.joining import GUESS, IMAGES
+from gsba.trajectory.judgement import Steps
+from gsba.trajectory.restarts import associate_pieces, split_restarts
 from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
 
 NUM, BREAK = 40, 17
@@ -50,14 +51,14 @@ def _coarse(poses: np.ndarray) -> CoarsePoses:
 
 
 def test_a_map_begun_anew_is_found() -> None:
-    found = read.split_restarts(Trajectory(TIMES, _begun_anew()))
+    found = split_restarts(Trajectory(TIMES, _begun_anew()))
     assert [len(piece.timestamps) for piece in found] == [BREAK, NUM - BREAK]
 
 
 def test_a_map_begun_anew_whose_first_pose_is_missing_is_found() -> None:
     """The first entry of a frame trajectory may be the second frame of its map."""
     poses, first = np.delete(_begun_anew(0.6), BREAK, axis=0), np.delete(TIMES, BREAK)
-    found = read.split_restarts(Trajectory(first, poses))
+    found = split_restarts(Trajectory(first, poses))
     assert [len(piece.timestamps) for piece in found] == [BREAK, NUM - BREAK - 1]
 
 
@@ -69,13 +70,13 @@ def test_one_map_stays_one(what: str) -> None:
         poses[12:16, 0, 3] += 1e-3
     elif what == "standing at the start":
         poses[:5] = np.eye(4)
-    assert len(read.split_restarts(Trajectory(TIMES, poses))) == 1
+    assert len(split_restarts(Trajectory(TIMES, poses))) == 1
 
 
 def test_pieces_keep_their_worlds_until_joined() -> None:
     poses = _begun_anew()
     pieces = [Trajectory(TIMES[:BREAK], poses[:BREAK]), Trajectory(TIMES[BREAK:], poses[BREAK:])]
-    coarse = read.associate_pieces(_frames(), pieces[::-1], ReadSettings())  # in any order
+    coarse = associate_pieces(_frames(), pieces[::-1], ReadSettings())  # in any order
     np.testing.assert_allclose(coarse.world_T_rigs, poses, atol=1e-12)
     assert coarse.segments is not None
     np.testing.assert_array_equal(coarse.segments, np.arange(NUM) >= BREAK)
@@ -86,7 +87,7 @@ def test_frames_between_pieces_go_on_from_the_nearer_one() -> None:
     poses = _begun_anew()
     first, second = slice(0, BREAK - 4), slice(BREAK + 2, NUM)
     pieces = [Trajectory(TIMES[piece], poses[piece]) for piece in (first, second)]
-    coarse = read.associate_pieces(_frames(), pieces, ReadSettings())
+    coarse = associate_pieces(_frames(), pieces, ReadSettings())
     between = np.arange(BREAK - 4, BREAK + 2)
     assert (coarse.sources[between] == PoseSource.EXTRAPOLATED).all()
     assert coarse.segments is not None and coarse.segments[BREAK - 4] == 0
@@ -98,18 +99,18 @@ def test_frames_between_pieces_go_on_from_the_nearer_one() -> None:
 def test_where_pieces_overlap_the_earlier_leads() -> None:
     other = carried(TRUTH, SCALE, MOVE)
     pieces = [Trajectory(TIMES[:25], TRUTH[:25]), Trajectory(TIMES[10:], other[10:])]
-    coarse = read.associate_pieces(_frames(), pieces, ReadSettings())
+    coarse = associate_pieces(_frames(), pieces, ReadSettings())
     np.testing.assert_allclose(coarse.world_T_rigs[:25], TRUTH[:25], atol=1e-12)
     np.testing.assert_allclose(coarse.world_T_rigs[25:], other[25:], atol=1e-12)
     inside = [pieces[0], Trajectory(TIMES[10:20], other[10:20])]
-    alone = read.associate_pieces(_frames(25), inside, ReadSettings())
+    alone = associate_pieces(_frames(25), inside, ReadSettings())
     assert alone.segments is None
 
 
 def test_the_images_over_the_break_join_both_pieces() -> None:
     poses = TRUTH.copy()
     poses[BREAK:] = carried(TRUTH[BREAK:], SCALE, MOVE)
-    coarse, joints = segments.join(_coarse(poses), *_steps(np.ones(NUM - 1, bool)))
+    coarse, joints = joining.join(_coarse(poses), *_steps(np.ones(NUM - 1, bool)))
     np.testing.assert_allclose(coarse.world_T_rigs, TRUTH, atol=1e-6)
     (joint,) = joints
     assert (joint.first, joint.last, joint.how) == (BREAK, NUM - 1, IMAGES)
@@ -124,7 +125,7 @@ def test_false_poses_near_the_break_do_not_bend_the_joint() -> None:
     turn = Rotation.from_rotvec([0, 0.5, 0]).as_matrix()
     for f in (BREAK - 3, BREAK + 2):
         poses[f] = poses[f] @ pose(turn, np.array([0.5, 0.3, 0]))
-    coarse, (joint,) = segments.join(_coarse(poses), *_steps(np.ones(NUM - 1, bool)))
+    coarse, (joint,) = joining.join(_coarse(poses), *_steps(np.ones(NUM - 1, bool)))
     good = ~np.isin(np.arange(NUM), (BREAK - 3, BREAK + 2))
     off = np.linalg.norm(coarse.world_T_rigs[good, :3, 3] - TRUTH[good, :3, 3], axis=1)
     turned = np.swapaxes(coarse.world_T_rigs[good, :3, :3], 1, 2) @ TRUTH[good, :3, :3]
@@ -137,8 +138,8 @@ def test_without_images_over_the_break_the_pace_goes_on() -> None:
     poses[BREAK:] = carried(TRUTH[BREAK:], SCALE, MOVE)
     seen = np.ones(NUM - 1, bool)
     seen[BREAK - 1] = False
-    coarse, joints = segments.join(_coarse(poses), *_steps(seen))
+    coarse, joints = joining.join(_coarse(poses), *_steps(seen))
     assert joints[0].how == GUESS and joints[0].scale == pytest.approx(1 / SCALE, rel=0.1)
-    np.testing.assert_array_equal(np.flatnonzero(segments.guessed(joints, NUM)), [BREAK - 1])
+    np.testing.assert_array_equal(np.flatnonzero(joining.guessed(joints, NUM)), [BREAK - 1])
     steps = np.linalg.norm(np.diff(coarse.world_T_rigs[:, :3, 3], axis=0), axis=1)
     assert steps[BREAK - 1] < 2 * np.median(steps)

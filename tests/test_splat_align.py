@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 from tiny_run import Case
 
+from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.config import SplatSettings
-from gsba.evaluate import evaluate
+from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import pose
-from gsba.rig import RIG_R_FACE, CubeRig
+from gsba.splat.alignment import align, bearing_block, render_view
 from gsba.splat.backend import CpuBackend
 from gsba.splat.gaussians import Gaussians, from_cloud
+from gsba.splat.scene import load_faces, make_views, near_of, start_cloud
 from gsba.splat.train import train
-from gsba.splat_align import align, bearing_block, render_view
-from gsba.splatting import load_faces, make_views, near_of, start_cloud
 from gsba.types import Trajectory
 
 BACKEND = CpuBackend(2)

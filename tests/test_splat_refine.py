@@ -8,10 +8,10 @@ import pytest
 from splat_moves import HARMS, harmed, run, settings_for, spoiled
 from tiny_run import NUM_FRAMES, Case, computed_stages
 
-from gsba import splat_refine
 from gsba.config_file import load_config
-from gsba.evaluate import evaluate
+from gsba.evaluate.trajectory import evaluate
 from gsba.log import GsbaError
+from gsba.splat import refinement
 from gsba.types import Trajectory
 
 
@@ -41,8 +41,8 @@ def test_a_harmful_move_is_undone(
 ) -> None:
     given = spoiled(case, 0.1, 0.003, 50.0)
     settings = settings_for(sizes=(48,), first_steps=80, steps=40, max_growth=100.0)
-    worse = harmed(splat_refine._Turns._moved, HARMS[harm], 0)
-    monkeypatch.setattr(splat_refine._Turns, "_moved", worse)
+    worse = harmed(refinement._Turns._moved, HARMS[harm], 0)
+    monkeypatch.setattr(refinement._Turns, "_moved", worse)
     with caplog.at_level(logging.INFO, "gsba"):
         result = run(case, given, settings)
     (move,) = result.moves
@@ -56,8 +56,8 @@ def test_a_move_that_nothing_speaks_for_is_undone(
 ) -> None:
     """A thousandth of the helpful move, away from poses that fit their observations."""
     given = spoiled(case, 0.0, 0.0, 1.0)
-    tiny = harmed(splat_refine._Turns._moved, lambda steps, rng: rng.normal(0, 1e-6, (8, 6)), 0)
-    monkeypatch.setattr(splat_refine._Turns, "_moved", tiny)
+    tiny = harmed(refinement._Turns._moved, lambda steps, rng: rng.normal(0, 1e-6, (8, 6)), 0)
+    monkeypatch.setattr(refinement._Turns, "_moved", tiny)
     (move,) = run(case, given, settings_for(sizes=(48,))).moves
     assert not move.accepted and abs(move.evidence) < 2
 
@@ -82,7 +82,7 @@ def test_an_interrupted_refinement_goes_on_to_the_same_result(
 ) -> None:
     given, settings = spoiled(case, 0.1, 0.003, 50.0), settings_for(sizes=(24, 32))
     whole = run(case, given, settings)
-    real, calls = splat_refine._Turns.turn, []
+    real, calls = refinement._Turns.turn, []
 
     def turn(self, before):
         calls.append(before.turns)
@@ -90,7 +90,7 @@ def test_an_interrupted_refinement_goes_on_to_the_same_result(
             raise KeyboardInterrupt
         return real(self, before)
 
-    monkeypatch.setattr(splat_refine._Turns, "turn", turn)
+    monkeypatch.setattr(refinement._Turns, "turn", turn)
     kept = {"checkpoint": tmp_path / "turns.npz", "key": "these"}
     with pytest.raises(KeyboardInterrupt):
         run(case, given, settings, **kept)

@@ -6,7 +6,7 @@ import dense_splat
 import numpy as np
 import pytest
 
-from gsba.rig import CubeRig
+from gsba.camera.rig import CubeRig
 from gsba.splat import _tiles
 from gsba.splat.camera import FaceCamera, face_camera
 from gsba.splat.gaussians import Gaussians

@@ -9,17 +9,16 @@ import pytest
 from tiny_run import Case
 from typer.testing import CliRunner
 
-from gsba import splatting
+from gsba.camera.rig import CubeRig
 from gsba.cli import app
 from gsba.config import SplatSettings
-from gsba.evaluate_splat import compare, poses_for
+from gsba.evaluate.splats import compare, poses_for
 from gsba.geometry import pose
 from gsba.log import GsbaError
-from gsba.pipeline import load_run
-from gsba.read import read_trajectory, write_tum
-from gsba.rig import CubeRig
-from gsba.splat import from_cloud, read_ply
+from gsba.pipeline.refine import load_run
+from gsba.splat import from_cloud, read_ply, scene
 from gsba.splat.backend import CpuBackend
+from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
 TINY = ["--iterations", "30", "--face-size", "32", "--backend", "cpu"]
@@ -95,24 +94,24 @@ def test_bad_options_are_one_line(run: Path, option: tuple[str, str]) -> None:
 def test_held_out_frames_are_whole_and_spread() -> None:
     usable = np.ones(20, bool)
     usable[3] = False
-    split = splatting.split_frames(usable, 8)
+    split = scene.split_frames(usable, 8)
     assert split.held_out.tolist() == [5, 13] and len(split.training) == 17
     assert not np.isin(3, split.training)
     with pytest.raises(GsbaError, match="too few"):
-        splatting.split_frames(usable[:3], 8)
+        scene.split_frames(usable[:3], 8)
 
 
 def test_start_cloud_lies_in_the_world_of_the_poses(case: Case) -> None:
     reconstruction = case.result.reconstruction
     poses = reconstruction.world_T_rigs
     frames = np.arange(len(poses))
-    cloud = splatting.start_cloud(reconstruction, poses, frames, 0)
+    cloud = scene.start_cloud(reconstruction, poses, frames, 0)
     known = {tuple(np.round(point, 2)) for point in reconstruction.points_world}
     same = [tuple(np.round(point, 2)) in known for point in cloud.means.astype(float)]
     assert len(cloud) > 0.5 * len(known) and np.mean(same) > 0.7
     doubled = poses.copy()
     doubled[:, :3, 3] *= 2
-    twice = splatting.start_cloud(reconstruction, doubled, frames, 0)
+    twice = scene.start_cloud(reconstruction, doubled, frames, 0)
     assert len(twice) == len(cloud) and np.allclose(twice.means, 2 * cloud.means, rtol=1e-3)
 
 
@@ -129,8 +128,8 @@ def test_a_panorama_shows_what_the_faces_show(run: Path) -> None:
     reconstruction, _ = load_run(run)
     splat = read_ply(run / "splat/refined/point_cloud.ply")
     where, backend = reconstruction.world_T_rigs[0], CpuBackend(1)
-    panorama = splatting.render_panorama(splat, where, 256, 0.01, backend)
-    faces = splatting.render_faces(splat, where, CubeRig(65, np.pi / 2), 0.01, backend)
+    panorama = scene.render_panorama(splat, where, 256, 0.01, backend)
+    faces = scene.render_faces(splat, where, CubeRig(65, np.pi / 2), 0.01, backend)
     assert np.abs(panorama[64, 128].astype(int) - faces[0, 32, 32]).max() < 12  # straight ahead
     assert np.abs(panorama[64, 192].astype(int) - faces[1, 32, 32]).max() < 12  # right
 
@@ -139,20 +138,20 @@ def test_a_masked_face_is_left_out(case: Case) -> None:
     images = np.zeros((6, 16, 16, 3), np.uint8)
     use = np.ones((6, 16, 16), bool)
     use[5] = False
-    views = splatting.make_views(images, use, np.eye(4)[None])
+    views = scene.make_views(images, use, np.eye(4)[None])
     assert len(views.cameras) == 5 and views.use is None
-    nothing = splatting.make_views(images, np.zeros_like(use), np.eye(4)[None])
+    nothing = scene.make_views(images, np.zeros_like(use), np.eye(4)[None])
     gaussians = from_cloud(np.ones((2, 3)), np.zeros((2, 3), np.uint8))
     with pytest.raises(GsbaError, match="held-out frames are masked"):
-        splatting.measure(gaussians, nothing, SplatSettings(), 0.01, CpuBackend(1))
+        scene.measure(gaussians, nothing, SplatSettings(), 0.01, CpuBackend(1))
 
 
 def test_panoramas_at_one_place_are_scored_apart() -> None:
     images = np.zeros((12, 16, 16, 3), np.uint8)
     images[6:] = 128
-    views = splatting.make_views(images, np.ones((12, 16, 16), bool), np.eye(4)[None].repeat(2, 0))
+    views = scene.make_views(images, np.ones((12, 16, 16), bool), np.eye(4)[None].repeat(2, 0))
     gaussians = from_cloud(np.full((2, 3), 99.0), np.zeros((2, 3), np.uint8))
-    scores = splatting.measure(gaussians, views, SplatSettings(), 0.01, CpuBackend(1))
+    scores = scene.measure(gaussians, views, SplatSettings(), 0.01, CpuBackend(1))
     assert list(scores) == [0, 1] and scores[0].psnr > scores[1].psnr
     assert scores[1].psnr == pytest.approx(-20 * np.log10(128 / 255), abs=1e-3)
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gsba.camera.rig import CubeRig
 from gsba.config import SplatSettings
 from gsba.geometry import pose
 from gsba.log import GsbaError
-from gsba.rig import CubeRig
 from gsba.splat import adam
 from gsba.splat.backend import CpuBackend, choose_backend
 from gsba.splat.camera import face_camera

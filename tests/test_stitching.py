@@ -8,13 +8,13 @@ import pytest
 from synthetic import RIG, World, make_world
 
 from factors.sphere_field import SphereField, num_harmonics
-from gsba import adjust, graph, stitching
-from gsba.adjust import Adjustment
+from gsba.bundle import adjustment, prior_factors, stitching
+from gsba.bundle.adjustment import Adjustment
+from gsba.bundle.optimizer import optimize
+from gsba.bundle.stitching import Stitching, corrected, with_noise_of
+from gsba.camera.straighten import straightened
 from gsba.config import RefineSettings
 from gsba.geometry import bearings_from_erp, pose_similarity
-from gsba.optimize import optimize
-from gsba.read.corrected import straightened
-from gsba.stitching import Stitching, corrected, with_noise_of
 from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
 
 SIGMA = 2e-4  # radians
@@ -44,18 +44,18 @@ def _found(bent: bool) -> tuple[World, Adjustment, Keypoints, Stitching]:
     sighted = Sighted(
         keypoints, np.ones(len(keypoints.faces), bool), world.tracks, Counts(0, 0, "observations")
     )
-    priors = graph.build(world.world_T_rigs, SETTINGS.priors)
-    start = adjust.start(world.world_T_rigs)
+    priors = prior_factors.build(world.world_T_rigs, SETTINGS.priors)
+    start = adjustment.start(world.world_T_rigs)
     given = priors, RIG, (30.0, 6.0), SETTINGS, 1
-    solved, calibrated = adjust.run_sighted(sighted, start, *given)
+    solved, calibrated = adjustment.run_sighted(sighted, start, *given)
     none = SphereField.none()
     found = stitching.run(sighted, calibrated, solved, none, priors, RIG, SETTINGS, 1)
     return world, solved, keypoints, found
 
 
-def _errors(world: World, adjustment: Adjustment) -> tuple[float, float]:
+def _errors(world: World, solved: Adjustment) -> tuple[float, float]:
     """Root mean square error of positions, and of rotations in radians, after Sim(3)."""
-    poses, true = adjustment.world_T_rigs, world.world_T_rigs
+    poses, true = solved.world_T_rigs, world.world_T_rigs
     scale, rotation, shift = pose_similarity(poses, true)
     off = scale * poses[:, :3, 3] @ rotation.T + shift - true[:, :3, 3]
     turned = rotation @ poses[:, :3, :3] - true[:, :3, :3]
@@ -113,7 +113,7 @@ def test_too_little_is_left_alone() -> None:
     small = replace(before, landmarks=landmarks)
     sighted = Sighted(keypoints, np.ones(len(keypoints.faces), bool), some, Counts(0, 0, "o"))
     found = stitching.run(
-        sighted, keypoints, small, SphereField.none(), graph.build(world.world_T_rigs,
+        sighted, keypoints, small, SphereField.none(), prior_factors.build(world.world_T_rigs,
         SETTINGS.priors), RIG, SETTINGS, 1,
     )  # fmt: skip
     assert not found.field and found.adjustment is small
@@ -126,14 +126,14 @@ def test_model_predicts_the_cost() -> None:
         update={"loss": "none", "relative_tolerance": 1e-9}
     )  # fmt: skip
     settings = SETTINGS.model_copy(update={"solver": plain})
-    priors = graph.build(world.world_T_rigs, settings.priors)
+    priors = prior_factors.build(world.world_T_rigs, settings.priors)
     landmarks = Landmarks(world.points_world, world.tracks, Counts(0, 0, "tracks"))
 
     def solved(field: SphereField) -> tuple[Adjustment, float]:
         given = corrected(keypoints, field, RIG), RIG, 1.0, settings, 1
-        block = adjust.landmark_block(landmarks, *given)
-        result = optimize(priors, [block], adjust.values_of(world.world_T_rigs), plain)
-        poses = adjust.poses_of(result.values, len(world.world_T_rigs))
+        block = adjustment.landmark_block(landmarks, *given)
+        result = optimize(priors, [block], adjustment.values_of(world.world_T_rigs), plain)
+        poses = adjustment.poses_of(result.values, len(world.world_T_rigs))
         return Adjustment(poses, landmarks, 1.0, ()), block.error(result.values)
 
     before, cost = solved(SphereField.none())

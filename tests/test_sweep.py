@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
-from gsba import sweep
 from gsba.geometry import bearings_from_erp, erp_from_bearings, pose
+from gsba.masks import _distractor_kernels
 
 HEIGHT, WIDTH, NUM, CAP = 24, 48, 5, 60.0
 
@@ -41,7 +41,7 @@ def test_comparison_is_that_of_numpy() -> None:
 
     differences = np.empty((NUM, HEIGHT, WIDTH), np.float32)
     away, spread = np.empty((HEIGHT, WIDTH), np.float32), np.empty((HEIGHT, WIDTH), np.float32)
-    sweep.compare(
+    _distractor_kernels.compare(
         own, least, most, others, n_T_own, rays.astype(np.float32), inverse, np.float32(CAP),
         differences, away, spread,
     )  # fmt: skip
@@ -81,7 +81,9 @@ def test_best_distances_are_kept() -> None:
     steps = draw.uniform(0, CAP, (4, NUM, *shape)).astype(np.float32)
     away, spread = draw.uniform(0, CAP, (2, 4, *shape)).astype(np.float32)
     for step in range(4):
-        sweep.keep_best(steps[step], away[step], spread[step], best, away_best, spread_best)
+        _distractor_kernels.keep_best(
+            steps[step], away[step], spread[step], best, away_best, spread_best
+        )
     ordered = np.sort(steps, axis=1).min(axis=0)
     np.testing.assert_array_equal(best, ordered[1:3])
     np.testing.assert_array_equal(spread_best, spread.min(axis=0))

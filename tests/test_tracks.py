@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsba import tracks
+from gsba.bundle import tracks
 from gsba.types import Matches, Tracks
 
 

@@ -4,9 +4,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from synthetic import RIG, unit, with_noise
 
-from gsba import tripod
+from gsba.bundle import rotation_only
+from gsba.camera.rig import owner_faces
 from gsba.geometry import rotation_angle
-from gsba.rig import owner_faces
 from gsba.types import Keypoints, Tracks
 
 NUM, DIRECTIONS, SIGMA = 40, 800, 1e-3
@@ -43,7 +43,7 @@ def _drifting(rotations: np.ndarray) -> np.ndarray:
 def test_rotations_are_found_to_their_covariances() -> None:
     rotations, tracks, keypoints = _scene(false_share=0.05)
     start = _drifting(rotations)
-    found, covariances, used = tripod.solve(start, tracks, keypoints)
+    found, covariances, used = rotation_only.solve(start, tracks, keypoints)
     errors = Rotation.from_matrix(np.swapaxes(rotations, 1, 2) @ found).as_rotvec()
     before = rotation_angle(np.swapaxes(rotations, 1, 2) @ start)
     assert np.linalg.norm(errors, axis=1).max() < 5e-4 < 0.02 < before.max()
@@ -61,5 +61,5 @@ def test_exact_rays_give_exact_rotations() -> None:
     exact = np.concatenate([unit(directions) @ rotation for rotation in rotations])
     keypoints = Keypoints(starts, keypoints.pixels, keypoints.faces, exact, keypoints.sigmas_rad,
                           keypoints.colors)  # fmt: skip
-    found, _, _ = tripod.solve(_drifting(rotations), tracks, keypoints)
+    found, _, _ = rotation_only.solve(_drifting(rotations), tracks, keypoints)
     assert rotation_angle(np.swapaxes(rotations, 1, 2) @ found).max() < 1e-8

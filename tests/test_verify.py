@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import bearings_of, unit, with_noise
 
-from gsba import verify
 from gsba.config import VerifySettings
 from gsba.geometry import pose, rotation_angle
+from gsba.matching import verification
 from gsba.types import Keypoints, Matches, VerifiedPairs
 
 NUM = 200
@@ -36,7 +36,7 @@ def _direction_error(found: np.ndarray, true: np.ndarray) -> float:
 @pytest.mark.parametrize("seed", range(3))
 def test_the_pose_is_found_among_outliers(seed: int) -> None:
     bearings0, bearings1, true = _see(F0_T_F1, 0.4, seed)
-    estimate = verify.relative_pose(bearings0, bearings1, SETTINGS, 0)
+    estimate = verification.relative_pose(bearings0, bearings1, SETTINGS, 0)
     assert estimate is not None
     found, inliers = estimate
     # 120 bearings of 0.017 degrees with some 10 degrees of parallax.
@@ -51,9 +51,9 @@ def test_the_pose_is_found_among_outliers(seed: int) -> None:
 def test_too_few_matches_make_no_pose() -> None:
     bearings0, bearings1, _ = _see(F0_T_F1, 0.0)
     few = SETTINGS.min_inliers - 1
-    assert verify.relative_pose(bearings0[:few], bearings1[:few], SETTINGS, 0) is None
+    assert verification.relative_pose(bearings0[:few], bearings1[:few], SETTINGS, 0) is None
     noise0, noise1, _ = _see(F0_T_F1, 1.0)
-    assert verify.relative_pose(noise0, noise1, SETTINGS, 0) is None
+    assert verification.relative_pose(noise0, noise1, SETTINGS, 0) is None
 
 
 def _run(
@@ -80,7 +80,7 @@ def _run(
         np.concatenate([np.zeros((0, 2), np.int32), *rows]),
     )
     spread = np.zeros(len(views)) if sigmas is None else np.array(sigmas)
-    return verify.run(matches, keypoints, np.array(priors), spread, SETTINGS, 0)
+    return verification.run(matches, keypoints, np.array(priors), spread, SETTINGS, 0)
 
 
 def _turned(f0_T_f1: np.ndarray, degrees: float) -> np.ndarray:
@@ -161,6 +161,6 @@ def test_no_pairs_are_no_error() -> None:
 
 def test_the_seed_decides() -> None:
     bearings0, bearings1, _ = _see(F0_T_F1, 0.4)
-    first, again = (verify.relative_pose(bearings0, bearings1, SETTINGS, 7) for _ in range(2))
+    first, again = (verification.relative_pose(bearings0, bearings1, SETTINGS, 7) for _ in range(2))
     assert first is not None and again is not None
     np.testing.assert_array_equal(first[0], again[0])

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from gsba import read
 from gsba.cli import app
 from gsba.config import VideoSettings
+from gsba.frames.scan import scan
 from gsba.log import GsbaError
+from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory
 from gsba.video import extract, extraction, is_video
 from gsba.video.likeness import apparent_motion_deg, miniature, sharpness
@@ -108,7 +109,7 @@ def test_times_are_those_of_presentation(tmp_path: Path, suffix: str, codec: str
     np.testing.assert_allclose(list(times.values()), expected, atol=1e-9)
     assert list(times) == [f"{i:06d}.jpg" for i in range(0, 40, 3)]
     assert _indices(tmp_path / "frames") == list(range(0, 40, 3))
-    frames = read.scan(tmp_path / "frames")
+    frames = scan(tmp_path / "frames")
     np.testing.assert_array_equal(frames.timestamps, list(times.values()))
     assert (frames.width, frames.height) == (WIDTH, HEIGHT)
 
@@ -135,11 +136,11 @@ def test_frames_at_the_times_of_a_trajectory(film: Path, tmp_path: Path) -> None
     wanted = np.array([3, 4, 40, 89])
     poses = np.tile(np.eye(4), (5, 1, 1))
     times = np.append(wanted * 1001 / 30_000 + 1e-4, 99.0)  # stella's clock rounds; one is outside
-    read.write_tum(tmp_path / "keyframes.tum", Trajectory(times, poses))
+    write_tum(tmp_path / "keyframes.tum", Trajectory(times, poses))
     settings = VideoSettings(at=str(tmp_path / "keyframes.tum"))
     extract(film, tmp_path / "frames", settings)
     assert _indices(tmp_path / "frames") == list(wanted)
-    read.write_tum(tmp_path / "late.tum", Trajectory(times + 50, poses))
+    write_tum(tmp_path / "late.tum", Trajectory(times + 50, poses))
     with pytest.raises(GsbaError, match=r"late\.tum: none of its times"):
         extract(film, tmp_path / "none", VideoSettings(at=str(tmp_path / "late.tum")))
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from tiny_run import SETTINGS, Case, computed_stages
 
-from gsba import read, refine
+from gsba import refine
 from gsba.config import VideoSettings
 from gsba.log import GsbaError
+from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.video import extract
 
 av = pytest.importorskip("av", reason="PyAV is not installed")
@@ -49,9 +50,9 @@ def test_bad_input_fails_before_decoding(tmp_path: Path) -> None:
     (tmp_path / "walk.mp4").write_bytes(b"no video")
     with pytest.raises(GsbaError, match=r"nowhere\.tum"):
         refine(tmp_path / "walk.mp4", tmp_path / "nowhere.tum", tmp_path / "run")
-    read.write_tum(
+    write_tum(
         tmp_path / "slam.tum",
-        read.read_trajectory(_two_poses(tmp_path / "two.tum")),
+        read_trajectory(_two_poses(tmp_path / "two.tum")),
     )
     with pytest.raises(GsbaError, match=r"walk\.mp4: cannot be read as video"):
         refine(tmp_path / "walk.mp4", tmp_path / "slam.tum", tmp_path / "run")

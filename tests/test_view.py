@@ -22,11 +22,11 @@ from tiny_run import NUM_FRAMES, Case
 from typer.testing import CliRunner
 
 from gsba import view
+from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.cli import app
 from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
-from gsba.placement import Placement, read_placement
-from gsba.rig import RIG_R_FACE, CubeRig
+from gsba.placement.placement import Placement, read_placement
 from gsba.splat import Gaussians, write_ply
 from gsba.types import FACES
 

@@ -4,8 +4,8 @@ import numpy as np
 
 from gsba.config import AlignSettings
 from gsba.geometry import pose
+from gsba.photometric.references import references, views
 from gsba.types import Counts, Landmarks, Tracks
-from gsba.views import references, views
 
 ALL = np.ones(1, bool)
 

@@ -55,8 +55,8 @@ def mask(
     ] = None,
 ) -> None:
     """Find what carries the camera and write it as a mask to look at and to use."""
-    from gsba.carrier import find_carrier, write_carrier
-    from gsba.read.frames import find_panoramas
+    from gsba.frames.scan import find_panoramas
+    from gsba.masks.carrier import find_carrier, write_carrier
 
     found_frames = find_panoramas(frames, masks)
     carrier = find_carrier(found_frames)

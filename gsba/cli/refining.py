@@ -131,9 +131,9 @@ def demo(
     """Render a walk with exact truth, spoil its trajectory as SLAM would, refine and compare."""
     from gsba.config import RefineSettings
     from gsba.demo import make_walk
-    from gsba.evaluate import evaluate as compare
-    from gsba.evaluate import format_table
-    from gsba.read import read_trajectory
+    from gsba.evaluate.trajectory import evaluate as compare
+    from gsba.evaluate.trajectory import format_table
+    from gsba.trajectory.files import read_trajectory
 
     walk = make_walk(out / "walk", path, heading, frames, width, seed)  # type: ignore[arg-type]
     run = out / "run"

@@ -20,7 +20,7 @@ from gsba.cli.splat import (
 from gsba.log import GsbaError
 
 if TYPE_CHECKING:
-    from gsba.consistency import Consistency
+    from gsba.evaluate.consistency import Consistency
     from gsba.types import Trajectory
 
 
@@ -62,14 +62,14 @@ def export(
     from gsba.config_file import validated
     from gsba.export import ExportFormat
     from gsba.export import export as write
-    from gsba.run_folder import claim
+    from gsba.store.folder import claim
 
     if to not in list(ExportFormat):
         raise GsbaError(f"--to {to} is not known: use one of {', '.join(ExportFormat)}")
     asked = {"up": up, "length": scale, "between": between, "gps": gps, "align": align}
     settings = validated({"placement": asked, "export": {"face_size": face_size}}).placement
-    from gsba.pipeline import load_run
-    from gsba.placement import place
+    from gsba.pipeline.refine import load_run
+    from gsba.placement.placement import place
 
     reconstruction, frames, *_ = load_run(run)
     folder = out or run / to
@@ -112,11 +112,11 @@ def evaluate(
         if not splat:
             raise GsbaError("nothing to compare with: give --truth FILE, or --splat")
         return
-    from gsba.evaluate import evaluate as compare
-    from gsba.evaluate import format_table
-    from gsba.induced import depth_maps, induced_errors
-    from gsba.read import read_trajectory
-    from gsba.records import atomic_write
+    from gsba.evaluate.pixels import depth_maps, induced_errors
+    from gsba.evaluate.trajectory import evaluate as compare
+    from gsba.evaluate.trajectory import format_table
+    from gsba.store.records import atomic_write
+    from gsba.trajectory.files import read_trajectory
 
     path = estimate / "trajectory.tum" if estimate.is_dir() else estimate
     found, true = read_trajectory(path), read_trajectory(truth)
@@ -144,8 +144,8 @@ def evaluate(
 
 def _consistency(run: Path, truth: "Trajectory") -> "tuple[Consistency | None, str]":
     """How the covariances of a run compare with its errors, and that or why not in words."""
-    from gsba.consistency import format_consistency, judge
-    from gsba.results import load_run
+    from gsba.evaluate.consistency import format_consistency, judge
+    from gsba.pipeline.outputs import load_run
 
     try:
         reconstruction, frames = load_run(run)

@@ -55,13 +55,12 @@ def render(
     """Render a splat at the refined pose of a frame: six faces and a panorama."""
     import numpy as np
 
-    from gsba import splatting
-    from gsba.evaluate_splat import write_image
-    from gsba.pipeline import load_run
-    from gsba.rig import CubeRig
-    from gsba.run_folder import claim
-    from gsba.splat import read_ply
+    from gsba.camera.rig import CubeRig
+    from gsba.evaluate.splats import write_image
+    from gsba.pipeline.refine import load_run
+    from gsba.splat import read_ply, scene
     from gsba.splat.backend import choose_backend
+    from gsba.store.folder import claim
     from gsba.types import FACES
 
     settings = splat_settings(None, face_size, backend)
@@ -69,11 +68,11 @@ def render(
     if frame not in frames.names:
         raise GsbaError(f"no frame {frame!r} in {run}: its first is {frames.names[0]!r}")
     gaussians, renderer = read_ply(splat), choose_backend(settings.backend)
-    near = splatting.near_of(reconstruction.world_T_rigs, settings)
+    near = scene.near_of(reconstruction.world_T_rigs, settings)
     pose = reconstruction.world_T_rigs[frames.names.index(frame)]
     folder, rig = out or run / "renderings", CubeRig(settings.face_size, np.pi / 2)
-    faces = splatting.render_faces(gaussians, pose, rig, near, renderer)
-    panorama = splatting.render_panorama(gaussians, pose, 4 * settings.face_size, near, renderer)
+    faces = scene.render_faces(gaussians, pose, rig, near, renderer)
+    panorama = scene.render_panorama(gaussians, pose, 4 * settings.face_size, near, renderer)
     for name, image in [*zip(FACES, faces, strict=True), ("erp", panorama)]:
         write_image(folder / f"{frame}_{name}.png", image)
     if folder.resolve().is_relative_to(run.resolve()):
@@ -85,8 +84,8 @@ def evaluate_splat(
     run: Path, against: Sequence[Path], settings: "SplatSettings", lpips: Sequence[Path]
 ) -> None:
     """Train and measure a splat on the run's poses and on others."""
-    from gsba.evaluate_splat import format_table
-    from gsba.read import read_trajectory
+    from gsba.evaluate.splats import format_table
+    from gsba.trajectory.files import read_trajectory
 
     out = run / "splat-evaluation"
     others = {}
@@ -106,11 +105,11 @@ def _compare(
     run: Path, others, settings: "SplatSettings", out: Path, lpips_weights: Sequence[Path]
 ):
     """Results of the run's own poses and of others."""
-    from gsba.evaluate_splat import compare, poses_for
-    from gsba.pipeline import load_run
-    from gsba.run_folder import claim
+    from gsba.evaluate.splats import compare, poses_for
+    from gsba.pipeline.refine import load_run
     from gsba.splat.backend import choose_backend
     from gsba.splat.lpips import Lpips
+    from gsba.store.folder import claim
 
     lpips = Lpips(lpips_weights) if lpips_weights else None
     reconstruction, frames = load_run(run)

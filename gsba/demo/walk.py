@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from gsba.demo.degrade import degrade
 from gsba.geometry import bearings_from_erp, pose
 from gsba.log import GsbaError, track
-from gsba.read import write_tum
+from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory
 
 WalkPath = Literal["rectangle", "oval", "open"]

@@ -19,11 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.rig import RIG_R_FACE
 from gsba.export.images import face_size_for, suffix_of, write_faces, write_panoramas
 from gsba.export.ply import write_splat_points
 from gsba.geometry import erp_from_bearings, inverse, quaternion_from_rotation
 from gsba.log import GsbaError
-from gsba.rig import RIG_R_FACE
 from gsba.types import FACES, FrameSet, Reconstruction
 
 TEST_EVERY = 8  # frames, as the trainers' own hold-out

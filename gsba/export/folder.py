@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from gsba.log import GsbaError
-from gsba.records import disk_errors
+from gsba.store.records import disk_errors
 from gsba.version import __version__
 
 MARKER = "export.json"  # {"gsba": version, "format": name, "wrote": top-level entries}

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba.export.folder import output_folder
-from gsba.placement import Placement
+from gsba.placement.placement import Placement
 from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -92,7 +92,7 @@ def _write(
                 partial / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
             )
         case ExportFormat.TUM:
-            from gsba.read import write_tum
+            from gsba.trajectory.files import write_tum
 
             trajectory = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
             write_tum(partial / "trajectory.tum", trajectory)

@@ -17,9 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.rig import CubeRig
+from gsba.frames.masks import load_mask
+from gsba.frames.scan import load_erp, load_faces
 from gsba.log import GsbaError, track
-from gsba.read import load_erp, load_faces, load_mask
-from gsba.rig import CubeRig
 from gsba.types import FACES, FrameSet
 
 JPEG_QUALITY = 95
@@ -74,7 +75,7 @@ def write_faces(
     def write(f: int) -> None:
         paths = [image_path(f, face) for face in faces]
         if frames.layout == "erp":
-            from gsba.cubemap import cut
+            from gsba.frames.cubemap import cut
 
             _write_all(paths, cut(load_erp(frames, f), rig))
         elif size == frames.width and all(
@@ -159,7 +160,7 @@ def _write_all(paths: Sequence[Path], images: np.ndarray) -> None:
 def _write_face_masks(
     frames: FrameSet, f: int, rig: CubeRig, paths: Sequence[Path], faces: Sequence[str]
 ) -> None:
-    from gsba.cubemap import cut_mask
+    from gsba.frames.cubemap import cut_mask
 
     mask = load_mask(frames, f)
     use = np.ones((len(FACES), rig.size, rig.size), bool) if mask is None else cut_mask(mask, rig)

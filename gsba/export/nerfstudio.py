@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from gsba.camera.rig import RIG_R_FACE
 from gsba.export.images import (
     face_size_for,
     has_masks,
@@ -22,7 +23,6 @@ from gsba.export.images import (
     write_panoramas,
 )
 from gsba.export.ply import write_splat_points
-from gsba.rig import RIG_R_FACE
 from gsba.types import FACES, FrameSet, Reconstruction
 
 NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba.config import FeatureSettings
-from gsba.features import FaceKeypoints
+from gsba.features.detection import FaceKeypoints
 from gsba.learned.interfaces import Detector
 from gsba.learned.weights import missing_library
 

@@ -4,7 +4,7 @@ from typing import Protocol
 
 import numpy as np
 
-from gsba.features import FaceKeypoints
+from gsba.features.detection import FaceKeypoints
 
 
 class Detector(Protocol):

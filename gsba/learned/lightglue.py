@@ -6,7 +6,7 @@ import kornia.feature  # pyright: ignore[reportMissingImports]
 import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 
-from gsba.features import FaceKeypoints
+from gsba.features.detection import FaceKeypoints
 from gsba.learned.weights import load_into, read_state
 
 _MIN_SCORE = 0.1  # as published

@@ -18,7 +18,7 @@ from transformers import (  # pyright: ignore[reportMissingImports]
     SuperPointForKeypointDetection,
 )
 
-from gsba.features import FaceKeypoints
+from gsba.features.detection import FaceKeypoints
 from gsba.learned.interfaces import Detector
 from gsba.learned.weights import load_into, read_state
 

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.rig import owner_faces
 from gsba.config import MatchingSettings, RefineSettings
-from gsba.features import FaceKeypoints
+from gsba.features.detection import FaceKeypoints
 from gsba.learned.interfaces import FaceNetwork
 from gsba.learned.weights import missing_library
-from gsba.matching import (
+from gsba.matching.guided_search import (
     Gate,
     Matcher,
     SearchableFrames,
@@ -18,7 +19,6 @@ from gsba.matching import (
     strongest_of,
     within_gate,
 )
-from gsba.rig import owner_faces
 from gsba.types import FACES, Features
 
 _PARALLAX_RAD = np.deg2rad(10.0)  # that a pair of faces is expected to differ by
@@ -53,7 +53,7 @@ def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: in
 
 
 class FaceMatcher:
-    """A Matcher (`gsba.matching`) that asks a network, face by face.
+    """A Matcher (`gsba.matching.guided_search`) that asks a network, face by face.
 
     It takes the place of guided search wherever descriptors decide: between neighbours in time,
     along epipolar lines, and at loops. The network sees only pairs of faces that the predicted

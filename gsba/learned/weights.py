@@ -15,7 +15,7 @@ from typing import Any
 
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
-from gsba.records import atomic_write
+from gsba.store.records import atomic_write
 
 logger = logging.getLogger(__name__)
 

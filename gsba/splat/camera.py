@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.rig import RIG_R_FACE, CubeRig
+from gsba.camera.rig import RIG_R_FACE, CubeRig
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from gsba.log import GsbaError
-from gsba.records import atomic_write
 from gsba.splat.gaussians import Gaussians
+from gsba.store.records import atomic_write
 
 _TYPES = {
     **dict.fromkeys(("float", "float32"), "<f4"),

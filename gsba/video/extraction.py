@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from gsba.config import VideoSettings
+from gsba.frames.times import read_times
 from gsba.log import GsbaError, track
-from gsba.read import read_trajectory
-from gsba.read.times import read_times
-from gsba.records import RecordError, atomic_write, disk_errors, remove_temporaries, typed
-from gsba.store import digest, fingerprint
+from gsba.store.records import RecordError, atomic_write, disk_errors, remove_temporaries, typed
+from gsba.store.store import digest, fingerprint
+from gsba.trajectory.files import read_trajectory
 from gsba.types import Counts
 from gsba.version import __version__
 from gsba.video.likeness import apparent_motion_deg, miniature, sharpness

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gsba.camera.rig import RIG_R_FACE
 from gsba.geometry import quaternion_from_rotation
 from gsba.log import GsbaError
-from gsba.report import frame_quality
-from gsba.rig import RIG_R_FACE
+from gsba.report.report import frame_quality
 from gsba.types import FACES, PoseStatus
 from gsba.view.scene import Scene, faces_of
 

@@ -7,15 +7,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsba import cubemap, read
+from gsba.camera.rig import CubeRig
+from gsba.frames import cubemap
 from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
-from gsba.pipeline import load_run
-from gsba.placement import Placement, read_placement
-from gsba.report_html.views import viewing_axes
-from gsba.rig import CubeRig
+from gsba.pipeline.refine import load_run
+from gsba.placement.placement import Placement, read_placement
+from gsba.report.html.views import viewing_axes
 from gsba.splat.gaussians import SH_CONSTANT, Gaussians
 from gsba.splat.ply import read_ply
+from gsba.trajectory.files import read_trajectory
 from gsba.types import FACES, FrameSet, Reconstruction
 
 logger = logging.getLogger(__name__)
@@ -128,7 +129,7 @@ def _coarse(run: Path, placement: Placement, num_frames: int) -> np.ndarray | No
     path = run / "coarse.tum"
     if not path.exists():
         return None
-    world_T_rigs = read.read_trajectory(path).world_T_rigs.copy()
+    world_T_rigs = read_trajectory(path).world_T_rigs.copy()
     if len(world_T_rigs) != num_frames:
         logger.warning("%s is of other frames: it is not shown", path)
         return None

@@ -1,0 +1,285 @@
+"""Rounds of triangulation, bundle adjustment and filtering over one set of tracks."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import gtsam
+import numpy as np
+
+from factors import (
+    BearingTerm,
+    FaceCameras,
+    LandmarkBlock,
+    ReprojectionTerm,
+    RobustLoss,
+    tangent_basis,
+)
+from gsba.bundle import prior_factors, triangulation
+from gsba.bundle.optimizer import Iteration, marginal_covariances, optimize
+from gsba.camera.rig import RIG_R_FACE, CubeRig
+from gsba.config import RefineSettings, SolverSettings
+from gsba.types import Counts, JointErrors, Keypoints, Landmarks, Sighted, Tracks
+
+logger = logging.getLogger(__name__)
+
+_LEAST = 1e-3  # times its claimed sigma: no observation is better than that
+_WIDE = 20.0  # gate in sigmas for observations whose noise is not known yet
+_DRAWS = 500  # errors of all poses, that tell how those of different ones belong together
+_REDUNDANT = 0.1  # least share of residual dimensions left over by the unknowns
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """One bundle adjustment and what was kept of it."""
+
+    gate_sigmas: float  # observations further off were left out
+    noise: float  # estimated noise after the round, in units of the features' own sigmas
+    observations: int  # used
+    points: int  # used
+    support: int  # observations within the last gate of all tracks, under the round's poses
+    accepted: bool  # False: the poses before the round have more support and were kept
+    iterations: tuple[Iteration, ...]  # cost by family
+    reason: str  # why the solver stopped
+
+
+@dataclass(frozen=True, slots=True)
+class Adjustment:
+    """Poses and points after the last good round."""
+
+    world_T_rigs: np.ndarray  # (F, 4, 4) float64
+    landmarks: Landmarks
+    noise: float  # of observations, in units of the features' own sigmas
+    rounds: tuple[Round, ...]
+
+
+def start(world_T_rigs: np.ndarray) -> Adjustment:
+    """Poses (F, 4, 4) as a solution without points."""
+    nothing = np.zeros(0, np.int32)
+    landmarks = Landmarks(
+        np.zeros((0, 3)), Tracks(nothing, nothing, nothing, 0), Counts(0, 0, "tracks")
+    )
+    return Adjustment(world_T_rigs, landmarks, 1.0, ())
+
+
+def run_sighted(
+    sighted: Sighted,
+    before: Adjustment,
+    priors: gtsam.NonlinearFactorGraph,
+    rig: CubeRig,
+    gates: Sequence[float],
+    settings: RefineSettings,
+    num_threads: int,
+) -> tuple[Adjustment, Keypoints]:
+    """As `run`, of aligned and former observations, the noise of either estimated on its own.
+
+    Returns:
+        The solution, and its keypoints with the noise that they turned out to have.
+    """
+    solved, rounds = before, []
+    for number, gate in enumerate(gates, 1):
+        sighted = calibrate(sighted, solved, settings)
+        tracks, keypoints, start = sighted.tracks, sighted.keypoints, replace(solved, noise=1.0)
+        solver = _solver(settings, last=number == len(gates))
+        so_far = settings.model_copy(update={"solver": solver})
+        solved = run(tracks, keypoints, start, priors, rig, (gate,), so_far, num_threads)
+        rounds += solved.rounds
+    return replace(solved, rounds=tuple(rounds)), sighted.keypoints
+
+
+def calibrate(sighted: Sighted, before: Adjustment, settings: RefineSettings) -> Sighted:
+    """Scale new and former observations' noise to what a solution shows of each.
+
+    A patch's covariance knows the image's noise and texture, not how far a surface or a lens is
+    from the model; residuals do. They also hold what the poses are off: too much noise, until
+    poses are adjusted.
+    """
+    tracks, keypoints = sighted.tracks, sighted.keypoints
+    rows, poses = keypoints.rows(tracks), before.world_T_rigs
+    bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
+    placed = triangulation.run(tracks, bearings, sigmas, poses, _WIDE, settings.triangulate)
+    factors = np.ones(len(keypoints.faces))
+    for group in (sighted.aligned, ~sighted.aligned):
+        chosen = group[keypoints.rows(placed.tracks)]
+        if np.count_nonzero(chosen) >= settings.rounds.min_observations:
+            factors[group] = max(_noise(placed, keypoints, poses, chosen), _LEAST)
+    infos = keypoints.sqrt_infos
+    scaled = replace(
+        keypoints,
+        sigmas_rad=keypoints.sigmas_rad * factors,
+        sqrt_infos=None if infos is None else infos / factors[:, None, None],
+    )
+    return replace(sighted, keypoints=scaled)
+
+
+def run(
+    tracks: Tracks,
+    keypoints: Keypoints,
+    start: Adjustment,
+    priors: gtsam.NonlinearFactorGraph,
+    rig: CubeRig,
+    gates: Sequence[float],
+    settings: RefineSettings,
+    num_threads: int,
+    final: bool = True,
+) -> Adjustment:
+    """Solve for all poses in rounds of tightening gates.
+
+    The noise of observations is estimated anew after each round from what the unknowns leave over,
+    so that gates and robust weights fit images of any quality. A round whose poses explain
+    clearly fewer observations than those before it is undone.
+
+    Args:
+        tracks: candidate tracks; every round starts from all of them.
+        keypoints: of all frames.
+        start: poses to start from, and the noise known so far.
+        priors: factors on the poses, gauge included.
+        rig: the faces, for the reprojection family.
+        gates: of each round, in standard deviations of the noise.
+        settings: families, loss, solver.
+        num_threads: of the solver.
+        final: whether the last round is solved to the end; others lose observations anyway.
+    """
+    world_T_rigs, noise, rounds = start.world_T_rigs, start.noise, []
+    rows = keypoints.rows(tracks)
+    bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
+    shared = {"settings": settings.triangulate, "num_threads": num_threads}
+    place = partial(triangulation.run, tracks, bearings, sigmas, **shared)
+    last_gate = gates[-1] * noise
+    support = len(place(world_T_rigs, last_gate).tracks)
+    for number, gate in enumerate(gates, 1):
+        landmarks = place(world_T_rigs, gate * noise)
+        spread = noise * max(1.0, gate / settings.rounds.gate_scale)
+        block = landmark_block(landmarks, keypoints, rig, spread, settings, num_threads)
+        solver = _solver(settings, last=final and number == len(gates))
+        result = optimize(priors, [block], values_of(world_T_rigs), solver)
+        poses = poses_of(result.values, len(world_T_rigs))
+        new_support = len(place(poses, last_gate).tracks)
+        accepted = new_support >= settings.rounds.min_support * support
+        if accepted:
+            world_T_rigs, support = poses, new_support
+            placed = place(poses, gate * noise)
+            if len(placed.tracks):
+                noise = max(_noise(placed, keypoints, poses), settings.rounds.min_noise)
+        used = len(landmarks.tracks), landmarks.tracks.num_points
+        outcome = accepted, result.history, result.reason
+        rounds.append(Round(gate, noise, *used, new_support, *outcome))
+        logger.debug("round: %s", rounds[-1])
+    return Adjustment(world_T_rigs, place(world_T_rigs, gates[-1] * noise), noise, tuple(rounds))
+
+
+def carries(solved: Adjustment, before: Adjustment, least: int) -> bool:
+    """Whether every frame with `least` observations in one solution has as many in the other."""
+    num = len(before.world_T_rigs)
+    seen = [np.bincount(one.landmarks.tracks.frames, minlength=num) for one in (solved, before)]
+    return bool(np.all((seen[0] >= least) | (seen[1] < least)))
+
+
+def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
+    """Settings of a round: only the last of a run is solved to the end."""
+    if last or settings.rounds.tolerance < settings.solver.relative_tolerance:
+        return settings.solver
+    return settings.solver.model_copy(update={"relative_tolerance": settings.rounds.tolerance})
+
+
+def landmark_block(
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    rig: CubeRig,
+    noise: float,
+    settings: RefineSettings,
+    num_threads: int,
+) -> LandmarkBlock:
+    """The factor block of the chosen families; several share each observation's information."""
+    tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
+    share = noise * np.sqrt(len({"bearing", "reprojection"} & set(settings.factors)))
+    terms = []
+    if "bearing" in settings.factors:
+        sigmas, infos = share * keypoints.sigmas_rad[rows], keypoints.sqrt_infos
+        roots = None if infos is None else infos[rows] / share
+        bearings = keypoints.bearings_rig[rows]
+        terms.append(BearingTerm(tracks.frames, tracks.points, bearings, sigmas, roots))
+    if "reprojection" in settings.factors:
+        bearings, faces = keypoints.bearings_rig[rows], keypoints.faces[rows]
+        cosines = np.einsum("oi,oi->o", bearings, RIG_R_FACE[faces, :, 2])
+        sigmas_px = share * keypoints.sigmas_rad[rows] * rig.focal / cosines**1.5
+        num = len(RIG_R_FACE)
+        cameras = FaceCameras(RIG_R_FACE, np.full(num, rig.focal), np.full((num, 2), rig.principal))
+        pixels = keypoints.pixels[rows]
+        terms.append(
+            ReprojectionTerm(tracks.frames, tracks.points, pixels, faces, cameras, sigmas_px)
+        )
+    return LandmarkBlock(
+        [prior_factors.X(f) for f in range(len(keypoints.starts) - 1)],
+        landmarks.points_world,
+        terms,
+        RobustLoss(settings.solver.loss, settings.solver.loss_sigmas),
+        num_threads,
+    )
+
+
+def pose_covariances(
+    adjustment: Adjustment,
+    priors: gtsam.NonlinearFactorGraph,
+    keypoints: Keypoints,
+    rig: CubeRig,
+    settings: RefineSettings,
+    num_threads: int,
+    components: np.ndarray | None = None,
+) -> tuple[np.ndarray, JointErrors]:
+    """Marginal covariances (F, 6, 6) with the first pose and the extent of each map held fixed."""
+    block = landmark_block(
+        adjustment.landmarks, keypoints, rig, adjustment.noise, settings, num_threads
+    )
+    held = gtsam.NonlinearFactorGraph(priors)
+    held.push_back(prior_factors.fixed_scale(adjustment.world_T_rigs, components))
+    keys = [prior_factors.X(f) for f in range(len(adjustment.world_T_rigs))]
+    values = values_of(adjustment.world_T_rigs)
+    return marginal_covariances(held, [block], values, keys, _DRAWS, settings.seed)
+
+
+def _noise(
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    world_T_rigs: np.ndarray,
+    chosen: np.ndarray | slice = slice(None),
+) -> float:
+    """Noise in units of the features' sigmas: robust spread of residuals over its expectation.
+
+    The points are placed by least squares: under the robust loss of the adjustment they would lie
+    closer to most of their observations than the noise allows.
+
+    Args:
+        chosen: (O,) bool, observations whose spread is asked for; all share one redundancy.
+    """
+    tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
+    points, bearings = landmarks.points_world[tracks.points], keypoints.bearings_rig[rows]
+    world_T_rig = world_T_rigs[tracks.frames]
+    offsets = np.einsum("oji,oj->oi", world_T_rig[:, :3, :3], points - world_T_rig[:, :3, 3])
+    residuals = np.einsum("oij,oj->oi", tangent_basis(bearings), offsets)
+    residuals /= np.linalg.norm(offsets, axis=1, keepdims=True)  # sines: the angles are small
+    unknowns = 3 * landmarks.tracks.num_points + 6 * len(world_T_rigs)
+    redundancy = max(1 - unknowns / residuals.size, _REDUNDANT)
+    spread = 1.4826 * np.median(np.abs(_whitened(residuals, keypoints, rows)[chosen]))
+    return float(spread / np.sqrt(redundancy))
+
+
+def _whitened(residuals: np.ndarray, keypoints: Keypoints, rows: np.ndarray) -> np.ndarray:
+    """Residuals (O, 2) in radians in units of their standard deviations."""
+    if keypoints.sqrt_infos is None:
+        return residuals / keypoints.sigmas_rad[rows, None]
+    return np.einsum("oij,oj->oi", keypoints.sqrt_infos[rows], residuals)
+
+
+def values_of(world_T_rigs: np.ndarray) -> gtsam.Values:
+    """Poses (F, 4, 4) under their keys."""
+    values = gtsam.Values()
+    for f, world_T_rig in enumerate(world_T_rigs):
+        values.insert(prior_factors.X(f), gtsam.Pose3(world_T_rig))
+    return values
+
+
+def poses_of(values: gtsam.Values, num_frames: int) -> np.ndarray:
+    """Poses (F, 4, 4) of the first keys."""
+    return np.array([values.atPose3(prior_factors.X(f)).matrix() for f in range(num_frames)])

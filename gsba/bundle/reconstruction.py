@@ -1,0 +1,130 @@
+"""The result of a run, in the world and scale of the coarse trajectory."""
+
+import numpy as np
+
+from gsba.bundle.adjustment import Adjustment
+from gsba.geometry import NoSimilarityError, angular_errors, carried, pose, pose_similarity
+from gsba.log import GsbaError
+from gsba.types import (
+    CoarsePoses,
+    JointErrors,
+    Keypoints,
+    PoseSource,
+    PoseStatus,
+    Reconstruction,
+)
+
+_ALIKE = 0.1  # least correlation of refined and coarse positions: a walk and its drift have .8
+_MOST_RESIDUAL_DEG = 10.0  # median: gates leave a tenth of a degree, a failure anything
+
+
+def assemble(
+    adjustment: Adjustment,
+    covariances: np.ndarray,
+    keypoints: Keypoints,
+    coarse: CoarsePoses,
+    min_observations: int,
+    false_frames: np.ndarray | None = None,
+    correction: tuple[float, ...] = (),
+    components: np.ndarray | None = None,
+    joint_errors: JointErrors | None = None,
+) -> Reconstruction:
+    """Carry the solution back to the trajectory's world and gather what exports need.
+
+    Args:
+        adjustment: the last solution.
+        covariances: (F, 6, 6) of its poses.
+        keypoints: of all frames.
+        coarse: poses that define the world; interpolated ones have no say in it.
+        min_observations: frames with fewer count as unrefined.
+        false_frames: (F,) bool, frames whose coarse pose has no say either.
+        correction: of the frames, which the keypoints have.
+        components: (F,) map of each frame, each carried to its own coarse poses; None = one map.
+        joint_errors: of the poses; None = not known.
+
+    Raises:
+        GsbaError: not where the trajectory has its frames, or residuals that no solution leaves.
+    """
+    world_T_rigs, landmarks = adjustment.world_T_rigs, adjustment.landmarks
+    seen = np.bincount(landmarks.tracks.frames, minlength=len(world_T_rigs))
+    refined = seen >= min_observations
+    known = refined & (coarse.sources == PoseSource.SLAM)
+    if false_frames is not None:
+        known &= ~false_frames
+    groups = np.zeros(len(seen), np.int32) if components is None else components
+    placed, points_world, stretch = _placed(adjustment, coarse.world_T_rigs, known, groups)
+    rows = keypoints.rows(landmarks.tracks)
+    points = landmarks.tracks.points
+    lengths = np.bincount(points, minlength=len(landmarks.points_world))
+    bearings = keypoints.bearings_rig[rows]
+    poses = world_T_rigs[landmarks.tracks.frames]
+    errors = angular_errors(poses, landmarks.points_world[points], bearings)
+    _require_small(errors)
+    channels = keypoints.colors[rows].T
+    colors = [np.bincount(points, channel, len(lengths)) / lengths for channel in channels]
+    return Reconstruction(
+        placed,
+        covariances * stretch[:, :, None] * stretch[:, None, :],
+        np.where(refined, PoseStatus.REFINED, PoseStatus.UNREFINED).astype(np.uint8),
+        points_world,
+        np.rint(np.stack(colors, axis=1)).astype(np.uint8),
+        np.bincount(points, errors, len(lengths)) / lengths,
+        points,
+        landmarks.tracks.frames,
+        bearings,
+        adjustment.noise * keypoints.sigmas_rad[rows],
+        correction,
+        components,
+        joint_errors and joint_errors.scaled(stretch),
+    )
+
+
+def _require_small(errors: np.ndarray) -> None:
+    """GsbaError for residuals (O,) in radians that cannot be those of a solution."""
+    median = float(np.degrees(np.median(errors))) if len(errors) else 0.0
+    if not median <= _MOST_RESIDUAL_DEG:
+        raise GsbaError(
+            f"the solution fell apart (median residual {median:.1f} deg): nothing is written; "
+            "check that frames and trajectory belong together, or refine without it "
+            "(--no-trajectory)"
+        )
+
+
+def _placed(
+    adjustment: Adjustment, target_T_rigs: np.ndarray, known: np.ndarray, groups: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses, points, and factors (F, 6) of the standard deviations, each map in its own world.
+
+    Args:
+        adjustment: the last solution.
+        target_T_rigs: (F, 4, 4) poses that define the worlds.
+        known: (F,) bool, frames that say where their map goes; all, where fewer than two do.
+        groups: (F,) map of each frame, 0 = the largest; a smaller one that does not lie as its
+            coarse poses, at no scale, stays as it was solved.
+
+    Raises:
+        GsbaError: the largest does not.
+    """
+    poses, landmarks = adjustment.world_T_rigs, adjustment.landmarks
+    placed, stretch = np.empty_like(poses), np.ones((len(poses), 6))
+    points, tracks = np.empty_like(landmarks.points_world), landmarks.tracks
+    hosts = tracks.frames[np.searchsorted(tracks.points, np.arange(tracks.num_points))]
+    for group in np.unique(groups):
+        inside = groups == group
+        chosen = known & inside if np.count_nonzero(known & inside) > 1 else inside
+        try:
+            move = pose_similarity(poses[chosen], target_T_rigs[chosen], _ALIKE)
+        except NoSimilarityError as error:
+            if group == 0:
+                raise GsbaError(
+                    f"the {np.count_nonzero(chosen)} frames that could place the result do not "
+                    f"lie as the trajectory has them ({error}): check its times and --fps, or "
+                    "refine without it (--no-trajectory)"
+                ) from None
+            move = 1.0, np.eye(3), np.zeros(3)
+        scale, rotation, translation = move
+        placed[inside] = carried(poses[inside], scale, pose(rotation, translation))
+        stretch[inside, 3:] = scale
+        there = inside[hosts]
+        points[there] = scale * landmarks.points_world[there] @ rotation.T + translation
+    return placed, points, stretch

@@ -1,0 +1,172 @@
+"""A camera that turns but never moves: rotations alone, and no points.
+
+Without parallax a point is a direction. Each track has one, eliminated as the weighted mean of its
+rays; what remains is a problem of the frames' rotations, solved by Gauss-Newton under a robust
+loss. Frames far apart in time are matched too, since all see the same: rotations do not drift.
+"""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from factors import tangent_basis
+from gsba.bundle import tracks
+from gsba.bundle.adjustment import start
+from gsba.bundle.reconstruction import assemble
+from gsba.geometry import pose
+from gsba.matching.guided_search import Gate, MatchContext
+from gsba.types import CoarsePoses, Keypoints, Matches, PoseStatus, Reconstruction, Tracks
+
+logger = logging.getLogger(__name__)
+
+_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # frames between those matched
+_PREDICTED_DEG = 2.0  # around where a chain of turns sees a keypoint
+_ITERATIONS = 30
+_CONVERGED = 1e-9  # radians
+_LOSS_SIGMAS = 2.0  # Cauchy
+_OUTLIER_SIGMAS = 10.0  # of the loss's scale at the start
+_COLUMNS = 384  # of the inverse at a time
+
+
+def run(context: MatchContext, world_T_rigs: np.ndarray, coarse: CoarsePoses) -> Reconstruction:
+    """Refine the rotations of frames that were taken from one place.
+
+    Args:
+        context: of the run.
+        world_T_rigs: (F, 4, 4) rotations right but for the drift of a chain; positions are kept.
+        coarse: poses that define the world.
+
+    Returns:
+        A result without points; covariances are of rotations, NaN for positions.
+    """
+    matches = _matched(context, world_T_rigs)
+    keypoints = context.keypoints
+    found = tracks.run([matches], np.diff(keypoints.starts))
+    rotations, covariances, used = solve(world_T_rigs[:, :3, :3], found, keypoints)
+    least = context.settings.rounds.min_observations
+    six = np.full((len(rotations), 6, 6), np.nan)
+    six[:, :3, :3] = covariances
+    solved = start(pose(rotations, world_T_rigs[:, :3, 3]))
+    result = assemble(solved, six, keypoints, coarse, least)
+    refined = np.where(used >= least, PoseStatus.REFINED, PoseStatus.UNREFINED)
+    return replace(result, pose_statuses=refined.astype(np.uint8))
+
+
+def _matched(context: MatchContext, world_T_rigs: np.ndarray) -> Matches:
+    """Matches of frames near and far in time, where their rotations say."""
+    num = len(world_T_rigs)
+    chosen = [(f, f + gap) for gap in _GAPS for f in range(num - gap)]
+    pairs = np.array(chosen, np.int32).reshape(-1, 2)
+    still = world_T_rigs.copy()
+    still[:, :3, 3] = 0
+    gates = [Gate(np.pi, 1.0, np.pi, np.deg2rad(_PREDICTED_DEG))] * len(pairs)
+    directions = [context.keypoints.bearings_of(f) for f in range(num)]
+    return context.match(pairs, still, gates, directions)
+
+
+def solve(
+    world_R_rigs: np.ndarray, found: Tracks, keypoints: Keypoints
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rotations under which the rays of each track are parallel.
+
+    Args:
+        world_R_rigs: (F, 3, 3) to start from; the first is kept.
+        found: which keypoints show one direction; some may be false.
+        keypoints: of all frames.
+
+    Returns:
+        (F, 3, 3) rotations; their covariances (F, 3, 3) in the rig frame, radians squared, with
+        the first held; and how many observations of each frame (F,) were within the noise.
+    """
+    from scipy.spatial.transform import Rotation
+
+    rotations, num = world_R_rigs.copy(), len(world_R_rigs)
+    rows = keypoints.rows(found)
+    bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
+    wide, noise, weights = _OUTLIER_SIGMAS, 1.0, np.ones(len(rows))
+    system = None
+    for _ in range(_ITERATIONS):
+        rays = np.einsum("oij,oj->oi", rotations[found.frames], bearings)
+        bases = tangent_basis(_directions(rays, weights / sigmas**2, found))
+        residuals = np.einsum("oij,oj->oi", bases, rays) / sigmas[:, None]
+        lengths = np.linalg.norm(residuals, axis=1)
+        noise = max(float(np.median(lengths)) / 1.1774, 1e-9)  # of a Rayleigh distribution
+        weights = 1 / (1 + (lengths / (_LOSS_SIGMAS * wide * noise)) ** 2)
+        system, gradient = _system(rotations, bearings, bases, residuals, sigmas, weights, found)
+        step = _solved(system, -gradient[3:, None])[:, 0]
+        turns = Rotation.from_rotvec(np.concatenate([np.zeros(3), step]).reshape(num, 3))
+        rotations = rotations @ turns.as_matrix()
+        if np.abs(step).max() < _CONVERGED and wide == 1:
+            break
+        wide = max(0.5 * wide, 1.0)
+    covariances = np.zeros((num, 3, 3))
+    if system is not None:
+        covariances[1:] = noise**2 * _diagonal_blocks(system)
+    used = np.bincount(found.frames[weights > 0.1], minlength=num)
+    logger.info("rotations of %d frames from %d observations", num, int(used.sum()))
+    return rotations, covariances, used
+
+
+def _directions(rays: np.ndarray, information: np.ndarray, found: Tracks) -> np.ndarray:
+    """Unit direction (O, 3) of each observation's track."""
+    sums = [np.bincount(found.points, information * rays[:, k], found.num_points) for k in range(3)]
+    sums = np.stack(sums, axis=1)
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
+    return sums[found.points]
+
+
+def _system(
+    rotations: np.ndarray,
+    bearings: np.ndarray,
+    bases: np.ndarray,
+    residuals: np.ndarray,
+    sigmas: np.ndarray,
+    weights: np.ndarray,
+    found: Tracks,
+):
+    """Reduced normal equations: sparse (3F - 3, 3F - 3) without the first frame, gradient (3F,)."""
+    from scipy.sparse import csr_matrix, diags
+
+    num, count = len(rotations), len(bearings)
+    turned = np.cross(np.eye(3)[None], bearings[:, None, :])  # (O, axis, 3): a turn about each axis
+    jacobian = np.einsum("oij,ojl,okl->oik", bases, rotations[found.frames], turned)
+    jacobian *= (np.sqrt(weights) / sigmas)[:, None, None]
+    columns = np.repeat(3 * found.frames[:, None] + np.arange(3), 2, axis=0)
+    rows = np.repeat(np.arange(2 * count), 3)
+    values = jacobian.reshape(-1)
+    shape = (2 * count, 3 * num)
+    whitened = csr_matrix((values, (rows, columns.reshape(-1))), shape=shape)
+    # Each track's direction takes the mean: subtract what it explains.
+    roots = np.sqrt(weights) / sigmas
+    member = 2 * np.repeat(found.points, 2) + np.tile([0, 1], count)
+    gather = csr_matrix(
+        (np.repeat(roots, 2), (member, np.arange(2 * count))),
+        shape=(2 * found.num_points, shape[0]),
+    )
+    totals = np.bincount(found.points, roots**2, found.num_points)
+    shared, inverses = gather @ whitened, np.repeat(1 / np.maximum(totals, 1e-300), 2)
+    explained = shared.T @ diags(inverses) @ shared
+    system = (whitened.T @ whitened - explained).tocsc()[3:, 3:]
+    right = (np.sqrt(weights)[:, None] * residuals).reshape(-1)
+    return system, whitened.T @ right - shared.T @ (inverses * (gather @ right))
+
+
+def _solved(system, right: np.ndarray) -> np.ndarray:
+    from scipy.sparse import identity
+    from scipy.sparse.linalg import splu
+
+    damping = 1e-9 * float(np.mean(system.diagonal())) + 1e-12
+    return splu((system + damping * identity(system.shape[0])).tocsc()).solve(right)
+
+
+def _diagonal_blocks(system) -> np.ndarray:
+    """The 3x3 blocks (N, 3, 3) on the diagonal of a sparse matrix's inverse."""
+    size = system.shape[0]
+    blocks = np.empty((size // 3, 3, 3))
+    for first in range(0, size, _COLUMNS):
+        last = min(first + _COLUMNS, size)
+        columns = _solved(system, np.eye(size, last - first, -first))
+        for n in range(first // 3, last // 3):
+            blocks[n] = columns[3 * n : 3 * n + 3, 3 * n - first : 3 * n + 3 - first]
+    return blocks

@@ -1,0 +1,219 @@
+"""Whether covariances can be believed: errors against the truth in units of what they claim.
+
+An estimator is consistent where its errors are as large as its covariances say (Bar-Shalom, Li and
+Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4). Errors
+only compare with covariances in the gauge that these are of: the first pose and its distance to
+the position furthest from it are held, so the truth is moved, turned and scaled until exactly
+those agree. Along that distance the frame there has neither an error nor a variance, and five
+degrees of freedom are judged instead of six.
+
+Were errors independent, six times the number of poses times the mean of their normalised squares
+would follow a chi-square distribution of as many degrees of freedom. Those of one path have most in
+common and scatter more. What is expected is therefore measured on errors that the run drew from the
+joint distribution of all its poses, of which each pose's covariance is a part.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from gsba.evaluate.trajectory import associate
+from gsba.geometry import adjoint, carried, furthest, inverse, step_covariances
+from gsba.log import GsbaError
+from gsba.types import Reconstruction, Trajectory
+
+EXPECTED = 0.95  # share of drawn errors within the interval that is given
+_LEAST = 1e-12  # eigenvalue of a correlation matrix: less is rounding
+
+
+@dataclass(frozen=True, slots=True)
+class Statistic:
+    """A measure of the errors, and where errors as the covariances claim have it."""
+
+    value: float
+    low: float  # of EXPECTED of the draws
+    high: float
+
+    @property
+    def expected(self) -> bool:
+        """Whether the value is within the interval."""
+        return self.low <= self.value <= self.high
+
+
+@dataclass(frozen=True, slots=True)
+class Claims:
+    """What is left of the claims of some covariances."""
+
+    num: int  # poses or steps that were judged
+    rotation: Statistic  # rms of error / sigma over them and the axes of the rig
+    position: Statistic  # the same
+    nees: Statistic  # normalised estimation error squared e^T P^-1 e, mean over them; 6 if all is
+    # right, but for the degree of freedom that the gauge takes
+
+
+@dataclass(frozen=True, slots=True)
+class Consistency:
+    """How errors compare with the covariances of poses, in the gauge of these."""
+
+    first: int  # frame whose pose is held
+    furthest: int  # frame whose distance from it is held
+    absolute: Claims  # of each pose
+    consecutive: Claims | None  # of each frame in the axes of the one before; None = no two
+    # neighbours have a true pose
+
+    def to_json(self) -> dict:
+        """Plain dict for json.dump."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, slots=True)
+class _Judge:
+    """Covariances of some errors, ready to weigh them."""
+
+    rows: np.ndarray  # (N,) of all errors
+    axes: np.ndarray  # (N, 6, 6) orthogonal: error = axes @ error in the rig's axes
+    kept: np.ndarray  # (N, 6) bool, of those: the others are held by the gauge
+    sigmas: np.ndarray  # (N, 6) along them
+    whiteners: np.ndarray  # (N, 6, 6) of errors along them in sigmas
+
+    @classmethod
+    def of(cls, rows: np.ndarray, covariances: np.ndarray, held: np.ndarray) -> "_Judge":
+        """Of errors with covariances (N, 6, 6), without positions along `held (N, 3)` unless 0."""
+        axes, kept = np.tile(np.eye(6), (len(rows), 1, 1)), np.ones((len(rows), 6), bool)
+        for n in np.flatnonzero(held.any(axis=1)):
+            axes[n, 3:, 3:] = np.linalg.svd(held[n, None])[2]  # its first row is along
+            kept[n, 3] = False
+        along = axes @ covariances @ np.swapaxes(axes, 1, 2)
+        both = kept[:, :, None] & kept[:, None, :]
+        along = np.where(both, along, np.eye(6))
+        sigmas = np.sqrt(np.maximum(np.einsum("nii->ni", along), 1e-300))
+        values, vectors = np.linalg.eigh(along / (sigmas[:, :, None] * sigmas[:, None, :]))
+        roots = vectors / np.sqrt(np.maximum(values, _LEAST))[:, None, :]
+        return cls(rows, axes, kept, sigmas, roots @ np.swapaxes(vectors, 1, 2))
+
+    def measures(self, errors: np.ndarray) -> np.ndarray:
+        """Rotation and position over sigma, and NEES: (..., 3) of errors (..., N, 6)."""
+        scaled = np.einsum("nij,...nj->...ni", self.axes, errors) / self.sigmas * self.kept
+        squares, counts = np.sum(scaled**2, axis=-2), self.kept.sum(axis=0)
+        rms = [
+            np.sqrt(squares[..., part].sum(axis=-1) / counts[part].sum())
+            for part in (slice(3), slice(3, 6))
+        ]
+        whitened = np.einsum("nij,...nj->...ni", self.whiteners, scaled)
+        return np.stack([*rms, np.sum(whitened**2, axis=(-2, -1)) / len(self.rows)], axis=-1)
+
+    def claims(self, errors: np.ndarray, drawn: np.ndarray) -> Claims:
+        """What errors (N, 6) make of them, beside drawn ones (D, N, 6)."""
+        tails = (1 - EXPECTED) / 2
+        found, spread = self.measures(errors), self.measures(drawn)
+        lows, highs = np.quantile(spread, [tails, 1 - tails], axis=0)
+        three = [Statistic(*map(float, one)) for one in zip(found, lows, highs, strict=True)]
+        return Claims(len(self.rows), *three)
+
+
+def judge(
+    reconstruction: Reconstruction,
+    timestamps: np.ndarray,
+    truth: Trajectory,
+    tolerance_s: float = 0.01,
+) -> Consistency:
+    """Compare the covariances of a map's poses with the errors of these.
+
+    Args:
+        reconstruction: one map, as `load_run` gives it.
+        timestamps: (F,) of its frames, seconds.
+        truth: in any world and scale; frames without a true pose are not judged.
+        tolerance_s: largest difference of time stamps, seconds.
+
+    Raises:
+        GsbaError: the run has no covariances, or the truth lacks the frames that hold its gauge.
+    """
+    poses, covariances = reconstruction.world_T_rigs, reconstruction.pose_covariances
+    known = np.flatnonzero(np.isfinite(covariances).all(axis=(1, 2)))
+    joint = reconstruction.joint_errors
+    if joint is None or not len(known):
+        raise GsbaError("the run has no covariances of its poses")
+    far, _ = furthest(poses[:, :3, 3])
+    rows, of_truth = associate(Trajectory(timestamps, poses), truth, tolerance_s)
+    for frame in (0, far):
+        if not np.any(rows == frame):
+            raise GsbaError(
+                f"no true pose within {tolerance_s:g} s of {timestamps[frame]:.3f} s, where the "
+                "gauge of the covariances is held"
+            )
+    true_T_rigs = np.full_like(poses, np.nan)
+    true_T_rigs[rows] = truth.world_T_rigs[of_truth]
+    true_T_rigs = _in_gauge(true_T_rigs, poses, far)
+
+    toward = poses[far, :3, :3].T @ (poses[far, :3, 3] - poses[0, :3, 3])
+    held = np.zeros((len(poses), 3))
+    held[far] = toward / np.linalg.norm(toward)
+    judged = np.intersect1d(rows[rows > 0], known)
+    errors = _errors(poses, true_T_rigs)
+
+    steps, true_steps = (inverse(some[:-1]) @ some[1:] for some in (poses, true_T_rigs))
+    before = -adjoint(inverse(steps))  # step error = error + before @ error of the frame before
+    of_steps = step_covariances(poses, covariances, joint.neighbours)
+    step_errors = _errors(steps, true_steps)
+    sure = np.isfinite(of_steps).all(axis=(1, 2)) & np.isfinite(step_errors).all(axis=1)
+    chosen = np.flatnonzero(sure)
+    only = held[1:].copy()
+    only[1:] = 0  # a distance is held between neighbours only where the first step reaches there
+    drawn = joint.draws.astype(np.float64)
+    found = _Judge.of(judged, covariances[judged], held[judged])
+    absolute, consecutive = found.claims(errors[judged], drawn[:, judged]), None
+    if len(chosen):
+        found = _Judge.of(chosen, of_steps[chosen], only[chosen])
+        drawn = drawn[:, 1:] + np.einsum("fij,dfj->dfi", before, drawn[:, :-1])
+        consecutive = found.claims(step_errors[chosen], drawn[:, chosen])
+    return Consistency(0, far, absolute, consecutive)
+
+
+def format_consistency(found: Consistency, name: Callable[[int], str] = str) -> str:
+    """Text table; `name` says what a frame is called."""
+    header = ["", "poses", "rotation error/σ", "position error/σ", "NEES"]
+    rows = [header]
+    for title, claims in (("absolute", found.absolute), ("consecutive", found.consecutive)):
+        if claims is None:
+            continue
+        cells = [
+            f"{one.value:.2f} ({one.low:.2f} to {one.high:.2f})"
+            for one in (claims.rotation, claims.position, claims.nees)
+        ]
+        rows.append([title, str(claims.num), *cells])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [
+        "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows
+    ]
+    first, far = name(found.first), name(found.furthest)
+    lines.append(f"with the pose of {first} and its distance to {far} held; in brackets what")
+    lines.append(f"{EXPECTED:.0%} of errors as these covariances claim would give.")
+    return "\n".join(lines)
+
+
+def _in_gauge(true_T_rigs: np.ndarray, world_T_rigs: np.ndarray, far: int) -> np.ndarray:
+    """True poses with the first pose, and its distance to one frame, of the estimate."""
+    scales = [
+        np.linalg.norm(some[far, :3, 3] - some[0, :3, 3]) for some in (world_T_rigs, true_T_rigs)
+    ]
+    for owner, length in zip(("run", "truth"), scales, strict=True):
+        if not length > 0:
+            raise GsbaError(f"the {owner} does not move: its positions leave the scale open")
+    scale = float(scales[0] / scales[1])
+    local = carried(inverse(true_T_rigs[0]) @ true_T_rigs, scale, np.eye(4))
+    return world_T_rigs[0] @ local
+
+
+def _errors(estimates: np.ndarray, truths: np.ndarray) -> np.ndarray:
+    """Tangents (N, 6) [rotation, translation] at estimates (N, 4, 4) that lead to the truths.
+
+    To first order: the translation is not that of the group's logarithm.
+    """
+    from scipy.spatial.transform import Rotation
+
+    off = inverse(estimates) @ truths
+    out, known = np.full((len(off), 6), np.nan), np.isfinite(off).all(axis=(1, 2))
+    out[known, :3] = Rotation.from_matrix(off[known, :3, :3]).as_rotvec()
+    out[known, 3:] = off[known, :3, 3]
+    return out

@@ -1,0 +1,148 @@
+"""Induced pixel error: how far pose errors move what a frame shows in its neighbours' images."""
+
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsba.evaluate.trajectory import associate
+from gsba.geometry import bearings_from_erp, carried, pose, similarity
+from gsba.log import GsbaError
+from gsba.store.records import HEADER_ERRORS
+from gsba.types import Trajectory
+
+STEPS = (1, 4)  # frames between a frame and the neighbours that look at its pixels
+_FURTHEST = 1e12  # truth units: beyond, nothing was measured
+_SPACING = 4  # pixels of a depth map between samples
+
+
+@dataclass(frozen=True, slots=True)
+class InducedErrors:
+    """Angles between true and estimated sightings of the same pixels, in panorama pixels."""
+
+    median_px: float
+    percentile95_px: float
+    steps: tuple[int, ...]  # frames apart
+    medians_px: tuple[float, ...]  # of each step
+    num_samples: int
+
+
+def induced_errors(
+    estimate: Trajectory,
+    truth: Trajectory,
+    depth_of: Callable[[int], np.ndarray],
+    width: int,
+    steps: Sequence[int] = STEPS,
+    tolerance_s: float = 0.01,
+) -> InducedErrors:
+    """See every sampled pixel of each frame from its neighbours, under true and estimated poses.
+
+    A pixel goes out to its true depth, by the true and by the Sim(3)-aligned estimated pose, and
+    is seen from the neighbours `steps` frames before and after it by the same poses. The angle
+    between both directions is what a splat would be trained against.
+
+    Args:
+        estimate: poses to judge, associated with the truth by time.
+        truth: the true poses.
+        depth_of: row of `truth` -> range (h, 2h) along the ray of each pixel of a panorama of
+            that size, truth units; 0 = nothing there.
+        width: of the full panorama, in whose pixels (at the equator) errors are given.
+        steps: frames between both.
+        tolerance_s: of the association.
+
+    Raises:
+        GsbaError: fewer than three poses associate, or no frame has a neighbour.
+    """
+    rows_e, rows_t = associate(estimate, truth, tolerance_s)
+    if len(rows_t) < 3:
+        raise GsbaError(f"only {len(rows_t)} poses associate with the truth; alignment needs 3")
+    true_T_rigs = truth.world_T_rigs[rows_t]
+    poses = estimate.world_T_rigs[rows_e]
+    scale, rotation, shift = similarity(poses[:, :3, 3], true_T_rigs[:, :3, 3])
+    aligned = carried(poses, scale, pose(rotation, shift))
+    row_of = {int(t): row for row, t in enumerate(rows_t)}
+    errors: dict[int, list[np.ndarray]] = {step: [] for step in steps}
+    for frame, row in row_of.items():
+        points = _points(depth_of(frame))
+        for step in steps:
+            for other in (row_of.get(frame - step), row_of.get(frame + step)):
+                if other is not None:
+                    seen = _seen(true_T_rigs[row], true_T_rigs[other], points)
+                    shown = _seen(aligned[row], aligned[other], points)
+                    errors[step].append(_angles(seen, shown) * width / (2 * np.pi))
+    found = {step: np.concatenate(parts) for step, parts in errors.items() if parts}
+    found = {step: part for step, part in found.items() if len(part)}
+    pooled = np.concatenate(list(found.values())) if found else np.zeros(0)
+    if len(pooled) == 0:
+        raise GsbaError(
+            "no frame with depth has a neighbour: induced errors need two frames one or four "
+            "apart, and maps that hold a distance somewhere"
+        )
+    return InducedErrors(
+        float(np.median(pooled)),
+        float(np.percentile(pooled, 95)),
+        tuple(found),
+        tuple(float(np.median(part)) for part in found.values()),
+        len(pooled),
+    )
+
+
+def depth_maps(folder: Path, num: int) -> Callable[[int], np.ndarray]:
+    """Reader of the depth maps `NAME.npz` with a `range` array (h, 2h), in name order.
+
+    Args:
+        folder: of the maps.
+        num: poses of the truth, each of which has one.
+
+    Raises:
+        GsbaError: the folder holds another number; and from the reader, a map that is none.
+    """
+    files = sorted(folder.glob("*.npz"))
+    if len(files) != num:
+        raise GsbaError(
+            f"{folder}: {len(files)} depth maps for {num} true poses (NAME.npz with an array "
+            "`range`, one for each in name order)"
+        )
+
+    def read(frame: int) -> np.ndarray:
+        path = files[frame]
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                ranges = archive["range"]
+        except (OSError, EOFError, ValueError, KeyError, TypeError, IndexError) as error:
+            raise GsbaError(f"{path}: no depth map with an array `range` ({error})") from None
+        except (zipfile.BadZipFile, zlib.error, NotImplementedError, *HEADER_ERRORS) as error:
+            raise GsbaError(f"{path}: damaged depth map ({error})") from None
+        if ranges.ndim != 2 or ranges.dtype.kind not in "fiu":
+            raise GsbaError(f"{path}: `range` is no image of numbers, but {ranges.shape}")
+        if not 0 < 2 * ranges.shape[0] == ranges.shape[1]:
+            raise GsbaError(f"{path}: {ranges.shape[1]}x{ranges.shape[0]}, but a map is 2:1")
+        return ranges
+
+    return read
+
+
+def _points(ranges: np.ndarray) -> np.ndarray:
+    """Points (N, 3) in the rig frame of every few pixels of a depth map that hit something."""
+    height, width = ranges.shape
+    rows = np.arange(_SPACING // 2, height, _SPACING)
+    columns = np.arange(_SPACING // 2, width, _SPACING)
+    pixels = np.stack(np.meshgrid(columns + 0.5, rows + 0.5), axis=-1)
+    depths = ranges[np.ix_(rows, columns)].astype(np.float64)
+    hit = (depths > 0) & (depths < _FURTHEST)
+    return depths[hit][:, None] * bearings_from_erp(pixels[hit], width, height)
+
+
+def _seen(world_T_rig: np.ndarray, world_T_other: np.ndarray, points_rig: np.ndarray) -> np.ndarray:
+    """Points (N, 3) of one rig's frame in another's."""
+    points_world = points_rig @ world_T_rig[:3, :3].T + world_T_rig[:3, 3]
+    return (points_world - world_T_other[:3, 3]) @ world_T_other[:3, :3]
+
+
+def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles (N,) between vectors, accurate when small."""
+    across = np.linalg.norm(np.cross(a, b), axis=1)
+    return np.arctan2(across, np.einsum("ni,ni->n", a, b))

@@ -1,0 +1,322 @@
+"""What poses are worth to a splat: one training on several of them, measured on held-out frames.
+
+Every source trains on the same frames with the same settings and seed, from the run's tracks
+triangulated under its own poses, and is measured on panoramas it never saw, at its own poses.
+All are carried into the run's world first: a splat's Gaussians begin along the axes of its world,
+and walls along them are worth some 0.2 dB that no pose has earned.
+"""
+
+import json
+import logging
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsba.config import SplatSettings
+from gsba.evaluate.trajectory import associate
+from gsba.geometry import NoSimilarityError, carried, pose, pose_similarity
+from gsba.log import GsbaError
+from gsba.splat.backend import Backend
+from gsba.splat.gaussians import Gaussians
+from gsba.splat.ply import write_ply
+from gsba.splat.scene import (
+    Distance,
+    Score,
+    Split,
+    load_faces,
+    make_views,
+    mean_score,
+    measure,
+    near_of,
+    refined_frames,
+    render_faces,
+    split_frames,
+    start_cloud,
+)
+from gsba.splat.train import Views, train
+from gsba.store.records import atomic_write
+from gsba.store.store import digest, fingerprint
+from gsba.types import FrameSet, Reconstruction, Trajectory
+
+logger = logging.getLogger(__name__)
+
+NO_LPIPS = "not computed: no weights"
+_COLORS = ((200, 60, 40), (30, 110, 200), (40, 150, 60), (150, 60, 160), (220, 140, 20))  # RGB
+_CURVE_POINTS = 10  # measurements during a training
+
+
+@dataclass(frozen=True, slots=True)
+class SourceResult:
+    """One source of poses."""
+
+    frames: Mapping[str, Score]  # of the held-out frames, by name
+    mean: Score
+    curve: Mapping[int, Score]  # mean over held-out frames, by the steps made
+    num_gaussians: int
+
+
+def poses_for(frames: FrameSet, trajectory: Trajectory, tolerance_s: float = 0.01) -> np.ndarray:
+    """Pose (F, 4, 4) of each frame by time; NaN where the trajectory has none.
+
+    Raises:
+        GsbaError: no time fits.
+    """
+    expected = Trajectory(frames.timestamps, np.tile(np.eye(4), (len(frames), 1, 1)))
+    rows, which = associate(trajectory, expected, tolerance_s)
+    if len(which) == 0:
+        raise GsbaError(
+            f"no pose of the trajectory is within {tolerance_s:g} s of a frame: "
+            "check that both use one clock"
+        )
+    poses = np.full((len(frames), 4, 4), np.nan)
+    poses[which] = trajectory.world_T_rigs[rows]
+    return poses
+
+
+def compare(
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    sources: Mapping[str, np.ndarray],
+    settings: SplatSettings,
+    backend: Backend,
+    out: Path,
+    lpips: Distance | None = None,
+) -> dict[str, SourceResult]:
+    """Train and measure a splat for each source of poses; resumes what is done.
+
+    Writes `out`/SOURCE/point_cloud.ply and checkpoint.npz, results.json, table.txt,
+    curves.png, and pictures/FRAME.jpg: the six faces as captured, then as each source has them.
+
+    Args:
+        reconstruction, frames: of a finished run; its tracks make the start clouds.
+        sources: name -> world_T_rigs (F, 4, 4), each in any world and scale, NaN = no pose.
+        settings: of all trainings alike.
+        backend: the renderer.
+        out: folder to write.
+        lpips: distance of images for the last measurement; None = leave it out.
+
+    Raises:
+        GsbaError: too few frames have a pose in every source, or a training fails.
+    """
+    usable = refined_frames(reconstruction)
+    for poses in sources.values():
+        usable = usable & np.isfinite(poses).all(axis=(1, 2))
+    split = split_frames(usable, settings.held_out_every)
+    own = reconstruction.world_T_rigs[usable]
+    sources = {name: _beside(poses, usable, own) for name, poses in sources.items()}
+    faces = [
+        load_faces(frames, part, settings.face_size) for part in (split.training, split.held_out)
+    ]
+    results, splats = {}, {}
+    for name, poses in sources.items():
+        logger.info("splat on %s poses, %d frames", name, len(split.training))
+        training = make_views(*faces[0], poses[split.training])
+        held_out = make_views(*faces[1], poses[split.held_out])
+        key = digest(
+            fingerprint([p[0] for p in frames.paths]), poses.tolist(), settings, backend.name
+        )
+        splats[name], results[name] = train_and_measure(
+            reconstruction,
+            frames,
+            poses,
+            split,
+            training,
+            held_out,
+            settings,
+            backend,
+            out / name,
+            key,
+            lpips,
+        )
+    _write(out, results, settings, lpips is not None)
+    _write_pictures(
+        out / "pictures", frames, split, faces[1][0], sources, splats, settings, backend
+    )
+    return results
+
+
+def _beside(poses: np.ndarray, usable: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Poses (F, 4, 4) in the world and scale of the run's `own` ones of the `usable` frames."""
+    try:
+        scale, rotation, translation = pose_similarity(poses[usable], own)
+    except NoSimilarityError:
+        return poses  # nothing to lay them by: they are measured as they are
+    return carried(poses, scale, pose(rotation, translation))
+
+
+def _write(
+    out: Path, results: Mapping[str, SourceResult], settings: SplatSettings, with_lpips: bool
+) -> None:
+    """Table, numbers and curves."""
+    lines = format_table(results)
+    measured = "computed" if with_lpips else NO_LPIPS
+    content = {"lpips": measured, "settings": settings.model_dump(), "sources": to_json(results)}
+    atomic_write(out / "table.txt", lambda path: path.write_text(lines + "\n"))
+    atomic_write(out / "results.json", lambda path: path.write_text(json.dumps(content, indent=1)))
+    _write_curves(out / "curves.png", results)
+
+
+def train_and_measure(
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    poses: np.ndarray,
+    split: Split,
+    training: Views,
+    held_out: Views,
+    settings: SplatSettings,
+    backend: Backend,
+    out: Path,
+    key: str,
+    lpips: Distance | None,
+) -> tuple[Gaussians, SourceResult]:
+    """Train on one source of poses, and measure on the way.
+
+    Args:
+        reconstruction, frames: as for `compare`.
+        poses: (F, 4, 4) of the source.
+        split: of the frames.
+        training, held_out: views of either part, from these poses.
+        settings, backend: of the training.
+        out: folder to write, see `compare`.
+        key: what the training depends on; what another one left is not taken up.
+        lpips: see `compare`.
+    """
+    near = near_of(poses[split.training], settings)
+    curve = _read_curve(out / "curve.json", key)
+    every = max(settings.iterations // _CURVE_POINTS, 1)
+
+    def watch(step: int, gaussians: Gaussians) -> None:
+        if step // every > max(curve, default=0) // every:
+            curve[step] = mean_score(measure(gaussians, held_out, settings, near, backend).values())
+            content = {"key": key, "curve": {s: asdict(score) for s, score in curve.items()}}
+            atomic_write(out / "curve.json", lambda path: path.write_text(json.dumps(content)))
+
+    start = start_cloud(reconstruction, poses, split.training, settings.sh_degree)
+    splat = train(start, training, settings, backend, out / "checkpoint.npz", key, watch)
+    write_ply(out / "point_cloud.ply", splat)
+    scores = measure(splat, held_out, settings, near, backend, lpips)
+    by_frame = {frames.names[split.held_out[i]]: score for i, score in scores.items()}
+    return splat, SourceResult(by_frame, mean_score(scores.values()), curve, len(splat))
+
+
+def _read_curve(path: Path, key: str) -> dict[int, Score]:
+    try:
+        content = json.loads(path.read_text())
+        if content["key"] == key:
+            return {int(step): Score(**score) for step, score in content["curve"].items()}
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    return {}
+
+
+def to_json(results: Mapping[str, SourceResult]) -> dict[str, object]:
+    """Plain dicts for json.dump."""
+    return {name: asdict(result) for name, result in results.items()}
+
+
+def format_table(results: Mapping[str, SourceResult]) -> str:
+    """Text table with a line per source; the first source is what the others are compared with."""
+    rows = [
+        ["", "PSNR", "SSIM", "LPIPS", "PSNR exp.", "vs. first", "Gaussians"],
+        ["", "dB", "", "", "dB", "dB", ""],
+    ]
+    first = next(iter(results.values())).mean.psnr
+    for name, result in results.items():
+        mean = result.mean
+        far = "" if mean.lpips is None else f"{mean.lpips:.4f}"
+        cells = [name, f"{mean.psnr:.2f}", f"{mean.ssim:.4f}", far, f"{mean.psnr_exposed:.2f}"]
+        rows.append([*cells, f"{mean.psnr - first:+.2f}", str(result.num_gaussians)])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [
+        "  ".join(
+            cell.rjust(width) if i else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+    num = len(next(iter(results.values())).frames)
+    notes = [
+        f"Means over {num} held-out panoramas at each source's own poses. exp.: after the gain",
+        "of each channel that fits best. vs. first: PSNR less that of the first source.",
+    ]
+    if any(result.mean.lpips is None for result in results.values()):
+        notes.append(f"LPIPS {NO_LPIPS}.")
+    return "\n".join([*lines, *notes])
+
+
+def _write_pictures(
+    folder: Path,
+    frames: FrameSet,
+    split: Split,
+    captured: np.ndarray,
+    sources: Mapping[str, np.ndarray],
+    splats: Mapping[str, Gaussians],
+    settings: SplatSettings,
+    backend: Backend,
+) -> None:
+    """One row of faces for what was captured, then one for each source."""
+    from gsba.camera.rig import CubeRig
+
+    rig = CubeRig(settings.face_size, np.pi / 2)
+    for i, f in enumerate(split.held_out):
+        rows = [np.concatenate(list(captured[6 * i : 6 * i + 6]), axis=1)]
+        for name, poses in sources.items():
+            near = near_of(poses[split.training], settings)
+            rows.append(
+                np.concatenate(
+                    list(render_faces(splats[name], poses[f], rig, near, backend)), axis=1
+                )
+            )
+        write_image(folder / f"{frames.names[f]}.jpg", np.concatenate(rows))
+
+
+def _write_curves(path: Path, results: Mapping[str, SourceResult]) -> None:
+    """PSNR of held-out frames over steps, a line for each source."""
+    import cv2
+
+    left, top, wide, tall = 60, 20, 520, 300
+    lines = {
+        name: np.array([(step, score.psnr) for step, score in sorted(result.curve.items())])
+        for name, result in results.items()
+        if len(result.curve) > 1
+    }
+    if not lines:
+        return
+    every = np.concatenate(list(lines.values()))
+    low, high = np.floor(every[:, 1].min()), np.ceil(every[:, 1].max())
+    canvas = np.full((top + tall + 40, left + wide + 140, 3), 255, np.uint8)
+
+    def write(text: str, x: float, y: float, color: tuple[int, int, int] = (0, 0, 0)) -> None:
+        at = (int(x), int(y))
+        cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
+
+    for share in np.linspace(0, 1, 6):
+        y = int(top + (1 - share) * tall)
+        cv2.line(canvas, (left, y), (left + wide, y), (220, 220, 220), 1)
+        write(f"{low + share * (high - low):.1f}", 8, y + 4)
+        write(f"{share * every[:, 0].max():.0f}", left + share * wide - 12, top + tall + 16)
+    write("PSNR of held-out frames, dB, over steps", left, top + tall + 34)
+    for i, (name, line) in enumerate(lines.items()):
+        x = left + wide * line[:, 0] / every[:, 0].max()
+        y = top + tall * (high - line[:, 1]) / max(high - low, 1.0)
+        color = _COLORS[i % len(_COLORS)]
+        at = np.rint(np.column_stack([x, y])).astype(np.int32)
+        cv2.polylines(canvas, [at[:, None]], False, color, 2, cv2.LINE_AA)
+        write(name, left + wide + 8, y[-1] + 4, color)
+    write_image(path, canvas)
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Write an RGB image (H, W, 3) uint8, beside and renamed.
+
+    Raises:
+        GsbaError: the disk refuses.
+    """
+    import cv2
+
+    done, encoded = cv2.imencode(path.suffix, image[..., ::-1])
+    if not done:
+        raise GsbaError(f"{path}: cannot be encoded")
+    atomic_write(path, lambda temporary: temporary.write_bytes(encoded.tobytes()))

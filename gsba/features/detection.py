@@ -1,0 +1,151 @@
+"""Keypoints on cube faces, as bearings of the rig."""
+
+import ctypes
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from gsba.camera.rig import RIG_R_FACE, CubeRig, owner_faces
+from gsba.config import FeatureSettings
+from gsba.types import FACES, Features, Keypoints
+
+
+@dataclass(frozen=True, slots=True)
+class FaceKeypoints:
+    """What an extractor finds on one face."""
+
+    pixels: np.ndarray  # (K, 2) float64, (u, v), corner origin
+    sigmas_px: np.ndarray  # (K,) float64, per-axis localisation noise, face pixels
+    descriptors: np.ndarray  # (K, D)
+    scores: np.ndarray | None = None  # (K,) float32, a network's confidence
+
+
+# Parameters of mallopt(3), from malloc.h.
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+
+
+class Extractor(Protocol):
+    """Finds and describes keypoints on a pinhole image, the strongest first."""
+
+    def __call__(self, face_rgb: np.ndarray, mask: np.ndarray | None) -> FaceKeypoints:
+        """Keypoints of a (N, N, 3) uint8 image where mask (N, N) bool allows."""
+        ...
+
+
+class SiftExtractor:
+    """OpenCV SIFT (Lowe, IJCV 2004) with RootSIFT descriptors (Arandjelovic, CVPR 2012)."""
+
+    def __init__(self, settings: FeatureSettings) -> None:
+        self._settings = settings
+        self._sift = cv2.SIFT.create(
+            nfeatures=settings.max_per_face,
+            nOctaveLayers=3,
+            contrastThreshold=settings.contrast_threshold,
+            edgeThreshold=10,
+            sigma=1.6,
+            descriptorType=cv2.CV_32F,
+            enable_precise_upscale=True,
+        )
+
+    def __call__(self, face_rgb: np.ndarray, mask: np.ndarray | None) -> FaceKeypoints:
+        grey = cv2.cvtColor(face_rgb, cv2.COLOR_RGB2GRAY)
+        allowed = None if mask is None else mask.astype(np.uint8)
+        keypoints, descriptors = self._sift.detectAndCompute(grey, allowed)
+        if descriptors is None:
+            return FaceKeypoints(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8))
+        order = np.argsort([-k.response for k in keypoints], kind="stable")
+        keypoints, descriptors = [keypoints[k] for k in order], descriptors[order]
+        pixels = np.array([k.pt for k in keypoints]) + 0.5
+        sizes = np.array([k.size for k in keypoints])
+        sigmas = np.hypot(self._settings.sigma_px, self._settings.sigma_per_size * sizes)
+        return FaceKeypoints(pixels, sigmas, _root_sift(descriptors))
+
+
+def keep_freed_memory() -> None:
+    """Let glibc hold on to freed blocks instead of returning them to the system at once.
+
+    SIFT's pyramids allocate the same tens of megabytes for every face. Without this, fetching and
+    clearing fresh pages is a third of its time on faces of 600 pixels and more.
+    """
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "mallopt"):
+        libc.mallopt(_M_TRIM_THRESHOLD, 1 << 30)
+        libc.mallopt(_M_MMAP_THRESHOLD, 1 << 30)
+
+
+def _root_sift(descriptors: np.ndarray) -> np.ndarray:
+    """Hellinger-normalised descriptors, quantised to uint8 with factor 512."""
+    mass = descriptors.sum(axis=1, keepdims=True)
+    rooted = np.sqrt(descriptors / np.maximum(mass, 1e-12))
+    return np.minimum(np.rint(512 * rooted), 255).astype(np.uint8)
+
+
+def extract(
+    faces_rgb: np.ndarray, masks: np.ndarray | None, rig: CubeRig, extractor: Extractor
+) -> Features:
+    """Find keypoints on all faces of a frame; each stays only in the face that owns its bearing.
+
+    Args:
+        faces_rgb: (6, N, N, 3) uint8 in FACES order.
+        masks: (6, N, N) bool, True = use, or None.
+        rig: geometry of the faces.
+        extractor: the detector.
+    """
+    wanted = _owned(rig) if masks is None else _owned(rig) & masks
+    usable = [face for face in range(len(FACES)) if wanted[face].any()]
+    parts, scores = [], []
+    for face in usable or [0]:  # one at least: the extractor knows the shape of nothing
+        found = extractor(faces_rgb[face], wanted[face])
+        bearings = rig.bearings(found.pixels, face)
+        own = owner_faces(bearings) == face
+        parts.append(_record(found, bearings, own, face, faces_rgb[face], rig))
+        if found.scores is not None:
+            scores.append(found.scores[own])
+    features = Features(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return replace(features, scores=np.concatenate(scores)) if scores else features
+
+
+@lru_cache(maxsize=2)
+def _owned(rig: CubeRig) -> np.ndarray:
+    """Pixels (6, N, N) bool that hold something a face owns: no other is worth describing."""
+    centres = np.arange(rig.size) + 0.5
+    grid = np.stack(np.meshgrid(centres, centres), axis=-1)
+    owned = [owner_faces(rig.bearings(grid, face)) == face for face in range(len(FACES))]
+    border = np.ones((3, 3), np.uint8)
+    return np.stack([cv2.dilate(own.astype(np.uint8), border) > 0 for own in owned])
+
+
+def _record(
+    found: FaceKeypoints,
+    bearings: np.ndarray,
+    own: np.ndarray,
+    face: int,
+    image: np.ndarray,
+    rig: CubeRig,
+) -> tuple[np.ndarray, ...]:
+    """Fields of Features for the keypoints of one face that it owns."""
+    pixels = found.pixels[own]
+    # A pixel at angle a off the axis subtends cos^2 a radially and cos a tangentially of 1 / f;
+    # the geometric mean keeps the noise isotropic.
+    cosine = bearings[own] @ RIG_R_FACE[face, :, 2]
+    sigmas = found.sigmas_px[own] / rig.focal * cosine**1.5
+    rows, columns = np.minimum(pixels[:, 1], rig.size - 1), np.minimum(pixels[:, 0], rig.size - 1)
+    colors = image[rows.astype(int), columns.astype(int)]
+    owners = np.full(len(pixels), face, np.uint8)
+    return pixels, owners, bearings[own], sigmas, found.descriptors[own], colors
+
+
+def gather(frames: Iterable[Features]) -> Keypoints:
+    """Keypoints of all frames in one record, descriptors left behind."""
+    lengths, fields = [0], []
+    for found in frames:
+        lengths.append(len(found))
+        fields.append(
+            (found.pixels, found.faces, found.bearings_rig, found.sigmas_rad, found.colors)
+        )
+    columns = (np.concatenate(column) for column in zip(*fields, strict=True))
+    return Keypoints(np.cumsum(lengths), *columns)

@@ -1,0 +1,97 @@
+"""Cut the six pinhole faces of a frame out of its panorama."""
+
+import functools
+
+import cv2
+import numpy as np
+
+from gsba.camera.rig import CubeRig
+from gsba.camera.straighten import PAD, wrapped
+from gsba.config import CubemapSettings
+from gsba.frames.masks import load_mask
+from gsba.frames.scan import load_erp, load_faces
+from gsba.geometry import erp_from_bearings
+from gsba.types import FACES, FrameSet
+
+
+def rig_for(frames: FrameSet, settings: CubemapSettings) -> CubeRig:
+    """The rig on which features of these frames are found.
+
+    Unless a size is set, a face centre has `oversampling` times the pixel density of the
+    panorama's equator, within `min_face_size` and `max_face_size`: half is enough where patches
+    refine what features find. Frames that come as cube faces keep their own size and
+    90 degrees.
+    """
+    if frames.layout == "cube":
+        return CubeRig(frames.width, np.pi / 2)
+    hfov = np.deg2rad(settings.hfov_deg)
+    native = 2 * frames.width / (2 * np.pi) * np.tan(hfov / 2)
+    wanted = max(round(settings.oversampling * native), settings.min_face_size)
+    size = settings.face_size or min(wanted, settings.max_face_size)
+    return CubeRig(size, hfov)
+
+
+def load(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.ndarray | None]:
+    """Faces (6, size, size, 3) uint8 RGB of a frame and where they may be used, bool or None."""
+    mask = load_mask(frames, frame)
+    masks = None if mask is None else cut_mask(mask, rig)
+    if frames.layout == "erp":
+        width = _dense_enough(frames.width, rig)
+        return cut(load_erp(frames, frame, width=width), rig), masks
+    images = np.zeros((len(FACES), rig.size, rig.size, 3), np.uint8)
+    present = [FACES.index(name) for name in frames.faces]
+    images[present] = load_faces(frames, frame)
+    usable = np.zeros((len(FACES), rig.size, rig.size), bool)
+    usable[present] = True
+    return images, usable if masks is None else usable & masks
+
+
+def cut(erp: np.ndarray, rig: CubeRig) -> np.ndarray:
+    """Sample the faces of a panorama, bicubic, continuous over the seam and the poles.
+
+    Args:
+        erp: (H, 2H) or (H, 2H, C) uint8 equirectangular image.
+        rig: faces to cut.
+
+    Returns:
+        (6, size, size[, C]) uint8, in FACES order.
+    """
+    width = _dense_enough(erp.shape[1], rig)
+    height = width // 2
+    if width < erp.shape[1]:
+        erp = cv2.resize(erp, (width, height), interpolation=cv2.INTER_AREA)
+    padded = wrapped(erp)
+    maps = _face_maps(rig, width, height)
+    return np.stack(
+        [
+            cv2.remap(padded, maps[face, 0], maps[face, 1], cv2.INTER_CUBIC)
+            for face in range(len(FACES))
+        ]
+    )
+
+
+def _dense_enough(width: int, rig: CubeRig) -> int:
+    """Width to average a panorama down to: detail beyond the faces' resolution aliases."""
+    density = 2 * np.pi * rig.focal  # panorama width at which pixels are as dense as the face's
+    return 2 * round(density / 2) if width > 1.5 * density else width
+
+
+def cut_mask(mask: np.ndarray, rig: CubeRig) -> np.ndarray:
+    """Nearest-neighbour faces (6, size, size) of an ERP mask (H, 2H), bool or float32 weights."""
+    height, width = mask.shape
+    padded = wrapped(mask.astype(np.uint8) if mask.dtype == bool else mask)
+    maps = _face_maps(rig, width, height)
+    faces = [cv2.remap(padded, u, v, cv2.INTER_NEAREST) for u, v in maps]
+    return np.stack(faces).astype(mask.dtype)
+
+
+@functools.lru_cache(maxsize=2)
+def _face_maps(rig: CubeRig, width: int, height: int) -> np.ndarray:
+    """Sampling positions (6, 2, size, size) float32 in the padded panorama, OpenCV pixels."""
+    centres = np.arange(rig.size) + 0.5
+    grid = np.stack(np.meshgrid(centres, centres), axis=-1)
+    maps = np.empty((len(FACES), 2, rig.size, rig.size), np.float32)
+    for face in range(len(FACES)):
+        erp_pixels = erp_from_bearings(rig.bearings(grid, face), width, height)
+        maps[face] = np.moveaxis(erp_pixels - 0.5 + PAD, -1, 0)
+    return maps

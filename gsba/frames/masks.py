@@ -1,0 +1,102 @@
+"""Equirectangular masks: white = use, black = do not, light grey = use with less weight."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gsba.camera.straighten import straightened
+from gsba.frames.files import IMAGE_SUFFIXES, decode, image_size, is_image
+from gsba.log import GsbaError
+from gsba.types import FrameSet
+
+_UNUSED = 127  # grey level up to which pixels are not used
+
+
+def find_masks(
+    masks: Path | None, names: Sequence[str], erp_size: tuple[int, int] | None
+) -> tuple[Path | None, ...]:
+    """Mask file of each frame.
+
+    Args:
+        masks: one image for all frames, or a folder with `NAME.png` or `NAME.jpg.png` for each.
+        names: (F,) frame names without extension.
+        erp_size: width and height that masks must have; None (cube frames) = any, as long as 2:1.
+
+    Returns:
+        (F,) paths, all None without masks.
+
+    Raises:
+        GsbaError: a missing or unreadable mask, or one of another size.
+    """
+    if masks is None:
+        return (None,) * len(names)
+    if masks.is_dir():
+        by_name = {_frame_name(path): path for path in sorted(masks.iterdir()) if is_image(path)}
+        missing = [name for name in names if name not in by_name]
+        if missing:
+            raise GsbaError(
+                f"{masks}: no mask for frame '{missing[0]}' ({len(missing)} of {len(names)} "
+                "missing); a mask folder holds NAME.png for every frame"
+            )
+        paths = tuple(by_name[name] for name in names)
+    else:
+        paths = (masks,) * len(names)
+    for path in dict.fromkeys(paths):
+        w, h = image_size(path)
+        if erp_size and (w, h) != erp_size:
+            raise GsbaError(f"{path}: mask is {w}x{h}, but frames are {erp_size[0]}x{erp_size[1]}")
+        if w != 2 * h:
+            raise GsbaError(f"{path}: mask is {w}x{h}; masks are equirectangular, 2:1")
+    return tuple(path.absolute() for path in paths)
+
+
+def load_mask(frames: FrameSet, f: int) -> np.ndarray | None:
+    """ERP mask of frame f, (H, 2H) bool, True = use; None if the frame has none.
+
+    Where the frames have a correction, it is applied.
+    """
+    levels = _load_levels(frames, f)
+    if levels is None:
+        return None
+    usable = levels > _UNUSED
+    return straightened(usable, frames.correction) if frames.correction else usable
+
+
+def load_weights(frames: FrameSet, f: int) -> np.ndarray | None:
+    """Weights (H, 2H) float32 of the pixels of frame f, 0..1; None if the frame has no mask.
+
+    0 is where `load_mask` is False; above, they grow with the grey level to 1 at white.
+    """
+    levels = _load_levels(frames, f)
+    if levels is None:
+        return None
+    usable = levels > _UNUSED
+    if frames.correction:
+        usable, levels = (straightened(image, frames.correction) for image in (usable, levels))
+    above = np.maximum(levels, _UNUSED + 1) - np.float32(_UNUSED)
+    return np.where(usable, above / (255 - _UNUSED), 0).astype(np.float32)
+
+
+def levels_of(weights: np.ndarray) -> np.ndarray:
+    """Grey levels (H, 2H) uint8 of a mask file with these weights (H, 2H) 0..1, or bool."""
+    above = np.maximum(np.rint((255 - _UNUSED) * weights.astype(np.float32)), 1)
+    return np.where(weights > 0, _UNUSED + above, 0).astype(np.uint8)
+
+
+def _load_levels(frames: FrameSet, f: int) -> np.ndarray | None:
+    """Grey levels (H, 2H) uint8 as they are in the file."""
+    path = frames.mask_paths[f]
+    if path is None:
+        return None
+    size = (frames.width, frames.height) if frames.layout == "erp" else image_size(path)
+    values = decode(path, size, gray=True)
+    if values.max() == 1:
+        raise GsbaError(f"{path}: mask holds 0 and 1; write 255 where pixels are to be used")
+    return values
+
+
+def _frame_name(path: Path) -> str:
+    """`NAME` of `NAME.png` and of `NAME.jpg.png`."""
+    inner = Path(path.stem)
+    return inner.stem if inner.suffix.lower() in IMAGE_SUFFIXES else path.stem

@@ -1,0 +1,147 @@
+"""Grey panoramas of frames of any layout, for sampling on the sphere."""
+
+import functools
+
+import cv2
+import numpy as np
+
+from gsba.camera.rig import CubeRig, owner_faces
+from gsba.frames.masks import load_mask
+from gsba.frames.scan import load_erp, load_faces
+from gsba.geometry import bearings_from_erp
+from gsba.types import FACES, FrameSet
+
+_LOOKS = 5  # frames whose brightness stands for all
+_PAD = 3  # pixels of a face's neighbours around it: the support of bicubic sampling, and one
+
+
+def width_for(frames: FrameSet, max_width: int) -> int:
+    """Width of the panoramas that `load_grey` makes.
+
+    Cube faces become a panorama with at least their own density at their centres.
+    """
+    width = frames.width if frames.layout == "erp" else 4 * frames.width
+    while width > max_width and width % 4 == 0:
+        width //= 2
+    return width
+
+
+def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """Panorama of a frame and where it may be used.
+
+    Args:
+        width: as `width_for` says.
+
+    Returns:
+        (width / 2, width) uint8 grey; (width / 2, width) bool or None, True = use.
+    """
+    mask = load_mask(frames, frame)
+    if frames.layout == "erp":
+        grey = load_erp(frames, frame, gray=True, width=width)
+        return grey, None if mask is None else fit_mask(mask, width)
+    size = frames.width
+    faces = np.zeros((len(FACES), size, size), np.uint8)
+    present = [FACES.index(name) for name in frames.faces]
+    faces[present] = load_faces(frames, frame, gray=True)
+    native = 4 * size
+    maps, owners = _erp_maps(size, native)
+    grey = np.empty(owners.shape, np.uint8)
+    for face, padded in enumerate(_padded(faces)):
+        own = owners == face
+        grey[own] = cv2.remap(padded, maps[0], maps[1], cv2.INTER_CUBIC)[own]
+    usable = np.isin(owners, present)
+    if mask is not None:
+        usable &= fit_mask(mask, native)
+    whole = bool(usable.all())
+    return _fit(grey, width), None if whole else fit_mask(usable, width)
+
+
+def wrapped(image: np.ndarray, columns: int) -> np.ndarray:
+    """A panorama (h, 2h[, C]) with columns from beyond the seam on either side."""
+    return np.concatenate([image[:, -columns:], image, image[:, :columns]], axis=1)
+
+
+class Greys:
+    """Grey panoramas of frames that are read again and again: the first ones stay in memory."""
+
+    def __init__(self, frames: FrameSet, max_width: int, limit_mb: float = 128.0) -> None:
+        self.num_frames, self.width = len(frames), width_for(frames, max_width)
+        self._frames = frames
+        self._room = int(limit_mb * 2**20 / self.width**2)  # images of width^2 / 2, and masks
+        self._kept: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
+
+    def __getitem__(self, frame: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """As `load_grey`, from any thread."""
+        found = self._kept.get(frame)
+        if found is None:
+            found = load_grey(self._frames, frame, self.width)
+            if len(self._kept) < self._room:
+                self._kept[frame] = found
+        return found
+
+
+def bright_level(greys: Greys) -> int:
+    """Grey value that 99 % of the usable pixels of some frames do not exceed; 255 without any."""
+    chosen = np.unique(np.linspace(0, greys.num_frames - 1, _LOOKS).astype(int))
+    found = [greys[int(f)] for f in chosen]
+    used = [(grey if mask is None else grey[mask]).ravel() for grey, mask in found]
+    values = np.concatenate(used)
+    return int(np.percentile(values, 99)) if len(values) else 255
+
+
+def _fit(grey: np.ndarray, width: int) -> np.ndarray:
+    """An image averaged down to a width."""
+    if grey.shape[1] == width:
+        return grey
+    return cv2.resize(grey, (width, width // 2), interpolation=cv2.INTER_AREA)
+
+
+def fit_mask(mask: np.ndarray, width: int) -> np.ndarray:
+    """A mask resized to a width; a pixel is usable where all it covers is."""
+    if mask.shape[1] == width:
+        return mask
+    share = cv2.resize(mask.astype(np.float32), (width, width // 2), interpolation=cv2.INTER_AREA)
+    return share > 0.999
+
+
+@functools.lru_cache(maxsize=2)
+def _erp_maps(size: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places (2, H, W) float32 in the padded owner faces, OpenCV pixels; owners (H, W) uint8."""
+    centres = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
+    bearings = bearings_from_erp(np.stack(centres, axis=-1), width, width // 2)
+    owners = owner_faces(bearings)
+    pixels = CubeRig(size, np.pi / 2).project(bearings, owners)
+    return np.moveaxis(pixels - 0.5 + _PAD, -1, 0).astype(np.float32), owners
+
+
+@functools.lru_cache(maxsize=2)
+def _border_maps(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where the padding of each face lies on others: as `_erp_maps`, (2, 6, N, N) and (6, N, N)."""
+    rig = CubeRig(size, np.pi / 2)
+    places = np.arange(-_PAD, size + _PAD) + 0.5
+    grid = np.stack(np.meshgrid(places, places), axis=-1)
+    bearings = np.stack([rig.bearings(grid, face) for face in range(len(FACES))])
+    owners = owner_faces(bearings)
+    pixels = rig.project(bearings, owners)
+    return np.moveaxis(pixels - 0.5, -1, 0).astype(np.float32), owners
+
+
+def _padded(faces: np.ndarray) -> np.ndarray:
+    """Faces (6, N, N) with a border of their neighbours' pixels."""
+    maps, owners = _border_maps(faces.shape[1])
+    out = np.pad(faces, ((0, 0), (_PAD, _PAD), (_PAD, _PAD)), mode="edge")
+    inner = np.zeros(owners.shape[1:], bool)
+    inner[_PAD:-_PAD, _PAD:-_PAD] = True
+    for face in range(len(FACES)):
+        for other in range(len(FACES)):
+            own = (owners[face] == other) & ~inner
+            if own.any():
+                found = cv2.remap(
+                    faces[other],
+                    maps[0, face][own][None],
+                    maps[1, face][own][None],
+                    cv2.INTER_CUBIC,
+                    borderMode=cv2.BORDER_REPLICATE,
+                )
+                out[face][own] = found[0]
+    return out

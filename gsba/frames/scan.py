@@ -1,0 +1,311 @@
+"""Captured frames on disk: which images form a frame, in what order, and their pixels."""
+
+import logging
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from gsba.camera.straighten import straightened
+from gsba.frames.files import decode, image_size, is_image
+from gsba.frames.masks import find_masks
+from gsba.frames.times import frame_times
+from gsba.log import GsbaError, track
+from gsba.types import FACES, FrameSet
+
+_log = logging.getLogger(__name__)
+
+MIN_FRAMES = 3
+_SIDES = ("front", "right", "back", "left")
+_TIMES_FILE = "timestamps.csv"
+_FOREIGN = {  # images that are not read, by suffix
+    ".avif": "AVIF",
+    ".bmp": "BMP",
+    ".dng": "DNG",
+    ".exr": "EXR",
+    ".heic": "HEIC",
+    ".heif": "HEIF",
+    ".insp": "INSP",
+    ".jp2": "JPEG 2000",
+    ".jxl": "JPEG XL",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".webp": "WebP",
+}
+
+
+def scan(
+    folder: Path,
+    timestamps: Path | None = None,
+    fps: float | None = None,
+    masks: Path | None = None,
+    order_suffices: bool = False,
+) -> FrameSet:
+    """Frames of a folder, in time order, checked by their headers; no pixel is decoded.
+
+    The folder holds equirectangular images, or cube faces: subfolders `front`, `right`, ... with
+    equal names, or files `NAME_front.jpg`, ...; up and down may be absent from all frames.
+
+    Args:
+        folder: JPEG or PNG images; other files are ignored.
+        timestamps: table of times (see `read_times`); else `timestamps.csv` in the folder, unless
+            `fps` is given; else the file names, if they are times.
+        fps: frames per second of these files in name order.
+        masks: one ERP mask for all frames, or a folder with one for each; white = use.
+        order_suffices: where nothing gives times, name order stands in for them.
+
+    Raises:
+        GsbaError: naming the first file or frame that cannot be used.
+    """
+    if timestamps is not None and fps is not None:
+        raise GsbaError("--timestamps and --fps both say when frames were taken; pass one")
+    layout, faces, found = _find_frames(Path(folder))
+    if len(found) < MIN_FRAMES:
+        raise GsbaError(f"{folder}: {len(found)} frames; at least {MIN_FRAMES} are needed")
+    names = sorted(found, key=_natural)
+    _check_names(Path(folder), names)
+    if names != sorted(names):
+        _log.warning("frames are taken in numeric order (%s before %s)", *_first_swap(names))
+    table = timestamps
+    if table is None and fps is None and (Path(folder) / _TIMES_FILE).is_file():
+        table = Path(folder) / _TIMES_FILE
+    if fps is not None:
+        _warn_of_slots(Path(folder), max(path.name for path in found[names[-1]]))
+    times, timed = frame_times(names, table, fps, order_suffices)
+    order = np.argsort(times, kind="stable")
+    names, times = [names[i] for i in order], times[order]
+    same = np.flatnonzero(np.diff(times) <= 0)
+    if len(same):
+        a, b = names[same[0]], names[same[0] + 1]
+        raise GsbaError(f"frames '{a}' and '{b}' have the same time {times[same[0]]!r}")
+    paths = tuple(found[name] for name in names)
+    width, height = _common_size(paths, layout)
+    erp_size = (width, height) if layout == "erp" else None
+    return FrameSet(
+        names=tuple(names),
+        paths=_absolute(paths),
+        timestamps=times,
+        layout=layout,
+        faces=faces,
+        width=width,
+        height=height,
+        mask_paths=find_masks(masks, names, erp_size),
+        timed=timed,
+    )
+
+
+def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
+    """Panoramas of a folder in name order; nothing is asked of their times, which are 0, 1, ...
+
+    Raises:
+        GsbaError: no panoramas, or a mask that does not fit.
+    """
+    layout, _, found = _find_frames(Path(folder))
+    if layout != "erp":
+        raise GsbaError(f"{folder}: holds cube faces; panoramas are wanted here")
+    names = sorted(found, key=_natural)
+    _check_names(Path(folder), names)
+    paths = tuple(found[name] for name in names)
+    width, height = _common_size(paths, layout)
+    return FrameSet(
+        names=tuple(names),
+        paths=_absolute(paths),
+        timestamps=np.arange(len(names), dtype=np.float64),
+        layout=layout,
+        faces=(),
+        width=width,
+        height=height,
+        mask_paths=find_masks(masks, names, (width, height)),
+        timed=False,
+    )
+
+
+def load_erp(frames: FrameSet, f: int, gray: bool = False, width: int | None = None) -> np.ndarray:
+    """Equirectangular image of frame f, (height, width, 3) uint8 RGB, or (height, width) grey.
+
+    Where the frames have a correction, it is applied.
+
+    Args:
+        frames: panoramas.
+        f: index of the frame.
+        gray: one channel instead of RGB.
+        width: pixels across, even: wider frames are averaged down to it.
+    """
+    import cv2
+
+    if frames.layout != "erp":
+        raise ValueError("load_erp needs equirectangular frames")
+    erp = decode(frames.paths[f][0], (frames.width, frames.height), gray, at_least=width)
+    if width is not None and width < erp.shape[1]:
+        erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
+    return straightened(erp, frames.correction) if frames.correction else erp
+
+
+def load_faces(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
+    """Cube faces of frame f, (len(frames.faces), height, width[, 3]) uint8, RGB or grey."""
+    if frames.layout != "cube":
+        raise ValueError("load_faces needs cube frames")
+    size = frames.width, frames.height
+    return np.stack([decode(path, size, gray) for path in frames.paths[f]])
+
+
+def _check_names(folder: Path, names: Sequence[str]) -> None:
+    """Refuse names that no table and no dataset could hold."""
+    for name in names:
+        if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in name):
+            raise GsbaError(
+                f"{folder}: the file name {name!r} holds control characters or is not UTF-8: "
+                "rename it"
+            )
+
+
+def _absolute(paths: Sequence[Sequence[Path]]) -> tuple[tuple[Path, ...], ...]:
+    """Paths that hold from any working folder."""
+    return tuple(tuple(path.absolute() for path in group) for group in paths)
+
+
+def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Path, ...]]]:
+    """Layout, faces, and the images of each frame by name."""
+    entries = _entries(folder)
+    images = [path for path in entries if is_image(path) and path.is_file()]
+    subfolders = {
+        path.name.lower(): path
+        for path in entries
+        if path.name.lower() in FACES and path.is_dir() and any(map(is_image, path.iterdir()))
+    }
+    if subfolders and images:
+        raise GsbaError(
+            f"{folder}: holds both images ('{images[0].name}') and face folders "
+            f"('{next(iter(subfolders.values())).name}'); keep one of them"
+        )
+    others = [p.name for p in entries if p not in images and p not in subfolders.values()]
+    others = [name for name in others if name != _TIMES_FILE]
+    if others:
+        _log.info("%s: ignored %d other entries: %s", folder, len(others), ", ".join(others[:5]))
+    places = [folder, *(path for path in entries if path.name.lower() in FACES and path.is_dir())]
+    foreign = _foreign(path for place in places for path in _entries(place))
+    if foreign and (subfolders or images):
+        _log.warning("%s: left out %s: convert them to JPEG or PNG", folder, foreign)
+    if subfolders:
+        by_face = {
+            face: _by_name(folder, filter(is_image, _entries(subfolders[face])))
+            for face in FACES
+            if face in subfolders
+        }
+        return "cube", *_cube_frames(folder, by_face)
+    if not images and foreign:
+        raise GsbaError(f"{folder}: no JPEG or PNG images, but {foreign}: convert them first")
+    if not images:
+        counts = Counter(Path(name).suffix.lower() or Path(name).name for name in others)
+        held = ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items())[:5]) or "nothing"
+        raise GsbaError(
+            f"{folder}: no JPEG or PNG images (it holds {held}); extract the video's frames there "
+            "first"
+        )
+    tagged = {path: m for path in images if (m := re.fullmatch(_TAGGED, path.stem))}
+    tags = {match["face"].lower() for match in tagged.values()}
+    if not tags.issuperset(_SIDES) and len(tagged) < len(images):
+        found = _by_name(folder, images)
+        return "erp", (), {name: (path,) for name, path in found.items()}
+    stray = next((path for path in images if path not in tagged), None)
+    if stray:
+        raise GsbaError(f"{folder}: '{stray.name}' lies among cube faces but names no face")
+    by_face = {
+        face: {m["name"]: path for path, m in tagged.items() if m["face"].lower() == face}
+        for face in FACES
+        if face in tags
+    }
+    return "cube", *_cube_frames(folder, by_face)
+
+
+_TAGGED = re.compile(rf"(?P<name>.+)_(?P<face>{'|'.join(FACES)})", re.IGNORECASE)
+
+
+def _foreign(paths: Iterable[Path]) -> str:
+    """How many images of which formats that are not read: "2 TIFF and 1 WebP images", or ""."""
+    kinds = [_FOREIGN.get(path.suffix.lower()) for path in paths if path.name[0] != "."]
+    counts = sorted(Counter(kind for kind in kinds if kind).items())
+    *front, last = [f"{n} {kind}" for kind, n in counts] or [""]
+    text = f"{', '.join(front)} and {last}" if front else last
+    return text and f"{text} image{'s' if sum(n for _, n in counts) > 1 else ''}"
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(folder.iterdir())
+    except FileNotFoundError:
+        raise GsbaError(f"{folder}: no such folder") from None
+    except NotADirectoryError:
+        raise GsbaError(f"{folder}: is a file; give the folder of extracted frames") from None
+    except OSError as error:
+        raise GsbaError(f"{folder}: cannot be read ({error.strerror})") from None
+
+
+def _by_name(folder: Path, images: Sequence[Path] | filter) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for path in images:
+        if path.stem in found:
+            raise GsbaError(
+                f"{folder}: '{found[path.stem].name}' and '{path.name}' are one frame's name twice"
+            )
+        found[path.stem] = path
+    return found
+
+
+def _cube_frames(
+    folder: Path, by_face: Mapping[str, Mapping[str, Path]]
+) -> tuple[tuple[str, ...], dict[str, tuple[Path, ...]]]:
+    """Faces present and each frame's images in that order; all frames have the same faces."""
+    faces = tuple(by_face)
+    names = set().union(*by_face.values())
+    for face in dict.fromkeys((*_SIDES, *faces)):
+        missing = sorted(names - set(by_face.get(face, ())), key=_natural)
+        if missing:
+            raise GsbaError(
+                f"{folder}: frame '{missing[0]}' has no {face} face "
+                f"({len(missing)} of {len(names)} frames lack it)"
+            )
+    return faces, {name: tuple(by_face[face][name] for face in faces) for name in names}
+
+
+def _common_size(paths: Sequence[tuple[Path, ...]], layout: str) -> tuple[int, int]:
+    """Width and height that all images share, of the shape the layout asks for."""
+    first = paths[0][0]
+    width, height = image_size(first)
+    for group in track(paths, "checking frames"):
+        for path in group:
+            w, h = image_size(path)
+            if layout == "erp" and (w != 2 * h or h == 0):
+                raise GsbaError(f"{path}: is {w}x{h}; an equirectangular frame is 2:1")
+            if layout == "cube" and (w != h or h == 0):
+                raise GsbaError(f"{path}: is {w}x{h}; a cube face is square")
+            if (w, h) != (width, height):
+                raise GsbaError(f"{path}: is {w}x{h}, but '{first.name}' is {width}x{height}")
+    return width, height
+
+
+def _warn_of_slots(folder: Path, last: str) -> None:
+    """stella_vslam gives every file of a folder a time slot, images or not."""
+    early = [p.name for p in _entries(folder) if p.is_file() and not is_image(p) and p.name < last]
+    if early:
+        _log.warning(
+            "--fps counts images only; if stella_vslam read this folder with '%s' in it, its times "
+            "are %d frames later",
+            early[0],
+            len(early),
+        )
+
+
+def _natural(name: str) -> tuple[list[tuple[str, int]], str]:
+    """Sort key in which runs of digits count as numbers."""
+    parts = re.split(r"([0-9]+)", name)
+    keys = [(p, -1) if i % 2 == 0 else ("", int(p)) for i, p in enumerate(parts)]
+    return keys, name
+
+
+def _first_swap(names: Sequence[str]) -> tuple[str, str]:
+    return next((a, b) for a, b in pairwise(names) if a > b)

@@ -1,0 +1,227 @@
+"""Times of frames and poses: tables on disk, frame rates, file names."""
+
+import logging
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsba.frames.files import IMAGE_SUFFIXES
+from gsba.log import GsbaError, brief
+
+_log = logging.getLogger(__name__)
+
+# Whole numbers that are Unix times between 2001 and 2100, by unit: ticks per second.
+_UNIX_RANGE_S = (1_000_000_000, 4_102_444_800)
+_TICKS = {"seconds": 1, "milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}
+
+_LATEST_S = 1e20  # even nanoseconds since 1970 taken for seconds are earlier
+_RATES = (1e-6, 1e6)  # frames per second that --fps may be
+_MIN_INTERVAL_S = 1e-3  # frame intervals shorter than this are not times but numbering
+_HOW = "pass --timestamps FILE or --fps F, or put a timestamps.csv (name,timestamp) beside them"
+
+
+class NoTimesError(GsbaError):
+    """Nothing says when frames were taken."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimeRow:
+    """One line of a table of times."""
+
+    line: int  # 1-based
+    name: str | None  # file name as written; None in a plain list
+    timestamp: float  # seconds
+
+
+def read_lines(path: Path) -> list[tuple[int, str]]:
+    """Numbered lines of a text file without blank lines and # comments.
+
+    Raises:
+        GsbaError: missing, unreadable or not text.
+    """
+    try:
+        if path.is_dir() or path.is_char_device() or path.is_block_device():
+            raise GsbaError(f"{path}: is a folder or a device; give a text file")
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise GsbaError(f"{path}: not a text file") from None
+    stripped = ((number, line.strip()) for number, line in enumerate(text.split("\n"), 1))
+    return [(number, line) for number, line in stripped if line and not line.startswith("#")]
+
+
+def seconds(text: str) -> float:
+    """Seconds written as a decimal number, or as Unix time in whole ms, us or ns.
+
+    Raises:
+        ValueError: not a finite number, or none that a clock could show.
+    """
+    unit = unix_unit(text)
+    value = int(text) / _TICKS[unit] if unit else float(text)
+    if not abs(value) <= _LATEST_S:
+        raise ValueError(text)
+    return value
+
+
+def unix_unit(text: str) -> str | None:
+    """Unit in which a whole number is a Unix time of this century; None if in none."""
+    if not re.fullmatch(r"[0-9]+", text):
+        return None
+    low, high = _UNIX_RANGE_S
+    return next((u for u, t in _TICKS.items() if low * t <= int(text) < high * t), None)
+
+
+def read_times(path: Path) -> list[TimeRow]:
+    """Rows of a table of times: `name,timestamp`, `timestamp name`, or one timestamp a line.
+
+    A header is optional. Columns are separated by commas or blanks.
+
+    Raises:
+        GsbaError: naming the line that is malformed.
+    """
+    lines = read_lines(path)
+    rows = [
+        (number, [p.strip() for p in line.split(",")] if "," in line else line.split())
+        for number, line in lines
+    ]
+    header = rows.pop(0)[1] if rows and not any(map(_is_seconds, rows[0][1])) else None
+    if not rows:
+        raise GsbaError(f"{path}: holds no times")
+    columns = len(rows[0][1])
+    if columns > 2:
+        raise GsbaError(f"{path}: {columns} columns; want name,timestamp or one timestamp a line")
+    if header:
+        time_first = header[0].lower().startswith("time")
+    else:  # `timestamp name` where only the first column is numbers
+        time_first = all(_is_seconds(cells[0]) for _, cells in rows)
+        time_first &= not all(_is_seconds(cells[-1]) for _, cells in rows)
+    table = []
+    for number, cells in rows:
+        if len(cells) != columns:
+            raise GsbaError(f"{path}:{number}: {len(cells)} columns where others have {columns}")
+        name, time = (cells[-1], cells[0]) if time_first else (cells[0], cells[-1])
+        if not _is_seconds(time):
+            raise GsbaError(f"{path}:{number}: '{brief(time)}' is not a time in seconds")
+        table.append(TimeRow(number, name if columns == 2 else None, seconds(time)))
+    return table
+
+
+def _is_seconds(text: str) -> bool:
+    try:
+        seconds(text)
+    except ValueError:
+        return False
+    return True
+
+
+def frame_times(
+    names: Sequence[str], table: Path | None, fps: float | None, order_suffices: bool = False
+) -> tuple[np.ndarray, bool]:
+    """Time of each frame from a table, a rate, or the names themselves.
+
+    Args:
+        names: (F,) frame names without extension, in name order.
+        table: file that `read_times` understands; a plain list is in name order.
+        fps: frames per second of these very frames: frame i is at i / fps.
+        order_suffices: where nothing gives times, name order stands in for them.
+
+    Returns:
+        (F,) float64 seconds, not necessarily sorted, and whether they are times.
+
+    Raises:
+        GsbaError: a frame without a time, or times that would have to be guessed.
+    """
+    if table is not None:
+        rows = read_times(table)
+        if rows[0].name is None:
+            return _times_from_list(names, table, rows), True
+        return _times_by_name(names, table, rows), True
+    try:
+        given = _times_from_names(names) if fps is None else _times_at_rate(names, check_fps(fps))
+    except NoTimesError as error:
+        if not order_suffices:
+            raise
+        _log.info("frames are taken in the order of their names (%s)", error)
+        return np.arange(len(names)) / (fps or 1.0), False
+    return given, True
+
+
+def check_fps(fps: float) -> float:
+    """A rate that was asked for, if it is one.
+
+    Raises:
+        GsbaError: not positive, or so small or large that no camera has it.
+    """
+    if not _RATES[0] <= fps <= _RATES[1]:
+        raise GsbaError(
+            f"--fps {fps}: must be a positive number of frames per second, from {_RATES[0]:g} to "
+            f"{_RATES[1]:g}"
+        )
+    return fps
+
+
+def _times_from_list(names: Sequence[str], path: Path, rows: list[TimeRow]) -> np.ndarray:
+    if len(rows) != len(names):
+        raise GsbaError(
+            f"{path}: {len(rows)} times for {len(names)} frames; give one a frame in name order, "
+            "or name,timestamp rows"
+        )
+    return np.array([row.timestamp for row in rows])
+
+
+def _times_by_name(names: Sequence[str], path: Path, rows: list[TimeRow]) -> np.ndarray:
+    by_name: dict[str, float] = {}
+    for row in rows:
+        name = stem_of(row.name or "")
+        if name in by_name:
+            raise GsbaError(f"{path}:{row.line}: a second time for frame '{name}'")
+        by_name[name] = row.timestamp
+    missing = [name for name in names if name not in by_name]
+    if missing:
+        raise GsbaError(
+            f"{path}: no time for frame '{missing[0]}' ({len(missing)} of {len(names)} missing)"
+        )
+    if len(by_name) > len(names):
+        _log.info("%s: %d rows name no frame here", path, len(by_name) - len(names))
+    return np.array([by_name[name] for name in names])
+
+
+def stem_of(name: str) -> str:
+    """A frame's name: a file name without folder and image suffix."""
+    path = Path(name.replace("\\", "/"))
+    return path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name
+
+
+def _times_at_rate(names: Sequence[str], fps: float) -> np.ndarray:
+    counters = [int(m[0]) for name in names if (m := re.search(r"[0-9]{1,18}$", name))]
+    steps = np.diff(counters)
+    skips = np.flatnonzero(steps != np.median(steps)) if len(counters) == len(names) else []
+    if 0 < len(skips) <= len(steps) / 2:  # mostly even: counters with holes
+        before, after = names[skips[0]], names[skips[0] + 1]
+        raise NoTimesError(
+            f"frame numbers skip between '{before}' and '{after}', so --fps alone does not say "
+            "when frames were taken; pass --timestamps FILE"
+        )
+    return np.arange(len(names)) / fps
+
+
+def _times_from_names(names: Sequence[str]) -> np.ndarray:
+    """Times of names that are decimal seconds, or whole Unix times after a common prefix."""
+    if all(re.fullmatch(r"[0-9]+\.[0-9]+", name) for name in names):
+        times = np.array([float(name) for name in names])
+        if np.median(np.diff(np.sort(times))) < _MIN_INTERVAL_S:
+            raise NoTimesError(f"names like '{names[0]}' are too close to be seconds; {_HOW}")
+        _log.info("frame times are the file names, in seconds")
+        return times
+    split = [re.fullmatch(r"(.*?)([0-9]+)", name) for name in names]
+    found = [m.groups() for m in split if m]
+    units = {unix_unit(digits) for _, digits in found}
+    prefixes = {prefix for prefix, _ in found}
+    if len(found) == len(names) and len(prefixes) == 1 and len(units) == 1 and None not in units:
+        _log.info("frame times are the file names, Unix time in %s", units.pop())
+        return np.array([seconds(digits) for _, digits in found])
+    raise NoTimesError(f"nothing says when the frames ('{names[0]}', ...) were taken; {_HOW}")

@@ -1,0 +1,318 @@
+"""Parts of a map that no step of the images ties together: joined where they meet, or kept apart.
+
+A pause of the video, a restarted SLAM or frames that show nothing leave maps with a scale and a
+world of their own. Whole panoramas that look alike are compared; points that a frame of either
+map knows give the similarity between both, and it is believed if several pairs agree. A frame
+alone, without a map, gets its pose from points of the map. What meets nowhere is held by the
+trajectory where it knows better, and is a map of its own otherwise.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsba.bundle.adjustment import Adjustment
+from gsba.geometry import carried, inverse
+from gsba.loop_closure import loops
+from gsba.loop_closure.connectivity import by_size
+from gsba.loop_closure.map_similarity import Meeting, agreeing, measure, refined
+from gsba.loop_closure.merged_map import Registered
+from gsba.loop_closure.registration import resect
+from gsba.matching import recovery
+from gsba.matching.correspondences import median_depth, points_by_keypoint
+from gsba.matching.guided_search import Gate, MatchContext
+from gsba.types import Counts, Landmarks
+
+_LOOKS = 3  # places compared for each frame of a part; twice as many for a frame alone
+_SAMPLED = 24  # frames of a part that are looked for elsewhere
+_BESIDE = 3  # frames from a break that are compared whatever they look like
+_BEST = 2  # meetings whose surroundings are compared too
+_MIN_SHARE = 0.25  # of the matches, to measure a pair at all: agreement decides
+_MIN_MAP = 3  # frames of a part that is a map
+_BEHIND = 3.0  # times the pace: a frame alone is no further off than that
+_APART = 4.0  # extents between maps that nothing ties together
+_ANYWHERE = Gate(np.pi, 1e3, np.pi)
+
+
+def run(
+    context: MatchContext,
+    solved: Adjustment,
+    parts: np.ndarray,
+    held: np.ndarray,
+    seen: np.ndarray,
+    timestamps: np.ndarray,
+) -> Registered:
+    """Join the parts of a map where they meet, and register frames that are in none.
+
+    Args:
+        context: of the run.
+        solved: poses and points, right within every part.
+        parts: (F,) int, see `gsba.loop_closure.connectivity.parted`.
+        held: (F - 1,) bool, steps that no image shows but the trajectory knows.
+        seen: (F - 1,) bool, steps that images show: what becomes of frames with too few points.
+        timestamps: (F,) seconds.
+    """
+    joining = _Joining(context, solved, parts, held, held | seen, timestamps)
+    component = 0
+    while joining.begin(component):
+        progress = True
+        while progress:
+            progress = joining.by_images() or joining.by_ties()
+        component += 1
+    return joining.result()
+
+
+class _Joining:
+    """The map while it grows: what was carried where so far."""
+
+    def __init__(
+        self,
+        context: MatchContext,
+        solved: Adjustment,
+        parts: np.ndarray,
+        held: np.ndarray,
+        ties: np.ndarray,
+        timestamps: np.ndarray,
+    ) -> None:
+        num = len(parts)
+        self.context, self.solved, self.parts = context, solved, parts
+        self.held, self.ties = held, ties
+        self.times, self.depth = timestamps, median_depth(solved)
+        self.looks = loops.describe(context.strongest, num, context.settings.seed)
+        self.poses = solved.world_T_rigs.copy()
+        self.known = points_by_keypoint(solved, context.keypoints)  # rig frames, own units
+        self.scales, self.moves = np.ones(num), np.tile(np.eye(4), (num, 1, 1))
+        self.components = np.full(num, -1)
+        self.met, self.alone = np.zeros(num, bool), np.zeros(num, bool)
+        self.tried: set[tuple[int, int]] = set()  # part, size of the map it was compared with
+        self.current = 0
+
+    def begin(self, component: int) -> bool:
+        """Start a map from the largest part that is in none; False if there is no such part."""
+        free = self.components < 0
+        sizes = np.bincount(self.parts[free], minlength=1)
+        if not free.any() or (component > 0 and sizes.max() < _MIN_MAP):
+            return False
+        base = self.parts == int(np.argmax(sizes))
+        self.components[base], self.met[base], self.current = component, True, component
+        return True
+
+    def by_images(self) -> bool:
+        """Carry one more part to where it meets the map; False if none does."""
+        inside = np.flatnonzero(self.components == self.current)
+        free = self.components < 0
+        for part in np.unique(self.parts[free]).tolist():
+            if (part, len(inside)) in self.tried:
+                continue
+            self.tried.add((part, len(inside)))
+            rows = np.flatnonzero(self.parts == part)
+            if len(rows) >= _MIN_MAP and any(np.isfinite(self.known[f]).any() for f in rows):
+                moves = self._similarity(rows, inside)
+                if moves is not None:
+                    self._carry(rows, *moves)
+                    self.met[rows] = True
+                    return True
+                continue
+            placed = [self._register(int(f), inside) for f in rows]
+            if any(placed):
+                return True
+        return False
+
+    def by_ties(self) -> bool:
+        """Carry one more part along with the map that the trajectory or a step ties it to."""
+        for f in np.flatnonzero(self.ties).tolist():
+            for inner, outer in ((f, f + 1), (f + 1, f)):
+                if self.components[inner] == self.current and self.components[outer] < 0:
+                    rows = np.flatnonzero((self.parts == self.parts[outer]) & (self.components < 0))
+                    self._carry(rows, float(self.scales[inner]), self.moves[inner])
+                    return True
+        return False
+
+    def _carry(self, rows: np.ndarray, scale: float, moves: np.ndarray) -> None:
+        self.poses[rows] = carried(self.poses[rows], scale, moves)
+        for f in rows:
+            self.known[f] = scale * self.known[f]
+        self.scales[rows], self.moves[rows] = scale, moves
+        self.components[rows] = self.current
+
+    def _candidates(self, rows: np.ndarray, inside: np.ndarray, looks: int) -> np.ndarray:
+        """Pairs (P, 2) of a frame outside and one inside: alike, or next in time."""
+        alike = self.looks[rows] @ self.looks[inside].T
+        found = set()
+        for n, f in enumerate(rows.tolist()):
+            near = np.argsort(-alike[n])[:looks].tolist()
+            after = int(np.searchsorted(inside, f))
+            beside = [g for g in (after - 1, after) if 0 <= g < len(inside)]
+            near += [g for g in beside if abs(int(inside[g]) - f) <= _BESIDE]
+            found |= {(f, int(inside[g])) for g in near}
+        return np.array(sorted(found), np.int32).reshape(-1, 2)
+
+    def _similarity(self, rows: np.ndarray, inside: np.ndarray) -> tuple[float, np.ndarray] | None:
+        """Scale and move that carry a part to where it meets the map; None if it does not."""
+        sampled = np.linspace(0, len(rows) - 1, _SAMPLED).astype(int)
+        sampled = rows[np.unique([*sampled, *range(_BESIDE), *range(-_BESIDE, 0)])]
+        chosen = self._candidates(sampled, inside, _LOOKS)
+        strongest = replace(self.context, frames=self.context.strongest)
+        meetings = self._meetings(strongest, chosen)
+        group = agreeing(meetings, self.poses, self.depth)
+        if meetings and not group:  # too few of them, perhaps: look around the best
+            around = self._around(meetings, rows, inside, chosen)
+            meetings += self._meetings(self.context, around)
+            group = agreeing(meetings, self.poses, self.depth)
+        if not group or (self._held(rows) and not all(map(self._plausible, group))):
+            return None
+        return refined(group, self.poses)
+
+    def _meetings(self, context: MatchContext, chosen: np.ndarray) -> list[Meeting]:
+        """What pairs (P, 2) of a frame outside and one inside the map ask for."""
+        verified = recovery.match_anywhere(context, np.sort(chosen, axis=1), _MIN_SHARE)
+        outside = set(chosen[:, 0].tolist())
+        meetings = []
+        for p, (f0, f1) in enumerate(verified.matches.pairs.tolist()):
+            matched = verified.matches.of(p)
+            (f, g), columns = ((f0, f1), (0, 1)) if f0 in outside else ((f1, f0), (1, 0))
+            own = self.known[f][matched[:, columns[0]]]
+            theirs = self.known[g][matched[:, columns[1]]]
+            both = np.isfinite(own).all(axis=1) & np.isfinite(theirs).all(axis=1)
+            seed = self.context.settings.seed
+            meeting = measure(f, g, own[both], theirs[both], self.poses, seed)
+            if meeting is not None:
+                meetings.append(meeting)
+        return meetings
+
+    def _around(
+        self, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray, chosen: np.ndarray
+    ) -> np.ndarray:
+        """Pairs (P, 2) beside the meetings of the most points that were not compared yet."""
+        best = sorted(meetings, key=lambda meeting: -len(meeting.own))[:_BEST]
+        reach = range(-_BESIDE + 1, _BESIDE)
+        found = {(m.f + i, m.g + j) for m in best for i in reach for j in reach}
+        found &= {(int(f), int(g)) for f in rows for g in inside}
+        found -= {(int(f), int(g)) for f, g in chosen}
+        return np.array(sorted(found), np.int32).reshape(-1, 2)
+
+    def _held(self, rows: np.ndarray) -> bool:
+        """Whether the trajectory ties a part to the map."""
+        inside = self.components == self.current
+        outside = np.zeros(len(self.parts), bool)
+        outside[rows] = True
+        return bool((self.held & ((inside[1:] & outside[:-1]) | (inside[:-1] & outside[1:]))).any())
+
+    def _plausible(self, meeting: Meeting) -> bool:
+        """Whether a meeting asks for no more than the trajectory can have drifted."""
+        f, g, poses, settings = meeting.f, meeting.g, self.poses, self.context.settings
+        ends = {g: poses[g], f: carried(poses[f], meeting.scale, meeting.move)}
+        first, last = sorted(ends)
+        asked = inverse(ends[first]) @ ends[last]
+        loop = loops.Loop(first, last, asked, len(meeting.own))
+        solved = replace(self.solved, world_T_rigs=poses)
+        even = abs(np.log(meeting.scale)) < np.log(settings.verify.max_length_ratio)
+        return even and loops.within_drift(loop, solved, self.held, settings)
+
+    def _register(self, f: int, inside: np.ndarray) -> bool:
+        """Pose of a frame alone from points of the map; False if none can be believed."""
+        chosen = self._candidates(np.array([f]), inside, 2 * _LOOKS)
+        for strongest in (True, False):
+            rows, points = self._sightings(f, chosen, strongest)
+            if len(rows) == 0:
+                continue
+            bearings = self.context.keypoints.bearings_of(f)[rows]
+            settings = self.context.settings
+            found = resect(bearings, points, settings.verify, settings.seed)
+            if found is not None and not found.reason and self._in_reach(f, found.world_T_rig):
+                self.moves[f] = found.world_T_rig @ inverse(self.poses[f])
+                self.poses[f] = found.world_T_rig
+                self.components[f] = self.current
+                self.met[f] = self.alone[f] = True
+                return True
+        return False
+
+    def _sightings(
+        self, f: int, chosen: np.ndarray, strongest: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Keypoints (m,) of a frame and the points (m, 3) of the map that each may show."""
+        nowhere = np.tile(np.eye(4), (len(self.parts), 1, 1))
+        gates = [_ANYWHERE] * len(chosen)
+        found = self.context.match(chosen, nowhere, gates, strongest=strongest)
+        rows, points = [np.zeros(0, np.int32)], [np.zeros((0, 3))]
+        for p, (_, g) in enumerate(chosen.tolist()):
+            matched = found.of(p)
+            known = self.known[g][matched[:, 1]]
+            seen = np.isfinite(known).all(axis=1)
+            rows.append(matched[seen, 0])
+            points.append(known[seen] @ self.poses[g, :3, :3].T + self.poses[g, :3, 3])
+        rows, points = np.concatenate(rows), np.concatenate(points)
+        once = np.round(points / max(1e-6 * self.depth, 1e-12))
+        _, first = np.unique(np.column_stack([rows, once]), axis=0, return_index=True)
+        return rows[first], points[first]
+
+    def _in_reach(self, f: int, world_T_rig: np.ndarray) -> bool:
+        """Whether a frame is no further from those next in time than one can have gone."""
+        inside = np.flatnonzero(self.components == self.current)
+        lengths = np.linalg.norm(np.diff(self.poses[inside, :3, 3], axis=0), axis=1)
+        pace = float(np.median(lengths / np.diff(self.times[inside])))
+        after = int(np.searchsorted(inside, f))
+        for n in (after - 1, after):
+            if 0 <= n < len(inside):
+                g = inside[n]
+                off = np.linalg.norm(world_T_rig[:3, 3] - self.poses[g, :3, 3])
+                if off > _BEHIND * pace * abs(self.times[f] - self.times[g]) + self.depth:
+                    return False
+        return True
+
+    def result(self) -> Registered:
+        """The map as it is now; a frame in no part of it is apart, beside the one before it."""
+        lost, maps = self.components < 0, int(self.components.max()) + 1
+        for n, f in enumerate(np.flatnonzero(lost).tolist()):
+            placed = np.flatnonzero(~lost)
+            nearest = int(placed[np.argmin(np.abs(placed - f))])
+            self.components[f] = maps + n
+            self.scales[f], self.moves[f] = self.scales[nearest], self.moves[nearest]
+            self.poses[f] = carried(self.poses[f], float(self.scales[f]), self.moves[f])
+        order = by_size(self.components)
+        offsets = self._side_by_side(order)
+        num, alone = int(self.parts.max()) + 1, int(lost.sum())
+        dropped = {"frames alone": alone, "apart": maps - 1}
+        kept = num - maps - alone
+        return Registered(
+            _moved(self.solved, self.poses, self.scales, self.moves, offsets),
+            order.astype(np.int32),
+            self.scales,
+            self.moves,
+            offsets,
+            self.met,
+            self.alone,
+            lost,
+            Counts(num - 1, kept, "parts", dropped),
+        )
+
+    def _side_by_side(self, components: np.ndarray) -> np.ndarray:
+        """Offsets (F, 3) after which no frame of one map is near a point of another."""
+        positions, offsets = self.poses[:, :3, 3], np.zeros((len(components), 3))
+        groups = [components == c for c in range(int(components.max()) + 1)]
+        extent = max(float(np.linalg.norm(np.ptp(positions[group], axis=0))) for group in groups)
+        extent += self.context.settings.pairs.max_baseline_depths * self.depth
+        for number, group in enumerate(groups[1:], 1):
+            away = np.array([number * _APART * extent, 0, 0])
+            offsets[group] = positions[groups[0]].mean(axis=0) + away
+            offsets[group] -= positions[group].mean(axis=0)
+        return offsets
+
+
+def _moved(
+    solved: Adjustment,
+    world_T_rigs: np.ndarray,
+    scales: np.ndarray,
+    moves: np.ndarray,
+    offsets: np.ndarray,
+) -> Adjustment:
+    """The new poses with their offsets; points go with the first frame that sees them."""
+    tracks, landmarks = solved.landmarks.tracks, solved.landmarks
+    hosts = tracks.frames[np.searchsorted(tracks.points, np.arange(tracks.num_points))]
+    points = scales[hosts, None] * np.einsum(
+        "jik,jk->ji", moves[hosts, :3, :3], landmarks.points_world
+    )
+    moved = Landmarks(points + moves[hosts, :3, 3] + offsets[hosts], tracks, landmarks.counts)
+    poses = world_T_rigs.copy()
+    poses[:, :3, 3] += offsets
+    return replace(solved, world_T_rigs=poses, landmarks=moved)

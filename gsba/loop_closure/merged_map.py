@@ -1,0 +1,106 @@
+"""A map whose parts were joined, and what follows from that for the trajectory and its report."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gsba.bundle.adjustment import Adjustment
+from gsba.geometry import carried
+from gsba.trajectory.joining import GUESS, PLACES, Joint
+from gsba.trajectory.judgement import Trust
+from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource
+
+
+@dataclass(frozen=True, slots=True)
+class Registered:
+    """A map whose parts were joined as far as they meet."""
+
+    solved: Adjustment
+    components: np.ndarray  # (F,) int32, map of each frame, 0 = the largest
+    scales: np.ndarray  # (F,) float64: each frame was carried by scale * R @ x + t
+    moves: np.ndarray  # (F, 4, 4) float64, R and t
+    offsets: np.ndarray  # (F, 3) float64: and by this, so that maps lie side by side
+    met: np.ndarray  # (F,) bool: images tie it to the map's first part
+    alone: np.ndarray  # (F,) bool: got its pose from points of the map
+    lost: np.ndarray  # (F,) bool: nothing could place it
+    counts: Counts  # of parts
+
+
+def side_by_side(world_T_rigs: np.ndarray, registered: Registered | None) -> np.ndarray:
+    """Poses (F, 4, 4) where the map has their frames: each map beside the others."""
+    poses = world_T_rigs.copy()
+    if registered is not None:
+        poses[:, :3, 3] += registered.offsets
+    return poses
+
+
+def follow(
+    registered: Registered, coarse: CoarsePoses, trust: Trust, joints: tuple[Joint, ...]
+) -> tuple[CoarsePoses, Trust, tuple[Joint, ...]]:
+    """The trajectory, its judgement and its joints after parts of the map were carried.
+
+    Steps that no image shows lose their prior where images tie both their frames to one map. A
+    piece of the trajectory that was placed by guess goes where its frames were carried.
+    """
+    together = registered.components[:-1] == registered.components[1:]
+    met = registered.met[:-1] & registered.met[1:] & together
+    false = trust.false_steps | (trust.unseen_steps & met) | ~together
+    placed = registered.solved.world_T_rigs.copy()
+    trust = replace(trust, world_T_rigs=placed.copy(), false_steps=false)
+    placed[:, :3, 3] -= registered.offsets
+    if (coarse.sources == PoseSource.NONE).all():
+        return replace(coarse, world_T_rigs=placed), trust, joints
+    poses, followed = coarse.world_T_rigs.copy(), []
+    for joint in joints:
+        rows = np.arange(joint.first, joint.last + 1)
+        known = rows[registered.met[rows] & ~registered.alone[rows]]
+        if joint.how == GUESS and len(known) and registered.components[known[0]] == 0:
+            scale, move = float(registered.scales[known[0]]), registered.moves[known[0]]
+            poses[rows] = carried(poses[rows], scale, move)
+            world_T_own = carried(joint.world_T_own, scale, move)
+            joint = replace(joint, scale=scale * joint.scale, world_T_own=world_T_own, how=PLACES)
+        followed.append(joint)
+    return replace(coarse, world_T_rigs=poses), trust, tuple(followed)
+
+
+def describe(
+    registered: Registered | None, joints: tuple[Joint, ...], frames: FrameSet
+) -> tuple[dict[str, Any], list[str]]:
+    """Pieces, maps and registered frames by their names, for the report, and what to note."""
+    names, notes = np.array(frames.names), []
+    pieces = [
+        {
+            "first": names[joint.first],
+            "last": names[joint.last],
+            "scale": joint.scale,
+            "world_T_own": joint.world_T_own,
+            "how": joint.how,
+        }
+        for joint in joints
+    ]
+    for joint in joints:
+        notes.append(
+            f"the trajectory begins anew at {names[joint.first]}: joined by {joint.how}, "
+            f"scale {joint.scale:.4g}"
+        )
+    judgement: dict[str, Any] = {"joints": pieces} if pieces else {}
+    if registered is None:
+        return judgement, notes
+    alone, lost = names[registered.alone].tolist(), names[registered.lost].tolist()
+    own = registered.components[~registered.lost]
+    maps = [names[registered.components == c].tolist() for c in np.unique(own)]
+    count = len(maps)
+    judgement |= {"registered": alone, "not_registered": lost}
+    judgement["maps"] = maps if count > 1 else []
+    if alone:
+        notes.append(f"registered against the map: {', '.join(alone)}")
+    if lost:
+        notes.append(f"could not be registered, not exported: {', '.join(lost)}")
+    if count > 1:
+        parts = "; ".join(f"{m[0]} to {m[-1]} ({len(m)} frames)" for m in maps[1:])
+        notes.append(
+            f"nothing ties {count} places together: each is refined, the largest with "
+            f"{len(maps[0])} frames is exported, the others are in poses.csv: {parts}"
+        )
+    return judgement, notes

@@ -1,0 +1,302 @@
+"""What moves by itself, found from a solved map: pixels that no static scene explains.
+
+A panorama is compared with its neighbours through their solved poses, at a range of distances
+that the map's points around each direction allow (a plane sweep, Collins, CVPR 1996). What stands
+still agrees with several neighbours at some distance. What walked about agrees with hardly any,
+while those agree with one another on what was behind it. A pixel is accused only where enough
+neighbours could have seen it.
+"""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from gsba.frames import panorama
+from gsba.frames.masks import load_mask
+from gsba.frames.scan import load_erp
+from gsba.geometry import bearings_from_erp, erp_from_bearings, inverse
+from gsba.masks import _distractor_kernels
+from gsba.types import FrameSet, Landmarks
+
+_WIDTH = 512  # pixels across the panoramas that are compared
+_NEIGHBOURS = 6
+_WITNESSES = 3  # fewer neighbours accuse nobody
+_LEAST_SHARED = 30  # points that a neighbour shares
+_DISTANCES = 18
+_MARGIN = 1.4  # beyond the nearest and furthest points around a direction
+_CELL = 8  # pixels: the grid on which distances are bounded
+_REACH = 3  # cells around a direction whose points bound it
+_EMPTY = np.float32(-1e9)  # a cell of it without points
+_PATCH = 5  # pixels over which differences are averaged
+_CAP = 60.0  # grey levels
+_WEAK, _STRONG = 5.0, 14.0  # grey levels: of a distractor's pixels, and of some of them
+_NOISE = 1.0  # grey levels that half of the pixels of good pictures stay below
+_WORST = 5.0  # grey levels: where half of the pixels do not, nothing can be told
+_AGREE = 2.0  # spreads of the neighbours that a pixel must be away from their median
+_THIN = 5  # pixels: narrower is an edge
+_LEAST_AREA = 120  # strong pixels at the equator
+_CLOSED = 13  # pixels: gaps up to this are closed
+_GROWN = 5  # pixels: the rim is blurred, and a splat shows what is left of it
+_MOST = 0.35  # of a picture: more is a wrong pose, or light that changed
+_LEVELS = 15  # of a weight that is kept
+_WRAP = 32  # pixels over the seam
+_wrapped = partial(panorama.wrapped, columns=_WRAP)
+
+
+@dataclass(frozen=True, slots=True)
+class Distractors:
+    """What was found in one frame."""
+
+    weights: np.ndarray  # compressed (h, 2h) 0..1, 0 = distractor; see `distractor_weights`
+    share: float  # of the sphere
+    reason: str  # why nothing was looked for, or ""
+
+
+def distractor_weights(found: Distractors) -> np.ndarray:
+    """How far pixels can be trusted, (h, 2h) float32, 0..1, 0 = distractor."""
+    levels = np.asarray(cv2.imdecode(found.weights, cv2.IMREAD_GRAYSCALE), np.float32)
+    return levels / _LEVELS
+
+
+def distractor_mask(found: Distractors) -> np.ndarray:
+    """(h, 2h) bool, True = distractor."""
+    return distractor_weights(found) == 0
+
+
+class Scene:
+    """A solved map, ready to be asked frame by frame, from any thread.
+
+    Small pictures are kept in memory up to a limit; the rest is read again.
+
+    Args:
+        frames: of any layout; what their masks exclude neither accuses nor is accused.
+        world_T_rigs: (F, 4, 4) solved poses.
+        landmarks: the solved points.
+        known: distractors (h, w) bool of a frame found before: they explain and accuse nobody, and
+            stay what they are where too few neighbours are left to tell.
+        limit_mb: of memory.
+    """
+
+    def __init__(
+        self,
+        frames: FrameSet,
+        world_T_rigs: np.ndarray,
+        landmarks: Landmarks,
+        known: Callable[[int], np.ndarray] | None = None,
+        limit_mb: float = 256.0,
+    ) -> None:
+        self._frames, self._poses, self._landmarks = frames, world_T_rigs, landmarks
+        whole = frames.layout == "erp"
+        self.width = min(_WIDTH, frames.width) if whole else panorama.width_for(frames, _WIDTH)
+        self._known, self._rays = known, _rays(self.width)
+        self._room = int(limit_mb * 2**20 / (1.5 * self.width**2))
+        self._kept: dict[int, np.ndarray] = {}
+        self._lock = threading.Lock()
+        tracks = landmarks.tracks
+        order = np.argsort(tracks.frames, kind="stable")
+        starts = np.searchsorted(tracks.frames[order], np.arange(len(frames) + 1))
+        self._seen = [np.unique(tracks.points[order[a:b]]) for a, b in pairwise(starts)]
+
+    def find(self, frame: int) -> Distractors:
+        """Distractors in one frame."""
+        shape = (self.width // 2, self.width)
+        near = self._neighbours(frame)
+        if len(near) < _WITNESSES:
+            return _packed(np.ones(shape), "too few frames share points with it")
+        own = self._picture(frame)
+        usable = own[..., 0] >= 0
+        others = np.stack([self._exposed(n, frame, own) for n in near])
+        n_T_own = (inverse(self._poses[near]) @ self._poses[frame]).astype(np.float32)
+        lowest, highest = self._bounds(frame, near)
+        middle = np.exp(0.5 * (lowest + highest)).astype(np.float32)
+        seen = _distractor_kernels.witnesses(others[..., 0] >= 0, n_T_own, self._rays, middle)
+        score = _score(own, others, n_T_own, self._rays, lowest, highest)
+        unjudged = seen < min(_WITNESSES, len(near))
+        score[unjudged | ~usable] = 0
+        noise = max(1.0, float(np.median(score)) / _NOISE)
+        found = _decide(score, noise)
+        if self._known is not None:  # whom the first look accused and none is left to judge
+            found |= self._known(frame) & unjudged
+        found &= usable
+        if np.median(score) > _WORST or _share(found) > _MOST:
+            return _packed(np.ones(shape), "fits no neighbour: its pose or light is off")
+        return _packed(np.where(found, 0, 1 / (1 + (score / (noise * _WEAK)) ** 2)), "")
+
+    def _neighbours(self, frame: int) -> np.ndarray:
+        """The frames that share most points, most first."""
+        inside = np.zeros(len(self._landmarks.points_world), bool)
+        inside[self._seen[frame]] = True
+        shared = np.array([np.count_nonzero(inside[seen]) for seen in self._seen])
+        shared[frame] = 0
+        best = np.argsort(-shared, kind="stable")[:_NEIGHBOURS]
+        return best[shared[best] >= _LEAST_SHARED]
+
+    def _picture(self, frame: int) -> np.ndarray:
+        """Small panorama (h, w, C) float32, negative where it may not be used."""
+        kept = self._kept.get(frame)
+        if kept is None:
+            kept = _load(self._frames, frame, self.width)
+            with self._lock:
+                self._kept[frame] = kept
+                while len(self._kept) > max(self._room, 1):
+                    self._kept.pop(next(iter(self._kept)))
+        picture = kept[..., :-1].astype(np.float32)
+        picture[kept[..., -1] == 0] = -1.0
+        return picture
+
+    def _exposed(self, other: int, frame: int, own: np.ndarray) -> np.ndarray:
+        """A neighbour's picture at the exposure of a frame, judged by the points that both see."""
+        picture = self._picture(other)
+        if self._known is not None:
+            picture[self._known(other)] = -1.0
+        points = np.intersect1d(self._seen[frame], self._seen[other], assume_unique=True)
+        a, b = self._colors(own, frame, points), self._colors(picture, other, points)
+        good = (a.min(axis=1) > 0) & (b.min(axis=1) > 0)
+        if np.count_nonzero(good) >= _LEAST_SHARED // 2:
+            gain = np.median(a[good] / b[good], axis=0)
+            picture = np.where(picture < 0, -1.0, np.clip(gain, 0.4, 2.5) * picture)
+        return picture.astype(np.float32)
+
+    def _colors(self, picture: np.ndarray, frame: int, points: np.ndarray) -> np.ndarray:
+        """Colours (P, C) of points in a frame's picture."""
+        u, v = self._pixels(frame, points, self.width)[0].T
+        return picture[v, u]
+
+    def _pixels(self, frame: int, points: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (P, 2) int64 of points in a panorama of some width, and their distances (P,)."""
+        pose = self._poses[frame]
+        local = (self._landmarks.points_world[points] - pose[:3, 3]) @ pose[:3, :3]
+        uv = erp_from_bearings(local, width, width // 2).astype(np.int64)
+        uv[:, 0] %= width
+        uv[:, 1] = np.clip(uv[:, 1], 0, width // 2 - 1)
+        return uv, np.maximum(np.linalg.norm(local, axis=1), 1e-9)
+
+    def _bounds(self, frame: int, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Logarithms (h, w) float32 of the least and largest inverse distance to assume."""
+        points = np.unique(np.concatenate([self._seen[f] for f in (frame, *near)]))
+        width = self.width // _CELL
+        pixels, distances = self._pixels(frame, points, width)
+        u, v = pixels.T
+        logs = -np.log(distances).astype(np.float32)
+        high = np.full((width // 2, width), _EMPTY, np.float32)
+        low = high.copy()  # of the negative, so that both are maxima
+        np.maximum.at(high, (v, u), logs)
+        np.maximum.at(low, (v, u), -logs)
+        high, low = _spread_out(high), _spread_out(low)
+        size = (self.width, self.width // 2)
+        margin = np.float32(np.log(_MARGIN))
+        return -cv2.resize(low, size) - margin, cv2.resize(high, size) + margin
+
+
+def _rays(width: int) -> np.ndarray:
+    grid = np.stack(np.meshgrid(np.arange(width), np.arange(width // 2)), axis=-1) + 0.5
+    return bearings_from_erp(grid, width, width // 2).astype(np.float32)
+
+
+def _load(frames: FrameSet, frame: int, width: int) -> np.ndarray:
+    """Small picture (h, w, C + 1) uint8: colours, or grey of cube faces, and where to use it."""
+    if frames.layout == "erp":
+        color = load_erp(frames, frame, width=width)
+        mask = load_mask(frames, frame)
+        use = np.ones(color.shape[:2], np.uint8)
+        if mask is not None:
+            use = panorama.fit_mask(mask, width).astype(np.uint8)
+        return np.dstack([color, use])
+    grey, mask = panorama.load_grey(frames, frame, width)
+    use = np.ones_like(grey) if mask is None else mask.astype(np.uint8)
+    return np.dstack([grey, use])
+
+
+def _spread_out(cells: np.ndarray) -> np.ndarray:
+    """Maxima over the cells around each (h, w), then outward until no cell is empty."""
+    window = np.ones((2 * _REACH + 1, 2 * _REACH + 1), np.uint8)
+
+    def widened(a: np.ndarray) -> np.ndarray:
+        ring = np.concatenate([a[:, -_REACH:], a, a[:, :_REACH]], axis=1)
+        return np.maximum(cv2.dilate(ring, window)[:, _REACH:-_REACH], _EMPTY)
+
+    cells = widened(cells)
+    while (cells <= _EMPTY).any():
+        cells = np.where(cells <= _EMPTY, widened(cells), cells)
+    return cells
+
+
+def _score(
+    own: np.ndarray,
+    others: np.ndarray,
+    n_T_own: np.ndarray,
+    rays: np.ndarray,
+    lowest: np.ndarray,
+    highest: np.ndarray,
+) -> np.ndarray:
+    """Grey levels (h, w) by which no assumed distance explains a pixel.
+
+    Two neighbours must explain it; or three, where all of them agree on something else.
+    """
+    num, shape = len(others), own.shape[:2]
+    kernel = np.ones((3, 3), np.uint8)
+    least, most = (op(_wrapped(own), kernel) for op in (cv2.erode, cv2.dilate))
+    least, most = (np.ascontiguousarray(_unwrapped(x)).reshape(own.shape) for x in (least, most))
+    differences = np.empty((num, *shape), np.float32)
+    away, spread = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    best = np.full((2, *shape), _CAP, np.float32)
+    away_best, spread_best = np.zeros(shape, np.float32), np.full(shape, 2 * _CAP, np.float32)
+    nearest, furthest = np.exp(highest), np.exp(lowest)
+    for step in np.linspace(0, 1, _DISTANCES, dtype=np.float32):  # even steps in the pictures
+        assumed = (1 - step) * nearest + step * furthest
+        _distractor_kernels.compare(
+            own, least, most, others, n_T_own, rays, assumed, np.float32(_CAP),
+            differences, away, spread,
+        )  # fmt: skip
+        smooth = np.stack([_averaged(differences[n]) for n in range(num)])
+        _distractor_kernels.keep_best(
+            smooth, _averaged(away), _averaged(spread), best, away_best, spread_best
+        )
+    contradicted = 0.5 * (away_best - _AGREE * spread_best)
+    return np.maximum(best[0], np.minimum(best[1], contradicted))
+
+
+def _decide(score: np.ndarray, noise: float) -> np.ndarray:
+    """Distractors (h, w) bool: connected, not thin, and strong somewhere."""
+    wide = _wrapped(score)
+    weak = cv2.morphologyEx(
+        (wide > noise * _WEAK).astype(np.uint8), cv2.MORPH_OPEN, np.ones((_THIN, _THIN), np.uint8)
+    )
+    num, parts = cv2.connectedComponents(weak, connectivity=4)
+    labels = np.asarray(parts, np.int32)
+    rows = (np.arange(len(wide)) + 0.5) / len(wide)
+    areas = np.broadcast_to(np.sin(np.pi * rows)[:, None], wide.shape)
+    strong = (weak > 0) & (wide > noise * _STRONG)
+    sums = np.bincount(labels[strong], weights=areas[strong], minlength=num)
+    sums[0] = 0
+    found = (sums >= _LEAST_AREA)[labels].astype(np.uint8)
+    ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_CLOSED, _CLOSED))
+    found = cv2.morphologyEx(found, cv2.MORPH_CLOSE, ellipse)
+    outlines, _ = cv2.findContours(found, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(found, outlines, -1, 1, cv2.FILLED)
+    grown = cv2.dilate(found, np.ones((_GROWN, _GROWN), np.uint8))
+    return _unwrapped(grown) > 0
+
+
+def _packed(weights: np.ndarray, reason: str) -> Distractors:
+    levels = np.where(weights > 0, np.maximum(np.rint(_LEVELS * weights), 1), 0).astype(np.uint8)
+    return Distractors(cv2.imencode(".png", levels)[1].ravel(), _share(weights == 0), reason)
+
+
+def _share(found: np.ndarray) -> float:
+    """Part of the sphere."""
+    weights = np.sin(np.pi * (np.arange(len(found)) + 0.5) / len(found))
+    return float(found.mean(axis=1) @ weights / weights.sum())
+
+
+def _unwrapped(image: np.ndarray) -> np.ndarray:
+    return image[:, _WRAP:-_WRAP]
+
+
+def _averaged(image: np.ndarray) -> np.ndarray:
+    return _unwrapped(cv2.blur(_wrapped(image), (_PATCH, _PATCH), borderType=cv2.BORDER_REPLICATE))

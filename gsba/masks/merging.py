@@ -1,0 +1,224 @@
+"""The masks of a run: given, found before the first solution and after it, merged into files.
+
+White = use. What is found is written where it can be looked at; features, patches, splats and
+exports then read the files as they read masks that were given.
+"""
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gsba.bundle.adjustment import Adjustment
+from gsba.frames.masks import levels_of, load_mask, load_weights
+from gsba.frames.scan import load_erp
+from gsba.log import GsbaError, track
+from gsba.masks.carrier import Carrier, carrier_mask, find_carrier, write_carrier
+from gsba.masks.distractors import Distractors, Scene, distractor_mask, distractor_weights
+from gsba.masks.segmentation import Segment, load_segmented, segmented
+from gsba.store.records import atomic_write
+from gsba.store.store import PerFrame, RunStore, fingerprint
+from gsba.types import Counts, FrameSet
+
+logger = logging.getLogger(__name__)
+
+AUTO, CARRIER, DISTRACTORS = "auto", "carrier", "distractors"  # in place of a file
+Masks = Path | str | Sequence[Path | str] | None
+_FOLDER = "masks"
+_SHOWN, _SHOWN_WIDTH = 6, 768  # frames and pixels of the picture to look at
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Where masks come from."""
+
+    given: Path | None  # file or folder
+    carrier: bool
+    distractors: bool
+    segment: Segment | None
+
+
+def choose(masks: Masks, segment: Segment | None = None) -> Choice:
+    """What `--masks` and `--segment` ask for.
+
+    Args:
+        masks: a file or a folder, "carrier" (or "auto"), "distractors", or several of these.
+        segment: see `gsba.masks.segmentation`.
+
+    Raises:
+        GsbaError: two files or folders.
+    """
+    values = [masks] if isinstance(masks, Path | str) else list(masks or ())
+    words = {str(value) for value in values} & {AUTO, CARRIER, DISTRACTORS}
+    files = [Path(value) for value in values if str(value) not in words]
+    if len(files) > 1:
+        raise GsbaError(f"--masks {files[0]} and {files[1]}: give one file or one folder")
+    return Choice(
+        files[0] if files else None, bool(words & {AUTO, CARRIER}), DISTRACTORS in words, segment
+    )
+
+
+def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
+    """Frames without what is known before any solution: what is segmented, and the carrier."""
+    inputs = fingerprint(path for group in frames.paths for path in group)
+    parts: list[Callable[[int], np.ndarray | None]] = []
+    names = []
+    if choice.segment is not None:
+        found = segmented(store, frames, choice.segment)
+        parts.append(lambda f: load_segmented(found, frames, f))
+        names.append("segmented")
+    if choice.carrier:
+        carrier = _carrier(store, frames, inputs)
+        if carrier.share and not (parts or carrier.turns.any() or any(frames.mask_paths)):
+            frames = replace(frames, mask_paths=(store.root / "carrier.png",) * len(frames))
+        elif carrier.share:
+            parts.append(lambda f: carrier_mask(carrier, frames, f))
+            names.append("carrier")
+    if not parts:
+        return frames
+    final = not choice.distractors
+    folder = store.root / (_FOLDER if final else f"stages/first-{_FOLDER}")
+    return _merge(store, folder, frames, parts, names)
+
+
+def after(
+    store: RunStore, frames: FrameSet, solved: Adjustment, stage: str, num_threads: int
+) -> tuple[FrameSet, Counts]:
+    """Frames without what no static scene explains.
+
+    It is looked for twice: the second time, what the first has found in other frames neither
+    explains nor accuses.
+
+    Args:
+        solved: a first solution.
+        stage: its name.
+        num_threads: frames looked at at a time.
+    """
+    items = dict.fromkeys(frames.names)
+    index = {name: f for f, name in enumerate(frames.names)}
+
+    def look(name: str, known: PerFrame[Distractors] | None) -> PerFrame[Distractors]:
+        def of(f: int) -> np.ndarray:
+            assert known is not None
+            return distractor_mask(known[frames.names[f]])
+
+        given = frames, solved.world_T_rigs, solved.landmarks
+        scene = Scene(*given, None if known is None else of)
+        return store.per_frame(
+            name,
+            None,
+            items,
+            lambda frame: scene.find(index[frame]),
+            Distractors,
+            [stage] if known is None else ["distractors1"],
+            num_threads,
+        )
+
+    found = look("distractors", look("distractors1", None))
+    results = [found[name] for name in frames.names]
+    parts = [lambda f: distractor_weights(results[f])]
+    merged = _merge(store, store.root / _FOLDER, frames, parts, ["distractors"])
+    shares = np.array([one.share for one in results])
+    check = store.root / "masks_check.jpg"
+    if not (check.exists() and store.records["masks"].resumed):
+        _write_check(check, merged, shares)
+    store.claim(check)
+    reasons = [one.reason.partition(":")[0] for one in results if one.reason]
+    for name, one in zip(frames.names, results, strict=True):
+        if one.reason:
+            logger.warning("%s: no distractors looked for: %s", name, one.reason)
+    logger.info("distractors: %.1f%% of the pictures", 100 * shares.mean())
+    dropped = {reason: reasons.count(reason) for reason in dict.fromkeys(reasons)}
+    return merged, Counts(len(results), len(results) - len(reasons), "frames", dropped)
+
+
+def _carrier(store: RunStore, frames: FrameSet, inputs: object) -> Carrier:
+    """The carrier, and its pictures in the run's folder."""
+    found = store.stage("carrier", inputs, lambda: find_carrier(frames), Carrier)
+    path = store.root / "carrier.png"
+    if not (path.exists() and store.records["carrier"].resumed):  # a new file would undo all stages
+        write_carrier(found, frames, store.root, merge=False)
+    for name in ("carrier.png", "carrier_check.jpg"):
+        store.claim(store.root / name)
+    return found
+
+
+def _merge(
+    store: RunStore,
+    folder: Path,
+    frames: FrameSet,
+    parts: Sequence[Callable[[int], np.ndarray | None]],
+    stages: Sequence[str],
+) -> FrameSet:
+    """Frames with masks `folder`/NAME.png of what they had and all parts.
+
+    A part is (h, 2h), bool or weights 0..1, or None.
+
+    A file that would not change keeps its time, so that stages which depend on it resume.
+    """
+    paths = [folder / f"{name}.png" for name in frames.names]
+
+    def compute() -> Counts:
+        masked = 0
+        for f, path in enumerate(track(paths, "writing masks")):
+            weights = load_weights(frames, f)
+            if weights is None:
+                width = frames.width if frames.layout == "erp" else 4 * frames.width
+                weights = np.ones((width // 2, width), np.float32)
+            for part in parts:
+                found = part(f)
+                if found is not None:
+                    weights = weights * _fit(found, weights.shape[1])
+            _write_if_new(path, levels_of(weights))
+            masked += not weights.all()
+        return Counts(len(paths), masked, "masks", {"nothing masked": len(paths) - masked})
+
+    name = "masks" if folder.parent == store.root else "first-masks"
+    if not all(path.exists() for path in paths):
+        store.forget(name)
+    inputs = fingerprint(frames.mask_paths), frames.width, frames.layout
+    store.stage(name, inputs, compute, Counts, stages)
+    if name == "masks":
+        store.claim(folder)
+    return replace(frames, mask_paths=tuple(paths))
+
+
+def _fit(weights: np.ndarray, width: int) -> np.ndarray:
+    """Weights (h, 2h) 0..1, or bool, at another width, their outline smooth, as float32."""
+    values = weights.astype(np.float32)
+    if values.shape[1] == width:
+        return values
+    size = (width, width // 2)
+    values, inside = (cv2.resize(part, size) for part in (values, (values > 0).astype(np.float32)))
+    return np.where(inside > 0.5, values / np.maximum(inside, 0.5), 0)
+
+
+def _write_if_new(path: Path, levels: np.ndarray) -> None:
+    encoded = cv2.imencode(".png", levels)[1].tobytes()
+    if not (path.exists() and path.read_bytes() == encoded):
+        atomic_write(path, lambda temporary: temporary.write_bytes(encoded))
+
+
+def _write_check(path: Path, frames: FrameSet, shares: np.ndarray) -> None:
+    """The frames with most distractors, what is masked in them tinted."""
+    rows = []
+    for f in np.sort(np.argsort(-shares, kind="stable")[:_SHOWN]):
+        size = (_SHOWN_WIDTH, _SHOWN_WIDTH // 2)
+        if frames.layout == "erp":
+            shown = cv2.resize(load_erp(frames, int(f), width=_SHOWN_WIDTH), size)
+        else:
+            shown = np.full((size[1], size[0], 3), 128, np.uint8)
+        mask = load_mask(frames, int(f))
+        assert mask is not None
+        out = _fit(mask, _SHOWN_WIDTH) == 0
+        shown[out] = (shown[out] * 0.5 + np.array([128, 0, 60])).astype(np.uint8)
+        outlines, _ = cv2.findContours(out.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(shown, outlines, -1, (255, 80, 160), 1)
+        place = (6, size[1] - 8)
+        cv2.putText(shown, frames.names[f], place, cv2.FONT_HERSHEY_PLAIN, 1, (255, 255, 255))
+        rows.append(shown)
+    encoded = cv2.imencode(".jpg", np.concatenate(rows)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+    atomic_write(path, lambda temporary: temporary.write_bytes(encoded[1].tobytes()))

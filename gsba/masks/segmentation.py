@@ -1,0 +1,197 @@
+"""A segmentation model of the user's own: a command or a Python callable that masks faces.
+
+Each frame is cut into faces of 90 degrees; the model says where they may be used (white = use),
+and the answers are put back onto the sphere.
+"""
+
+import functools
+import shlex
+import shutil
+import subprocess
+import threading
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gsba.camera.rig import CubeRig, owner_faces
+from gsba.frames import cubemap
+from gsba.frames.files import decode, image_size
+from gsba.geometry import bearings_from_erp
+from gsba.log import GsbaError, track
+from gsba.store.records import atomic_write, disk_errors
+from gsba.store.store import PerFrame, RunStore, fingerprint
+from gsba.types import FACES, FrameSet
+
+Segment = str | Callable[[np.ndarray], np.ndarray]
+"""A command line, or a function from a face (N, N, 3) uint8 RGB to (N, N) bool, True = use."""
+
+_MAX_FACE = 1024  # pixels
+_FIELDS = ("{image}", "{mask}", "{images}", "{masks}")
+
+
+@dataclass(frozen=True, slots=True)
+class Segmented:
+    """Where the faces of one frame may be used."""
+
+    bits: np.ndarray  # packed (6, size, size) bool, True = use, in FACES order
+    size: int  # pixels
+
+
+def segmented(store: RunStore, frames: FrameSet, segment: Segment) -> PerFrame[Segmented]:
+    """Faces' masks by frame name, as stage `segmented` of a run.
+
+    A command is called once, `COMMAND IMAGES MASKS` with two folders: one PNG for each face is to
+    be answered by one of the same name and size. `{images}` and `{masks}` in it say where the
+    folders go; `{image}` and `{mask}` make it a call for every face. A callable's results are
+    never resumed.
+
+    Raises:
+        GsbaError: a command that fails, or a mask that is missing or of another size.
+    """
+    index = {name: f for f, name in enumerate(frames.names)}
+    size = frames.width if frames.layout == "cube" else min(_MAX_FACE, frames.width // 4)
+    rig = CubeRig(size, np.pi / 2)
+    folder = store.root / "stages" / "segmented-faces"
+    present = [FACES.index(face) for face in frames.faces] or list(range(len(FACES)))
+    ask = _Once(lambda: _run(str(segment), frames, rig, present, folder))
+
+    def compute(name: str) -> Segmented:
+        use = np.ones((len(FACES), size, size), bool)
+        if callable(segment):
+            faces, _ = cubemap.load(frames, index[name], rig)
+            for c in present:
+                use[c] = _checked(segment(faces[c]), size, f"{name}, {FACES[c]}")
+        else:
+            ask()
+            for c in present:
+                path = folder / "masks" / f"{name}_{FACES[c]}.png"
+                use[c] = decode(path, (size, size), gray=True) > 127
+        return Segmented(np.packbits(use), size)
+
+    key = [uuid.uuid4().hex if callable(segment) else segment, size]
+    items = {name: fingerprint(frames.paths[f]) for name, f in index.items()}
+    found = store.per_frame("segmented", key, items, compute, Segmented)
+    shutil.rmtree(folder, ignore_errors=True)
+    return found
+
+
+def load_segmented(found: PerFrame[Segmented], frames: FrameSet, frame: int) -> np.ndarray:
+    """Where frame may be used, (h, 2h) bool as dense as the faces."""
+    one = found[frames.names[frame]]
+    use = np.unpackbits(one.bits, count=len(FACES) * one.size**2) > 0
+    return use[_places(one.size)]
+
+
+class _Once:
+    """Calls a function once, whoever comes first."""
+
+    def __init__(self, work: Callable[[], None]) -> None:
+        self._work, self._lock, self._done = work, threading.Lock(), False
+
+    def __call__(self) -> None:
+        with self._lock:
+            if not self._done:
+                self._work()
+                self._done = True
+
+
+def _run(command: str, frames: FrameSet, rig: CubeRig, present: list[int], folder: Path) -> None:
+    """Write all faces, call the command, and check that it has answered them."""
+    images, masks = folder / "images", folder / "masks"
+    shutil.rmtree(folder, ignore_errors=True)
+    with disk_errors(folder):
+        images.mkdir(parents=True)
+        masks.mkdir()
+    names = [f"{name}_{FACES[c]}.png" for name in frames.names for c in present]
+    for f, name in enumerate(track(frames.names, "cutting faces")):
+        faces, _ = cubemap.load(frames, f, rig)
+        for c in present:
+            encoded = cv2.imencode(".png", faces[c][..., ::-1])[1].tobytes()
+            path = images / f"{name}_{FACES[c]}.png"
+            atomic_write(path, functools.partial(_write, encoded))
+    words = _words(command)
+    if any("{image}" in word or "{mask}" in word for word in words):
+        for name in track(names, "segmenting"):
+            _call(words, {"{image}": images / name, "{mask}": masks / name}, command)
+    else:
+        if not any(field in word for word in words for field in _FIELDS):
+            words = [*words, "{images}", "{masks}"]
+        _call(words, {"{images}": images, "{masks}": masks}, command)
+    missing = [name for name in names if not (masks / name).is_file()]
+    if missing:
+        raise GsbaError(
+            f"--segment {command}: wrote no mask {missing[0]} ({len(missing)} of {len(names)} "
+            "missing): it must write one of each face's name"
+        )
+    for name in names:
+        width, height = image_size(masks / name)
+        if (width, height) != (rig.size, rig.size):
+            raise GsbaError(
+                f"--segment {command}: mask {name} is {width}x{height}, its face is "
+                f"{rig.size}x{rig.size}"
+            )
+
+
+def _write(content: bytes, path: Path) -> None:
+    path.write_bytes(content)
+
+
+def _words(command: str) -> list[str]:
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise GsbaError(f"--segment {command}: {error}") from None
+    if not words:
+        raise GsbaError("--segment: no command given")
+    return words
+
+
+def _call(words: list[str], values: dict[str, Path], command: str) -> None:
+    """Run a command without a shell.
+
+    Raises:
+        GsbaError: it cannot be started, or fails: with the last line that it said.
+    """
+    filled = []
+    for word in words:
+        for field, value in values.items():
+            word = word.replace(field, str(value.resolve()))
+        filled.append(word)
+    try:
+        done = subprocess.run(filled, capture_output=True, text=True, errors="replace", check=False)
+    except OSError as error:
+        raise GsbaError(f"--segment {command}: cannot be run ({error.strerror})") from None
+    if done.returncode:
+        said = (done.stderr.strip() or done.stdout.strip() or "it said nothing").splitlines()[-1]
+        raise GsbaError(f"--segment {command}: failed with exit code {done.returncode}: {said}")
+
+
+def _checked(mask: np.ndarray, size: int, where: str) -> np.ndarray:
+    """A callable's mask.
+
+    Raises:
+        GsbaError: not (size, size) bool.
+    """
+    mask = np.asarray(mask)
+    if mask.shape != (size, size) or mask.dtype != bool:
+        raise GsbaError(
+            f"segment: mask of {where} is {mask.dtype} of shape {mask.shape}; a face's mask is "
+            f"bool of shape {(size, size)}, True = use"
+        )
+    return mask
+
+
+@functools.lru_cache(maxsize=1)
+def _places(size: int) -> np.ndarray:
+    """Index (2 size, 4 size) int64 into flat faces of what each panorama pixel shows."""
+    width, height = 4 * size, 2 * size
+    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + 0.5
+    bearings = bearings_from_erp(grid, width, height)
+    owners = owner_faces(bearings)
+    pixels = CubeRig(size, np.pi / 2).project(bearings, owners)
+    u, v = np.clip(np.moveaxis(pixels, -1, 0).astype(np.int64), 0, size - 1)
+    return (owners.astype(np.int64) * size + v) * size + u

@@ -1,0 +1,166 @@
+"""From poses to correspondences: neighbours in time, closed loops, and the map itself."""
+
+from functools import partial
+
+import numpy as np
+
+from gsba.bundle.adjustment import Adjustment
+from gsba.config import RefineSettings
+from gsba.geometry import inverse
+from gsba.matching import pairs, verification
+from gsba.matching.guided_search import Gate, MatchContext
+from gsba.types import Keypoints, Matches, VerifiedPairs
+
+
+def match_neighbours(context: MatchContext, start: Adjustment) -> VerifiedPairs:
+    """Match frames next to one another in time, guided by the coarse poses, and verify them.
+
+    Where many matches of a step disagree, repeated structure may have won with few: people who walk
+    along hide what would contradict it. Such steps are decided by all keypoints.
+    """
+    world_T_rigs, settings = start.world_T_rigs, context.settings
+    chosen = pairs.adjacent(len(world_T_rigs))
+    prior = settings.pairs.prior
+    gate = _gate(prior.rotation_deg, prior.direction, settings)
+
+    # The strongest keypoints are enough to find a pair's geometry, at a tenth of the cost.
+    found = context.match(chosen, world_T_rigs, [gate] * len(chosen), strongest=True)
+    f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
+    judge = partial(
+        verification.judge,
+        keypoints=context.keypoints,
+        prior_f0_T_f1s=f0_T_f1s,
+        position_sigmas=np.zeros(len(chosen)),
+        settings=settings.verify,
+    )
+    estimates = _estimates(found, context)
+    neighbours = judge(found, estimates)
+    scarce = np.diff(found.offsets) < settings.pairs.scarce_matches
+    steps = chosen[:, 1] - chosen[:, 0] == 1
+    doubtful = steps & (_shares(found, neighbours) < settings.pairs.least_agreement)
+    rows = np.flatnonzero(scarce | doubtful)
+    if len(rows) == 0:
+        return neighbours
+    again = context.match(chosen[rows], world_T_rigs, [gate] * len(rows))
+    for p, estimate in zip(rows, _estimates(again, context), strict=True):
+        estimates[p] = estimate
+    return judge(_replaced(found, rows, again), estimates)
+
+
+def match_loops(context: MatchContext, solved: Adjustment) -> VerifiedPairs:
+    """Match frames close in space but far in time, as far as drift leaves them predictable.
+
+    Only known points are looked for, as far around their predicted bearing as drift can have moved
+    them. What repeats at a distance, arches or columns, is further off than that.
+
+    Args:
+        context: of the run.
+        solved: poses and points that are right between neighbours.
+    """
+    settings, keypoints = context.settings, context.keypoints
+    world_T_rigs, positions = solved.world_T_rigs, solved.world_T_rigs[:, :3, 3]
+    depth = median_depth(solved)
+    chosen = pairs.covisible(positions, depth, settings.pairs)[1]
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    along = np.concatenate([[0], np.cumsum(steps)])
+    drifts = settings.pairs.drift * (along[chosen[:, 1]] - along[chosen[:, 0]])
+    gates = [
+        _point_gate(np.deg2rad(settings.pairs.loop_deg) + 2 * drift / max(depth, 1e-12))
+        for drift in drifts
+    ]
+    known = points_by_keypoint(solved, keypoints)
+    found = context.match(chosen, world_T_rigs, gates, known)
+    f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
+    return verified(found, f0_T_f1s, drifts, context)
+
+
+def match_along_epipolars(context: MatchContext, solved: Adjustment) -> Matches:
+    """Match neighbours in time again, along the epipolar lines of poses that are nearly right."""
+    poses, refined = solved.world_T_rigs, context.settings.pairs.refined
+    chosen = pairs.adjacent(len(poses))
+    gates = [_gate(refined.rotation_deg, refined.direction, context.settings)] * len(chosen)
+    return context.match(chosen, poses, gates)
+
+
+def match_known_points(context: MatchContext, solved: Adjustment, loops_closed: bool) -> Matches:
+    """Match frames further apart only where a known point must appear.
+
+    Prediction is the verification: what merely looks alike elsewhere, a column further on, is not
+    a candidate.
+
+    Args:
+        context: of the run.
+        solved: the current solution.
+        loops_closed: whether frames far apart in time are predictable too.
+    """
+    poses, settings = solved.world_T_rigs, context.settings.pairs
+    near, loops = pairs.covisible(poses[:, :3, 3], median_depth(solved), settings)
+    chosen = near[near[:, 1] - near[:, 0] > 2]
+    if loops_closed:
+        chosen = np.concatenate([chosen, loops])
+    gates = [_point_gate(np.deg2rad(settings.point_deg))] * len(chosen)
+    known = points_by_keypoint(solved, context.keypoints)
+    # Where a point is known this well, no network knows better.
+    return context.match(chosen, poses, gates, known, guided_only=True)
+
+
+def median_depth(solved: Adjustment) -> float:
+    """Median distance of points from the frames that see them, map units; 0 without points."""
+    tracks, points = solved.landmarks.tracks, solved.landmarks.points_world
+    offsets = points[tracks.points] - solved.world_T_rigs[tracks.frames, :3, 3]
+    return float(np.median(np.linalg.norm(offsets, axis=1))) if len(offsets) else 0.0
+
+
+def points_by_keypoint(solved: Adjustment, keypoints: Keypoints) -> list[np.ndarray]:
+    """For each frame (K_f, 3): its keypoints' points in its rig frame, NaN where unknown."""
+    tracks = solved.landmarks.tracks
+    known = np.full((len(keypoints.faces), 3), np.nan)
+    world_T_rig = solved.world_T_rigs[tracks.frames]
+    offsets = solved.landmarks.points_world[tracks.points] - world_T_rig[:, :3, 3]
+    known[keypoints.rows(tracks)] = np.einsum("oji,oj->oi", world_T_rig[:, :3, :3], offsets)
+    return np.split(known, keypoints.starts[1:-1])
+
+
+def verified(
+    found: Matches,
+    f0_T_f1s: np.ndarray | None,
+    sigmas: np.ndarray | None,
+    context: MatchContext,
+) -> VerifiedPairs:
+    """Matches whose geometry holds: see `verify.run`."""
+    settings, threads = context.settings, context.num_threads
+    return verification.run(
+        found, context.keypoints, f0_T_f1s, sigmas, settings.verify, settings.seed, threads
+    )
+
+
+def _estimates(found: Matches, context: MatchContext) -> list[verification.Estimate | None]:
+    """The geometry of each pair, whatever the trajectory says."""
+    settings, threads = context.settings, context.num_threads
+    return verification.estimate(found, context.keypoints, settings.verify, settings.seed, threads)
+
+
+def _shares(found: Matches, kept: VerifiedPairs) -> np.ndarray:
+    """Part (P,) of the matches of each pair that its geometry explains; 0 for pairs dropped."""
+    index = {(int(f0), int(f1)): p for p, (f0, f1) in enumerate(found.pairs)}
+    rows = [index[int(f0), int(f1)] for f0, f1 in kept.matches.pairs]
+    shares = np.zeros(len(found.pairs))
+    shares[rows] = np.diff(kept.matches.offsets)
+    return shares / np.maximum(np.diff(found.offsets), 1)
+
+
+def _replaced(matches: Matches, indices: np.ndarray, others: Matches) -> Matches:
+    """Matches with those of some pairs exchanged."""
+    rows = [matches.of(p) for p in range(len(matches.pairs))]
+    for n, p in enumerate(indices):
+        rows[p] = others.of(n)
+    return Matches(matches.pairs, np.cumsum([0, *map(len, rows)]), np.concatenate(rows))
+
+
+def _point_gate(radius_rad: float) -> Gate:
+    """A gate around predicted points only."""
+    return Gate(np.pi, 1.0, np.pi, min(radius_rad, np.pi))
+
+
+def _gate(rotation_deg: float, direction: float, settings: RefineSettings) -> Gate:
+    return Gate(np.deg2rad(rotation_deg), direction, np.deg2rad(settings.pairs.max_parallax_deg))

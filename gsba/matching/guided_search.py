@@ -1,0 +1,335 @@
+"""Descriptor matching guided by a predicted relative pose.
+
+A point seen along `a` in frame 0 must lie, in frame 1, on the great circle through the rotated
+`a` and the epipole, displaced away from the direction of motion. Candidates outside that band are
+never compared: this is the speed, and the defence against repeated structure.
+"""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from threading import Lock
+from typing import Protocol
+
+import numpy as np
+
+from gsba.camera.rig import RIG_R_FACE, owner_faces
+from gsba.config import MatchingSettings, RefineSettings
+from gsba.geometry import inverse
+from gsba.log import track
+from gsba.matching._search_kernels import HEAD, Cells, Limits, Rows, passes, search
+from gsba.types import Features, Keypoints, Matches
+
+_CELLS = 8  # cells along a face's side
+_NO_MATCHES = np.zeros((0, 2), np.int32)
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """How far a match may stray from a predicted relative pose."""
+
+    rotation_rad: float  # uncertainty of the relative rotation, and of keypoints
+    direction: float  # tangent of the uncertainty of the translation direction
+    max_parallax_rad: float  # largest angle between both bearings in one orientation
+    point_rad: float = 0.0  # uncertainty of the bearing of a point of known depth
+
+
+@dataclass(frozen=True, slots=True)
+class Searchable:
+    """Features of a frame sorted into cells of the sphere."""
+
+    bearings: np.ndarray  # (K, 3) float32, rig frame, sorted by cell
+    descriptors: np.ndarray  # (K, D) float32, unit length, in the axes of a basis
+    tails: np.ndarray  # (K,) float32, norm of what lies beyond the first HEAD axes
+    keypoints: np.ndarray  # (K,) int32, index of the keypoint standing for each row
+    starts: np.ndarray  # (C + 1,) int32, rows of each cell
+    centres: np.ndarray  # (C, 3) float32, unit
+    radii: np.ndarray  # (C,) float32, largest chord from a centre to a member
+
+
+def principal_axes(descriptors: np.ndarray) -> np.ndarray:
+    """Orthonormal axes (D, D) float32 as columns, those that hold most of descriptors first."""
+    rows = descriptors.astype(np.float64)
+    return np.linalg.eigh(rows.T @ rows)[1][:, ::-1].astype(np.float32)
+
+
+def searchable(
+    features: Features, axes: np.ndarray | None = None, strongest: int | None = None
+) -> Searchable:
+    """Sort features into cells; keypoints at one place (several orientations) become one.
+
+    Args:
+        features: of one frame.
+        axes: (D, D) orthonormal columns, the same for all frames; similarities do not depend on
+            them, but the search is fast if the first columns hold most of the descriptors.
+        strongest: keypoints of a face to search among, None for all.
+    """
+    chosen = strongest_of(features, strongest)
+    bearings = features.bearings_rig[chosen]
+    faces = owner_faces(bearings)
+    local = np.einsum("kji,kj->ki", RIG_R_FACE[faces], bearings)
+    angles = np.arctan2(local[:, :2], local[:, 2:]) / (np.pi / 2) + 0.5
+    cell_uv = np.clip((angles * _CELLS).astype(int), 0, _CELLS - 1)
+    cells = (faces.astype(int) * _CELLS + cell_uv[:, 1]) * _CELLS + cell_uv[:, 0]
+    order = np.argsort(cells, kind="stable")
+    starts = np.searchsorted(cells[order], np.arange(6 * _CELLS * _CELLS + 1)).astype(np.int32)
+    places = features.pixels[chosen, 0] + 1j * features.pixels[chosen, 1]  # one number sorts fast
+    places += 1e6 * features.faces[chosen]
+    _, first, inverse = np.unique(places, return_index=True, return_inverse=True)
+    sums = np.zeros((len(starts) - 1, 3))
+    np.add.at(sums, cells, bearings)
+    centres = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
+    radii = np.zeros(len(centres))
+    np.maximum.at(radii, cells, np.linalg.norm(bearings - centres[cells], axis=1))
+    descriptors = features.descriptors[chosen[order]].astype(np.float32)
+    descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-12)
+    if axes is not None:
+        descriptors = descriptors @ axes
+    return Searchable(
+        bearings[order].astype(np.float32),
+        descriptors,
+        np.linalg.norm(descriptors[:, HEAD:], axis=1),
+        chosen[first[inverse][order]].astype(np.int32),
+        starts,
+        centres.astype(np.float32),
+        radii.astype(np.float32),
+    )
+
+
+def strongest_of(features: Features, per_face: int | None) -> np.ndarray:
+    """Indices, ascending, of the strongest keypoints of each face; of all for None."""
+    if per_face is None:
+        return np.arange(len(features))
+    ranks = np.arange(len(features)) - np.searchsorted(features.faces, features.faces)
+    return np.flatnonzero(ranks < per_face)
+
+
+def match_pair(
+    first: Searchable,
+    second: Searchable,
+    f0_T_f1: np.ndarray,
+    gate: Gate,
+    settings: MatchingSettings,
+    points_f0: np.ndarray | None = None,
+) -> np.ndarray:
+    """Mutual, distinctive nearest neighbours within the gate.
+
+    Args:
+        first, second: features of both frames.
+        f0_T_f1: (4, 4) predicted pose of frame 1 in frame 0; its translation's length is unused.
+        gate: allowed deviation from the prediction.
+        points_f0: (K, 3) scene points of frame 0's keypoints in its rig frame, NaN where unknown.
+            Given, only keypoints with a point are matched, close to where it must appear.
+
+    Returns:
+        (m, 2) int32 keypoint indices in frame 0 and frame 1, sorted, unique.
+    """
+    rotation = f0_T_f1[:3, :3].astype(np.float32)
+    direction, limits = _limits(f0_T_f1, gate, settings)
+    best, similarity = search(
+        Rows(first.bearings, first.descriptors, first.tails),
+        Rows(second.bearings @ rotation.T, second.descriptors, second.tails),
+        Cells(second.starts, second.centres @ rotation.T, second.radii),
+        _targets(f0_T_f1, points_f0, first.keypoints),
+        points_f0 is not None,
+        direction,
+        limits,
+    )
+    rows = np.flatnonzero(best >= 0)
+    pairs = np.column_stack([first.keypoints[rows], second.keypoints[best[rows]]])
+    return one_to_one(pairs, similarity[rows])
+
+
+def within_gate(
+    pairs: np.ndarray,
+    first: Features,
+    second: Features,
+    f0_T_f1: np.ndarray,
+    gate: Gate,
+    points_f0: np.ndarray | None = None,
+) -> np.ndarray:
+    """Which matches (m, 2) `match_pair` would have considered under the same gate: (m,) bool."""
+    rotation = f0_T_f1[:3, :3].astype(np.float32)
+    direction, limits = _limits(f0_T_f1, gate, MatchingSettings())
+    return passes(
+        first.bearings_rig[pairs[:, 0]].astype(np.float32),
+        second.bearings_rig[pairs[:, 1]].astype(np.float32) @ rotation.T,
+        _targets(f0_T_f1, points_f0, pairs[:, 0]),
+        points_f0 is not None,
+        direction,
+        limits,
+    )
+
+
+def _limits(
+    f0_T_f1: np.ndarray, gate: Gate, settings: MatchingSettings
+) -> tuple[tuple[np.float32, ...], Limits]:
+    """Unit vector of the predicted motion, and a gate as the compiled search takes it."""
+    length = np.linalg.norm(f0_T_f1[:3, 3])
+    limits = Limits(
+        np.float32(gate.rotation_rad),
+        np.float32(gate.direction if length > 1e-12 else 1e3),
+        np.float32(2 * np.sin(min(gate.max_parallax_rad, np.pi) / 2)),
+        np.float32(gate.point_rad),
+        np.float32(settings.min_similarity),
+        np.float32(settings.max_ratio),
+    )
+    return tuple((f0_T_f1[:3, 3] / max(length, 1e-12)).astype(np.float32)), limits
+
+
+def _targets(
+    f0_T_f1: np.ndarray, points_f0: np.ndarray | None, keypoints: np.ndarray
+) -> np.ndarray:
+    """Directions (n, 3) float32 from frame 1, in frame 0's axes, of the points of keypoints (n,)
+    of frame 0; NaN where unknown."""
+    if points_f0 is None:
+        return np.full((len(keypoints), 3), np.nan, np.float32)
+    offsets = points_f0[keypoints] - f0_T_f1[:3, 3]
+    lengths = np.linalg.norm(offsets, axis=1, keepdims=True)
+    return (offsets / np.maximum(lengths, 1e-12)).astype(np.float32)
+
+
+def one_to_one(pairs: np.ndarray, similarity: np.ndarray) -> np.ndarray:
+    """Keep the best match of every keypoint that took part under several orientations or faces."""
+    order = np.argsort(-similarity, kind="stable")
+    pairs = pairs[order]
+    for column in (0, 1):
+        _, keep = np.unique(pairs[:, column], return_index=True)
+        pairs = pairs[np.sort(keep)]
+    return pairs[np.argsort(pairs[:, 0])].astype(np.int32)
+
+
+class Matcher(Protocol):
+    """Finds corresponding keypoints of two frames whose relative pose is predicted.
+
+    `guided` compares descriptors one by one; a learned matcher looks at all keypoints of two
+    faces at once. Either way nothing outside the gate is returned.
+    """
+
+    def __call__(
+        self,
+        frames: "SearchableFrames",
+        pair: tuple[int, int],
+        f0_T_f1: np.ndarray,
+        gate: Gate,
+        settings: MatchingSettings,
+        points_f0: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Matches (m, 2) int32 of a pair of frames, sorted, one to one; see `match_pair`."""
+        ...
+
+
+class SearchableFrames:
+    """Features of frames and how to match them; read when asked for, the latest used are kept.
+
+    Args:
+        load: reads the features of a frame.
+        strongest: keypoints of a face to match, None for all.
+        capacity: frames kept in memory.
+    """
+
+    def __init__(
+        self,
+        load: Callable[[int], Features],
+        strongest: int | None = None,
+        capacity: int = 96,
+    ) -> None:
+        first = load(0)
+        axes = principal_axes(first.descriptors) if len(first) else None
+        self._get = lru_cache(capacity)(lambda frame: searchable(load(frame), axes, strongest))
+        self._features = lru_cache(max(capacity // 8, 2))(load)
+        self._lock = Lock()
+        self.strongest = strongest
+
+    def __getitem__(self, frame: int) -> Searchable:
+        with self._lock:
+            return self._get(int(frame))
+
+    def features(self, frame: int) -> Features:
+        """All features of a frame, as they were extracted."""
+        with self._lock:
+            return self._features(int(frame))
+
+
+def guided(
+    frames: SearchableFrames,
+    pair: tuple[int, int],
+    f0_T_f1: np.ndarray,
+    gate: Gate,
+    settings: MatchingSettings,
+    points_f0: np.ndarray | None = None,
+) -> np.ndarray:
+    """The Matcher that searches the gate for each descriptor's nearest: `match_pair`."""
+    first, second = frames[pair[0]], frames[pair[1]]
+    return match_pair(first, second, f0_T_f1, gate, settings, points_f0)
+
+
+@dataclass(frozen=True, slots=True)
+class MatchContext:
+    """What a run's frames are matched by: their features, and how."""
+
+    frames: SearchableFrames
+    strongest: SearchableFrames  # the same with the strongest keypoints only
+    keypoints: Keypoints  # of all frames
+    settings: RefineSettings  # of pairs, matching and verification
+    num_threads: int  # pairs matched at a time
+    matcher: Matcher = guided  # compares two frames
+
+    def match(
+        self,
+        pairs: np.ndarray,
+        world_T_rigs: np.ndarray,
+        gates: Sequence[Gate],
+        points_rig: Sequence[np.ndarray] | None = None,
+        *,
+        strongest: bool = False,
+        guided_only: bool = False,
+    ) -> Matches:
+        """Match frame pairs as `run` does, on demand by guided search whatever the matcher."""
+        frames = self.strongest if strongest else self.frames
+        how = self.settings.matching, self.num_threads
+        matcher = guided if guided_only else self.matcher
+        return run(pairs, world_T_rigs, gates, frames, *how, points_rig, matcher)
+
+
+def run(
+    pairs: np.ndarray,
+    world_T_rigs: np.ndarray,
+    gates: Sequence[Gate],
+    frames: SearchableFrames,
+    settings: MatchingSettings,
+    num_threads: int,
+    points_rig: Sequence[np.ndarray] | None = None,
+    matcher: Matcher = guided,
+) -> Matches:
+    """Match frame pairs.
+
+    Args:
+        pairs: (P, 2) frame indices.
+        world_T_rigs: (F, 4, 4) poses that predict the pairs' geometry.
+        gates: (P) how far to trust the prediction.
+        frames: features.
+        settings: similarity and distinctiveness.
+        num_threads: pairs matched at a time.
+        points_rig: (F) arrays (K_f, 3), see `match_pair`; frame 0 of a pair must be known.
+        matcher: compares two frames.
+    """
+    f0_T_f1s = inverse(world_T_rigs[pairs[:, 0]]) @ world_T_rigs[pairs[:, 1]]
+
+    def match(p: int) -> np.ndarray:
+        f0, f1 = (int(f) for f in pairs[p])
+        points = None if points_rig is None else points_rig[f0]
+        return matcher(frames, (f0, f1), f0_T_f1s[p], gates[p], settings, points)
+
+    order = np.lexsort((pairs[:, 1], pairs[:, 0]))  # pairs that share frames follow one another
+    rows = [_NO_MATCHES] * len(pairs)
+    with ThreadPoolExecutor(num_threads) as pool:
+        found = track(pool.map(match, order), "matching", len(pairs))
+        for p, matched in zip(order, found, strict=True):
+            rows[p] = matched
+    return Matches(
+        np.asarray(pairs, np.int32).reshape(-1, 2),
+        np.cumsum([0, *map(len, rows)]),
+        np.concatenate([_NO_MATCHES, *rows]),
+    )

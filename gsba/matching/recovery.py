@@ -1,0 +1,254 @@
+"""Neighbours that the trajectory cannot guide: matched without it, and what that says about it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsba.config import RefineSettings
+from gsba.geometry import inverse
+from gsba.matching import pairs
+from gsba.matching.correspondences import verified
+from gsba.matching.guided_search import Gate, MatchContext
+from gsba.trajectory import clock, joining, judgement, misread
+from gsba.trajectory.clock import ClockEstimate
+from gsba.trajectory.joining import Joint
+from gsba.trajectory.judgement import Trust
+from gsba.types import CoarsePoses, Counts, Keypoints, Matches, Trajectory, VerifiedPairs
+
+_PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
+_MANY_LOST = 0.2  # part of the neighbours
+_ANYWHERE = Gate(np.pi, 1e3, np.pi)
+
+
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """Neighbours in time, verified with or without the trajectory, and its judgement."""
+
+    neighbours: VerifiedPairs
+    trust: Trust
+    coarse: CoarsePoses  # the trajectory, its pieces in one world
+    joints: tuple[Joint, ...] = ()  # of those pieces
+
+
+def run(
+    context: MatchContext, guided: VerifiedPairs, coarse: CoarsePoses, timestamps: np.ndarray
+) -> Recovered:
+    """Match the neighbours that guidance lost, judge the trajectory, and guide anew from that.
+
+    Frames next to one another are compared as a whole: they share so much that repeated structure
+    does not mislead. Frames two apart, or with a pause between them, where it does, are only
+    matched along the steps found or the trajectory.
+
+    Args:
+        context: of the run.
+        guided: neighbours verified under the trajectory's guidance; all of them where it is right.
+        coarse: the trajectory.
+        timestamps: (F,) seconds.
+
+    Raises:
+        GsbaError: the images contradict most of the trajectory.
+    """
+    settings, keypoints = context.settings, context.keypoints
+    chosen = pairs.adjacent(len(coarse.sources))
+    intervals = np.diff(timestamps)
+    close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
+    lost = _missing(np.column_stack([close, close + 1]), guided)
+    alone = _join([guided, match_anywhere(context, lost)])
+    steps = judgement.steps(alone, keypoints, settings.verify)
+    alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
+    coarse, joints = _joined(coarse, alone, steps, keypoints)
+    misread.refuse_misfit(coarse, steps, settings.verify)
+    trust = _judge(alone, keypoints, coarse, settings)
+    if trust.sound and not joints:
+        return Recovered(guided, trust, coarse)
+    again = _missing(chosen, alone)
+    again = again[again[:, 1] - again[:, 0] == 2]
+    over = _match_along(context, trust.world_T_rigs, again)
+    neighbours = _join([alone, _consistent(over, steps, keypoints, settings)])
+    doubtful = [p for p in _index(lost) if not _supported(p, neighbours, keypoints, settings)]
+    if doubtful:
+        neighbours = _without(neighbours, doubtful)
+        trust = _judge(neighbours, keypoints, coarse, settings)
+    counts = Counts(
+        len(chosen),
+        len(neighbours.matches.pairs),
+        "pairs",
+        {"no common geometry": len(chosen) - len(neighbours.matches.pairs)},
+    )
+    neighbours = VerifiedPairs(neighbours.matches, neighbours.f0_T_f1s, counts)
+    guessed = joining.guessed(joints, len(coarse.sources))
+    guessed |= trust.unseen_steps & judgement.leaps(coarse.world_T_rigs, timestamps)
+    trust = replace(trust, false_steps=trust.false_steps | guessed)
+    return Recovered(neighbours, trust, coarse, joints)
+
+
+def _joined(
+    coarse: CoarsePoses, found: VerifiedPairs, steps: judgement.Steps, keypoints: Keypoints
+) -> tuple[CoarsePoses, tuple[Joint, ...]]:
+    """The trajectory with its pieces in one world, if there are several."""
+    if coarse.segments is None:
+        return coarse, ()
+    return joining.join(coarse, steps, *judgement.length_ratios(found, steps, keypoints))
+
+
+def check_clock(
+    context: MatchContext,
+    guided: VerifiedPairs,
+    coarse: CoarsePoses,
+    timestamps: np.ndarray,
+    trajectory: Trajectory,
+) -> ClockEstimate:
+    """Whether the trajectory turns when the images do, or at other times.
+
+    One that fits if read otherwise is refused first: it may turn like the images at other times.
+
+    Args:
+        context: of the run.
+        guided: neighbours verified under the trajectory's guidance. Where it lost many, whole
+            panoramas are compared: a clock that is off loses the turns, which tell it.
+        coarse: the trajectory at the frames' times.
+        timestamps: (F,) seconds.
+        trajectory: all its entries.
+
+    Raises:
+        GsbaError: it is reversed, mirrored, inverted or in other axes.
+    """
+    settings, intervals = context.settings, np.diff(timestamps)
+    close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
+    chosen = np.column_stack([close, close + 1])
+    lost = _missing(chosen, guided)
+    if len(lost) > _MANY_LOST * len(chosen):
+        guided = _join([guided, match_anywhere(context, lost)])
+    steps = judgement.steps(guided, context.keypoints, settings.verify)
+    misread.refuse_misread(coarse, steps, settings.verify)
+    reach = settings.read.max_clock_shift_s
+    return clock.estimate(timestamps, steps, trajectory, coarse.time_offset, reach)
+
+
+def _match_along(
+    context: MatchContext, world_T_rigs: np.ndarray, chosen: np.ndarray
+) -> VerifiedPairs:
+    """Match pairs (P, 2) guided by the start, and verify that they agree with it."""
+    settings = context.settings.pairs
+    prior, limit = settings.prior, np.deg2rad(settings.max_parallax_deg)
+    gates = [Gate(np.deg2rad(prior.rotation_deg), prior.direction, limit)] * len(chosen)
+    found = context.match(chosen, world_T_rigs, gates)
+    f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
+    return verified(found, f0_T_f1s, np.zeros(len(chosen)), context)
+
+
+def nothing_verified() -> VerifiedPairs:
+    """No pairs: what guidance finds where there is no trajectory."""
+    none = np.zeros((0, 2), np.int32)
+    matches = Matches(none, np.zeros(1, np.int64), none)
+    return VerifiedPairs(matches, np.zeros((0, 4, 4)), Counts(0, 0, "pairs"))
+
+
+def match_anywhere(
+    context: MatchContext, chosen: np.ndarray, min_share: float | None = None
+) -> VerifiedPairs:
+    """Match whole panoramas without any prediction, and verify their geometry alone.
+
+    The strongest features are tried first, and all for pairs that those do not settle.
+
+    Args:
+        context: of the run.
+        chosen: (P, 2) frame indices.
+        min_share: part of the matches that must be of one geometry; None = as for neighbours.
+    """
+    if min_share is not None:
+        least = context.settings.verify.model_copy(update={"min_share": min_share})
+        context = replace(context, settings=context.settings.model_copy(update={"verify": least}))
+    nowhere = np.tile(np.eye(4), (len(context.keypoints.starts) - 1, 1, 1))
+
+    def match(some: np.ndarray, strongest: bool) -> VerifiedPairs:
+        gates = [_ANYWHERE] * len(some)
+        # Nothing predicts which faces a learned matcher should compare.
+        found = context.match(some, nowhere, gates, strongest=strongest, guided_only=True)
+        return verified(found, None, None, context)
+
+    first = match(chosen, strongest=True)
+    if context.strongest is context.frames:
+        return first
+    rest = _missing(chosen, first)
+    return _join([first, match(rest, strongest=False)]) if len(rest) else first
+
+
+def _judge(
+    found: VerifiedPairs, keypoints: Keypoints, coarse: CoarsePoses, settings: RefineSettings
+) -> Trust:
+    steps = judgement.steps(found, keypoints, settings.verify)
+    logs, sigmas = judgement.length_ratios(found, steps, keypoints)
+    return judgement.judge(coarse, steps, logs, sigmas, settings.verify, settings.priors)
+
+
+def _supported(
+    pair: tuple[int, int], found: VerifiedPairs, keypoints: Keypoints, settings: RefineSettings
+) -> bool:
+    """Whether a third frame confirms a step that no trajectory guided.
+
+    Either a pair that spans it fits the steps it is made of, or points that it shares with a step
+    beside it lie at distances in one proportion.
+    """
+    f = pair[0]
+    present = _index(found.matches.pairs)
+    if {(f - 1, f + 1), (f, f + 2)} & present:
+        return True
+    steps = judgement.steps(found, keypoints, settings.verify)
+    if not steps.directed[f]:
+        return True  # a turn on the spot: whole panoramas agree on one rotation
+    sigmas = judgement.length_ratios(found, steps, keypoints)[1]
+    return bool(np.isfinite(sigmas[max(f - 1, 0) : f + 1]).any()) or len(steps.verified) == 1
+
+
+def _consistent(
+    found: VerifiedPairs, steps: judgement.Steps, keypoints: Keypoints, settings: RefineSettings
+) -> VerifiedPairs:
+    """Pairs without those over two steps that a repeated structure made up: see `off_steps`."""
+    off = judgement.off_steps(found, steps, keypoints, settings.verify)
+    false = off > np.deg2rad(settings.verify.max_triplet_deg)
+    return _taken(found, np.flatnonzero(~false).tolist()) if false.any() else found
+
+
+def _index(some: np.ndarray) -> set[tuple[int, int]]:
+    return {(int(f0), int(f1)) for f0, f1 in some}
+
+
+def _missing(chosen: np.ndarray, found: VerifiedPairs) -> np.ndarray:
+    """Those of some pairs (P, 2) that were not verified."""
+    present = _index(found.matches.pairs)
+    rows = [pair for pair in chosen.tolist() if tuple(pair) not in present]
+    return np.array(rows, np.int32).reshape(-1, 2)
+
+
+def _without(found: VerifiedPairs, dropped: list[tuple[int, int]]) -> VerifiedPairs:
+    keep = [p for p, pair in enumerate(found.matches.pairs.tolist()) if tuple(pair) not in dropped]
+    return _taken(found, keep)
+
+
+def _taken(found: VerifiedPairs, rows: list[int]) -> VerifiedPairs:
+    """Some of verified pairs, in the order given."""
+    matches = [found.matches.of(p) for p in rows]
+    kept = Matches(
+        found.matches.pairs[rows].reshape(-1, 2),
+        np.cumsum([0, *map(len, matches)]),
+        np.concatenate([np.zeros((0, 2), np.int32), *matches]),
+    )
+    poses = found.f0_T_f1s[rows].reshape(-1, 4, 4)
+    return VerifiedPairs(kept, poses, found.counts)
+
+
+def _join(parts: list[VerifiedPairs]) -> VerifiedPairs:
+    """All pairs of several sets, those of the closest frames first."""
+    offsets = np.cumsum([0, *(len(part.matches.keypoints) for part in parts)])
+    matches = Matches(
+        np.concatenate([part.matches.pairs for part in parts]),
+        np.concatenate(
+            [[0], *(part.matches.offsets[1:] + o for part, o in zip(parts, offsets, strict=False))]
+        ).astype(np.int64),
+        np.concatenate([part.matches.keypoints for part in parts]),
+    )
+    poses = np.concatenate([part.f0_T_f1s for part in parts])
+    joined = VerifiedPairs(matches, poses, parts[0].counts)
+    gaps = matches.pairs[:, 1] - matches.pairs[:, 0]
+    return _taken(joined, np.lexsort((matches.pairs[:, 0], gaps)).tolist())

@@ -1,0 +1,357 @@
+"""Direct photometric refinement: patches of all frames, joint with the map's observations."""
+
+import logging
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from factors import LandmarkBlock, RobustLoss
+from factors.patch_windows import PatchPixels, PatchTable, patch_spans, poor_views
+from factors.photometric import PhotometricBlock
+from factors.sphere_image import SphereImage
+from gsba.bundle import adjustment, prior_factors, triangulation
+from gsba.bundle.adjustment import Adjustment, Round
+from gsba.bundle.optimizer import OptimizeResult, optimize
+from gsba.camera.rig import CubeRig
+from gsba.config import PhotometricSettings, RefineSettings
+from gsba.frames.masks import load_weights
+from gsba.log import GsbaError, track
+from gsba.photometric import patches
+from gsba.types import Counts, FrameSet, Keypoints
+
+logger = logging.getLogger(__name__)
+
+_LEAST_WEIGHT = 1e-3  # of a frame
+_DEPTH_STEPS = 5  # Gauss-Newton steps on the planes at each level
+_LEAST_JUDGED = 10  # observations of a frame that is judged
+_CHUNK = 40_000  # observations whose depths are found at a time: bounds the windows held
+
+
+@dataclass(frozen=True, slots=True)
+class PhotometricResult:
+    """Poses and points after the joint solve, and what became of the patches."""
+
+    adjustment: Adjustment
+    counts: tuple[Counts, ...]  # of patches, then of observations, for each level
+    frame_weights: np.ndarray  # (F,) float64, 1 = full trust in a frame's pixels
+    residuals: np.ndarray  # (F,) float64, median over a frame of patches' residuals, sigmas
+
+
+def check(frames: FrameSet, settings: RefineSettings) -> None:
+    """Where the family is asked for, refuse frames that patches cannot be sampled from.
+
+    Raises:
+        GsbaError: cube faces, or panoramas of an odd height.
+    """
+    if "photometric" not in settings.factors:
+        return
+    if frames.layout != "erp" or frames.height % 2:
+        what = "cube faces" if frames.layout != "erp" else f"{frames.height} rows"
+        raise GsbaError(
+            f"the photometric family reads panoramas of even height, not {what}: leave it out of "
+            "--factors"
+        )
+
+
+def run(
+    frames: FrameSet,
+    keypoints: Keypoints,
+    start: Adjustment,
+    priors: gtsam.NonlinearFactorGraph,
+    rig: CubeRig,
+    settings: RefineSettings,
+    num_threads: int,
+) -> PhotometricResult:
+    """Refine a solved map by the grey values of patches, level after level.
+
+    Args:
+        frames: panoramas; read twice a level, one at a time.
+        keypoints: of all frames.
+        start: the solved map.
+        priors: factors on the poses, gauge included.
+        rig: the faces, for the reprojection family.
+        settings: families, loss, solver, patches.
+        num_threads: of the solver.
+    """
+    solved, counts = start, []
+    weights, residuals = np.ones(len(frames)), np.full(len(frames), np.nan)
+    for level in settings.photometric.levels:
+        pixels, trust, found = _patches(frames, solved, level, settings, num_threads)
+        counts += found
+        if pixels is None:
+            logger.warning("no patch is seen twice at level %d: left as it was", level)
+            continue
+        solved, weights, residuals = _solve(
+            pixels, trust, keypoints, solved, priors, rig, settings, num_threads
+        )
+    return PhotometricResult(solved, tuple(counts), weights, residuals)
+
+
+def _patches(
+    frames: FrameSet, solved: Adjustment, level: int, settings: RefineSettings, num_threads: int
+) -> tuple[PatchPixels | None, np.ndarray, list[Counts]]:
+    """Pixels of the patches and observations that are good enough, if any; weights; the counts."""
+    chosen, world_T_rigs = settings.photometric, solved.world_T_rigs
+    bearings, width = [], 0
+    for f in track(range(len(frames)), "choosing patches"):
+        greys, usable = patches.pyramid(frames, f, chosen, level)
+        grey = greys[-1]
+        usable = patches.coarser(usable, len(usable) // len(grey))
+        bearings.append(patches.candidates(grey, usable, chosen))
+        width, level = grey.shape[1], len(greys) - 1  # a small panorama has fewer
+    table, counts = patches.table_of(bearings, world_T_rigs, solved.landmarks, width, chosen)
+    num, dropped = len(table.targets), {}
+    left = np.ones(num, bool)
+    for reason, flag in poor_views(table, world_T_rigs, table.planes).items():
+        dropped[reason] = int(np.count_nonzero(flag & left))
+        left &= ~flag
+    table, _ = table.select(left)
+    trust = np.zeros(len(table.targets))
+    rows = np.cumsum(np.diff(table.offsets)) // _CHUNK
+    for chunk in np.unique(rows):
+        observations = (rows == chunk)[table.owners]
+        part, own = table.select(observations)
+        block = _with_depths(frames, part, world_T_rigs, level, settings, num_threads, dropped)
+        table.planes[own] = block.planes
+        trust[observations] = block.weights
+    kept = trust > 0
+    seen = Counts(num, int(np.count_nonzero(kept)), "patch observations", dropped)
+    table, _ = table.select(kept)
+    gathered, _ = _gather(frames, table, world_T_rigs, level, level, chosen)
+    return next(iter(gathered), None), trust[kept], [counts, seen]
+
+
+def _with_depths(
+    frames: FrameSet,
+    table: PatchTable,
+    world_T_rigs: np.ndarray,
+    level: int,
+    settings: RefineSettings,
+    num_threads: int,
+    dropped: dict[str, int],
+) -> PhotometricBlock:
+    """Patches with planes found at fixed poses, coarse to fine; only what correlates counts.
+
+    What does not is added to `dropped`.
+    """
+    chosen, values = settings.photometric, adjustment.values_of(world_T_rigs)
+    gathered, visible = _gather(
+        frames, table, world_T_rigs, level, level + chosen.depth_levels, chosen
+    )
+    planes = table.planes
+    for pixels in reversed(gathered):
+        block = make_block(pixels, visible, settings, num_threads)
+        block.planes = planes
+        block.refresh(values)
+        block.polish(values, _DEPTH_STEPS)
+        planes = block.planes
+    block.refresh(values)
+    correlated = block.correlations(values) >= chosen.min_correlation
+    reasons = {
+        "masked or saturated": np.count_nonzero(visible == 0),
+        **block.dropped,
+        "does not correlate": np.count_nonzero(block.counted & ~correlated),
+    }
+    for reason, number in reasons.items():
+        dropped[reason] = dropped.get(reason, 0) + int(number)
+    block.weigh_observations(correlated)
+    block.refresh(values)
+    return block
+
+
+def _gather(
+    frames: FrameSet,
+    table: PatchTable,
+    world_T_rigs: np.ndarray,
+    level: int,
+    top: int,
+    settings: PhotometricSettings,
+) -> tuple[list[PatchPixels], np.ndarray]:
+    """Pixels of the patches at the levels from `level` to `top`; weights (O,) by both masks."""
+    gathered: list[PatchPixels] = []
+    visible, trusted = np.ones(len(table.targets)), np.ones(len(table))
+    needed = np.union1d(table.hosts, table.targets)
+    for f in track(needed.tolist(), "sampling patches"):
+        greys, usable = patches.pyramid(frames, f, settings, top)
+        for k, grey in enumerate(greys[level:]):
+            if k == len(gathered):
+                scaled = replace(table, grid=2.0**k * table.grid)
+                gathered.append(PatchPixels(scaled, world_T_rigs, grey.shape[1]))
+            gathered[k].take(f, SphereImage.of(grey))
+        rows = np.flatnonzero(table.targets == f)
+        spans = patch_spans(table, world_T_rigs, table.planes, rows)
+        visible[rows] = patches.values_at(usable, spans[:, 0])
+        weights = load_weights(frames, f)
+        if weights is not None:
+            visible[rows] *= patches.values_at(weights, spans[:, 0])
+            own = np.flatnonzero(table.hosts == f)
+            trusted[own] = patches.values_at(weights, table.bearings_rig[own])
+    return gathered, visible * trusted[table.owners]
+
+
+def _solve(
+    pixels: PatchPixels,
+    trust: np.ndarray,
+    keypoints: Keypoints,
+    solved: Adjustment,
+    priors: gtsam.NonlinearFactorGraph,
+    rig: CubeRig,
+    settings: RefineSettings,
+    num_threads: int,
+) -> tuple[Adjustment, np.ndarray, np.ndarray]:
+    """The joint solve, repeated once where frames are doubted: their weights, their residuals.
+
+    It is undone where it explains the map's own observations worse than before.
+    """
+    chosen, values = settings.photometric, adjustment.values_of(solved.world_T_rigs)
+    solver = settings.solver.model_copy(update={"relative_tolerance": chosen.tolerance})
+    start = make_block(pixels, trust, settings, num_threads)
+    noise = _noise(start, values) * chosen.inflation
+    weights = np.ones(pixels.num_frames)
+    for _ in range(2):
+        block = make_block(pixels, start.counted * trust, settings, num_threads, noise)
+        block.weigh(weights)
+        landmarks = adjustment.landmark_block(
+            solved.landmarks, keypoints, rig, solved.noise, settings, num_threads
+        )
+        landmarks.polish(values)
+        before, fits = landmarks.error(values), _geometric_fits(landmarks, values)
+        result = optimize(priors, [landmarks, block], values, solver)
+        growth = _geometric_fits(landmarks, result.values) / fits
+        doubts, residuals = _frame_weights(block, result.values, growth, chosen)
+        if np.all(doubts >= 1) or np.any(weights < 1):
+            break
+        weights = doubts
+    accepted = landmarks.error(result.values) <= chosen.max_growth * before
+    adjusted = _adjusted(solved, keypoints, result, accepted, settings, num_threads)
+    return adjusted, weights, residuals
+
+
+def joint(
+    frames: FrameSet,
+    solved: Adjustment,
+    frame_weights: np.ndarray,
+    settings: RefineSettings,
+    num_threads: int,
+) -> list[PhotometricBlock]:
+    """The patches of a solved map, to join the solve of a further family; none if not asked for.
+
+    Args:
+        frame_weights: (F,) of each frame's pixels, see `PhotometricResult`.
+    """
+    if "photometric" not in settings.factors:
+        return []
+    level = settings.photometric.levels[-1]
+    pixels, trust, _ = _patches(frames, solved, level, settings, num_threads)
+    if pixels is None:
+        return []
+    start = make_block(pixels, trust, settings, num_threads)
+    noise = (
+        _noise(start, adjustment.values_of(solved.world_T_rigs)) * settings.photometric.inflation
+    )
+    block = make_block(pixels, start.counted * trust, settings, num_threads, noise)
+    block.weigh(frame_weights)
+    return [block]
+
+
+def make_block(
+    pixels: PatchPixels,
+    weights: np.ndarray,
+    settings: RefineSettings,
+    num_threads: int,
+    noise: float = 1.0,
+) -> PhotometricBlock:
+    """The factor block of gathered patches, `noise` times as uncertain as the settings say."""
+    chosen = settings.photometric
+    contrasts = pixels.templates.std(axis=1).astype(np.float64)
+    sigmas = noise * np.hypot(chosen.noise_grey, chosen.noise_contrast * contrasts)
+    return PhotometricBlock(
+        [prior_factors.X(f) for f in range(pixels.num_frames)],
+        pixels,
+        sigmas,
+        RobustLoss("cauchy", chosen.loss_sigmas / chosen.inflation),
+        weights,
+        num_threads,
+        chosen.polish_steps,
+    )
+
+
+def _noise(block: PhotometricBlock, values: gtsam.Values) -> float:
+    """Typical residual of a pixel at the start, in units of the settings' sigma."""
+    block.refresh(values)
+    if not block.counted.any():
+        return 1.0
+    return float(np.sqrt(np.median(block.errors(values)[block.counted])))
+
+
+def _geometric_fits(landmarks: LandmarkBlock, values: gtsam.Values) -> np.ndarray:
+    """Median residual (F,) of each frame's geometric observations, sigmas; 1 without any."""
+    residuals, _ = landmarks.residuals(values)
+    norms = np.linalg.norm(np.concatenate(residuals), axis=1)
+    frames = np.concatenate([term.frames for term in landmarks.terms])
+    fits = np.ones(len(landmarks.pose_keys))
+    for f in range(len(fits)):
+        rows = frames == f
+        if np.count_nonzero(rows) >= _LEAST_JUDGED:
+            fits[f] = max(float(np.median(norms[rows])), 1e-9)
+    return fits
+
+
+def _frame_weights(
+    block: PhotometricBlock,
+    values: gtsam.Values,
+    growth: np.ndarray,
+    settings: PhotometricSettings,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weight (F,) of each frame's pixels, and the median (F,) of its residuals in sigmas.
+
+    Blur, a passer-by or a wrong pose make a frame's patches fit worse than those of the others;
+    or its pixels pull it off its geometric observations, whose residuals grow by `growth (F,)`.
+    Beyond what is allowed a weight falls with the square of the ratio.
+    """
+    kept = block.counted
+    errors = np.sqrt(block.errors(values)[kept])
+    targets, hosts = block.table.targets[kept], block.table.hosts[block.table.owners][kept]
+    residuals = np.full(len(block.pose_keys), np.nan)
+    for f in range(len(residuals)):
+        rows = (targets == f) | (hosts == f)
+        if np.count_nonzero(rows) >= _LEAST_JUDGED:
+            residuals[f] = np.median(errors[rows])
+    typical = np.nanmedian(residuals) if np.isfinite(residuals).any() else 1.0
+    ratios = np.nan_to_num(residuals / typical, nan=1.0) / settings.max_frame_ratio
+    worst = np.maximum(1.0, np.maximum(ratios, growth / settings.max_frame_growth))
+    return np.maximum(worst**-2.0, _LEAST_WEIGHT), residuals
+
+
+def _adjusted(
+    solved: Adjustment,
+    keypoints: Keypoints,
+    result: OptimizeResult,
+    accepted: bool,
+    settings: RefineSettings,
+    num_threads: int,
+) -> Adjustment:
+    """The solution with the joint solve's poses, or as it was if not accepted.
+
+    Points are placed anew as after a bundle adjustment: those of the solve lie closer to most
+    observations than noise allows.
+    """
+    tracks, least = solved.landmarks.tracks, settings.rounds.min_observations
+    gate = solved.rounds[-1].gate_sigmas if solved.rounds else np.inf
+    rows, poses = (
+        keypoints.rows(tracks),
+        adjustment.poses_of(result.values, len(solved.world_T_rigs)),
+    )
+    bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
+    placed = triangulation.run(
+        tracks, bearings, sigmas, poses, gate * solved.noise, settings.triangulate, num_threads
+    )
+    after = replace(solved, world_T_rigs=poses, landmarks=placed)
+    accepted &= adjustment.carries(after, solved, least)
+    support = len(placed.tracks)
+    note = Round(
+        gate, solved.noise, len(tracks), tracks.num_points, support, accepted, result.history,
+        result.reason,
+    )  # fmt: skip
+    return replace(after if accepted else solved, rounds=(*solved.rounds, note))

@@ -1,0 +1,215 @@
+"""Patches for photometric refinement: spread over the sphere, depth from the map, seen nearby."""
+
+import functools
+
+import cv2
+import numpy as np
+from scipy.ndimage import correlate1d
+
+from factors.patch_windows import PatchTable, over_poles, patch_axes, pixel_grid
+from gsba.config import PhotometricSettings
+from gsba.frames.masks import load_mask
+from gsba.frames.scan import load_erp
+from gsba.geometry import bearings_from_erp, erp_from_bearings
+from gsba.types import Counts, FrameSet, Landmarks
+
+_NEIGHBOURS = 8  # map points that a patch's plane is laid through
+_DARK, _BRIGHT = 3, 252  # grey values beyond which a pixel counts as saturated
+_EDGE_SHARE = 0.05  # of an edge's strength, beside that of a corner
+_MAX_LATITUDE = np.deg2rad(80.0)  # beyond, pixels of a panorama are mostly invented
+
+
+def pyramid(
+    frames: FrameSet, frame: int, settings: PhotometricSettings, top: int
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Grey images of a frame, level 0 to `top`, and where level 0 may be used.
+
+    Level 0 is the largest within `settings.max_width`; each further one has half the width, down
+    to 64 pixels, where the levels end.
+
+    Returns:
+        (H, 2 H) float32 of each level, and (H, 2 H) bool: not masked, neither black nor saturated.
+    """
+    grey = cv2.cvtColor(load_erp(frames, frame), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    usable = (grey > _DARK) & (grey < _BRIGHT)
+    mask = load_mask(frames, frame)
+    if mask is not None:
+        usable &= mask
+    while grey.shape[1] > settings.max_width and _divides(grey):
+        grey = halved(grey)
+        usable = coarser(usable, 2)
+    levels = [grey]
+    while len(levels) <= top and _divides(levels[-1]):
+        levels.append(halved(levels[-1]))
+    return levels, usable
+
+
+def halved(grey: np.ndarray) -> np.ndarray:
+    """The next level of a pyramid: (H, 2 H) to (H / 2, H) float32, low-passed; H in fours.
+
+    The filter [1 3 3 1] / 8 sits on the corners between pixels, so that bearings stay in place.
+    """
+    image, rows = np.asarray(grey, dtype=np.float32), 2
+    taps = np.array([1, 3, 3, 1], dtype=np.float32) / 8
+    tall = correlate1d(over_poles(image, rows), taps, axis=0, origin=-1)[rows:-rows][::2]
+    return correlate1d(tall, taps, axis=1, mode="wrap", origin=-1)[:, ::2]
+
+
+def coarser(usable: np.ndarray, step: int) -> np.ndarray:
+    """(H / step, W / step) bool, whether all of step x step pixels (H, W) bool may be used."""
+    height, width = usable.shape
+    blocks = usable.reshape(height // step, step, width // step, step)
+    return np.logical_and.reduce(blocks, axis=(1, 3))
+
+
+def _divides(image: np.ndarray) -> bool:
+    return len(image) % 4 == 0 and len(image) >= 64
+
+
+def candidates(grey: np.ndarray, usable: np.ndarray, settings: PhotometricSettings) -> np.ndarray:
+    """Bearings (K, 3) of the best-textured pixel of each cell of an even grid on the sphere."""
+    height, width = grey.shape
+    latitude = np.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
+    size = (settings.size, settings.size)
+    across = cv2.Scharr(_ring(grey), cv2.CV_32F, 1, 0)[:, 1:-1] / (32 * np.cos(latitude))
+    down = cv2.Scharr(_ring(grey), cv2.CV_32F, 0, 1)[:, 1:-1] / 32
+    xx, xy, yy = (
+        cv2.boxFilter(product.astype(np.float32), -1, size)
+        for product in (across * across, across * down, down * down)
+    )
+    spread = np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+    least, most = 0.5 * (xx + yy) - spread, 0.5 * (xx + yy) + spread
+    score = least + _EDGE_SHARE * most
+    border = 2 * (settings.size // 2) + 3
+    open_ = cv2.erode(usable.astype(np.uint8), np.ones((border, border), np.uint8)) > 0
+    open_[:, : border // 2] = open_[:, -(border // 2) :] = False  # erosion knows no seam
+    score = np.where(open_ & (np.abs(latitude) < _MAX_LATITUDE), score, 0.0).ravel()
+    order, starts = _cells(width, height, settings.spacing_deg)
+    ranked = score[order]
+    best = np.maximum.reduceat(ranked, starts)
+    cell = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
+    first = np.full(len(starts), len(order))
+    hits = np.flatnonzero(ranked == best[cell])
+    np.minimum.at(first, cell[hits], hits)
+    chosen = order[first[best > settings.min_gradient**2]]
+    v, u = np.divmod(chosen, width)
+    return bearings_from_erp(np.column_stack([u + 0.5, v + 0.5]), width, height)
+
+
+@functools.lru_cache(maxsize=2)
+def _cells(width: int, height: int, spacing_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels sorted by their cell, and where each cell starts: rings of equal height."""
+    rings = max(1, round(180 / spacing_deg))
+    ring = np.minimum(np.arange(height) * rings // height, rings - 1)
+    middle = np.pi * ((np.arange(rings) + 0.5) / rings - 0.5)
+    columns = np.maximum(1, np.rint(2 * rings * np.cos(middle))).astype(np.int64)
+    firsts = np.concatenate([[0], np.cumsum(columns)[:-1]])
+    column = np.arange(width)[None, :] * columns[ring][:, None] // width
+    cell = (firsts[ring][:, None] + column).ravel()
+    order = np.argsort(cell, kind="stable")
+    return order, np.flatnonzero(np.diff(cell[order], prepend=-1))
+
+
+def _ring(image: np.ndarray) -> np.ndarray:
+    """An image with one column of wrap-around at either side."""
+    return np.concatenate([image[:, -1:], image, image[:, :1]], axis=1)
+
+
+def lay_planes(
+    bearings: np.ndarray, points_rig: np.ndarray, settings: PhotometricSettings
+) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse-depth planes of patches through map points around them.
+
+    A plane's inverse depth is linear over the tangent plane, so that a weighted linear fit to the
+    nearest points gives it; its slopes are held by a prior that faces the patch to its host.
+
+    Args:
+        bearings: (K, 3) unit, centres of patches.
+        points_rig: (M, 3) points that the host sees, its rig frame.
+
+    Returns:
+        planes (K, 3), 1 / map units, and (K,) bool, whether the points around agree on one.
+    """
+    from scipy.spatial import KDTree
+
+    planes, clear = np.zeros((len(bearings), 3)), np.zeros(len(bearings), bool)
+    ranges = np.linalg.norm(points_rig, axis=1)
+    if len(points_rig) < _NEIGHBOURS or len(bearings) == 0:
+        return planes, clear
+    reach = 2 * np.sin(np.deg2rad(settings.depth_reach_deg) / 2)
+    chords, rows = KDTree(points_rig / ranges[:, None]).query(bearings, k=_NEIGHBOURS)
+    local = np.einsum("pki,pni->pnk", patch_axes(bearings), points_rig[rows])
+    ahead = (local[..., 0] > 0) & (chords < reach)
+    depth = np.where(ahead, local[..., 0], 1.0)
+    x = np.concatenate([np.ones_like(depth[..., None]), local[..., 1:] / depth[..., None]], axis=2)
+    y = 1.0 / depth
+    weights = np.where(ahead, 1 / (chords**2 + (0.25 * reach) ** 2), 0.0)
+    trust = weights
+    for _ in range(4):  # reweighted: points of another surface let go
+        typical = (trust * y).sum(axis=1) / np.maximum(trust.sum(axis=1), 1e-300)
+        V = np.einsum("pn,pni,pnj->pij", trust, x, x)
+        ridge = (settings.depth_tolerance / settings.slope_sigma) ** 2 * weights.max(axis=1)
+        V[:, [1, 2], [1, 2]] += ridge[:, None]
+        V += 1e-12 * np.eye(3)
+        planes = np.linalg.solve(V, np.einsum("pn,pni,pn->pi", trust, x, y)[..., None])[..., 0]
+        off = (np.einsum("pni,pi->pn", x, planes) - y) / np.maximum(typical, 1e-12)[:, None]
+        trust = weights / (1 + (off / settings.depth_tolerance) ** 2)
+    agreeing = (ahead & (np.abs(off) < 2 * settings.depth_tolerance)).sum(axis=1)
+    nearest = chords[:, 0] < 0.25 * reach
+    agrees = np.abs(off[:, 0]) < settings.depth_tolerance
+    clear = (planes[:, 0] > 0) & (agreeing >= 3) & (agrees | ~nearest)
+    clear &= agreeing >= 0.6 * ahead.sum(axis=1)
+    return planes, clear
+
+
+def table_of(
+    bearings: list[np.ndarray],
+    world_T_rigs: np.ndarray,
+    landmarks: Landmarks,
+    width: int,
+    settings: PhotometricSettings,
+) -> tuple[PatchTable, Counts]:
+    """Patches of all frames with planes from the map, and the frames near each host.
+
+    Args:
+        bearings: of each frame, (K, 3) candidates.
+        world_T_rigs: (F, 4, 4) solved poses.
+        landmarks: the solved map.
+        width: of the panoramas that patches are sampled from, pixels.
+    """
+    tracks = landmarks.tracks
+    positions = world_T_rigs[:, :3, 3]
+    hosts, centres, planes, targets = [], [], [], []
+    received = 0
+    for f, found in enumerate(bearings):
+        received += len(found)
+        seen = landmarks.points_world[tracks.points[tracks.frames == f]]
+        points_rig = (seen - positions[f]) @ world_T_rigs[f, :3, :3]
+        laid, clear = lay_planes(found, points_rig, settings)
+        distances = np.linalg.norm(positions - positions[f], axis=1)
+        distances[f] = np.inf
+        near = np.argsort(distances, kind="stable")[: min(settings.targets, len(positions) - 1)]
+        hosts.append(np.full(np.count_nonzero(clear), f))
+        centres.append(found[clear])
+        planes.append(laid[clear])
+        targets.append(np.broadcast_to(near, (int(np.count_nonzero(clear)), len(near))))
+    plane = np.concatenate(planes)
+    sigmas = [settings.depth_sigma, settings.slope_sigma, settings.slope_sigma]
+    table = PatchTable(
+        np.concatenate(hosts),
+        np.concatenate(centres),
+        plane,
+        plane[:, :1] * np.array(sigmas),
+        np.arange(len(plane) + 1, dtype=np.int64) * targets[0].shape[1],
+        np.concatenate(targets).ravel(),
+        pixel_grid(settings.size, 2 * np.pi / width),
+    )
+    dropped = {"no clear depth": received - len(plane)}
+    return table, Counts(received, len(plane), "patches", dropped)
+
+
+def values_at(image: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Values (R,) of the pixels of a panorama (H, 2H) that vectors (R, 3) point to."""
+    height, width = image.shape
+    uv = erp_from_bearings(directions, width, height).astype(np.int64)
+    return image[np.clip(uv[:, 1], 0, height - 1), uv[:, 0] % width]

@@ -1,0 +1,77 @@
+"""What a run starts from, as its caller names it: files of poses, and frames of a video."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gsba import video
+from gsba.config import RefineSettings
+from gsba.frames.times import check_fps
+from gsba.log import GsbaError
+from gsba.placement.placement import EXIF
+from gsba.store.store import RunStore
+from gsba.trajectory.association import without_trajectory
+from gsba.trajectory.files import read_trajectory
+from gsba.trajectory.keyframes import follow_keyframes
+from gsba.trajectory.misread import refuse_useless
+from gsba.trajectory.restarts import associate_pieces, split_restarts
+from gsba.types import CoarsePoses, FrameSet, Trajectory
+
+logger = logging.getLogger(__name__)
+
+_NO_MOTION = 1e-9  # extent in map units that is rounding alone
+
+
+def trajectory_files(
+    trajectory: Path | str | Sequence[Path | str] | None, keyframes: Path | None
+) -> dict[str, Path]:
+    """The files that poses come from, by what they are."""
+    given = [trajectory] if isinstance(trajectory, Path | str) else list(trajectory or ())
+    if keyframes is not None and len(given) > 1:
+        raise GsbaError("keyframes go with one trajectory: give either several, or keyframes")
+    origin = {f"trajectory{n or ''}": Path(path) for n, path in enumerate(given)}
+    return origin if keyframes is None else origin | {"keyframes": Path(keyframes)}
+
+
+def read_trajectories(origin: Mapping[str, Path], timestamps: Path | None) -> list[Trajectory]:
+    """The trajectories of the files of a run, in pieces that each have a world of their own."""
+    given = [path for name, path in origin.items() if name.startswith("trajectory")]
+    pieces = [read_trajectory(path, timestamps) for path in given]
+    if "keyframes" in origin:
+        keyframes = read_trajectory(origin["keyframes"], timestamps)
+        pieces = [follow_keyframes(pieces[0], keyframes)]
+    return [part for piece in pieces for part in split_restarts(piece)]
+
+
+def coarse_poses(
+    frames: FrameSet, given: Sequence[Trajectory], settings: RefineSettings
+) -> CoarsePoses:
+    """Start poses of frames, refused where no video could have them."""
+    if not given:
+        return without_trajectory(frames)
+    coarse = associate_pieces(frames, given, settings.read)
+    refuse_useless(coarse)
+    if np.ptp(coarse.world_T_rigs[:, :3, 3], axis=0).max() < _NO_MOTION:
+        logger.warning("the trajectory only turns: positions come from the images alone")
+        return without_trajectory(frames)
+    return coarse
+
+
+def extract_frames(
+    out: Path,
+    origin: Mapping[str, Path],
+    settings: RefineSettings,
+    fps: float | None,
+    fresh: bool,
+) -> None:
+    """Write the frames of the video that a run is about to `out`/frames."""
+    chosen = settings.video
+    if settings.placement.gps == EXIF:
+        raise GsbaError("--gps exif: a video's frames have no tags; give positions as a file")
+    if fps is not None:
+        chosen = chosen.model_copy(update={"fps": check_fps(fps), "every": None, "at": None})
+    with RunStore(out, dict(origin), fresh) as store:
+        video.extract(origin["frames"], out / "frames", chosen, replace=True)
+        store.claim(out / "frames")

@@ -1,0 +1,136 @@
+"""Which way is up: the rigs' common up axis, made exact by vertical edges in the pictures."""
+
+import logging
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from gsba.camera.rig import CubeRig
+from gsba.frames import cubemap
+from gsba.types import FACES, FrameSet, PoseStatus, Reconstruction
+
+logger = logging.getLogger(__name__)
+
+_MAX_FRAMES = 24  # whose edges are looked at
+_FACE = 640  # pixels
+_MIN_LENGTH = 40.0  # pixels of an edge
+_GATES_DEG = (8.0, 4.0, 2.0, 1.0, 0.6)  # around vertical, from the rigs' up axis to the edges'
+_MIN_EDGES = 40  # within the last gate, or the edges say nothing
+_MIN_SPREAD = 0.1  # of the edges' directions around the vertical: 0 = all in one plane, 1 = even
+_MAX_TURN_DEG = 10.0  # from the rigs' up axis; what is further off is no gravity
+
+
+@dataclass(frozen=True, slots=True)
+class Gravity:
+    """Up in the world of a reconstruction."""
+
+    up: np.ndarray  # (3,) float64, unit
+    by_rigs: np.ndarray  # (3,) float64, unit, the rigs' common up axis
+    spread_deg: float  # median angle of a rig's up axis to the common one
+    num_edges: int  # vertical edges it rests on; 0 = on the rigs alone
+
+    @property
+    def turn_deg(self) -> float:
+        """How far the edges moved it from the rigs' up axis."""
+        return float(np.degrees(np.arccos(np.clip(self.up @ self.by_rigs, -1, 1))))
+
+
+def estimate(reconstruction: Reconstruction, frames: FrameSet) -> Gravity | None:
+    """Direction of up, or None where neither rigs nor edges tell.
+
+    The geometric median of the rigs' up axes is right to the degrees that people sway. Vertical
+    edges (doors, walls, posts) then decide: the plane through the camera and such an edge holds the
+    vertical, so that its normal is level. The normals' least principal axis is taken over edges
+    from all around, in gates that tighten (after Kosecka and Zhang, Video Compass, ECCV 2002).
+
+    Args:
+        reconstruction: refined poses; unrefined ones have no say.
+        frames: whose pictures are read, a few of them.
+    """
+    good = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.REFINED)
+    if not len(good):
+        return None
+    ups = -reconstruction.world_T_rigs[good, :3, 1]
+    by_rigs = _median_direction(ups)
+    spread = float(np.degrees(np.median(np.arccos(np.clip(ups @ by_rigs, -1, 1)))))
+    if spread > 30:
+        logger.warning("the rigs agree on no up axis (%.0f degrees apart)", spread)
+        return None
+    chosen = good[np.unique(np.linspace(0, len(good) - 1, _MAX_FRAMES).astype(int))]
+    found = [_edge_normals(frames, int(f), reconstruction.world_T_rigs[f]) for f in chosen]
+    normals, weights = (np.concatenate(part) for part in zip(*found, strict=True))
+    up, num_edges = _level_axis(normals, weights, by_rigs)
+    gravity = Gravity(up, by_rigs, spread, num_edges)
+    if gravity.turn_deg > _MAX_TURN_DEG:
+        logger.warning("vertical edges are %.1f degrees off the rigs: ignored", gravity.turn_deg)
+        gravity = Gravity(by_rigs, by_rigs, spread, 0)
+    logger.info(
+        "up: %d vertical edges, %.2f degrees from the rigs' common axis (these %.2f degrees apart)",
+        gravity.num_edges,
+        gravity.turn_deg,
+        spread,
+    )
+    return gravity
+
+
+def _median_direction(directions: np.ndarray) -> np.ndarray:
+    """Unit vector (3,) of least summed chord to unit vectors (N, 3) (Weiszfeld)."""
+    median = directions.mean(axis=0)
+    for _ in range(50):
+        distance = np.linalg.norm(directions - median, axis=1)
+        weights = 1 / np.maximum(distance, 1e-6)
+        median = weights @ directions / weights.sum()
+    length = np.linalg.norm(median)
+    return median / length if length > 1e-9 else np.array([0.0, -1.0, 0.0])
+
+
+def _edge_normals(
+    frames: FrameSet, f: int, world_T_rig: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normals (E, 3) in the world of the planes through straight edges, and lengths (E,), rad."""
+    images, masks = _side_faces(frames, f)
+    rig = CubeRig(images.shape[1], np.pi / 2)
+    detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD)
+    normals, lengths = [np.zeros((0, 3))], [np.zeros(0)]
+    for face, image in enumerate(images):
+        lines = detector.detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))[0]
+        if lines is None:
+            continue
+        ends = lines.reshape(-1, 2, 2).astype(np.float64) + 0.5
+        long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= _MIN_LENGTH * rig.size / _FACE
+        if masks is not None:
+            middle = np.clip(ends.mean(axis=1).astype(int), 0, rig.size - 1)
+            long &= masks[face][middle[:, 1], middle[:, 0]]
+        rays = rig.bearings(ends[long], face)
+        across = np.cross(rays[:, 0], rays[:, 1])
+        sine = np.linalg.norm(across, axis=1)
+        normals.append(across / np.maximum(sine, 1e-12)[:, None] @ world_T_rig[:3, :3].T)
+        lengths.append(np.arcsin(np.clip(sine, 0, 1)))
+    return np.concatenate(normals), np.concatenate(lengths)
+
+
+def _side_faces(frames: FrameSet, f: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """The four faces around the horizon (4, N, N, 3), and where they may be used (4, N, N)."""
+    assert FACES[:4] == ("front", "right", "back", "left")
+    size = frames.width if frames.layout == "cube" else min(_FACE, frames.width // 4)
+    images, masks = cubemap.load(frames, f, CubeRig(size, np.pi / 2))
+    return images[:4], None if masks is None else masks[:4]
+
+
+def _level_axis(
+    normals: np.ndarray, weights: np.ndarray, start: np.ndarray
+) -> tuple[np.ndarray, int]:
+    """Axis (3,) near `start` that most normals are square to, and how many are; 0 = unchanged."""
+    up, near = start, np.zeros(len(normals), bool)
+    for gate in _GATES_DEG:
+        for _ in range(5):
+            near = np.abs(normals @ up) < np.sin(np.deg2rad(gate))
+            if near.sum() < _MIN_EDGES:
+                return start, 0
+            weighted = normals[near] * weights[near, None]
+            values, axes = np.linalg.eigh(weighted.T @ weighted)
+            if values[1] < _MIN_SPREAD * values[2]:
+                return start, 0
+            up = axes[:, 0] * np.sign(axes[:, 0] @ start)
+    return up, int(near.sum())

@@ -1,0 +1,346 @@
+"""Where an exported world is: turned upright, scaled to metres, or put where GPS or truth has it.
+
+A run stays in the world and scale of its SLAM trajectory. An export may be placed elsewhere by one
+similarity, which `transform.json` in it states together with its inverse.
+"""
+
+import dataclasses
+import json
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsba.config import PlacementSettings
+from gsba.evaluate.trajectory import associate
+from gsba.geometry import pose, pose_similarity, similarity
+from gsba.log import GsbaError, brief
+from gsba.placement.exif import read_exif_gps
+from gsba.placement.gps import GpsFixes, local_from_geodetic, read_gps
+from gsba.similarity import extents, level_similarity, naming, residuals_of, robust_similarity
+from gsba.trajectory.files import read_trajectory
+from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
+from gsba.version import __version__
+
+logger = logging.getLogger(__name__)
+
+EXIF = "exif"  # in place of a file of positions: those in the pictures
+_UP_WORLD = np.array([0.0, -1.0, 0.0])  # of an upright world: y down, as cameras have it
+_TOLERANCE_S = 0.02  # of true poses around a frame
+_SCALES = (1e-12, 1e12)  # that a run may be placed at; others are slips
+_FURTHEST = 1e12  # from the origin, in the placed unit
+_FAR = 1e4  # coordinates beyond lose digits as float32: an offset is kept apart
+_STUCK_M = 1e-3  # extent of positions, metres: a receiver that works scatters by more
+_LEVEL_SPREAD = 0.02  # of a path's second extent to its first: below, positions leave a roll open
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """placed = scale * rotation @ run + translation; world = placed + offset."""
+
+    scale: float = 1.0
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))  # (3, 3) float64
+    translation: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) float64
+    unit: str = "map units"  # of the placed world
+    up: str | None = None  # axis of the placed world that points up: "-y", "z"; None = unknown
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,), unit of the placed
+    origin: tuple[float, float, float] | None = None  # latitude, longitude, altitude of placed 0
+    grounds: dict[str, Any] = field(default_factory=dict)  # what it rests on, and how well
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """(4, 4) float64: placed = matrix @ run, homogeneous."""
+        return pose(self.scale * self.rotation, self.translation)
+
+    @property
+    def inverse(self) -> np.ndarray:
+        """(4, 4) float64: run = inverse @ placed, homogeneous."""
+        back = self.rotation.T / self.scale
+        return pose(back, -back @ self.translation)
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) of the run where they are placed."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def apply(self, reconstruction: Reconstruction) -> Reconstruction:
+        """A reconstruction in its place; angles, and what the images say, stay as they are."""
+        poses = reconstruction.world_T_rigs
+        stretch = np.array([1.0, 1, 1, self.scale, self.scale, self.scale])  # rig axes do not turn
+        joint = reconstruction.joint_errors
+        return dataclasses.replace(
+            reconstruction,
+            world_T_rigs=pose(self.rotation @ poses[:, :3, :3], self.points(poses[:, :3, 3])),
+            points_world=self.points(reconstruction.points_world),
+            pose_covariances=reconstruction.pose_covariances * stretch[:, None] * stretch,
+            joint_errors=joint and joint.scaled(np.tile(stretch, (len(poses), 1))),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Content of transform.json."""
+        names = ("latitude", "longitude", "altitude")
+        return {
+            "gsba": __version__,
+            "meaning": "placed = scale * rotation @ run + translation; world = placed + offset",
+            "scale": self.scale,
+            "rotation": self.rotation.tolist(),
+            "translation": self.translation.tolist(),
+            "matrix": self.matrix.tolist(),
+            "inverse": self.inverse.tolist(),
+            "unit": self.unit,
+            "up": self.up,
+            "offset": self.offset.tolist(),
+            "origin": None if self.origin is None else dict(zip(names, self.origin, strict=True)),
+            "grounds": self.grounds,
+        }
+
+    def write(self, path: Path) -> None:
+        """Write transform.json."""
+        text = json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n"
+        path.write_text(text, encoding="utf-8")
+
+
+def read_placement(path: Path) -> Placement:
+    """Where an export is, by the transform.json in it.
+
+    Raises:
+        GsbaError: no such file, or none that gsba wrote.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        scale, rotation = float(content["scale"]), np.array(content["rotation"], np.float64)
+        origin, up = content["origin"], content["up"]
+        if origin is not None:
+            origin = origin["latitude"], origin["longitude"], origin["altitude"]
+        return Placement(
+            scale,
+            rotation.reshape(3, 3),
+            np.array(content["translation"], np.float64).reshape(3),
+            str(content["unit"]),
+            up,
+            np.array(content["offset"], np.float64).reshape(3),
+            origin,
+            content["grounds"],
+        )
+    except OSError as error:
+        raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+        raise GsbaError(f"{path}: not a transform.json of gsba: export again") from None
+
+
+def place(
+    reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings
+) -> Placement:
+    """Where the settings want the world of a run.
+
+    Args:
+        reconstruction: in the run's world.
+        frames: its frames; their pictures are read to find the vertical.
+        settings: `up` alone turns as little as it takes to make -y the way up. With `length`
+            the unit becomes the metre. `gps` gives metres east, north and up; together with `up` it
+            decides heading, scale and place only; "exif" takes the positions in the pictures.
+            `align` gives the world of the true poses.
+
+    Raises:
+        GsbaError: settings that exclude one another, or data that do not suffice.
+    """
+    check(settings)
+    placement = _placement(reconstruction, frames, settings)
+    placed = placement.points(reconstruction.world_T_rigs[:, :3, 3])
+    far = np.abs(placed).max(initial=0)
+    if not (_SCALES[0] <= placement.scale <= _SCALES[1] and far <= _FURTHEST):
+        raise GsbaError(
+            f"the run would be placed at a scale of {placement.scale:g}, up to {far:g} from the "
+            "origin: check what --scale, --between, --gps or --align say"
+        )
+    return placement
+
+
+def _placement(
+    reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings
+) -> Placement:
+    """What the settings ask for, however odd."""
+    if settings.align is not None:
+        return _aligned(reconstruction, frames, Path(settings.align))
+    placement = Placement()
+    if settings.up == "auto":
+        placement = _upright(reconstruction, frames)
+    if settings.gps is not None:
+        return _on_earth(reconstruction, frames, Path(settings.gps), placement)
+    if settings.length is not None and settings.between is not None:
+        first, second = (_point(end, reconstruction, frames) for end in settings.between)
+        distance = float(np.linalg.norm(second - first))
+        if distance <= 1e-9 * (1 + np.abs(first).max()):
+            raise GsbaError(f"--between {' '.join(settings.between)}: both are at one place")
+        scale = settings.length / distance
+        grounds = {**placement.grounds, "length": settings.length, "between": settings.between}
+        placement = dataclasses.replace(placement, scale=scale, unit="m", grounds=grounds)
+    return placement
+
+
+def check(settings: PlacementSettings, frames: FrameSet | None = None) -> None:
+    """Raise GsbaError for settings that exclude one another and for files that cannot be read.
+
+    With `frames`, those of a run, also for pictures without the positions that are asked for.
+    """
+    if (settings.length is None) != (settings.between is None):
+        raise GsbaError("--scale LENGTH and --between A B need one another")
+    ways = [settings.length is not None, settings.gps is not None, settings.align is not None]
+    if sum(ways) > 1:
+        raise GsbaError("--scale, --gps and --align each decide the scale: pass one")
+    if settings.align is not None and settings.up != "none":
+        raise GsbaError("--align decides which way is up: leave out --up auto")
+    if settings.gps == EXIF:
+        if frames is not None:
+            read_exif_gps(frames)
+    elif settings.gps is not None:
+        read_gps(Path(settings.gps))
+    if settings.align is not None:
+        read_trajectory(Path(settings.align))
+
+
+def _upright(reconstruction: Reconstruction, frames: FrameSet) -> Placement:
+    from gsba.placement.gravity import estimate
+
+    gravity = estimate(reconstruction, frames)
+    if gravity is None:
+        raise GsbaError(
+            "--up auto: the frames agree on no way up; leave it out, or place the world by --gps "
+            "or --align"
+        )
+    grounds = {
+        "vertical_edges": gravity.num_edges,
+        "edges_to_rigs_deg": round(gravity.turn_deg, 4),
+        "rigs_spread_deg": round(gravity.spread_deg, 4),
+    }
+    rotation = _least_turn(gravity.up, _UP_WORLD)
+    return Placement(rotation=rotation, up="-y", grounds={"gravity": grounds})
+
+
+def _least_turn(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Smallest rotation (3, 3) that carries one unit vector onto another."""
+    axis, cosine = np.cross(source, target), float(source @ target)
+    if cosine < -1 + 1e-12:  # opposite: half a turn around anything square to it
+        other = np.eye(3)[np.argmin(np.abs(source))]
+        axis = np.cross(source, other)
+        axis /= np.linalg.norm(axis)
+        return 2 * np.outer(axis, axis) - np.eye(3)
+    x, y, z = axis
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + skew + skew @ skew / (1 + cosine)
+
+
+def _point(text: str, reconstruction: Reconstruction, frames: FrameSet) -> np.ndarray:
+    """Position (3,) in the run's world of a frame by name, or of "x,y,z"."""
+    if text in frames.names:
+        return reconstruction.world_T_rigs[frames.names.index(text), :3, 3]
+    try:
+        point = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        point = np.zeros(0)
+    if len(point) != 3 or not (np.abs(point) <= _FURTHEST).all():
+        raise GsbaError(
+            f"--between {brief(text)}: is neither a frame (such as {frames.names[0]}) nor a point "
+            "x,y,z"
+        )
+    return point
+
+
+def _on_earth(
+    reconstruction: Reconstruction, frames: FrameSet, path: Path, upright: Placement
+) -> Placement:
+    """East, north and up in metres around the middle of the fixes."""
+    fixes = read_exif_gps(frames) if str(path) == EXIF else read_gps(path)
+    rows, geodetic = _fixes_of_frames(path, fixes, frames)
+    good = reconstruction.pose_statuses[rows] == PoseStatus.REFINED
+    rows, geodetic = rows[good], geodetic[good]
+    if len(rows) < 3:
+        raise GsbaError(
+            f"{path}: {len(rows)} of its positions are of refined frames; 3 are needed: check that "
+            "they are of this recording and on the frames' clock"
+        )
+    origin = np.median(geodetic, axis=0)
+    target = local_from_geodetic(geodetic, origin)
+    if np.ptp(target, axis=0).max() < _STUCK_M:
+        raise GsbaError(f"{path}: all {len(rows)} positions are the same: the receiver was stuck")
+    positions = reconstruction.world_T_rigs[rows, :3, 3]
+    with naming(path):
+        if upright.up is None:
+            if extents(positions)[1] <= _LEVEL_SPREAD:
+                raise GsbaError(f"{path}: the frames lie on a line: add --up auto")
+            fit, used, sigma = robust_similarity(positions, target, similarity, 3)
+        else:
+            level = _least_turn(_UP_WORLD, np.array([0.0, 0, 1])) @ upright.rotation
+            fit, used, sigma = robust_similarity(positions @ level.T, target, level_similarity, 2)
+            fit = (fit[0], fit[1] @ level, fit[2])
+    grounds = {
+        **upright.grounds,
+        "gps": {
+            "file": str(path),
+            "fixes": len(rows),
+            "outliers": int(np.sum(~used)),
+            "rmse_m": sigma,
+        },
+    }
+    logger.info("--gps %s: %d of %d positions agree to %.3g m", path, used.sum(), len(used), sigma)
+    where = (float(origin[0]), float(origin[1]), float(origin[2]))
+    return Placement(*fit, unit="m", up="z", origin=where, grounds=grounds)
+
+
+def _fixes_of_frames(
+    path: Path, fixes: GpsFixes, frames: FrameSet
+) -> tuple[np.ndarray, np.ndarray]:
+    """Frames (M,) with a fix, and it (M, 3): by name, or between the fixes before and after."""
+    if fixes.names is not None:
+        by_name = dict(zip(fixes.names, fixes.geodetic, strict=True))
+        rows = [f for f, name in enumerate(frames.names) if name in by_name]
+        found = np.array([by_name[frames.names[f]] for f in rows]).reshape(-1, 3)
+        return np.array(rows, np.int64), found
+    times, entries = frames.timestamps, fixes.timestamps
+    assert entries is not None
+    _require_times(path, frames)
+    inside = np.flatnonzero((times >= entries[0]) & (times <= entries[-1]))
+    if not len(inside):
+        raise GsbaError(
+            f"{path}: no overlap in time: positions span {entries[0]:.3f} to {entries[-1]:.3f} s, "
+            f"frames {times[0]:.3f} to {times[-1]:.3f} s; put both on one clock"
+        )
+    geodetic = [np.interp(times[inside], entries, column) for column in fixes.geodetic.T]
+    return inside, np.stack(geodetic, axis=1)
+
+
+def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Placement:
+    """The world of true poses; large coordinates are kept apart."""
+    truth = read_trajectory(path)
+    _require_times(path, frames)
+    run = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
+    rows, of_truth = associate(run, truth, _TOLERANCE_S)
+    good = reconstruction.pose_statuses[rows] == PoseStatus.REFINED
+    rows, of_truth = rows[good], of_truth[good]
+    if len(rows) < 3:
+        raise GsbaError(
+            f"{path}: {len(rows)} of its poses are within {_TOLERANCE_S} s of a refined frame; 3 "
+            "are needed: check that both use one clock"
+        )
+    true_T_rigs = truth.world_T_rigs[of_truth].copy()
+    middle = np.median(true_T_rigs[:, :3, 3], axis=0)
+    offset = np.round(middle, -2) if np.abs(middle).max() > _FAR else np.zeros(3)
+    true_T_rigs[:, :3, 3] -= offset
+    world_T_rigs = reconstruction.world_T_rigs[rows]
+    source, target = world_T_rigs[:, :3, 3], true_T_rigs[:, :3, 3]
+    with naming(path):
+        if extents(source)[1] > _LEVEL_SPREAD:
+            fit, used, sigma = robust_similarity(source, target, similarity, 3)
+        else:  # a straight path leaves a roll open that orientations know
+            fit = pose_similarity(world_T_rigs, true_T_rigs)
+            residuals = residuals_of(fit, source, target)
+            used, sigma = np.ones(len(rows), bool), float(np.sqrt(np.mean(residuals**2)))
+    grounds = {"file": str(path), "poses": len(rows), "outliers": int(np.sum(~used)), "rmse": sigma}
+    unit = "units of the true poses"
+    return Placement(*fit, unit=unit, offset=offset, grounds={"align": grounds})
+
+
+def _require_times(path: Path, frames: FrameSet) -> None:
+    if not frames.timed:
+        raise GsbaError(f"{path}: nothing says when frames were taken: refine with --timestamps")

@@ -1,0 +1,93 @@
+"""The page: style, script and data put into one file that needs no network."""
+
+import json
+import logging
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsba.log import GsbaError
+from gsba.report.html import pictures, views
+from gsba.report.report import frame_quality, plain
+from gsba.store.records import atomic_write
+from gsba.types import CoarsePoses, FrameSet, Reconstruction
+
+logger = logging.getLogger(__name__)
+
+_PARTS = {"/*STYLE*/": ("style.css",), "/*SCRIPT*/": ("base.js", "charts.js", "main.js")}
+_DATA = "/*DATA*/"
+
+
+def write_html(
+    path: Path,
+    frames: FrameSet,
+    coarse: CoarsePoses,
+    reconstruction: Reconstruction,
+    report: Mapping[str, Any],
+) -> None:
+    """Write a run as a page that opens from disk: poses before and after, residuals, costs.
+
+    Args:
+        path: the page, replaced as a whole.
+        frames: pictures of the worst ones are read again and put into the page, small.
+        coarse: poses before.
+        reconstruction: poses after, cloud and observations.
+        report: content of report.json.
+    """
+    data = {
+        "run": path.resolve().parent.name,
+        "report": {name: value for name, value in report.items() if name != "residual_sphere"},
+        "map": views.world_map(coarse, reconstruction),
+        "frames": _frames(frames, coarse, reconstruction),
+        "matches": views.match_matrix(reconstruction),
+        "sphere": report["residual_sphere"],
+        "field": views.field_sphere(reconstruction.correction),
+        "erp_width": frames.width if frames.layout == "erp" else 4 * frames.width,
+        "worst": _worst(frames, reconstruction),
+    }
+    text = _assembled(json.dumps(plain(data, digits=6), allow_nan=False, separators=(",", ":")))
+    atomic_write(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def _assembled(data: str) -> str:
+    """The template with its parts; no `</` of the data can end the element that holds it."""
+    folder = files("gsba.report.html")
+    text = (folder / "template.html").read_text(encoding="utf-8")
+    for mark, names in _PARTS.items():
+        parts = [(folder / name).read_text(encoding="utf-8") for name in names]
+        text = text.replace(mark, "\n".join(parts))
+    return text.replace(_DATA, data.replace("<", "\\u003c"))
+
+
+def _frames(
+    frames: FrameSet, coarse: CoarsePoses, reconstruction: Reconstruction
+) -> dict[str, Any]:
+    """Columns over the frames."""
+    quality = frame_quality(reconstruction)
+    moved, turned = views.displacements(coarse, reconstruction)
+    return {
+        "name": frames.names,
+        "time": frames.timestamps,
+        "source": coarse.sources,
+        "status": reconstruction.pose_statuses,
+        "moved": moved,
+        "turned_deg": turned,
+        "residual_deg": quality.median_residuals_deg,
+        "observations": quality.num_observations,
+        "std_deg": np.linalg.norm(quality.std_rotations_deg, axis=1),
+        "std": np.linalg.norm(quality.std_translations, axis=1),
+    }
+
+
+def _worst(frames: FrameSet, reconstruction: Reconstruction) -> list[dict[str, Any]]:
+    """Pictures of the worst frames; one that has vanished meanwhile is left out."""
+    found = []
+    for f in pictures.worst_frames(reconstruction):
+        try:
+            found.append(pictures.picture(frames, reconstruction, f))
+        except GsbaError as error:
+            logger.warning("report.html: no picture of frame %s (%s)", frames.names[f], error)
+    return found

@@ -1,0 +1,333 @@
+"""What a run did and how good it is: report.json and poses.csv."""
+
+import csv
+import dataclasses
+import json
+import logging
+import math
+import os
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from enum import Enum
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from gsba.bundle.map_strength import scale_sigmas
+from gsba.geometry import angular_errors, quaternion_from_rotation
+from gsba.store.store import StageRecord, atomic_write
+from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
+from gsba.version import __version__
+
+logger = logging.getLogger(__name__)
+
+_PACKAGES = ("gtsam", "numpy", "numba", "scipy", "opencv-python-headless", "pycolmap")
+_AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # of a pose covariance
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class FrameQuality:
+    """How well the images support each pose."""
+
+    num_observations: np.ndarray  # (F,) int64
+    median_residuals_deg: np.ndarray  # (F,) float64, degrees; NaN without observations
+    std_rotations_deg: np.ndarray  # (F, 3) float64, degrees, rig axes; NaN where unknown
+    std_translations: np.ndarray  # (F, 3) float64, map units, rig axes; NaN where unknown
+
+
+def frame_quality(reconstruction: Reconstruction) -> FrameQuality:
+    """Observations, angular residuals and standard deviations of every frame."""
+    frames = reconstruction.observation_frames
+    num_frames = len(reconstruction.world_T_rigs)
+    residuals = angular_residuals(reconstruction)
+    counts = np.bincount(frames, minlength=num_frames)
+    medians = np.full(num_frames, np.nan)
+    seen = counts > 0
+    ordered = residuals[np.lexsort((residuals, frames))]
+    starts = (np.cumsum(counts) - counts)[seen]
+    middles = ordered[starts + (counts[seen] - 1) // 2] + ordered[starts + counts[seen] // 2]
+    medians[seen] = np.degrees(middles / 2)
+    variances = np.diagonal(reconstruction.pose_covariances, axis1=1, axis2=2)
+    deviations = np.sqrt(np.where(variances >= 0, variances, np.nan))
+    return FrameQuality(counts, medians, np.degrees(deviations[:, :3]), deviations[:, 3:])
+
+
+def median_residual_deg(reconstruction: Reconstruction, world_T_rigs: np.ndarray) -> float:
+    """Median angular residual in degrees that the same observations leave under other poses.
+
+    Each point is placed anew, nearest to the rays of its observations. NaN without observations.
+    """
+    frames, points = reconstruction.observation_frames, reconstruction.observation_points
+    if len(frames) == 0:
+        return math.nan
+    rotations, centres = world_T_rigs[frames, :3, :3], world_T_rigs[frames, :3, 3]
+    rays = np.einsum("oij,oj->oi", rotations, reconstruction.observation_bearings)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # off the ray
+    shape = len(reconstruction.points_world)
+    normal, target = np.zeros((shape, 3, 3)), np.zeros((shape, 3))
+    np.add.at(normal, points, across)
+    np.add.at(target, points, np.einsum("oij,oj->oi", across, centres))
+    normal += 1e-9 * np.eye(3)  # parallel rays leave the depth open
+    placed = np.linalg.solve(normal, target[..., None])[..., 0]
+    moved = dataclasses.replace(reconstruction, world_T_rigs=world_T_rigs, points_world=placed)
+    return float(np.degrees(np.median(angular_residuals(moved))))
+
+
+def angular_residuals(reconstruction: Reconstruction) -> np.ndarray:
+    """Angles (O,) in radians between each observed bearing and the direction to its point."""
+    return angular_errors(
+        reconstruction.world_T_rigs[reconstruction.observation_frames],
+        reconstruction.points_world[reconstruction.observation_points],
+        reconstruction.observation_bearings,
+    )
+
+
+def take_notes(
+    frames: FrameSet,
+    coarse: CoarsePoses,
+    reconstruction: Reconstruction,
+    undone: Sequence[str],
+    frame_weights: np.ndarray,
+    max_scale_sigma: float,
+) -> list[str]:
+    """What the user should know about a run, also logged as warnings.
+
+    Args:
+        undone: stages in which a round of bundle adjustment was undone.
+        frame_weights: (F,) of each frame's pixels, below 1 where they contradict the others.
+        max_scale_sigma: of a step's length over the one before it; above, a place is named.
+    """
+    absent = coarse.sources == PoseSource.NONE
+    filled = np.flatnonzero((coarse.sources != PoseSource.SLAM) & ~absent)
+    lost = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
+    notes = []
+    if absent.all():
+        notes.append("no trajectory: started from the images alone, in units of their own")
+    if coarse.time_offset:
+        notes.append(f"frame times were shifted by {coarse.time_offset:.6f} s")
+    if len(filled):
+        notes.append(f"no SLAM pose, started from neighbours: {_names(frames, filled)}")
+    if len(lost):
+        notes.append(f"matched nothing, held by the trajectory alone: {_names(frames, lost)}")
+    if undone:
+        notes.append(f"rounds were undone in {', '.join(undone)}: they explained less")
+    if len(doubted := np.flatnonzero(frame_weights < 1)):
+        notes.append(f"pixels fit badly and were weighted down: {_names(frames, doubted)}")
+    if len(weak := _weak_places(reconstruction, max_scale_sigma)):
+        notes.append(
+            f"the scale may change here by more than {max_scale_sigma:.2%}, as few points hold it: "
+            f"{_names(frames, weak)}"
+        )
+    for note in notes:
+        logger.warning(note)
+    return notes
+
+
+def _weak_places(reconstruction: Reconstruction, max_scale_sigma: float) -> np.ndarray:
+    """Frames at which images hand the scale on poorly, even after a closer look."""
+    poses, joint = reconstruction.world_T_rigs, reconstruction.joint_errors
+    if joint is None or len(poses) < 3:
+        return np.zeros(0, np.intp)
+    return 1 + np.flatnonzero(scale_sigmas(poses, joint.draws) > max_scale_sigma)
+
+
+def _names(frames: FrameSet, chosen: np.ndarray) -> str:
+    """The first twenty names, and how many more."""
+    names = ", ".join(frames.names[f] for f in chosen[:20])
+    return names if len(chosen) <= 20 else f"{names} and {len(chosen) - 20} more"
+
+
+def build_report(
+    *,
+    settings: BaseModel,
+    frames: FrameSet,
+    coarse: CoarsePoses,
+    reconstruction: Reconstruction,
+    stages: Iterable[StageRecord],
+    counts: Mapping[str, Sequence[Counts]],
+    solver: Sequence[object],
+    gauge: str,
+    notes: Sequence[str] = (),
+    trajectory: Mapping[str, Any] | None = None,
+    moves: Sequence[object] = (),
+    stitching: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Content of report.json: plain values only.
+
+    Args:
+        settings: as resolved.
+        stages: cost of each stage, in order.
+        counts: stage name -> what it received, kept and dropped.
+        solver: one record for each round, holding its iterations with their cost by family.
+        gauge: a sentence on where the refined map sits.
+        notes: what the user should know: frames without images, unmatched frames, ...
+        trajectory: the images' judgement of it, see `gsba.trajectory.judgement.describe`.
+        moves: of the poses against a splat, see `gsba.splat.refinement.Move`.
+        stitching: the field of directions, see `gsba.bundle.stitching.describe`.
+    """
+    quality = frame_quality(reconstruction)
+    stage_rows = [
+        {**dataclasses.asdict(stage), "counts": counts.get(stage.name, ())} for stage in stages
+    ]
+    report = {
+        "gsba": __version__,
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        "summary": _summary(frames, coarse, reconstruction),
+        "gauge": gauge,
+        "notes": notes,
+        "trajectory": trajectory,
+        "stitching": stitching,
+        "stages": stage_rows,
+        "solver": solver,
+        "splat": moves,
+        "frames": _frame_rows(frames, coarse, reconstruction, quality),
+        "settings": settings,
+        "machine": _machine(),
+        "versions": {name: _version(name) for name in _PACKAGES},
+    }
+    return plain(report)
+
+
+def _summary(
+    frames: FrameSet, coarse: CoarsePoses, reconstruction: Reconstruction
+) -> dict[str, Any]:
+    """What a run comes down to."""
+    residuals = np.degrees(angular_residuals(reconstruction))
+    lengths = np.bincount(
+        reconstruction.observation_points, minlength=len(reconstruction.points_world)
+    )
+    return {
+        "frames": len(frames),
+        "refined": np.count_nonzero(reconstruction.pose_statuses == PoseStatus.REFINED),
+        "points": len(lengths),
+        "observations": len(residuals),
+        "mean_track_length": lengths.mean() if len(lengths) else math.nan,
+        "median_residual_deg": np.median(residuals) if len(residuals) else math.nan,
+        "median_residual_deg_coarse": median_residual_deg(reconstruction, coarse.world_T_rigs),
+    }
+
+
+def write_report(path: Path, report: Mapping[str, Any]) -> None:
+    """Write a report as valid JSON, atomically."""
+    text = json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    atomic_write(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def write_poses(
+    path: Path, frames: FrameSet, coarse: CoarsePoses, reconstruction: Reconstruction
+) -> None:
+    """Write poses.csv: world_T_rig, its quality and its covariance for every frame.
+
+    Covariances are of the tangent [rotation (radians), translation (map units)] in the rig frame;
+    the upper triangle is written row by row. Cells of unknown values are empty. Frames of the same
+    `map` share a world; 0 is the largest.
+    """
+    quality = frame_quality(reconstruction)
+    rows, columns = np.triu_indices(6)
+    poses = reconstruction.world_T_rigs
+    wxyz = quaternion_from_rotation(poses[:, :3, :3])
+    numbers = np.hstack(
+        [
+            poses[:, :3, 3],
+            wxyz,
+            quality.std_rotations_deg,
+            quality.std_translations,
+            reconstruction.pose_covariances[:, rows, columns],
+        ]
+    )
+    maps = reconstruction.components
+    header = ["frame", "timestamp", "status", "source", "num_observations", "median_residual_deg"]
+    header += ["tx", "ty", "tz", "qw", "qx", "qy", "qz"]
+    header += [f"std_{axis}_deg" for axis in _AXES[:3]] + [f"std_{axis}" for axis in _AXES[3:]]
+    header += [f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in zip(rows, columns, strict=True)]
+    header += ["map"]
+
+    def write(temporary: Path) -> None:
+        with temporary.open("w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file)
+            table.writerow(header)
+            for f, name in enumerate(frames.names):
+                status = PoseStatus(reconstruction.pose_statuses[f]).name.lower()
+                source = PoseSource(coarse.sources[f]).name.lower()
+                table.writerow(
+                    [name, repr(float(frames.timestamps[f])), status, source]
+                    + [int(quality.num_observations[f]), _cell(quality.median_residuals_deg[f])]
+                    + [_cell(value) for value in numbers[f]]
+                    + [0 if maps is None else int(maps[f])]
+                )
+
+    atomic_write(path, write)
+
+
+def _cell(value: float) -> str:
+    return f"{value:.12g}" if math.isfinite(value) else ""
+
+
+def _frame_rows(
+    frames: FrameSet, coarse: CoarsePoses, reconstruction: Reconstruction, quality: FrameQuality
+) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": name,
+            "status": PoseStatus(reconstruction.pose_statuses[f]).name.lower(),
+            "coarse_pose": PoseSource(coarse.sources[f]).name.lower(),
+            "observations": quality.num_observations[f],
+            "median_residual_deg": quality.median_residuals_deg[f],
+            "std_rotation_deg": np.linalg.norm(quality.std_rotations_deg[f]),
+            "std_translation": np.linalg.norm(quality.std_translations[f]),
+        }
+        for f, name in enumerate(frames.names)
+    ]
+
+
+def _machine() -> dict[str, Any]:
+    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return {
+        "platform": platform.platform(),
+        "processor": _processor(),
+        "cpus": len(os.sched_getaffinity(0)),
+        "memory_mb": round(pages / 2**20),
+        "python": platform.python_version(),
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def plain(value: Any, digits: int = 17) -> Any:
+    """Values JSON can hold, floats to `digits`; what is not finite becomes null."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {
+            entry.name: plain(getattr(value, entry.name), digits)
+            for entry in dataclasses.fields(value)
+        }
+    if isinstance(value, Mapping):
+        return {str(key): plain(item, digits) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist(), digits)
+    if isinstance(value, list | tuple):
+        return [plain(item, digits) for item in value]
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, float):
+        return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value

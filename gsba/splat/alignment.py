@@ -1,0 +1,186 @@
+"""Frames against a splat: the block that aligns rig poses to what the splat renders."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors import BearingTerm, FaceCameras, LandmarkBlock, RobustLoss
+from factors.splat import RenderedView, SplatBlock
+from gsba.bundle import prior_factors
+from gsba.bundle.optimizer import optimize
+from gsba.camera.rig import RIG_R_FACE, CubeRig
+from gsba.config import SolverSettings
+from gsba.frames import cubemap
+from gsba.frames.masks import load_weights
+from gsba.log import track
+from gsba.splat.backend import Backend
+from gsba.splat.camera import rig_cameras
+from gsba.splat.gaussians import Gaussians
+from gsba.splat.scene import cut_faces, place_points
+from gsba.types import FACES, FrameSet, Reconstruction
+
+MIN_ALPHA = 0.95  # of a rendered pixel that is believed
+MAX_STEP = 0.1  # of the depth, between neighbouring pixels: more is an edge
+MAX_STEPS = 15  # of the solver at each size
+GATES_DEG = (16.0, 5.0, 1.5, 0.5)  # of observations at the first sizes; then the last
+_GATE_SIGMAS = 10.0  # wider gates loosen the loss in proportion
+_LUMA = np.array([0.299, 0.587, 0.114])
+_MARGIN_HFOV_DEG = 100.0  # of captured faces, so that samples beyond an edge find pixels
+
+
+@dataclass(frozen=True, slots=True)
+class Captured:
+    """Grey faces of frames, to be aligned to renderings of one size."""
+
+    which: np.ndarray  # (W,) int, frame indices
+    size: int  # pixels of a rendered face
+    rig: CubeRig  # the captured faces
+    images: tuple[np.ndarray, ...]  # (W,) of (6, S, S) float32, 0..1
+    weights: tuple[np.ndarray | None, ...]  # (W,) of (6, S, S) float32, 0..1; None = all one
+
+
+def align(
+    gaussians: Gaussians,
+    frames: FrameSet,
+    world_T_rigs: np.ndarray,
+    near: float,
+    backend: Backend,
+    sizes: Sequence[int] = (24, 48, 96, 192),
+    reconstruction: Reconstruction | None = None,
+) -> np.ndarray:
+    """Align the poses of all frames to a splat that stays as it is, from coarse to fine.
+
+    The splat holds the gauge. The coarsest faces have the widest basin; observations, where given,
+    join from the start, with a gate and a loss that tighten from size to size.
+
+    Args:
+        gaussians: the splat.
+        frames: captured frames.
+        world_T_rigs: (F, 4, 4) start, in the splat's world.
+        near: least z of a Gaussian, map units.
+        backend: the renderer.
+        sizes: pixels of a face at each level.
+        reconstruction: whose observations join as bearing factors; None = the splat alone.
+
+    Returns:
+        (F, 4, 4) float64.
+    """
+    which = np.arange(len(frames))
+    settings = SolverSettings(max_iterations=MAX_STEPS, relative_tolerance=1e-5)
+    poses = world_T_rigs
+    for level, size in enumerate(sizes):
+        blocks: list = [splat_block(gaussians, capture(frames, which, size), near, backend)]
+        if reconstruction is not None:
+            gate = float(np.deg2rad(GATES_DEG[min(level, len(GATES_DEG) - 1)]))
+            blocks.append(bearing_block(reconstruction, poses, gate))
+        values = gtsam.Values()
+        for f in which:
+            values.insert(prior_factors.X(int(f)), gtsam.Pose3(poses[f]))
+        found = optimize(gtsam.NonlinearFactorGraph(), blocks, values, settings).values
+        poses = np.stack([found.atPose3(prior_factors.X(int(f))).matrix() for f in which])
+    return poses
+
+
+def bearing_block(
+    reconstruction: Reconstruction, world_T_rigs: np.ndarray, gate_rad: float
+) -> LandmarkBlock:
+    """A run's observations as bearing factors, points placed under given poses.
+
+    Args:
+        world_T_rigs: (F, 4, 4).
+        gate_rad: observations further from their point are left out; what such a gate lets in is
+            believed less than what the run has found.
+    """
+    which = np.arange(len(world_T_rigs))
+    landmarks, _ = place_points(reconstruction, world_T_rigs, which, gate_rad)
+    tracks = landmarks.tracks
+    sigmas = reconstruction.observation_sigmas[tracks.keypoints]
+    spread = gate_rad / (_GATE_SIGMAS * float(np.median(sigmas))) if len(sigmas) else 1.0
+    bearings = reconstruction.observation_bearings[tracks.keypoints]
+    term = BearingTerm(tracks.frames, tracks.points, bearings, max(1.0, spread) * sigmas)
+    keys = [prior_factors.X(int(f)) for f in which]
+    return LandmarkBlock(keys, landmarks.points_world, [term], RobustLoss("cauchy", 1.0))
+
+
+def capture(frames: FrameSet, which: np.ndarray, size: int) -> Captured:
+    """Grey faces of some frames, as dense as rendered ones of `size` pixels."""
+    rig = _captured_rig(frames, size)
+    images, weights = [], []
+    for f in track(which, "cutting faces", total=len(which)):
+        faces, mask = cut_faces(frames, int(f), rig)
+        images.append((faces @ _LUMA / 255).astype(np.float32))
+        found = load_weights(frames, int(f))
+        trust = 1.0 if found is None else cubemap.cut_mask(found, rig)
+        weights.append(None if mask is None else (mask * trust).astype(np.float32))
+    return Captured(which, size, rig, tuple(images), tuple(weights))
+
+
+def splat_block(
+    gaussians: Gaussians,
+    captured: Captured,
+    near: float,
+    backend: Backend,
+    loss: RobustLoss | None = None,
+) -> SplatBlock:
+    """The block of captured frames against a fixed splat.
+
+    Args:
+        gaussians: the splat; its world is the poses'.
+        captured: frames; keys are graph.X(frame). Coarse to fine is one block after another.
+        near: least z of a Gaussian, map units.
+        backend: the renderer.
+        loss: see `factors.splat.SplatBlock`.
+    """
+    rendered, rig, num = CubeRig(captured.size, np.pi / 2), captured.rig, len(FACES)
+    cameras = FaceCameras(RIG_R_FACE, np.full(num, rig.focal), np.full((num, 2), rig.principal))
+
+    def render(_row: int, world_T_rig: np.ndarray) -> RenderedView:
+        return render_view(gaussians, world_T_rig, rendered, near, backend)
+
+    keys = [prior_factors.X(int(f)) for f in captured.which]
+    return SplatBlock(keys, captured.images, captured.weights, cameras, render, loss)
+
+
+def render_view(
+    gaussians: Gaussians, world_T_rig: np.ndarray, rig: CubeRig, near: float, backend: Backend
+) -> RenderedView:
+    """Pixels of all faces that the splat is sure of, as points with grey values.
+
+    Args:
+        world_T_rig: (4, 4), where to render from.
+        rig: faces to render.
+    """
+    centres = np.arange(rig.size) + 0.5
+    grid = np.stack(np.meshgrid(centres, centres), axis=-1)
+    points, greys = [], []
+    cameras = rig_cameras(world_T_rig, rig)
+    images = backend.render(gaussians, cameras, None, near)
+    for camera, image in zip(cameras, images, strict=True):
+        sure = (image.alpha > MIN_ALPHA) & ~_edges(image.depth)
+        depth = image.depth[sure].astype(np.float64)
+        offsets = (grid[sure] - rig.principal) / rig.focal
+        local = np.column_stack([offsets, np.ones(len(offsets))]) * depth[:, None]
+        points.append(local @ camera.world_R_face.T + camera.face_in_world)
+        # What lies behind a pixel that is not quite opaque is unknown: leave its share out.
+        greys.append((image.color[sure] @ _LUMA) / image.alpha[sure])
+    return RenderedView(np.concatenate(points), np.concatenate(greys))
+
+
+def _edges(depth: np.ndarray) -> np.ndarray:
+    """Pixels (H, W) bool at a jump of the depth, where an expected depth is nobody's."""
+    low, high = depth.copy(), depth.copy()
+    for axis in (0, 1):
+        for shift in (1, -1):
+            other = np.roll(depth, shift, axis)
+            low, high = np.minimum(low, other), np.maximum(high, other)
+    return high - low > MAX_STEP * np.maximum(depth, 1e-9)
+
+
+def _captured_rig(frames: FrameSet, size: int) -> CubeRig:
+    """Faces as dense as rendered ones and a little wider; those of cube frames are as they are."""
+    if frames.layout == "cube":
+        return CubeRig(frames.width, np.pi / 2)
+    hfov = np.deg2rad(_MARGIN_HFOV_DEG)
+    return CubeRig(round(size * np.tan(hfov / 2)), hfov)

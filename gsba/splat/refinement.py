@@ -1,0 +1,343 @@
+"""Poses refined against a splat of their own frames, judged on frames that no splat has seen.
+
+Splat and poses take turns. The poses move by a few joint steps against the splat as it is, the
+map's own observations, the patches if there are any, and the priors, which hold the gauge. Then
+training goes on, once with the poses as they were and once as they moved, and evidence whose noise
+is known judges the move:
+
+- Faces of whole panoramas that are neither trained on nor aligned to the splat: how much better
+  each of them looks. Both trainings have the same Gaussians, views and order. Density control
+  rests, because what it clones and prunes sends two trainings tenths of a dB apart, when a
+  twentieth of a pixel is worth hundredths.
+- Points of the map: by how much the cost of each one's observations falls. The poses may have been
+  fitted to them before, so a change that fitting six numbers per pose gains by chance says nothing.
+
+A move is taken where both together are clearly for it; otherwise it is undone, and finer faces have
+their turn.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from factors import Block, LandmarkBlock
+from gsba.bundle import adjustment, triangulation
+from gsba.bundle.adjustment import Adjustment, Round
+from gsba.bundle.optimizer import OptimizeResult, optimize
+from gsba.camera.rig import CubeRig
+from gsba.config import RefineSettings, SplatSettings
+from gsba.splat.alignment import Captured, capture, splat_block
+from gsba.splat.backend import choose_backend
+from gsba.splat.evidence import score, standard_error, together
+from gsba.splat.gaussians import Gaussians, from_cloud
+from gsba.splat.scene import Split, face_psnrs, load_faces, make_views, near_of, split_frames
+from gsba.splat.train import State, Views, advance, begin
+from gsba.store.records import RecordError, load_record, read_info, save_record
+from gsba.types import Counts, FrameSet, Keypoints, Landmarks
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """One joint move of all poses, and what held-out frames say of it."""
+
+    size: int  # pixels of a face
+    psnr_stayed: float  # dB, mean of held-out faces, exposure aside, poses as they were
+    psnr_moved: float  # the same, trained and measured with the moved poses
+    psnr_sigma: float  # standard error of the difference of both, from face to face
+    growth: float  # cost of the map's own observations after the move, over that before
+    growth_sigma: float  # its standard error, from point to point
+    evidence: float  # of both together for the move, in standard errors
+    turned_deg: float  # median turn of a pose
+    shifted: float  # median shift of a pose, map units
+    accepted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SplatResult:
+    """Poses and points after the last move that was taken."""
+
+    adjustment: Adjustment
+    counts: tuple[Counts, ...]  # of frames: those the splat is trained on are kept
+    moves: tuple[Move, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Progress:
+    """Where an interrupted refinement goes on."""
+
+    level: int  # index into the sizes
+    turns: int  # moves made at this level; -1: its first training is still to come
+    world_T_rigs: np.ndarray  # (F, 4, 4)
+    state: State
+    moves: tuple[Move, ...]
+    rounds: tuple[Round, ...]
+
+
+def run(
+    frames: FrameSet,
+    keypoints: Keypoints,
+    start: Adjustment,
+    priors: gtsam.NonlinearFactorGraph,
+    rig: CubeRig,
+    settings: RefineSettings,
+    num_threads: int,
+    further: Sequence[Block] = (),
+    checkpoint: Path | None = None,
+    key: str = "",
+) -> SplatResult:
+    """Refine a solved map against splats of its own frames, from coarse faces to fine.
+
+    Args:
+        frames: panoramas or cube faces; the faces of all are held in memory, one size at a time.
+        keypoints: of all frames.
+        start: the solved map.
+        priors: factors on the poses, gauge included.
+        rig: the faces of the keypoints, for the reprojection family.
+        settings: families, loss, solver, splat.
+        num_threads: of solver and renderer.
+        further: blocks that join each move, on the same keys.
+        checkpoint: file that keeps the turns made, and that they go on from; None = none.
+        key: what the turns depend on; a checkpoint of another key is not taken up.
+
+    Raises:
+        GsbaError: all frames are masked, or a splat that is no longer finite.
+    """
+    chosen = settings.splat
+    seen = np.bincount(start.landmarks.tracks.frames, minlength=len(frames))
+    usable = seen >= settings.rounds.min_observations
+    if np.count_nonzero(usable) <= chosen.held_out_every:
+        few = int(np.count_nonzero(usable))
+        logger.warning("%d refined frames are too few for a splat to judge poses by", few)
+        return SplatResult(start, (Counts(len(frames), 0, "frames", {"too few": few}),), ())
+    split = split_frames(usable, chosen.held_out_every)
+    dropped = {"held out": len(split.held_out), "unrefined": int(np.count_nonzero(~usable))}
+    counts = Counts(len(frames), len(split.training), "frames", dropped)
+    turns = _Turns(keypoints, start, priors, rig, settings, num_threads, further, split)
+    progress = _resume(checkpoint, key)
+    if progress is None:
+        cloud = _cloud(start.landmarks, keypoints, chosen.sh_degree)
+        first = begin(cloud, turns.training(0))
+        progress = _Progress(0, -1, start.world_T_rigs, first, (), ())
+    while progress.level < len(chosen.sizes):
+        turns.look(frames, progress.level)
+        while progress.turns < chosen.moves:
+            progress = turns.turn(progress)
+            if checkpoint is not None:
+                save_record(checkpoint, progress, {"key": key})
+            if progress.turns > 0 and not progress.moves[-1].accepted:
+                break
+        progress = replace(progress, level=progress.level + 1, turns=-1)
+    return SplatResult(turns.adjusted(progress), (counts,), progress.moves)
+
+
+def _resume(checkpoint: Path | None, key: str) -> _Progress | None:
+    if checkpoint is None or not checkpoint.exists():
+        return None
+    try:
+        if read_info(checkpoint).get("key") != key:
+            return None
+        progress = load_record(checkpoint, _Progress)
+    except RecordError as error:
+        logger.warning("taking turns anew: %s", error)
+        return None
+    logger.info("going on after %d moves of %s", len(progress.moves), checkpoint)
+    return progress
+
+
+def _cloud(landmarks: Landmarks, keypoints: Keypoints, sh_degree: int) -> Gaussians:
+    """Gaussians at the map's points, in the mean colours of their observations."""
+    points, rows = landmarks.tracks.points, keypoints.rows(landmarks.tracks)
+    lengths = np.bincount(points, minlength=len(landmarks.points_world))
+    sums = [np.bincount(points, keypoints.colors[rows, c], len(lengths)) for c in range(3)]
+    colors = np.rint(np.column_stack(sums) / np.maximum(lengths, 1)[:, None]).astype(np.uint8)
+    return from_cloud(landmarks.points_world, colors, sh_degree)
+
+
+class _Turns:
+    """What does not change from turn to turn, and the faces of one size."""
+
+    def __init__(
+        self,
+        keypoints: Keypoints,
+        solved: Adjustment,
+        priors: gtsam.NonlinearFactorGraph,
+        rig: CubeRig,
+        settings: RefineSettings,
+        num_threads: int,
+        further: Sequence[Block],
+        split: Split,
+    ) -> None:
+        self.keypoints, self.solved, self.priors, self.rig = keypoints, solved, priors, rig
+        self.settings, self.num_threads, self.further = settings, num_threads, further
+        self.split = split
+        self.backend = choose_backend(settings.splat.backend, num_threads)
+        self.faces: tuple[np.ndarray, np.ndarray]
+        self.held_out: tuple[np.ndarray, np.ndarray]
+        self.captured: Captured
+
+    def training(self, level: int) -> SplatSettings:
+        """Settings of the one training that all turns are parts of, at a level's size."""
+        chosen = self.settings.splat
+        each = chosen.first_steps + chosen.moves * chosen.steps
+        return SplatSettings(
+            iterations=len(chosen.sizes) * each,
+            face_size=chosen.sizes[level],
+            sh_degree=chosen.sh_degree,
+            max_gaussians=chosen.max_gaussians,
+            held_out_every=chosen.held_out_every,
+            seed=self.settings.seed,
+        )
+
+    def look(self, frames: FrameSet, level: int) -> None:
+        """Cut the faces of a level."""
+        size = self.settings.splat.sizes[level]
+        self.faces = load_faces(frames, self.split.training, size)
+        self.held_out = load_faces(frames, self.split.held_out, size)
+        self.captured = capture(frames, self.split.training, size)
+
+    def turn(self, before: _Progress) -> _Progress:
+        """The first training of a level, or a move of the poses and the training after it."""
+        chosen, poses = self.settings.splat, before.world_T_rigs
+        settings = self.training(before.level)
+        if before.turns < 0:
+            trained = self._trained(before.state, poses, settings, chosen.first_steps)
+            return replace(before, turns=0, state=trained)
+        moved, result = self._moved(before.state.gaussians, poses)
+        fixed = settings.model_copy(update={"densify": False})
+        stayed = self._trained(before.state, poses, fixed, chosen.steps)
+        went = self._trained(before.state, moved, fixed, chosen.steps)
+        looks = [self._looks(stayed, poses, settings), self._looks(went, moved, settings)]
+        costs = [self._point_costs(poses), self._point_costs(moved)]
+        gains, savings = looks[1] - looks[0], costs[0] - costs[1]
+        total, later = max(float(costs[0].sum()), 1e-12), float(costs[1].sum())
+        growth, chance = later / total, self._chance(min(total, later))
+        evidence = together(score(gains), score(savings, chance))
+        after = self._placed(moved)
+        accepted = evidence > chosen.min_sigmas and growth <= chosen.max_growth
+        least = self.settings.rounds.min_observations
+        accepted &= adjustment.carries(replace(self.solved, landmarks=after), self.solved, least)
+        move = Move(
+            settings.face_size, float(looks[0].mean()), float(looks[1].mean()),
+            standard_error(gains), growth, len(savings) * standard_error(savings) / total,
+            evidence, *_way(poses, moved), accepted,
+        )  # fmt: skip
+        _log(move)
+        tracks = self.solved.landmarks.tracks
+        note = Round(
+            self._gate(), self.solved.noise, len(tracks), tracks.num_points, len(after.tracks),
+            accepted, result.history, result.reason,
+        )  # fmt: skip
+        return _Progress(
+            before.level,
+            before.turns + 1,
+            moved if accepted else poses,
+            went if accepted else stayed,
+            (*before.moves, move),
+            (*before.rounds, note),
+        )
+
+    def adjusted(self, progress: _Progress) -> Adjustment:
+        """The solution with the last poses taken, points placed anew; or as it was."""
+        rounds = (*self.solved.rounds, *progress.rounds)
+        if not any(move.accepted for move in progress.moves):
+            return replace(self.solved, rounds=rounds)
+        poses = progress.world_T_rigs
+        return replace(
+            self.solved, world_T_rigs=poses, landmarks=self._placed(poses), rounds=rounds
+        )
+
+    def _moved(
+        self, gaussians: Gaussians, world_T_rigs: np.ndarray
+    ) -> tuple[np.ndarray, OptimizeResult]:
+        """Poses after a few joint steps, and the solver's way."""
+        settings, values = self.settings, adjustment.values_of(world_T_rigs)
+        landmarks = self._block()
+        landmarks.polish(values)
+        near = near_of(world_T_rigs[self.split.training], SplatSettings())
+        pixels = splat_block(gaussians, self.captured, near, self.backend)
+        solver = settings.solver.model_copy(update={"max_iterations": settings.splat.solver_steps})
+        result = optimize(self.priors, [landmarks, *self.further, pixels], values, solver)
+        return adjustment.poses_of(result.values, len(world_T_rigs)), result
+
+    def _block(self) -> LandmarkBlock:
+        return adjustment.landmark_block(
+            self.solved.landmarks, self.keypoints, self.rig, self.solved.noise, self.settings,
+            self.num_threads,
+        )  # fmt: skip
+
+    def _point_costs(self, world_T_rigs: np.ndarray) -> np.ndarray:
+        """Robust cost (J,) of each point's observations, the point at its best under the poses."""
+        block, values = self._block(), adjustment.values_of(world_T_rigs)
+        block.polish(values)
+        costs = np.zeros(len(block.points_world))
+        for term, residuals in zip(block.terms, block.residuals(values)[0], strict=True):
+            losses = block.loss.rho(np.einsum("oi,oi->o", residuals, residuals))
+            costs += np.bincount(term.points, losses, len(costs))
+        return costs
+
+    def _chance(self, cost: float) -> float:
+        """What of a total cost of observations fitting all poses to their noise gains."""
+        tracks = self.solved.landmarks.tracks
+        unknowns = 6 * len(np.unique(tracks.frames))
+        redundancy = 2 * len(tracks) - 3 * tracks.num_points - unknowns
+        return unknowns * cost / redundancy if redundancy > 0 else np.inf
+
+    def _trained(
+        self, state: State, world_T_rigs: np.ndarray, settings: SplatSettings, steps: int
+    ) -> State:
+        views = self._views(self.faces, world_T_rigs, self.split.training)
+        return advance(state, views, settings, self.backend, steps)
+
+    def _looks(self, state: State, world_T_rigs: np.ndarray, settings: SplatSettings) -> np.ndarray:
+        """PSNR (V,) of each held-out face in dB, exposure aside."""
+        views = self._views(self.held_out, world_T_rigs, self.split.held_out)
+        near = near_of(world_T_rigs[self.split.training], settings)
+        return face_psnrs(state.gaussians, views, settings, near, self.backend)
+
+    @staticmethod
+    def _views(
+        faces: tuple[np.ndarray, np.ndarray], world_T_rigs: np.ndarray, which: np.ndarray
+    ) -> Views:
+        return make_views(*faces, world_T_rigs[which])
+
+    def _placed(self, world_T_rigs: np.ndarray) -> Landmarks:
+        """The map's points under other poses."""
+        tracks = self.solved.landmarks.tracks
+        rows = self.keypoints.rows(tracks)
+        return triangulation.run(
+            tracks,
+            self.keypoints.bearings_rig[rows],
+            self.keypoints.sigmas_rad[rows],
+            world_T_rigs,
+            self._gate() * self.solved.noise,
+            self.settings.triangulate,
+            self.num_threads,
+        )
+
+    def _gate(self) -> float:
+        rounds = self.solved.rounds
+        return rounds[-1].gate_sigmas if rounds else np.inf
+
+
+def _log(move: Move) -> None:
+    gain, verdict = move.psnr_moved - move.psnr_stayed, "taken" if move.accepted else "undone"
+    logger.info(
+        "faces of %d px: held out %+.4f dB (standard error %.4f), cost of observations times %.4f "
+        "(%.4f): evidence %+.1f, %s",
+        move.size, gain, move.psnr_sigma, move.growth, move.growth_sigma, move.evidence, verdict,
+    )  # fmt: skip
+
+
+def _way(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
+    """Median turn in degrees and median shift in map units between poses (F, 4, 4)."""
+    turns = np.einsum("fji,fjk->fik", before[:, :3, :3], after[:, :3, :3])
+    cosines = (np.trace(turns, axis1=1, axis2=2) - 1) / 2
+    shifts = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+    angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    return float(np.median(angles)), float(np.median(shifts))

@@ -1,0 +1,132 @@
+"""Who a run folder belongs to, who holds it, and which files in it are gsba's.
+
+`RUN/gsba.json` names the inputs the run is about and lists the files gsba wrote, so that a folder
+of something else is refused and `--fresh` deletes nothing but our own.
+"""
+
+import fcntl
+import json
+import logging
+import os
+import shutil
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from gsba.log import GsbaError
+from gsba.store.records import RecordError, atomic_write, disk_errors, remove_temporaries, typed
+from gsba.version import __version__
+
+logger = logging.getLogger(__name__)
+
+MARKER = "gsba.json"
+STAGES = "stages"  # subfolder of intermediate results; all of it is gsba's
+
+
+def open_run_folder(root: Path, origin: Mapping[str, Path], fresh: bool) -> int:
+    """Make or take over a run folder and hold it against other processes.
+
+    Args:
+        root: the folder, made if missing.
+        origin: what the run is about, e.g. `{"frames": path, "trajectory": path}`.
+        fresh: delete what gsba wrote for an earlier run, whatever that was about.
+    Returns:
+        File descriptor of the lock: closing it (or dying) releases the folder.
+    Raises:
+        GsbaError: the folder belongs to another run, to something else, or to a live process.
+    """
+    resolved = {name: str(path.resolve()) for name, path in origin.items()}
+    with disk_errors(root):
+        _require_ours_or_empty(root)
+        root.mkdir(parents=True, exist_ok=True)
+        lock = _acquire_lock(root)
+    try:
+        marker = read_marker(root)
+        if marker and fresh:
+            _remove_claimed(root, marker)
+            marker = {}
+        if marker and marker["origin"] != resolved:
+            raise GsbaError(
+                f"{root} holds another run (of {', '.join(marker['origin'].values())}): "
+                "choose another --out, or --fresh to replace it"
+            )
+        remove_temporaries(root)
+        _write_marker(root, resolved, marker.get("wrote", ()))
+    except BaseException:
+        os.close(lock)
+        raise
+    return lock
+
+
+def is_run_folder(root: Path) -> bool:
+    """Whether gsba has ever taken this folder for a run."""
+    return (root / MARKER).is_file()
+
+
+def claim(root: Path, path: Path) -> None:
+    """Note a file, or all files of a folder, as written by gsba into the run folder `root`."""
+    marker = read_marker(root)
+    files = (entry for entry in path.rglob("*") if entry.is_file()) if path.is_dir() else [path]
+    names = {entry.relative_to(root).as_posix() for entry in files}
+    _write_marker(root, marker["origin"], names.union(marker["wrote"]))
+
+
+def read_marker(root: Path) -> dict[str, Any]:
+    """`gsba.json` as {"gsba": version, "origin": {...}, "wrote": [...]}; {} where there is none."""
+    path = root / MARKER
+    try:
+        marker = json.loads(path.read_text())
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, RecursionError) as error:
+        raise GsbaError(f"{path} is unreadable: choose another --out") from error
+    try:
+        origin = typed(marker["origin"], dict[str, str])
+        wrote = typed(marker["wrote"], list[str])
+    except (RecordError, TypeError, KeyError):
+        raise GsbaError(f"{path} was not written by gsba: choose another --out") from None
+    return marker | {"origin": origin, "wrote": wrote}
+
+
+def _write_marker(root: Path, origin: Mapping[str, str], wrote: Any) -> None:
+    marker = {"gsba": __version__, "origin": origin, "wrote": sorted(wrote)}
+    text = json.dumps(marker, indent=1) + "\n"
+    atomic_write(root / MARKER, lambda temporary: temporary.write_text(text))
+
+
+def _require_ours_or_empty(root: Path) -> None:
+    if root.exists() and not root.is_dir():
+        raise GsbaError(f"{root} is a file: choose another --out")
+    if root.is_dir() and not is_run_folder(root) and any(root.iterdir()):
+        raise GsbaError(f"{root} is not empty and not a gsba run: choose another --out")
+
+
+def _acquire_lock(root: Path) -> int:
+    """Lock the folder itself: the kernel frees it when the holder dies, so it is never stale."""
+    lock = os.open(root, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(lock)
+        raise GsbaError(f"{root} is in use by another gsba process: wait for it to end") from error
+    except OSError as error:  # some network file systems cannot lock
+        logger.warning("%s cannot be locked (%s): let no second process use it", root, error)
+    return lock
+
+
+def _remove_claimed(root: Path, marker: Mapping[str, Any]) -> None:
+    """Delete the files gsba wrote, then the folders this left empty."""
+    with disk_errors(root):
+        if (root / STAGES).exists():
+            shutil.rmtree(root / STAGES)
+        for name in marker["wrote"]:
+            path = root / name
+            if root.resolve() not in path.resolve().parents:
+                continue  # an edited marker must not reach outside
+            path.unlink(missing_ok=True)
+            for parent in path.relative_to(root).parents:
+                with suppress(OSError):
+                    if parent != Path():
+                        (root / parent).rmdir()
+        (root / MARKER).unlink()

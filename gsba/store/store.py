@@ -1,0 +1,314 @@
+"""Stage results kept under their key: resume, and re-running just what a change affects.
+
+A stage's key is the hash of everything its result depends on: its name and settings, the input
+files, the keys of the stages before it, and the version of gsba. A stored result whose key still
+matches is taken as it is; anything else (other settings, another version, a damaged file) is
+computed again. Results lie in `RUN/stages/NAME.npz`, those of a per-frame stage in
+`RUN/stages/NAME/FRAME.npz`.
+"""
+
+import dataclasses
+import hashlib
+import json
+import logging
+import os
+import resource
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Generic, TypeVar
+
+from pydantic import BaseModel
+
+from gsba.log import GsbaError, track
+from gsba.store.folder import MARKER, STAGES, claim, is_run_folder, open_run_folder
+from gsba.store.records import (
+    FORMAT,
+    RecordError,
+    atomic_write,
+    load_record,
+    read_info,
+    save_record,
+    typed,
+)
+from gsba.version import __version__
+
+logger = logging.getLogger(__name__)
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class StageRecord:
+    """What a stage cost. A resumed stage shows the cost of the call that computed it."""
+
+    name: str
+    key: str  # hash of all the result depends on
+    resumed: bool  # taken from an earlier call
+    seconds: float  # wall clock
+    cpu_seconds: float  # all threads of the process
+    peak_mb: float  # high-water mark of the process's resident memory when the stage ended
+
+
+class RunStore:
+    """One run's folder, held by one process at a time; use as a context manager.
+
+    Args:
+        root: folder of the run, made if missing.
+        origin: what the run is about, e.g. `{"frames": path, "trajectory": path}`.
+        fresh: forget an earlier run in `root`: delete what gsba wrote there, and only that.
+    Raises:
+        GsbaError: the folder belongs to another run, to something else, or to a live process.
+    """
+
+    def __init__(self, root: Path, origin: Mapping[str, Path], fresh: bool = False) -> None:
+        self.root = root
+        self.records: dict[str, StageRecord] = {}  # stages of this call, in order
+        self._prefix = ""
+        self._lock = open_run_folder(root, origin, fresh)
+
+    def __enter__(self) -> "RunStore":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._lock)
+
+    @contextmanager
+    def named(self, prefix: str) -> Iterator[None]:
+        """Meanwhile stages, and those they come after, are named `prefix-NAME`."""
+        before, self._prefix = self._prefix, f"{prefix}-"
+        try:
+            yield
+        finally:
+            self._prefix = before
+
+    def stage(
+        self,
+        name: str,
+        settings: object,
+        compute: Callable[[], T],
+        returns: type[T],
+        after: Sequence[str] = (),
+    ) -> T:
+        """Result of a stage: the stored one if its key matches, else computed and stored.
+
+        Args:
+            name: names the stage, its file and its row in the report.
+            settings: everything `compute` depends on besides earlier stages: settings models,
+                `fingerprint(...)` of input files, numbers, ... (see `digest`).
+            compute: makes the result; called without arguments.
+            returns: type of the result, a record of gsba.types or a tuple of such.
+            after: names of earlier stages of this call whose results `compute` uses.
+        """
+        key = self._key(name, settings, after)
+        name = self._prefix + name
+        path = _stage_path(self.root, name)
+        stored = _load_if_current(path, key, returns)
+        if stored is not None:
+            value, record = stored
+            self._note(replace(record, resumed=True))
+            return value
+        wall, cpu = time.perf_counter(), time.process_time()
+        with _named_in_memory_errors(name):
+            value = compute()
+        record = _measured(name, key, wall, cpu)
+        save_record(path, value, dataclasses.asdict(record))
+        self._note(record)
+        return value
+
+    def per_frame(
+        self,
+        name: str,
+        settings: object,
+        items: Mapping[str, object],
+        compute: Callable[[str], T],
+        returns: type[T],
+        after: Sequence[str] = (),
+        num_threads: int = 1,
+    ) -> "PerFrame[T]":
+        """Results of a stage that treats every frame alone, one file each, resumed frame by frame.
+
+        Args:
+            items: frame name -> what this frame's result depends on besides `settings`, e.g.
+                `fingerprint(paths)`; only frames whose entry changed are computed again.
+            compute: makes the result of the named frame.
+            name, settings, returns, after: as for `stage`.
+            num_threads: frames computed at a time.
+        """
+        base = self._key(name, settings, after)
+        name = self._prefix + name
+        keys = {item: digest(base, item, depends) for item, depends in items.items()}
+        folder = self.root / STAGES / name
+        frames = PerFrame(folder, keys, compute, returns)
+        frames.discard_others()
+        missing = [item for item in frames if not frames.is_stored(item)]
+        spent = _read_cost(folder / "cost.json", base) if len(missing) < len(keys) else None
+        wall, cpu = time.perf_counter(), time.process_time()
+        try:
+            with _named_in_memory_errors(name), ThreadPoolExecutor(num_threads) as pool:
+                running = [pool.submit(frames.__getitem__, item) for item in missing]
+                try:
+                    for future in track(running, name):
+                        future.result()
+                finally:
+                    pool.shutdown(wait=True, cancel_futures=True)
+        finally:
+            record = _measured(name, base, wall, cpu, spent)
+            text = json.dumps(dataclasses.asdict(record))
+            atomic_write(folder / "cost.json", lambda temporary: temporary.write_text(text))
+        self._note(replace(record, key=digest(base, keys), resumed=not missing))
+        return frames
+
+    def forget(self, name: str) -> None:
+        """Drop the stored result of a stage, so that it is computed again."""
+        _stage_path(self.root, name).unlink(missing_ok=True)
+
+    def claim(self, path: Path) -> None:
+        """Note a final output (a file, or a folder with all its files) as written by gsba."""
+        claim(self.root, path)
+
+    def _key(self, name: str, settings: object, after: Sequence[str]) -> str:
+        keys = [self.records[self._prefix + stage].key for stage in after]
+        return digest(__version__, FORMAT, self._prefix + name, settings, keys)
+
+    def _note(self, record: StageRecord) -> None:
+        self.records[record.name] = record
+        how = "resumed, computed in" if record.resumed else "done in"
+        logger.info("%s: %s %.1f s, %.0f MB", record.name, how, record.seconds, record.peak_mb)
+
+
+class PerFrame(Generic[T]):
+    """Results of a per-frame stage: frame name -> record, read from disk whenever asked for.
+
+    Nothing is held in memory. A missing, outdated or damaged file is computed again.
+    """
+
+    def __init__(
+        self, folder: Path, keys: Mapping[str, str], compute: Callable[[str], T], returns: type[T]
+    ) -> None:
+        self._folder = folder
+        self._keys = keys
+        self._compute = compute
+        self._returns = returns
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._keys)
+
+    def __getitem__(self, name: str) -> T:
+        path = self._path(name)
+        if self.is_stored(name):
+            try:
+                return load_record(path, self._returns)
+            except RecordError as error:
+                logger.warning("computing again: %s", error)
+        value = self._compute(name)
+        save_record(path, value, {"key": self._keys[name]})
+        return value
+
+    def is_stored(self, name: str) -> bool:
+        """Whether a result with the right key lies on disk."""
+        try:
+            return read_info(self._path(name)).get("key") == self._keys[name]
+        except RecordError:
+            return False
+
+    def discard_others(self) -> None:
+        """Delete results of frames that are no longer asked for."""
+        for path in set(self._folder.glob("*.npz")) - {self._path(name) for name in self}:
+            path.unlink()
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}.npz"
+
+
+def load_stage(root: Path, name: str, returns: type[T]) -> T:
+    """Result of a finished stage of a run, whatever its settings; for export and evaluate.
+
+    Raises:
+        GsbaError: `root` is no gsba run, or the stage is missing or damaged.
+    """
+    if not is_run_folder(root):
+        raise GsbaError(f"{root} is not a gsba run: it has no {MARKER}")
+    try:
+        return load_record(_stage_path(root, name), returns)
+    except RecordError as error:
+        raise GsbaError(
+            f"{root} has no usable {name!r} result: run gsba refine with --out {root} to the end"
+        ) from error
+
+
+def digest(*parts: object) -> str:
+    """SHA-256 of JSON-able values, settings models, dataclasses and paths; equal across calls."""
+    text = json.dumps(parts, sort_keys=True, default=_jsonable)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def fingerprint(paths: Iterable[Path | None]) -> tuple[tuple[str, int, int], ...]:
+    """(path, bytes, modification time in ns) of input files: cheap to take and to compare."""
+    stats = ((path, path.stat()) for path in paths if path is not None)
+    return tuple((str(path), stat.st_size, stat.st_mtime_ns) for path, stat in stats)
+
+
+def _jsonable(value: object) -> object:
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {entry.name: getattr(value, entry.name) for entry in dataclasses.fields(value)}
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"a {type(value).__name__} cannot be part of a stage's key")
+
+
+@contextmanager
+def _named_in_memory_errors(stage: str) -> Iterator[None]:
+    try:
+        yield
+    except MemoryError as error:
+        error.add_note(stage)
+        raise
+
+
+def _stage_path(root: Path, name: str) -> Path:
+    return root / STAGES / f"{name}.npz"
+
+
+def _load_if_current(path: Path, key: str, returns: type[T]) -> tuple[T, StageRecord] | None:
+    """The stored result and its cost, or None where there is none that can be used."""
+    if not path.exists():
+        return None
+    try:
+        info = read_info(path)
+        if info.get("key") != key:
+            logger.info("%s: settings or inputs changed, computing again", path.stem)
+            return None
+        return load_record(path, returns), typed(info, StageRecord)
+    except RecordError as error:
+        logger.warning("%s: stored result is unusable, computing again (%s)", path.stem, error)
+        return None
+
+
+def _measured(
+    name: str, key: str, wall: float, cpu: float, spent: StageRecord | None = None
+) -> StageRecord:
+    """Cost since the given clocks, on top of what an interrupted call has `spent`."""
+    seconds = time.perf_counter() - wall
+    cpu_seconds = time.process_time() - cpu
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0  # Linux counts in kB
+    if spent is not None:
+        seconds += spent.seconds
+        cpu_seconds += spent.cpu_seconds
+        peak_mb = max(peak_mb, spent.peak_mb)
+    return StageRecord(name, key, False, seconds, cpu_seconds, peak_mb)
+
+
+def _read_cost(path: Path, key: str) -> StageRecord | None:
+    try:
+        record = typed(json.loads(path.read_text()), StageRecord)
+    except (OSError, ValueError, RecursionError, RecordError):
+        return None
+    return record if record.key == key else None

@@ -1,0 +1,194 @@
+"""Coarse pose of every frame from a trajectory on its own clock."""
+
+import logging
+
+import numpy as np
+
+from gsba.config import ReadSettings
+from gsba.geometry import pose
+from gsba.log import GsbaError
+from gsba.trajectory.units import refuse_apart, refuse_intervals, refuse_other_unit, span
+from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
+
+_log = logging.getLogger(__name__)
+
+_SHARED = 0.5  # part of the frames or of the entries that must lie in the other's span
+_GRID_TOLERANCE = 0.1  # of the shortest interval: how well times must meet to find an offset
+# Beyond an end: the stretch whose velocity is continued, and the time constants with which its two
+# parts fade. Chosen by predicting real SLAM output of walks 0.1 to 4 s ahead: people keep walking
+# but do not keep turning.
+_VELOCITY_S = 0.5
+_TRANSLATION_FADE_S = 10.0
+_ROTATION_FADE_S = 1.0
+
+
+def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) -> CoarsePoses:
+    """Give each frame the trajectory's pose at its time, interpolated or extrapolated if need be.
+
+    Between entries rotations are slerped and positions linear. Beyond the ends the velocity there
+    is continued and fades out. A frame counts as seen by the SLAM if an entry lies within half an
+    interval of frames or entries, whichever is shorter.
+
+    Args:
+        frames: F frames.
+        trajectory: N entries; its clock may differ from the frames' by a constant.
+        settings: `clock_offset_s` states that constant. Without it the clocks must agree, or
+            exactly one offset must make all times meet; that one is then used, with a warning.
+
+    Raises:
+        GsbaError: no overlap in time, and no single offset that explains it; times in another
+            unit; next to no pose in the frames' time.
+    """
+    entries = trajectory.timestamps
+    refuse_intervals(frames.timestamps, entries)
+    refuse_other_unit(frames.timestamps, entries)
+    offset = _clock_offset(frames.timestamps, entries, settings.clock_offset_s)
+    times = frames.timestamps + offset
+    refuse_apart(times, entries, _half_interval(times, entries))
+    away = np.abs(entries[nearest(entries, times)] - times)
+    seen = away <= _half_interval(frames.timestamps, entries)
+    outside = (times < entries[0]) | (times > entries[-1])
+    sources = np.where(
+        seen, PoseSource.SLAM, np.where(outside, PoseSource.EXTRAPOLATED, PoseSource.INTERPOLATED)
+    ).astype(np.uint8)
+    _report(frames, sources, times, entries, settings.max_interpolation_s)
+    return CoarsePoses(poses_at(trajectory, times), sources, offset)
+
+
+def without_trajectory(frames: FrameSet) -> CoarsePoses:
+    """Placeholder poses where there is no trajectory: one unit ahead for every frame."""
+    positions = np.outer(np.arange(len(frames)), [0.0, 0.0, 1.0])
+    poses = pose(np.tile(np.eye(3), (len(frames), 1, 1)), positions)
+    return CoarsePoses(poses, np.full(len(frames), PoseSource.NONE, np.uint8), 0.0)
+
+
+def _report(
+    frames: FrameSet,
+    sources: np.ndarray,
+    times: np.ndarray,
+    entries: np.ndarray,
+    max_interpolation_s: float,
+) -> None:
+    counts = np.bincount(sources, minlength=len(PoseSource))
+    _log.info(
+        "coarse poses: %d from the trajectory, %d interpolated, %d extrapolated",
+        *(counts[s] for s in PoseSource if s != PoseSource.NONE),
+    )
+    inside = np.clip(np.searchsorted(entries, times), 1, len(entries) - 1)
+    gaps = entries[inside] - entries[inside - 1]
+    far = np.maximum(entries[0] - times, times - entries[-1])
+    distance = np.where(sources == PoseSource.INTERPOLATED, gaps, far)
+    long = (sources != PoseSource.SLAM) & (distance > max_interpolation_s)
+    if long.any():
+        f = int(np.argmax(np.where(long, distance, 0)))
+        _log.warning(
+            "%d frames lie in gaps of the trajectory longer than %g s (frame '%s': %.1f s); "
+            "their poses are rough",
+            long.sum(),
+            max_interpolation_s,
+            frames.names[f],
+            distance[f],
+        )
+
+
+def _clock_offset(frame_times: np.ndarray, entries: np.ndarray, stated: float | None) -> float:
+    """Seconds to add to frame times so that they are on the trajectory's clock."""
+    shared = _shared(frame_times + (stated or 0.0), entries)
+    if shared >= _SHARED or (stated is not None and shared > 0):
+        return stated or 0.0
+    ranges = (
+        f"frames span {span(frame_times + (stated or 0.0))} s, the trajectory {span(entries)} s"
+    )
+    if stated is not None:
+        raise GsbaError(f"no overlap in time with read.clock_offset_s = {stated}: {ranges}")
+    candidates = _offsets_that_fit(frame_times, entries)
+    overlap = "hardly overlap" if shared > 0 else "do not overlap"
+    if len(candidates) == 1:
+        _log.warning(
+            "frames and trajectory %s in time (%s): the only offset at which all times meet, "
+            "%.6f s, is added to frame times",
+            overlap,
+            ranges,
+            candidates[0],
+        )
+        return candidates[0]
+    refuse_other_unit(frame_times, entries, senseless=True)
+    why = "no offset makes all times meet"
+    if candidates:
+        why = f"several offsets fit, such as {candidates[0]:.6f} and {candidates[1]:.6f}"
+    raise GsbaError(
+        f"frames and trajectory {overlap} in time: {ranges}; {why}; correct the times or set "
+        "read.clock_offset_s (seconds to add to frame times)"
+    )
+
+
+def _shared(times: np.ndarray, entries: np.ndarray) -> float:
+    """Part of the frames in the trajectory's span or of the entries in the frames', the larger."""
+    half = _half_interval(times, entries)
+    frames_in = np.mean((times >= entries[0] - half) & (times <= entries[-1] + half))
+    entries_in = np.mean((entries >= times[0] - half) & (entries <= times[-1] + half))
+    return float(max(frames_in, entries_in)) if min(frames_in, entries_in) > 0 else 0.0
+
+
+def _offsets_that_fit(frame_times: np.ndarray, entries: np.ndarray) -> list[float]:
+    """At most two offsets at which the times of the smaller set all occur in the larger one."""
+    sign = 1.0
+    few, many = entries, frame_times
+    if len(few) > len(many):
+        sign, few, many = -1.0, many, few
+    tolerance = _GRID_TOLERANCE * min(np.diff(few).min(), np.diff(many).min())
+    found: list[float] = []
+    for shift in few[0] - many:
+        shifted = few - shift
+        if shifted[-1] > many[-1] + tolerance:
+            continue
+        residuals = shifted - many[nearest(many, shifted)]
+        if np.abs(residuals).max() <= tolerance:
+            found.append(float(sign * (shift + np.median(residuals))))
+            if len(found) == 2:
+                break
+    return found
+
+
+def poses_at(trajectory: Trajectory, times: np.ndarray) -> np.ndarray:
+    """Poses (F, 4, 4) of a trajectory at any times (F,)."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    entries, world_T_rigs = trajectory.timestamps, trajectory.world_T_rigs
+    inside = np.clip(times, entries[0], entries[-1])
+    rotations = Slerp(entries, Rotation.from_matrix(world_T_rigs[:, :3, :3]))(inside)
+    positions = np.stack(
+        [np.interp(inside, entries, world_T_rigs[:, axis, 3]) for axis in range(3)], axis=1
+    )
+    for end, direction in ((0, -1), (-1, 1)):
+        beyond = direction * (times - entries[end]) > 0
+        if not beyond.any():
+            continue
+        reach = np.abs(entries - entries[end])
+        other = int(np.argmin(np.abs(reach - _VELOCITY_S) + (reach == 0) * np.ptp(entries)))
+        ahead = np.abs(times[beyond] - entries[end])[:, None]
+        last = Rotation.from_matrix(world_T_rigs[end, :3, :3])
+        turn = (Rotation.from_matrix(world_T_rigs[other, :3, :3]).inv() * last).as_rotvec()
+        step = world_T_rigs[end, :3, 3] - world_T_rigs[other, :3, 3]
+        turned = _faded(ahead, _ROTATION_FADE_S) * turn / reach[other]
+        rotations[beyond] = last * Rotation.from_rotvec(turned)
+        moved = _faded(ahead, _TRANSLATION_FADE_S) * step / reach[other]
+        positions[beyond] = world_T_rigs[end, :3, 3] + moved
+    return pose(rotations.as_matrix(), positions)
+
+
+def _faded(duration: np.ndarray, time_constant: float) -> np.ndarray:
+    """Seconds at full speed that equal `duration` seconds of exponentially fading speed."""
+    return -time_constant * np.expm1(-duration / time_constant)
+
+
+def nearest(sorted_values: np.ndarray, queries: np.ndarray) -> np.ndarray:
+    """Index of the nearest of sorted values (N,), N >= 2, for each query (Q,)."""
+    right = np.clip(np.searchsorted(sorted_values, queries), 1, len(sorted_values) - 1)
+    left = right - 1
+    closer_left = queries - sorted_values[left] <= sorted_values[right] - queries
+    return np.where(closer_left, left, right)
+
+
+def _half_interval(times: np.ndarray, entries: np.ndarray) -> float:
+    return 0.5 * float(min(np.median(np.diff(times)), np.median(np.diff(entries))))

@@ -1,0 +1,116 @@
+"""Trajectories in several pieces: several files, or a map that was begun anew within one."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gsba.config import ReadSettings
+from gsba.geometry import rotation_angle
+from gsba.trajectory.association import associate, nearest, poses_at
+from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
+
+_log = logging.getLogger(__name__)
+
+_JUMP = 4.0  # median speeds: no step of the walk itself
+_ALONE = 12  # entries on either side without another jump: two of them are an excursion and back
+_NEAR_ORIGIN = 3.0  # median steps
+_NEAR_ORIGIN_DEG = 20.0
+_IDENTITY = 1e-9  # no tracked pose is that close to the origin by chance
+_LEAST_ENTRIES = 3  # of a piece that is a map of its own
+
+
+def split_restarts(trajectory: Trajectory) -> list[Trajectory]:
+    """Pieces of a trajectory whose SLAM lost its map and began another.
+
+    A new map begins at the origin: an entry that is exactly the identity, or one near it that only
+    a jump leads to, while the entries around keep the pace. A jump and another one back soon
+    after are false poses, not a map.
+
+    Args:
+        trajectory: N entries.
+
+    Returns:
+        The pieces in order of time, each with an origin and a scale of its own.
+    """
+    poses, times = trajectory.world_T_rigs, trajectory.timestamps
+    lengths, intervals = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1), np.diff(times)
+    speeds = lengths / intervals
+    if not (speeds > 0).any():
+        return [trajectory]
+    pace = float(np.median(speeds[speeds > 0]))
+    jumps = np.flatnonzero(speeds > _JUMP * pace)
+    away, turned = np.linalg.norm(poses[:, :3, 3], axis=1), rotation_angle(poses[:, :3, :3])
+    step = pace * float(np.median(intervals))
+    exactly = (away < _IDENTITY) & (turned < _IDENTITY)
+    nearly = (away < _NEAR_ORIGIN * step) & (turned < np.deg2rad(_NEAR_ORIGIN_DEG))
+    starts = [0]
+    for n in range(1, len(poses)):
+        fresh = exactly[n] and not exactly[n - 1]
+        if n - 1 in jumps and nearly[n]:
+            fresh |= np.count_nonzero(np.abs(jumps - (n - 1)) <= _ALONE) == 1
+        if fresh and min(n - starts[-1], len(poses) - n) >= _LEAST_ENTRIES:
+            starts.append(n)
+    ends = [*starts[1:], len(poses)]
+    return [Trajectory(times[a:b], poses[a:b]) for a, b in zip(starts, ends, strict=True)]
+
+
+def associate_pieces(
+    frames: FrameSet, pieces: Sequence[Trajectory], settings: ReadSettings
+) -> CoarsePoses:
+    """Coarse poses from pieces of a trajectory on one clock, each frame in its piece's own world.
+
+    A frame between two pieces belongs to the nearer one. Where pieces overlap in time the one that
+    begins first leads.
+
+    Args:
+        frames: F frames.
+        pieces: at least one.
+        settings: see `associate`.
+
+    Returns:
+        Poses with `segments` set if there is more than one piece; no two worlds are related yet.
+
+    Raises:
+        GsbaError: see `associate`.
+    """
+    pieces = _in_turn(pieces)
+    times = np.concatenate([piece.timestamps for piece in pieces])
+    poses = np.concatenate([piece.world_T_rigs for piece in pieces])
+    coarse = associate(frames, Trajectory(times, poses), settings)
+    if len(pieces) == 1:
+        return coarse
+    owners = np.repeat(np.arange(len(pieces)), [len(piece.timestamps) for piece in pieces])
+    at = frames.timestamps + coarse.time_offset
+    owner = owners[nearest(times, at)]
+    world_T_rigs, sources = coarse.world_T_rigs.copy(), coarse.sources.copy()
+    for n, piece in enumerate(pieces):
+        own = owner == n
+        world_T_rigs[own] = poses_at(piece, at[own])
+        outside = own & ((at < piece.timestamps[0]) | (at > piece.timestamps[-1]))
+        sources[outside & (sources == PoseSource.INTERPOLATED)] = PoseSource.EXTRAPOLATED
+    used, segments = np.unique(owner, return_inverse=True)
+    if len(used) == 1:
+        return replace(coarse, world_T_rigs=world_T_rigs, sources=sources)
+    _log.info("the trajectory is in %d pieces, each with a world of its own", len(used))
+    return replace(
+        coarse, world_T_rigs=world_T_rigs, sources=sources, segments=segments.astype(np.int32)
+    )
+
+
+def _in_turn(pieces: Sequence[Trajectory]) -> list[Trajectory]:
+    """Pieces in order of time, without what an earlier one covers already."""
+    kept: list[Trajectory] = []
+    for piece in sorted(pieces, key=lambda piece: float(piece.timestamps[0])):
+        later = piece.timestamps > kept[-1].timestamps[-1] if kept else slice(None)
+        trimmed = Trajectory(piece.timestamps[later], piece.world_T_rigs[later])
+        if len(trimmed.timestamps) >= 2:
+            kept.append(trimmed)
+        else:
+            _log.warning(
+                "a trajectory from %.6f to %.6f s lies within the time of another: not used",
+                piece.timestamps[0],
+                piece.timestamps[-1],
+            )
+    return kept
