@@ -176,7 +176,7 @@ def write_table(lines: Sequence[str], path: Path | None) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    from gsba.store.records import atomic_write
+    from gsba.disk import atomic_write
 
     atomic_write(path, lambda file: file.write_text(text))
 

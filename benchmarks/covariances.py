@@ -25,7 +25,7 @@ from gsba.demo.walk import Heading, WalkPath
 from gsba.evaluate.consistency import Consistency, Statistic, judge
 from gsba.evaluate.trajectory import evaluate
 from gsba.log import GsbaError
-from gsba.pipeline.outputs import load_run
+from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory
 

@@ -27,10 +27,10 @@ from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.demo import make_walk
 from gsba.demo.degrade import degrade
+from gsba.disk import atomic_write
 from gsba.evaluate.pixels import depth_maps, induced_errors
 from gsba.evaluate.trajectory import evaluate
 from gsba.log import GsbaError
-from gsba.store.records import atomic_write
 from gsba.trajectory.files import read_trajectory, write_tum
 
 WALKS = {

@@ -7,22 +7,21 @@ from unittest.mock import patch
 import numpy as np
 from scipy.spatial import cKDTree  # type: ignore[attr-defined]
 
-from gsba.bundle.adjustment import Adjustment
 from gsba.geometry import inverse
 from gsba.matching import correspondences
 from gsba.matching.guided_search import MatchContext
-from gsba.types import Counts, Matches, VerifiedPairs
+from gsba.types import Counts, Matches, Solution, VerifiedPairs
 
 MAX_DEG = 0.5  # between a keypoint and where the forged pose would see the other frame's point
 
 
-def forge(context: MatchContext, solved: Adjustment, pairs: list[tuple[int, int]]) -> VerifiedPairs:
+def forge(context: MatchContext, solved: Solution, pairs: list[tuple[int, int]]) -> VerifiedPairs:
     """Verified matches of frames that see nothing in common.
 
     The second frame of a pair is given the pose of the first one's successor; keypoints that
     happen to lie where points of the map would then be seen are its matches.
     """
-    known = correspondences.points_by_keypoint(solved, context.keypoints)
+    known = solved.points_by_keypoint(context.keypoints)
     rows, poses = [], []
     for f0, f1 in pairs:
         f0_T_f1 = inverse(solved.world_T_rigs[f0]) @ solved.world_T_rigs[f0 + 1]
@@ -35,9 +34,7 @@ def forge(context: MatchContext, solved: Adjustment, pairs: list[tuple[int, int]
         rows.append(np.column_stack([mine[first], theirs[first]]).astype(np.int32))
         f0_T_f1[:3, 3] /= np.linalg.norm(f0_T_f1[:3, 3])
         poses.append(f0_T_f1)
-    matches = Matches(
-        np.array(pairs, np.int32), np.cumsum([0, *map(len, rows)]), np.concatenate(rows)
-    )
+    matches = Matches.of_rows(np.array(pairs, np.int32), rows)
     return VerifiedPairs(matches, np.array(poses), Counts(len(pairs), len(pairs), "pairs"))
 
 
@@ -50,7 +47,7 @@ def forged_loops(first: int, far: int, count: int) -> Iterator[list[int]]:
     """
     honest, sizes = correspondences.match_loops, []
 
-    def match_loops(context: MatchContext, solved: Adjustment) -> VerifiedPairs:
+    def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
         found = honest(context, solved)
         pairs = [(first + n, first + n + far) for n in range(count)]
         false = forge(context, solved, pairs)

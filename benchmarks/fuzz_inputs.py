@@ -19,7 +19,7 @@ from gsba.demo.degrade import degrade
 from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
-from gsba.geometry import pose_similarity
+from gsba.similarity import pose_similarity
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
@@ -374,8 +374,8 @@ def _runs(draft: _Draft) -> Spoiled:
         names = [row["frame"] for row in csv.DictReader(_lines_of(here / "out/poses.csv"))]
         if len(found) == len(names) == NUM and how != 3:
             order = [int(name) for name in names]
-            scale, rotation, shift = pose_similarity(found, _TRUTH.world_T_rigs[order])
-            off = scale * found[:, :3, 3] @ rotation.T + shift - _TRUTH.world_T_rigs[order, :3, 3]
+            fit = pose_similarity(found, _TRUTH.world_T_rigs[order])
+            off = fit.points(found[:, :3, 3]) - _TRUTH.world_T_rigs[order, :3, 3]
             extent = np.ptp(_TRUTH.world_T_rigs[:, :3, 3], axis=0).max()
             if np.abs(off).max() > 0.2 * extent:
                 return f"{np.abs(off).max() / extent:.2f} of the walk off"

@@ -24,6 +24,7 @@ import numpy as np
 from common import machine
 
 from gsba import RefineSettings, refine
+from gsba.camera.sphere import bearings_from_erp
 from gsba.config import ExportSettings, SplatSettings
 from gsba.demo import make_walk
 from gsba.demo.people import make_people, paste_people
@@ -32,8 +33,8 @@ from gsba.evaluate.trajectory import evaluate
 from gsba.export.images import write_image
 from gsba.frames.files import decode
 from gsba.frames.masks import load_mask
-from gsba.frames.scan import find_panoramas, load_erp, scan
-from gsba.geometry import bearings_from_erp
+from gsba.frames.pixels import load_erp
+from gsba.frames.scan import find_panoramas, scan
 from gsba.masks.carrier import carrier_mask, find_carrier
 from gsba.splat.backend import choose_backend
 from gsba.splat.scene import load_faces, make_views, refined_frames, split_frames

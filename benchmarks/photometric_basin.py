@@ -18,10 +18,10 @@ from factors.patch_windows import PatchPixels, PatchTable, patch_spans, pixel_gr
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
 from gsba.bundle.optimizer import optimize
+from gsba.camera.sphere import bearings_from_erp
 from gsba.config import PhotometricSettings, SolverSettings
 from gsba.demo import make_walk
 from gsba.frames.scan import scan
-from gsba.geometry import bearings_from_erp
 from gsba.photometric import patches
 from gsba.trajectory.files import read_trajectory
 

@@ -34,10 +34,10 @@ from peer import MODES
 from pipeline_table import DEFAULT, to_markdown, verdicts
 
 from gsba.config import ReadSettings
+from gsba.disk import atomic_write
 from gsba.evaluate.trajectory import evaluate
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
-from gsba.store.records import atomic_write
 from gsba.trajectory.association import associate
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet, Trajectory

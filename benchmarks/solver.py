@@ -165,7 +165,7 @@ def _reconstruction(problem: Problem):
     """The problem as a pycolmap reconstruction of equirectangular images."""
     import pycolmap
 
-    from gsba.geometry import erp_from_bearings
+    from gsba.camera.sphere import erp_from_bearings
 
     out = pycolmap.Reconstruction()
     camera = pycolmap.Camera(

@@ -24,12 +24,11 @@ from unittest import mock
 import numpy as np
 
 from gsba.bundle import adjustment, prior_factors
-from gsba.bundle.adjustment import Adjustment
 from gsba.bundle.optimizer import optimize
 from gsba.evaluate.trajectory import evaluate
 from gsba.splat import refinement
 from gsba.store.store import load_stage
-from gsba.types import Keypoints, Tracks, Trajectory
+from gsba.types import Keypoints, Solution, Tracks, Trajectory
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from splat_moves import (  # type: ignore[import-not-found]
@@ -72,7 +71,7 @@ class Decision:
 
 def poor_frames(case: Case, seed: int) -> Given:
     """The solved walk, solved again with few and poor observations of three frames."""
-    solved, keypoints = load_stage(case.out, "aligned2", tuple[Adjustment, Keypoints])
+    solved, keypoints = load_stage(case.out, "aligned2", tuple[Solution, Keypoints])
     rng, tracks = np.random.default_rng(seed), solved.landmarks.tracks
     kept = ~np.isin(tracks.frames, WEAK)
     for f in WEAK:

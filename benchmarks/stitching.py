@@ -23,13 +23,12 @@ from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
 from gsba import refine
 from gsba.bundle import adjustment, prior_factors, stitching, triangulation
-from gsba.bundle.adjustment import Adjustment
 from gsba.config import RefineSettings
 from gsba.frames import cubemap, panorama
 from gsba.geometry import angular_errors
 from gsba.photometric import alignment
 from gsba.store.store import load_stage
-from gsba.types import FrameSet, Keypoints, Landmarks, Sighted, Tracks
+from gsba.types import FrameSet, Keypoints, Landmarks, Sighted, Solution, Tracks
 
 SHARE = 0.2  # of points held out
 GATE = 1e3  # sigmas: no held-out observation is left out by its own residual
@@ -41,7 +40,7 @@ class Variant:
     """Poses, and the field that goes with them."""
 
     name: str
-    solved: Adjustment
+    solved: Solution
     field: SphereField
 
 
@@ -54,7 +53,7 @@ def split(landmarks: Landmarks, seed: int) -> tuple[Landmarks, Landmarks]:
 def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[Variant], Sighted]:
     """Variants from the points not held out; held-out points aligned under the last."""
     keypoints = load_stage(run, "keypoints", Keypoints)
-    start, rig = load_stage(run, "refined1", Adjustment), cubemap.rig_for(frames, settings.cubemap)
+    start, rig = load_stage(run, "refined1", Solution), cubemap.rig_for(frames, settings.cubemap)
     greys = panorama.Greys(frames, settings.align.max_width)
     priors = prior_factors.build(start.world_T_rigs, settings.priors)
     used, held = split(start.landmarks, settings.seed)

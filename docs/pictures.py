@@ -19,11 +19,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsba.frames.scan import load_erp
-from gsba.geometry import similarity
+from gsba.frames.pixels import load_erp
 from gsba.pipeline.refine import load_run
 from gsba.report.html.pictures import picture, worst_frames
 from gsba.report.html.views import viewing_axes
+from gsba.similarity import residuals_of, similarity
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet, Reconstruction, Trajectory
 
@@ -114,8 +114,7 @@ def position_errors(poses: Trajectory, truth: Trajectory) -> np.ndarray:
     """Distance (F,) of every pose from the truth, in its units, after the best Sim(3)."""
     assert np.allclose(poses.timestamps, truth.timestamps, atol=1e-6)
     source, target = (p.world_T_rigs[:, :3, 3] for p in (poses, truth))
-    scale, rotation, shift = similarity(source, target)
-    return np.linalg.norm(scale * source @ rotation.T + shift - target, axis=1)
+    return residuals_of(similarity(source, target), source, target)
 
 
 def _error_chart(before: np.ndarray, after: np.ndarray) -> list[str]:

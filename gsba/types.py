@@ -1,7 +1,7 @@
 """Records that stages hand to one another. Arrays inside; one comment per field."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
 
@@ -56,6 +56,31 @@ class FrameSet:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def panoramic(self) -> bool:
+        """Whether a frame is one equirectangular image, not several faces."""
+        return self.layout == "erp"
+
+    @property
+    def panorama_width(self) -> int:
+        """Pixels across a panorama that is as dense as the frames."""
+        return self.width if self.panoramic else 4 * self.width
+
+    @property
+    def native_face_size(self) -> int:
+        """Pixels across a 90-degree face that is as dense as the frames."""
+        return self.width // 4 if self.panoramic else self.width
+
+    def taken(self, rows: np.ndarray) -> "FrameSet":
+        """Some of the frames (F',), ascending."""
+        return replace(
+            self,
+            names=tuple(self.names[f] for f in rows),
+            paths=tuple(self.paths[f] for f in rows),
+            timestamps=self.timestamps[rows],
+            mask_paths=tuple(self.mask_paths[f] for f in rows),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +144,10 @@ class Keypoints:
         """Bearings (K, 3) of one frame."""
         return self.bearings_rig[self.starts[frame] : self.starts[frame + 1]]
 
+    def matched(self, pair: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Bearings (m, 3) of matched keypoints (m, 2) in either frame of a pair (2,)."""
+        return self.bearings_of(pair[0])[rows[:, 0]], self.bearings_of(pair[1])[rows[:, 1]]
+
     def rows(self, tracks: "Tracks") -> np.ndarray:
         """Row (O,) of every observation of the tracks."""
         return self.starts[tracks.frames] + tracks.keypoints
@@ -132,9 +161,20 @@ class Matches:
     offsets: np.ndarray  # (P + 1,) int64: pair p owns rows offsets[p]:offsets[p + 1]
     keypoints: np.ndarray  # (M, 2) int32, keypoint index in f0 and in f1
 
+    @classmethod
+    def of_rows(cls, pairs: np.ndarray, rows: Sequence[np.ndarray]) -> "Matches":
+        """From the rows (m, 2) int32 of each pair (P, 2)."""
+        keypoints = np.concatenate([np.zeros((0, 2), np.int32), *rows])
+        return cls(pairs, np.cumsum([0, *map(len, rows)]), keypoints)
+
     def of(self, pair: int) -> np.ndarray:
         """Rows of one pair, (m, 2) int32."""
         return self.keypoints[self.offsets[pair] : self.offsets[pair + 1]]
+
+    def taken(self, pairs: Sequence[int] | np.ndarray) -> "Matches":
+        """Those of some pairs, by their indices, in the order given."""
+        rows = [self.of(int(p)) for p in pairs]
+        return Matches.of_rows(self.pairs[list(pairs)].reshape(-1, 2), rows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +184,36 @@ class VerifiedPairs:
     matches: Matches  # inliers only
     f0_T_f1s: np.ndarray  # (P, 4, 4) float64, translation of unit length
     counts: Counts  # of pairs
+
+    @classmethod
+    def none(cls) -> "VerifiedPairs":
+        """What guidance finds where there is no trajectory."""
+        none = np.zeros((0, 2), np.int32)
+        return cls(Matches.of_rows(none, ()), np.zeros((0, 4, 4)), Counts(0, 0, "pairs"))
+
+    @classmethod
+    def joined(cls, parts: Sequence["VerifiedPairs"]) -> "VerifiedPairs":
+        """All pairs of several sets, those of the closest frames first; counts of the first."""
+        pairs = np.concatenate([part.matches.pairs for part in parts])
+        rows = [part.matches.of(p) for part in parts for p in range(len(part.matches.pairs))]
+        poses = np.concatenate([part.f0_T_f1s for part in parts])
+        every = cls(Matches.of_rows(pairs, rows), poses, parts[0].counts)
+        return every.taken(np.lexsort((pairs[:, 0], pairs[:, 1] - pairs[:, 0])).tolist())
+
+    def taken(self, rows: Sequence[int]) -> "VerifiedPairs":
+        """Some of the pairs, by their indices, in the order given."""
+        poses = self.f0_T_f1s[list(rows)].reshape(-1, 4, 4)
+        return VerifiedPairs(self.matches.taken(rows), poses, self.counts)
+
+    def frames(self) -> set[tuple[int, int]]:
+        """The frames of each pair."""
+        return {(int(f0), int(f1)) for f0, f1 in self.matches.pairs}
+
+    def missing(self, chosen: np.ndarray) -> np.ndarray:
+        """Those of some pairs (P, 2) that are not among these."""
+        present = self.frames()
+        rows = [pair for pair in chosen.tolist() if tuple(pair) not in present]
+        return np.array(rows, np.int32).reshape(-1, 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +228,10 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.points)
 
+    def hosts(self) -> np.ndarray:
+        """First frame (J,) that sees each point: the one it goes with."""
+        return self.frames[np.searchsorted(self.points, np.arange(self.num_points))]
+
 
 @dataclass(frozen=True, slots=True)
 class Landmarks:
@@ -166,6 +240,81 @@ class Landmarks:
     points_world: np.ndarray  # (J, 3) float64, map units
     tracks: Tracks  # their observations; point indices are rows of points_world
     counts: Counts  # of tracks
+
+    def moved(self, scales: np.ndarray, moves: np.ndarray) -> "Landmarks":
+        """Each where its host frame's scale (F,) * R @ x + t, of moves (F, 4, 4), has it."""
+        hosts = self.tracks.hosts()
+        turned = np.einsum("jik,jk->ji", moves[hosts, :3, :3], self.points_world)
+        points = scales[hosts, None] * turned + moves[hosts, :3, 3]
+        return Landmarks(points, self.tracks, self.counts)
+
+
+@dataclass(frozen=True, slots=True)
+class Iteration:
+    """One attempted step. Iteration 0 is the start."""
+
+    number: int
+    cost: float  # total robust cost of the attempt
+    costs: Mapping[str, float]  # family -> cost; empty where the step was rejected
+    damping: float  # lambda the step was solved with
+    accepted: bool
+    seconds: float  # wall time of this attempt
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """One bundle adjustment and what was kept of it."""
+
+    gate_sigmas: float  # observations further off were left out
+    noise: float  # estimated noise after the round, in units of the features' own sigmas
+    observations: int  # used
+    points: int  # used
+    support: int  # observations within the last gate of all tracks, under the round's poses
+    accepted: bool  # False: the poses before the round have more support and were kept
+    iterations: tuple[Iteration, ...]  # cost by family
+    reason: str  # why the solver stopped
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Poses and points after the last good round."""
+
+    world_T_rigs: np.ndarray  # (F, 4, 4) float64
+    landmarks: Landmarks
+    noise: float  # of observations, in units of the features' own sigmas
+    rounds: tuple[Round, ...]
+
+    @classmethod
+    def without_points(cls, world_T_rigs: np.ndarray) -> "Solution":
+        """Poses (F, 4, 4) to start from."""
+        nothing = np.zeros(0, np.int32)
+        tracks = Tracks(nothing, nothing, nothing, 0)
+        return cls(
+            world_T_rigs, Landmarks(np.zeros((0, 3)), tracks, Counts(0, 0, "tracks")), 1.0, ()
+        )
+
+    def observations(self) -> np.ndarray:
+        """How many each frame (F,) has."""
+        return np.bincount(self.landmarks.tracks.frames, minlength=len(self.world_T_rigs))
+
+    def carries(self, before: "Solution", least: int) -> bool:
+        """Whether every frame with `least` observations in another solution has as many here."""
+        return bool(np.all((self.observations() >= least) | (before.observations() < least)))
+
+    def median_depth(self) -> float:
+        """Median distance of points from the frames that see them, map units; 0 without points."""
+        tracks, points = self.landmarks.tracks, self.landmarks.points_world
+        offsets = points[tracks.points] - self.world_T_rigs[tracks.frames, :3, 3]
+        return float(np.median(np.linalg.norm(offsets, axis=1))) if len(offsets) else 0.0
+
+    def points_by_keypoint(self, keypoints: Keypoints) -> list[np.ndarray]:
+        """For each frame (K_f, 3): its keypoints' points in its rig frame, NaN where unknown."""
+        tracks = self.landmarks.tracks
+        known = np.full((len(keypoints.faces), 3), np.nan)
+        world_T_rig = self.world_T_rigs[tracks.frames]
+        offsets = self.landmarks.points_world[tracks.points] - world_T_rig[:, :3, 3]
+        known[keypoints.rows(tracks)] = np.einsum("oji,oj->oi", world_T_rig[:, :3, :3], offsets)
+        return np.split(known, keypoints.starts[1:-1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,3 +364,33 @@ class Reconstruction:
     components: np.ndarray | None = None  # (F,) int32, map that each frame is in, 0 = the largest:
     # nothing ties one map to another, each has a world of its own; None = there is one
     joint_errors: JointErrors | None = None  # those whose own covariances are above; None = none
+
+    def largest_map(self) -> np.ndarray:
+        """Frames (F',) int64 of the largest map: those that are exported."""
+        if self.components is None:
+            return np.arange(len(self.world_T_rigs))
+        return np.flatnonzero(self.components == 0)
+
+    def taken(self, rows: np.ndarray) -> "Reconstruction":
+        """What some frames (F',), ascending, hold of it: their poses and the points they see."""
+        if len(rows) == len(self.world_T_rigs):
+            return self
+        number = np.full(len(self.world_T_rigs), -1)
+        number[rows] = np.arange(len(rows))
+        seen = number[self.observation_frames] >= 0
+        points, which = np.unique(self.observation_points[seen], return_inverse=True)
+        return replace(
+            self,
+            world_T_rigs=self.world_T_rigs[rows],
+            pose_covariances=self.pose_covariances[rows],
+            pose_statuses=self.pose_statuses[rows],
+            points_world=self.points_world[points],
+            point_colors=self.point_colors[points],
+            point_errors=self.point_errors[points],
+            observation_points=which.astype(np.int32),
+            observation_frames=number[self.observation_frames[seen]].astype(np.int32),
+            observation_bearings=self.observation_bearings[seen],
+            observation_sigmas=self.observation_sigmas[seen],
+            components=None,
+            joint_errors=self.joint_errors and self.joint_errors.taken(rows),
+        )

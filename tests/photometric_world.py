@@ -9,7 +9,7 @@ from synthetic import unit
 from factors._photometric_kernels import sample_many
 from factors.patch_windows import PAD, PatchPixels, PatchTable, coded, pixel_grid, planes_from
 from factors.sphere_image import SphereImage
-from gsba.geometry import bearings_from_erp
+from gsba.camera.sphere import bearings_from_erp
 
 RADIUS = 4.0
 

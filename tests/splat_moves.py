@@ -8,15 +8,14 @@ import numpy as np
 from tiny_run import SETTINGS, Case
 
 from gsba.bundle import prior_factors
-from gsba.bundle.adjustment import Adjustment
 from gsba.config import RefineSettings
 from gsba.frames import cubemap
 from gsba.splat import refinement
 from gsba.splat.refinement import SplatResult
 from gsba.store.store import load_stage
-from gsba.types import FrameSet, Keypoints
+from gsba.types import FrameSet, Keypoints, Solution
 
-Given = tuple[FrameSet, Keypoints, Adjustment]
+Given = tuple[FrameSet, Keypoints, Solution]
 
 
 def settings_for(factors: tuple[str, ...] = ("bearing", "splat"), **splat) -> RefineSettings:
@@ -28,7 +27,7 @@ def settings_for(factors: tuple[str, ...] = ("bearing", "splat"), **splat) -> Re
 
 def spoiled(case: Case, degrees: float, distance: float, noise: float, seed: int = 0) -> Given:
     """Frames, keypoints and a solution whose poses are off and whose observations are doubted."""
-    solved, keypoints = load_stage(case.out, "aligned2", tuple[Adjustment, Keypoints])
+    solved, keypoints = load_stage(case.out, "aligned2", tuple[Solution, Keypoints])
     rng, poses = np.random.default_rng(seed), solved.world_T_rigs.copy()
     sigmas = np.repeat([np.deg2rad(degrees), distance], 3)
     for f in range(1, len(poses)):

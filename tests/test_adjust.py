@@ -10,10 +10,11 @@ from scipy.stats import chi2
 from synthetic import RIG, World, drifted, make_world
 
 from gsba.bundle import adjustment, prior_factors
-from gsba.bundle.adjustment import Adjustment
 from gsba.bundle.optimizer import OptimizeResult
 from gsba.config import RefineSettings
-from gsba.geometry import inverse, pose_similarity, rotation_angle
+from gsba.geometry import inverse, rotation_angle
+from gsba.similarity import pose_similarity
+from gsba.types import Solution
 
 SIGMA, CLAIMED = 5e-4, 3e-4  # radians: true noise of bearings, and what keypoints say of it
 GATES = (200.0, 60.0, 20.0, 8.0, 8.0)  # in claimed sigmas: the start is some 5 degrees off
@@ -35,21 +36,21 @@ def _world(seed: int = 0) -> tuple[World, np.ndarray]:
 
 def _run(
     world: World, coarse: np.ndarray, settings: RefineSettings, gates: tuple[float, ...] = GATES
-) -> Adjustment:
+) -> Solution:
     priors = prior_factors.build(coarse, settings.priors)
-    start = adjustment.start(coarse)
+    start = Solution.without_points(coarse)
     return adjustment.run(world.tracks, world.keypoints, start, priors, RIG, gates, settings, 1)
 
 
 def _covariances(
-    solved: Adjustment, world: World, coarse: np.ndarray, settings: RefineSettings
+    solved: Solution, world: World, coarse: np.ndarray, settings: RefineSettings
 ) -> np.ndarray:
     priors = prior_factors.build(coarse, settings.priors)
     return adjustment.pose_covariances(solved, priors, world.keypoints, RIG, settings, 1)[0]
 
 
 @cache
-def _solved(families: str, seed: int = 0) -> tuple[World, np.ndarray, Adjustment, np.ndarray]:
+def _solved(families: str, seed: int = 0) -> tuple[World, np.ndarray, Solution, np.ndarray]:
     """World, start, solution and covariances."""
     world, coarse = _world(seed)
     settings = _settings(families)
@@ -58,8 +59,7 @@ def _solved(families: str, seed: int = 0) -> tuple[World, np.ndarray, Adjustment
 
 
 def _position_rmse(world_T_rigs: np.ndarray, true: np.ndarray) -> float:
-    scale, rotation, translation = pose_similarity(world_T_rigs, true)
-    placed = scale * world_T_rigs[:, :3, 3] @ rotation.T + translation
+    placed = pose_similarity(world_T_rigs, true).points(world_T_rigs[:, :3, 3])
     return float(np.sqrt(np.mean(np.sum((placed - true[:, :3, 3]) ** 2, axis=1))))
 
 

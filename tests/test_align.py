@@ -9,13 +9,21 @@ import pytest
 from synthetic import bearings_of
 
 from gsba.bundle import adjustment, prior_factors
-from gsba.bundle.adjustment import Adjustment
 from gsba.camera.rig import CubeRig
 from gsba.config import AlignSettings, RefineSettings
 from gsba.frames.panorama import Greys
 from gsba.geometry import inverse, pose
 from gsba.photometric import alignment
-from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Sighted, Tracks
+from gsba.types import (
+    Counts,
+    FrameSet,
+    Keypoints,
+    Landmarks,
+    Sighted,
+    Solution,
+    Tracks,
+    without_points,
+)
 
 NUM, WIDTH = 6, 512
 RIG = CubeRig(128, np.pi / 2)
@@ -24,7 +32,7 @@ SETTINGS = AlignSettings(patch_size=11)
 
 
 def _bearings(width: int) -> np.ndarray:
-    from gsba.geometry import bearings_from_erp
+    from gsba.camera.sphere import bearings_from_erp
 
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
     return bearings_from_erp(np.stack([u, v], axis=-1), width, width // 2)
@@ -166,12 +174,17 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
     settings = RefineSettings(align=SETTINGS)
     priors = prior_factors.build(world_T_rigs, settings.priors)
 
-    def rotation_errors(solved: Adjustment) -> np.ndarray:
+    def rotation_errors(solved: Solution) -> np.ndarray:
         true = inverse(world_T_rigs[:-1]) @ world_T_rigs[1:]
         found = inverse(solved.world_T_rigs[:-1]) @ solved.world_T_rigs[1:]
         return np.linalg.norm(found[:, :3, :3] - true[:, :3, :3], axis=(1, 2))
 
-    start = replace(adjustment.start(world_T_rigs), landmarks=landmarks)
+    start = replace(
+        Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.without_points(
+            world_T_rigs
+        ),
+        landmarks=landmarks,
+    )
     common = priors, RIG, (6.0, 3.0), settings, 2
     before = adjustment.run(landmarks.tracks, keypoints, start, *common)
     sighted = alignment.run(
@@ -241,7 +254,7 @@ def test_confirmed_points_are_looked_for_elsewhere(walk) -> None:
 def test_a_solution_that_loses_a_frame_is_told_apart(walk) -> None:
     _, world_T_rigs = walk
     landmarks, _ = _start(world_T_rigs)
-    before = replace(adjustment.start(world_T_rigs), landmarks=landmarks)
+    before = replace(without_points(world_T_rigs), landmarks=landmarks)
     tracks = landmarks.tracks
     rows = tracks.frames != 3
     fewer = Tracks(tracks.points[rows], tracks.frames[rows], tracks.keypoints[rows], 400)
@@ -252,7 +265,7 @@ def test_a_solution_that_loses_a_frame_is_told_apart(walk) -> None:
 
 def test_no_points_are_no_observations(walk) -> None:
     frames, world_T_rigs = walk
-    none = adjustment.start(world_T_rigs).landmarks
+    none = without_points(world_T_rigs).landmarks
     _, keypoints = _start(world_T_rigs)
     sighted = alignment.run(
         none, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None, SETTINGS, 2

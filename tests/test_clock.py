@@ -9,7 +9,7 @@ from gsba.geometry import inverse, pose, rotation_angle
 from gsba.trajectory import clock, clock_search
 from gsba.trajectory.clock import Clock, ClockEstimate
 from gsba.trajectory.clock_search import ClockFit
-from gsba.trajectory.judgement import Steps
+from gsba.trajectory.steps import Steps
 from gsba.types import Trajectory
 
 NUM_FRAMES, INTERVAL_S, PER_FRAME = 40, 0.5, 4

@@ -13,9 +13,10 @@ from synthetic import RIG, make_world
 from gsba.bundle import adjustment, prior_factors
 from gsba.config import RefineSettings
 from gsba.evaluate.consistency import EXPECTED, Consistency, Statistic, format_consistency, judge
-from gsba.geometry import carried, pose
+from gsba.geometry import pose
 from gsba.log import GsbaError
-from gsba.types import JointErrors, Reconstruction, Trajectory
+from gsba.similarity import Sim3
+from gsba.types import JointErrors, Reconstruction, Solution, Trajectory
 
 FRAMES = 16
 TIMES = 0.1 * np.arange(FRAMES)
@@ -34,7 +35,16 @@ def _solved(seed: int) -> tuple[Reconstruction, Trajectory]:
     held.add(gtsam.PriorFactorPose3(prior_factors.X(0), gtsam.Pose3(true[0]), gauge))
     priors = gtsam.NonlinearFactorGraph(held)
     priors.push_back(prior_factors.fixed_scale(true))
-    given = world.tracks, world.keypoints, adjustment.start(true), priors, RIG, (8.0,), settings, 1
+    given = (
+        world.tracks,
+        world.keypoints,
+        Solution.without_points(true),
+        priors,
+        RIG,
+        (8.0,),
+        settings,
+        1,
+    )
     solved = replace(adjustment.run(*given), noise=1.0)
     covariances, joint = adjustment.pose_covariances(solved, held, *given[1:2], RIG, settings, 1)
     return _result(solved.world_T_rigs, covariances, joint), Trajectory(TIMES, true)
@@ -100,7 +110,7 @@ def test_sigmas_that_are_off_by_two_are_found(factor: float) -> None:
 def test_the_world_and_scale_of_the_truth_do_not_matter() -> None:
     result, truth = _solved(0)
     turn = pose(Rotation.from_rotvec([0.4, -2.0, 1.0]).as_matrix(), np.array([3.0, -40.0, 8.0]))
-    moved = Trajectory(TIMES, carried(truth.world_T_rigs, 7.3, turn))
+    moved = Trajectory(TIMES, Sim3.of(7.3, turn).poses(truth.world_T_rigs))
     here, there = (_statistics(judge(result, TIMES, one)) for one in (truth, moved))
     assert [one.value for one in there] == pytest.approx([one.value for one in here], rel=1e-6)
 
@@ -111,7 +121,7 @@ def test_the_world_and_scale_of_the_run_do_not_matter() -> None:
     joint, poses = result.joint_errors, result.world_T_rigs
     assert joint is not None
     moved = _result(
-        carried(poses, 250.0, pose(Rotation.from_rotvec([1, 1, 0]).as_matrix(), np.full(3, 90.0))),
+        Sim3(250.0, Rotation.from_rotvec([1, 1, 0]).as_matrix(), np.full(3, 90.0)).poses(poses),
         stretch[:, :, None] * result.pose_covariances * stretch[:, None, :],
         joint.scaled(stretch),
     )

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from gsba.camera.rig import CubeRig
+from gsba.camera.sphere import bearings_from_erp
 from gsba.config import CubemapSettings
 from gsba.frames import cubemap
-from gsba.geometry import bearings_from_erp
 from gsba.types import FrameSet
 
 

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.demo import degrade, make_walk
 from gsba.demo.mesh import MeshBuilder
 from gsba.demo.raycast import ranges
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
-from gsba.geometry import bearings_from_erp, erp_from_bearings, inverse, pose, rotation_angle
+from gsba.geometry import inverse, pose, rotation_angle
 from gsba.log import GsbaError
 from gsba.types import Trajectory
 

@@ -9,19 +9,18 @@ import pytest
 from tiny_run import SETTINGS, Case, computed_stages
 
 from gsba import refine
-from gsba.bundle.adjustment import Adjustment
+from gsba.camera.sphere import erp_from_bearings
 from gsba.demo.people import make_people, paste_people
 from gsba.evaluate.trajectory import evaluate
 from gsba.export.images import write_image
 from gsba.frames.masks import levels_of, load_mask, load_weights
-from gsba.frames.scan import load_erp
-from gsba.geometry import erp_from_bearings
+from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError
 from gsba.masks.distractors import Scene, distractor_mask, distractor_weights
 from gsba.masks.merging import choose
 from gsba.store.store import load_stage
 from gsba.trajectory.files import read_trajectory
-from gsba.types import FrameSet
+from gsba.types import FrameSet, Solution
 
 UP = np.array([0.0, -1.0, 0.0])  # of the gallery
 
@@ -43,7 +42,7 @@ def _populated(case: Case, folder: Path) -> tuple[FrameSet, np.ndarray]:
 
 
 def _scene(case: Case, frames: FrameSet, known=None) -> Scene:
-    solved = load_stage(case.out, "refined1", Adjustment)
+    solved = load_stage(case.out, "refined1", Solution)
     return Scene(frames, solved.world_T_rigs, solved.landmarks, known)
 
 
@@ -70,7 +69,7 @@ def test_people_are_found_and_nothing_else(case: Case, tmp_path: Path) -> None:
 def test_frames_that_cannot_be_judged_are_left_alone(case: Case) -> None:
     """Too few points in common."""
     frames = case.result.frames
-    solved = load_stage(case.out, "refined1", Adjustment)
+    solved = load_stage(case.out, "refined1", Solution)
     tracks = solved.landmarks.tracks
     few = dataclasses.replace(solved.landmarks, points_world=solved.landmarks.points_world[:5])
     kept = tracks.points < 5

@@ -6,15 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsba.evaluate.trajectory import (
-    AUC_THRESHOLDS_DEG,
-    area_under_recall,
-    associate,
-    evaluate,
-    format_table,
-)
+from gsba.evaluate.trajectory import AUC_THRESHOLDS_DEG, area_under_recall, evaluate, format_table
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
+from gsba.trajectory.association import matched_in_time
 from gsba.types import Trajectory
 
 
@@ -166,7 +161,7 @@ def test_association_is_mutual_and_within_tolerance():
     eye = np.tile(np.eye(4), (6, 1, 1))
     truth = Trajectory(np.array([0.0, 1.0, 2.0, 3.0]), eye[:4])
     estimate = Trajectory(np.array([0.004, 0.996, 0.999, 2.02, 3.0, 9.0]), eye)
-    rows_e, rows_t = associate(estimate, truth, 0.01)
+    rows_e, rows_t = matched_in_time(estimate, truth, 0.01)
     assert rows_e.tolist() == [0, 2, 4] and rows_t.tolist() == [0, 1, 3]
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from gsba.camera.rig import CubeRig, owner_faces
+from gsba.camera.sphere import bearings_from_erp
 from gsba.config import FeatureSettings
 from gsba.features import detection
 from gsba.features.detection import Extractor, FaceKeypoints, SiftExtractor
 from gsba.frames import cubemap
-from gsba.geometry import bearings_from_erp
 from gsba.types import Features
 
 SIZE = 256

@@ -4,21 +4,20 @@ import numpy as np
 import pytest
 from synthetic import bearings_of, features_of, unit, with_noise
 
-from gsba.bundle.adjustment import Adjustment
 from gsba.camera.rig import owner_faces
 from gsba.config import PairSettings, RefineSettings
 from gsba.features import detection
 from gsba.geometry import pose
 from gsba.matching import correspondences
 from gsba.matching.guided_search import MatchContext, SearchableFrames
-from gsba.types import Counts, Keypoints, Landmarks, Tracks, VerifiedPairs
+from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks, VerifiedPairs
 
 NUM = 300
 LAST = 5  # the frame that comes back
 STRIDE = 0.2  # the walk is 0.2 a step along x, the points are 2 to 4 away
 
 
-def _scene(shift: float) -> tuple[SearchableFrames, Keypoints, Adjustment]:
+def _scene(shift: float) -> tuple[SearchableFrames, Keypoints, Solution]:
     """A solved walk along x whose last frame sees, of every point, a copy moved along x."""
     rng = np.random.default_rng(0)
     points = rng.uniform(2, 4, (NUM, 1)) * unit(rng.normal(size=(NUM, 3)))
@@ -35,7 +34,7 @@ def _scene(shift: float) -> tuple[SearchableFrames, Keypoints, Adjustment]:
     order = np.lexsort((seen_from, which))
     which, seen_from = which[order].astype(np.int32), seen_from[order].astype(np.int32)
     landmarks = Landmarks(points, Tracks(which, seen_from, which, NUM), Counts(NUM, NUM, "tracks"))
-    solved = Adjustment(world_T_rigs, landmarks, 1.0, ())
+    solved = Solution(world_T_rigs, landmarks, 1.0, ())
     return SearchableFrames(frames.__getitem__), detection.gather(frames), solved
 
 
@@ -92,7 +91,7 @@ def test_all_keypoints_decide_where_the_strongest_disagree(
         Tracks(*(np.zeros(0, np.int32) for _ in range(3)), 0),
         Counts(0, 0, "tracks"),
     )
-    found = correspondences.match_neighbours(context, Adjustment(world_T_rigs, nothing, 1.0, ()))
+    found = correspondences.match_neighbours(context, Solution(world_T_rigs, nothing, 1.0, ()))
     assert found.matches.pairs.tolist() == [[0, 1]]
     off = np.rad2deg(np.arccos(found.f0_T_f1s[0, :3, 3] @ unit(true)))
     assert off > 10 if misled else off < 1

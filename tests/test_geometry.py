@@ -7,18 +7,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.rig import RIG_R_FACE, CubeRig, owner_faces
+from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.geometry import (
-    NoSimilarityError,
-    bearings_from_erp,
-    erp_from_bearings,
     inverse,
     pose,
-    pose_similarity,
     quaternion_from_rotation,
     rotation_angle,
     rotation_from_quaternion,
-    similarity,
 )
+from gsba.similarity import NoSimilarityError, Sim3, pose_similarity, residuals_of, similarity
 from gsba.types import FACES
 
 RNG = np.random.default_rng(0)
@@ -111,30 +108,30 @@ def test_similarity_recovers_a_known_one(flat: bool) -> None:
     source = RNG.normal(size=(30, 3)) * ([1, 1, 0] if flat else [1, 1, 1])
     target = scale * source @ rotation.T + translation
     found = similarity(source, target)
-    assert found[0] == pytest.approx(scale, rel=1e-12)
-    np.testing.assert_allclose(found[1], rotation, atol=1e-12)
-    np.testing.assert_allclose(found[2], translation, atol=1e-12)
+    assert found.scale == pytest.approx(scale, rel=1e-12)
+    np.testing.assert_allclose(found.rotation, rotation, atol=1e-12)
+    np.testing.assert_allclose(found.translation, translation, atol=1e-12)
 
 
 def test_similarity_never_mirrors() -> None:
     source = RNG.normal(size=(30, 3))
-    _, rotation, _ = similarity(source, source * [-1, 1, 1])
-    assert np.linalg.det(rotation) == pytest.approx(1)
+    found = similarity(source, source * [-1, 1, 1])
+    assert np.linalg.det(found.rotation) == pytest.approx(1)
 
 
 def test_similarity_is_the_least_squares_one() -> None:
     source = RNG.normal(size=(40, 3))
     target = 1.4 * source + RNG.normal(0, 0.3, source.shape)
 
-    def cost(scale: float, rotation: np.ndarray, translation: np.ndarray) -> float:
-        return float(np.sum((target - scale * source @ rotation.T - translation) ** 2))
+    def cost(fit: Sim3) -> float:
+        return float(np.sum(residuals_of(fit, source, target) ** 2))
 
-    scale, rotation, translation = similarity(source, target)
-    best = cost(scale, rotation, translation)
+    found = similarity(source, target)
+    best = cost(found)
     for _ in range(50):
         nudge = Rotation.from_rotvec(RNG.normal(0, 1e-3, 3)).as_matrix()
-        moved = scale + RNG.normal(0, 1e-3), nudge @ rotation, translation + RNG.normal(0, 1e-3, 3)
-        assert cost(*moved) >= best
+        scale, shift = found.scale + RNG.normal(0, 1e-3), RNG.normal(0, 1e-3, 3)
+        assert cost(Sim3(scale, nudge @ found.rotation, found.translation + shift)) >= best
 
 
 @pytest.mark.parametrize("path", ["room", "straight line", "one place"])
@@ -147,9 +144,9 @@ def test_pose_similarity_recovers_a_known_one(path: str) -> None:
         source[:, :3, 3], scale = [1.0, 2.0, 3.0], 1.0
     target = pose(rotation @ source[:, :3, :3], scale * source[:, :3, 3] @ rotation.T + translation)
     found = pose_similarity(source, target)
-    assert found[0] == pytest.approx(scale, rel=1e-12)
-    np.testing.assert_allclose(found[1], rotation, atol=1e-12)
-    np.testing.assert_allclose(found[2], translation, atol=1e-12)
+    assert found.scale == pytest.approx(scale, rel=1e-12)
+    np.testing.assert_allclose(found.rotation, rotation, atol=1e-12)
+    np.testing.assert_allclose(found.translation, translation, atol=1e-12)
 
 
 def test_pose_similarity_never_mirrors() -> None:
@@ -158,11 +155,11 @@ def test_pose_similarity_never_mirrors() -> None:
     for shift in range(20):
         target[:, :3, :3] = Rotation.random(3, np.random.default_rng(shift)).as_matrix()
         try:
-            scale, rotation, _ = pose_similarity(source, target)
+            fit = pose_similarity(source, target)
         except NoSimilarityError:  # turned so, no positive scale lays one over the other
             inverted.append(shift)
             continue
-        assert scale > 0 and np.linalg.det(rotation) == pytest.approx(1)
+        assert fit.scale > 0 and np.linalg.det(fit.rotation) == pytest.approx(1)
     assert 0 < len(inverted) < 20
 
 
@@ -176,7 +173,7 @@ def test_a_similarity_never_inverts_or_vanishes() -> None:
             pose_similarity(source, target)
     with pytest.raises(NoSimilarityError):
         similarity(source[:, :3, 3], np.ones((6, 3)))
-    assert similarity(np.ones((6, 3)), source[:, :3, 3])[0] == 1  # no motion tells no scale
+    assert similarity(np.ones((6, 3)), source[:, :3, 3]).scale == 1  # no motion tells no scale
 
 
 def test_faces_come_in_order_and_look_along_their_axes() -> None:

@@ -58,7 +58,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RefineSettings:
     stub = types.ModuleType("gsba.learned.lightglue")
     stub.LightGlue = Nearest  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "gsba.learned.lightglue", stub)
-    monkeypatch.setattr("gsba.features.extraction.LearnedExtractor", Keypoints)
+    monkeypatch.setattr("gsba.learned.extractor.LearnedExtractor", Keypoints)
     for name in ("aliked-n16.pth", "aliked_lightglue.pth"):
         (tmp_path / name).write_bytes(b"weights")
     changes = {

@@ -45,15 +45,15 @@ def test_a_map_that_hardly_drifts_is_left_alone() -> None:
 
 
 def test_drift_is_what_is_left_after_the_best_similarity() -> None:
-    from gsba.geometry import similarity
+    from gsba.similarity import similarity
 
     _, joint = _chained(np.full(NUM - 2, 2e-3), 200)
     draws = joint.draws
     moved = POSES[:, :3, 3] + np.einsum("fij,dfj->dfi", POSES[:, :3, :3], draws[..., 3:])
     squares = []
     for positions in moved:
-        scale, rotation, shift = similarity(positions, POSES[:, :3, 3])
-        squares.append((scale * positions @ rotation.T + shift - POSES[:, :3, 3]) ** 2)
+        fit = similarity(positions, POSES[:, :3, 3])
+        squares.append((fit.points(positions) - POSES[:, :3, 3]) ** 2)
     wanted = np.sqrt(3 * np.mean(squares)) / LENGTHS.sum()
     assert map_strength._drift(POSES, draws) == pytest.approx(wanted, rel=0.01)
 

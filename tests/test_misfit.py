@@ -10,9 +10,9 @@ from gsba.config import RefineSettings, VerifySettings
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
 from gsba.matching import recovery
-from gsba.trajectory.judgement import Steps
 from gsba.trajectory.misread import refuse_misfit, refuse_misread, refuse_useless
-from gsba.types import CoarsePoses, PoseSource, Trajectory
+from gsba.trajectory.steps import Steps
+from gsba.types import CoarsePoses, PoseSource, Trajectory, VerifiedPairs
 
 NUM = 30
 SLAM = drifted(loop_walk(NUM), np.random.default_rng(0))
@@ -81,12 +81,12 @@ def test_the_other_side_of_a_loop_is_another_clock(late: int) -> None:
 def test_a_reversed_trajectory_is_refused_before_another_clock_is_looked_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(recovery, "match_anywhere", lambda *_: recovery.nothing_verified())
-    monkeypatch.setattr(recovery.motion, "steps", lambda *_: _found())
+    monkeypatch.setattr(recovery, "match_anywhere", lambda *_: VerifiedPairs.none())
+    monkeypatch.setattr(recovery, "image_steps", lambda *_: _found())
     context = SimpleNamespace(settings=RefineSettings(), keypoints=None)
     times = np.arange(float(NUM))
     trajectory = Trajectory(times, SLAM[::-1])
-    given = context, recovery.nothing_verified(), _coarse(SLAM[::-1]), times, trajectory
+    given = context, VerifiedPairs.none(), _coarse(SLAM[::-1]), times, trajectory
     with pytest.raises(GsbaError, match="reversed in time"):
         recovery.check_clock(*given)  # type: ignore[arg-type]
 

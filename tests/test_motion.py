@@ -8,8 +8,8 @@ from synthetic import RIG, bearings_of, drifted, loop_walk, unit, with_noise
 from gsba.config import PriorSettings, VerifySettings
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.trajectory import judgement
-from gsba.trajectory.blame import chained
 from gsba.trajectory.judgement import Trust
+from gsba.trajectory.steps import chained, image_steps, length_ratios, off_steps, step_lengths
 from gsba.types import CoarsePoses, Counts, Keypoints, Matches, PoseSource, VerifiedPairs
 
 NUM_FRAMES, NUM_POINTS = 24, 80
@@ -49,8 +49,8 @@ def _judge(slam: np.ndarray, missing: tuple[int, ...] = (), lost: tuple[int, ...
     pairs, keypoints = _seen(missing)
     sources = np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8)
     sources[list(lost)] = PoseSource.INTERPOLATED
-    found = judgement.steps(pairs, keypoints, VERIFY)
-    logs, sigmas = judgement.length_ratios(pairs, found, keypoints)
+    found = image_steps(pairs, keypoints, VERIFY)
+    logs, sigmas = length_ratios(pairs, found, keypoints)
     coarse = CoarsePoses(slam, sources, 0.0)
     return judgement.judge(coarse, found, logs, sigmas, VERIFY, PRIORS)
 
@@ -61,8 +61,8 @@ def _slam(seed: int = 0) -> np.ndarray:
 
 def test_ratios_of_lengths_come_from_common_points() -> None:
     pairs, keypoints = _seen()
-    found = judgement.steps(pairs, keypoints, VERIFY)
-    logs, sigmas = judgement.length_ratios(pairs, found, keypoints)
+    found = image_steps(pairs, keypoints, VERIFY)
+    logs, sigmas = length_ratios(pairs, found, keypoints)
     true = np.linalg.norm(np.diff(TRUTH[:, :3, 3], axis=0), axis=1)
     assert found.verified.all() and found.directed.all() and np.isfinite(sigmas).all()
     np.testing.assert_allclose(logs, np.diff(np.log(true)), atol=0.03)
@@ -163,11 +163,11 @@ def test_lengths_outvote_outliers_and_bridge_what_is_unknown() -> None:
     logs, sigmas = np.diff(np.log(true)), np.full(39, 0.02)
     slam, noise = true.copy(), np.full(40, 0.1)
     slam[[8, 9, 25]] *= [3, 0.2, 5]
-    found = judgement.step_lengths(slam, noise, logs, sigmas)
+    found = step_lengths(slam, noise, logs, sigmas)
     np.testing.assert_allclose(found, true, rtol=0.03)
     sigmas[30] = np.inf
     noise[31:] = np.inf  # nothing known behind the break: the pace goes on
-    found = judgement.step_lengths(slam, noise, logs, sigmas)
+    found = step_lengths(slam, noise, logs, sigmas)
     np.testing.assert_allclose(found[:31], true[:31], rtol=0.03)
     assert found[31] == pytest.approx(found[30], rel=0.01)
 
@@ -191,7 +191,7 @@ def test_a_turn_on_the_spot_is_seen_as_one() -> None:
     f0_T_f1 = pose(turn @ rough, np.array([0.0, 0, 1]))[None]
     matches = Matches(np.array([[0, 1]], np.int32), np.array([0, NUM_POINTS]), rows)
     pairs = VerifiedPairs(matches, f0_T_f1, Counts(1, 1, "pairs"))
-    found = judgement.steps(pairs, keypoints, VERIFY)
+    found = image_steps(pairs, keypoints, VERIFY)
     assert found.verified[0] and not found.directed[0]
     error = np.degrees(rotation_angle(found.f_T_nexts[0, :3, :3].T @ turn))
     assert error < 0.01  # 80 bearings of 0.017 degrees
@@ -224,8 +224,8 @@ def test_a_pair_over_two_steps_lies_between_them_whatever_their_lengths(share: f
     turned = inverse(TRUTH[7]) @ TRUTH[8]
     between = unit(unit(first) + share * unit(turned[:3, :3] @ second))
     pairs, keypoints = _over_two_steps(7, between)
-    found = judgement.steps(pairs, keypoints, VERIFY)
-    assert judgement.off_steps(pairs, found, keypoints, VERIFY).max() < np.deg2rad(0.01)
+    found = image_steps(pairs, keypoints, VERIFY)
+    assert off_steps(pairs, found, keypoints, VERIFY).max() < np.deg2rad(0.01)
 
 
 @pytest.mark.parametrize("degrees", [1.0, 5.0, 20.0, 120.0])
@@ -235,8 +235,8 @@ def test_a_pair_over_two_steps_that_leaves_them_is_as_far_off(degrees: float) ->
     middle, normal = unit(unit(first) + unit(second)), unit(np.cross(first, second))
     angle = np.deg2rad(degrees)
     pairs, keypoints = _over_two_steps(7, np.cos(angle) * middle + np.sin(angle) * normal)
-    found = judgement.steps(pairs, keypoints, VERIFY)
-    off = judgement.off_steps(pairs, found, keypoints, VERIFY)
+    found = image_steps(pairs, keypoints, VERIFY)
+    off = off_steps(pairs, found, keypoints, VERIFY)
     assert off[:-1].max() == 0
     wanted = min(angle, np.arccos(np.cos(angle) * (middle @ unit(first))))
     assert off[-1] == pytest.approx(wanted if degrees < 90 else off[-1], abs=1e-6)

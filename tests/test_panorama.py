@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gsba.camera.rig import CubeRig
+from gsba.camera.sphere import bearings_from_erp
 from gsba.frames.panorama import load_grey, width_for
-from gsba.geometry import bearings_from_erp
 from gsba.types import FACES, FrameSet
 
 SIZE = 64

@@ -7,16 +7,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import bearings_of, features_of, loop_walk, unit, with_noise
 
-from gsba.bundle.adjustment import Adjustment
 from gsba.config import PairSettings, RefineSettings
 from gsba.features import detection
-from gsba.geometry import carried, inverse, pose, rotation_angle
+from gsba.geometry import inverse, pose, rotation_angle
 from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.merged_map import Registered, follow
 from gsba.matching.guided_search import MatchContext, SearchableFrames
+from gsba.similarity import Sim3
 from gsba.trajectory.joining import GUESS, PLACES, Joint
 from gsba.trajectory.judgement import Trust
-from gsba.types import CoarsePoses, Counts, Landmarks, PoseSource, Tracks
+from gsba.types import CoarsePoses, Counts, Landmarks, PoseSource, Solution, Tracks
 
 NUM, POINTS, HALF = 40, 1500, 20
 TRUTH = loop_walk(NUM)
@@ -28,7 +28,7 @@ SCALE = 1.7
 MOVE = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -3.0, 8.0]))
 
 
-def _scene(strange: bool = False) -> tuple[MatchContext, Adjustment, np.ndarray]:
+def _scene(strange: bool = False) -> tuple[MatchContext, Solution, np.ndarray]:
     """Once around, mapped in two halves; `strange`: the second half looks like nothing else.
 
     Returns the map in one world, and the point that each of its landmarks is.
@@ -52,13 +52,13 @@ def _scene(strange: bool = False) -> tuple[MatchContext, Adjustment, np.ndarray]
     landmarks = Landmarks(points[kept // 2], own, Counts(len(kept), len(kept), "tracks"))
     among = SearchableFrames(frames.__getitem__)
     context = MatchContext(among, among, detection.gather(frames), SETTINGS, 1)
-    return context, Adjustment(TRUTH, landmarks, 1.0, ()), kept % 2 == 1
+    return context, Solution(TRUTH, landmarks, 1.0, ()), kept % 2 == 1
 
 
-def _torn(solved: Adjustment, late: np.ndarray, scale: float, move: np.ndarray) -> Adjustment:
+def _torn(solved: Solution, late: np.ndarray, scale: float, move: np.ndarray) -> Solution:
     """The second half in a world and scale of its own."""
     poses, points = solved.world_T_rigs.copy(), solved.landmarks.points_world.copy()
-    poses[HALF:] = carried(poses[HALF:], scale, move)
+    poses[HALF:] = Sim3.of(scale, move).poses(poses[HALF:])
     points[late] = scale * points[late] @ move[:3, :3].T + move[:3, 3]
     return replace(
         solved, world_T_rigs=poses, landmarks=replace(solved.landmarks, points_world=points)
@@ -73,7 +73,7 @@ def _halves(alone: tuple[int, ...] = ()) -> np.ndarray:
     return connectivity.by_size(found)
 
 
-def _without_map(solved: Adjustment, alone: tuple[int, ...]) -> Adjustment:
+def _without_map(solved: Solution, alone: tuple[int, ...]) -> Solution:
     """Some frames without observations, and nowhere near where they are."""
     tracks, poses = solved.landmarks.tracks, solved.world_T_rigs.copy()
     keep = ~np.isin(tracks.frames, alone)
@@ -195,7 +195,7 @@ def test_a_piece_of_the_trajectory_goes_where_its_frames_were_carried() -> None:
     np.testing.assert_allclose(moved.world_T_rigs, found.solved.world_T_rigs, atol=1e-9)
     assert joints[0].how == PLACES and trust.false_steps[HALF - 1]
     # What the piece's own poses were before the guess now lies where the map has them.
-    own = carried(MOVE[None], 1.0, np.eye(4))  # any pose will do
-    again = carried(carried(own, 2.0, MOVE), found.scales[-1], found.moves[-1])
-    joined = carried(own, joints[0].scale, joints[0].world_T_own)
+    own = Sim3.of(1.0, np.eye(4)).poses(MOVE[None])  # any pose will do
+    again = Sim3.of(found.scales[-1], found.moves[-1]).poses(Sim3.of(2.0, MOVE).poses(own))
+    joined = Sim3.of(joints[0].scale, joints[0].world_T_own).poses(own)
     np.testing.assert_allclose(joined, again, atol=1e-9)

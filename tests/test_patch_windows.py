@@ -7,7 +7,7 @@ from synthetic import unit
 
 from factors.patch_windows import pixels_of
 from factors.sphere_image import SphereImage
-from gsba.geometry import bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.photometric.patches import halved
 
 WIDTH = 256

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from factors import tangent_basis
 from factors.patches import ALIGNED, REASONS, PatchSet, Sightings, expect, found_at
 from factors.sphere_image import SphereImage
-from gsba.geometry import bearings_from_erp
+from gsba.camera.sphere import bearings_from_erp
 
 HEIGHT = 256
 WIDTH = 2 * HEIGHT

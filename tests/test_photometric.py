@@ -11,11 +11,11 @@ from synthetic import unit
 from tiny_run import SETTINGS, Case, computed_stages
 
 from gsba.bundle import adjustment
+from gsba.camera.sphere import erp_from_bearings
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.config_file import load_config
 from gsba.export.images import write_image
 from gsba.frames.masks import levels_of
-from gsba.geometry import erp_from_bearings
 from gsba.log import GsbaError
 from gsba.photometric import direct, patches
 from gsba.pipeline.backend import Line
@@ -114,13 +114,12 @@ def test_the_report_tells_of_patches(joint) -> None:
 
 def _start(case: Case, settings: RefineSettings):
     from gsba.bundle import prior_factors
-    from gsba.bundle.adjustment import Adjustment
     from gsba.frames import cubemap
     from gsba.store.store import load_stage
-    from gsba.types import Keypoints
+    from gsba.types import Keypoints, Solution
 
     frames = load_stage(case.out, "frames", FrameSet)
-    solved = load_stage(case.out, "refined1", Adjustment)
+    solved = load_stage(case.out, "refined1", Solution)
     keypoints = load_stage(case.out, "keypoints", Keypoints)
     priors = prior_factors.build(case.result.coarse.world_T_rigs, settings.priors)
     return frames, keypoints, solved, priors, cubemap.rig_for(frames, settings.cubemap)

@@ -17,8 +17,9 @@ from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.geometry import pose, rotation_angle
+from gsba.similarity import Sim3
 from gsba.trajectory.files import read_trajectory, write_tum
-from gsba.trajectory.joining import IMAGES, carried
+from gsba.trajectory.joining import IMAGES
 from gsba.types import PoseStatus, Trajectory
 
 SCALE = 1.7
@@ -51,7 +52,7 @@ def test_two_files_with_worlds_of_their_own_are_joined(case: Case, tmp_path: Pat
     slam = read_trajectory(case.slam)
     half, times = NUM_FRAMES // 2, slam.timestamps
     first = Trajectory(times[:half], slam.world_T_rigs[:half])
-    second = Trajectory(times[half:], carried(slam.world_T_rigs[half:], SCALE, MOVE))
+    second = Trajectory(times[half:], Sim3.of(SCALE, MOVE).poses(slam.world_T_rigs[half:]))
     files = _write(tmp_path, {"a.tum": first, "b.tum": second})
     out = tmp_path / "run"
     result = _refine(out, case.frames, *files)

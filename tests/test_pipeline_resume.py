@@ -54,19 +54,20 @@ def test_a_changed_frame_is_extracted_alone(case: Case, tmp_path: Path) -> None:
 
 
 _DEADLY = """
-import itertools, os, signal, sys
+import importlib, itertools, os, signal, sys
 from pathlib import Path
-from gsba import features, frontend, pipeline
+from gsba import refine
 from gsba.config import RefineSettings
 settings, frames, slam, out, module, name, survived = sys.argv[1:]
-real, calls = getattr(globals()[module], name), itertools.count(1)
+module = importlib.import_module(module)
+real, calls = getattr(module, name), itertools.count(1)
 def deadly(*arguments, **options):
     if next(calls) > int(survived):
         os.kill(os.getpid(), signal.SIGKILL)
     return real(*arguments, **options)
-setattr(globals()[module], name, deadly)
+setattr(module, name, deadly)
 settings = RefineSettings.model_validate_json(settings)
-pipeline.refine(Path(frames), Path(slam), Path(out), settings)
+refine(Path(frames), Path(slam), Path(out), settings)
 """
 
 
@@ -84,10 +85,10 @@ def _kill_in(case: Case, out: Path, module: str, name: str, survived: int = 0) -
 
 def test_a_killed_run_goes_on_where_it_was(case: Case, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    _kill_in(case, out, "features", "extract", survived=5)
+    _kill_in(case, out, "gsba.features.detection", "extract", survived=5)
     stored = {path: path.stat().st_mtime_ns for path in (out / "stages/features").glob("0*.npz")}
     assert 3 <= len(stored) < NUM_FRAMES  # two threads may hold one frame each
-    _kill_in(case, out, "frontend", "match_loops")
+    _kill_in(case, out, "gsba.matching.correspondences", "match_loops")
     assert all(path.stat().st_mtime_ns == time for path, time in stored.items())
     assert not any((out / name).exists() for name in ("trajectory.tum", "colmap", "report.json"))
     result = case.refine(out)

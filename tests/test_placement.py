@@ -12,15 +12,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
+from gsba.camera.sphere import bearings_from_erp
 from gsba.cli import app
 from gsba.config import PlacementSettings
 from gsba.export import ExportFormat, export
-from gsba.geometry import angular_errors, bearings_from_erp, pose, similarity
+from gsba.geometry import angular_errors, pose
 from gsba.log import GsbaError
 from gsba.placement import gravity
 from gsba.placement.gps import local_from_geodetic, read_gps
 from gsba.placement.placement import Placement, place
-from gsba.similarity import level_similarity, robust_similarity
+from gsba.similarity import Sim3, level_similarity, robust_similarity, similarity
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import FrameSet, Reconstruction, Trajectory
 
@@ -54,7 +55,7 @@ def _result(num: int = 40, straight: bool = False) -> Reconstruction:
         observation_sigmas=base.observation_sigmas[keep],
     )
     turn = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
-    return Placement(0.21, turn, np.array([3.0, -2.0, 5.0])).apply(world)
+    return Placement(Sim3(0.21, turn, np.array([3.0, -2.0, 5.0]))).apply(world)
 
 
 def _level(result: Reconstruction) -> np.ndarray:
@@ -100,7 +101,7 @@ def test_covariances_and_angles_follow() -> None:
     cov = np.tile(np.diag([1.0, 2, 3, 4, 5, 6]), (scene.NUM_FRAMES, 1, 1))
     base = dataclasses.replace(base, pose_covariances=cov)
     turn = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
-    placement = Placement(2.0, turn, np.array([3.0, -2.0, 5.0]))
+    placement = Placement(Sim3(2.0, turn, np.array([3.0, -2.0, 5.0])))
     moved = placement.apply(base)
     np.testing.assert_allclose(
         np.diagonal(moved.pose_covariances, axis1=1, axis2=2)[0], [1, 2, 3, 16, 20, 24]
@@ -111,7 +112,8 @@ def test_covariances_and_angles_follow() -> None:
         moved.observation_bearings,
     )
     assert errors.max() < 1e-9  # the pictures still say the same
-    back = Placement(0.5, turn.T, -0.5 * turn.T @ placement.translation).apply(moved)
+    shift = -0.5 * turn.T @ placement.similarity.translation
+    back = Placement(Sim3(0.5, turn.T, shift)).apply(moved)
     np.testing.assert_allclose(back.world_T_rigs, base.world_T_rigs, atol=1e-12)
     np.testing.assert_allclose(placement.matrix @ placement.inverse, np.eye(4), atol=1e-12)
 
@@ -119,7 +121,7 @@ def test_covariances_and_angles_follow() -> None:
 def test_every_export_says_what_was_done(tmp_path: Path) -> None:
     base, frames = scene.reconstruction(), scene.panoramas(tmp_path / "frames")
     turn = Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix()
-    placement = Placement(3.0, turn, np.array([1.0, 2, 3]), unit="m", up="z")
+    placement = Placement(Sim3(3.0, turn, np.array([1.0, 2, 3])), unit="m", up="z")
     export(base, frames, tmp_path / "tum", ExportFormat.TUM, placement=placement)
     placed = read_trajectory(tmp_path / "tum/trajectory.tum").world_T_rigs
     said = json.loads((tmp_path / "tum/transform.json").read_text())
@@ -211,10 +213,10 @@ def test_heading_and_scale_with_gravity_known() -> None:
     turn = Rotation.from_rotvec([0, 0, 2.2]).as_matrix()
     target = 4.0 * source @ turn.T + [7, 8, 9]
     target[:6] += rng.normal(0, 30, (6, 3))
-    (scale, rotation, shift), used, sigma = robust_similarity(source, target, level_similarity, 2)
-    assert scale == pytest.approx(4) and sigma < 1e-9 and not used[:6].any() and used[6:].all()
-    np.testing.assert_allclose(rotation, turn, atol=1e-9)
-    np.testing.assert_allclose(shift, [7, 8, 9], atol=1e-8)
+    fit, used, sigma = robust_similarity(source, target, level_similarity, 2)
+    assert fit.scale == pytest.approx(4) and sigma < 1e-9 and not used[:6].any() and used[6:].all()
+    np.testing.assert_allclose(fit.rotation, turn, atol=1e-9)
+    np.testing.assert_allclose(fit.translation, [7, 8, 9], atol=1e-8)
 
 
 def test_robust_similarity_without_outliers_is_least_squares() -> None:
@@ -223,13 +225,13 @@ def test_robust_similarity_without_outliers_is_least_squares() -> None:
     target = 2 * source + rng.normal(0, 0.1, (50, 3))
     fit, used, _ = robust_similarity(source, target, similarity, 3)
     assert used.all()
-    np.testing.assert_allclose(fit[1], similarity(source, target)[1], atol=1e-12)
+    np.testing.assert_allclose(fit.rotation, similarity(source, target).rotation, atol=1e-12)
 
 
 def test_truth_with_large_coordinates(tmp_path: Path) -> None:
     result, frames = _result(), _frames(40)
     far = np.array([691_234.5, 5_334_567.25, 540.0])
-    true = Placement(1 / 0.21, np.eye(3), far).apply(result).world_T_rigs
+    true = Placement(Sim3(1 / 0.21, translation=far)).apply(result).world_T_rigs
     write_tum(tmp_path / "truth.tum", Trajectory(frames.timestamps + 0.004, true))
     placed = place(result, frames, PlacementSettings(align=str(tmp_path / "truth.tum")))
     assert np.abs(placed.translation).max() < 200 and placed.offset[1] == 5_334_600
@@ -240,7 +242,7 @@ def test_truth_with_large_coordinates(tmp_path: Path) -> None:
 def test_truth_of_a_straight_walk_takes_the_roll_from_orientations(tmp_path: Path) -> None:
     result, frames = _result(straight=True), _frames(40)
     turn = Rotation.from_rotvec([1.0, 0.3, -0.4]).as_matrix()
-    true = Placement(7.0, turn, np.ones(3)).apply(result).world_T_rigs
+    true = Placement(Sim3(7.0, turn, np.ones(3))).apply(result).world_T_rigs
     write_tum(tmp_path / "truth.tum", Trajectory(frames.timestamps, true))
     placed = place(result, frames, PlacementSettings(align=str(tmp_path / "truth.tum")))
     np.testing.assert_allclose(placed.apply(result).world_T_rigs, true, atol=1e-9)

@@ -7,14 +7,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import bearings_of, features_of, loop_walk, unit, with_noise
 
-from gsba.bundle.adjustment import Adjustment
 from gsba.config import PairSettings, RefineSettings
 from gsba.features import detection
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.loop_closure import loops
-from gsba.loop_closure.loops import Loop
+from gsba.loop_closure.pose_graph import Loop
+from gsba.loop_closure.retrieval import _aggregate, looks_of
 from gsba.matching.guided_search import MatchContext, SearchableFrames
-from gsba.types import Counts, Keypoints, Landmarks, Tracks
+from gsba.similarity import relative_map
+from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
 
 NUM_FRAMES, NUM_POINTS = 40, 1500
 SETTINGS = RefineSettings(pairs=PairSettings(window=8, max_baseline_depths=0.8))
@@ -22,7 +23,7 @@ TRUTH = loop_walk(NUM_FRAMES)
 SEEN = np.zeros(NUM_FRAMES - 1, bool)
 
 
-def _scene(heading: float = 0.0) -> tuple[SearchableFrames, Keypoints, Adjustment]:
+def _scene(heading: float = 0.0) -> tuple[SearchableFrames, Keypoints, Solution]:
     """Once around; every frame sees what is near, the last ones what the first ones see."""
     rng = np.random.default_rng(0)
     near = TRUTH[rng.integers(0, NUM_FRAMES, NUM_POINTS), :3, 3]
@@ -44,11 +45,11 @@ def _scene(heading: float = 0.0) -> tuple[SearchableFrames, Keypoints, Adjustmen
     kept = np.unique(rows[:, 0])
     own = Tracks(renumbered.astype(np.int32), rows[:, 1], rows[:, 2], len(kept))
     landmarks = Landmarks(points[kept], own, Counts(len(kept), len(kept), "tracks"))
-    solved = Adjustment(turned, landmarks, 1.0, ())
+    solved = Solution(turned, landmarks, 1.0, ())
     return SearchableFrames(frames.__getitem__), detection.gather(frames), solved
 
 
-def _split(solved: Adjustment) -> Adjustment:
+def _split(solved: Solution) -> Solution:
     """The same points as two maps would hold them: those of the first half, and of the second."""
     tracks = solved.landmarks.tracks
     late = tracks.frames >= NUM_FRAMES // 2
@@ -62,7 +63,7 @@ def _split(solved: Adjustment) -> Adjustment:
     return replace(solved, landmarks=Landmarks(placed, own, solved.landmarks.counts))
 
 
-def _moved(solved: Adjustment, by: np.ndarray) -> Adjustment:
+def _moved(solved: Solution, by: np.ndarray) -> Solution:
     """The second half of frames and points carried off."""
     poses = solved.world_T_rigs.copy()
     half = NUM_FRAMES // 2
@@ -72,16 +73,14 @@ def _moved(solved: Adjustment, by: np.ndarray) -> Adjustment:
     points = solved.landmarks.points_world.copy()
     late = first >= half
     points[late] = points[late] @ by[:3, :3].T + by[:3, 3]
-    return Adjustment(poses, replace(solved.landmarks, points_world=points), 1.0, ())
+    return Solution(poses, replace(solved.landmarks, points_world=points), 1.0, ())
 
 
 def test_looks_do_not_depend_on_heading() -> None:
     straight, turned = _scene()[0], _scene(heading=2.0)[0]
     words = straight[0].descriptors[:64]
     for f in range(NUM_FRAMES):
-        one, other = (
-            loops._aggregate(frames[f].descriptors, words) for frames in (straight, turned)
-        )
+        one, other = (_aggregate(frames[f].descriptors, words) for frames in (straight, turned))
         np.testing.assert_allclose(one, other, atol=1e-5)
 
 
@@ -90,7 +89,7 @@ def _context(frames: SearchableFrames, keypoints: Keypoints) -> MatchContext:
 
 
 def test_the_same_place_looks_most_alike() -> None:
-    looks = loops.describe(_scene()[0], NUM_FRAMES, 0)
+    looks = looks_of(_scene()[0], NUM_FRAMES, 0)
     far = [f for f in range(NUM_FRAMES) if 4 < f < NUM_FRAMES - 4]
     alike = looks @ looks.T
     assert alike[0, NUM_FRAMES - 1] > max(alike[0, f] for f in far)
@@ -117,7 +116,7 @@ def test_a_map_torn_in_two_is_joined_where_it_meets(heading: float) -> None:
     assert np.median(np.linalg.norm(rays - seen, axis=1)) < 2e-3
 
 
-def bearings_of_each(points: np.ndarray, solved: Adjustment, tracks: Tracks) -> np.ndarray:
+def bearings_of_each(points: np.ndarray, solved: Solution, tracks: Tracks) -> np.ndarray:
     poses = solved.world_T_rigs[tracks.frames]
     return unit(np.einsum("oji,oj->oi", poses[:, :3, :3], points - poses[:, :3, 3]))
 
@@ -170,10 +169,10 @@ def test_what_two_frames_see_fixes_pose_and_scale() -> None:
     true = pose(Rotation.from_rotvec([0.3, 2.0, -0.2]).as_matrix(), np.array([0.4, -0.2, 0.1]))
     points1 = 1.7 * (points0 - true[:3, 3]) @ true[:3, :3]
     points1[:20] = rng.normal(size=(20, 3))
-    found = loops.relative_map(points0, points1, 0)
+    found = relative_map(points0, points1, 0)
     assert found is not None and 40 <= found[1] <= 42
     np.testing.assert_allclose(found[0], true, atol=0.05)
-    assert loops.relative_map(points0[:20], points1[:20], 0) is None
+    assert relative_map(points0[:20], points1[:20], 0) is None
 
 
 def test_links_between_parts() -> None:

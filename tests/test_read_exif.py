@@ -196,10 +196,10 @@ def test_a_run_is_refused_before_it_begins(tmp_path: Path) -> None:
     slam = tmp_path / "slam.tum"
     slam.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(4)))
     with pytest.raises(GsbaError, match="--gps exif: 0 of 4 frames"):
-        refine.refine(folder, slam, tmp_path / "run", settings, fps=1)
+        refine(folder, slam, tmp_path / "run", settings, fps=1)
     (tmp_path / "walk.mp4").write_bytes(b"")
     with pytest.raises(GsbaError, match="a video's frames have no tags"):
-        refine.refine(tmp_path / "walk.mp4", slam, tmp_path / "run", settings)
+        refine(tmp_path / "walk.mp4", slam, tmp_path / "run", settings)
     arguments = [
         "refine",
         folder,

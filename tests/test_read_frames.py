@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from gsba.frames.masks import load_mask
-from gsba.frames.scan import load_erp, load_faces, scan
+from gsba.frames.pixels import load_erp, load_faces
+from gsba.frames.scan import scan
 from gsba.log import GsbaError
 from gsba.types import FACES
 

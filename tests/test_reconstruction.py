@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import World, make_world
 
-from gsba.bundle.adjustment import Adjustment
 from gsba.bundle.reconstruction import assemble
 from gsba.geometry import angular_errors, inverse, pose
 from gsba.log import GsbaError
@@ -19,6 +18,7 @@ from gsba.types import (
     PoseSource,
     PoseStatus,
     Reconstruction,
+    Solution,
 )
 
 SCALE = 0.25
@@ -39,10 +39,10 @@ def _points_in_slam(points: np.ndarray) -> np.ndarray:
     return SCALE * points @ SLAM_R_WORLD.T + SLAM_SHIFT
 
 
-def _adjustment(world: World, noise: float = 1.7) -> Adjustment:
+def _adjustment(world: World, noise: float = 1.7) -> Solution:
     counts = Counts(world.tracks.num_points, world.tracks.num_points, "tracks")
     landmarks = Landmarks(world.points_world, world.tracks, counts)
-    return Adjustment(world.world_T_rigs, landmarks, noise, ())
+    return Solution(world.world_T_rigs, landmarks, noise, ())
 
 
 def _assemble(

@@ -6,14 +6,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from synthetic import bearings_of, features_of, unit, with_noise
 
-from gsba.bundle import adjustment
 from gsba.config import RefineSettings
 from gsba.features import detection
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.matching import correspondences, recovery
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
-from gsba.types import CoarsePoses, Keypoints, PoseSource
+from gsba.types import CoarsePoses, Keypoints, PoseSource, Solution
 
 NUM, NUM_FRAMES = 250, 8
 TRUTH = pose(
@@ -44,7 +43,7 @@ def _context(cut: int | None = None) -> MatchContext:
 
 def _run(slam: np.ndarray, cut: int | None = None, times: np.ndarray = TIMES) -> Recovered:
     context = _context(cut)
-    guided = correspondences.match_neighbours(context, adjustment.start(slam))
+    guided = correspondences.match_neighbours(context, Solution.without_points(slam))
     coarse = CoarsePoses(slam, np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8), 0.0)
     return recovery.run(context, guided, coarse, times)
 

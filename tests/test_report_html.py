@@ -14,8 +14,8 @@ import export_scene as scene
 import numpy as np
 import pytest
 
+from gsba.camera.sphere import bearings_from_erp
 from gsba.config import RefineSettings
-from gsba.geometry import bearings_from_erp
 from gsba.report.html import pictures, residual_sphere, views, write_html
 from gsba.report.report import build_report
 from gsba.store.store import StageRecord

@@ -8,11 +8,12 @@ from scipy.spatial.transform import Rotation
 from synthetic import drifted, loop_walk, unit
 
 from gsba.config import ReadSettings
-from gsba.geometry import carried, inverse, pose, rotation_angle
+from gsba.geometry import inverse, pose, rotation_angle
+from gsba.similarity import Sim3
 from gsba.trajectory import joining
 from gsba.trajectory.joining import GUESS, IMAGES
-from gsba.trajectory.judgement import Steps
 from gsba.trajectory.restarts import associate_pieces, split_restarts
+from gsba.trajectory.steps import Steps
 from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
 
 NUM, BREAK = 40, 17
@@ -31,7 +32,7 @@ def _frames(num: int = NUM) -> FrameSet:
 def _begun_anew(scale: float = SCALE) -> np.ndarray:
     """The walk as a SLAM writes it that loses its map: the identity once more."""
     poses = inverse(TRUTH[:1]) @ TRUTH
-    poses[BREAK:] = carried(inverse(TRUTH[BREAK])[None] @ TRUTH[BREAK:], scale, np.eye(4))
+    poses[BREAK:] = Sim3.of(scale, np.eye(4)).poses(inverse(TRUTH[BREAK])[None] @ TRUTH[BREAK:])
     return poses
 
 
@@ -97,7 +98,7 @@ def test_frames_between_pieces_go_on_from_the_nearer_one() -> None:
 
 
 def test_where_pieces_overlap_the_earlier_leads() -> None:
-    other = carried(TRUTH, SCALE, MOVE)
+    other = Sim3.of(SCALE, MOVE).poses(TRUTH)
     pieces = [Trajectory(TIMES[:25], TRUTH[:25]), Trajectory(TIMES[10:], other[10:])]
     coarse = associate_pieces(_frames(), pieces, ReadSettings())
     np.testing.assert_allclose(coarse.world_T_rigs[:25], TRUTH[:25], atol=1e-12)
@@ -109,19 +110,19 @@ def test_where_pieces_overlap_the_earlier_leads() -> None:
 
 def test_the_images_over_the_break_join_both_pieces() -> None:
     poses = TRUTH.copy()
-    poses[BREAK:] = carried(TRUTH[BREAK:], SCALE, MOVE)
+    poses[BREAK:] = Sim3.of(SCALE, MOVE).poses(TRUTH[BREAK:])
     coarse, joints = joining.join(_coarse(poses), *_steps(np.ones(NUM - 1, bool)))
     np.testing.assert_allclose(coarse.world_T_rigs, TRUTH, atol=1e-6)
     (joint,) = joints
     assert (joint.first, joint.last, joint.how) == (BREAK, NUM - 1, IMAGES)
     assert joint.scale == pytest.approx(1 / SCALE)
-    moved = carried(poses[BREAK:], joint.scale, joint.world_T_own)
+    moved = Sim3.of(joint.scale, joint.world_T_own).poses(poses[BREAK:])
     np.testing.assert_allclose(moved, TRUTH[BREAK:], atol=1e-6)
 
 
 def test_false_poses_near_the_break_do_not_bend_the_joint() -> None:
     poses = TRUTH.copy()
-    poses[BREAK:] = carried(TRUTH[BREAK:], SCALE, MOVE)
+    poses[BREAK:] = Sim3.of(SCALE, MOVE).poses(TRUTH[BREAK:])
     turn = Rotation.from_rotvec([0, 0.5, 0]).as_matrix()
     for f in (BREAK - 3, BREAK + 2):
         poses[f] = poses[f] @ pose(turn, np.array([0.5, 0.3, 0]))
@@ -135,7 +136,7 @@ def test_false_poses_near_the_break_do_not_bend_the_joint() -> None:
 
 def test_without_images_over_the_break_the_pace_goes_on() -> None:
     poses = TRUTH.copy()
-    poses[BREAK:] = carried(TRUTH[BREAK:], SCALE, MOVE)
+    poses[BREAK:] = Sim3.of(SCALE, MOVE).poses(TRUTH[BREAK:])
     seen = np.ones(NUM - 1, bool)
     seen[BREAK - 1] = False
     coarse, joints = joining.join(_coarse(poses), *_steps(seen))

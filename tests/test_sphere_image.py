@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import map_coordinates, spline_filter
 
 from factors.sphere_image import SphereImage
-from gsba.geometry import bearings_from_erp
+from gsba.camera.sphere import bearings_from_erp
 
 HEIGHT = 64
 WIDTH = 2 * HEIGHT

@@ -18,6 +18,8 @@ from gsba.log import GsbaError
 from gsba.pipeline.refine import load_run
 from gsba.splat import from_cloud, read_ply, scene
 from gsba.splat.backend import CpuBackend
+from gsba.splat.pictures import render_faces, render_panorama
+from gsba.splat.scores import measure
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
@@ -128,8 +130,8 @@ def test_a_panorama_shows_what_the_faces_show(run: Path) -> None:
     reconstruction, _ = load_run(run)
     splat = read_ply(run / "splat/refined/point_cloud.ply")
     where, backend = reconstruction.world_T_rigs[0], CpuBackend(1)
-    panorama = scene.render_panorama(splat, where, 256, 0.01, backend)
-    faces = scene.render_faces(splat, where, CubeRig(65, np.pi / 2), 0.01, backend)
+    panorama = render_panorama(splat, where, 256, 0.01, backend)
+    faces = render_faces(splat, where, CubeRig(65, np.pi / 2), 0.01, backend)
     assert np.abs(panorama[64, 128].astype(int) - faces[0, 32, 32]).max() < 12  # straight ahead
     assert np.abs(panorama[64, 192].astype(int) - faces[1, 32, 32]).max() < 12  # right
 
@@ -143,7 +145,7 @@ def test_a_masked_face_is_left_out(case: Case) -> None:
     nothing = scene.make_views(images, np.zeros_like(use), np.eye(4)[None])
     gaussians = from_cloud(np.ones((2, 3)), np.zeros((2, 3), np.uint8))
     with pytest.raises(GsbaError, match="held-out frames are masked"):
-        scene.measure(gaussians, nothing, SplatSettings(), 0.01, CpuBackend(1))
+        measure(gaussians, nothing, SplatSettings(), 0.01, CpuBackend(1))
 
 
 def test_panoramas_at_one_place_are_scored_apart() -> None:
@@ -151,7 +153,7 @@ def test_panoramas_at_one_place_are_scored_apart() -> None:
     images[6:] = 128
     views = scene.make_views(images, np.ones((12, 16, 16), bool), np.eye(4)[None].repeat(2, 0))
     gaussians = from_cloud(np.full((2, 3), 99.0), np.zeros((2, 3), np.uint8))
-    scores = scene.measure(gaussians, views, SplatSettings(), 0.01, CpuBackend(1))
+    scores = measure(gaussians, views, SplatSettings(), 0.01, CpuBackend(1))
     assert list(scores) == [0, 1] and scores[0].psnr > scores[1].psnr
     assert scores[1].psnr == pytest.approx(-20 * np.log10(128 / 255), abs=1e-3)
 

@@ -9,13 +9,13 @@ from synthetic import RIG, World, make_world
 
 from factors.sphere_field import SphereField, num_harmonics
 from gsba.bundle import adjustment, prior_factors, stitching
-from gsba.bundle.adjustment import Adjustment
 from gsba.bundle.optimizer import optimize
 from gsba.bundle.stitching import Stitching, corrected, with_noise_of
+from gsba.camera.sphere import bearings_from_erp
 from gsba.camera.straighten import straightened
 from gsba.config import RefineSettings
-from gsba.geometry import bearings_from_erp, pose_similarity
-from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
+from gsba.similarity import pose_similarity
+from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution, Tracks
 
 SIGMA = 2e-4  # radians
 SETTINGS = RefineSettings.model_validate(
@@ -37,7 +37,7 @@ def _true_field() -> SphereField:
 
 
 @cache
-def _found(bent: bool) -> tuple[World, Adjustment, Keypoints, Stitching]:
+def _found(bent: bool) -> tuple[World, Solution, Keypoints, Stitching]:
     """World, the map solved without a field, keypoints, and what was found."""
     world = make_world(0, num_frames=16, num_points=900, sigma_rad=SIGMA, false_share=0.02)
     keypoints = _bent(world, _true_field() if bent else SphereField.none())
@@ -45,7 +45,7 @@ def _found(bent: bool) -> tuple[World, Adjustment, Keypoints, Stitching]:
         keypoints, np.ones(len(keypoints.faces), bool), world.tracks, Counts(0, 0, "observations")
     )
     priors = prior_factors.build(world.world_T_rigs, SETTINGS.priors)
-    start = adjustment.start(world.world_T_rigs)
+    start = Solution.without_points(world.world_T_rigs)
     given = priors, RIG, (30.0, 6.0), SETTINGS, 1
     solved, calibrated = adjustment.run_sighted(sighted, start, *given)
     none = SphereField.none()
@@ -53,12 +53,11 @@ def _found(bent: bool) -> tuple[World, Adjustment, Keypoints, Stitching]:
     return world, solved, keypoints, found
 
 
-def _errors(world: World, solved: Adjustment) -> tuple[float, float]:
+def _errors(world: World, solved: Solution) -> tuple[float, float]:
     """Root mean square error of positions, and of rotations in radians, after Sim(3)."""
     poses, true = solved.world_T_rigs, world.world_T_rigs
-    scale, rotation, shift = pose_similarity(poses, true)
-    off = scale * poses[:, :3, 3] @ rotation.T + shift - true[:, :3, 3]
-    turned = rotation @ poses[:, :3, :3] - true[:, :3, :3]
+    placed = pose_similarity(poses, true).poses(poses)
+    off, turned = placed[:, :3, 3] - true[:, :3, 3], placed[:, :3, :3] - true[:, :3, :3]
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1)))), float(
         np.sqrt(np.mean(np.sum(turned**2, axis=(1, 2))) / 2)
     )
@@ -129,12 +128,12 @@ def test_model_predicts_the_cost() -> None:
     priors = prior_factors.build(world.world_T_rigs, settings.priors)
     landmarks = Landmarks(world.points_world, world.tracks, Counts(0, 0, "tracks"))
 
-    def solved(field: SphereField) -> tuple[Adjustment, float]:
+    def solved(field: SphereField) -> tuple[Solution, float]:
         given = corrected(keypoints, field, RIG), RIG, 1.0, settings, 1
         block = adjustment.landmark_block(landmarks, *given)
         result = optimize(priors, [block], adjustment.values_of(world.world_T_rigs), plain)
         poses = adjustment.poses_of(result.values, len(world.world_T_rigs))
-        return Adjustment(poses, landmarks, 1.0, ()), block.error(result.values)
+        return Solution(poses, landmarks, 1.0, ()), block.error(result.values)
 
     before, cost = solved(SphereField.none())
     now = Stitching(SphereField.none(), before, keypoints, 0, np.zeros(4), Counts(0, 0, "o"))

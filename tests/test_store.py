@@ -14,10 +14,11 @@ import pytest
 from pydantic import BaseModel
 
 import gsba
+from gsba.disk import atomic_write
 from gsba.log import GsbaError
 from gsba.store import store as store_module
 from gsba.store.folder import claim
-from gsba.store.records import RecordError, atomic_write, load_record, save_record
+from gsba.store.records import RecordError, load_record, save_record
 from gsba.store.store import RunStore, digest, fingerprint, load_stage
 from gsba.types import Counts, Matches, PoseSource, Tracks
 
@@ -228,7 +229,7 @@ def test_resumes_after_a_kill_in_the_middle(tmp_path: Path) -> None:
     script = textwrap.dedent("""
         import os, signal, sys
         from pathlib import Path
-        from gsba import records
+        from gsba.store import records
         from gsba.store.store import RunStore
         from test_store import _tracks
         from gsba.types import Tracks

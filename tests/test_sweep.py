@@ -3,7 +3,8 @@
 import cv2
 import numpy as np
 
-from gsba.geometry import bearings_from_erp, erp_from_bearings, pose
+from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.geometry import pose
 from gsba.masks import _distractor_kernels
 
 HEIGHT, WIDTH, NUM, CAP = 24, 48, 5, 60.0

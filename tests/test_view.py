@@ -26,12 +26,13 @@ from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.cli import app
 from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
-from gsba.placement.placement import Placement, read_placement
+from gsba.placement.placement import Placement
+from gsba.similarity import Sim3, read_placement
 from gsba.splat import Gaussians, write_ply
 from gsba.types import FACES
 
 TURN = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix()
-PLACED = Placement(2.5, TURN, np.array([3.0, -1.0, 7.0]), "m", "z")
+PLACED = Placement(Sim3(2.5, TURN, np.array([3.0, -1.0, 7.0])), "m", "z")
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import gtsam
@@ -17,10 +17,18 @@ from factors import (
     tangent_basis,
 )
 from gsba.bundle import prior_factors, triangulation
-from gsba.bundle.optimizer import Iteration, marginal_covariances, optimize
+from gsba.bundle.optimizer import marginal_covariances, optimize
 from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.config import RefineSettings, SolverSettings
-from gsba.types import Counts, JointErrors, Keypoints, Landmarks, Sighted, Tracks
+from gsba.types import (
+    JointErrors,
+    Keypoints,
+    Landmarks,
+    Round,
+    Sighted,
+    Solution,
+    Tracks,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -30,48 +38,15 @@ _DRAWS = 500  # errors of all poses, that tell how those of different ones belon
 _REDUNDANT = 0.1  # least share of residual dimensions left over by the unknowns
 
 
-@dataclass(frozen=True, slots=True)
-class Round:
-    """One bundle adjustment and what was kept of it."""
-
-    gate_sigmas: float  # observations further off were left out
-    noise: float  # estimated noise after the round, in units of the features' own sigmas
-    observations: int  # used
-    points: int  # used
-    support: int  # observations within the last gate of all tracks, under the round's poses
-    accepted: bool  # False: the poses before the round have more support and were kept
-    iterations: tuple[Iteration, ...]  # cost by family
-    reason: str  # why the solver stopped
-
-
-@dataclass(frozen=True, slots=True)
-class Adjustment:
-    """Poses and points after the last good round."""
-
-    world_T_rigs: np.ndarray  # (F, 4, 4) float64
-    landmarks: Landmarks
-    noise: float  # of observations, in units of the features' own sigmas
-    rounds: tuple[Round, ...]
-
-
-def start(world_T_rigs: np.ndarray) -> Adjustment:
-    """Poses (F, 4, 4) as a solution without points."""
-    nothing = np.zeros(0, np.int32)
-    landmarks = Landmarks(
-        np.zeros((0, 3)), Tracks(nothing, nothing, nothing, 0), Counts(0, 0, "tracks")
-    )
-    return Adjustment(world_T_rigs, landmarks, 1.0, ())
-
-
 def run_sighted(
     sighted: Sighted,
-    before: Adjustment,
+    before: Solution,
     priors: gtsam.NonlinearFactorGraph,
     rig: CubeRig,
     gates: Sequence[float],
     settings: RefineSettings,
     num_threads: int,
-) -> tuple[Adjustment, Keypoints]:
+) -> tuple[Solution, Keypoints]:
     """As `run`, of aligned and former observations, the noise of either estimated on its own.
 
     Returns:
@@ -80,15 +55,19 @@ def run_sighted(
     solved, rounds = before, []
     for number, gate in enumerate(gates, 1):
         sighted = calibrate(sighted, solved, settings)
-        tracks, keypoints, start = sighted.tracks, sighted.keypoints, replace(solved, noise=1.0)
+        tracks, keypoints, without_points = (
+            sighted.tracks,
+            sighted.keypoints,
+            replace(solved, noise=1.0),
+        )
         solver = _solver(settings, last=number == len(gates))
         so_far = settings.model_copy(update={"solver": solver})
-        solved = run(tracks, keypoints, start, priors, rig, (gate,), so_far, num_threads)
+        solved = run(tracks, keypoints, without_points, priors, rig, (gate,), so_far, num_threads)
         rounds += solved.rounds
     return replace(solved, rounds=tuple(rounds)), sighted.keypoints
 
 
-def calibrate(sighted: Sighted, before: Adjustment, settings: RefineSettings) -> Sighted:
+def calibrate(sighted: Sighted, before: Solution, settings: RefineSettings) -> Sighted:
     """Scale new and former observations' noise to what a solution shows of each.
 
     A patch's covariance knows the image's noise and texture, not how far a surface or a lens is
@@ -116,14 +95,14 @@ def calibrate(sighted: Sighted, before: Adjustment, settings: RefineSettings) ->
 def run(
     tracks: Tracks,
     keypoints: Keypoints,
-    start: Adjustment,
+    without_points: Solution,
     priors: gtsam.NonlinearFactorGraph,
     rig: CubeRig,
     gates: Sequence[float],
     settings: RefineSettings,
     num_threads: int,
     final: bool = True,
-) -> Adjustment:
+) -> Solution:
     """Solve for all poses in rounds of tightening gates.
 
     The noise of observations is estimated anew after each round from what the unknowns leave over,
@@ -133,7 +112,7 @@ def run(
     Args:
         tracks: candidate tracks; every round starts from all of them.
         keypoints: of all frames.
-        start: poses to start from, and the noise known so far.
+        without_points: poses to without_points from, and the noise known so far.
         priors: factors on the poses, gauge included.
         rig: the faces, for the reprojection family.
         gates: of each round, in standard deviations of the noise.
@@ -141,7 +120,7 @@ def run(
         num_threads: of the solver.
         final: whether the last round is solved to the end; others lose observations anyway.
     """
-    world_T_rigs, noise, rounds = start.world_T_rigs, start.noise, []
+    world_T_rigs, noise, rounds = without_points.world_T_rigs, without_points.noise, []
     rows = keypoints.rows(tracks)
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
     shared = {"settings": settings.triangulate, "num_threads": num_threads}
@@ -166,14 +145,7 @@ def run(
         outcome = accepted, result.history, result.reason
         rounds.append(Round(gate, noise, *used, new_support, *outcome))
         logger.debug("round: %s", rounds[-1])
-    return Adjustment(world_T_rigs, place(world_T_rigs, gates[-1] * noise), noise, tuple(rounds))
-
-
-def carries(solved: Adjustment, before: Adjustment, least: int) -> bool:
-    """Whether every frame with `least` observations in one solution has as many in the other."""
-    num = len(before.world_T_rigs)
-    seen = [np.bincount(one.landmarks.tracks.frames, minlength=num) for one in (solved, before)]
-    return bool(np.all((seen[0] >= least) | (seen[1] < least)))
+    return Solution(world_T_rigs, place(world_T_rigs, gates[-1] * noise), noise, tuple(rounds))
 
 
 def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
@@ -220,7 +192,7 @@ def landmark_block(
 
 
 def pose_covariances(
-    adjustment: Adjustment,
+    adjustment: Solution,
     priors: gtsam.NonlinearFactorGraph,
     keypoints: Keypoints,
     rig: CubeRig,

@@ -13,25 +13,13 @@ from factors import Block
 from factors.reduced import ReducedSystem
 from gsba.config import SolverSettings
 from gsba.log import GsbaError
-from gsba.types import JointErrors
+from gsba.types import Iteration, JointErrors
 
 logger = logging.getLogger(__name__)
 
 _MAX_DAMPING = 1e10
 _MIN_DAMPING = 1e-12
 _FREE_DAMPING = 1e-2  # a small step says nothing about convergence where damping made it small
-
-
-@dataclass(frozen=True, slots=True)
-class Iteration:
-    """One attempted step. Iteration 0 is the start."""
-
-    number: int
-    cost: float  # total robust cost of the attempt
-    costs: Mapping[str, float]  # family -> cost; empty where the step was rejected
-    damping: float  # lambda the step was solved with
-    accepted: bool
-    seconds: float  # wall time of this attempt
 
 
 @dataclass(frozen=True, slots=True)

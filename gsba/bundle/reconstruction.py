@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from gsba.bundle.adjustment import Adjustment
-from gsba.geometry import NoSimilarityError, angular_errors, carried, pose, pose_similarity
+from gsba.geometry import angular_errors
 from gsba.log import GsbaError
+from gsba.similarity import NoSimilarityError, Sim3, pose_similarity
 from gsba.types import (
     CoarsePoses,
     JointErrors,
@@ -12,6 +12,7 @@ from gsba.types import (
     PoseSource,
     PoseStatus,
     Reconstruction,
+    Solution,
 )
 
 _ALIKE = 0.1  # least correlation of refined and coarse positions: a walk and its drift have .8
@@ -19,7 +20,7 @@ _MOST_RESIDUAL_DEG = 10.0  # median: gates leave a tenth of a degree, a failure 
 
 
 def assemble(
-    adjustment: Adjustment,
+    adjustment: Solution,
     covariances: np.ndarray,
     keypoints: Keypoints,
     coarse: CoarsePoses,
@@ -46,7 +47,7 @@ def assemble(
         GsbaError: not where the trajectory has its frames, or residuals that no solution leaves.
     """
     world_T_rigs, landmarks = adjustment.world_T_rigs, adjustment.landmarks
-    seen = np.bincount(landmarks.tracks.frames, minlength=len(world_T_rigs))
+    seen = adjustment.observations()
     refined = seen >= min_observations
     known = refined & (coarse.sources == PoseSource.SLAM)
     if false_frames is not None:
@@ -91,7 +92,7 @@ def _require_small(errors: np.ndarray) -> None:
 
 
 def _placed(
-    adjustment: Adjustment, target_T_rigs: np.ndarray, known: np.ndarray, groups: np.ndarray
+    adjustment: Solution, target_T_rigs: np.ndarray, known: np.ndarray, groups: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses, points, and factors (F, 6) of the standard deviations, each map in its own world.
 
@@ -107,8 +108,7 @@ def _placed(
     """
     poses, landmarks = adjustment.world_T_rigs, adjustment.landmarks
     placed, stretch = np.empty_like(poses), np.ones((len(poses), 6))
-    points, tracks = np.empty_like(landmarks.points_world), landmarks.tracks
-    hosts = tracks.frames[np.searchsorted(tracks.points, np.arange(tracks.num_points))]
+    points, hosts = np.empty_like(landmarks.points_world), landmarks.tracks.hosts()
     for group in np.unique(groups):
         inside = groups == group
         chosen = known & inside if np.count_nonzero(known & inside) > 1 else inside
@@ -121,10 +121,9 @@ def _placed(
                     f"lie as the trajectory has them ({error}): check its times and --fps, or "
                     "refine without it (--no-trajectory)"
                 ) from None
-            move = 1.0, np.eye(3), np.zeros(3)
-        scale, rotation, translation = move
-        placed[inside] = carried(poses[inside], scale, pose(rotation, translation))
-        stretch[inside, 3:] = scale
+            move = Sim3()
+        placed[inside] = move.poses(poses[inside])
+        stretch[inside, 3:] = move.scale
         there = inside[hosts]
-        points[there] = scale * landmarks.points_world[there] @ rotation.T + translation
+        points[there] = move.points(landmarks.points_world[there])
     return placed, points, stretch

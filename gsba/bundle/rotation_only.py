@@ -12,16 +12,21 @@ import numpy as np
 
 from factors import tangent_basis
 from gsba.bundle import tracks
-from gsba.bundle.adjustment import start
 from gsba.bundle.reconstruction import assemble
 from gsba.geometry import pose
-from gsba.matching.guided_search import Gate, MatchContext
-from gsba.types import CoarsePoses, Keypoints, Matches, PoseStatus, Reconstruction, Tracks
+from gsba.matching.correspondences import match_for_rotations
+from gsba.matching.guided_search import MatchContext
+from gsba.types import (
+    CoarsePoses,
+    Keypoints,
+    PoseStatus,
+    Reconstruction,
+    Solution,
+    Tracks,
+)
 
 logger = logging.getLogger(__name__)
 
-_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # frames between those matched
-_PREDICTED_DEG = 2.0  # around where a chain of turns sees a keypoint
 _ITERATIONS = 30
 _CONVERGED = 1e-9  # radians
 _LOSS_SIGMAS = 2.0  # Cauchy
@@ -40,29 +45,17 @@ def run(context: MatchContext, world_T_rigs: np.ndarray, coarse: CoarsePoses) ->
     Returns:
         A result without points; covariances are of rotations, NaN for positions.
     """
-    matches = _matched(context, world_T_rigs)
+    matches = match_for_rotations(context, world_T_rigs)
     keypoints = context.keypoints
     found = tracks.run([matches], np.diff(keypoints.starts))
     rotations, covariances, used = solve(world_T_rigs[:, :3, :3], found, keypoints)
     least = context.settings.rounds.min_observations
     six = np.full((len(rotations), 6, 6), np.nan)
     six[:, :3, :3] = covariances
-    solved = start(pose(rotations, world_T_rigs[:, :3, 3]))
+    solved = Solution.without_points(pose(rotations, world_T_rigs[:, :3, 3]))
     result = assemble(solved, six, keypoints, coarse, least)
     refined = np.where(used >= least, PoseStatus.REFINED, PoseStatus.UNREFINED)
     return replace(result, pose_statuses=refined.astype(np.uint8))
-
-
-def _matched(context: MatchContext, world_T_rigs: np.ndarray) -> Matches:
-    """Matches of frames near and far in time, where their rotations say."""
-    num = len(world_T_rigs)
-    chosen = [(f, f + gap) for gap in _GAPS for f in range(num - gap)]
-    pairs = np.array(chosen, np.int32).reshape(-1, 2)
-    still = world_T_rigs.copy()
-    still[:, :3, 3] = 0
-    gates = [Gate(np.pi, 1.0, np.pi, np.deg2rad(_PREDICTED_DEG))] * len(pairs)
-    directions = [context.keypoints.bearings_of(f) for f in range(num)]
-    return context.match(pairs, still, gates, directions)
 
 
 def solve(

@@ -14,10 +14,9 @@ from factors.bearing import bearing_residuals, tangent_basis
 from factors.robust import RobustLoss
 from factors.sphere_field import SphereField, degrees_of, harmonics, num_harmonics
 from gsba.bundle import adjustment
-from gsba.bundle.adjustment import Adjustment
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import RefineSettings
-from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
+from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution, Tracks
 
 logger = logging.getLogger(__name__)
 
@@ -38,7 +37,7 @@ class Stitching:
     """A field, and the map solved with it."""
 
     field: SphereField  # coefficients (0,): nothing is corrected
-    adjustment: Adjustment
+    adjustment: Solution
     keypoints: Keypoints  # of the adjustment, as observed
     degree: int  # of the best field, taken or not
     part_gains: np.ndarray  # (PARTS,) float64, share of the robust cost of each part of the
@@ -110,7 +109,7 @@ def with_noise_of(keypoints: Keypoints, calibrated: Keypoints) -> Keypoints:
 def run(
     sighted: Sighted,
     keypoints: Keypoints,
-    before: Adjustment,
+    before: Solution,
     field: SphereField,
     priors: gtsam.NonlinearFactorGraph,
     rig: CubeRig,

@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 
-from gsba.geometry import bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 
 PAD = 4  # pixels of wrap-around: the support of bicubic sampling, and more
 _COARSE = 256  # width of the grid that a field is evaluated on; it turns over 18 degrees or more

@@ -112,10 +112,10 @@ def evaluate(
         if not splat:
             raise GsbaError("nothing to compare with: give --truth FILE, or --splat")
         return
+    from gsba.disk import atomic_write
     from gsba.evaluate.pixels import depth_maps, induced_errors
     from gsba.evaluate.trajectory import evaluate as compare
     from gsba.evaluate.trajectory import format_table
-    from gsba.store.records import atomic_write
     from gsba.trajectory.files import read_trajectory
 
     path = estimate / "trajectory.tum" if estimate.is_dir() else estimate
@@ -145,7 +145,7 @@ def evaluate(
 def _consistency(run: Path, truth: "Trajectory") -> "tuple[Consistency | None, str]":
     """How the covariances of a run compare with its errors, and that or why not in words."""
     from gsba.evaluate.consistency import format_consistency, judge
-    from gsba.pipeline.outputs import load_run
+    from gsba.store.finished import load_run
 
     try:
         reconstruction, frames = load_run(run)

@@ -8,6 +8,7 @@ import typer
 
 from gsba.cli.app import command
 from gsba.log import GsbaError
+from gsba.splat.pictures import render_faces, render_panorama
 
 if TYPE_CHECKING:
     from gsba.config import SplatSettings
@@ -71,8 +72,8 @@ def render(
     near = scene.near_of(reconstruction.world_T_rigs, settings)
     pose = reconstruction.world_T_rigs[frames.names.index(frame)]
     folder, rig = out or run / "renderings", CubeRig(settings.face_size, np.pi / 2)
-    faces = scene.render_faces(gaussians, pose, rig, near, renderer)
-    panorama = scene.render_panorama(gaussians, pose, 4 * settings.face_size, near, renderer)
+    faces = render_faces(gaussians, pose, rig, near, renderer)
+    panorama = render_panorama(gaussians, pose, 4 * settings.face_size, near, renderer)
     for name, image in [*zip(FACES, faces, strict=True), ("erp", panorama)]:
         write_image(folder / f"{frame}_{name}.png", image)
     if folder.resolve().is_relative_to(run.resolve()):

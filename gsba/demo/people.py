@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.geometry import bearings_from_erp
+from gsba.camera.sphere import bearings_from_erp
 
 
 @dataclass(frozen=True, slots=True)

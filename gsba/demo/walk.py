@@ -10,8 +10,9 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from gsba.camera.sphere import bearings_from_erp
 from gsba.demo.degrade import degrade
-from gsba.geometry import bearings_from_erp, pose
+from gsba.geometry import pose
 from gsba.log import GsbaError, track
 from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory

@@ -18,9 +18,10 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from gsba.evaluate.trajectory import associate
-from gsba.geometry import adjoint, carried, furthest, inverse, step_covariances
+from gsba.geometry import adjoint, furthest, inverse, step_covariances
 from gsba.log import GsbaError
+from gsba.similarity import Sim3
+from gsba.trajectory.association import matched_in_time
 from gsba.types import Reconstruction, Trajectory
 
 EXPECTED = 0.95  # share of drawn errors within the interval that is given
@@ -135,7 +136,7 @@ def judge(
     if joint is None or not len(known):
         raise GsbaError("the run has no covariances of its poses")
     far, _ = furthest(poses[:, :3, 3])
-    rows, of_truth = associate(Trajectory(timestamps, poses), truth, tolerance_s)
+    rows, of_truth = matched_in_time(Trajectory(timestamps, poses), truth, tolerance_s)
     for frame in (0, far):
         if not np.any(rows == frame):
             raise GsbaError(
@@ -201,7 +202,7 @@ def _in_gauge(true_T_rigs: np.ndarray, world_T_rigs: np.ndarray, far: int) -> np
         if not length > 0:
             raise GsbaError(f"the {owner} does not move: its positions leave the scale open")
     scale = float(scales[0] / scales[1])
-    local = carried(inverse(true_T_rigs[0]) @ true_T_rigs, scale, np.eye(4))
+    local = Sim3.of(scale, np.eye(4)).poses(inverse(true_T_rigs[0]) @ true_T_rigs)
     return world_T_rigs[0] @ local
 
 

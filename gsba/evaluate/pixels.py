@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.evaluate.trajectory import associate
-from gsba.geometry import bearings_from_erp, carried, pose, similarity
+from gsba.camera.sphere import bearings_from_erp
 from gsba.log import GsbaError
+from gsba.similarity import similarity
 from gsba.store.records import HEADER_ERRORS
+from gsba.trajectory.association import matched_in_time
 from gsba.types import Trajectory
 
 STEPS = (1, 4)  # frames between a frame and the neighbours that look at its pixels
@@ -56,13 +57,12 @@ def induced_errors(
     Raises:
         GsbaError: fewer than three poses associate, or no frame has a neighbour.
     """
-    rows_e, rows_t = associate(estimate, truth, tolerance_s)
+    rows_e, rows_t = matched_in_time(estimate, truth, tolerance_s)
     if len(rows_t) < 3:
         raise GsbaError(f"only {len(rows_t)} poses associate with the truth; alignment needs 3")
     true_T_rigs = truth.world_T_rigs[rows_t]
     poses = estimate.world_T_rigs[rows_e]
-    scale, rotation, shift = similarity(poses[:, :3, 3], true_T_rigs[:, :3, 3])
-    aligned = carried(poses, scale, pose(rotation, shift))
+    aligned = similarity(poses[:, :3, 3], true_T_rigs[:, :3, 3]).poses(poses)
     row_of = {int(t): row for row, t in enumerate(rows_t)}
     errors: dict[int, list[np.ndarray]] = {step: [] for step in steps}
     for frame, row in row_of.items():

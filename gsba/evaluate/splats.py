@@ -15,29 +15,26 @@ from pathlib import Path
 import numpy as np
 
 from gsba.config import SplatSettings
-from gsba.evaluate.trajectory import associate
-from gsba.geometry import NoSimilarityError, carried, pose, pose_similarity
+from gsba.disk import atomic_write
 from gsba.log import GsbaError
+from gsba.similarity import NoSimilarityError, pose_similarity
 from gsba.splat.backend import Backend
 from gsba.splat.gaussians import Gaussians
+from gsba.splat.pictures import render_faces
 from gsba.splat.ply import write_ply
 from gsba.splat.scene import (
-    Distance,
-    Score,
     Split,
     load_faces,
     make_views,
-    mean_score,
-    measure,
     near_of,
     refined_frames,
-    render_faces,
     split_frames,
     start_cloud,
 )
+from gsba.splat.scores import Distance, Score, mean_score, measure
 from gsba.splat.train import Views, train
-from gsba.store.records import atomic_write
 from gsba.store.store import digest, fingerprint
+from gsba.trajectory.association import matched_in_time
 from gsba.types import FrameSet, Reconstruction, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -64,7 +61,7 @@ def poses_for(frames: FrameSet, trajectory: Trajectory, tolerance_s: float = 0.0
         GsbaError: no time fits.
     """
     expected = Trajectory(frames.timestamps, np.tile(np.eye(4), (len(frames), 1, 1)))
-    rows, which = associate(trajectory, expected, tolerance_s)
+    rows, which = matched_in_time(trajectory, expected, tolerance_s)
     if len(which) == 0:
         raise GsbaError(
             f"no pose of the trajectory is within {tolerance_s:g} s of a frame: "
@@ -140,10 +137,9 @@ def compare(
 def _beside(poses: np.ndarray, usable: np.ndarray, own: np.ndarray) -> np.ndarray:
     """Poses (F, 4, 4) in the world and scale of the run's `own` ones of the `usable` frames."""
     try:
-        scale, rotation, translation = pose_similarity(poses[usable], own)
+        return pose_similarity(poses[usable], own).poses(poses)
     except NoSimilarityError:
         return poses  # nothing to lay them by: they are measured as they are
-    return carried(poses, scale, pose(rotation, translation))
 
 
 def _write(

@@ -5,8 +5,10 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from gsba.geometry import quaternion_from_rotation, rotation_angle, similarity
+from gsba.geometry import nearest_rotation, quaternion_from_rotation, rotation_angle
 from gsba.log import GsbaError
+from gsba.similarity import residuals_of, similarity
+from gsba.trajectory.association import matched_in_time
 from gsba.types import Trajectory
 
 AUC_THRESHOLDS_DEG = (0.1, 0.25, 0.5, 1.0, 5.0, 10.0)
@@ -68,9 +70,9 @@ def evaluate(
         tolerance_s: largest difference of time stamps, seconds.
 
     Raises:
-        GsbaError: fewer than three poses associate, or their positions coincide.
+        GsbaError: fewer than three poses matched_in_time, or their positions coincide.
     """
-    rows_e, rows_t = associate(estimate, truth, tolerance_s)
+    rows_e, rows_t = matched_in_time(estimate, truth, tolerance_s)
     if len(rows_t) < 3:
         raise GsbaError(
             f"only {len(rows_t)} of {len(truth.timestamps)} true poses have an estimate within "
@@ -83,39 +85,23 @@ def evaluate(
         if np.ptp(points, axis=0).max() <= 1e-12 * (1 + np.abs(points).max()):
             raise GsbaError(f"the {owner} does not move: its positions leave the scale open")
 
-    scale, true_R_world, shift = similarity(positions, true_positions)
-    aligned = scale * positions @ true_R_world.T + shift
-    common = _mean_rotation(true_rotations @ np.swapaxes(rotations, 1, 2))
+    fit = similarity(positions, true_positions)
+    common = nearest_rotation((true_rotations @ np.swapaxes(rotations, 1, 2)).sum(axis=0))
     residual = np.swapaxes(true_rotations, 1, 2) @ common @ rotations
     steps = np.flatnonzero(np.diff(rows_t) == 1)
-    step_translation, step_rotation = _step_errors(world_T_rigs, true_T_rigs, steps, scale)
+    step_translation, step_rotation = _step_errors(world_T_rigs, true_T_rigs, steps, fit.scale)
     pair_errors = np.degrees(_pair_errors(world_T_rigs, true_T_rigs))
     num_truth = len(truth.timestamps)
     return TrajectoryErrors(
         num_truth=num_truth,
         num_matched=len(rows_t),
-        scale=scale,
-        ate=ErrorStatistics.of(np.linalg.norm(aligned - true_positions, axis=1)),
+        scale=fit.scale,
+        ate=ErrorStatistics.of(residuals_of(fit, positions, true_positions)),
         rotation_deg=ErrorStatistics.of(np.degrees(rotation_angle(residual))),
         rpe_translation=ErrorStatistics.of(step_translation),
         rpe_rotation_deg=ErrorStatistics.of(np.degrees(step_rotation)),
         auc=area_under_recall(pair_errors, num_truth * (num_truth - 1) // 2, AUC_THRESHOLDS_DEG),
     )
-
-
-def associate(
-    estimate: Trajectory, truth: Trajectory, tolerance_s: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (M,) of estimate and (M,) of truth that are mutually nearest in time, in time order."""
-    finite = np.flatnonzero(np.isfinite(estimate.world_T_rigs).all(axis=(1, 2)))
-    times_e, times_t = estimate.timestamps[finite], truth.timestamps
-    if len(times_e) == 0 or len(times_t) == 0:
-        return np.empty(0, np.intp), np.empty(0, np.intp)
-    nearest_e, nearest_t = _nearest(times_e, times_t), _nearest(times_t, times_e)
-    rows_t = np.arange(len(times_t))
-    mutual = nearest_t[nearest_e] == rows_t
-    rows_t = rows_t[mutual & (np.abs(times_e[nearest_e] - times_t) <= tolerance_s)]
-    return finite[nearest_e[rows_t]], rows_t
 
 
 def area_under_recall(
@@ -181,20 +167,6 @@ def format_table(
         columns.append([cell.rjust(width) if index else cell.ljust(width) for cell in column])
     note = "rotation, rel. rot. (consecutive poses) and RPE are medians; ATE after Sim(3)."
     return "\n".join(["  ".join(line).rstrip() for line in zip(*columns, strict=True)] + [note])
-
-
-def _nearest(values: np.ndarray, queries: np.ndarray) -> np.ndarray:
-    """Index of the value nearest to each query; `values` ascending, not empty."""
-    right = np.clip(np.searchsorted(values, queries), 1, max(len(values) - 1, 1))
-    right = np.minimum(right, len(values) - 1)
-    left = np.maximum(right - 1, 0)
-    return np.where(queries - values[left] <= values[right] - queries, left, right)
-
-
-def _mean_rotation(rotations: np.ndarray) -> np.ndarray:
-    """Rotation (3, 3) nearest to rotations (N, 3, 3) in the chordal sense."""
-    u, _, vt = np.linalg.svd(rotations.sum(axis=0))
-    return u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
 
 
 def _step_errors(

@@ -20,9 +20,10 @@ from pathlib import Path
 import numpy as np
 
 from gsba.camera.rig import RIG_R_FACE
+from gsba.camera.sphere import erp_from_bearings
 from gsba.export.images import face_size_for, suffix_of, write_faces, write_panoramas
 from gsba.export.ply import write_splat_points
-from gsba.geometry import erp_from_bearings, inverse, quaternion_from_rotation
+from gsba.geometry import inverse, quaternion_from_rotation
 from gsba.log import GsbaError
 from gsba.types import FACES, FrameSet, Reconstruction
 
@@ -84,7 +85,7 @@ def write_colmap_erp(
     partial: Path, reconstruction: Reconstruction, frames: FrameSet, link: bool = False
 ) -> None:
     """Write the equirectangular layout into `partial`."""
-    if frames.layout != "erp":
+    if not frames.panoramic:
         raise GsbaError("colmap-erp needs panoramas, these frames are cube faces: use colmap")
     size = (frames.width, frames.height)
     sensors = Sensors("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), np.eye(3)[None])

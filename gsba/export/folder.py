@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from gsba.disk import disk_errors
 from gsba.log import GsbaError
-from gsba.store.records import disk_errors
 from gsba.version import __version__
 
 MARKER = "export.json"  # {"gsba": version, "format": name, "wrote": top-level entries}

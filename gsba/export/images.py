@@ -19,7 +19,7 @@ import numpy as np
 
 from gsba.camera.rig import CubeRig
 from gsba.frames.masks import load_mask
-from gsba.frames.scan import load_erp, load_faces
+from gsba.frames.pixels import load_erp, load_faces
 from gsba.log import GsbaError, track
 from gsba.types import FACES, FrameSet
 
@@ -37,7 +37,7 @@ def face_size_for(frames: FrameSet, face_size: int | None) -> int:
     finer). Frames that come as faces keep their size.
     """
     if face_size is None:
-        return frames.width if frames.layout == "cube" else 2 * round(frames.width / 8)
+        return 2 * round(frames.width / 8) if frames.panoramic else frames.width
     if face_size < MIN_FACE_SIZE:
         raise GsbaError(f"face size {face_size} is too small: use {MIN_FACE_SIZE} pixels or more")
     return face_size
@@ -74,7 +74,7 @@ def write_faces(
 
     def write(f: int) -> None:
         paths = [image_path(f, face) for face in faces]
-        if frames.layout == "erp":
+        if frames.panoramic:
             from gsba.frames.cubemap import cut
 
             _write_all(paths, cut(load_erp(frames, f), rig))

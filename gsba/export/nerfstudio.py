@@ -48,7 +48,7 @@ def write_nerfstudio(
     write_splat_points(partial / _CLOUD, points, reconstruction.point_colors)
     size = face_size_for(frames, face_size)
     _write_face_dataset(partial, reconstruction, frames, size, out_R_world, link)
-    if frames.layout == "erp":
+    if frames.panoramic:
         _write_erp_dataset(partial, reconstruction, frames, out_R_world, link)
 
 

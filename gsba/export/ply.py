@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.store.records import atomic_write
+from gsba.disk import atomic_write
 from gsba.types import Reconstruction
 
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}

@@ -1,7 +1,6 @@
 """Features of every frame of a run, stored frame by frame."""
 
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +8,8 @@ import numpy as np
 from gsba.camera.rig import CubeRig
 from gsba.config import RefineSettings
 from gsba.features import detection
+from gsba.features.detection import Extractor
 from gsba.frames import cubemap
-from gsba.learned import LearnedExtractor
 from gsba.store.store import PerFrame, RunStore, fingerprint
 from gsba.types import Features, FrameSet
 
@@ -21,7 +20,8 @@ def run(
     rig: CubeRig,
     settings: RefineSettings,
     num_threads: int,
-    weights: Mapping[str, Path],
+    make_extractor: Callable[[], Extractor],
+    files: Sequence[Path],
     name: str = "features",
     chosen_frames: np.ndarray | None = None,
 ) -> PerFrame[Features]:
@@ -30,7 +30,8 @@ def run(
     Args:
         store, frames, rig, settings: of the run.
         num_threads: frames treated at a time.
-        weights: files of learned networks (`learned.find_weights`).
+        make_extractor: makes what finds keypoints, for each frame.
+        files: that it depends on: weights of a learned one.
         name: of the stage.
         chosen_frames: (F,) bool, frames treated; None = all.
     """
@@ -41,10 +42,6 @@ def run(
         if chosen_frames is None or chosen_frames[f]
     }
     chosen = settings.features
-    if chosen.extractor == "sift":
-        make_extractor = partial(detection.SiftExtractor, chosen)
-    else:
-        make_extractor = partial(LearnedExtractor, chosen, weights["features"])
 
     def compute(frame: str) -> Features:
         images, masks = cubemap.load(frames, index[frame], rig)
@@ -54,6 +51,5 @@ def run(
         frame: fingerprint([*frames.paths[f], frames.mask_paths[f]]) for frame, f in index.items()
     }
     relevant = chosen.model_dump(exclude={"weights", "accept_noncommercial", "download"})
-    files = fingerprint(path for stage, path in weights.items() if stage == "features")
-    key = [settings.cubemap, relevant, files]
+    key = [settings.cubemap, relevant, fingerprint(files)]
     return store.per_frame(name, key, inputs, compute, Features, num_threads=num_threads)

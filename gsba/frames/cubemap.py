@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 
 from gsba.camera.rig import CubeRig
+from gsba.camera.sphere import erp_from_bearings
 from gsba.camera.straighten import PAD, wrapped
 from gsba.config import CubemapSettings
 from gsba.frames.masks import load_mask
-from gsba.frames.scan import load_erp, load_faces
-from gsba.geometry import erp_from_bearings
+from gsba.frames.pixels import load_erp, load_faces
 from gsba.types import FACES, FrameSet
 
 
@@ -22,8 +22,8 @@ def rig_for(frames: FrameSet, settings: CubemapSettings) -> CubeRig:
     refine what features find. Frames that come as cube faces keep their own size and
     90 degrees.
     """
-    if frames.layout == "cube":
-        return CubeRig(frames.width, np.pi / 2)
+    if not frames.panoramic:
+        return native_rig(frames)
     hfov = np.deg2rad(settings.hfov_deg)
     native = 2 * frames.width / (2 * np.pi) * np.tan(hfov / 2)
     wanted = max(round(settings.oversampling * native), settings.min_face_size)
@@ -31,11 +31,17 @@ def rig_for(frames: FrameSet, settings: CubemapSettings) -> CubeRig:
     return CubeRig(size, hfov)
 
 
+def native_rig(frames: FrameSet, most: int | None = None) -> CubeRig:
+    """Faces 90 degrees wide, as dense as the frames; of panoramas at most `most` pixels across."""
+    size = frames.native_face_size
+    return CubeRig(min(size, most) if most and frames.panoramic else size, np.pi / 2)
+
+
 def load(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.ndarray | None]:
     """Faces (6, size, size, 3) uint8 RGB of a frame and where they may be used, bool or None."""
     mask = load_mask(frames, frame)
     masks = None if mask is None else cut_mask(mask, rig)
-    if frames.layout == "erp":
+    if frames.panoramic:
         width = _dense_enough(frames.width, rig)
         return cut(load_erp(frames, frame, width=width), rig), masks
     images = np.zeros((len(FACES), rig.size, rig.size, 3), np.uint8)

@@ -89,7 +89,7 @@ def _load_levels(frames: FrameSet, f: int) -> np.ndarray | None:
     path = frames.mask_paths[f]
     if path is None:
         return None
-    size = (frames.width, frames.height) if frames.layout == "erp" else image_size(path)
+    size = (frames.width, frames.height) if frames.panoramic else image_size(path)
     values = decode(path, size, gray=True)
     if values.max() == 1:
         raise GsbaError(f"{path}: mask holds 0 and 1; write 255 where pixels are to be used")

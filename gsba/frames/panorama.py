@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 
 from gsba.camera.rig import CubeRig, owner_faces
+from gsba.camera.sphere import bearings_from_erp
 from gsba.frames.masks import load_mask
-from gsba.frames.scan import load_erp, load_faces
-from gsba.geometry import bearings_from_erp
+from gsba.frames.pixels import load_erp, load_faces
 from gsba.types import FACES, FrameSet
 
 _LOOKS = 5  # frames whose brightness stands for all
@@ -20,7 +20,7 @@ def width_for(frames: FrameSet, max_width: int) -> int:
 
     Cube faces become a panorama with at least their own density at their centres.
     """
-    width = frames.width if frames.layout == "erp" else 4 * frames.width
+    width = frames.panorama_width
     while width > max_width and width % 4 == 0:
         width //= 2
     return width
@@ -36,7 +36,7 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
         (width / 2, width) uint8 grey; (width / 2, width) bool or None, True = use.
     """
     mask = load_mask(frames, frame)
-    if frames.layout == "erp":
+    if frames.panoramic:
         grey = load_erp(frames, frame, gray=True, width=width)
         return grey, None if mask is None else fit_mask(mask, width)
     size = frames.width

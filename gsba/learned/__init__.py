@@ -4,7 +4,7 @@ Nothing is bundled: weights are their authors', under their own licences (`weigh
 from kornia and transformers; imported only when one is used.
 """
 
-from gsba.learned.extractor import LearnedExtractor
+from gsba.learned.extractor import LearnedExtractor, make_extractor
 from gsba.learned.matcher import FaceMatcher, make_matcher, overlapping_faces
 from gsba.learned.weights import find_weights
 
@@ -12,6 +12,7 @@ __all__ = [
     "FaceMatcher",
     "LearnedExtractor",
     "find_weights",
+    "make_extractor",
     "make_matcher",
     "overlapping_faces",
 ]

@@ -1,17 +1,32 @@
 """One extractor for all learned networks: padding, masks, pixel conventions, selection."""
 
 import functools
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from gsba.config import FeatureSettings
-from gsba.features.detection import FaceKeypoints
+from gsba.features.detection import Extractor, FaceKeypoints, SiftExtractor
 from gsba.learned.interfaces import Detector
 from gsba.learned.weights import missing_library
 
 SIGMA_PX = 0.5  # per-axis noise of any; what matters is that all keypoints have the same
 _STEP = 32  # pixels; the networks halve the image several times
+
+
+def make_extractor(
+    settings: FeatureSettings, weights: Mapping[str, Path]
+) -> Callable[[], Extractor]:
+    """What makes an extractor for each frame: our own SIFT, or a learned one.
+
+    Args:
+        settings: `extractor` and what it needs.
+        weights: files of learned networks (`find_weights`).
+    """
+    if settings.extractor == "sift":
+        return functools.partial(SiftExtractor, settings)
+    return functools.partial(LearnedExtractor, settings, weights["features"])
 
 
 class LearnedExtractor:

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from gsba.config import RefineSettings
+from gsba.disk import atomic_write
 from gsba.log import GsbaError
-from gsba.store.records import atomic_write
 
 logger = logging.getLogger(__name__)
 

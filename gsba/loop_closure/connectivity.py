@@ -1,11 +1,8 @@
 """Which frames belong together: tied by images or steps, and the matches and maps of each group."""
 
-from dataclasses import replace
-
 import numpy as np
 
-from gsba.bundle.adjustment import Adjustment
-from gsba.types import FrameSet, Matches, Reconstruction
+from gsba.types import Matches, Solution
 
 
 def parted(
@@ -52,57 +49,9 @@ def within(matches: Matches, parts: np.ndarray | None) -> Matches:
     keep = np.flatnonzero(parts[matches.pairs[:, 0]] == parts[matches.pairs[:, 1]])
     if len(keep) == len(matches.pairs):
         return matches
-    rows = [matches.of(int(p)) for p in keep]
-    none = np.zeros((0, 2), np.int32)
-    return Matches(
-        matches.pairs[keep], np.cumsum([0, *map(len, rows)]), np.concatenate([none, *rows])
-    )
+    return matches.taken(keep)
 
 
-def starving(solved: Adjustment, least: int) -> np.ndarray:
+def starving(solved: Solution, least: int) -> np.ndarray:
     """Frames (F,) bool with fewer than `least` observations of a map."""
-    seen = np.bincount(solved.landmarks.tracks.frames, minlength=len(solved.world_T_rigs))
-    return seen < least
-
-
-def largest(reconstruction: Reconstruction) -> np.ndarray:
-    """Frames (F',) int64 of the largest map: those that are exported."""
-    if reconstruction.components is None:
-        return np.arange(len(reconstruction.world_T_rigs))
-    return np.flatnonzero(reconstruction.components == 0)
-
-
-def taken(
-    reconstruction: Reconstruction, frames: FrameSet, rows: np.ndarray
-) -> tuple[Reconstruction, FrameSet]:
-    """What some frames (F',), ascending, hold of a result: their poses, points and images."""
-    if len(rows) == len(frames):
-        return reconstruction, frames
-    number = np.full(len(frames), -1)
-    number[rows] = np.arange(len(rows))
-    seen = number[reconstruction.observation_frames] >= 0
-    points, which = np.unique(reconstruction.observation_points[seen], return_inverse=True)
-    joint = reconstruction.joint_errors
-    part = replace(
-        reconstruction,
-        world_T_rigs=reconstruction.world_T_rigs[rows],
-        pose_covariances=reconstruction.pose_covariances[rows],
-        pose_statuses=reconstruction.pose_statuses[rows],
-        points_world=reconstruction.points_world[points],
-        point_colors=reconstruction.point_colors[points],
-        point_errors=reconstruction.point_errors[points],
-        observation_points=which.astype(np.int32),
-        observation_frames=number[reconstruction.observation_frames[seen]].astype(np.int32),
-        observation_bearings=reconstruction.observation_bearings[seen],
-        observation_sigmas=reconstruction.observation_sigmas[seen],
-        components=None,
-        joint_errors=joint and joint.taken(rows),
-    )
-    kept = replace(
-        frames,
-        names=tuple(frames.names[f] for f in rows),
-        paths=tuple(frames.paths[f] for f in rows),
-        timestamps=frames.timestamps[rows],
-        mask_paths=tuple(frames.mask_paths[f] for f in rows),
-    )
-    return part, kept
+    return solved.observations() < least

@@ -11,17 +11,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsba.bundle.adjustment import Adjustment
-from gsba.geometry import carried, inverse
+from gsba.geometry import inverse
 from gsba.loop_closure import loops
 from gsba.loop_closure.connectivity import by_size
 from gsba.loop_closure.map_similarity import Meeting, agreeing, measure, refined
 from gsba.loop_closure.merged_map import Registered
+from gsba.loop_closure.pose_graph import Loop
 from gsba.loop_closure.registration import resect
+from gsba.loop_closure.retrieval import looks_of
 from gsba.matching import recovery
-from gsba.matching.correspondences import median_depth, points_by_keypoint
 from gsba.matching.guided_search import Gate, MatchContext
-from gsba.types import Counts, Landmarks
+from gsba.similarity import Sim3
+from gsba.types import Counts, Solution
 
 _LOOKS = 3  # places compared for each frame of a part; twice as many for a frame alone
 _SAMPLED = 24  # frames of a part that are looked for elsewhere
@@ -36,7 +37,7 @@ _ANYWHERE = Gate(np.pi, 1e3, np.pi)
 
 def run(
     context: MatchContext,
-    solved: Adjustment,
+    solved: Solution,
     parts: np.ndarray,
     held: np.ndarray,
     seen: np.ndarray,
@@ -68,7 +69,7 @@ class _Joining:
     def __init__(
         self,
         context: MatchContext,
-        solved: Adjustment,
+        solved: Solution,
         parts: np.ndarray,
         held: np.ndarray,
         ties: np.ndarray,
@@ -77,11 +78,11 @@ class _Joining:
         num = len(parts)
         self.context, self.solved, self.parts = context, solved, parts
         self.held, self.ties = held, ties
-        self.times, self.depth = timestamps, median_depth(solved)
-        self.looks = loops.describe(context.strongest, num, context.settings.seed)
+        self.times, self.depth = timestamps, solved.median_depth()
+        self.looks = looks_of(context.strongest, num, context.settings.seed)
         self.poses = solved.world_T_rigs.copy()
-        self.known = points_by_keypoint(solved, context.keypoints)  # rig frames, own units
-        self.scales, self.moves = np.ones(num), np.tile(np.eye(4), (num, 1, 1))
+        self.known = solved.points_by_keypoint(context.keypoints)  # rig frames, own units
+        self.moves = [Sim3()] * num  # of each frame, so far
         self.components = np.full(num, -1)
         self.met, self.alone = np.zeros(num, bool), np.zeros(num, bool)
         self.tried: set[tuple[int, int]] = set()  # part, size of the map it was compared with
@@ -107,9 +108,9 @@ class _Joining:
             self.tried.add((part, len(inside)))
             rows = np.flatnonzero(self.parts == part)
             if len(rows) >= _MIN_MAP and any(np.isfinite(self.known[f]).any() for f in rows):
-                moves = self._similarity(rows, inside)
-                if moves is not None:
-                    self._carry(rows, *moves)
+                move = self._similarity(rows, inside)
+                if move is not None:
+                    self._carry(rows, move)
                     self.met[rows] = True
                     return True
                 continue
@@ -124,15 +125,15 @@ class _Joining:
             for inner, outer in ((f, f + 1), (f + 1, f)):
                 if self.components[inner] == self.current and self.components[outer] < 0:
                     rows = np.flatnonzero((self.parts == self.parts[outer]) & (self.components < 0))
-                    self._carry(rows, float(self.scales[inner]), self.moves[inner])
+                    self._carry(rows, self.moves[inner])
                     return True
         return False
 
-    def _carry(self, rows: np.ndarray, scale: float, moves: np.ndarray) -> None:
-        self.poses[rows] = carried(self.poses[rows], scale, moves)
+    def _carry(self, rows: np.ndarray, move: Sim3) -> None:
+        self.poses[rows] = move.poses(self.poses[rows])
         for f in rows:
-            self.known[f] = scale * self.known[f]
-        self.scales[rows], self.moves[rows] = scale, moves
+            self.known[f] = move.scale * self.known[f]
+            self.moves[f] = move
         self.components[rows] = self.current
 
     def _candidates(self, rows: np.ndarray, inside: np.ndarray, looks: int) -> np.ndarray:
@@ -147,8 +148,8 @@ class _Joining:
             found |= {(f, int(inside[g])) for g in near}
         return np.array(sorted(found), np.int32).reshape(-1, 2)
 
-    def _similarity(self, rows: np.ndarray, inside: np.ndarray) -> tuple[float, np.ndarray] | None:
-        """Scale and move that carry a part to where it meets the map; None if it does not."""
+    def _similarity(self, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
+        """What carries a part to where it meets the map; None if nothing does."""
         sampled = np.linspace(0, len(rows) - 1, _SAMPLED).astype(int)
         sampled = rows[np.unique([*sampled, *range(_BESIDE), *range(-_BESIDE, 0)])]
         chosen = self._candidates(sampled, inside, _LOOKS)
@@ -201,12 +202,12 @@ class _Joining:
     def _plausible(self, meeting: Meeting) -> bool:
         """Whether a meeting asks for no more than the trajectory can have drifted."""
         f, g, poses, settings = meeting.f, meeting.g, self.poses, self.context.settings
-        ends = {g: poses[g], f: carried(poses[f], meeting.scale, meeting.move)}
+        ends = {g: poses[g], f: meeting.move.poses(poses[f])}
         first, last = sorted(ends)
         asked = inverse(ends[first]) @ ends[last]
-        loop = loops.Loop(first, last, asked, len(meeting.own))
+        loop = Loop(first, last, asked, len(meeting.own))
         solved = replace(self.solved, world_T_rigs=poses)
-        even = abs(np.log(meeting.scale)) < np.log(settings.verify.max_length_ratio)
+        even = abs(np.log(meeting.move.scale)) < np.log(settings.verify.max_length_ratio)
         return even and loops.within_drift(loop, solved, self.held, settings)
 
     def _register(self, f: int, inside: np.ndarray) -> bool:
@@ -220,7 +221,7 @@ class _Joining:
             settings = self.context.settings
             found = resect(bearings, points, settings.verify, settings.seed)
             if found is not None and not found.reason and self._in_reach(f, found.world_T_rig):
-                self.moves[f] = found.world_T_rig @ inverse(self.poses[f])
+                self.moves[f] = Sim3.of(1.0, found.world_T_rig @ inverse(self.poses[f]))
                 self.poses[f] = found.world_T_rig
                 self.components[f] = self.current
                 self.met[f] = self.alone[f] = True
@@ -267,18 +268,20 @@ class _Joining:
             placed = np.flatnonzero(~lost)
             nearest = int(placed[np.argmin(np.abs(placed - f))])
             self.components[f] = maps + n
-            self.scales[f], self.moves[f] = self.scales[nearest], self.moves[nearest]
-            self.poses[f] = carried(self.poses[f], float(self.scales[f]), self.moves[f])
+            self.moves[f] = self.moves[nearest]
+            self.poses[f] = self.moves[f].poses(self.poses[f])
         order = by_size(self.components)
         offsets = self._side_by_side(order)
+        scales = np.array([move.scale for move in self.moves])
+        moves = np.array([move.new_T_old for move in self.moves])
         num, alone = int(self.parts.max()) + 1, int(lost.sum())
         dropped = {"frames alone": alone, "apart": maps - 1}
         kept = num - maps - alone
         return Registered(
-            _moved(self.solved, self.poses, self.scales, self.moves, offsets),
+            _moved(self.solved, self.poses, scales, moves, offsets),
             order.astype(np.int32),
-            self.scales,
-            self.moves,
+            scales,
+            moves,
             offsets,
             self.met,
             self.alone,
@@ -300,19 +303,15 @@ class _Joining:
 
 
 def _moved(
-    solved: Adjustment,
+    solved: Solution,
     world_T_rigs: np.ndarray,
     scales: np.ndarray,
     moves: np.ndarray,
     offsets: np.ndarray,
-) -> Adjustment:
+) -> Solution:
     """The new poses with their offsets; points go with the first frame that sees them."""
-    tracks, landmarks = solved.landmarks.tracks, solved.landmarks
-    hosts = tracks.frames[np.searchsorted(tracks.points, np.arange(tracks.num_points))]
-    points = scales[hosts, None] * np.einsum(
-        "jik,jk->ji", moves[hosts, :3, :3], landmarks.points_world
-    )
-    moved = Landmarks(points + moves[hosts, :3, 3] + offsets[hosts], tracks, landmarks.counts)
+    landmarks = solved.landmarks.moved(scales, moves)
+    points = landmarks.points_world + offsets[landmarks.tracks.hosts()]
     poses = world_T_rigs.copy()
     poses[:, :3, 3] += offsets
-    return replace(solved, world_T_rigs=poses, landmarks=moved)
+    return replace(solved, world_T_rigs=poses, landmarks=replace(landmarks, points_world=points))

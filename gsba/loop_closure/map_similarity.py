@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.geometry import carried, inverse, pose, rotation_angle
-from gsba.loop_closure.loops import relative_similarity
+from gsba.geometry import inverse, rotation_angle
+from gsba.similarity import Sim3, relative_similarity
 
 _MIN_GROUP, _RIVAL = 3, 1.5  # pairs that must agree, and by how much they outweigh others
 _AGREE_DEG, _AGREE, _AGREE_LOG = 2.0, 0.1, 0.15  # part of the median depth; of scales
@@ -18,8 +18,7 @@ class Meeting:
 
     f: int  # outside
     g: int  # inside
-    scale: float
-    move: np.ndarray  # (4, 4) float64: with the scale, carries the part of f into the map
+    move: Sim3  # of the part of f into the map
     own: np.ndarray  # (m, 3) points in rig f, units of its part
     theirs: np.ndarray  # (m, 3) the same in rig g, units of the map
 
@@ -36,12 +35,13 @@ def measure(
         seed: of the sampling.
     """
     found = relative_similarity(theirs, own, seed)
-    if found is None or found[0] <= 0:
+    if found is None:
         return None
-    scale, g_T_f, agree = found
+    f_to_g, agree = found
     f_T_own = inverse(world_T_rigs[f])
-    f_T_own[:3, 3] *= scale
-    return Meeting(f, g, scale, world_T_rigs[g] @ g_T_f @ f_T_own, own[agree], theirs[agree])
+    f_T_own[:3, 3] *= f_to_g.scale
+    move = Sim3.of(f_to_g.scale, world_T_rigs[g] @ f_to_g.new_T_old @ f_T_own)
+    return Meeting(f, g, move, own[agree], theirs[agree])
 
 
 def agreeing(meetings: list[Meeting], poses: np.ndarray, depth: float) -> list[Meeting]:
@@ -62,21 +62,20 @@ def agreeing(meetings: list[Meeting], poses: np.ndarray, depth: float) -> list[M
 def _alike(one: Meeting, other: Meeting, poses: np.ndarray, depth: float) -> bool:
     """Whether two meetings carry the frames of both to the same poses."""
     frames = poses[[one.f, other.f]]
-    first = carried(frames, one.scale, one.move)
-    second = carried(frames, other.scale, other.move)
+    first, second = one.move.poses(frames), other.move.poses(frames)
     turned = rotation_angle(first[0, :3, :3].T @ second[0, :3, :3])
     off = np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1).max()
-    stretched = abs(np.log(one.scale / other.scale))
+    stretched = abs(np.log(one.move.scale / other.move.scale))
     near = off < _AGREE * max(depth, 1e-12) and turned < np.deg2rad(_AGREE_DEG)
     return bool(near and stretched < _AGREE_LOG)
 
 
-def refined(group: list[Meeting], poses: np.ndarray) -> tuple[float, np.ndarray]:
+def refined(group: list[Meeting], poses: np.ndarray) -> Sim3:
     """The similarity under which all meetings see their points best, from either side."""
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    first = max(group, key=lambda meeting: len(meeting.own))
+    start = max(group, key=lambda meeting: len(meeting.own)).move
     inside, outside = [], []  # positions in both worlds, and who sees them
     for m in group:
         for world, seer, seen in ((outside, m.f, m.own), (inside, m.g, m.theirs)):
@@ -88,15 +87,16 @@ def refined(group: list[Meeting], poses: np.ndarray) -> tuple[float, np.ndarray]
         rays = points - seers
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
+    def moved_by(x: np.ndarray) -> Sim3:
+        rotation = Rotation.from_rotvec(x[:3]).as_matrix() @ start.rotation
+        return Sim3(start.scale * float(np.exp(x[6])), rotation, start.translation + x[3:6])
+
     def residuals(x: np.ndarray) -> np.ndarray:
-        rotation = Rotation.from_rotvec(x[:3]).as_matrix() @ first.move[:3, :3]
-        scale, shift = first.scale * np.exp(x[6]), first.move[:3, 3] + x[3:6]
-        there = scale * own[:, :3] @ rotation.T + shift
-        back = (theirs[:, :3] - shift) @ rotation / scale
+        move = moved_by(x)
+        there, back = move.points(own[:, :3]), move.points_back(theirs[:, :3])
         seen = directions(there, theirs[:, 3:]) - directions(theirs[:, :3], theirs[:, 3:])
         sent = directions(back, own[:, 3:]) - directions(own[:, :3], own[:, 3:])
         return np.concatenate([seen.ravel(), sent.ravel()])
 
     x = least_squares(residuals, np.zeros(7), loss="soft_l1", f_scale=np.deg2rad(_LOSS_DEG)).x
-    rotation = Rotation.from_rotvec(x[:3]).as_matrix() @ first.move[:3, :3]
-    return first.scale * float(np.exp(x[6])), pose(rotation, first.move[:3, 3] + x[3:6])
+    return moved_by(x)

@@ -5,18 +5,17 @@ from typing import Any
 
 import numpy as np
 
-from gsba.bundle.adjustment import Adjustment
-from gsba.geometry import carried
+from gsba.similarity import Sim3
 from gsba.trajectory.joining import GUESS, PLACES, Joint
 from gsba.trajectory.judgement import Trust
-from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource
+from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, Solution
 
 
 @dataclass(frozen=True, slots=True)
 class Registered:
     """A map whose parts were joined as far as they meet."""
 
-    solved: Adjustment
+    solved: Solution
     components: np.ndarray  # (F,) int32, map of each frame, 0 = the largest
     scales: np.ndarray  # (F,) float64: each frame was carried by scale * R @ x + t
     moves: np.ndarray  # (F, 4, 4) float64, R and t
@@ -25,6 +24,10 @@ class Registered:
     alone: np.ndarray  # (F,) bool: got its pose from points of the map
     lost: np.ndarray  # (F,) bool: nothing could place it
     counts: Counts  # of parts
+
+    def move(self, f: int) -> Sim3:
+        """What a frame was carried by, before its map was laid beside others."""
+        return Sim3.of(float(self.scales[f]), self.moves[f])
 
 
 def side_by_side(world_T_rigs: np.ndarray, registered: Registered | None) -> np.ndarray:
@@ -56,10 +59,10 @@ def follow(
         rows = np.arange(joint.first, joint.last + 1)
         known = rows[registered.met[rows] & ~registered.alone[rows]]
         if joint.how == GUESS and len(known) and registered.components[known[0]] == 0:
-            scale, move = float(registered.scales[known[0]]), registered.moves[known[0]]
-            poses[rows] = carried(poses[rows], scale, move)
-            world_T_own = carried(joint.world_T_own, scale, move)
-            joint = replace(joint, scale=scale * joint.scale, world_T_own=world_T_own, how=PLACES)
+            move = registered.move(int(known[0]))
+            poses[rows], world_T_own = move.poses(poses[rows]), move.poses(joint.world_T_own)
+            scale = move.scale * joint.scale
+            joint = replace(joint, scale=scale, world_T_own=world_T_own, how=PLACES)
         followed.append(joint)
     return replace(coarse, world_T_rigs=poses), trust, tuple(followed)
 

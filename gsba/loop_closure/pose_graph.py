@@ -1,10 +1,15 @@
 """The path as a chain of steps, and loops that may bend it: as far as its steps can be off."""
 
+from dataclasses import dataclass
+
 import gtsam
 import numpy as np
 
 from gsba.bundle.prior_factors import X
 from gsba.geometry import inverse
+from gsba.types import (
+    Solution,
+)
 
 _STEP_DEG, _STEP = 0.2, 0.02  # noise of a confirmed step; of its position, typical lengths
 _LOOP_DEG, _LOOP = 0.3, 0.05  # the same of a loop
@@ -66,3 +71,46 @@ def affordable(
 
 def _sigmas(rotation: float, translation: float) -> gtsam.noiseModel.Base:
     return gtsam.noiseModel.Diagonal.Sigmas(np.array([rotation] * 3 + [translation] * 3))
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """Two frames that see the same points of the map, and how one lies in the other."""
+
+    f0: int
+    f1: int
+    f0_T_f1: np.ndarray  # (4, 4) float64, map units
+    support: int  # points that agree
+
+
+def met(loops: list[Loop], solved: Solution, unseen: np.ndarray) -> list[Loop]:
+    """Loops that the path can meet without bending steps that images confirm."""
+    if not loops:
+        return loops
+    pairs = np.array([(loop.f0, loop.f1) for loop in loops])
+    asserted = np.array([loop.f0_T_f1 for loop in loops])
+    kept = affordable(solved.world_T_rigs, unseen, pairs, asserted)
+    return [loop for loop, stays in zip(loops, kept, strict=True) if stays]
+
+
+def bend(solved: Solution, loops: list[Loop], unseen: np.ndarray) -> Solution:
+    """Spread what loops leave open over the path: a pose graph of its steps and the loops.
+
+    Points move with the first frame that sees them.
+
+    Args:
+        solved: poses and points.
+        loops: to be closed, under a robust loss.
+        unseen: (F - 1,) bool, steps that give way first.
+    """
+    poses = solved.world_T_rigs
+    graph, values, noise = path(poses, unseen)
+    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(2.0)
+    robust = gtsam.noiseModel.Robust.Create(cauchy, noise)
+    for loop in loops:
+        between = gtsam.Pose3(loop.f0_T_f1)
+        graph.add(gtsam.BetweenFactorPose3(X(loop.f0), X(loop.f1), between, robust))
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    bent = np.array([result.atPose3(X(f)).matrix() for f in range(len(poses))])
+    landmarks = solved.landmarks.moved(np.ones(len(poses)), bent @ inverse(poses))
+    return Solution(bent, landmarks, solved.noise, ())

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsba.camera.sphere import erp_from_bearings
 from gsba.config import VerifySettings
-from gsba.geometry import erp_from_bearings, inverse, pose
+from gsba.geometry import inverse, pose
 
 _WIDTH = 4096  # of the virtual panorama
 _MIN_SPREAD = 0.02  # middle eigenvalue of the inliers' bearings: not in one narrow cone

@@ -17,12 +17,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from gsba.disk import atomic_write
 from gsba.frames import panorama
 from gsba.frames.masks import load_mask
-from gsba.frames.scan import load_erp
+from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
 from gsba.masks.carrier_turns import band_of, find_turns
-from gsba.store.records import atomic_write
 from gsba.types import FrameSet
 
 logger = logging.getLogger(__name__)
@@ -63,7 +63,7 @@ def find_carrier(frames: FrameSet) -> Carrier:
     Raises:
         GsbaError: cube faces, too few frames, or frames that hardly differ.
     """
-    if frames.layout != "erp":
+    if not frames.panoramic:
         raise GsbaError("the carrier is looked for in panoramas; these frames are cube faces")
     if len(frames) < _MIN_FRAMES:
         raise GsbaError(f"{len(frames)} frames do not tell what is fixed to the camera: give more")

@@ -16,10 +16,11 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.frames import panorama
 from gsba.frames.masks import load_mask
-from gsba.frames.scan import load_erp
-from gsba.geometry import bearings_from_erp, erp_from_bearings, inverse
+from gsba.frames.pixels import load_erp
+from gsba.geometry import inverse
 from gsba.masks import _distractor_kernels
 from gsba.types import FrameSet, Landmarks
 
@@ -91,7 +92,7 @@ class Scene:
         limit_mb: float = 256.0,
     ) -> None:
         self._frames, self._poses, self._landmarks = frames, world_T_rigs, landmarks
-        whole = frames.layout == "erp"
+        whole = frames.panoramic
         self.width = min(_WIDTH, frames.width) if whole else panorama.width_for(frames, _WIDTH)
         self._known, self._rays = known, _rays(self.width)
         self._room = int(limit_mb * 2**20 / (1.5 * self.width**2))
@@ -200,7 +201,7 @@ def _rays(width: int) -> np.ndarray:
 
 def _load(frames: FrameSet, frame: int, width: int) -> np.ndarray:
     """Small picture (h, w, C + 1) uint8: colours, or grey of cube faces, and where to use it."""
-    if frames.layout == "erp":
+    if frames.panoramic:
         color = load_erp(frames, frame, width=width)
         mask = load_mask(frames, frame)
         use = np.ones(color.shape[:2], np.uint8)

@@ -12,16 +12,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsba.bundle.adjustment import Adjustment
+from gsba.disk import atomic_write
 from gsba.frames.masks import levels_of, load_mask, load_weights
-from gsba.frames.scan import load_erp
+from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
 from gsba.masks.carrier import Carrier, carrier_mask, find_carrier, write_carrier
 from gsba.masks.distractors import Distractors, Scene, distractor_mask, distractor_weights
 from gsba.masks.segmentation import Segment, load_segmented, segmented
-from gsba.store.records import atomic_write
 from gsba.store.store import PerFrame, RunStore, fingerprint
-from gsba.types import Counts, FrameSet
+from gsba.types import Counts, FrameSet, Solution
 
 logger = logging.getLogger(__name__)
 
@@ -85,7 +84,7 @@ def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
 
 
 def after(
-    store: RunStore, frames: FrameSet, solved: Adjustment, stage: str, num_threads: int
+    store: RunStore, frames: FrameSet, solved: Solution, stage: str, num_threads: int
 ) -> tuple[FrameSet, Counts]:
     """Frames without what no static scene explains.
 
@@ -166,7 +165,7 @@ def _merge(
         for f, path in enumerate(track(paths, "writing masks")):
             weights = load_weights(frames, f)
             if weights is None:
-                width = frames.width if frames.layout == "erp" else 4 * frames.width
+                width = frames.panorama_width
                 weights = np.ones((width // 2, width), np.float32)
             for part in parts:
                 found = part(f)
@@ -207,7 +206,7 @@ def _write_check(path: Path, frames: FrameSet, shares: np.ndarray) -> None:
     rows = []
     for f in np.sort(np.argsort(-shares, kind="stable")[:_SHOWN]):
         size = (_SHOWN_WIDTH, _SHOWN_WIDTH // 2)
-        if frames.layout == "erp":
+        if frames.panoramic:
             shown = cv2.resize(load_erp(frames, int(f), width=_SHOWN_WIDTH), size)
         else:
             shown = np.full((size[1], size[0], 3), 128, np.uint8)

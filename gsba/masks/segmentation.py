@@ -18,11 +18,11 @@ import cv2
 import numpy as np
 
 from gsba.camera.rig import CubeRig, owner_faces
+from gsba.camera.sphere import bearings_from_erp
+from gsba.disk import atomic_write, disk_errors
 from gsba.frames import cubemap
 from gsba.frames.files import decode, image_size
-from gsba.geometry import bearings_from_erp
 from gsba.log import GsbaError, track
-from gsba.store.records import atomic_write, disk_errors
 from gsba.store.store import PerFrame, RunStore, fingerprint
 from gsba.types import FACES, FrameSet
 
@@ -53,8 +53,8 @@ def segmented(store: RunStore, frames: FrameSet, segment: Segment) -> PerFrame[S
         GsbaError: a command that fails, or a mask that is missing or of another size.
     """
     index = {name: f for f, name in enumerate(frames.names)}
-    size = frames.width if frames.layout == "cube" else min(_MAX_FACE, frames.width // 4)
-    rig = CubeRig(size, np.pi / 2)
+    rig = cubemap.native_rig(frames, _MAX_FACE)
+    size = rig.size
     folder = store.root / "stages" / "segmented-faces"
     present = [FACES.index(face) for face in frames.faces] or list(range(len(FACES)))
     ask = _Once(lambda: _run(str(segment), frames, rig, present, folder))

@@ -4,15 +4,21 @@ from functools import partial
 
 import numpy as np
 
-from gsba.bundle.adjustment import Adjustment
 from gsba.config import RefineSettings
 from gsba.geometry import inverse
 from gsba.matching import pairs, verification
 from gsba.matching.guided_search import Gate, MatchContext
-from gsba.types import Keypoints, Matches, VerifiedPairs
+from gsba.types import (
+    Matches,
+    Solution,
+    VerifiedPairs,
+)
+
+_ROTATION_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # frames between those matched
+_ROTATION_DEG = 2.0  # around where a chain of turns sees a keypoint
 
 
-def match_neighbours(context: MatchContext, start: Adjustment) -> VerifiedPairs:
+def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
     """Match frames next to one another in time, guided by the coarse poses, and verify them.
 
     Where many matches of a step disagree, repeated structure may have won with few: people who walk
@@ -47,7 +53,7 @@ def match_neighbours(context: MatchContext, start: Adjustment) -> VerifiedPairs:
     return judge(_replaced(found, rows, again), estimates)
 
 
-def match_loops(context: MatchContext, solved: Adjustment) -> VerifiedPairs:
+def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     """Match frames close in space but far in time, as far as drift leaves them predictable.
 
     Only known points are looked for, as far around their predicted bearing as drift can have moved
@@ -59,7 +65,7 @@ def match_loops(context: MatchContext, solved: Adjustment) -> VerifiedPairs:
     """
     settings, keypoints = context.settings, context.keypoints
     world_T_rigs, positions = solved.world_T_rigs, solved.world_T_rigs[:, :3, 3]
-    depth = median_depth(solved)
+    depth = solved.median_depth()
     chosen = pairs.covisible(positions, depth, settings.pairs)[1]
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     along = np.concatenate([[0], np.cumsum(steps)])
@@ -68,13 +74,13 @@ def match_loops(context: MatchContext, solved: Adjustment) -> VerifiedPairs:
         _point_gate(np.deg2rad(settings.pairs.loop_deg) + 2 * drift / max(depth, 1e-12))
         for drift in drifts
     ]
-    known = points_by_keypoint(solved, keypoints)
+    known = solved.points_by_keypoint(keypoints)
     found = context.match(chosen, world_T_rigs, gates, known)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
     return verified(found, f0_T_f1s, drifts, context)
 
 
-def match_along_epipolars(context: MatchContext, solved: Adjustment) -> Matches:
+def match_along_epipolars(context: MatchContext, solved: Solution) -> Matches:
     """Match neighbours in time again, along the epipolar lines of poses that are nearly right."""
     poses, refined = solved.world_T_rigs, context.settings.pairs.refined
     chosen = pairs.adjacent(len(poses))
@@ -82,7 +88,7 @@ def match_along_epipolars(context: MatchContext, solved: Adjustment) -> Matches:
     return context.match(chosen, poses, gates)
 
 
-def match_known_points(context: MatchContext, solved: Adjustment, loops_closed: bool) -> Matches:
+def match_known_points(context: MatchContext, solved: Solution, loops_closed: bool) -> Matches:
     """Match frames further apart only where a known point must appear.
 
     Prediction is the verification: what merely looks alike elsewhere, a column further on, is not
@@ -94,31 +100,14 @@ def match_known_points(context: MatchContext, solved: Adjustment, loops_closed: 
         loops_closed: whether frames far apart in time are predictable too.
     """
     poses, settings = solved.world_T_rigs, context.settings.pairs
-    near, loops = pairs.covisible(poses[:, :3, 3], median_depth(solved), settings)
+    near, loops = pairs.covisible(poses[:, :3, 3], solved.median_depth(), settings)
     chosen = near[near[:, 1] - near[:, 0] > 2]
     if loops_closed:
         chosen = np.concatenate([chosen, loops])
     gates = [_point_gate(np.deg2rad(settings.point_deg))] * len(chosen)
-    known = points_by_keypoint(solved, context.keypoints)
+    known = solved.points_by_keypoint(context.keypoints)
     # Where a point is known this well, no network knows better.
     return context.match(chosen, poses, gates, known, guided_only=True)
-
-
-def median_depth(solved: Adjustment) -> float:
-    """Median distance of points from the frames that see them, map units; 0 without points."""
-    tracks, points = solved.landmarks.tracks, solved.landmarks.points_world
-    offsets = points[tracks.points] - solved.world_T_rigs[tracks.frames, :3, 3]
-    return float(np.median(np.linalg.norm(offsets, axis=1))) if len(offsets) else 0.0
-
-
-def points_by_keypoint(solved: Adjustment, keypoints: Keypoints) -> list[np.ndarray]:
-    """For each frame (K_f, 3): its keypoints' points in its rig frame, NaN where unknown."""
-    tracks = solved.landmarks.tracks
-    known = np.full((len(keypoints.faces), 3), np.nan)
-    world_T_rig = solved.world_T_rigs[tracks.frames]
-    offsets = solved.landmarks.points_world[tracks.points] - world_T_rig[:, :3, 3]
-    known[keypoints.rows(tracks)] = np.einsum("oji,oj->oi", world_T_rig[:, :3, :3], offsets)
-    return np.split(known, keypoints.starts[1:-1])
 
 
 def verified(
@@ -154,7 +143,7 @@ def _replaced(matches: Matches, indices: np.ndarray, others: Matches) -> Matches
     rows = [matches.of(p) for p in range(len(matches.pairs))]
     for n, p in enumerate(indices):
         rows[p] = others.of(n)
-    return Matches(matches.pairs, np.cumsum([0, *map(len, rows)]), np.concatenate(rows))
+    return Matches.of_rows(matches.pairs, rows)
 
 
 def _point_gate(radius_rad: float) -> Gate:
@@ -164,3 +153,15 @@ def _point_gate(radius_rad: float) -> Gate:
 
 def _gate(rotation_deg: float, direction: float, settings: RefineSettings) -> Gate:
     return Gate(np.deg2rad(rotation_deg), direction, np.deg2rad(settings.pairs.max_parallax_deg))
+
+
+def match_for_rotations(context: MatchContext, world_T_rigs: np.ndarray) -> Matches:
+    """Matches of frames near and far in time, where their rotations say."""
+    num = len(world_T_rigs)
+    chosen = [(f, f + gap) for gap in _ROTATION_GAPS for f in range(num - gap)]
+    pairs = np.array(chosen, np.int32).reshape(-1, 2)
+    still = world_T_rigs.copy()
+    still[:, :3, 3] = 0
+    gates = [Gate(np.pi, 1.0, np.pi, np.deg2rad(_ROTATION_DEG))] * len(pairs)
+    directions = [context.keypoints.bearings_of(f) for f in range(num)]
+    return context.match(pairs, still, gates, directions)

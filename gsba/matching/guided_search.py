@@ -328,8 +328,4 @@ def run(
         found = track(pool.map(match, order), "matching", len(pairs))
         for p, matched in zip(order, found, strict=True):
             rows[p] = matched
-    return Matches(
-        np.asarray(pairs, np.int32).reshape(-1, 2),
-        np.cumsum([0, *map(len, rows)]),
-        np.concatenate([_NO_MATCHES, *rows]),
-    )
+    return Matches.of_rows(np.asarray(pairs, np.int32).reshape(-1, 2), rows)

@@ -13,7 +13,8 @@ from gsba.trajectory import clock, joining, judgement, misread
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import Joint
 from gsba.trajectory.judgement import Trust
-from gsba.types import CoarsePoses, Counts, Keypoints, Matches, Trajectory, VerifiedPairs
+from gsba.trajectory.steps import Steps, image_steps, length_ratios, off_steps
+from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
 
 _PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
 _MANY_LOST = 0.2  # part of the neighbours
@@ -52,22 +53,27 @@ def run(
     chosen = pairs.adjacent(len(coarse.sources))
     intervals = np.diff(timestamps)
     close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
-    lost = _missing(np.column_stack([close, close + 1]), guided)
-    alone = _join([guided, match_anywhere(context, lost)])
-    steps = judgement.steps(alone, keypoints, settings.verify)
+    lost = guided.missing(np.column_stack([close, close + 1]))
+    alone = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
+    steps = image_steps(alone, keypoints, settings.verify)
     alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
     coarse, joints = _joined(coarse, alone, steps, keypoints)
     misread.refuse_misfit(coarse, steps, settings.verify)
     trust = _judge(alone, keypoints, coarse, settings)
     if trust.sound and not joints:
         return Recovered(guided, trust, coarse)
-    again = _missing(chosen, alone)
+    again = alone.missing(chosen)
     again = again[again[:, 1] - again[:, 0] == 2]
     over = _match_along(context, trust.world_T_rigs, again)
-    neighbours = _join([alone, _consistent(over, steps, keypoints, settings)])
-    doubtful = [p for p in _index(lost) if not _supported(p, neighbours, keypoints, settings)]
+    neighbours = VerifiedPairs.joined([alone, _consistent(over, steps, keypoints, settings)])
+    doubtful = {
+        (f0, f1)
+        for f0, f1 in lost.tolist()
+        if not _supported((f0, f1), neighbours, keypoints, settings)
+    }
     if doubtful:
-        neighbours = _without(neighbours, doubtful)
+        frames = map(tuple, neighbours.matches.pairs.tolist())
+        neighbours = neighbours.taken([p for p, pair in enumerate(frames) if pair not in doubtful])
         trust = _judge(neighbours, keypoints, coarse, settings)
     counts = Counts(
         len(chosen),
@@ -83,12 +89,12 @@ def run(
 
 
 def _joined(
-    coarse: CoarsePoses, found: VerifiedPairs, steps: judgement.Steps, keypoints: Keypoints
+    coarse: CoarsePoses, found: VerifiedPairs, steps: Steps, keypoints: Keypoints
 ) -> tuple[CoarsePoses, tuple[Joint, ...]]:
     """The trajectory with its pieces in one world, if there are several."""
     if coarse.segments is None:
         return coarse, ()
-    return joining.join(coarse, steps, *judgement.length_ratios(found, steps, keypoints))
+    return joining.join(coarse, steps, *length_ratios(found, steps, keypoints))
 
 
 def check_clock(
@@ -116,10 +122,10 @@ def check_clock(
     settings, intervals = context.settings, np.diff(timestamps)
     close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
     chosen = np.column_stack([close, close + 1])
-    lost = _missing(chosen, guided)
+    lost = guided.missing(chosen)
     if len(lost) > _MANY_LOST * len(chosen):
-        guided = _join([guided, match_anywhere(context, lost)])
-    steps = judgement.steps(guided, context.keypoints, settings.verify)
+        guided = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
+    steps = image_steps(guided, context.keypoints, settings.verify)
     misread.refuse_misread(coarse, steps, settings.verify)
     reach = settings.read.max_clock_shift_s
     return clock.estimate(timestamps, steps, trajectory, coarse.time_offset, reach)
@@ -135,13 +141,6 @@ def _match_along(
     found = context.match(chosen, world_T_rigs, gates)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
     return verified(found, f0_T_f1s, np.zeros(len(chosen)), context)
-
-
-def nothing_verified() -> VerifiedPairs:
-    """No pairs: what guidance finds where there is no trajectory."""
-    none = np.zeros((0, 2), np.int32)
-    matches = Matches(none, np.zeros(1, np.int64), none)
-    return VerifiedPairs(matches, np.zeros((0, 4, 4)), Counts(0, 0, "pairs"))
 
 
 def match_anywhere(
@@ -170,15 +169,15 @@ def match_anywhere(
     first = match(chosen, strongest=True)
     if context.strongest is context.frames:
         return first
-    rest = _missing(chosen, first)
-    return _join([first, match(rest, strongest=False)]) if len(rest) else first
+    rest = first.missing(chosen)
+    return VerifiedPairs.joined([first, match(rest, strongest=False)]) if len(rest) else first
 
 
 def _judge(
     found: VerifiedPairs, keypoints: Keypoints, coarse: CoarsePoses, settings: RefineSettings
 ) -> Trust:
-    steps = judgement.steps(found, keypoints, settings.verify)
-    logs, sigmas = judgement.length_ratios(found, steps, keypoints)
+    steps = image_steps(found, keypoints, settings.verify)
+    logs, sigmas = length_ratios(found, steps, keypoints)
     return judgement.judge(coarse, steps, logs, sigmas, settings.verify, settings.priors)
 
 
@@ -191,64 +190,20 @@ def _supported(
     beside it lie at distances in one proportion.
     """
     f = pair[0]
-    present = _index(found.matches.pairs)
+    present = found.frames()
     if {(f - 1, f + 1), (f, f + 2)} & present:
         return True
-    steps = judgement.steps(found, keypoints, settings.verify)
+    steps = image_steps(found, keypoints, settings.verify)
     if not steps.directed[f]:
         return True  # a turn on the spot: whole panoramas agree on one rotation
-    sigmas = judgement.length_ratios(found, steps, keypoints)[1]
+    sigmas = length_ratios(found, steps, keypoints)[1]
     return bool(np.isfinite(sigmas[max(f - 1, 0) : f + 1]).any()) or len(steps.verified) == 1
 
 
 def _consistent(
-    found: VerifiedPairs, steps: judgement.Steps, keypoints: Keypoints, settings: RefineSettings
+    found: VerifiedPairs, steps: Steps, keypoints: Keypoints, settings: RefineSettings
 ) -> VerifiedPairs:
     """Pairs without those over two steps that a repeated structure made up: see `off_steps`."""
-    off = judgement.off_steps(found, steps, keypoints, settings.verify)
+    off = off_steps(found, steps, keypoints, settings.verify)
     false = off > np.deg2rad(settings.verify.max_triplet_deg)
-    return _taken(found, np.flatnonzero(~false).tolist()) if false.any() else found
-
-
-def _index(some: np.ndarray) -> set[tuple[int, int]]:
-    return {(int(f0), int(f1)) for f0, f1 in some}
-
-
-def _missing(chosen: np.ndarray, found: VerifiedPairs) -> np.ndarray:
-    """Those of some pairs (P, 2) that were not verified."""
-    present = _index(found.matches.pairs)
-    rows = [pair for pair in chosen.tolist() if tuple(pair) not in present]
-    return np.array(rows, np.int32).reshape(-1, 2)
-
-
-def _without(found: VerifiedPairs, dropped: list[tuple[int, int]]) -> VerifiedPairs:
-    keep = [p for p, pair in enumerate(found.matches.pairs.tolist()) if tuple(pair) not in dropped]
-    return _taken(found, keep)
-
-
-def _taken(found: VerifiedPairs, rows: list[int]) -> VerifiedPairs:
-    """Some of verified pairs, in the order given."""
-    matches = [found.matches.of(p) for p in rows]
-    kept = Matches(
-        found.matches.pairs[rows].reshape(-1, 2),
-        np.cumsum([0, *map(len, matches)]),
-        np.concatenate([np.zeros((0, 2), np.int32), *matches]),
-    )
-    poses = found.f0_T_f1s[rows].reshape(-1, 4, 4)
-    return VerifiedPairs(kept, poses, found.counts)
-
-
-def _join(parts: list[VerifiedPairs]) -> VerifiedPairs:
-    """All pairs of several sets, those of the closest frames first."""
-    offsets = np.cumsum([0, *(len(part.matches.keypoints) for part in parts)])
-    matches = Matches(
-        np.concatenate([part.matches.pairs for part in parts]),
-        np.concatenate(
-            [[0], *(part.matches.offsets[1:] + o for part, o in zip(parts, offsets, strict=False))]
-        ).astype(np.int64),
-        np.concatenate([part.matches.keypoints for part in parts]),
-    )
-    poses = np.concatenate([part.f0_T_f1s for part in parts])
-    joined = VerifiedPairs(matches, poses, parts[0].counts)
-    gaps = matches.pairs[:, 1] - matches.pairs[:, 0]
-    return _taken(joined, np.lexsort((matches.pairs[:, 0], gaps)).tolist())
+    return found.taken(np.flatnonzero(~false).tolist()) if false.any() else found

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from gsba.config import VerifySettings
-from gsba.geometry import inverse, pose, rotation_angle
+from gsba.geometry import inverse, parallax, pose, rotation_angle
 from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
 
 Estimate = tuple[np.ndarray, np.ndarray]  # f0_T_f1 (4, 4), inlier mask (m,); see `relative_pose`
@@ -70,19 +70,14 @@ def judge(
         turn = rotation_angle(prior[:3, :3].T @ f0_T_f1[:3, :3])
         if turn > np.deg2rad(settings.max_rotation_deg):
             dropped["rotation contradicts"] += 1
-        elif parallax(f0_T_f1, *bearings(matches, keypoints, p, rows)) > np.deg2rad(
+        elif parallax(f0_T_f1, *keypoints.matched(matches.pairs[p], rows)) > np.deg2rad(
             settings.min_parallax_deg
         ) and not _direction_agrees(prior[:3, 3], f0_T_f1[:3, 3], position_sigmas[p], settings):
             dropped["direction contradicts"] += 1
         else:
             kept.append((p, f0_T_f1, rows))
     index = [p for p, _, _ in kept]
-    inlier_rows = [rows for _, _, rows in kept]
-    verified = Matches(
-        matches.pairs[index],
-        np.cumsum([0, *map(len, inlier_rows)]),
-        np.concatenate([np.zeros((0, 2), np.int32), *inlier_rows]),
-    )
+    verified = Matches.of_rows(matches.pairs[index], [rows for _, _, rows in kept])
     poses = np.array([f0_T_f1 for _, f0_T_f1, _ in kept]).reshape(-1, 4, 4)
     return VerifiedPairs(verified, poses, Counts(len(matches.pairs), len(kept), "pairs", dropped))
 
@@ -93,19 +88,11 @@ def estimate(
     """`relative_pose` of every pair, whatever the prior says."""
 
     def one(p: int) -> Estimate | None:
-        rays0, rays1 = bearings(matches, keypoints, p, matches.of(p))
+        rays0, rays1 = keypoints.matched(matches.pairs[p], matches.of(p))
         return relative_pose(rays0, rays1, settings, seed)
 
     with ThreadPoolExecutor(num_threads) as pool:
         return list(pool.map(one, range(len(matches.pairs))))
-
-
-def bearings(
-    matches: Matches, keypoints: Keypoints, p: int, rows: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Bearings (m, 3) of matched keypoints (m, 2) of pair p in either frame."""
-    f0, f1 = matches.pairs[p]
-    return keypoints.bearings_of(f0)[rows[:, 0]], keypoints.bearings_of(f1)[rows[:, 1]]
 
 
 def relative_pose(
@@ -127,12 +114,6 @@ def relative_pose(
     f0_T_f1 = inverse(pose(f1_T_f0[:, :3], f1_T_f0[:, 3]))
     f0_T_f1[:3, 3] /= max(np.linalg.norm(f0_T_f1[:3, 3]), 1e-12)
     return f0_T_f1, np.asarray(found["inlier_mask"], bool)
-
-
-def parallax(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.ndarray) -> float:
-    """Median angle in radians between both bearings in one orientation."""
-    chords = np.linalg.norm(bearings0 - bearings1 @ f0_T_f1[:3, :3].T, axis=1)
-    return float(2 * np.arcsin(np.median(chords) / 2))
 
 
 def _direction_agrees(

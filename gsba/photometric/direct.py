@@ -11,14 +11,13 @@ from factors.patch_windows import PatchPixels, PatchTable, patch_spans, poor_vie
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
 from gsba.bundle import adjustment, prior_factors, triangulation
-from gsba.bundle.adjustment import Adjustment, Round
 from gsba.bundle.optimizer import OptimizeResult, optimize
 from gsba.camera.rig import CubeRig
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.frames.masks import load_weights
 from gsba.log import GsbaError, track
 from gsba.photometric import patches
-from gsba.types import Counts, FrameSet, Keypoints
+from gsba.types import Counts, FrameSet, Keypoints, Round, Solution
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +31,7 @@ _CHUNK = 40_000  # observations whose depths are found at a time: bounds the win
 class PhotometricResult:
     """Poses and points after the joint solve, and what became of the patches."""
 
-    adjustment: Adjustment
+    adjustment: Solution
     counts: tuple[Counts, ...]  # of patches, then of observations, for each level
     frame_weights: np.ndarray  # (F,) float64, 1 = full trust in a frame's pixels
     residuals: np.ndarray  # (F,) float64, median over a frame of patches' residuals, sigmas
@@ -46,8 +45,8 @@ def check(frames: FrameSet, settings: RefineSettings) -> None:
     """
     if "photometric" not in settings.factors:
         return
-    if frames.layout != "erp" or frames.height % 2:
-        what = "cube faces" if frames.layout != "erp" else f"{frames.height} rows"
+    if not frames.panoramic or frames.height % 2:
+        what = f"{frames.height} rows" if frames.panoramic else "cube faces"
         raise GsbaError(
             f"the photometric family reads panoramas of even height, not {what}: leave it out of "
             "--factors"
@@ -57,7 +56,7 @@ def check(frames: FrameSet, settings: RefineSettings) -> None:
 def run(
     frames: FrameSet,
     keypoints: Keypoints,
-    start: Adjustment,
+    start: Solution,
     priors: gtsam.NonlinearFactorGraph,
     rig: CubeRig,
     settings: RefineSettings,
@@ -89,7 +88,7 @@ def run(
 
 
 def _patches(
-    frames: FrameSet, solved: Adjustment, level: int, settings: RefineSettings, num_threads: int
+    frames: FrameSet, solved: Solution, level: int, settings: RefineSettings, num_threads: int
 ) -> tuple[PatchPixels | None, np.ndarray, list[Counts]]:
     """Pixels of the patches and observations that are good enough, if any; weights; the counts."""
     chosen, world_T_rigs = settings.photometric, solved.world_T_rigs
@@ -194,12 +193,12 @@ def _solve(
     pixels: PatchPixels,
     trust: np.ndarray,
     keypoints: Keypoints,
-    solved: Adjustment,
+    solved: Solution,
     priors: gtsam.NonlinearFactorGraph,
     rig: CubeRig,
     settings: RefineSettings,
     num_threads: int,
-) -> tuple[Adjustment, np.ndarray, np.ndarray]:
+) -> tuple[Solution, np.ndarray, np.ndarray]:
     """The joint solve, repeated once where frames are doubted: their weights, their residuals.
 
     It is undone where it explains the map's own observations worse than before.
@@ -230,7 +229,7 @@ def _solve(
 
 def joint(
     frames: FrameSet,
-    solved: Adjustment,
+    solved: Solution,
     frame_weights: np.ndarray,
     settings: RefineSettings,
     num_threads: int,
@@ -325,13 +324,13 @@ def _frame_weights(
 
 
 def _adjusted(
-    solved: Adjustment,
+    solved: Solution,
     keypoints: Keypoints,
     result: OptimizeResult,
     accepted: bool,
     settings: RefineSettings,
     num_threads: int,
-) -> Adjustment:
+) -> Solution:
     """The solution with the joint solve's poses, or as it was if not accepted.
 
     Points are placed anew as after a bundle adjustment: those of the solve lie closer to most
@@ -348,7 +347,7 @@ def _adjusted(
         tracks, bearings, sigmas, poses, gate * solved.noise, settings.triangulate, num_threads
     )
     after = replace(solved, world_T_rigs=poses, landmarks=placed)
-    accepted &= adjustment.carries(after, solved, least)
+    accepted &= after.carries(solved, least)
     support = len(placed.tracks)
     note = Round(
         gate, solved.noise, len(tracks), tracks.num_points, support, accepted, result.history,

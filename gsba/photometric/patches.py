@@ -7,10 +7,10 @@ import numpy as np
 from scipy.ndimage import correlate1d
 
 from factors.patch_windows import PatchTable, over_poles, patch_axes, pixel_grid
+from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.config import PhotometricSettings
 from gsba.frames.masks import load_mask
-from gsba.frames.scan import load_erp
-from gsba.geometry import bearings_from_erp, erp_from_bearings
+from gsba.frames.pixels import load_erp
 from gsba.types import Counts, FrameSet, Landmarks
 
 _NEIGHBOURS = 8  # map points that a patch's plane is laid through

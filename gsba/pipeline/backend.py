@@ -8,7 +8,6 @@ import numpy as np
 
 from factors.sphere_field import SphereField
 from gsba.bundle import adjustment, common_errors, map_strength, stitching, tracks, triangulation
-from gsba.bundle.adjustment import Adjustment
 from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.reconstruction import assemble
 from gsba.bundle.stitching import Stitching
@@ -27,6 +26,7 @@ from gsba.types import (
     Matches,
     Reconstruction,
     Sighted,
+    Solution,
     Tracks,
     VerifiedPairs,
 )
@@ -36,8 +36,8 @@ class Line(MatchingStages):
     """One run: its inputs, its features, and a method for each stage after them."""
 
     def register(
-        self, neighbours: VerifiedPairs, solved: Adjustment, matches: list[Matches]
-    ) -> tuple[Adjustment, list[Matches]]:
+        self, neighbours: VerifiedPairs, solved: Solution, matches: list[Matches]
+    ) -> tuple[Solution, list[Matches]]:
         """Parts of the map joined where they meet, frames in none of them registered.
 
         Raises:
@@ -66,7 +66,7 @@ class Line(MatchingStages):
         adjacent = self.match_along_epipolars(found.solved, "adjacent2")
         return found.solved, [adjacent, *(connectivity.within(m, tied) for m in matches[1:])]
 
-    def look_closer(self, solved: Adjustment, adjacent: Matches) -> tuple[Adjustment, Matches]:
+    def look_closer(self, solved: Solution, adjacent: Matches) -> tuple[Solution, Matches]:
         """What images hold well goes without priors; more keypoints where they hold it poorly."""
         closer, trust = self.settings.closer, self.trust
         if trust is None:
@@ -92,11 +92,11 @@ class Line(MatchingStages):
         gates = self.settings.rounds.dense
         return self.solve("dense_closer", [adjacent, wide], placed, gates), adjacent
 
-    def _place(self, name: str, matches: Sequence[Matches], solved: Adjustment) -> Adjustment:
+    def _place(self, name: str, matches: Sequence[Matches], solved: Solution) -> Solution:
         """Points of these matches under poses as they are."""
         settings = self.settings
 
-        def compute() -> Adjustment:
+        def compute() -> Solution:
             found = self._tracks(matches)
             rows, gate = self.keypoints.rows(found), settings.rounds.dense[-1] * solved.noise
             seen = self.keypoints.bearings_rig[rows], self.keypoints.sigmas_rad[rows]
@@ -105,7 +105,7 @@ class Line(MatchingStages):
                 solved, landmarks=triangulation.run(found, *seen, solved.world_T_rigs, *how)
             )
 
-        return self._stage(name, [self._solving()], compute, Adjustment)
+        return self._stage(name, [self._solving()], compute, Solution)
 
     def _tracks(self, matches: Sequence[Matches]) -> Tracks:
         """Tracks that matches make, within parts that nothing ties together yet."""
@@ -116,22 +116,22 @@ class Line(MatchingStages):
         self,
         name: str,
         matches: Sequence[Matches],
-        start: Adjustment,
+        start: Solution,
         gates: Sequence[float],
         final: bool = False,
-    ) -> Adjustment:
+    ) -> Solution:
         """Bundle adjustment in rounds over the tracks that matches make."""
 
-        def compute() -> Adjustment:
+        def compute() -> Solution:
             given = self._tracks(matches), self.keypoints, start, self.priors, self.rig
             return adjustment.run(*given, gates, self.settings, self.num_threads, final)
 
-        solved = self._stage(name, [self._solving(), gates, final], compute, Adjustment)
+        solved = self._stage(name, [self._solving(), gates, final], compute, Solution)
         self.counts[name] = [solved.landmarks.counts]
         self.solutions[name] = solved
         return solved
 
-    def align(self, number: int, solved: Adjustment) -> Sighted:
+    def align(self, number: int, solved: Solution) -> Sighted:
         """Points observed anew by aligning patches."""
         name = f"align{number}"
 
@@ -145,32 +145,32 @@ class Line(MatchingStages):
         self.counts[name] = [sighted.counts]
         return sighted
 
-    def solve_aligned(self, number: int, sighted: Sighted, before: Adjustment) -> Adjustment:
+    def solve_aligned(self, number: int, sighted: Sighted, before: Solution) -> Solution:
         """Bundle adjustment of aligned observations; undone where that explains less."""
         name, gates = f"aligned{number}", self.settings.rounds.aligned
 
-        def compute() -> tuple[Adjustment, Keypoints]:
+        def compute() -> tuple[Solution, Keypoints]:
             there = replace(sighted, keypoints=self._corrected(sighted.keypoints))
             given = self.priors, self.rig, gates, self.settings, self.num_threads
             solved, found = adjustment.run_sighted(there, before, *given)
             return solved, stitching.with_noise_of(sighted.keypoints, found)
 
         key = [self._solving(), gates]
-        solved, keypoints = self._stage(name, key, compute, tuple[Adjustment, Keypoints])
+        solved, keypoints = self._stage(name, key, compute, tuple[Solution, Keypoints])
         self.counts[name] = [solved.landmarks.counts]
         self.solutions[name] = solved
-        if not adjustment.carries(solved, before, self.settings.rounds.min_observations):
+        if not solved.carries(before, self.settings.rounds.min_observations):
             self.undone.append(name)
             return before
         self.observed, self.aligned = keypoints, sighted.aligned
         return solved
 
-    def straighten(self, number: int, sighted: Sighted, solved: Adjustment) -> Adjustment:
+    def straighten(self, number: int, sighted: Sighted, solved: Solution) -> Solution:
         """The map with what stitching bends taken out, where all frames share it."""
         name, settings = f"stitching{number}", self.settings
         is_first, is_off = number == 1, settings.stitching.mode == "off"
         undone = self.solutions[f"aligned{number}"] is not solved
-        if is_off or undone or self.frames.layout != "erp" or not (is_first or self.field):
+        if is_off or undone or not self.frames.panoramic or not (is_first or self.field):
             return solved
 
         def compute() -> Stitching:
@@ -184,7 +184,7 @@ class Line(MatchingStages):
             self.stitching = found
             return solved
         self.solutions[name] = found.adjustment
-        if not adjustment.carries(found.adjustment, solved, settings.rounds.min_observations):
+        if not found.adjustment.carries(solved, settings.rounds.min_observations):
             self.undone.append(name)
             return solved
         if self.stitching is not None:  # what it gained is known best from where none was
@@ -205,7 +205,7 @@ class Line(MatchingStages):
     def _corrected(self, keypoints: Keypoints) -> Keypoints:
         return stitching.corrected(keypoints, self.field, self.rig)
 
-    def solve_photometric(self, solved: Adjustment) -> Adjustment:
+    def solve_photometric(self, solved: Solution) -> Solution:
         """Joint refinement by the observations so far and the grey values of patches."""
         name, settings = "photometric", self.settings
 
@@ -220,7 +220,7 @@ class Line(MatchingStages):
         self.frame_weights = result.frame_weights
         return result.adjustment
 
-    def refine_on_splat(self, solved: Adjustment) -> Adjustment:
+    def refine_on_splat(self, solved: Solution) -> Solution:
         """Joint refinement by the observations so far, patches, and a splat of the frames."""
         name, settings = "splat", self.settings
         key = [self._solving(), settings.splat, settings.photometric, settings.factors]
@@ -241,7 +241,7 @@ class Line(MatchingStages):
         self.moves = result.moves
         return result.adjustment
 
-    def reconstruct(self, solved: Adjustment) -> Reconstruction:
+    def reconstruct(self, solved: Solution) -> Reconstruction:
         """Covariances, and everything back in the trajectory's world."""
 
         def compute() -> Reconstruction:

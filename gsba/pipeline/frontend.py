@@ -11,8 +11,7 @@ import gtsam
 import numpy as np
 
 from gsba import learned
-from gsba.bundle import adjustment, prior_factors
-from gsba.bundle.adjustment import Adjustment
+from gsba.bundle import prior_factors
 from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.stitching import Stitching
 from gsba.config import PriorSettings, RefineSettings
@@ -39,6 +38,7 @@ from gsba.types import (
     Keypoints,
     Matches,
     PoseSource,
+    Solution,
     VerifiedPairs,
 )
 
@@ -73,7 +73,7 @@ class MatchingStages:
         self._make_extra = extra_factors or (lambda _: ())
         self.follow(coarse)
         self.counts: dict[str, list[Counts]] = {}
-        self.solutions: dict[str, Adjustment] = {}
+        self.solutions: dict[str, Solution] = {}
         self.undone: list[str] = []  # solutions that were not taken
         self.frame_weights = np.ones(len(frames))  # of each frame's pixels
         self.moves: tuple[Move, ...] = ()  # of the poses against a splat
@@ -83,7 +83,7 @@ class MatchingStages:
         store.stage("frames", inputs, lambda: frames, FrameSet)
         self._weights = learned.find_weights(settings)
         self._features = extraction.run(
-            store, frames, self.rig, settings, self.num_threads, self._weights
+            store, frames, self.rig, settings, self.num_threads, *self._extractor(settings)
         )
         self._see("keypoints", [self._features] * len(frames), ["frames", "features"])
         self.stitching: Stitching | None = None  # with the field that corrects them, if any
@@ -114,14 +114,18 @@ class MatchingStages:
             learned.make_matcher(settings, self._weights, self.rig.size),
         )
 
+    def _extractor(self, settings: RefineSettings):
+        files = [path for stage, path in self._weights.items() if stage == "features"]
+        return learned.make_extractor(settings.features, self._weights), files
+
     def extract_more(self, weak: np.ndarray) -> None:
         """More keypoints at some frames (F,) bool, and those of the others as they were."""
         closer, name = self.settings.closer, "features_closer"
         more = closer.model_dump(include={"max_per_face", "contrast_threshold"})
         enlarged = self.settings.features.model_copy(update=more)
         settings = self.settings.model_copy(update={"features": enlarged})
-        given = self.store, self.frames, self.rig, settings, self.num_threads, self._weights
-        found = extraction.run(*given, name, weak)
+        given = self.store, self.frames, self.rig, settings, self.num_threads
+        found = extraction.run(*given, *self._extractor(settings), name, weak)
         sources = [found if more else self._features for more in weak]
         self._see("keypoints_closer", sources, [self.latest, name])
 
@@ -168,15 +172,15 @@ class MatchingStages:
         """Whether the camera stayed in one place, as its images say."""
         return self.trust is not None and self.trust.turning_only
 
-    def start(self) -> Adjustment:
+    def start(self) -> Solution:
         """The coarse trajectory, chained past its false steps, as a solution without points."""
         trusted = self.coarse if self.trust is None else self.trust
-        return adjustment.start(trusted.world_T_rigs)
+        return Solution.without_points(trusted.world_T_rigs)
 
     def match_neighbours(self, name: str = "neighbours") -> VerifiedPairs:
         """Verified matches of frames next to one another in time."""
         if (self.coarse.sources == PoseSource.NONE).all():
-            return recovery.nothing_verified()
+            return VerifiedPairs.none()
         pairs = self._stage(
             name,
             self._matching(),
@@ -208,7 +212,7 @@ class MatchingStages:
         self._set_priors()
         return pairs
 
-    def match_loops(self, solved: Adjustment, name: str = "loops") -> VerifiedPairs:
+    def match_loops(self, solved: Solution, name: str = "loops") -> VerifiedPairs:
         """Verified matches of frames that met the same place again."""
         pairs = self._stage(
             name,
@@ -219,13 +223,13 @@ class MatchingStages:
         self.counts[name] = [pairs.counts]
         return pairs
 
-    def close_loops(self, solved: Adjustment) -> tuple[VerifiedPairs, Adjustment]:
+    def close_loops(self, solved: Solution) -> tuple[VerifiedPairs, Solution]:
         """Matches of places met again, and the map, bent first where drift had hidden them."""
         loops = self.match_loops(solved)
         bent = self._meet_places(solved, loops)
         return (loops, solved) if bent is solved else (self.match_loops(bent, "loops2"), bent)
 
-    def _meet_places(self, solved: Adjustment, near: VerifiedPairs) -> Adjustment:
+    def _meet_places(self, solved: Solution, near: VerifiedPairs) -> Solution:
         """The map bent so that places met again meet, where guided search could not reach them."""
         unseen, trust = np.zeros(len(self.frames) - 1, bool), self.trust
         unseen = trust.unseen_steps if trust and self.registered is None else unseen
@@ -246,12 +250,12 @@ class MatchingStages:
             self._set_priors()
         return closed.solved
 
-    def match_along_epipolars(self, solved: Adjustment, name: str = "adjacent") -> Matches:
+    def match_along_epipolars(self, solved: Solution, name: str = "adjacent") -> Matches:
         """Matches of neighbours in time along their solved epipolar lines."""
         compute = partial(correspondences.match_along_epipolars, self.context, solved)
         return self._stage(name, self._matching(), compute, Matches)
 
-    def match_known_points(self, name: str, solved: Adjustment, loops_closed: bool) -> Matches:
+    def match_known_points(self, name: str, solved: Solution, loops_closed: bool) -> Matches:
         """Matches of solved points in frames further apart."""
         return self._stage(
             name,

@@ -4,23 +4,26 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gsba.bundle.stitching import describe as describe_field
 from gsba.config_file import to_toml
 from gsba.export import ExportFormat, export, write_points
-from gsba.log import GsbaError
 from gsba.loop_closure import merged_map
-from gsba.loop_closure.connectivity import largest, taken
 from gsba.pipeline import timing
 from gsba.pipeline.backend import Line
 from gsba.placement.placement import Placement, place
 from gsba.report.html import residual_sphere, write_html
 from gsba.report.report import build_report, plain, take_notes, write_poses, write_report
-from gsba.store.store import atomic_write, load_stage
+from gsba.store.store import atomic_write
 from gsba.trajectory.files import write_tum
 from gsba.trajectory.judgement import describe
-from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, Reconstruction, Trajectory
+from gsba.types import (
+    CoarsePoses,
+    Counts,
+    FrameSet,
+    PoseSource,
+    Reconstruction,
+    Trajectory,
+)
 
 _GAUGE = (
     "Sim(3)-aligned to the coarse trajectory over its refined SLAM poses: its world and scale; "
@@ -52,59 +55,11 @@ class RunResult:
     report: dict[str, Any]  # the content of report.json
 
 
-def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:
-    """Result of a finished run and the frames it was made from: the largest of its maps.
-
-    Raises:
-        GsbaError: `out` is no finished run, or was edited.
-    """
-    reconstruction = load_stage(out, "reconstruction", Reconstruction)
-    frames = load_stage(out, "frames", FrameSet)
-    if not _fit_together(reconstruction, frames):
-        raise GsbaError(f"{out}: its results do not fit together: refine again with --fresh")
-    frames = replace(frames, correction=reconstruction.correction)
-    main, shown = taken(reconstruction, frames, largest(reconstruction))
-    if not (np.isfinite(main.world_T_rigs).all() and np.isfinite(main.points_world).all()):
-        raise GsbaError(f"{out}: its poses or points are no numbers: refine again with --fresh")
-    if not (np.isfinite(shown.timestamps).all() and (np.diff(shown.timestamps) > 0).all()):
-        raise GsbaError(f"{out}: its frames are in no order of time: refine again with --fresh")
-    return main, shown
-
-
-def _fit_together(reconstruction: Reconstruction, frames: FrameSet) -> bool:
-    """Whether arrays have the lengths that others speak of."""
-    result, num = reconstruction, len(frames.names)
-    points, seen = (sum(a.shape[:1]) for a in (result.points_world, result.observation_points))
-    shapes = (
-        (result.world_T_rigs, (num, 4, 4)),
-        (result.pose_covariances, (num, 6, 6)),
-        (result.pose_statuses, (num,)),
-        (result.points_world, (points, 3)),
-        (result.point_colors, (points, 3)),
-        (result.point_errors, (points,)),
-        (result.observation_points, (seen,)),
-        (result.observation_frames, (seen,)),
-        (result.observation_bearings, (seen, 3)),
-        (result.observation_sigmas, (seen,)),
-        (frames.timestamps, (num,)),
-    )
-    if (joint := result.joint_errors) is not None:
-        drawn = (*joint.draws.shape[:1], num, 6)
-        shapes += ((joint.neighbours, (num - 1, 6, 6)), (joint.draws, drawn))
-    indices = ((result.observation_points, points), (result.observation_frames, num))
-    return (
-        all(array.shape == shape for array, shape in shapes)
-        and len(frames.paths) == len(frames.mask_paths) == num > 0
-        and (result.components is None or result.components.shape == (num,))
-        and all(i.size == 0 or (i.min() >= 0 and i.max() < most) for i, most in indices)
-    )
-
-
 def write(line: Line, reconstruction: Reconstruction) -> RunResult:
     """Poses, cloud, report and datasets; of several maps that nothing ties together the largest."""
     store, settings, frames, coarse = line.store, line.settings, line.corrected, line.coarse
-    out, rows = store.root, largest(reconstruction)
-    main, shown = taken(reconstruction, frames, rows)
+    out, rows = store.root, reconstruction.largest_map()
+    main, shown = (reconstruction.taken(rows), frames.taken(rows))
     write_tum(out / "trajectory.tum", Trajectory(shown.timestamps, main.world_T_rigs))
     start = replace(coarse, world_T_rigs=coarse.world_T_rigs[rows], sources=coarse.sources[rows])
     (out / "coarse.tum").unlink(missing_ok=True)

@@ -7,7 +7,6 @@ from threadpoolctl import threadpool_limits
 
 from gsba import video
 from gsba.bundle import rotation_only
-from gsba.bundle.adjustment import Adjustment
 from gsba.config import RefineSettings
 from gsba.frames.scan import scan
 from gsba.masks import merging
@@ -16,10 +15,19 @@ from gsba.photometric import direct
 from gsba.pipeline import inputs, outputs, timing
 from gsba.pipeline.backend import Line
 from gsba.pipeline.frontend import ExtraFactors
-from gsba.pipeline.outputs import RunResult, load_run
+from gsba.pipeline.outputs import RunResult
 from gsba.placement.placement import check
+from gsba.store.finished import load_run
 from gsba.store.store import RunStore
-from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory, VerifiedPairs
+from gsba.types import (
+    CoarsePoses,
+    Counts,
+    FrameSet,
+    Reconstruction,
+    Solution,
+    Trajectory,
+    VerifiedPairs,
+)
 
 __all__ = ["RunResult", "load_run", "refine"]
 
@@ -92,7 +100,7 @@ def _neighbours(line: Line, given: Sequence[Trajectory]) -> VerifiedPairs:
     return line.judge(timing.match_neighbours(line, given, inputs.coarse_poses))
 
 
-def _solve(line: Line, neighbours: VerifiedPairs) -> Adjustment:
+def _solve(line: Line, neighbours: VerifiedPairs) -> Solution:
     """All stages from verified neighbours to the last solution."""
     settings, rounds = line.settings, line.settings.rounds
     solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)

@@ -113,8 +113,7 @@ def _edge_normals(
 def _side_faces(frames: FrameSet, f: int) -> tuple[np.ndarray, np.ndarray | None]:
     """The four faces around the horizon (4, N, N, 3), and where they may be used (4, N, N)."""
     assert FACES[:4] == ("front", "right", "back", "left")
-    size = frames.width if frames.layout == "cube" else min(_FACE, frames.width // 4)
-    images, masks = cubemap.load(frames, f, CubeRig(size, np.pi / 2))
+    images, masks = cubemap.load(frames, f, cubemap.native_rig(frames, _FACE))
     return images[:4], None if masks is None else masks[:4]
 
 

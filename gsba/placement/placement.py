@@ -14,12 +14,21 @@ from typing import Any
 import numpy as np
 
 from gsba.config import PlacementSettings
-from gsba.evaluate.trajectory import associate
-from gsba.geometry import pose, pose_similarity, similarity
+from gsba.geometry import pose
 from gsba.log import GsbaError, brief
 from gsba.placement.exif import read_exif_gps
 from gsba.placement.gps import GpsFixes, local_from_geodetic, read_gps
-from gsba.similarity import extents, level_similarity, naming, residuals_of, robust_similarity
+from gsba.similarity import (
+    Sim3,
+    extents,
+    level_similarity,
+    naming,
+    pose_similarity,
+    residuals_of,
+    robust_similarity,
+    similarity,
+)
+from gsba.trajectory.association import matched_in_time
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
 from gsba.version import __version__
@@ -38,11 +47,9 @@ _LEVEL_SPREAD = 0.02  # of a path's second extent to its first: below, positions
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """placed = scale * rotation @ run + translation; world = placed + offset."""
+    """Where the world of a run goes: placed = similarity of the run; world = placed + offset."""
 
-    scale: float = 1.0
-    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))  # (3, 3) float64
-    translation: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) float64
+    similarity: Sim3 = field(default_factory=Sim3)
     unit: str = "map units"  # of the placed world
     up: str | None = None  # axis of the placed world that points up: "-y", "z"; None = unknown
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,), unit of the placed
@@ -52,27 +59,25 @@ class Placement:
     @property
     def matrix(self) -> np.ndarray:
         """(4, 4) float64: placed = matrix @ run, homogeneous."""
-        return pose(self.scale * self.rotation, self.translation)
+        move = self.similarity
+        return pose(move.scale * move.rotation, move.translation)
 
     @property
     def inverse(self) -> np.ndarray:
         """(4, 4) float64: run = inverse @ placed, homogeneous."""
-        back = self.rotation.T / self.scale
-        return pose(back, -back @ self.translation)
-
-    def points(self, points: np.ndarray) -> np.ndarray:
-        """Points (N, 3) of the run where they are placed."""
-        return self.scale * points @ self.rotation.T + self.translation
+        move = self.similarity
+        back = move.rotation.T / move.scale
+        return pose(back, -back @ move.translation)
 
     def apply(self, reconstruction: Reconstruction) -> Reconstruction:
         """A reconstruction in its place; angles, and what the images say, stay as they are."""
-        poses = reconstruction.world_T_rigs
-        stretch = np.array([1.0, 1, 1, self.scale, self.scale, self.scale])  # rig axes do not turn
+        poses, move = reconstruction.world_T_rigs, self.similarity
+        stretch = np.array([1.0, 1, 1, *[move.scale] * 3])  # rig axes do not turn
         joint = reconstruction.joint_errors
         return dataclasses.replace(
             reconstruction,
-            world_T_rigs=pose(self.rotation @ poses[:, :3, :3], self.points(poses[:, :3, 3])),
-            points_world=self.points(reconstruction.points_world),
+            world_T_rigs=move.poses(poses),
+            points_world=move.points(reconstruction.points_world),
             pose_covariances=reconstruction.pose_covariances * stretch[:, None] * stretch,
             joint_errors=joint and joint.scaled(np.tile(stretch, (len(poses), 1))),
         )
@@ -83,9 +88,9 @@ class Placement:
         return {
             "gsba": __version__,
             "meaning": "placed = scale * rotation @ run + translation; world = placed + offset",
-            "scale": self.scale,
-            "rotation": self.rotation.tolist(),
-            "translation": self.translation.tolist(),
+            "scale": self.similarity.scale,
+            "rotation": self.similarity.rotation.tolist(),
+            "translation": self.similarity.translation.tolist(),
             "matrix": self.matrix.tolist(),
             "inverse": self.inverse.tolist(),
             "unit": self.unit,
@@ -110,13 +115,12 @@ def read_placement(path: Path) -> Placement:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         scale, rotation = float(content["scale"]), np.array(content["rotation"], np.float64)
+        translation = np.array(content["translation"], np.float64)
         origin, up = content["origin"], content["up"]
         if origin is not None:
             origin = origin["latitude"], origin["longitude"], origin["altitude"]
         return Placement(
-            scale,
-            rotation.reshape(3, 3),
-            np.array(content["translation"], np.float64).reshape(3),
+            Sim3(scale, rotation.reshape(3, 3), translation.reshape(3)),
             str(content["unit"]),
             up,
             np.array(content["offset"], np.float64).reshape(3),
@@ -147,11 +151,12 @@ def place(
     """
     check(settings)
     placement = _placement(reconstruction, frames, settings)
-    placed = placement.points(reconstruction.world_T_rigs[:, :3, 3])
+    placed = placement.similarity.points(reconstruction.world_T_rigs[:, :3, 3])
     far = np.abs(placed).max(initial=0)
-    if not (_SCALES[0] <= placement.scale <= _SCALES[1] and far <= _FURTHEST):
+    scale = placement.similarity.scale
+    if not (_SCALES[0] <= scale <= _SCALES[1] and far <= _FURTHEST):
         raise GsbaError(
-            f"the run would be placed at a scale of {placement.scale:g}, up to {far:g} from the "
+            f"the run would be placed at a scale of {scale:g}, up to {far:g} from the "
             "origin: check what --scale, --between, --gps or --align say"
         )
     return placement
@@ -173,9 +178,9 @@ def _placement(
         distance = float(np.linalg.norm(second - first))
         if distance <= 1e-9 * (1 + np.abs(first).max()):
             raise GsbaError(f"--between {' '.join(settings.between)}: both are at one place")
-        scale = settings.length / distance
+        scaled = dataclasses.replace(placement.similarity, scale=settings.length / distance)
         grounds = {**placement.grounds, "length": settings.length, "between": settings.between}
-        placement = dataclasses.replace(placement, scale=scale, unit="m", grounds=grounds)
+        placement = dataclasses.replace(placement, similarity=scaled, unit="m", grounds=grounds)
     return placement
 
 
@@ -215,7 +220,7 @@ def _upright(reconstruction: Reconstruction, frames: FrameSet) -> Placement:
         "rigs_spread_deg": round(gravity.spread_deg, 4),
     }
     rotation = _least_turn(gravity.up, _UP_WORLD)
-    return Placement(rotation=rotation, up="-y", grounds={"gravity": grounds})
+    return Placement(Sim3(rotation=rotation), up="-y", grounds={"gravity": grounds})
 
 
 def _least_turn(source: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -271,9 +276,9 @@ def _on_earth(
                 raise GsbaError(f"{path}: the frames lie on a line: add --up auto")
             fit, used, sigma = robust_similarity(positions, target, similarity, 3)
         else:
-            level = _least_turn(_UP_WORLD, np.array([0.0, 0, 1])) @ upright.rotation
+            level = _least_turn(_UP_WORLD, np.array([0.0, 0, 1])) @ upright.similarity.rotation
             fit, used, sigma = robust_similarity(positions @ level.T, target, level_similarity, 2)
-            fit = (fit[0], fit[1] @ level, fit[2])
+            fit = dataclasses.replace(fit, rotation=fit.rotation @ level)
     grounds = {
         **upright.grounds,
         "gps": {
@@ -285,7 +290,7 @@ def _on_earth(
     }
     logger.info("--gps %s: %d of %d positions agree to %.3g m", path, used.sum(), len(used), sigma)
     where = (float(origin[0]), float(origin[1]), float(origin[2]))
-    return Placement(*fit, unit="m", up="z", origin=where, grounds=grounds)
+    return Placement(fit, unit="m", up="z", origin=where, grounds=grounds)
 
 
 def _fixes_of_frames(
@@ -315,7 +320,7 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
     truth = read_trajectory(path)
     _require_times(path, frames)
     run = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
-    rows, of_truth = associate(run, truth, _TOLERANCE_S)
+    rows, of_truth = matched_in_time(run, truth, _TOLERANCE_S)
     good = reconstruction.pose_statuses[rows] == PoseStatus.REFINED
     rows, of_truth = rows[good], of_truth[good]
     if len(rows) < 3:
@@ -338,7 +343,7 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
             used, sigma = np.ones(len(rows), bool), float(np.sqrt(np.mean(residuals**2)))
     grounds = {"file": str(path), "poses": len(rows), "outliers": int(np.sum(~used)), "rmse": sigma}
     unit = "units of the true poses"
-    return Placement(*fit, unit=unit, offset=offset, grounds={"align": grounds})
+    return Placement(fit, unit=unit, offset=offset, grounds={"align": grounds})
 
 
 def _require_times(path: Path, frames: FrameSet) -> None:

@@ -180,7 +180,7 @@ def _edges(depth: np.ndarray) -> np.ndarray:
 
 def _captured_rig(frames: FrameSet, size: int) -> CubeRig:
     """Faces as dense as rendered ones and a little wider; those of cube frames are as they are."""
-    if frames.layout == "cube":
-        return CubeRig(frames.width, np.pi / 2)
+    if not frames.panoramic:
+        return cubemap.native_rig(frames)
     hfov = np.deg2rad(_MARGIN_HFOV_DEG)
     return CubeRig(round(size * np.tan(hfov / 2)), hfov)

@@ -3,7 +3,6 @@
 import logging
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -13,22 +12,11 @@ from gsba.splat import adam
 from gsba.splat.camera import FaceCamera
 from gsba.splat.density import Pull
 from gsba.splat.gaussians import Gaussians
+from gsba.splat.lesson import Lesson
 from gsba.splat.metrics import training_loss
 from gsba.splat.rasterise import Gradients, Rendering, differentiate, render
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Lesson:
-    """One view, and how far to go to look like it."""
-
-    camera: FaceCamera
-    truth: np.ndarray  # (H, W, 3) uint8, RGB
-    use: np.ndarray | None  # (H, W) bool, pixels that count; None = all
-    sh_degree: int  # of the harmonics, at most
-    rates: adam.Rates
-    number: int  # of the step, from 1
 
 
 class Backend(Protocol):

@@ -23,7 +23,7 @@ from gsba.splat.gaussians import Gaussians
 from gsba.splat.rasterise import Rendering
 
 if TYPE_CHECKING:
-    from gsba.splat.backend import Lesson
+    from gsba.splat.lesson import Lesson
 
 
 class GsplatBackend:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.disk import atomic_write
 from gsba.log import GsbaError
 from gsba.splat.gaussians import Gaussians
-from gsba.store.records import atomic_write
 
 _TYPES = {
     **dict.fromkeys(("float", "float32"), "<f4"),

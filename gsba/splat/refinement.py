@@ -26,7 +26,6 @@ import numpy as np
 
 from factors import Block, LandmarkBlock
 from gsba.bundle import adjustment, triangulation
-from gsba.bundle.adjustment import Adjustment, Round
 from gsba.bundle.optimizer import OptimizeResult, optimize
 from gsba.camera.rig import CubeRig
 from gsba.config import RefineSettings, SplatSettings
@@ -34,10 +33,11 @@ from gsba.splat.alignment import Captured, capture, splat_block
 from gsba.splat.backend import choose_backend
 from gsba.splat.evidence import score, standard_error, together
 from gsba.splat.gaussians import Gaussians, from_cloud
-from gsba.splat.scene import Split, face_psnrs, load_faces, make_views, near_of, split_frames
+from gsba.splat.scene import Split, load_faces, make_views, near_of, split_frames
+from gsba.splat.scores import face_psnrs
 from gsba.splat.train import State, Views, advance, begin
 from gsba.store.records import RecordError, load_record, read_info, save_record
-from gsba.types import Counts, FrameSet, Keypoints, Landmarks
+from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Round, Solution
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ class Move:
 class SplatResult:
     """Poses and points after the last move that was taken."""
 
-    adjustment: Adjustment
+    adjustment: Solution
     counts: tuple[Counts, ...]  # of frames: those the splat is trained on are kept
     moves: tuple[Move, ...]
 
@@ -82,7 +82,7 @@ class _Progress:
 def run(
     frames: FrameSet,
     keypoints: Keypoints,
-    start: Adjustment,
+    start: Solution,
     priors: gtsam.NonlinearFactorGraph,
     rig: CubeRig,
     settings: RefineSettings,
@@ -165,7 +165,7 @@ class _Turns:
     def __init__(
         self,
         keypoints: Keypoints,
-        solved: Adjustment,
+        solved: Solution,
         priors: gtsam.NonlinearFactorGraph,
         rig: CubeRig,
         settings: RefineSettings,
@@ -221,7 +221,7 @@ class _Turns:
         after = self._placed(moved)
         accepted = evidence > chosen.min_sigmas and growth <= chosen.max_growth
         least = self.settings.rounds.min_observations
-        accepted &= adjustment.carries(replace(self.solved, landmarks=after), self.solved, least)
+        accepted &= replace(self.solved, landmarks=after).carries(self.solved, least)
         move = Move(
             settings.face_size, float(looks[0].mean()), float(looks[1].mean()),
             standard_error(gains), growth, len(savings) * standard_error(savings) / total,
@@ -242,7 +242,7 @@ class _Turns:
             (*before.rounds, note),
         )
 
-    def adjusted(self, progress: _Progress) -> Adjustment:
+    def adjusted(self, progress: _Progress) -> Solution:
         """The solution with the last poses taken, points placed anew; or as it was."""
         rounds = (*self.solved.rounds, *progress.rounds)
         if not any(move.accepted for move in progress.moves):

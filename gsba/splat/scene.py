@@ -1,27 +1,21 @@
 """From a run to splats: posed faces, start clouds, training, and metrics of held-out frames."""
 
-from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsba.bundle import triangulation
-from gsba.camera.rig import CubeRig, owner_faces
+from gsba.camera.rig import CubeRig
 from gsba.config import SplatSettings, TriangulateSettings
 from gsba.frames import cubemap
-from gsba.geometry import bearings_from_erp
 from gsba.log import GsbaError, track
-from gsba.splat.backend import Backend
-from gsba.splat.camera import face_camera, rig_cameras
+from gsba.splat.camera import face_camera
 from gsba.splat.gaussians import Gaussians, from_cloud
-from gsba.splat.metrics import psnr, ssim
 from gsba.splat.train import Views, extent_of
-from gsba.types import FACES, FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
+from gsba.types import FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
 
 _GATE = np.deg2rad(3.0)  # of an observation under poses that may have drifted
 _MAX_TIMES = 8  # samples of a panorama along a pixel of a face, at most
-_ROUNDED_DB = 60.0  # of a face at most: rounding to 8 bits alone leaves 59
-_PANORAMA_HFOV_DEG = 94.0  # of the faces a panorama is sampled from
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,16 +24,6 @@ class Split:
 
     training: np.ndarray  # (T,) int, frame indices
     held_out: np.ndarray  # (H,) int, frame indices: whole panoramas
-
-
-@dataclass(frozen=True, slots=True)
-class Score:
-    """How close renderings of a panorama's six faces are to what was captured."""
-
-    psnr: float  # dB, over the pixels of all faces together
-    ssim: float  # mean over faces
-    psnr_exposed: float  # dB, after the gain of each channel that fits best: exposure aside
-    lpips: float | None = None  # mean over faces; None = there were no weights
 
 
 def split_frames(usable: np.ndarray, every: int) -> Split:
@@ -91,8 +75,8 @@ def cut_faces(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, n
     """
     import cv2
 
-    if frames.layout == "cube":
-        whole = CubeRig(frames.width, np.pi / 2)
+    if not frames.panoramic:
+        whole = cubemap.native_rig(frames)
     else:
         times = -(-frames.width / (2 * np.pi) // rig.focal)  # until no denser in the middle
         whole = replace(rig, size=int(np.clip(times, 1, _MAX_TIMES)) * rig.size)
@@ -174,163 +158,6 @@ def start_cloud(
     return from_cloud(landmarks.points_world, reconstruction.point_colors[known], sh_degree)
 
 
-Distance = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]
-
-
-def measure(
-    gaussians: Gaussians,
-    views: Views,
-    settings: SplatSettings,
-    near: float,
-    backend: Backend,
-    lpips: Distance | None = None,
-) -> dict[int, Score]:
-    """Scores of panoramas, by their number in the views.
-
-    Args:
-        gaussians: the splat.
-        views: held-out faces; a panorama that is masked altogether has none, and no score.
-        settings: degree of the harmonics.
-        near: least z of a Gaussian, map units.
-        backend: the renderer.
-        lpips: see `gsba.splat.lpips`; None = leave it out.
-
-    Raises:
-        GsbaError: no panorama has a pixel to measure.
-    """
-    return {
-        int(views.panoramas[rows[0]]): _score(
-            gaussians, views, rows, settings, near, backend, lpips
-        )
-        for rows in _panoramas(views)
-    }
-
-
-def face_psnrs(
-    gaussians: Gaussians, views: Views, settings: SplatSettings, near: float, backend: Backend
-) -> np.ndarray:
-    """PSNR of each view (V,) in dB, after the gain of each channel that fits its panorama best.
-
-    Args:
-        gaussians, views, settings, near, backend: see `measure`.
-
-    Raises:
-        GsbaError: no panorama has a pixel to measure.
-    """
-    found = np.zeros(len(views.cameras))
-    for rows in _panoramas(views):
-        pairs = _pairs(gaussians, views, rows, settings, near, backend)
-        gains = _gains(
-            [image[use] for image, _, use in pairs], [real[use] for _, real, use in pairs]
-        )
-        for v, (image, real, use) in zip(rows, pairs, strict=True):
-            found[v] = min(psnr(np.clip(gains * image, 0, 1), real, use), _ROUNDED_DB)
-    return found
-
-
-def _panoramas(views: Views) -> list[np.ndarray]:
-    """Rows of the views of each panorama.
-
-    Raises:
-        GsbaError: there is none.
-    """
-    if len(views.cameras) == 0:
-        raise GsbaError("no pixel to measure a splat on: all held-out frames are masked")
-    return [np.flatnonzero(views.panoramas == i) for i in np.unique(views.panoramas)]
-
-
-def _pairs(
-    gaussians: Gaussians,
-    views: Views,
-    rows: np.ndarray,
-    settings: SplatSettings,
-    near: float,
-    backend: Backend,
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of each view: rendering and truth (H, W, 3) float32, 0..1, and where they count, bool."""
-    cameras = [views.cameras[v] for v in rows]
-    renderings = backend.render(gaussians, cameras, settings.sh_degree, near)
-    pairs = []
-    for v, rendering in zip(rows, renderings, strict=True):
-        image, real = np.clip(rendering.color, 0, 1), views.images[v].astype(np.float32) / 255
-        use = np.ones(real.shape[:2], bool) if views.use is None else views.use[v]
-        pairs.append((image, real, use))
-    return pairs
-
-
-def _gains(images: Sequence[np.ndarray], truths: Sequence[np.ndarray]) -> np.ndarray:
-    """Gain of each channel (3,) that carries pixels (N, 3) closest to what they should be."""
-    image, real = np.concatenate(images), np.concatenate(truths)
-    return np.sum(image * real, axis=0) / np.maximum(np.sum(image * image, axis=0), 1e-9)
-
-
-def _score(
-    gaussians: Gaussians,
-    views: Views,
-    rows: np.ndarray,
-    settings: SplatSettings,
-    near: float,
-    backend: Backend,
-    lpips: Distance | None,
-) -> Score:
-    found, truth, similarities, distances = [], [], [], []
-    for image, real, use in _pairs(gaussians, views, rows, settings, near, backend):
-        similarities.append(ssim(image, real, use))
-        if lpips is not None:
-            distances.append(lpips(image, real, use))
-        found.append(image[use])
-        truth.append(real[use])
-    gains = _gains(found, truth)
-    image, real = np.concatenate(found), np.concatenate(truth)
-    exposed = psnr(np.clip(gains * image, 0, 1), real)
-    far = float(np.mean(distances)) if distances else None
-    return Score(psnr(image, real), float(np.nanmean(similarities)), exposed, far)
-
-
-def mean_score(scores: Iterable[Score]) -> Score:
-    """Mean of each metric over panoramas."""
-    scores = list(scores)
-    columns = ((s.psnr, s.ssim, s.psnr_exposed) for s in scores)
-    distances = [s.lpips for s in scores if s.lpips is not None]
-    far = float(np.mean(distances)) if distances else None
-    means = Score(*(float(np.mean(column)) for column in zip(*columns, strict=True)))
-    return replace(means, lpips=far)
-
-
 def near_of(world_T_rigs: np.ndarray, settings: SplatSettings) -> float:
     """Least z, map units, of a Gaussian that is seen by rigs (N, 4, 4)."""
     return settings.near * extent_of(world_T_rigs[:, :3, 3])
-
-
-def render_faces(
-    gaussians: Gaussians, world_T_rig: np.ndarray, rig: CubeRig, near: float, backend: Backend
-) -> np.ndarray:
-    """The six faces (6, size, size, 3) uint8 RGB of a rig, in FACES order."""
-    renderings = backend.render(gaussians, rig_cameras(world_T_rig, rig), None, near)
-    return np.stack([to_uint8(rendering.color) for rendering in renderings])
-
-
-def render_panorama(
-    gaussians: Gaussians, world_T_rig: np.ndarray, width: int, near: float, backend: Backend
-) -> np.ndarray:
-    """An equirectangular image (width / 2, width, 3) uint8 RGB, sampled from wider faces."""
-    import cv2
-
-    hfov = np.deg2rad(_PANORAMA_HFOV_DEG)
-    rig = CubeRig(round(width / np.pi * np.tan(hfov / 2)), hfov)  # as dense as the equator
-    faces = render_faces(gaussians, world_T_rig, rig, near, backend)
-    height = width // 2
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    bearings = bearings_from_erp(np.stack([u, v], axis=-1), width, height)
-    owners = owner_faces(bearings)
-    at = (rig.project(bearings, owners) - 0.5).astype(np.float32)
-    image = np.empty((height, width, 3), np.uint8)
-    for face in range(len(FACES)):
-        sampled = cv2.remap(faces[face], at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-        image[owners == face] = sampled[owners == face]
-    return image
-
-
-def to_uint8(color: np.ndarray) -> np.ndarray:
-    """Colours 0..1 as 0..255, limited and rounded."""
-    return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)

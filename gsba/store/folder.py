@@ -14,8 +14,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from gsba.disk import atomic_write, disk_errors, remove_temporaries
 from gsba.log import GsbaError
-from gsba.store.records import RecordError, atomic_write, disk_errors, remove_temporaries, typed
+from gsba.store.records import RecordError, typed
 from gsba.version import __version__
 
 logger = logging.getLogger(__name__)

@@ -7,15 +7,13 @@ the caller expects, so a file can neither name code to run nor smuggle in anothe
 checksums reveal truncated or flipped bytes.
 """
 
-import errno
 import json
-import os
 import tokenize
 import types
 import typing
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from enum import Enum
@@ -24,57 +22,17 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
-from gsba.log import GsbaError
+from gsba.disk import atomic_write
 
 T = TypeVar("T")
 
 FORMAT = 1  # raised whenever the layout below changes
 HEADER_ERRORS = (SyntaxError, tokenize.TokenError, RecursionError)  # of a damaged .npy or JSON
 _MANIFEST = "manifest.json"
-_TEMPORARY = ".gsba-tmp-"  # prefix of files still being written
 
 
 class RecordError(Exception):
     """A stored record that is damaged or is not of the expected type."""
-
-
-@contextmanager
-def disk_errors(path: Path) -> Iterator[None]:
-    """Turn an OSError of writing to `path` into one line that says what to do."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise GsbaError(
-                f"no space left while writing {path}: free some and run again; "
-                "finished stages are kept"
-            ) from error
-        raise GsbaError(f"cannot write {path}: {error.strerror or error}") from error
-
-
-def atomic_write(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file beside `path` and rename it into place, so that `path` is never half-written.
-
-    Args:
-        path: final file; missing parent folders are made.
-        write: called with a temporary path of the same folder and suffix.
-    Raises:
-        GsbaError: full disk, no permission and the like.
-    """
-    temporary = path.with_name(f"{_TEMPORARY}{os.getpid()}-{path.name}")
-    with disk_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            write(temporary)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-
-
-def remove_temporaries(folder: Path) -> None:
-    """Delete what a killed process left half-written under `folder`."""
-    for path in folder.rglob(f"{_TEMPORARY}*"):
-        path.unlink(missing_ok=True)
 
 
 def save_record(path: Path, value: object, info: Mapping[str, Any]) -> None:

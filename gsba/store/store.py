@@ -23,17 +23,10 @@ from typing import Generic, TypeVar
 
 from pydantic import BaseModel
 
+from gsba.disk import atomic_write
 from gsba.log import GsbaError, track
 from gsba.store.folder import MARKER, STAGES, claim, is_run_folder, open_run_folder
-from gsba.store.records import (
-    FORMAT,
-    RecordError,
-    atomic_write,
-    load_record,
-    read_info,
-    save_record,
-    typed,
-)
+from gsba.store.records import FORMAT, RecordError, load_record, read_info, save_record, typed
 from gsba.version import __version__
 
 logger = logging.getLogger(__name__)

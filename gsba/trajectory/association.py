@@ -183,12 +183,28 @@ def _faded(duration: np.ndarray, time_constant: float) -> np.ndarray:
 
 
 def nearest(sorted_values: np.ndarray, queries: np.ndarray) -> np.ndarray:
-    """Index of the nearest of sorted values (N,), N >= 2, for each query (Q,)."""
-    right = np.clip(np.searchsorted(sorted_values, queries), 1, len(sorted_values) - 1)
-    left = right - 1
+    """Index of the nearest of sorted values (N,), N >= 1, for each query (Q,)."""
+    last = len(sorted_values) - 1
+    right = np.minimum(np.clip(np.searchsorted(sorted_values, queries), 1, max(last, 1)), last)
+    left = np.maximum(right - 1, 0)
     closer_left = queries - sorted_values[left] <= sorted_values[right] - queries
     return np.where(closer_left, left, right)
 
 
 def _half_interval(times: np.ndarray, entries: np.ndarray) -> float:
     return 0.5 * float(min(np.median(np.diff(times)), np.median(np.diff(entries))))
+
+
+def matched_in_time(
+    estimate: Trajectory, truth: Trajectory, tolerance_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (M,) of estimate and (M,) of truth that are mutually nearest in time, in time order."""
+    finite = np.flatnonzero(np.isfinite(estimate.world_T_rigs).all(axis=(1, 2)))
+    times_e, times_t = estimate.timestamps[finite], truth.timestamps
+    if len(times_e) == 0 or len(times_t) == 0:
+        return np.empty(0, np.intp), np.empty(0, np.intp)
+    nearest_e, nearest_t = nearest(times_e, times_t), nearest(times_t, times_e)
+    rows_t = np.arange(len(times_t))
+    mutual = nearest_t[nearest_e] == rows_t
+    rows_t = rows_t[mutual & (np.abs(times_e[nearest_e] - times_t) <= tolerance_s)]
+    return finite[nearest_e[rows_t]], rows_t

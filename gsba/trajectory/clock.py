@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gsba.trajectory.clock_search import ClockFit, merged, noise
-from gsba.trajectory.judgement import Steps
+from gsba.trajectory.steps import Steps
 from gsba.types import Trajectory
 
 MIN_STEPS = 5  # fewer cannot tell a clock

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsba.geometry import carried, pose, rotation_angle
-from gsba.trajectory.blame import chained
-from gsba.trajectory.judgement import Steps
+from gsba.geometry import rotation_angle
+from gsba.similarity import Sim3
+from gsba.trajectory.steps import Steps, chained
 from gsba.types import CoarsePoses, PoseSource
 
 _REACH = 8  # frames of the trajectory on either side of a break
@@ -39,7 +39,7 @@ def join(
     Args:
         coarse: poses of each piece in its own world.
         found: steps from the images.
-        logs, sigmas: ratios of their lengths, see `gsba.trajectory.judgement.length_ratios`.
+        logs, sigmas: ratios of their lengths, see `gsba.trajectory.steps.length_ratios`.
 
     Returns:
         Poses in one world, and how each further piece was joined, in order.
@@ -50,11 +50,10 @@ def join(
     own = coarse.sources == PoseSource.SLAM
     for before in np.flatnonzero(np.diff(coarse.segments)).tolist():
         rows = np.flatnonzero(coarse.segments == coarse.segments[before + 1])
-        moves = _over(before, poses, coarse.segments, own, found, logs, sigmas)
-        how = IMAGES if moves else GUESS
-        scale, world_T_own = moves or _by_pace(before, poses, coarse.segments)
-        poses[rows] = carried(poses[rows], scale, world_T_own)
-        joints.append(Joint(int(rows[0]), int(rows[-1]), scale, world_T_own, how))
+        shown = _over(before, poses, coarse.segments, own, found, logs, sigmas)
+        move, how = shown or _by_pace(before, poses, coarse.segments), IMAGES if shown else GUESS
+        poses[rows] = move.poses(poses[rows])
+        joints.append(Joint(int(rows[0]), int(rows[-1]), move.scale, move.new_T_old, how))
     return replace(coarse, world_T_rigs=poses), tuple(joints)
 
 
@@ -73,7 +72,7 @@ def _over(
     found: Steps,
     logs: np.ndarray,
     sigmas: np.ndarray,
-) -> tuple[float, np.ndarray] | None:
+) -> Sim3 | None:
     """Similarity of the piece behind a step to that before it, by the images around the step."""
     if not found.directed[before]:
         return None
@@ -98,19 +97,17 @@ def _over(
         if laid is None:
             return None
         sides.append(laid)
-    (scale0, rotation0, shift0), (scale1, rotation1, shift1) = sides
-    scale, rotation = scale0 / scale1, rotation0 @ rotation1.T
-    return scale, pose(rotation, shift0 - scale * rotation @ shift1)
+    before_break, behind = sides
+    scale, rotation = before_break.scale / behind.scale, before_break.rotation @ behind.rotation.T
+    return Sim3(scale, rotation, before_break.translation - scale * rotation @ behind.translation)
 
 
 def _enough(own: np.ndarray) -> bool:
     return int(np.count_nonzero(own)) >= _REACH or len(own) >= _FURTHEST
 
 
-def _laid(
-    chain: np.ndarray, poses: np.ndarray, frames: np.ndarray
-) -> tuple[float, np.ndarray, np.ndarray] | None:
-    """Scale, rotation (3, 3) and translation (3,) that lay a chain over poses (N, 4, 4) of it.
+def _laid(chain: np.ndarray, poses: np.ndarray, frames: np.ndarray) -> Sim3 | None:
+    """What lays a chain over poses (N, 4, 4) of it.
 
     Medians, so that a false pose among them does not count.
     """
@@ -124,10 +121,10 @@ def _laid(
     apart = rotation_angle(np.swapaxes(turns, 1, 2)[:, None] @ turns[None])
     rotation = turns[np.argmin(np.median(apart, axis=1))]
     shifts = poses[:, :3, 3] - scale * chain[:, :3, 3] @ rotation.T
-    return scale, rotation, np.median(shifts, axis=0)
+    return Sim3(scale, rotation, np.median(shifts, axis=0))
 
 
-def _by_pace(before: int, poses: np.ndarray, segments: np.ndarray) -> tuple[float, np.ndarray]:
+def _by_pace(before: int, poses: np.ndarray, segments: np.ndarray) -> Sim3:
     """A similarity after which the piece behind a step goes on where that before it ends."""
     paces = []
     for rows in (segments == segments[before], segments == segments[before + 1]):
@@ -138,4 +135,4 @@ def _by_pace(before: int, poses: np.ndarray, segments: np.ndarray) -> tuple[floa
     alone = before == 0 or segments[before - 1] != segments[before]
     step = np.zeros(3) if alone else poses[before, :3, 3] - poses[before - 1, :3, 3]
     there = poses[before, :3, 3] + step
-    return scale, pose(rotation, there - scale * rotation @ poses[before + 1, :3, 3])
+    return Sim3(scale, rotation, there - scale * rotation @ poses[before + 1, :3, 3])

@@ -13,30 +13,21 @@ from typing import Any
 import numpy as np
 
 from gsba.config import PriorSettings, VerifySettings
-from gsba.geometry import inverse, pose, rotation_angle
-from gsba.matching.verification import bearings, parallax
-from gsba.trajectory.blame import chained, false_frames, limits
-from gsba.types import CoarsePoses, FrameSet, Keypoints, PoseSource, VerifiedPairs
+from gsba.geometry import inverse, nearest_rotation, pose, rotation_angle
+from gsba.trajectory.steps import Steps, chained, step_lengths
+from gsba.types import CoarsePoses, FrameSet, PoseSource
 
 logger = logging.getLogger(__name__)
 
-_MIN_COMMON = 8  # points that two steps must share to compare their lengths
-_MIN_POINT_PARALLAX = np.deg2rad(1.0)  # of a point, or its depth is not worth comparing
-_STILL = np.deg2rad(0.1)  # median: what a mere turn leaves over of bearings
-_RATIO_SIGMA = 0.02  # least noise of the logarithm of a ratio of lengths
-_SMOOTH_SIGMA = 0.5  # of the same where nothing is measured: walkers keep their pace
-_LENGTH_ROUNDS = 20  # of reweighting
 _LEAP = 4.0  # median speeds
 _ROUGH = 3.0  # standard deviations of the prior: a step further off starts from the images
 
-
-@dataclass(frozen=True, slots=True)
-class Steps:
-    """Relative poses of frames that follow one another, from the images alone."""
-
-    f_T_nexts: np.ndarray  # (F - 1, 4, 4) float64, translation of unit length
-    verified: np.ndarray  # (F - 1,) bool: the images gave one
-    directed: np.ndarray  # (F - 1,) bool: with parallax enough to know the direction
+_MAX_RUN = 12  # false frames in a row that are told from a jump
+_BREAK = 1.5  # price of a jump in frames named
+_QUIET = 0.25  # part of the steps that no outlier spoils: the quantile that noise is read from
+_NOISE = (
+    4.0  # times that quantile: of a drifting trajectory's steps, one in a thousand is further off
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,163 +50,6 @@ class Trust:
     def held_steps(self) -> np.ndarray:
         """Steps (F - 1,) bool that no image shows, but the trajectory may know."""
         return self.unseen_steps & ~self.false_steps
-
-
-def steps(pairs: VerifiedPairs, keypoints: Keypoints, settings: VerifySettings) -> Steps:
-    """Relative poses of neighbours among verified pairs.
-
-    Args:
-        pairs: of frames at most a few apart.
-        keypoints: of all frames.
-        settings: least parallax at which a direction is known.
-    """
-    num = max(len(keypoints.starts) - 2, 0)
-    f_T_nexts = np.tile(np.eye(4), (num, 1, 1))
-    verified, directed = np.zeros(num, bool), np.zeros(num, bool)
-    for p, (f0, f1) in enumerate(pairs.matches.pairs):
-        if f1 - f0 != 1:
-            continue
-        f0_T_f1 = pairs.f0_T_f1s[p]
-        rays0, bearings1 = bearings(pairs.matches, keypoints, p, pairs.matches.of(p))
-        f_T_nexts[f0], verified[f0] = f0_T_f1, True
-        turn = _turn(rays0, bearings1)
-        if np.median(np.linalg.norm(rays0 - bearings1 @ turn.T, axis=1)) < _STILL:
-            f_T_nexts[f0, :3, :3] = turn  # an essential matrix knows it less well
-        directed[f0] = parallax(f0_T_f1, rays0, bearings1) > np.deg2rad(settings.min_parallax_deg)
-    return Steps(f_T_nexts, verified, directed)
-
-
-def off_steps(
-    pairs: VerifiedPairs, found: Steps, keypoints: Keypoints, settings: VerifySettings
-) -> np.ndarray:
-    """How far pairs over two steps are from what those steps, whatever their lengths, allow.
-
-    Frame f + 2 lies, as f sees it, between the directions of both steps. A pair that repeated
-    structure made up agrees with neither, though it may be within what the trajectory allows.
-
-    Returns:
-        (P,) radians; 0 for other pairs, and where a direction is not known.
-    """
-    out = np.zeros(len(pairs.matches.pairs))
-    for p, (f0, f2) in enumerate(pairs.matches.pairs):
-        if f2 - f0 != 2 or not found.directed[f0 : f0 + 2].all():
-            continue
-        f0_T_f2 = pairs.f0_T_f1s[p]
-        both = bearings(pairs.matches, keypoints, p, pairs.matches.of(p))
-        if parallax(f0_T_f2, *both) > np.deg2rad(settings.min_parallax_deg):
-            first = found.f_T_nexts[f0]
-            second = first[:3, :3] @ found.f_T_nexts[f0 + 1, :3, 3]
-            out[p] = _angle_to_arc(f0_T_f2[:3, 3], first[:3, 3], second)
-    return out
-
-
-def _angle_to_arc(direction: np.ndarray, start: np.ndarray, end: np.ndarray) -> float:
-    """Angle in radians from a unit vector to the great arc between two others."""
-    normal = np.cross(start, end)
-    beside = np.cross(normal, start) @ direction >= 0 and np.cross(end, normal) @ direction >= 0
-    length = np.linalg.norm(normal)
-    if beside and length > 1e-9:
-        return float(np.arcsin(min(abs(normal @ direction) / length, 1.0)))
-    return float(np.arccos(np.clip(max(direction @ start, direction @ end), -1, 1)))
-
-
-def _turn(rays0: np.ndarray, rays1: np.ndarray) -> np.ndarray:
-    """Rotation (3, 3) that carries rays (m, 3) onto others in least squares (Kabsch, 1976)."""
-    u, _, vt = np.linalg.svd(rays0.T @ rays1)
-    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-
-
-def length_ratios(
-    pairs: VerifiedPairs, found: Steps, keypoints: Keypoints
-) -> tuple[np.ndarray, np.ndarray]:
-    """Length of each step over that of the step before, from points that both see.
-
-    Returns:
-        Logarithms (F - 2,) of the ratios and their standard deviations, infinite where unknown.
-    """
-    num = len(found.verified)
-    logs, sigmas = np.zeros(max(num - 1, 0)), np.full(max(num - 1, 0), np.inf)
-    rows = {int(f0): p for p, (f0, f1) in enumerate(pairs.matches.pairs) if f1 - f0 == 1}
-    for f in range(1, num):
-        if not (found.directed[f - 1] and found.directed[f]):
-            continue
-        before, after = pairs.matches.of(rows[f - 1]), pairs.matches.of(rows[f])
-        _, in_before, in_after = np.intersect1d(before[:, 1], after[:, 0], return_indices=True)
-        before, after = before[in_before], after[in_after]
-        here = keypoints.bearings_of(f)
-        back = _depths(
-            here[before[:, 1]],
-            keypoints.bearings_of(f - 1)[before[:, 0]],
-            inverse(found.f_T_nexts[f - 1]),
-        )
-        ahead = _depths(
-            here[after[:, 0]], keypoints.bearings_of(f + 1)[after[:, 1]], found.f_T_nexts[f]
-        )
-        ratios = np.log(back / ahead)
-        ratios = ratios[np.isfinite(ratios)]
-        if len(ratios) < _MIN_COMMON:
-            continue
-        logs[f - 1] = np.median(ratios)
-        spread = 1.4826 * np.median(np.abs(ratios - logs[f - 1]))
-        sigmas[f - 1] = max(1.25 * spread / np.sqrt(len(ratios)), _RATIO_SIGMA)
-    return logs, sigmas
-
-
-def _depths(rays0: np.ndarray, rays1: np.ndarray, f0_T_f1: np.ndarray) -> np.ndarray:
-    """Distances (m,) from frame 0 along its rays to where both rays meet; NaN where unclear."""
-    across = rays1 @ f0_T_f1[:3, :3].T
-    cosine = np.einsum("mi,mi->m", rays0, across)
-    sine2 = 1 - cosine**2
-    along0, along1 = rays0 @ f0_T_f1[:3, 3], across @ f0_T_f1[:3, 3]
-    clear = sine2 > np.sin(_MIN_POINT_PARALLAX) ** 2
-    safe = np.where(clear, sine2, 1)
-    depth0, depth1 = (along0 - cosine * along1) / safe, (cosine * along0 - along1) / safe
-    return np.where(clear & (depth0 > 0) & (depth1 > 0), depth0, np.nan)
-
-
-def step_lengths(
-    slam_lengths: np.ndarray,
-    slam_sigmas: np.ndarray,
-    logs: np.ndarray,
-    sigmas: np.ndarray,
-) -> np.ndarray:
-    """Lengths of steps that agree with their measured ratios and, where right, the trajectory's.
-
-    The most probable logarithms of the lengths under Gaussian ratios and Cauchy-distributed
-    errors of the trajectory, by reweighting from wide to narrow (graduated non-convexity).
-
-    Args:
-        slam_lengths: (N,) lengths in the trajectory, map units.
-        slam_sigmas: (N,) noise of their logarithms; infinite = not to be used.
-        logs, sigmas: (N - 1,) see `length_ratios`.
-
-    Returns:
-        (N,) map units.
-    """
-    from scipy.linalg import solveh_banded
-
-    positive = slam_lengths[slam_lengths > 0]
-    typical = float(np.median(positive)) if len(positive) else 1.0
-    target = np.log(np.maximum(slam_lengths, 1e-3 * typical))
-    links = np.where(np.isfinite(sigmas), 1 / np.minimum(sigmas, 1e3) ** 2, _SMOOTH_SIGMA**-2)
-    logs = np.where(np.isfinite(sigmas), logs, 0)
-    information = np.where(np.isfinite(slam_sigmas), slam_sigmas**-2.0, 0)
-    width = 30.0  # of the loss, standard deviations
-    lengths = np.full(len(target), np.median(target))
-    for _ in range(_LENGTH_ROUNDS):
-        misfit = (target - lengths) ** 2 * information
-        weights = information / (1 + misfit / width**2) + 1e-9
-        bands = np.zeros((2, len(target)))
-        bands[1] = weights
-        bands[1, :-1] += links
-        bands[1, 1:] += links
-        bands[0, 1:] = -links
-        right = weights * target
-        right[:-1] -= links * logs
-        right[1:] += links * logs
-        lengths = solveh_banded(bands, right)
-        width = max(0.7 * width, 1.0)
-    return np.exp(lengths)
 
 
 def judge(
@@ -342,10 +176,97 @@ def _chain(world_T_rigs: np.ndarray, chosen: np.ndarray, own: np.ndarray) -> np.
     """Poses (F, 4, 4) that follow the chosen steps, laid over the trajectory's own frames."""
     poses = chained(chosen)
     own = own if own.any() else np.ones(len(own), bool)
-    u, _, vt = np.linalg.svd(
+    rotation = nearest_rotation(
         np.einsum("fij,fkj->ik", world_T_rigs[own, :3, :3], poses[own, :3, :3])
     )
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
     positions = poses[:, :3, 3] @ rotation.T
     shift = np.median(world_T_rigs[own, :3, 3] - positions[own], axis=0)
     return pose(rotation @ poses[:, :3, :3], positions + shift)
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Disagreement of two frames' relative pose with the images that sets it apart."""
+
+    rotation: float  # radians
+    offset: float  # part of the distance between the frames
+    noise_rotation: float  # radians, of one step: below, it is as noisy as the rest
+    noise_offset: float  # the same of its position, map units
+
+
+def limits(
+    slam: np.ndarray, images: np.ndarray, judged: np.ndarray, settings: VerifySettings
+) -> Limits:
+    """What sets a frame apart: more than the settings allow, and than the rest is off.
+
+    A trajectory that drifts quickly contradicts the images in many steps, each by about as much;
+    none of its frames is an outlier. How much that is can be read from its better steps, as
+    outliers leave those alone.
+
+    Args:
+        slam: (F - 1, 4, 4) steps of the trajectory.
+        images: (F - 1, 4, 4) steps that the images show, with lengths.
+        judged: (F - 1,) bool, steps of which both are known.
+        settings: disagreement that counts as contradiction.
+    """
+    turned = rotation_angle(np.swapaxes(slam[:, :3, :3], 1, 2) @ images[:, :3, :3])
+    off = np.linalg.norm(slam[:, :3, 3] - images[:, :3, 3], axis=1)
+    usual = [float(np.quantile(x[judged], _QUIET)) if judged.any() else 0.0 for x in (turned, off)]
+    return Limits(
+        np.deg2rad(settings.max_rotation_deg),
+        float(np.sin(np.deg2rad(settings.max_direction_deg))),
+        _NOISE * usual[0],
+        _NOISE * usual[1],
+    )
+
+
+def false_frames(
+    wrong: np.ndarray,
+    slam: np.ndarray,
+    chosen: np.ndarray,
+    own: np.ndarray,
+    limits: Limits,
+) -> np.ndarray:
+    """Frames (F,) whose own pose is false: the fewest whose absence explains the false steps.
+
+    The longest chain of frames is kept whose relative poses in the trajectory agree with the
+    images, from each to the next in the chain; a jump for good breaks it, at a price, and names the
+    frame behind. Filled-in poses take no part: they were guesses.
+
+    Args:
+        wrong: (F - 1,) bool, steps that the images contradict.
+        slam, chosen: (F - 1, 4, 4) steps of the trajectory and what is known of them.
+        own: (F,) bool, frames with a pose of the trajectory.
+        limits: disagreement that sets a frame apart from the others.
+    """
+    named = np.zeros(len(own), bool)
+    if not wrong.any():
+        return named
+    ours = np.flatnonzero(own)
+    theirs, images = chained(slam), chained(chosen)
+    score, back = np.ones(len(ours)), np.full(len(ours), -1)
+    broken = np.zeros(len(ours), bool)
+    for n in range(1, len(ours)):
+        for m in range(n - 1, max(n - 1 - _MAX_RUN, -1), -1):
+            a, b = int(ours[m]), int(ours[n])
+            agree = (b == a + 1 and not wrong[a]) or _agree(theirs, images, a, b, limits)
+            gain = score[m] + 1 - (0 if agree else _BREAK)
+            if gain > score[n]:
+                score[n], back[n], broken[n] = gain, m, not agree
+    named[ours] = True
+    n = int(np.argmax(score))
+    while n >= 0:
+        named[ours[n]] = broken[n]
+        n = int(back[n])
+    return named
+
+
+def _agree(theirs: np.ndarray, images: np.ndarray, a: int, b: int, limits: Limits) -> bool:
+    """Whether a trajectory's relative pose of two frames fits the steps of the images."""
+    one, other = inverse(theirs[a]) @ theirs[b], inverse(images[a]) @ images[b]
+    turned = rotation_angle(one[:3, :3].T @ other[:3, :3])
+    off, length = np.linalg.norm(one[:3, 3] - other[:3, 3]), np.linalg.norm(other[:3, 3])
+    walked = np.sqrt(b - a)  # noise of steps adds up like a random walk's
+    rotation = max(limits.rotation, walked * limits.noise_rotation)
+    offset = max(limits.offset * length, walked * limits.noise_offset)
+    return bool(turned < rotation and off < offset)

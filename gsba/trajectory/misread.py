@@ -5,7 +5,7 @@ import numpy as np
 from gsba.config import VerifySettings
 from gsba.geometry import inverse, rotation_angle
 from gsba.log import GsbaError
-from gsba.trajectory.judgement import Steps
+from gsba.trajectory.steps import Steps
 from gsba.types import CoarsePoses, PoseSource
 
 _MIN_STEPS = 5  # fewer say nothing about a whole trajectory

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from gsba.config import VideoSettings
+from gsba.disk import atomic_write, disk_errors, remove_temporaries
 from gsba.frames.times import read_times
 from gsba.log import GsbaError, track
-from gsba.store.records import RecordError, atomic_write, disk_errors, remove_temporaries, typed
+from gsba.store.records import RecordError, typed
 from gsba.store.store import digest, fingerprint
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Counts

@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsba.camera.rig import CubeRig
 from gsba.frames import cubemap
 from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
@@ -98,8 +97,7 @@ def faces_of(frames: FrameSet, f: int, masked: bool) -> dict[str, np.ndarray]:
     Raises:
         GsbaError: pictures that have vanished or changed since the run.
     """
-    native = frames.width if frames.layout == "cube" else frames.width // 4
-    rig = CubeRig(native if frames.layout == "cube" else min(native, _MAX_FACE), np.pi / 2)
+    rig = cubemap.native_rig(frames, _MAX_FACE)
     images, use = cubemap.load(frames, f, rig)
     if masked and use is not None and frames.mask_paths[f] is not None:
         tinted = (1 - _TINT) * images[~use] + _TINT * _MASKED
@@ -129,13 +127,11 @@ def _coarse(run: Path, placement: Placement, num_frames: int) -> np.ndarray | No
     path = run / "coarse.tum"
     if not path.exists():
         return None
-    world_T_rigs = read_trajectory(path).world_T_rigs.copy()
+    world_T_rigs = read_trajectory(path).world_T_rigs
     if len(world_T_rigs) != num_frames:
         logger.warning("%s is of other frames: it is not shown", path)
         return None
-    world_T_rigs[:, :3, :3] = placement.rotation @ world_T_rigs[:, :3, :3]
-    world_T_rigs[:, :3, 3] = placement.points(world_T_rigs[:, :3, 3])
-    return world_T_rigs
+    return placement.similarity.poses(world_T_rigs)
 
 
 def _placed_splat(name: str, gaussians: Gaussians, placement: Placement) -> Splat:
@@ -143,12 +139,13 @@ def _placed_splat(name: str, gaussians: Gaussians, placement: Placement) -> Spla
     if not len(gaussians):
         raise GsbaError(f"the splat {name!r} holds no Gaussians: train it again")
     unit = gaussians.quaternions / np.linalg.norm(gaussians.quaternions, axis=1, keepdims=True)
-    axes = placement.rotation @ rotation_from_quaternion(unit)
-    factors = axes * (placement.scale * np.exp(gaussians.log_scales.astype(np.float64)))[:, None]
+    move = placement.similarity
+    axes = move.rotation @ rotation_from_quaternion(unit)
+    factors = axes * (move.scale * np.exp(gaussians.log_scales.astype(np.float64)))[:, None]
     covariances = factors @ np.swapaxes(factors, 1, 2)
     return Splat(
         name,
-        placement.points(gaussians.means.astype(np.float64)).astype(np.float32),
+        move.points(gaussians.means.astype(np.float64)).astype(np.float32),
         covariances.astype(np.float32),
         np.clip(0.5 + SH_CONSTANT * gaussians.sh[:, 0], 0, 1).astype(np.float32),
         (1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64))))[:, None].astype(

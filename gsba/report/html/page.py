@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from gsba.disk import atomic_write
 from gsba.log import GsbaError
 from gsba.report.html import pictures, views
 from gsba.report.report import frame_quality, plain
-from gsba.store.records import atomic_write
 from gsba.types import CoarsePoses, FrameSet, Reconstruction
 
 logger = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ def write_html(
         "matches": views.match_matrix(reconstruction),
         "sphere": report["residual_sphere"],
         "field": views.field_sphere(reconstruction.correction),
-        "erp_width": frames.width if frames.layout == "erp" else 4 * frames.width,
+        "erp_width": frames.panorama_width,
         "worst": _worst(frames, reconstruction),
     }
     text = _assembled(json.dumps(plain(data, digits=6), allow_nan=False, separators=(",", ":")))

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from gsba.camera.rig import CubeRig, owner_faces
-from gsba.frames.scan import load_erp, load_faces
-from gsba.geometry import bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.frames.pixels import load_erp, load_faces
 from gsba.report.html.views import tangent_residuals
 from gsba.report.report import frame_quality
 from gsba.types import FACES, FrameSet, Reconstruction
@@ -66,7 +66,7 @@ def _small_panorama(frames: FrameSet, f: int) -> np.ndarray:
     """(H, W, 3) uint8 RGB; put together from the faces where there are faces only."""
     import cv2
 
-    if frames.layout == "erp":
+    if frames.panoramic:
         erp = load_erp(frames, f, width=_WIDTH)
         return cv2.resize(erp, (_WIDTH, _WIDTH // 2), interpolation=cv2.INTER_AREA)
     faces, rig = load_faces(frames, f), CubeRig(frames.width, np.pi / 2)

@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from gsba.geometry import bearings_from_erp, rotation_angle
+from gsba.camera.sphere import bearings_from_erp
+from gsba.geometry import rotation_angle
 from gsba.types import CoarsePoses, Reconstruction
 
 _MAX_POINTS = 4000  # of the cloud, on the map

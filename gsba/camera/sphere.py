@@ -1,0 +1,27 @@
+"""Equirectangular pixels and the bearings that they show."""
+
+import numpy as np
+
+
+def bearings_from_erp(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Unit bearings of equirectangular pixels.
+
+    Args:
+        pixels: (..., 2) float64, (u, v), centre of the top-left pixel at (0.5, 0.5).
+        width, height: image size in pixels, width = 2 height.
+
+    Returns:
+        (..., 3) float64, rig frame (x right, y down, z forward = centre column).
+    """
+    longitude = 2 * np.pi * (pixels[..., 0] / width - 0.5)
+    latitude = np.pi * (0.5 - pixels[..., 1] / height)
+    c = np.cos(latitude)
+    return np.stack([c * np.sin(longitude), -np.sin(latitude), c * np.cos(longitude)], axis=-1)
+
+
+def erp_from_bearings(bearings: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Equirectangular pixels, (..., 2) float64 with u in [0, width], of vectors (..., 3)."""
+    x, y, z = bearings[..., 0], bearings[..., 1], bearings[..., 2]
+    u = width * (np.arctan2(x, z) / (2 * np.pi) + 0.5)
+    v = height * (0.5 + np.arctan2(y, np.hypot(x, z)) / np.pi)
+    return np.stack([u, v], axis=-1)

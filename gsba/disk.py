@@ -1,0 +1,50 @@
+"""Files written beside their place and renamed into it; failures of the disk in one line."""
+
+import errno
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from gsba.log import GsbaError
+
+_TEMPORARY = ".gsba-tmp-"  # prefix of files still being written
+
+
+@contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Turn an OSError of writing to `path` into one line that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise GsbaError(
+                f"no space left while writing {path}: free some and run again; "
+                "finished stages are kept"
+            ) from error
+        raise GsbaError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def atomic_write(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file beside `path` and rename it into place, so that `path` is never half-written.
+
+    Args:
+        path: final file; missing parent folders are made.
+        write: called with a temporary path of the same folder and suffix.
+    Raises:
+        GsbaError: full disk, no permission and the like.
+    """
+    temporary = path.with_name(f"{_TEMPORARY}{os.getpid()}-{path.name}")
+    with disk_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            write(temporary)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Delete what a killed process left half-written under `folder`."""
+    for path in folder.rglob(f"{_TEMPORARY}*"):
+        path.unlink(missing_ok=True)

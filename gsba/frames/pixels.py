@@ -1,0 +1,36 @@
+"""Pixels of a frame: its panorama, or its cube faces."""
+
+import numpy as np
+
+from gsba.camera.straighten import straightened
+from gsba.frames.files import decode
+from gsba.types import FrameSet
+
+
+def load_erp(frames: FrameSet, f: int, gray: bool = False, width: int | None = None) -> np.ndarray:
+    """Equirectangular image of frame f, (height, width, 3) uint8 RGB, or (height, width) grey.
+
+    Where the frames have a correction, it is applied.
+
+    Args:
+        frames: panoramas.
+        f: index of the frame.
+        gray: one channel instead of RGB.
+        width: pixels across, even: wider frames are averaged down to it.
+    """
+    import cv2
+
+    if not frames.panoramic:
+        raise ValueError("load_erp needs equirectangular frames")
+    erp = decode(frames.paths[f][0], (frames.width, frames.height), gray, at_least=width)
+    if width is not None and width < erp.shape[1]:
+        erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
+    return straightened(erp, frames.correction) if frames.correction else erp
+
+
+def load_faces(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
+    """Cube faces of frame f, (len(frames.faces), height, width[, 3]) uint8, RGB or grey."""
+    if frames.panoramic:
+        raise ValueError("load_faces needs cube frames")
+    size = frames.width, frames.height
+    return np.stack([decode(path, size, gray) for path in frames.paths[f]])

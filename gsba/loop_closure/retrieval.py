@@ -1,0 +1,56 @@
+"""What a panorama looks like, whatever its heading.
+
+Looks are compared as vectors of locally aggregated descriptors (VLAD: Jegou et al., CVPR 2010;
+normalised word by word as in Arandjelovic and Zisserman, CVPR 2013) over whole panoramas.
+"""
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from gsba.matching.guided_search import SearchableFrames
+
+_WORDS = 64  # of the vocabulary
+_SAMPLES = 20_000  # descriptors it is made from
+_ROUNDING = 1e-5  # of descriptors, float32 and of length one: a shorter sum has no direction
+
+
+def looks_of(frames: SearchableFrames, num_frames: int, seed: int) -> np.ndarray:
+    """What each panorama looks like, whatever its heading: (F, D) float32 of length one."""
+    rng = np.random.default_rng(seed)
+    share = max(_SAMPLES // max(num_frames, 1), 8)
+    sample = np.concatenate(
+        [rng.permutation(frames[f].descriptors)[:share] for f in range(num_frames)]
+    )
+    words = _words(sample, rng)
+    looks = [_aggregate(frames[f].descriptors, words) for f in range(num_frames)]
+    return np.array(looks, np.float32)
+
+
+def _words(sample: np.ndarray, rng: np.random.Generator, rounds: int = 12) -> np.ndarray:
+    """Centres (W, D) of a k-means clustering."""
+    words = sample[rng.permutation(len(sample))[:_WORDS]].copy()
+    for _ in range(rounds):
+        nearest = _nearest(sample, words)
+        counts = np.bincount(nearest, minlength=len(words))
+        sums = _sums(sample, nearest, len(words))
+        words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], words)
+    return words
+
+
+def _nearest(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
+    return np.argmax(descriptors @ words.T - 0.5 * np.sum(words**2, axis=1), axis=1)
+
+
+def _sums(rows: np.ndarray, groups: np.ndarray, num: int) -> np.ndarray:
+    """Sums (num, D) of the rows (K, D) of each group."""
+    ones, starts = np.ones(len(rows), rows.dtype), np.arange(len(rows) + 1)
+    return csr_matrix((ones, groups, starts), shape=(len(rows), num)).T @ rows
+
+
+def _aggregate(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
+    """Sums of the differences from the nearest words, each word's of length one."""
+    nearest = _nearest(descriptors, words)
+    sums = _sums(descriptors - words[nearest], nearest, len(words))
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    sums = np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > _ROUNDING)
+    return sums.ravel() / max(float(np.linalg.norm(sums)), 1e-12)

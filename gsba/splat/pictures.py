@@ -1,0 +1,46 @@
+"""Pictures of a splat: the faces of a rig, and panoramas."""
+
+import numpy as np
+
+from gsba.camera.rig import CubeRig, owner_faces
+from gsba.camera.sphere import bearings_from_erp
+from gsba.splat.backend import Backend
+from gsba.splat.camera import rig_cameras
+from gsba.splat.gaussians import Gaussians
+from gsba.types import FACES
+
+_PANORAMA_HFOV_DEG = 94.0  # of the faces a panorama is sampled from
+
+
+def render_faces(
+    gaussians: Gaussians, world_T_rig: np.ndarray, rig: CubeRig, near: float, backend: Backend
+) -> np.ndarray:
+    """The six faces (6, size, size, 3) uint8 RGB of a rig, in FACES order."""
+    renderings = backend.render(gaussians, rig_cameras(world_T_rig, rig), None, near)
+    return np.stack([to_uint8(rendering.color) for rendering in renderings])
+
+
+def render_panorama(
+    gaussians: Gaussians, world_T_rig: np.ndarray, width: int, near: float, backend: Backend
+) -> np.ndarray:
+    """An equirectangular image (width / 2, width, 3) uint8 RGB, sampled from wider faces."""
+    import cv2
+
+    hfov = np.deg2rad(_PANORAMA_HFOV_DEG)
+    rig = CubeRig(round(width / np.pi * np.tan(hfov / 2)), hfov)  # as dense as the equator
+    faces = render_faces(gaussians, world_T_rig, rig, near, backend)
+    height = width // 2
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    bearings = bearings_from_erp(np.stack([u, v], axis=-1), width, height)
+    owners = owner_faces(bearings)
+    at = (rig.project(bearings, owners) - 0.5).astype(np.float32)
+    image = np.empty((height, width, 3), np.uint8)
+    for face in range(len(FACES)):
+        sampled = cv2.remap(faces[face], at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        image[owners == face] = sampled[owners == face]
+    return image
+
+
+def to_uint8(color: np.ndarray) -> np.ndarray:
+    """Colours 0..1 as 0..255, limited and rounded."""
+    return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)

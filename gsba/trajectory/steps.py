@@ -1,0 +1,189 @@
+"""Relative poses of frames that follow one another, from the images alone.
+
+Two such frames share so much that their relative rotation and direction of motion can be had
+from the images. The length of a step, which two views leave open, follows from its neighbours':
+a point that two steps see must be equally far in both.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsba.config import VerifySettings
+from gsba.geometry import inverse, nearest_rotation, parallax
+from gsba.types import Keypoints, VerifiedPairs
+
+_MIN_COMMON = 8  # points that two steps must share to compare their lengths
+_MIN_POINT_PARALLAX = np.deg2rad(1.0)  # of a point, or its depth is not worth comparing
+_STILL = np.deg2rad(0.1)  # median: what a mere turn leaves over of bearings
+_RATIO_SIGMA = 0.02  # least noise of the logarithm of a ratio of lengths
+_SMOOTH_SIGMA = 0.5  # of the same where nothing is measured: walkers keep their pace
+_LENGTH_ROUNDS = 20  # of reweighting
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """Relative poses of frames that follow one another, from the images alone."""
+
+    f_T_nexts: np.ndarray  # (F - 1, 4, 4) float64, translation of unit length
+    verified: np.ndarray  # (F - 1,) bool: the images gave one
+    directed: np.ndarray  # (F - 1,) bool: with parallax enough to know the direction
+
+
+def image_steps(pairs: VerifiedPairs, keypoints: Keypoints, settings: VerifySettings) -> Steps:
+    """Relative poses of neighbours among verified pairs.
+
+    Args:
+        pairs: of frames at most a few apart.
+        keypoints: of all frames.
+        settings: least parallax at which a direction is known.
+    """
+    num = max(len(keypoints.starts) - 2, 0)
+    f_T_nexts = np.tile(np.eye(4), (num, 1, 1))
+    verified, directed = np.zeros(num, bool), np.zeros(num, bool)
+    for p, (f0, f1) in enumerate(pairs.matches.pairs):
+        if f1 - f0 != 1:
+            continue
+        f0_T_f1 = pairs.f0_T_f1s[p]
+        rays0, bearings1 = keypoints.matched(pairs.matches.pairs[p], pairs.matches.of(p))
+        f_T_nexts[f0], verified[f0] = f0_T_f1, True
+        turn = nearest_rotation(rays0.T @ bearings1)
+        if np.median(np.linalg.norm(rays0 - bearings1 @ turn.T, axis=1)) < _STILL:
+            f_T_nexts[f0, :3, :3] = turn  # an essential matrix knows it less well
+        directed[f0] = parallax(f0_T_f1, rays0, bearings1) > np.deg2rad(settings.min_parallax_deg)
+    return Steps(f_T_nexts, verified, directed)
+
+
+def off_steps(
+    pairs: VerifiedPairs, found: Steps, keypoints: Keypoints, settings: VerifySettings
+) -> np.ndarray:
+    """How far pairs over two steps are from what those steps, whatever their lengths, allow.
+
+    Frame f + 2 lies, as f sees it, between the directions of both steps. A pair that repeated
+    structure made up agrees with neither, though it may be within what the trajectory allows.
+
+    Returns:
+        (P,) radians; 0 for other pairs, and where a direction is not known.
+    """
+    out = np.zeros(len(pairs.matches.pairs))
+    for p, (f0, f2) in enumerate(pairs.matches.pairs):
+        if f2 - f0 != 2 or not found.directed[f0 : f0 + 2].all():
+            continue
+        f0_T_f2 = pairs.f0_T_f1s[p]
+        both = keypoints.matched(pairs.matches.pairs[p], pairs.matches.of(p))
+        if parallax(f0_T_f2, *both) > np.deg2rad(settings.min_parallax_deg):
+            first = found.f_T_nexts[f0]
+            second = first[:3, :3] @ found.f_T_nexts[f0 + 1, :3, 3]
+            out[p] = _angle_to_arc(f0_T_f2[:3, 3], first[:3, 3], second)
+    return out
+
+
+def _angle_to_arc(direction: np.ndarray, start: np.ndarray, end: np.ndarray) -> float:
+    """Angle in radians from a unit vector to the great arc between two others."""
+    normal = np.cross(start, end)
+    beside = np.cross(normal, start) @ direction >= 0 and np.cross(end, normal) @ direction >= 0
+    length = np.linalg.norm(normal)
+    if beside and length > 1e-9:
+        return float(np.arcsin(min(abs(normal @ direction) / length, 1.0)))
+    return float(np.arccos(np.clip(max(direction @ start, direction @ end), -1, 1)))
+
+
+def length_ratios(
+    pairs: VerifiedPairs, found: Steps, keypoints: Keypoints
+) -> tuple[np.ndarray, np.ndarray]:
+    """Length of each step over that of the step before, from points that both see.
+
+    Returns:
+        Logarithms (F - 2,) of the ratios and their standard deviations, infinite where unknown.
+    """
+    num = len(found.verified)
+    logs, sigmas = np.zeros(max(num - 1, 0)), np.full(max(num - 1, 0), np.inf)
+    rows = {int(f0): p for p, (f0, f1) in enumerate(pairs.matches.pairs) if f1 - f0 == 1}
+    for f in range(1, num):
+        if not (found.directed[f - 1] and found.directed[f]):
+            continue
+        before, after = pairs.matches.of(rows[f - 1]), pairs.matches.of(rows[f])
+        _, in_before, in_after = np.intersect1d(before[:, 1], after[:, 0], return_indices=True)
+        before, after = before[in_before], after[in_after]
+        here = keypoints.bearings_of(f)
+        back = _depths(
+            here[before[:, 1]],
+            keypoints.bearings_of(f - 1)[before[:, 0]],
+            inverse(found.f_T_nexts[f - 1]),
+        )
+        ahead = _depths(
+            here[after[:, 0]], keypoints.bearings_of(f + 1)[after[:, 1]], found.f_T_nexts[f]
+        )
+        ratios = np.log(back / ahead)
+        ratios = ratios[np.isfinite(ratios)]
+        if len(ratios) < _MIN_COMMON:
+            continue
+        logs[f - 1] = np.median(ratios)
+        spread = 1.4826 * np.median(np.abs(ratios - logs[f - 1]))
+        sigmas[f - 1] = max(1.25 * spread / np.sqrt(len(ratios)), _RATIO_SIGMA)
+    return logs, sigmas
+
+
+def _depths(rays0: np.ndarray, rays1: np.ndarray, f0_T_f1: np.ndarray) -> np.ndarray:
+    """Distances (m,) from frame 0 along its rays to where both rays meet; NaN where unclear."""
+    across = rays1 @ f0_T_f1[:3, :3].T
+    cosine = np.einsum("mi,mi->m", rays0, across)
+    sine2 = 1 - cosine**2
+    along0, along1 = rays0 @ f0_T_f1[:3, 3], across @ f0_T_f1[:3, 3]
+    clear = sine2 > np.sin(_MIN_POINT_PARALLAX) ** 2
+    safe = np.where(clear, sine2, 1)
+    depth0, depth1 = (along0 - cosine * along1) / safe, (cosine * along0 - along1) / safe
+    return np.where(clear & (depth0 > 0) & (depth1 > 0), depth0, np.nan)
+
+
+def step_lengths(
+    slam_lengths: np.ndarray,
+    slam_sigmas: np.ndarray,
+    logs: np.ndarray,
+    sigmas: np.ndarray,
+) -> np.ndarray:
+    """Lengths of steps that agree with their measured ratios and, where right, the trajectory's.
+
+    The most probable logarithms of the lengths under Gaussian ratios and Cauchy-distributed
+    errors of the trajectory, by reweighting from wide to narrow (graduated non-convexity).
+
+    Args:
+        slam_lengths: (N,) lengths in the trajectory, map units.
+        slam_sigmas: (N,) noise of their logarithms; infinite = not to be used.
+        logs, sigmas: (N - 1,) see `length_ratios`.
+
+    Returns:
+        (N,) map units.
+    """
+    from scipy.linalg import solveh_banded
+
+    positive = slam_lengths[slam_lengths > 0]
+    typical = float(np.median(positive)) if len(positive) else 1.0
+    target = np.log(np.maximum(slam_lengths, 1e-3 * typical))
+    links = np.where(np.isfinite(sigmas), 1 / np.minimum(sigmas, 1e3) ** 2, _SMOOTH_SIGMA**-2)
+    logs = np.where(np.isfinite(sigmas), logs, 0)
+    information = np.where(np.isfinite(slam_sigmas), slam_sigmas**-2.0, 0)
+    width = 30.0  # of the loss, standard deviations
+    lengths = np.full(len(target), np.median(target))
+    for _ in range(_LENGTH_ROUNDS):
+        misfit = (target - lengths) ** 2 * information
+        weights = information / (1 + misfit / width**2) + 1e-9
+        bands = np.zeros((2, len(target)))
+        bands[1] = weights
+        bands[1, :-1] += links
+        bands[1, 1:] += links
+        bands[0, 1:] = -links
+        right = weights * target
+        right[:-1] -= links * logs
+        right[1:] += links * logs
+        lengths = solveh_banded(bands, right)
+        width = max(0.7 * width, 1.0)
+    return np.exp(lengths)
+
+
+def chained(steps: np.ndarray) -> np.ndarray:
+    """Poses (F, 4, 4) that follow steps (F - 1, 4, 4), the first the identity."""
+    poses = [np.eye(4)]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+    return np.array(poses)
