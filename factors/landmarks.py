@@ -6,15 +6,16 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from factors._host_factors import host_factors
 from factors._kernels import eliminate_range, polish_range, residuals_range
 from factors._observations import Term, check_term, sort_observations
 from factors._terms import pose_rows
 from factors.block import PoseSystem
+from factors.reduced_factor import reduced_factor
 from factors.robust import RobustLoss
 from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 
 _POLISH_TOLERANCE = 1e-12  # of a landmark's cost
+_HOST_POLISH_STEPS = 50  # at each evaluation: an error is a function of the poses alone
 _PROPOSAL_TOLERANCE = 1e-6  # of a landmark's cost: further steps gain less than the poses do
 
 
@@ -157,8 +158,60 @@ class LandmarkBlock:
         return sum(self.costs(values).values())
 
     def factors(self) -> list[gtsam.CustomFactor]:
-        """The same cost as ordinary GTSAM factors on poses, one per first frame of landmarks."""
-        return host_factors(self)
+        """The same cost as ordinary GTSAM factors on poses, one per first frame of landmarks.
+
+        The landmarks of a group are eliminated inside the callback, each at its best for the poses
+        asked about. Where derivatives are asked for too, they become the block's current ones.
+        """
+        offsets, frames = self._obs.offsets, self._obs.frames
+        seen = np.flatnonzero(np.diff(offsets))  # landmarks without observations say nothing
+        hosts = frames[offsets[seen]]  # observations are sorted by frame: the first one
+        bounds = np.flatnonzero(np.diff(hosts, prepend=-1))
+        return [
+            self._host_factor(int(rows[0]), int(rows[-1]) + 1)
+            for rows in np.split(seen, bounds[1:])
+            if len(rows)
+        ]
+
+    def _host_factor(self, first: int, last: int) -> gtsam.CustomFactor:
+        """One factor for the landmarks first..last."""
+        obs = self._obs
+        rows = slice(int(obs.offsets[first]), int(obs.offsets[last]))
+        global_frames, local_frames = np.unique(obs.frames[rows], return_inverse=True)
+        local = obs._replace(
+            offsets=obs.offsets[first : last + 1] - obs.offsets[first],
+            frames=local_frames.astype(np.int32),
+            kinds=obs.kinds[rows],
+            families=obs.families[rows],
+            measurements=obs.measurements[rows],
+            whiteners=obs.whiteners[rows],
+        )
+        keys = [self.pose_keys[f] for f in global_frames]
+        num = len(keys)
+        pairs = np.stack(np.triu_indices(num, 1), axis=1)
+        row_starts = np.concatenate([[0], np.cumsum(np.arange(num - 1, -1, -1))]).astype(np.int64)
+
+        def evaluate(values: gtsam.Values, with_system: bool) -> tuple[float, PoseSystem | None]:
+            poses = pose_rows(values, keys)
+            start, no_steps = self._points[first:last], np.zeros((num, 6))
+            points, costs = np.empty_like(start), np.empty(last - first)
+            polish_range(
+                0, last - first, local, start, poses, poses, no_steps, False, _HOST_POLISH_STEPS,
+                _POLISH_TOLERANCE, costs, points, costs,
+            )  # fmt: skip
+            if not with_system:
+                return float(costs.sum()), None
+            self._points[first:last] = points
+            diagonal, gradient = np.zeros((num, 6, 6)), np.zeros((num, 6))
+            off_diagonal = np.zeros((len(pairs), 6, 6))
+            eliminate_range(
+                0, last - first, local, points, poses, row_starts, pairs[:, 1].astype(np.int64),
+                diagonal, off_diagonal, gradient, np.zeros(len(self.families)),
+                np.empty(last - first),
+            )  # fmt: skip
+            return float(costs.sum()), PoseSystem(diagonal, off_diagonal, gradient, {})
+
+        return reduced_factor(keys, pairs, evaluate)
 
     def _residuals(self, values: gtsam.Values) -> tuple[np.ndarray, np.ndarray]:
         """Whitened residuals (O, 2) and validity (O,), in the order of the sorted observations."""

@@ -8,12 +8,12 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from factors._photometric_host import host_factors
 from factors._photometric_kernels import DIMS, PatchData, observe_range
 from factors._photometric_schur import eliminate_range
 from factors._terms import pose_rows
 from factors.block import PoseSystem
 from factors.patch_windows import PatchPixels, covisible_frames, patch_axes, poor_views
+from factors.reduced_factor import reduced_factor
 from factors.robust import RobustLoss
 from factors.threads import balanced_ranges, run_in_threads
 
@@ -224,8 +224,30 @@ class PhotometricBlock:
         return part
 
     def factors(self) -> list[gtsam.CustomFactor]:
-        """The same cost as ordinary GTSAM factors on poses, one per host frame."""
-        return host_factors(self)
+        """The same cost as ordinary GTSAM factors on poses, one per host frame.
+
+        The planes of a host's patches are eliminated inside the callback, each at its best for the
+        poses asked about, from where the block has them. Observations count as the last `refresh`
+        left them.
+        """
+        hosts = self.table.hosts
+        observed = np.diff(self.table.offsets) > 0  # the others say nothing
+        groups = [np.flatnonzero(observed & (hosts == host)) for host in np.unique(hosts)]
+        return [self._host_factor(rows) for rows in groups if len(rows)]
+
+    def _host_factor(self, rows: np.ndarray) -> gtsam.CustomFactor:
+        """One factor for some patches."""
+        part, starts = self.subset(rows), self.planes[rows].copy()
+
+        def evaluate(values: gtsam.Values, with_system: bool) -> tuple[float, PoseSystem | None]:
+            part.planes = starts
+            cost = part.polish(values)
+            if not with_system:
+                return cost, None
+            self.planes[rows] = part.planes
+            return cost, part.linearize(values)
+
+        return reduced_factor(part.pose_keys, part.pairs, evaluate)
 
     def _blemishes(self, values: gtsam.Values, errors: np.ndarray) -> dict[str, np.ndarray]:
         """Reason -> observations (O,) bool that cannot count, at the current planes."""

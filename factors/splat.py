@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from factors._host_factors import _square_root
 from factors._terms import pose_rows
 from factors.block import PoseSystem
 from factors.compiled import kernel_and_part
+from factors.reduced_factor import reduced_factor
 from factors.reprojection import FaceCameras
 from factors.robust import RobustLoss
 
@@ -139,19 +139,14 @@ class SplatBlock:
         return [self._factor(f, key) for f, key in enumerate(self.pose_keys)]
 
     def _factor(self, f: int, key: int) -> gtsam.CustomFactor:
-        def error(_factor, values: gtsam.Values, jacobians) -> np.ndarray:
+        def evaluate(values: gtsam.Values, with_system: bool) -> tuple[float, PoseSystem | None]:
             pose = pose_rows(values, [key])[0]
-            out = np.zeros(7)
-            if jacobians is None:
-                out[6] = np.sqrt(2 * self._frame_cost(f, pose))
-                return out
-            root, gradient, cost = self._frame_system(f, pose)
-            out[:6] = _square_root(root, gradient)
-            out[6] = np.sqrt(max(2 * cost - float(out @ out), 0.0))
-            jacobians[0] = np.asfortranarray(np.vstack([root, np.zeros((1, 6))]))
-            return out
+            if not with_system:
+                return self._frame_cost(f, pose), None
+            H, gradient, cost = self._frame_system(f, pose)
+            return cost, PoseSystem(H[None], np.zeros((0, 6, 6)), gradient[None], {})
 
-        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(7), [key], error)
+        return reduced_factor([key], np.zeros((0, 2), np.int64), evaluate)
 
     def _frame_system(self, f: int, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """H (6, 6), gradient (6,) and cost of a frame at a pose row (12,)."""
