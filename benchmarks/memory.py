@@ -80,7 +80,7 @@ def run(folder: Path, num_threads: int) -> dict[str, float]:
     settings = AlignSettings()
     greys = panorama.Greys(frames, settings.max_width)
     before = peak_mb()
-    sighted = alignment.run(
+    sighted = alignment.align(
         landmarks, poses, keypoints, 1.0, greys, rig, "align", None, settings, num_threads
     )
     kept, received = sighted.counts.kept, sighted.counts.received

@@ -95,10 +95,11 @@ def poor_frames(case: Case, seed: int) -> Given:
         sqrt_infos=None,
     )
     rig = refinement.CubeRig(SETTINGS.cubemap.face_size, np.pi / 2)  # bearings ask no face
-    block = adjustment.landmark_block(landmarks, keypoints, rig, 1.0, SETTINGS, 2)
+    priors = prior_factors.build(case.result.coarse.world_T_rigs, SETTINGS.priors)
+    problem = adjustment.Problem(priors, rig, SETTINGS, 2)
+    block = adjustment.landmark_block(landmarks, keypoints, 1.0, problem)
     values = adjustment.values_of(solved.world_T_rigs)
     block.polish(values)
-    priors = prior_factors.build(case.result.coarse.world_T_rigs, SETTINGS.priors)
     values = optimize(priors, [block], values, SETTINGS.solver).values
     poses = adjustment.poses_of(values, len(solved.world_T_rigs))
     landmarks = replace(landmarks, points_world=block.points_world)

@@ -58,27 +58,27 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
     priors = prior_factors.build(start.world_T_rigs, settings.priors)
     used, held = split(start.landmarks, settings.seed)
     none, threads = SphereField.none(), 2
-    common = priors, rig, settings.rounds.aligned, settings, threads
+    problem = adjustment.Problem(priors, rig, settings, threads)
 
-    bearing = adjustment.run(
-        used.tracks, keypoints, start, priors, rig, settings.rounds.refined[-1:], settings, threads
+    bearing = adjustment.adjust(
+        used.tracks, keypoints, start, problem, settings.rounds.refined[-1:]
     )
     variants = [Variant("bearing", bearing, none)]
     for name, uses_field in (("aligned", False), ("aligned, field", True)):
         solved, observed, aligned, field = bearing, keypoints, None, none
         for number in (1, 2):
-            sighted = alignment.run(
+            sighted = alignment.align(
                 solved.landmarks, solved.world_T_rigs, observed, solved.noise, greys, rig,
                 f"{name} {number}", aligned, settings.align, threads, field,
             )  # fmt: skip
             there = replace(sighted, keypoints=stitching.corrected(sighted.keypoints, field, rig))
-            solved, found = adjustment.run_sighted(there, solved, *common)
+            solved, found = adjustment.adjust_sighted(
+                there, solved, problem, settings.rounds.aligned
+            )
             observed = stitching.with_noise_of(sighted.keypoints, found)
             aligned = sighted.aligned
             if uses_field:
-                result = stitching.run(
-                    sighted, observed, solved, field, priors, rig, settings, threads
-                )
+                result = stitching.estimate(sighted, observed, solved, field, problem)
                 solved, observed, field = result.adjustment, result.keypoints, result.field
                 print(
                     f"parts gain {result.part_gains.round(3)}, degree {result.degree}", flush=True
@@ -86,7 +86,7 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
         variants.append(Variant(name, solved, field))
     last = variants[-1]
     placed = place(last, held.tracks, keypoints, settings)
-    sighted = alignment.run(
+    sighted = alignment.align(
         placed, last.solved.world_T_rigs, keypoints, start.noise, greys, rig, "held out", None,
         settings.align, threads, last.field,
     )  # fmt: skip
@@ -100,7 +100,7 @@ def place(
     rows = keypoints.rows(tracks)
     bearings = variant.field.corrected(keypoints.bearings_rig[rows])
     given = keypoints.sigmas_rad[rows], variant.solved.world_T_rigs, GATE, settings.triangulate
-    return triangulation.run(tracks, bearings, *given, 2)
+    return triangulation.triangulate(tracks, bearings, *given, 2)
 
 
 def reprojections(variant: Variant, landmarks: Landmarks, keypoints: Keypoints) -> np.ndarray:

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from synthetic import RIG, World, drifted, make_world
 
 from gsba.bundle import adjustment, prior_factors
+from gsba.bundle.adjustment import Problem
 from gsba.bundle.optimizer import OptimizeResult
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle
@@ -39,14 +40,16 @@ def _run(
 ) -> Solution:
     priors = prior_factors.build(coarse, settings.priors)
     start = Solution.without_points(coarse)
-    return adjustment.run(world.tracks, world.keypoints, start, priors, RIG, gates, settings, 1)
+    problem = Problem(priors, RIG, settings, 1)
+    return adjustment.adjust(world.tracks, world.keypoints, start, problem, gates)
 
 
 def _covariances(
     solved: Solution, world: World, coarse: np.ndarray, settings: RefineSettings
 ) -> np.ndarray:
     priors = prior_factors.build(coarse, settings.priors)
-    return adjustment.pose_covariances(solved, priors, world.keypoints, RIG, settings, 1)[0]
+    problem = Problem(priors, RIG, settings, 1)
+    return adjustment.pose_covariances(solved, world.keypoints, problem)[0]
 
 
 @cache

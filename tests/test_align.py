@@ -9,6 +9,7 @@ import pytest
 from synthetic import bearings_of
 
 from gsba.bundle import adjustment, prior_factors
+from gsba.bundle.adjustment import Problem
 from gsba.camera.rig import CubeRig
 from gsba.config import AlignSettings, RefineSettings
 from gsba.frames.panorama import Greys
@@ -22,7 +23,6 @@ from gsba.types import (
     Sighted,
     Solution,
     Tracks,
-    without_points,
 )
 
 NUM, WIDTH = 6, 512
@@ -114,7 +114,7 @@ def _run(
 ) -> Sighted:
     frames, world_T_rigs = walk
     landmarks, keypoints = _start(world_T_rigs, sigma_px)
-    return alignment.run(
+    return alignment.align(
         landmarks,
         world_T_rigs,
         keypoints,
@@ -180,18 +180,16 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
         return np.linalg.norm(found[:, :3, :3] - true[:, :3, :3], axis=(1, 2))
 
     start = replace(
-        Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.Solution.without_points(
-            world_T_rigs
-        ),
+        Solution.without_points(world_T_rigs),
         landmarks=landmarks,
     )
-    common = priors, RIG, (6.0, 3.0), settings, 2
-    before = adjustment.run(landmarks.tracks, keypoints, start, *common)
-    sighted = alignment.run(
+    problem, gates = Problem(priors, RIG, settings, 2), (6.0, 3.0)
+    before = adjustment.adjust(landmarks.tracks, keypoints, start, problem, gates)
+    sighted = alignment.align(
         before.landmarks, before.world_T_rigs, keypoints, before.noise, Greys(frames, 4096), RIG,
         "align", None, SETTINGS, 2,
     )  # fmt: skip
-    after, known = adjustment.run_sighted(sighted, before, *common)
+    after, known = adjustment.adjust_sighted(sighted, before, problem, gates)
     assert np.median(rotation_errors(after)) < 0.5 * np.median(rotation_errors(before))
     assert 0.5 <= after.noise < 2 and all(step.accepted for step in after.rounds)
     aligned = sighted.aligned
@@ -233,7 +231,7 @@ def test_points_at_a_centre_and_behind_walls_do_no_harm(walk) -> None:
     points[50:100] *= 50
     points[100] = world_T_rigs[landmarks.tracks.frames[300], :3, 3]
     moved = replace(landmarks, points_world=points)
-    sighted = alignment.run(
+    sighted = alignment.align(
         moved, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None, SETTINGS, 2
     )
     assert np.isfinite(sighted.keypoints.bearings_rig).all()
@@ -254,20 +252,20 @@ def test_confirmed_points_are_looked_for_elsewhere(walk) -> None:
 def test_a_solution_that_loses_a_frame_is_told_apart(walk) -> None:
     _, world_T_rigs = walk
     landmarks, _ = _start(world_T_rigs)
-    before = replace(without_points(world_T_rigs), landmarks=landmarks)
+    before = replace(Solution.without_points(world_T_rigs), landmarks=landmarks)
     tracks = landmarks.tracks
     rows = tracks.frames != 3
     fewer = Tracks(tracks.points[rows], tracks.frames[rows], tracks.keypoints[rows], 400)
     without = replace(before, landmarks=replace(landmarks, tracks=fewer))
-    assert adjustment.carries(before, before, 12) and adjustment.carries(before, without, 12)
-    assert not adjustment.carries(without, before, 12)
+    assert before.carries(before, 12) and before.carries(without, 12)
+    assert not without.carries(before, 12)
 
 
 def test_no_points_are_no_observations(walk) -> None:
     frames, world_T_rigs = walk
-    none = without_points(world_T_rigs).landmarks
+    none = Solution.without_points(world_T_rigs).landmarks
     _, keypoints = _start(world_T_rigs)
-    sighted = alignment.run(
+    sighted = alignment.align(
         none, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None, SETTINGS, 2
     )
     assert len(sighted.tracks) == 0 and sighted.counts.received == 0

@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from synthetic import RIG, make_world
 
 from gsba.bundle import adjustment, prior_factors
+from gsba.bundle.adjustment import Problem
 from gsba.config import RefineSettings
 from gsba.evaluate.consistency import EXPECTED, Consistency, Statistic, format_consistency, judge
 from gsba.geometry import pose
@@ -35,18 +36,12 @@ def _solved(seed: int) -> tuple[Reconstruction, Trajectory]:
     held.add(gtsam.PriorFactorPose3(prior_factors.X(0), gtsam.Pose3(true[0]), gauge))
     priors = gtsam.NonlinearFactorGraph(held)
     priors.push_back(prior_factors.fixed_scale(true))
-    given = (
-        world.tracks,
-        world.keypoints,
-        Solution.without_points(true),
-        priors,
-        RIG,
-        (8.0,),
-        settings,
-        1,
-    )
-    solved = replace(adjustment.run(*given), noise=1.0)
-    covariances, joint = adjustment.pose_covariances(solved, held, *given[1:2], RIG, settings, 1)
+    start = Solution.without_points(true)
+    problem = Problem(priors, RIG, settings, 1)
+    solved = adjustment.adjust(world.tracks, world.keypoints, start, problem, (8.0,))
+    solved = replace(solved, noise=1.0)
+    problem = replace(problem, priors=held)
+    covariances, joint = adjustment.pose_covariances(solved, world.keypoints, problem)
     return _result(solved.world_T_rigs, covariances, joint), Trajectory(TIMES, true)
 
 

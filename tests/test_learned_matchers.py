@@ -103,7 +103,7 @@ def test_contract(
     ) -> guided_search.Matches:
         pairs, frames = np.array([[0, 1]] * num), _frames(found, strongest)
         how = settings.matching, num
-        return guided_search.run(pairs, poses, [GATE] * num, frames, *how, matcher=compare)
+        return guided_search.match(pairs, poses, [GATE] * num, frames, *how, matcher=compare)
 
     matched = match(poses, num=2)
     rows = matched.of(0)

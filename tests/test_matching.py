@@ -301,7 +301,7 @@ def test_pairs_are_matched_in_order_whatever_the_threads(scene: Scene) -> None:
     world_T_rigs = np.stack([np.eye(4), F0_T_F1, np.eye(4)])
     pairs = np.array([[0, 1], [1, 2], [0, 2]])
     single, threaded = (
-        guided_search.run(
+        guided_search.match(
             pairs, world_T_rigs, [BAND] * 3, SearchableFrames(_reader(frames)), SETTINGS, threads
         )
         for threads in (1, 3)
@@ -315,7 +315,7 @@ def test_pairs_are_matched_in_order_whatever_the_threads(scene: Scene) -> None:
 def test_no_pairs_are_no_error(scene: Scene) -> None:
     none = np.zeros((0, 2), np.int32)
     frames = SearchableFrames(_reader([scene.first()]))
-    found = guided_search.run(none, np.eye(4)[None], [], frames, SETTINGS, 2)
+    found = guided_search.match(none, np.eye(4)[None], [], frames, SETTINGS, 2)
     assert found.keypoints.shape == (0, 2) and found.pairs.shape == (0, 2)
 
 

@@ -101,7 +101,7 @@ def _errors(found: Registered, true: np.ndarray = TRUTH) -> tuple[float, float]:
 def test_two_maps_of_any_scale_are_joined_where_they_meet(scale: float) -> None:
     context, whole, late = _scene()
     torn = _torn(whole, late, scale, MOVE)
-    found = map_merging.run(context, torn, _halves(), NOBODY, ~BREAK, TIMES)
+    found = map_merging.merge(context, torn, _halves(), NOBODY, ~BREAK, TIMES)
     assert not found.components.any() and found.met.all() and not found.lost.any()
     np.testing.assert_allclose(found.scales[HALF:], 1 / scale, rtol=0.005)
     off, turned = _errors(found)
@@ -112,7 +112,7 @@ def test_two_maps_of_any_scale_are_joined_where_they_meet(scale: float) -> None:
 
 def test_strangers_stay_apart() -> None:
     context, whole, late = _scene(strange=True)
-    found = map_merging.run(
+    found = map_merging.merge(
         context, _torn(whole, late, SCALE, MOVE), _halves(), NOBODY, ~BREAK, TIMES
     )
     np.testing.assert_array_equal(found.components, np.arange(NUM) >= HALF)
@@ -127,7 +127,7 @@ def test_strangers_that_the_trajectory_ties_together_stay_where_it_has_them() ->
     context, whole, _ = _scene(strange=True)
     held = NOBODY.copy()
     held[HALF - 1] = True
-    found = map_merging.run(context, whole, _halves(), held, ~BREAK, TIMES)
+    found = map_merging.merge(context, whole, _halves(), held, ~BREAK, TIMES)
     assert not found.components.any() and not found.met[HALF:].any()
     np.testing.assert_allclose(found.solved.world_T_rigs, TRUTH, atol=1e-12)
 
@@ -139,10 +139,10 @@ def test_a_join_that_asks_for_more_than_drift_is_not_believed_against_the_trajec
     held[HALF - 1] = True
     step = far.world_T_rigs[HALF, :3, 3] - far.world_T_rigs[HALF - 1, :3, 3]
     assert np.linalg.norm(step) > 40  # the trajectory vouches for a long step: as long may it err
-    joined = map_merging.run(context, far, _halves(), held, ~BREAK, TIMES)
+    joined = map_merging.merge(context, far, _halves(), held, ~BREAK, TIMES)
     assert joined.met.all()
     turned = _torn(whole, late, 3.0, np.eye(4))
-    kept = map_merging.run(context, turned, _halves(), held, ~BREAK, TIMES)
+    kept = map_merging.merge(context, turned, _halves(), held, ~BREAK, TIMES)
     assert not kept.met[HALF:].any()
     np.testing.assert_allclose(kept.solved.world_T_rigs, turned.world_T_rigs, atol=1e-12)
 
@@ -151,7 +151,7 @@ def test_frames_alone_are_registered_against_the_map() -> None:
     context, whole, _ = _scene()
     alone = (7, 13, 14)
     whole = _without_map(whole, alone)
-    found = map_merging.run(context, whole, _halves(alone), NOBODY, NOBODY, TIMES)
+    found = map_merging.merge(context, whole, _halves(alone), NOBODY, NOBODY, TIMES)
     np.testing.assert_array_equal(np.flatnonzero(found.alone), alone)
     off, turned = _errors(found)
     assert off < 0.02 and turned < 0.2
@@ -162,7 +162,7 @@ def test_a_frame_of_elsewhere_is_not_registered() -> None:
     context, whole, _ = _scene(strange=True)
     parts_of = (np.arange(NUM) == 30).astype(int)
     rest = _without_map(whole, tuple(range(HALF, NUM)))
-    found = map_merging.run(context, rest, parts_of, NOBODY, NOBODY, TIMES)
+    found = map_merging.merge(context, rest, parts_of, NOBODY, NOBODY, TIMES)
     np.testing.assert_array_equal(np.flatnonzero(found.lost), [30])
     np.testing.assert_array_equal(found.components, parts_of)  # apart: a guess is not exported
     assert not found.alone.any() and found.counts.dropped == {"frames alone": 1, "apart": 0}
@@ -172,7 +172,7 @@ def test_a_frame_with_too_few_points_stays_where_its_steps_have_it() -> None:
     context, whole, _ = _scene(strange=True)
     parts_of = (np.arange(NUM) == 30).astype(int)
     rest = _without_map(whole, tuple(range(HALF, NUM)))
-    found = map_merging.run(context, rest, parts_of, NOBODY, ~NOBODY, TIMES)
+    found = map_merging.merge(context, rest, parts_of, NOBODY, ~NOBODY, TIMES)
     assert not found.lost.any() and not found.components.any()
 
 
@@ -190,7 +190,7 @@ def test_a_piece_of_the_trajectory_goes_where_its_frames_were_carried() -> None:
     slam = np.full(NUM, PoseSource.SLAM, np.uint8)
     coarse = CoarsePoses(torn.world_T_rigs, slam, 0.0, segments)
     joints = (Joint(HALF, NUM - 1, 2.0, MOVE, GUESS),)
-    found = map_merging.run(context, torn, _halves(), NOBODY, ~BREAK, TIMES)
+    found = map_merging.merge(context, torn, _halves(), NOBODY, ~BREAK, TIMES)
     moved, trust, joints = follow(found, coarse, _trust(torn.world_T_rigs, unseen), joints)
     np.testing.assert_allclose(moved.world_T_rigs, found.solved.world_T_rigs, atol=1e-9)
     assert joints[0].how == PLACES and trust.false_steps[HALF - 1]

@@ -102,7 +102,7 @@ def test_a_map_torn_in_two_is_joined_where_it_meets(heading: float) -> None:
     torn = _moved(_split(whole), by)
     unseen = SEEN.copy()
     unseen[NUM_FRAMES // 2 - 1] = True
-    closed = loops.run(_context(strongest, keypoints), torn, unseen)
+    closed = loops.close(_context(strongest, keypoints), torn, unseen)
     assert len(closed.pairs) >= 3
     relative = inverse(closed.solved.world_T_rigs[0]) @ closed.solved.world_T_rigs
     true = inverse(whole.world_T_rigs[0]) @ whole.world_T_rigs
@@ -125,7 +125,7 @@ def test_a_confirmed_path_is_not_bent_further_than_it_drifts() -> None:
     """The same torn map, but every step was confirmed by images: then the loops are the error."""
     strongest, keypoints, whole = _scene()
     torn = _moved(_split(whole), pose(np.eye(3), np.array([3.0, 0, 0])))
-    closed = loops.run(_context(strongest, keypoints), torn, SEEN)
+    closed = loops.close(_context(strongest, keypoints), torn, SEEN)
     assert len(closed.pairs) == 0 and closed.solved is torn
 
 

@@ -45,7 +45,7 @@ def _run(slam: np.ndarray, cut: int | None = None, times: np.ndarray = TIMES) ->
     context = _context(cut)
     guided = correspondences.match_neighbours(context, Solution.without_points(slam))
     coarse = CoarsePoses(slam, np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8), 0.0)
-    return recovery.run(context, guided, coarse, times)
+    return recovery.recover(context, guided, coarse, times)
 
 
 def test_a_right_trajectory_is_left_alone() -> None:

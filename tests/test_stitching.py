@@ -9,6 +9,7 @@ from synthetic import RIG, World, make_world
 
 from factors.sphere_field import SphereField, num_harmonics
 from gsba.bundle import adjustment, prior_factors, stitching
+from gsba.bundle.adjustment import Problem
 from gsba.bundle.optimizer import optimize
 from gsba.bundle.stitching import Stitching, corrected, with_noise_of
 from gsba.camera.sphere import bearings_from_erp
@@ -46,10 +47,9 @@ def _found(bent: bool) -> tuple[World, Solution, Keypoints, Stitching]:
     )
     priors = prior_factors.build(world.world_T_rigs, SETTINGS.priors)
     start = Solution.without_points(world.world_T_rigs)
-    given = priors, RIG, (30.0, 6.0), SETTINGS, 1
-    solved, calibrated = adjustment.run_sighted(sighted, start, *given)
-    none = SphereField.none()
-    found = stitching.run(sighted, calibrated, solved, none, priors, RIG, SETTINGS, 1)
+    problem = Problem(priors, RIG, SETTINGS, 1)
+    solved, calibrated = adjustment.adjust_sighted(sighted, start, problem, (30.0, 6.0))
+    found = stitching.estimate(sighted, calibrated, solved, SphereField.none(), problem)
     return world, solved, keypoints, found
 
 
@@ -111,10 +111,9 @@ def test_too_little_is_left_alone() -> None:
     )
     small = replace(before, landmarks=landmarks)
     sighted = Sighted(keypoints, np.ones(len(keypoints.faces), bool), some, Counts(0, 0, "o"))
-    found = stitching.run(
-        sighted, keypoints, small, SphereField.none(), prior_factors.build(world.world_T_rigs,
-        SETTINGS.priors), RIG, SETTINGS, 1,
-    )  # fmt: skip
+    priors = prior_factors.build(world.world_T_rigs, SETTINGS.priors)
+    problem = Problem(priors, RIG, SETTINGS, 1)
+    found = stitching.estimate(sighted, keypoints, small, SphereField.none(), problem)
     assert not found.field and found.adjustment is small
 
 
@@ -126,25 +125,26 @@ def test_model_predicts_the_cost() -> None:
     )  # fmt: skip
     settings = SETTINGS.model_copy(update={"solver": plain})
     priors = prior_factors.build(world.world_T_rigs, settings.priors)
+    problem = Problem(priors, RIG, settings, 1)
     landmarks = Landmarks(world.points_world, world.tracks, Counts(0, 0, "tracks"))
 
     def solved(field: SphereField) -> tuple[Solution, float]:
-        given = corrected(keypoints, field, RIG), RIG, 1.0, settings, 1
-        block = adjustment.landmark_block(landmarks, *given)
+        there = corrected(keypoints, field, RIG)
+        block = adjustment.landmark_block(landmarks, there, 1.0, problem)
         result = optimize(priors, [block], adjustment.values_of(world.world_T_rigs), plain)
         poses = adjustment.poses_of(result.values, len(world.world_T_rigs))
         return Solution(poses, landmarks, 1.0, ()), block.error(result.values)
 
     before, cost = solved(SphereField.none())
     now = Stitching(SphereField.none(), before, keypoints, 0, np.zeros(4), Counts(0, 0, "o"))
-    system = stitching._system(landmarks, now, keypoints, 3, RIG, settings)
+    system = stitching._system(landmarks, now, keypoints, 3, problem)
     assert system.cost == pytest.approx(cost, rel=0.02)  # poses are at their best already
     field = SphereField(stitching._fitted([system], 3, 1e-2))
     after, least = solved(field)
     assert system.gain(field.coefficients) == pytest.approx(cost - least, rel=0.02)
     assert least < 0.1 * cost
     later, there = replace(now, field=field, adjustment=after), corrected(keypoints, field, RIG)
-    again = stitching._system(landmarks, later, there, 3, RIG, settings)
+    again = stitching._system(landmarks, later, there, 3, problem)
     assert again.cost == pytest.approx(cost, rel=0.05)  # extrapolated back to no field
 
 

@@ -35,7 +35,7 @@ def _reference(rows: list[tuple[int, int, int, int]]) -> set[frozenset[tuple[int
 
 
 def test_a_chain_becomes_one_track() -> None:
-    found = tracks.run([_matches((0, 4, 1, 2), (1, 2, 2, 7), (3, 1, 2, 7))], np.full(4, 8))
+    found = tracks.build([_matches((0, 4, 1, 2), (1, 2, 2, 7), (3, 1, 2, 7))], np.full(4, 8))
     assert _as_sets(found) == {frozenset([(0, 4), (1, 2), (2, 7), (3, 1)])}
     assert found.num_points == 1
 
@@ -44,22 +44,22 @@ def test_the_more_trusted_match_wins_a_conflict() -> None:
     """Keypoints 1 and 2 of frame 0 both want keypoint 5 of frame 1: the earlier match has it."""
     first, second = (0, 1, 1, 5), (0, 2, 1, 5)
     size = np.full(2, 8)
-    assert _as_sets(tracks.run([_matches(first, second)], size)) == {frozenset([(0, 1), (1, 5)])}
-    assert _as_sets(tracks.run([_matches(second, first)], size)) == {frozenset([(0, 2), (1, 5)])}
+    assert _as_sets(tracks.build([_matches(first, second)], size)) == {frozenset([(0, 1), (1, 5)])}
+    assert _as_sets(tracks.build([_matches(second, first)], size)) == {frozenset([(0, 2), (1, 5)])}
     # And so across sets.
-    found = tracks.run([_matches(second), _matches(first)], size)
+    found = tracks.build([_matches(second), _matches(first)], size)
     assert _as_sets(found) == {frozenset([(0, 2), (1, 5)])}
 
 
 def test_a_conflict_through_a_third_frame_is_seen() -> None:
     rows = [(0, 0, 1, 0), (2, 0, 3, 0), (0, 1, 2, 0), (1, 0, 3, 0)]  # the last would join (0, 0)
-    found = tracks.run([_matches(*rows)], np.full(4, 2))
+    found = tracks.build([_matches(*rows)], np.full(4, 2))
     assert _as_sets(found) == {frozenset([(0, 0), (1, 0)]), frozenset([(0, 1), (2, 0), (3, 0)])}
 
 
 def test_no_matches_make_no_tracks() -> None:
     for sets in ([], [_matches()]):
-        found = tracks.run(sets, np.array([3, 0, 2]))
+        found = tracks.build(sets, np.array([3, 0, 2]))
         assert (len(found), found.num_points) == (0, 0)
 
 
@@ -80,7 +80,7 @@ def _match_lists(draw: st.DrawFn) -> tuple[list[tuple[int, int, int, int]], np.n
 @given(_match_lists(), st.integers(0, 30))
 def test_tracks_are_those_of_a_plain_reference(case: tuple, cut: int) -> None:
     rows, sizes = case
-    found = tracks.run([_matches(*rows[:cut]), _matches(*rows[cut:])], sizes)
+    found = tracks.build([_matches(*rows[:cut]), _matches(*rows[cut:])], sizes)
     assert _as_sets(found) == _reference(rows)
     key = found.points.astype(np.int64) * len(sizes) + found.frames
     assert (np.diff(key) > 0).all()  # by point, then frame; a frame once

@@ -33,7 +33,7 @@ def _run(
 ) -> Landmarks:
     tracks = _all_see_all(len(world_T_rigs), len(bearings) // len(world_T_rigs))
     sigmas = np.full(len(bearings), SIGMA)
-    return triangulation.run(tracks, bearings, sigmas, world_T_rigs, gate, settings)
+    return triangulation.triangulate(tracks, bearings, sigmas, world_T_rigs, gate, settings)
 
 
 def _points(num: int, rng: np.random.Generator) -> np.ndarray:
@@ -121,7 +121,7 @@ def test_points_are_the_least_squares_ones() -> None:
     bearings = with_noise(_observe(points, world_T_rigs), SIGMA, rng)
     tracks = _all_see_all(6, 25)
     sigmas = SIGMA * rng.uniform(0.5, 2, len(bearings))
-    found = triangulation.run(tracks, bearings, sigmas, world_T_rigs, 50.0, SETTINGS)
+    found = triangulation.triangulate(tracks, bearings, sigmas, world_T_rigs, 50.0, SETTINGS)
     assert len(found.tracks) == len(tracks)  # no gate at work: the plain problem
     rays = np.einsum("fij,pfj->pfi", world_T_rigs[:, :3, :3], bearings.reshape(25, 6, 3))
     for j, (point, ray) in enumerate(zip(found.points_world, rays, strict=True)):
@@ -139,7 +139,7 @@ def test_points_are_the_least_squares_ones() -> None:
 
 def test_no_tracks_make_no_points() -> None:
     nothing = np.zeros(0, np.int32)
-    found = triangulation.run(
+    found = triangulation.triangulate(
         Tracks(nothing, nothing, nothing, 0),
         np.zeros((0, 3)),
         np.zeros(0),

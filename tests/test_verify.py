@@ -80,7 +80,7 @@ def _run(
         np.concatenate([np.zeros((0, 2), np.int32), *rows]),
     )
     spread = np.zeros(len(views)) if sigmas is None else np.array(sigmas)
-    return verification.run(matches, keypoints, np.array(priors), spread, SETTINGS, 0)
+    return verification.verify(matches, keypoints, np.array(priors), spread, SETTINGS, 0)
 
 
 def _turned(f0_T_f1: np.ndarray, degrees: float) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import gtsam
@@ -38,31 +38,35 @@ _DRAWS = 500  # errors of all poses, that tell how those of different ones belon
 _REDUNDANT = 0.1  # least share of residual dimensions left over by the unknowns
 
 
-def run_sighted(
-    sighted: Sighted,
-    before: Solution,
-    priors: gtsam.NonlinearFactorGraph,
-    rig: CubeRig,
-    gates: Sequence[float],
-    settings: RefineSettings,
-    num_threads: int,
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """What all adjustments at one time of a run share."""
+
+    priors: gtsam.NonlinearFactorGraph  # factors on the poses, gauge included
+    rig: CubeRig  # the faces, for the reprojection family
+    settings: RefineSettings  # families, loss, solver, rounds
+    num_threads: int  # of the solver
+
+
+def adjust_sighted(
+    sighted: Sighted, before: Solution, problem: Problem, gates: Sequence[float]
 ) -> tuple[Solution, Keypoints]:
-    """As `run`, of aligned and former observations, the noise of either estimated on its own.
+    """As `adjust`, of aligned and former observations, the noise of either estimated on its own.
 
     Returns:
         The solution, and its keypoints with the noise that they turned out to have.
     """
-    solved, rounds = before, []
+    solved, rounds, settings = before, [], problem.settings
     for number, gate in enumerate(gates, 1):
         sighted = calibrate(sighted, solved, settings)
-        tracks, keypoints, without_points = (
+        tracks, keypoints, start = (
             sighted.tracks,
             sighted.keypoints,
             replace(solved, noise=1.0),
         )
         solver = _solver(settings, last=number == len(gates))
-        so_far = settings.model_copy(update={"solver": solver})
-        solved = run(tracks, keypoints, without_points, priors, rig, (gate,), so_far, num_threads)
+        so_far = replace(problem, settings=settings.model_copy(update={"solver": solver}))
+        solved = adjust(tracks, keypoints, start, so_far, (gate,))
         rounds += solved.rounds
     return replace(solved, rounds=tuple(rounds)), sighted.keypoints
 
@@ -77,7 +81,7 @@ def calibrate(sighted: Sighted, before: Solution, settings: RefineSettings) -> S
     tracks, keypoints = sighted.tracks, sighted.keypoints
     rows, poses = keypoints.rows(tracks), before.world_T_rigs
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
-    placed = triangulation.run(tracks, bearings, sigmas, poses, _WIDE, settings.triangulate)
+    placed = triangulation.triangulate(tracks, bearings, sigmas, poses, _WIDE, settings.triangulate)
     factors = np.ones(len(keypoints.faces))
     for group in (sighted.aligned, ~sighted.aligned):
         chosen = group[keypoints.rows(placed.tracks)]
@@ -92,15 +96,12 @@ def calibrate(sighted: Sighted, before: Solution, settings: RefineSettings) -> S
     return replace(sighted, keypoints=scaled)
 
 
-def run(
+def adjust(
     tracks: Tracks,
     keypoints: Keypoints,
-    without_points: Solution,
-    priors: gtsam.NonlinearFactorGraph,
-    rig: CubeRig,
+    start: Solution,
+    problem: Problem,
     gates: Sequence[float],
-    settings: RefineSettings,
-    num_threads: int,
     final: bool = True,
 ) -> Solution:
     """Solve for all poses in rounds of tightening gates.
@@ -112,27 +113,25 @@ def run(
     Args:
         tracks: candidate tracks; every round starts from all of them.
         keypoints: of all frames.
-        without_points: poses to without_points from, and the noise known so far.
-        priors: factors on the poses, gauge included.
-        rig: the faces, for the reprojection family.
+        start: poses to start from, and the noise known so far.
+        problem: priors, families, loss, solver.
         gates: of each round, in standard deviations of the noise.
-        settings: families, loss, solver.
-        num_threads: of the solver.
         final: whether the last round is solved to the end; others lose observations anyway.
     """
-    world_T_rigs, noise, rounds = without_points.world_T_rigs, without_points.noise, []
+    world_T_rigs, noise, rounds = start.world_T_rigs, start.noise, []
+    settings = problem.settings
     rows = keypoints.rows(tracks)
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
-    shared = {"settings": settings.triangulate, "num_threads": num_threads}
-    place = partial(triangulation.run, tracks, bearings, sigmas, **shared)
+    shared = {"settings": settings.triangulate, "num_threads": problem.num_threads}
+    place = partial(triangulation.triangulate, tracks, bearings, sigmas, **shared)
     last_gate = gates[-1] * noise
     support = len(place(world_T_rigs, last_gate).tracks)
     for number, gate in enumerate(gates, 1):
         landmarks = place(world_T_rigs, gate * noise)
         spread = noise * max(1.0, gate / settings.rounds.gate_scale)
-        block = landmark_block(landmarks, keypoints, rig, spread, settings, num_threads)
+        block = landmark_block(landmarks, keypoints, spread, problem)
         solver = _solver(settings, last=final and number == len(gates))
-        result = optimize(priors, [block], values_of(world_T_rigs), solver)
+        result = optimize(problem.priors, [block], values_of(world_T_rigs), solver)
         poses = poses_of(result.values, len(world_T_rigs))
         new_support = len(place(poses, last_gate).tracks)
         accepted = new_support >= settings.rounds.min_support * support
@@ -156,14 +155,16 @@ def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
 
 
 def landmark_block(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    rig: CubeRig,
-    noise: float,
-    settings: RefineSettings,
-    num_threads: int,
+    landmarks: Landmarks, keypoints: Keypoints, noise: float, problem: Problem
 ) -> LandmarkBlock:
-    """The factor block of the chosen families; several share each observation's information."""
+    """The factor block of the chosen families; several share each observation's information.
+
+    Args:
+        landmarks, keypoints: what is observed, where.
+        noise: of the observations, in units of the keypoints' own sigmas.
+        problem: faces, families, loss.
+    """
+    rig, settings = problem.rig, problem.settings
     tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
     share = noise * np.sqrt(len({"bearing", "reprojection"} & set(settings.factors)))
     terms = []
@@ -187,28 +188,23 @@ def landmark_block(
         landmarks.points_world,
         terms,
         RobustLoss(settings.solver.loss, settings.solver.loss_sigmas),
-        num_threads,
+        problem.num_threads,
     )
 
 
 def pose_covariances(
-    adjustment: Solution,
-    priors: gtsam.NonlinearFactorGraph,
+    solved: Solution,
     keypoints: Keypoints,
-    rig: CubeRig,
-    settings: RefineSettings,
-    num_threads: int,
+    problem: Problem,
     components: np.ndarray | None = None,
 ) -> tuple[np.ndarray, JointErrors]:
     """Marginal covariances (F, 6, 6) with the first pose and the extent of each map held fixed."""
-    block = landmark_block(
-        adjustment.landmarks, keypoints, rig, adjustment.noise, settings, num_threads
-    )
-    held = gtsam.NonlinearFactorGraph(priors)
-    held.push_back(prior_factors.fixed_scale(adjustment.world_T_rigs, components))
-    keys = [prior_factors.X(f) for f in range(len(adjustment.world_T_rigs))]
-    values = values_of(adjustment.world_T_rigs)
-    return marginal_covariances(held, [block], values, keys, _DRAWS, settings.seed)
+    block = landmark_block(solved.landmarks, keypoints, solved.noise, problem)
+    held = gtsam.NonlinearFactorGraph(problem.priors)
+    held.push_back(prior_factors.fixed_scale(solved.world_T_rigs, components))
+    keys = [prior_factors.X(f) for f in range(len(solved.world_T_rigs))]
+    values = values_of(solved.world_T_rigs)
+    return marginal_covariances(held, [block], values, keys, _DRAWS, problem.settings.seed)
 
 
 def _noise(

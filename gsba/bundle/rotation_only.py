@@ -47,7 +47,7 @@ def run(context: MatchContext, world_T_rigs: np.ndarray, coarse: CoarsePoses) ->
     """
     matches = match_for_rotations(context, world_T_rigs)
     keypoints = context.keypoints
-    found = tracks.run([matches], np.diff(keypoints.starts))
+    found = tracks.build([matches], np.diff(keypoints.starts))
     rotations, covariances, used = solve(world_T_rigs[:, :3, :3], found, keypoints)
     least = context.settings.rounds.min_observations
     six = np.full((len(rotations), 6, 6), np.nan)

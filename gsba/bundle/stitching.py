@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
-import gtsam
 import numpy as np
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import splu
@@ -14,8 +13,8 @@ from factors.bearing import bearing_residuals, tangent_basis
 from factors.robust import RobustLoss
 from factors.sphere_field import SphereField, degrees_of, harmonics, num_harmonics
 from gsba.bundle import adjustment
+from gsba.bundle.adjustment import Problem
 from gsba.camera.rig import CubeRig, owner_faces
-from gsba.config import RefineSettings
 from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution, Tracks
 
 logger = logging.getLogger(__name__)
@@ -106,15 +105,12 @@ def with_noise_of(keypoints: Keypoints, calibrated: Keypoints) -> Keypoints:
     return replace(keypoints, sigmas_rad=calibrated.sigmas_rad, sqrt_infos=scaled)
 
 
-def run(
+def estimate(
     sighted: Sighted,
     keypoints: Keypoints,
     before: Solution,
     field: SphereField,
-    priors: gtsam.NonlinearFactorGraph,
-    rig: CubeRig,
-    settings: RefineSettings,
-    num_threads: int,
+    problem: Problem,
 ) -> Stitching:
     """Find the field, by cross-validation over parts of the sequence, and solve the map with it.
 
@@ -128,18 +124,16 @@ def run(
         keypoints: the same with the noise they turned out to have.
         before: the map solved with `field`.
         field: so far.
-        priors: factors on the poses, gauge included.
-        rig: the faces, for the reprojection family.
-        settings: limits, loss, solver.
-        num_threads: of the solver.
+        problem: priors, limits, loss, solver.
     """
-    chosen, given = settings.stitching, (rig, settings, num_threads)
+    settings = problem.settings
+    chosen = settings.stitching
     whole = _MOST, chosen.max_degree, chosen.min_gain
     probe = _PROBE[0], min(_PROBE[1], chosen.max_degree), 0.5 * chosen.min_gain
     now = Stitching(field, before, keypoints, 0, np.zeros(PARTS), Counts(0, 0, "observations"))
     systems, spread = [], 0.0
     for most, max_degree, least in [whole] if field else [probe, whole]:
-        systems, counts = _systems(now, most, max_degree, *given)
+        systems, counts = _systems(now, most, max_degree, problem)
         if not systems:
             return replace(now, counts=counts)
         degree, spread, gains = _choose(systems, max_degree)
@@ -149,13 +143,11 @@ def run(
             return now
     for number in range(chosen.rounds):
         if number:
-            systems, _ = _systems(now, _MOST, chosen.max_degree, *given)
+            systems, _ = _systems(now, _MOST, chosen.max_degree, problem)
         field = SphereField(_fitted(systems, now.degree, spread))
-        there = replace(sighted, keypoints=corrected(sighted.keypoints, field, rig))
+        there = replace(sighted, keypoints=corrected(sighted.keypoints, field, problem.rig))
         gates = settings.rounds.aligned[-1:]
-        solved, found = adjustment.run_sighted(
-            there, now.adjustment, priors, rig, gates, *given[1:]
-        )
+        solved, found = adjustment.adjust_sighted(there, now.adjustment, problem, gates)
         keypoints = with_noise_of(sighted.keypoints, found)
         now = replace(now, field=field, adjustment=solved, keypoints=keypoints)
     logger.info("stitching: %.4f deg rms, degree %d", np.rad2deg(field.rms_rad), now.degree)
@@ -163,22 +155,18 @@ def run(
 
 
 def _systems(
-    now: Stitching,
-    most: int,
-    max_degree: int,
-    rig: CubeRig,
-    settings: RefineSettings,
-    num_threads: int,
+    now: Stitching, most: int, max_degree: int, problem: Problem
 ) -> tuple[list[_System], Counts]:
     """Models of the cost of each part of the sequence; none where there is too little."""
-    landmarks = _drawn(now.adjustment.landmarks, most, settings.seed)
+    landmarks = _drawn(now.adjustment.landmarks, most, problem.settings.seed)
     counts = Counts(len(now.adjustment.landmarks.tracks), len(landmarks.tracks), "observations")
-    there = corrected(now.keypoints, now.field, rig)
+    there = corrected(now.keypoints, now.field, problem.rig)
+    alone = replace(problem, num_threads=1)  # parts run side by side
 
     def model(part: Landmarks) -> _System:
-        return _system(part, now, there, max_degree, rig, settings)
+        return _system(part, now, there, max_degree, alone)
 
-    with ThreadPoolExecutor(num_threads) as pool:
+    with ThreadPoolExecutor(problem.num_threads) as pool:
         return list(pool.map(model, _parts(landmarks))), counts
 
 
@@ -222,12 +210,11 @@ def _system(
     now: Stitching,
     there: Keypoints,
     max_degree: int,
-    rig: CubeRig,
-    settings: RefineSettings,
+    problem: Problem,
 ) -> _System:
     """Model of the robust cost of some points, keypoints corrected by the field so far."""
     keypoints, solved, field, noise = now.keypoints, now.adjustment, now.field, now.adjustment.noise
-    block = adjustment.landmark_block(landmarks, there, rig, noise, settings, num_threads=1)
+    block = adjustment.landmark_block(landmarks, there, noise, problem)
     block.polish(adjustment.values_of(solved.world_T_rigs))
     tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
     residuals, by_pose, by_point = bearing_residuals(
@@ -240,7 +227,8 @@ def _system(
     if there.sqrt_infos is not None:
         roots = there.sqrt_infos[rows]
     whitened = np.einsum("oij,oj->oi", roots, residuals) / noise
-    loss = RobustLoss(settings.solver.loss, settings.solver.loss_sigmas)
+    solver = problem.settings.solver
+    loss = RobustLoss(solver.loss, solver.loss_sigmas)
     roots = np.sqrt(loss.weights(np.sum(whitened**2, axis=1)))[:, None, None] * roots / noise
     reduced = _reduced(
         tracks,

@@ -10,7 +10,7 @@ from gsba.types import Matches, Tracks
 _kernel, _ = kernel_and_part()
 
 
-def run(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
+def build(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
     """Merge matches into tracks that see a frame at most once.
 
     Matches are taken in the order given, the most trusted first: one that would give a track two

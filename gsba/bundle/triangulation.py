@@ -11,7 +11,7 @@ _kernel, _part = kernel_and_part()
 _MAX_HYPOTHESES = 12  # pairs of observations tried per track
 
 
-def run(
+def triangulate(
     tracks: Tracks,
     bearings_rig: np.ndarray,
     sigmas_rad: np.ndarray,
@@ -43,13 +43,13 @@ def run(
     parallaxes = np.zeros(tracks.num_points)
     ranges = balanced_ranges(starts)
 
-    def triangulate(part: int) -> None:
+    def work(part: int) -> None:
         gate = float(max_error_sigmas)
         _triangulate(
             starts, *ranges[part], rays, centres, sigmas_rad, gate, points, inliers, parallaxes
         )
 
-    run_in_threads(triangulate, len(ranges), num_threads)
+    run_in_threads(work, len(ranges), num_threads)
     lengths = np.add.reduceat(inliers, starts[:-1]) if len(rays) else np.zeros(0, int)
     short = lengths < settings.min_track_length
     flat = ~short & (parallaxes < np.deg2rad(settings.min_parallax_deg))

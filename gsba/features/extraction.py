@@ -14,7 +14,7 @@ from gsba.store.store import PerFrame, RunStore, fingerprint
 from gsba.types import Features, FrameSet
 
 
-def run(
+def extract(
     store: RunStore,
     frames: FrameSet,
     rig: CubeRig,

@@ -41,7 +41,7 @@ class Closed:
     counts: Counts  # of pairs compared
 
 
-def run(context: MatchContext, solved: Solution, unseen: np.ndarray) -> Closed:
+def close(context: MatchContext, solved: Solution, unseen: np.ndarray) -> Closed:
     """Find places met again, and bend the map so that they coincide.
 
     Args:

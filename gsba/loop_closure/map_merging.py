@@ -35,7 +35,7 @@ _APART = 4.0  # extents between maps that nothing ties together
 _ANYWHERE = Gate(np.pi, 1e3, np.pi)
 
 
-def run(
+def merge(
     context: MatchContext,
     solved: Solution,
     parts: np.ndarray,

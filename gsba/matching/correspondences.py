@@ -118,7 +118,7 @@ def verified(
 ) -> VerifiedPairs:
     """Matches whose geometry holds: see `verify.run`."""
     settings, threads = context.settings, context.num_threads
-    return verification.run(
+    return verification.verify(
         found, context.keypoints, f0_T_f1s, sigmas, settings.verify, settings.seed, threads
     )
 

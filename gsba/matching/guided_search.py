@@ -286,14 +286,14 @@ class MatchContext:
         strongest: bool = False,
         guided_only: bool = False,
     ) -> Matches:
-        """Match frame pairs as `run` does, on demand by guided search whatever the matcher."""
+        """Match frame pairs as `match` does, on demand by guided search whatever the matcher."""
         frames = self.strongest if strongest else self.frames
         how = self.settings.matching, self.num_threads
         matcher = guided if guided_only else self.matcher
-        return run(pairs, world_T_rigs, gates, frames, *how, points_rig, matcher)
+        return match(pairs, world_T_rigs, gates, frames, *how, points_rig, matcher)
 
 
-def run(
+def match(
     pairs: np.ndarray,
     world_T_rigs: np.ndarray,
     gates: Sequence[Gate],
@@ -317,7 +317,7 @@ def run(
     """
     f0_T_f1s = inverse(world_T_rigs[pairs[:, 0]]) @ world_T_rigs[pairs[:, 1]]
 
-    def match(p: int) -> np.ndarray:
+    def match_pair(p: int) -> np.ndarray:
         f0, f1 = (int(f) for f in pairs[p])
         points = None if points_rig is None else points_rig[f0]
         return matcher(frames, (f0, f1), f0_T_f1s[p], gates[p], settings, points)
@@ -325,7 +325,7 @@ def run(
     order = np.lexsort((pairs[:, 1], pairs[:, 0]))  # pairs that share frames follow one another
     rows = [_NO_MATCHES] * len(pairs)
     with ThreadPoolExecutor(num_threads) as pool:
-        found = track(pool.map(match, order), "matching", len(pairs))
+        found = track(pool.map(match_pair, order), "matching", len(pairs))
         for p, matched in zip(order, found, strict=True):
             rows[p] = matched
     return Matches.of_rows(np.asarray(pairs, np.int32).reshape(-1, 2), rows)

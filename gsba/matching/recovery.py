@@ -31,7 +31,7 @@ class Recovered:
     joints: tuple[Joint, ...] = ()  # of those pieces
 
 
-def run(
+def recover(
     context: MatchContext, guided: VerifiedPairs, coarse: CoarsePoses, timestamps: np.ndarray
 ) -> Recovered:
     """Match the neighbours that guidance lost, judge the trajectory, and guide anew from that.

@@ -12,7 +12,7 @@ from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
 Estimate = tuple[np.ndarray, np.ndarray]  # f0_T_f1 (4, 4), inlier mask (m,); see `relative_pose`
 
 
-def run(
+def verify(
     matches: Matches,
     keypoints: Keypoints,
     prior_f0_T_f1s: np.ndarray | None,
@@ -50,7 +50,7 @@ def judge(
 
     Args:
         estimates: of `estimate`, for each pair.
-        matches, keypoints, prior_f0_T_f1s, position_sigmas, settings: as for `run`.
+        matches, keypoints, prior_f0_T_f1s, position_sigmas, settings: as for `verify`.
     """
     kept = []
     dropped = {"too few matches": 0, "rotation contradicts": 0, "direction contradicts": 0}

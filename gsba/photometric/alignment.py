@@ -39,7 +39,7 @@ class _Observed:
     covariances: np.ndarray  # (N, 2, 2) float64, radians squared, on tangent_basis
 
 
-def run(
+def align(
     landmarks: Landmarks,
     world_T_rigs: np.ndarray,
     keypoints: Keypoints,
@@ -88,11 +88,11 @@ def run(
     def cut(image: SphereImage, mask: _Mask, chosen: np.ndarray) -> None:
         patches.cut(image, mask, chosen, origins, spreads, settings.min_contrast)
 
-    def align(image: SphereImage, mask: _Mask, chosen: np.ndarray) -> None:
+    def align_in(image: SphereImage, mask: _Mask, chosen: np.ndarray) -> None:
         patches.align(image, mask, chosen, sightings, reach, _STEPS, _TOLERANCE)
 
     _stream(cut, greys, hosts, f"{name}: templates", num_threads)
-    _stream(align, greys, seeing, name, num_threads)
+    _stream(align_in, greys, seeing, name, num_threads)
     kept, found, dropped = _accepted(patches, sightings, seeing, 2 * np.pi / greys.width, settings)
     at_hosts = _at_hosts(patches, sightings, kept, hosts, origins, spreads)
     former = _former(landmarks, keypoints, noise, [found, at_hosts], greys.num_frames)

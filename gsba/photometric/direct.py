@@ -11,8 +11,8 @@ from factors.patch_windows import PatchPixels, PatchTable, patch_spans, poor_vie
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
 from gsba.bundle import adjustment, prior_factors, triangulation
+from gsba.bundle.adjustment import Problem
 from gsba.bundle.optimizer import OptimizeResult, optimize
-from gsba.camera.rig import CubeRig
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.frames.masks import load_weights
 from gsba.log import GsbaError, track
@@ -53,14 +53,11 @@ def check(frames: FrameSet, settings: RefineSettings) -> None:
         )
 
 
-def run(
+def refine(
     frames: FrameSet,
     keypoints: Keypoints,
     start: Solution,
-    priors: gtsam.NonlinearFactorGraph,
-    rig: CubeRig,
-    settings: RefineSettings,
-    num_threads: int,
+    problem: Problem,
 ) -> PhotometricResult:
     """Refine a solved map by the grey values of patches, level after level.
 
@@ -68,22 +65,17 @@ def run(
         frames: panoramas; read twice a level, one at a time.
         keypoints: of all frames.
         start: the solved map.
-        priors: factors on the poses, gauge included.
-        rig: the faces, for the reprojection family.
-        settings: families, loss, solver, patches.
-        num_threads: of the solver.
+        problem: priors, families, loss, solver, patches.
     """
-    solved, counts = start, []
+    solved, counts, settings = start, [], problem.settings
     weights, residuals = np.ones(len(frames)), np.full(len(frames), np.nan)
     for level in settings.photometric.levels:
-        pixels, trust, found = _patches(frames, solved, level, settings, num_threads)
+        pixels, trust, found = _patches(frames, solved, level, settings, problem.num_threads)
         counts += found
         if pixels is None:
             logger.warning("no patch is seen twice at level %d: left as it was", level)
             continue
-        solved, weights, residuals = _solve(
-            pixels, trust, keypoints, solved, priors, rig, settings, num_threads
-        )
+        solved, weights, residuals = _solve(pixels, trust, keypoints, solved, problem)
     return PhotometricResult(solved, tuple(counts), weights, residuals)
 
 
@@ -194,15 +186,13 @@ def _solve(
     trust: np.ndarray,
     keypoints: Keypoints,
     solved: Solution,
-    priors: gtsam.NonlinearFactorGraph,
-    rig: CubeRig,
-    settings: RefineSettings,
-    num_threads: int,
+    problem: Problem,
 ) -> tuple[Solution, np.ndarray, np.ndarray]:
     """The joint solve, repeated once where frames are doubted: their weights, their residuals.
 
     It is undone where it explains the map's own observations worse than before.
     """
+    settings, num_threads = problem.settings, problem.num_threads
     chosen, values = settings.photometric, adjustment.values_of(solved.world_T_rigs)
     solver = settings.solver.model_copy(update={"relative_tolerance": chosen.tolerance})
     start = make_block(pixels, trust, settings, num_threads)
@@ -211,12 +201,10 @@ def _solve(
     for _ in range(2):
         block = make_block(pixels, start.counted * trust, settings, num_threads, noise)
         block.weigh(weights)
-        landmarks = adjustment.landmark_block(
-            solved.landmarks, keypoints, rig, solved.noise, settings, num_threads
-        )
+        landmarks = adjustment.landmark_block(solved.landmarks, keypoints, solved.noise, problem)
         landmarks.polish(values)
         before, fits = landmarks.error(values), _geometric_fits(landmarks, values)
-        result = optimize(priors, [landmarks, block], values, solver)
+        result = optimize(problem.priors, [landmarks, block], values, solver)
         growth = _geometric_fits(landmarks, result.values) / fits
         doubts, residuals = _frame_weights(block, result.values, growth, chosen)
         if np.all(doubts >= 1) or np.any(weights < 1):
@@ -246,9 +234,8 @@ def joint(
     if pixels is None:
         return []
     start = make_block(pixels, trust, settings, num_threads)
-    noise = (
-        _noise(start, adjustment.values_of(solved.world_T_rigs)) * settings.photometric.inflation
-    )
+    values = adjustment.values_of(solved.world_T_rigs)
+    noise = _noise(start, values) * settings.photometric.inflation
     block = make_block(pixels, start.counted * trust, settings, num_threads, noise)
     block.weigh(frame_weights)
     return [block]
@@ -338,12 +325,10 @@ def _adjusted(
     """
     tracks, least = solved.landmarks.tracks, settings.rounds.min_observations
     gate = solved.rounds[-1].gate_sigmas if solved.rounds else np.inf
-    rows, poses = (
-        keypoints.rows(tracks),
-        adjustment.poses_of(result.values, len(solved.world_T_rigs)),
-    )
+    poses = adjustment.poses_of(result.values, len(solved.world_T_rigs))
+    rows = keypoints.rows(tracks)
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
-    placed = triangulation.run(
+    placed = triangulation.triangulate(
         tracks, bearings, sigmas, poses, gate * solved.noise, settings.triangulate, num_threads
     )
     after = replace(solved, world_T_rigs=poses, landmarks=placed)

@@ -57,7 +57,7 @@ class Line(MatchingStages):
         if tied is None:
             return solved, matches
         given = self.context, solved, tied, trust.held_steps, ~trust.unseen_steps
-        compute = partial(map_merging.run, *given, self.frames.timestamps)
+        compute = partial(map_merging.merge, *given, self.frames.timestamps)
         found = self._stage("registered", self._matching(), compute, Registered)
         self.counts["registered"] = [found.counts]
         self.registered, self.parts = found, connectivity.several(found.components)
@@ -102,7 +102,7 @@ class Line(MatchingStages):
             seen = self.keypoints.bearings_rig[rows], self.keypoints.sigmas_rad[rows]
             how = gate, settings.triangulate, self.num_threads
             return replace(
-                solved, landmarks=triangulation.run(found, *seen, solved.world_T_rigs, *how)
+                solved, landmarks=triangulation.triangulate(found, *seen, solved.world_T_rigs, *how)
             )
 
         return self._stage(name, [self._solving()], compute, Solution)
@@ -110,7 +110,7 @@ class Line(MatchingStages):
     def _tracks(self, matches: Sequence[Matches]) -> Tracks:
         """Tracks that matches make, within parts that nothing ties together yet."""
         tied = [connectivity.within(some, self.parts) for some in matches]
-        return tracks.run(tied, np.diff(self.keypoints.starts))
+        return tracks.build(tied, np.diff(self.keypoints.starts))
 
     def solve(
         self,
@@ -124,7 +124,7 @@ class Line(MatchingStages):
 
         def compute() -> Solution:
             given = self._tracks(matches), self.keypoints, start, self.priors, self.rig
-            return adjustment.run(*given, gates, self.settings, self.num_threads, final)
+            return adjustment.adjust(*given, gates, self.settings, self.num_threads, final)
 
         solved = self._stage(name, [self._solving(), gates, final], compute, Solution)
         self.counts[name] = [solved.landmarks.counts]
@@ -138,7 +138,7 @@ class Line(MatchingStages):
         def compute() -> Sighted:
             given = solved.landmarks, solved.world_T_rigs, self.observed, solved.noise
             how = name, self.aligned, self.settings.align, self.num_threads, self.field
-            return alignment.run(*given, self.greys, self.rig, *how)
+            return alignment.align(*given, self.greys, self.rig, *how)
 
         key = self.settings.align.model_dump(exclude={"rounds"})
         sighted = self._stage(name, key, compute, Sighted)
@@ -175,7 +175,7 @@ class Line(MatchingStages):
 
         def compute() -> Stitching:
             given = sighted, self.observed, solved, self.field, self.priors, self.rig
-            return stitching.run(*given, settings, self.num_threads)
+            return stitching.estimate(*given, settings, self.num_threads)
 
         key = [self._solving(), settings.stitching, settings.rounds.aligned]
         found = self._stage(name, key, compute, Stitching)
@@ -212,7 +212,7 @@ class Line(MatchingStages):
         def compute() -> PhotometricResult:
             observed = self._corrected(self.observed)
             given = self.corrected, observed, solved, self.priors, self.rig
-            return direct.run(*given, settings, self.num_threads)
+            return direct.refine(*given, settings, self.num_threads)
 
         key = [self._solving(), settings.photometric]
         result = self._stage(name, key, compute, PhotometricResult)
@@ -233,7 +233,7 @@ class Line(MatchingStages):
             observed = self._corrected(self.observed)
             given = self.corrected, observed, solved, self.priors, self.rig, settings
             start = digest(key, solved.world_T_rigs.tolist())
-            return refinement.run(*given, self.num_threads, further, turns, start)
+            return refinement.refine(*given, self.num_threads, further, turns, start)
 
         result = self._stage(name, key, compute, SplatResult)
         turns.unlink(missing_ok=True)

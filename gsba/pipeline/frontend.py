@@ -82,7 +82,7 @@ class MatchingStages:
         inputs = [fingerprint(paths), frames.timestamps.tolist(), frames.timed, *start]
         store.stage("frames", inputs, lambda: frames, FrameSet)
         self._weights = learned.find_weights(settings)
-        self._features = extraction.run(
+        self._features = extraction.extract(
             store, frames, self.rig, settings, self.num_threads, *self._extractor(settings)
         )
         self._see("keypoints", [self._features] * len(frames), ["frames", "features"])
@@ -125,7 +125,7 @@ class MatchingStages:
         enlarged = self.settings.features.model_copy(update=more)
         settings = self.settings.model_copy(update={"features": enlarged})
         given = self.store, self.frames, self.rig, settings, self.num_threads
-        found = extraction.run(*given, *self._extractor(settings), name, weak)
+        found = extraction.extract(*given, *self._extractor(settings), name, weak)
         sources = [found if more else self._features for more in weak]
         self._see("keypoints_closer", sources, [self.latest, name])
 
@@ -195,7 +195,7 @@ class MatchingStages:
         recovered = self._stage(
             "steps",
             [self._matching(), self.settings.priors],
-            lambda: recovery.run(self.context, guided, self.coarse, self.frames.timestamps),
+            lambda: recovery.recover(self.context, guided, self.coarse, self.frames.timestamps),
             Recovered,
         )
         pairs = recovered.neighbours
@@ -238,7 +238,7 @@ class MatchingStages:
         closed = self._stage(
             "places",
             self._matching(),
-            lambda: loops.run(self.context, solved, unseen),
+            lambda: loops.close(self.context, solved, unseen),
             Closed,
         )
         self.counts["places"] = [closed.counts]

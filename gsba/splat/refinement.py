@@ -21,14 +21,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import gtsam
 import numpy as np
 
 from factors import Block, LandmarkBlock
 from gsba.bundle import adjustment, triangulation
+from gsba.bundle.adjustment import Problem
 from gsba.bundle.optimizer import OptimizeResult, optimize
-from gsba.camera.rig import CubeRig
-from gsba.config import RefineSettings, SplatSettings
+from gsba.config import SplatSettings
 from gsba.splat.alignment import Captured, capture, splat_block
 from gsba.splat.backend import choose_backend
 from gsba.splat.evidence import score, standard_error, together
@@ -79,14 +78,11 @@ class _Progress:
     rounds: tuple[Round, ...]
 
 
-def run(
+def refine(
     frames: FrameSet,
     keypoints: Keypoints,
     start: Solution,
-    priors: gtsam.NonlinearFactorGraph,
-    rig: CubeRig,
-    settings: RefineSettings,
-    num_threads: int,
+    problem: Problem,
     further: Sequence[Block] = (),
     checkpoint: Path | None = None,
     key: str = "",
@@ -97,10 +93,7 @@ def run(
         frames: panoramas or cube faces; the faces of all are held in memory, one size at a time.
         keypoints: of all frames.
         start: the solved map.
-        priors: factors on the poses, gauge included.
-        rig: the faces of the keypoints, for the reprojection family.
-        settings: families, loss, solver, splat.
-        num_threads: of solver and renderer.
+        problem: priors, families, loss, solver, splat; its threads render, too.
         further: blocks that join each move, on the same keys.
         checkpoint: file that keeps the turns made, and that they go on from; None = none.
         key: what the turns depend on; a checkpoint of another key is not taken up.
@@ -108,9 +101,8 @@ def run(
     Raises:
         GsbaError: all frames are masked, or a splat that is no longer finite.
     """
-    chosen = settings.splat
-    seen = np.bincount(start.landmarks.tracks.frames, minlength=len(frames))
-    usable = seen >= settings.rounds.min_observations
+    chosen = problem.settings.splat
+    usable = start.observations() >= problem.settings.rounds.min_observations
     if np.count_nonzero(usable) <= chosen.held_out_every:
         few = int(np.count_nonzero(usable))
         logger.warning("%d refined frames are too few for a splat to judge poses by", few)
@@ -118,7 +110,7 @@ def run(
     split = split_frames(usable, chosen.held_out_every)
     dropped = {"held out": len(split.held_out), "unrefined": int(np.count_nonzero(~usable))}
     counts = Counts(len(frames), len(split.training), "frames", dropped)
-    turns = _Turns(keypoints, start, priors, rig, settings, num_threads, further, split)
+    turns = _Turns(keypoints, start, problem, further, split)
     progress = _resume(checkpoint, key)
     if progress is None:
         cloud = _cloud(start.landmarks, keypoints, chosen.sh_degree)
@@ -166,17 +158,13 @@ class _Turns:
         self,
         keypoints: Keypoints,
         solved: Solution,
-        priors: gtsam.NonlinearFactorGraph,
-        rig: CubeRig,
-        settings: RefineSettings,
-        num_threads: int,
+        problem: Problem,
         further: Sequence[Block],
         split: Split,
     ) -> None:
-        self.keypoints, self.solved, self.priors, self.rig = keypoints, solved, priors, rig
-        self.settings, self.num_threads, self.further = settings, num_threads, further
-        self.split = split
-        self.backend = choose_backend(settings.splat.backend, num_threads)
+        self.keypoints, self.solved, self.problem = keypoints, solved, problem
+        self.settings, self.further, self.split = problem.settings, further, split
+        self.backend = choose_backend(self.settings.splat.backend, problem.num_threads)
         self.faces: tuple[np.ndarray, np.ndarray]
         self.held_out: tuple[np.ndarray, np.ndarray]
         self.captured: Captured
@@ -262,14 +250,14 @@ class _Turns:
         near = near_of(world_T_rigs[self.split.training], SplatSettings())
         pixels = splat_block(gaussians, self.captured, near, self.backend)
         solver = settings.solver.model_copy(update={"max_iterations": settings.splat.solver_steps})
-        result = optimize(self.priors, [landmarks, *self.further, pixels], values, solver)
+        result = optimize(self.problem.priors, [landmarks, *self.further, pixels], values, solver)
         return adjustment.poses_of(result.values, len(world_T_rigs)), result
 
     def _block(self) -> LandmarkBlock:
+        solved = self.solved
         return adjustment.landmark_block(
-            self.solved.landmarks, self.keypoints, self.rig, self.solved.noise, self.settings,
-            self.num_threads,
-        )  # fmt: skip
+            solved.landmarks, self.keypoints, solved.noise, self.problem
+        )
 
     def _point_costs(self, world_T_rigs: np.ndarray) -> np.ndarray:
         """Robust cost (J,) of each point's observations, the point at its best under the poses."""
@@ -310,14 +298,14 @@ class _Turns:
         """The map's points under other poses."""
         tracks = self.solved.landmarks.tracks
         rows = self.keypoints.rows(tracks)
-        return triangulation.run(
+        return triangulation.triangulate(
             tracks,
             self.keypoints.bearings_rig[rows],
             self.keypoints.sigmas_rad[rows],
             world_T_rigs,
             self._gate() * self.solved.noise,
             self.settings.triangulate,
-            self.num_threads,
+            self.problem.num_threads,
         )
 
     def _gate(self) -> float:

@@ -131,7 +131,7 @@ def place_points(
         np.arange(len(rows), dtype=np.int32),
         len(known),
     )
-    placed = triangulation.run(
+    placed = triangulation.triangulate(
         candidates,
         reconstruction.observation_bearings[rows],
         np.ones(len(rows)),
