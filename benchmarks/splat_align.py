@@ -18,11 +18,11 @@ import numpy as np
 from gsba.config import SplatSettings
 from gsba.evaluate.trajectory import evaluate, format_table
 from gsba.log import show_log
-from gsba.pipeline.refine import load_run
 from gsba.splat import read_ply
 from gsba.splat.alignment import align
 from gsba.splat.backend import choose_backend
 from gsba.splat.scene import near_of
+from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory
 

@@ -32,9 +32,10 @@ from gsba.demo import make_walk
 from gsba.disk import atomic_write
 from gsba.evaluate.splats import SourceResult, compare, poses_for
 from gsba.log import GsbaError, show_log
-from gsba.pipeline.refine import load_run, refine
+from gsba.pipeline.refine import refine
 from gsba.splat.backend import choose_backend
 from gsba.splat.scores import Score, mean_score
+from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet
 

@@ -20,10 +20,10 @@ import cv2
 import numpy as np
 
 from gsba.frames.pixels import load_erp
-from gsba.pipeline.refine import load_run
 from gsba.report.html.pictures import picture, worst_frames
 from gsba.report.html.views import viewing_axes
 from gsba.similarity import residuals_of, similarity
+from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet, Reconstruction, Trajectory
 

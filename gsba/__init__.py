@@ -16,16 +16,18 @@ if TYPE_CHECKING:
     from gsba.config import RefineSettings
     from gsba.config_file import load_config
     from gsba.log import GsbaError
-    from gsba.pipeline.refine import RunResult, load_run, refine
+    from gsba.pipeline.outputs import RunResult
+    from gsba.pipeline.refine import refine
+    from gsba.store.finished import load_run
 
 __all__ = ["GsbaError", "RefineSettings", "RunResult", "load_config", "load_run", "refine"]
 
 _HOMES = {
     "GsbaError": "gsba.log",
     "RefineSettings": "gsba.config",
-    "RunResult": "gsba.pipeline.refine",
+    "RunResult": "gsba.pipeline.outputs",
     "load_config": "gsba.config_file",
-    "load_run": "gsba.pipeline.refine",
+    "load_run": "gsba.store.finished",
     "refine": "gsba.pipeline.refine",
 }
 

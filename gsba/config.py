@@ -354,6 +354,12 @@ class RefineSettings(_Settings):
     placement: PlacementSettings = PlacementSettings()
     seed: int = Field(default=0, ge=0, le=_MAX_SEED)
 
+    def plainer(self) -> "RefineSettings":
+        """For a first solution: features alone, without patches, pixels or splats."""
+        unaligned = self.align.model_copy(update={"rounds": 0})
+        families = tuple(name for name in self.factors if name not in ("photometric", "splat"))
+        return self.model_copy(update={"align": unaligned, "factors": families})
+
     @model_validator(mode="after")
     def _geometry_first(self) -> "RefineSettings":
         if not {"bearing", "reprojection"} & set(self.factors):

@@ -1,6 +1,7 @@
 """Files written beside their place and renamed into it; failures of the disk in one line."""
 
 import errno
+import json
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -42,6 +43,21 @@ def atomic_write(path: Path, write: Callable[[Path], object]) -> None:
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text as UTF-8, atomically; see `atomic_write`."""
+    atomic_write(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file's content atomically; see `atomic_write`."""
+    atomic_write(path, lambda temporary: temporary.write_bytes(content))
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write plain values as JSON with finite numbers, atomically; see `atomic_write`."""
+    write_text(path, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def remove_temporaries(folder: Path) -> None:

@@ -284,6 +284,11 @@ class Solution:
     noise: float  # of observations, in units of the features' own sigmas
     rounds: tuple[Round, ...]
 
+    @property
+    def counts(self) -> Counts:
+        """Of tracks."""
+        return self.landmarks.counts
+
     @classmethod
     def without_points(cls, world_T_rigs: np.ndarray) -> "Solution":
         """Poses (F, 4, 4) to start from."""

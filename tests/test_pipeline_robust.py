@@ -11,7 +11,7 @@ from gsba import refine
 from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import pose
 from gsba.log import GsbaError
-from gsba.pipeline.refine import RunResult
+from gsba.pipeline import RunResult
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import PoseStatus, Trajectory
 

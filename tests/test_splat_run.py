@@ -15,11 +15,11 @@ from gsba.config import SplatSettings
 from gsba.evaluate.splats import compare, poses_for
 from gsba.geometry import pose
 from gsba.log import GsbaError
-from gsba.pipeline.refine import load_run
 from gsba.splat import from_cloud, read_ply, scene
 from gsba.splat.backend import CpuBackend
 from gsba.splat.pictures import render_faces, render_panorama
 from gsba.splat.scores import measure
+from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 

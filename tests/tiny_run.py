@@ -11,7 +11,7 @@ from gsba.config import RefineSettings
 from gsba.demo import make_walk
 from gsba.demo.walk import Heading, WalkPath, walk_poses
 from gsba.evaluate.trajectory import TrajectoryErrors, evaluate
-from gsba.pipeline.refine import RunResult
+from gsba.pipeline import RunResult
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory
 

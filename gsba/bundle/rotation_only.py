@@ -11,11 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from factors import tangent_basis
-from gsba.bundle import tracks
 from gsba.bundle.reconstruction import assemble
 from gsba.geometry import pose
-from gsba.matching.correspondences import match_for_rotations
-from gsba.matching.guided_search import MatchContext
 from gsba.types import (
     CoarsePoses,
     Keypoints,
@@ -34,27 +31,31 @@ _OUTLIER_SIGMAS = 10.0  # of the loss's scale at the start
 _COLUMNS = 384  # of the inverse at a time
 
 
-def run(context: MatchContext, world_T_rigs: np.ndarray, coarse: CoarsePoses) -> Reconstruction:
+def refine(
+    found: Tracks,
+    keypoints: Keypoints,
+    world_T_rigs: np.ndarray,
+    coarse: CoarsePoses,
+    min_observations: int,
+) -> Reconstruction:
     """Refine the rotations of frames that were taken from one place.
 
     Args:
-        context: of the run.
+        found: which keypoints show one direction; some may be false.
+        keypoints: of all frames.
         world_T_rigs: (F, 4, 4) rotations right but for the drift of a chain; positions are kept.
         coarse: poses that define the world.
+        min_observations: frames with fewer count as unrefined.
 
     Returns:
         A result without points; covariances are of rotations, NaN for positions.
     """
-    matches = match_for_rotations(context, world_T_rigs)
-    keypoints = context.keypoints
-    found = tracks.build([matches], np.diff(keypoints.starts))
     rotations, covariances, used = solve(world_T_rigs[:, :3, :3], found, keypoints)
-    least = context.settings.rounds.min_observations
     six = np.full((len(rotations), 6, 6), np.nan)
     six[:, :3, :3] = covariances
     solved = Solution.without_points(pose(rotations, world_T_rigs[:, :3, 3]))
-    result = assemble(solved, six, keypoints, coarse, least)
-    refined = np.where(used >= least, PoseStatus.REFINED, PoseStatus.UNREFINED)
+    result = assemble(solved, six, keypoints, coarse, min_observations)
+    refined = np.where(used >= min_observations, PoseStatus.REFINED, PoseStatus.UNREFINED)
     return replace(result, pose_statuses=refined.astype(np.uint8))
 
 

@@ -3,7 +3,6 @@
 import logging
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_matrix, diags
@@ -15,7 +14,7 @@ from factors.sphere_field import SphereField, degrees_of, harmonics, num_harmoni
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import Problem
 from gsba.camera.rig import CubeRig, owner_faces
-from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution, Tracks
+from gsba.types import Counts, Keypoints, Landmarks, Round, Sighted, Solution, Tracks
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +43,11 @@ class Stitching:
     # without it
     counts: Counts  # of observations the field was found from
 
+    @property
+    def rounds(self) -> tuple[Round, ...]:
+        """Of the adjustment, if there is a field."""
+        return self.adjustment.rounds if self.field else ()
+
 
 @dataclass(frozen=True, slots=True)
 class _System:
@@ -67,22 +71,6 @@ class _System:
         return _System(
             self.cost - self.gain(step), self.gradient + self.hessian @ step, self.hessian
         )
-
-
-def describe(found: Stitching) -> dict[str, Any]:
-    """What report.json says of a field."""
-    field = found.field
-    rays = np.random.default_rng(0).normal(size=(2000, 3))
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    largest = np.linalg.norm(field.displacements(rays), axis=1).max()
-    return {
-        "taken": bool(field),
-        "degree": found.degree,
-        "rms_deg": np.rad2deg(field.rms_rad),
-        "max_deg": np.rad2deg(largest),
-        "gain_of_unseen_parts": found.part_gains,
-        "coefficients_rad": field.coefficients,
-    }
 
 
 def corrected(keypoints: Keypoints, field: SphereField, rig: CubeRig) -> Keypoints:

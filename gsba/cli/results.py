@@ -68,8 +68,8 @@ def export(
         raise GsbaError(f"--to {to} is not known: use one of {', '.join(ExportFormat)}")
     asked = {"up": up, "length": scale, "between": between, "gps": gps, "align": align}
     settings = validated({"placement": asked, "export": {"face_size": face_size}}).placement
-    from gsba.pipeline.refine import load_run
     from gsba.placement.placement import place
+    from gsba.store.finished import load_run
 
     reconstruction, frames, *_ = load_run(run)
     folder = out or run / to

@@ -58,9 +58,9 @@ def render(
 
     from gsba.camera.rig import CubeRig
     from gsba.evaluate.splats import write_image
-    from gsba.pipeline.refine import load_run
     from gsba.splat import read_ply, scene
     from gsba.splat.backend import choose_backend
+    from gsba.store.finished import load_run
     from gsba.store.folder import claim
     from gsba.types import FACES
 
@@ -107,9 +107,9 @@ def _compare(
 ):
     """Results of the run's own poses and of others."""
     from gsba.evaluate.splats import compare, poses_for
-    from gsba.pipeline.refine import load_run
     from gsba.splat.backend import choose_backend
     from gsba.splat.lpips import Lpips
+    from gsba.store.finished import load_run
     from gsba.store.folder import claim
 
     lpips = Lpips(lpips_weights) if lpips_weights else None

@@ -1,14 +1,13 @@
 """A map whose parts were joined, and what follows from that for the trajectory and its report."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from gsba.similarity import Sim3
 from gsba.trajectory.joining import GUESS, PLACES, Joint
 from gsba.trajectory.judgement import Trust
-from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, Solution
+from gsba.types import CoarsePoses, Counts, PoseSource, Solution
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,45 +64,3 @@ def follow(
             joint = replace(joint, scale=scale, world_T_own=world_T_own, how=PLACES)
         followed.append(joint)
     return replace(coarse, world_T_rigs=poses), trust, tuple(followed)
-
-
-def describe(
-    registered: Registered | None, joints: tuple[Joint, ...], frames: FrameSet
-) -> tuple[dict[str, Any], list[str]]:
-    """Pieces, maps and registered frames by their names, for the report, and what to note."""
-    names, notes = np.array(frames.names), []
-    pieces = [
-        {
-            "first": names[joint.first],
-            "last": names[joint.last],
-            "scale": joint.scale,
-            "world_T_own": joint.world_T_own,
-            "how": joint.how,
-        }
-        for joint in joints
-    ]
-    for joint in joints:
-        notes.append(
-            f"the trajectory begins anew at {names[joint.first]}: joined by {joint.how}, "
-            f"scale {joint.scale:.4g}"
-        )
-    judgement: dict[str, Any] = {"joints": pieces} if pieces else {}
-    if registered is None:
-        return judgement, notes
-    alone, lost = names[registered.alone].tolist(), names[registered.lost].tolist()
-    own = registered.components[~registered.lost]
-    maps = [names[registered.components == c].tolist() for c in np.unique(own)]
-    count = len(maps)
-    judgement |= {"registered": alone, "not_registered": lost}
-    judgement["maps"] = maps if count > 1 else []
-    if alone:
-        notes.append(f"registered against the map: {', '.join(alone)}")
-    if lost:
-        notes.append(f"could not be registered, not exported: {', '.join(lost)}")
-    if count > 1:
-        parts = "; ".join(f"{m[0]} to {m[-1]} ({len(m)} frames)" for m in maps[1:])
-        notes.append(
-            f"nothing ties {count} places together: each is refined, the largest with "
-            f"{len(maps[0])} frames is exported, the others are in poses.csv: {parts}"
-        )
-    return judgement, notes

@@ -30,6 +30,11 @@ class Recovered:
     coarse: CoarsePoses  # the trajectory, its pieces in one world
     joints: tuple[Joint, ...] = ()  # of those pieces
 
+    @property
+    def counts(self) -> Counts:
+        """Of pairs."""
+        return self.neighbours.counts
+
 
 def recover(
     context: MatchContext, guided: VerifiedPairs, coarse: CoarsePoses, timestamps: np.ndarray

@@ -36,6 +36,11 @@ class PhotometricResult:
     frame_weights: np.ndarray  # (F,) float64, 1 = full trust in a frame's pixels
     residuals: np.ndarray  # (F,) float64, median over a frame of patches' residuals, sigmas
 
+    @property
+    def rounds(self) -> tuple[Round, ...]:
+        """Of the adjustment."""
+        return self.adjustment.rounds
+
 
 def check(frames: FrameSet, settings: RefineSettings) -> None:
     """Where the family is asked for, refuse frames that patches cannot be sampled from.

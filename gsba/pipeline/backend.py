@@ -1,4 +1,4 @@
-"""The stages of one run that solve for its poses, on top of those that match its frames."""
+"""The back end of a run: from matches to poses and points, and what refines these further."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,22 +6,32 @@ from functools import partial
 
 import numpy as np
 
-from factors.sphere_field import SphereField
-from gsba.bundle import adjustment, common_errors, map_strength, stitching, tracks, triangulation
+from gsba.bundle import (
+    adjustment,
+    common_errors,
+    map_strength,
+    rotation_only,
+    stitching,
+    tracks,
+    triangulation,
+)
 from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.reconstruction import assemble
 from gsba.bundle.stitching import Stitching
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.merged_map import Registered, follow
+from gsba.matching import correspondences
 from gsba.photometric import alignment, direct
 from gsba.photometric.direct import PhotometricResult
-from gsba.pipeline.frontend import MatchingStages
+from gsba.pipeline.frontend import Seen
+from gsba.pipeline.map import Map
+from gsba.pipeline.prior import Prior
+from gsba.pipeline.run import Run
 from gsba.splat import refinement
 from gsba.splat.refinement import SplatResult
 from gsba.store.store import digest
 from gsba.types import (
-    FrameSet,
     Keypoints,
     Matches,
     Reconstruction,
@@ -32,234 +42,211 @@ from gsba.types import (
 )
 
 
-class Line(MatchingStages):
-    """One run: its inputs, its features, and a method for each stage after them."""
+def adjust(
+    run: Run,
+    seen: Seen,
+    prior: Prior,
+    name: str,
+    matches: Sequence[Matches],
+    start: Solution,
+    gates: Sequence[float],
+    final: bool = False,
+) -> Solution:
+    """Bundle adjustment in rounds over the tracks that matches make."""
 
-    def register(
-        self, neighbours: VerifiedPairs, solved: Solution, matches: list[Matches]
-    ) -> tuple[Solution, list[Matches]]:
-        """Parts of the map joined where they meet, frames in none of them registered.
+    def compute() -> Solution:
+        found = _tracks(seen, prior, matches)
+        return adjustment.adjust(found, seen.keypoints, start, run.problem(prior), gates, final)
 
-        Raises:
-            GsbaError: there is no map at all, so that nothing could be registered against it.
-        """
-        if not len(solved.landmarks.points_world):
-            raise GsbaError(
-                "no scene point is seen from enough frames, with enough parallax: frames must "
-                "follow one another closely (or lower triangulate.min_track_length or "
-                "triangulate.min_parallax_deg)"
-            )
-        least, trust = self.settings.rounds.min_observations, self.trust
-        if trust is None:
-            return solved, matches
-        nothing, scarce = np.zeros_like(trust.held_steps), connectivity.starving(solved, least)
-        tied = connectivity.parted(neighbours.matches.pairs, nothing, scarce)
-        if tied is None:
-            return solved, matches
-        given = self.context, solved, tied, trust.held_steps, ~trust.unseen_steps
-        compute = partial(map_merging.merge, *given, self.frames.timestamps)
-        found = self._stage("registered", self._matching(), compute, Registered)
-        self.counts["registered"] = [found.counts]
-        self.registered, self.parts = found, connectivity.several(found.components)
-        self.coarse, self.trust, self.joints = follow(found, self.coarse, trust, self.joints)
-        self._set_priors()
-        adjacent = self.match_along_epipolars(found.solved, "adjacent2")
-        return found.solved, [adjacent, *(connectivity.within(m, tied) for m in matches[1:])]
+    return run.stage(name, [run.solving_key(), gates, final], compute, Solution)
 
-    def look_closer(self, solved: Solution, adjacent: Matches) -> tuple[Solution, Matches]:
-        """What images hold well goes without priors; more keypoints where they hold it poorly."""
-        closer, trust = self.settings.closer, self.trust
-        if trust is None:
-            return solved, adjacent
-        steps = ~trust.unseen_steps, ~trust.false_steps
-        faint = self.settings.priors.faint()
 
-        def compute() -> MapStrength:
-            given = self._priors(faint), self.keypoints, self.rig, self.settings, self.num_threads
-            known = adjustment.pose_covariances(solved, *given, self.parts)
-            coarse, how = self.coarse.world_T_rigs, (closer, self.settings.priors, self.parts)
-            return map_strength.measure(solved.world_T_rigs, *known, coarse, *steps, *how)
+def place(
+    run: Run, seen: Seen, prior: Prior, name: str, matches: Sequence[Matches], solved: Solution
+) -> Solution:
+    """Points of these matches under poses as they are."""
+    settings = run.settings
 
-        found = self._stage("strength", [self._solving(), closer], compute, MapStrength)
-        self.counts["strength"], self.strength = [found.counts], found
-        self._set_priors()
-        if closer.mode == "off" or not found.weak.any():
-            return solved, adjacent
-        self.extract_more(found.weak)
-        adjacent = self.match_along_epipolars(solved, "adjacent_closer")
-        placed = self._place("placed_closer", [adjacent], solved)
-        wide = self.match_known_points("wide_closer", placed, loops_closed=True)
-        gates = self.settings.rounds.dense
-        return self.solve("dense_closer", [adjacent, wide], placed, gates), adjacent
+    def compute() -> Solution:
+        found = _tracks(seen, prior, matches)
+        rows, gate = seen.keypoints.rows(found), settings.rounds.dense[-1] * solved.noise
+        observed = seen.keypoints.bearings_rig[rows], seen.keypoints.sigmas_rad[rows]
+        how = gate, settings.triangulate, run.num_threads
+        placed = triangulation.triangulate(found, *observed, solved.world_T_rigs, *how)
+        return replace(solved, landmarks=placed)
 
-    def _place(self, name: str, matches: Sequence[Matches], solved: Solution) -> Solution:
-        """Points of these matches under poses as they are."""
-        settings = self.settings
+    return run.stage(name, [run.solving_key()], compute, Solution, noted=False)
 
-        def compute() -> Solution:
-            found = self._tracks(matches)
-            rows, gate = self.keypoints.rows(found), settings.rounds.dense[-1] * solved.noise
-            seen = self.keypoints.bearings_rig[rows], self.keypoints.sigmas_rad[rows]
-            how = gate, settings.triangulate, self.num_threads
-            return replace(
-                solved, landmarks=triangulation.triangulate(found, *seen, solved.world_T_rigs, *how)
-            )
 
-        return self._stage(name, [self._solving()], compute, Solution)
+def _tracks(seen: Seen, prior: Prior, matches: Sequence[Matches]) -> Tracks:
+    """Tracks that matches make, within parts that nothing ties together yet."""
+    tied = [connectivity.within(some, prior.parts) for some in matches]
+    return tracks.build(tied, np.diff(seen.keypoints.starts))
 
-    def _tracks(self, matches: Sequence[Matches]) -> Tracks:
-        """Tracks that matches make, within parts that nothing ties together yet."""
-        tied = [connectivity.within(some, self.parts) for some in matches]
-        return tracks.build(tied, np.diff(self.keypoints.starts))
 
-    def solve(
-        self,
-        name: str,
-        matches: Sequence[Matches],
-        start: Solution,
-        gates: Sequence[float],
-        final: bool = False,
-    ) -> Solution:
-        """Bundle adjustment in rounds over the tracks that matches make."""
+def scattered(run: Run, prior: Prior, near: VerifiedPairs, solved: Solution) -> np.ndarray | None:
+    """Parts (F,) of the map that no step ties together; None = it is in one piece.
 
-        def compute() -> Solution:
-            given = self._tracks(matches), self.keypoints, start, self.priors, self.rig
-            return adjustment.adjust(*given, gates, self.settings, self.num_threads, final)
+    Raises:
+        GsbaError: there is no map at all, so that nothing could be registered against it.
+    """
+    if not len(solved.landmarks.points_world):
+        raise GsbaError(
+            "no scene point is seen from enough frames, with enough parallax: frames must "
+            "follow one another closely (or lower triangulate.min_track_length or "
+            "triangulate.min_parallax_deg)"
+        )
+    scarce = connectivity.starving(solved, run.settings.rounds.min_observations)
+    nothing = np.zeros_like(prior.trust.held_steps)
+    return connectivity.parted(near.matches.pairs, nothing, scarce)
 
-        solved = self._stage(name, [self._solving(), gates, final], compute, Solution)
-        self.counts[name] = [solved.landmarks.counts]
-        self.solutions[name] = solved
-        return solved
 
-    def align(self, number: int, solved: Solution) -> Sighted:
-        """Points observed anew by aligning patches."""
-        name = f"align{number}"
+def merge_maps(
+    run: Run, seen: Seen, prior: Prior, solved: Solution, parts: np.ndarray
+) -> tuple[Prior, Solution]:
+    """Parts of the map joined where they meet, frames in none of them registered."""
+    trust, times = prior.trust, run.frames.timestamps
+    given = seen.context, solved, parts, trust.held_steps, ~trust.unseen_steps, times
+    compute = partial(map_merging.merge, *given)
+    merged = run.stage("registered", run.matching_key(), compute, Registered)
+    coarse, trust, joints = follow(merged, prior.coarse, trust, prior.joints)
+    apart = connectivity.several(merged.components)
+    prior = replace(prior, merged=merged, parts=apart, coarse=coarse, trust=trust, joints=joints)
+    return prior, merged.solved
 
-        def compute() -> Sighted:
-            given = solved.landmarks, solved.world_T_rigs, self.observed, solved.noise
-            how = name, self.aligned, self.settings.align, self.num_threads, self.field
-            return alignment.align(*given, self.greys, self.rig, *how)
 
-        key = self.settings.align.model_dump(exclude={"rounds"})
-        sighted = self._stage(name, key, compute, Sighted)
-        self.counts[name] = [sighted.counts]
-        return sighted
+def measure_strength(run: Run, seen: Seen, prior: Prior, solved: Solution) -> Prior:
+    """What images hold well goes without priors; the rest are worth what the others show."""
+    closer, settings, trust = run.settings.closer, run.settings.priors, prior.trust
 
-    def solve_aligned(self, number: int, sighted: Sighted, before: Solution) -> Solution:
-        """Bundle adjustment of aligned observations; undone where that explains less."""
-        name, gates = f"aligned{number}", self.settings.rounds.aligned
+    def compute() -> MapStrength:
+        problem = run.problem(prior, settings.faint())
+        known = adjustment.pose_covariances(solved, seen.keypoints, problem, prior.parts)
+        coarse, steps = prior.coarse.world_T_rigs, (~trust.unseen_steps, ~trust.false_steps)
+        how = closer, settings, prior.parts
+        return map_strength.measure(solved.world_T_rigs, *known, coarse, *steps, *how)
 
-        def compute() -> tuple[Solution, Keypoints]:
-            there = replace(sighted, keypoints=self._corrected(sighted.keypoints))
-            given = self.priors, self.rig, gates, self.settings, self.num_threads
-            solved, found = adjustment.run_sighted(there, before, *given)
-            return solved, stitching.with_noise_of(sighted.keypoints, found)
+    strength = run.stage("strength", [run.solving_key(), closer], compute, MapStrength)
+    return replace(prior, strength=strength)
 
-        key = [self._solving(), gates]
-        solved, keypoints = self._stage(name, key, compute, tuple[Solution, Keypoints])
-        self.counts[name] = [solved.landmarks.counts]
-        self.solutions[name] = solved
-        if not solved.carries(before, self.settings.rounds.min_observations):
-            self.undone.append(name)
-            return before
-        self.observed, self.aligned = keypoints, sighted.aligned
-        return solved
 
-    def straighten(self, number: int, sighted: Sighted, solved: Solution) -> Solution:
-        """The map with what stitching bends taken out, where all frames share it."""
-        name, settings = f"stitching{number}", self.settings
-        is_first, is_off = number == 1, settings.stitching.mode == "off"
-        undone = self.solutions[f"aligned{number}"] is not solved
-        if is_off or undone or not self.frames.panoramic or not (is_first or self.field):
-            return solved
+def align_patches(run: Run, prior: Prior, world: Map, number: int) -> Map:
+    """Patches around the map's points aligned to its frames, solved, straightened.
 
-        def compute() -> Stitching:
-            given = sighted, self.observed, solved, self.field, self.priors, self.rig
-            return stitching.estimate(*given, settings, self.num_threads)
+    The map stays as it was where that explains less.
+    """
+    sighted = _align(run, world, f"align{number}")
+    better = _adjust_aligned(run, prior, world, sighted, f"aligned{number}")
+    if better is None:
+        return world
+    return _straighten(run, prior, better, sighted, number)
 
-        key = [self._solving(), settings.stitching, settings.rounds.aligned]
-        found = self._stage(name, key, compute, Stitching)
-        self.counts[name] = [found.counts]
-        if not found.field:
-            self.stitching = found
-            return solved
-        self.solutions[name] = found.adjustment
-        if not found.adjustment.carries(solved, settings.rounds.min_observations):
-            self.undone.append(name)
-            return solved
-        if self.stitching is not None:  # what it gained is known best from where none was
-            found = replace(found, part_gains=self.stitching.part_gains)
-        self.stitching, self.observed = found, found.keypoints
-        return found.adjustment
 
-    @property
-    def field(self) -> SphereField:
-        """What is known of what stitching bends."""
-        return SphereField.none() if self.stitching is None else self.stitching.field
+def _align(run: Run, world: Map, name: str) -> Sighted:
+    """Points observed anew."""
+    settings, solved = run.settings.align, world.solution
 
-    @property
-    def corrected(self) -> FrameSet:
-        """The frames, read as the field straightens them."""
-        return replace(self.frames, correction=tuple(self.field.coefficients.tolist()))
+    def compute() -> Sighted:
+        given = solved.landmarks, solved.world_T_rigs, world.observed, solved.noise
+        how = name, world.aligned, settings, run.num_threads, world.field
+        return alignment.align(*given, run.greys, run.rig, *how)
 
-    def _corrected(self, keypoints: Keypoints) -> Keypoints:
-        return stitching.corrected(keypoints, self.field, self.rig)
+    return run.stage(name, settings.model_dump(exclude={"rounds"}), compute, Sighted)
 
-    def solve_photometric(self, solved: Solution) -> Solution:
-        """Joint refinement by the observations so far and the grey values of patches."""
-        name, settings = "photometric", self.settings
 
-        def compute() -> PhotometricResult:
-            observed = self._corrected(self.observed)
-            given = self.corrected, observed, solved, self.priors, self.rig
-            return direct.refine(*given, settings, self.num_threads)
+def _adjust_aligned(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str) -> Map | None:
+    """Bundle adjustment of aligned observations; None where that explains less."""
+    gates = run.settings.rounds.aligned
 
-        key = [self._solving(), settings.photometric]
-        result = self._stage(name, key, compute, PhotometricResult)
-        self.counts[name], self.solutions[name] = list(result.counts), result.adjustment
-        self.frame_weights = result.frame_weights
-        return result.adjustment
+    def compute() -> tuple[Solution, Keypoints]:
+        corrected = stitching.corrected(sighted.keypoints, world.field, run.rig)
+        there = replace(sighted, keypoints=corrected)
+        solved, found = adjustment.adjust_sighted(there, world.solution, run.problem(prior), gates)
+        return solved, stitching.with_noise_of(sighted.keypoints, found)
 
-    def refine_on_splat(self, solved: Solution) -> Solution:
-        """Joint refinement by the observations so far, patches, and a splat of the frames."""
-        name, settings = "splat", self.settings
-        key = [self._solving(), settings.splat, settings.photometric, settings.factors]
-        turns = self.store.root / "stages" / name / "turns.npz"
+    key = [run.solving_key(), gates]
+    solved, keypoints = run.stage(name, key, compute, tuple[Solution, Keypoints])
+    if not solved.carries(world.solution, run.settings.rounds.min_observations):
+        run.journal.undo(name)
+        return None
+    return replace(world, solution=solved, observed=keypoints, aligned=sighted.aligned)
 
-        def compute() -> SplatResult:
-            further = direct.joint(
-                self.corrected, solved, self.frame_weights, settings, self.num_threads
-            )
-            observed = self._corrected(self.observed)
-            given = self.corrected, observed, solved, self.priors, self.rig, settings
-            start = digest(key, solved.world_T_rigs.tolist())
-            return refinement.refine(*given, self.num_threads, further, turns, start)
 
-        result = self._stage(name, key, compute, SplatResult)
-        turns.unlink(missing_ok=True)
-        self.counts[name], self.solutions[name] = list(result.counts), result.adjustment
-        self.moves = result.moves
-        return result.adjustment
+def _straighten(run: Run, prior: Prior, world: Map, sighted: Sighted, number: int) -> Map:
+    """The map with what stitching bends taken out, where all frames share it."""
+    name, settings = f"stitching{number}", run.settings
+    looked_for = number == 1 or world.field
+    if settings.stitching.mode == "off" or not run.frames.panoramic or not looked_for:
+        return world
 
-    def reconstruct(self, solved: Solution) -> Reconstruction:
-        """Covariances, and everything back in the trajectory's world."""
+    def compute() -> Stitching:
+        given = sighted, world.observed, world.solution, world.field
+        return stitching.estimate(*given, run.problem(prior))
 
-        def compute() -> Reconstruction:
-            observed, least = self._corrected(self.observed), self.settings.rounds.min_observations
-            given = self.priors, observed, self.rig, self.settings, self.num_threads
-            claimed = adjustment.pose_covariances(solved, *given, self.parts)
-            covariances, joint = common_errors.added(*claimed, solved.world_T_rigs, self.parts)
-            false = None if self.trust is None else self.trust.false_frames
-            last = self.corrected.correction, self.parts, joint
-            return assemble(solved, covariances, observed, self.coarse, least, false, *last)
+    key = [run.solving_key(), settings.stitching, settings.rounds.aligned]
+    found = run.stage(name, key, compute, Stitching)
+    if not found.field:
+        return replace(world, stitching=found)
+    if not found.adjustment.carries(world.solution, settings.rounds.min_observations):
+        run.journal.undo(name)
+        return world
+    if world.stitching is not None:  # what it gained is known best from where none was
+        found = replace(found, part_gains=world.stitching.part_gains)
+    return replace(world, solution=found.adjustment, observed=found.keypoints, stitching=found)
 
-        return self._stage("reconstruction", self._solving(), compute, Reconstruction)
 
-    def _solving(self) -> list[object]:
-        settings = self.settings
-        relevant = [settings.triangulate, settings.rounds, settings.priors, settings.solver]
-        return [
-            *relevant,
-            [f for f in settings.factors if f not in ("photometric", "splat")],
-            self.custom,
-        ]
+def refine_photometric(run: Run, prior: Prior, world: Map) -> Map:
+    """Joint refinement by the observations so far and the grey values of patches."""
+    key = [run.solving_key(), run.settings.photometric]
+
+    def compute() -> PhotometricResult:
+        given = world.straightened(run.frames), world.keypoints(run.rig), world.solution
+        return direct.refine(*given, run.problem(prior))
+
+    found = run.stage("photometric", key, compute, PhotometricResult)
+    return replace(world, solution=found.adjustment, frame_weights=found.frame_weights)
+
+
+def refine_on_splat(run: Run, prior: Prior, world: Map) -> Map:
+    """Joint refinement by the observations so far, patches, and a splat of the frames."""
+    settings, solved = run.settings, world.solution
+    key = [run.solving_key(), settings.splat, settings.photometric, settings.factors]
+    turns = run.store.root / "stages/splat/turns.npz"
+
+    def compute() -> SplatResult:
+        frames, start = world.straightened(run.frames), digest(key, solved.world_T_rigs.tolist())
+        patches = direct.joint(frames, solved, world.frame_weights, settings, run.num_threads)
+        given = frames, world.keypoints(run.rig), solved, run.problem(prior)
+        return refinement.refine(*given, patches, turns, start)
+
+    found = run.stage("splat", key, compute, SplatResult)
+    turns.unlink(missing_ok=True)
+    return replace(world, solution=found.adjustment, moves=found.moves)
+
+
+def reconstruct(run: Run, seen: Seen, prior: Prior, world: Map) -> Reconstruction:
+    """Covariances, and everything back in the trajectory's world; of a turn, rotations alone."""
+    if prior.turning_only:
+        return _reconstruct_rotations(run, seen, prior)
+    least, correction = run.settings.rounds.min_observations, world.straightened(run.frames)
+
+    def compute() -> Reconstruction:
+        solved, observed = world.solution, world.keypoints(run.rig)
+        claimed = adjustment.pose_covariances(solved, observed, run.problem(prior), prior.parts)
+        covariances, joint = common_errors.added(*claimed, solved.world_T_rigs, prior.parts)
+        false, last = prior.trust.false_frames, (correction.correction, prior.parts, joint)
+        return assemble(solved, covariances, observed, prior.coarse, least, false, *last)
+
+    return run.stage("reconstruction", run.solving_key(), compute, Reconstruction)
+
+
+def _reconstruct_rotations(run: Run, seen: Seen, prior: Prior) -> Reconstruction:
+    """Rotations alone, of a camera that stayed in one place."""
+    least, poses = run.settings.rounds.min_observations, prior.start().world_T_rigs
+
+    def compute() -> Reconstruction:
+        matches = correspondences.match_for_rotations(seen.context, poses)
+        found = tracks.build([matches], np.diff(seen.keypoints.starts))
+        return rotation_only.refine(found, seen.keypoints, poses, prior.coarse, least)
+
+    return run.stage("reconstruction", [run.settings.matching, least], compute, Reconstruction)

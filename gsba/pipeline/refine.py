@@ -6,30 +6,23 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from gsba import video
-from gsba.bundle import rotation_only
 from gsba.config import RefineSettings
 from gsba.frames.scan import scan
+from gsba.loop_closure import connectivity
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
 from gsba.photometric import direct
-from gsba.pipeline import inputs, outputs, timing
-from gsba.pipeline.backend import Line
-from gsba.pipeline.frontend import ExtraFactors
+from gsba.pipeline import backend, frontend, inputs, outputs
+from gsba.pipeline.frontend import Seen
+from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
+from gsba.pipeline.prior import ExtraFactors, Prior
+from gsba.pipeline.run import Journal, Run
 from gsba.placement.placement import check
-from gsba.store.finished import load_run
 from gsba.store.store import RunStore
-from gsba.types import (
-    CoarsePoses,
-    Counts,
-    FrameSet,
-    Reconstruction,
-    Solution,
-    Trajectory,
-    VerifiedPairs,
-)
+from gsba.types import CoarsePoses, FrameSet, Matches, Solution, Trajectory, VerifiedPairs
 
-__all__ = ["RunResult", "load_run", "refine"]
+__all__ = ["RunResult", "refine", "solve"]
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # frames have threads; sums keep their order
@@ -85,55 +78,96 @@ def refine(
     check(settings.placement, frame_set)
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh) as store:
-        frame_set, counts = merging.before(store, frame_set, chosen), {}
+        frame_set, journal = merging.before(store, frame_set, chosen), Journal()
         if chosen.distractors:
-            frame_set, counts = _without_distractors(store, frame_set, coarse, given, settings)
-        line = Line(store, frame_set, coarse, settings, extra_factors)
-        line.counts |= counts
-        neighbours = _neighbours(line, given)
-        found = _turned(line) if line.turns_only else line.reconstruct(_solve(line, neighbours))
-        return outputs.write(line, found)
+            frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
+        run = Run.begin(store, frame_set, coarse, settings, extra_factors, journal)
+        seen, prior = frontend.extract(run), Prior.of(coarse, extra_factors)
+        prior, world = solve(run, seen, prior, given)
+        result = backend.reconstruct(run, seen, prior, world)
+        return outputs.write(run, prior, world, result)
 
 
-def _neighbours(line: Line, given: Sequence[Trajectory]) -> VerifiedPairs:
-    """Neighbours in time, and what they say of the trajectory and its clock."""
-    return line.judge(timing.match_neighbours(line, given, inputs.coarse_poses))
+def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tuple[Prior, Map]:
+    """The method: from keypoints and a coarse trajectory to poses and points.
+
+    A stage that is optional takes a map and gives one: it is left out by leaving out its line.
+
+    Args:
+        run: what no stage changes.
+        seen: keypoints of the frames.
+        prior: what is believed of the trajectory at first.
+        given: its files, for a clock to be set right.
+
+    Returns:
+        What is believed in the end, and the map; of a camera that only turned one without points.
+
+    Raises:
+        GsbaError: images that do not match, or that contradict the trajectory.
+    """
+    rounds, families = run.settings.rounds, run.settings.factors
+    patch_rounds = run.settings.align.rounds
+    prior, near = frontend.match_neighbours(run, seen, prior, given)
+    prior, near = frontend.judge(run, seen, prior, near)
+    if prior.turning_only:
+        return prior, Map.of(prior.start(), seen.keypoints)
+    start = prior.start()
+    solved = backend.adjust(run, seen, prior, "chain", [near.matches], start, rounds.chain)
+    along = frontend.match_along_epipolars(run, seen, solved)
+    known = frontend.match_known_points(run, seen, solved, "near", loops_closed=False)
+    solved = backend.adjust(run, seen, prior, "dense", [along, known], solved, rounds.dense)
+    prior, solved, (along, known) = _merge_maps(run, seen, prior, near, solved, (along, known))
+    prior, solved, loops = frontend.close_loops(run, seen, prior, solved)
+    matches = [along, known, loops]
+    solved = backend.adjust(run, seen, prior, "closed", matches, solved, rounds.loops)
+    prior = backend.measure_strength(run, seen, prior, solved)
+    seen, solved, along = _look_closer(run, seen, prior, solved, along)
+    for n in range(1, rounds.map_passes + 1):
+        wide = frontend.match_known_points(run, seen, solved, f"everywhere{n}")
+        name, final = f"refined{n}", n == rounds.map_passes and patch_rounds == 0
+        matches = [along, wide]
+        solved = backend.adjust(run, seen, prior, name, matches, solved, rounds.refined, final)
+    world = Map.of(solved, seen.keypoints)
+    for n in range(1, patch_rounds + 1):
+        world = backend.align_patches(run, prior, world, n)
+    if "photometric" in families:
+        world = backend.refine_photometric(run, prior, world)
+    if "splat" in families:
+        world = backend.refine_on_splat(run, prior, world)
+    return prior, world
 
 
-def _solve(line: Line, neighbours: VerifiedPairs) -> Solution:
-    """All stages from verified neighbours to the last solution."""
-    settings, rounds = line.settings, line.settings.rounds
-    solved = line.solve("chain", [neighbours.matches], line.start(), rounds.chain)
-    adjacent = line.match_along_epipolars(solved)
-    near = line.match_known_points("near", solved, loops_closed=False)
-    solved = line.solve("dense", [adjacent, near], solved, rounds.dense)
-    solved, matches = line.register(neighbours, solved, [adjacent, near])
-    loops, solved = line.close_loops(solved)
-    solved = line.solve("closed", [*matches, loops.matches], solved, rounds.loops)
-    solved, adjacent = line.look_closer(solved, matches[0])
-    for number in range(1, rounds.map_passes + 1):
-        wide = line.match_known_points(f"everywhere{number}", solved, loops_closed=True)
-        final = number == rounds.map_passes and settings.align.rounds == 0
-        solved = line.solve(f"refined{number}", [adjacent, wide], solved, rounds.refined, final)
-    for number in range(1, settings.align.rounds + 1):
-        sighted = line.align(number, solved)
-        solved = line.straighten(number, sighted, line.solve_aligned(number, sighted, solved))
-    if "photometric" in settings.factors:
-        solved = line.solve_photometric(solved)
-    if "splat" in settings.factors:
-        solved = line.refine_on_splat(solved)
-    return solved
+def _merge_maps(
+    run: Run,
+    seen: Seen,
+    prior: Prior,
+    near: VerifiedPairs,
+    solved: Solution,
+    matches: tuple[Matches, Matches],
+) -> tuple[Prior, Solution, tuple[Matches, Matches]]:
+    """Parts of the map that nothing ties together, joined where they meet; and their matches."""
+    parts = backend.scattered(run, prior, near, solved)
+    if parts is None:
+        return prior, solved, matches
+    prior, solved = backend.merge_maps(run, seen, prior, solved, parts)
+    along = frontend.match_along_epipolars(run, seen, solved, "adjacent2")
+    return prior, solved, (along, connectivity.within(matches[1], parts))
 
 
-def _turned(line: Line) -> Reconstruction:
-    """Rotations alone, of a camera that stayed in one place."""
-    settings = line.settings
-    key = [settings.matching, settings.rounds.min_observations]
-
-    def compute() -> Reconstruction:
-        return rotation_only.run(line.context, line.start().world_T_rigs, line.coarse)
-
-    return line.store.stage("reconstruction", key, compute, Reconstruction, [line.latest])
+def _look_closer(
+    run: Run, seen: Seen, prior: Prior, solved: Solution, along: Matches
+) -> tuple[Seen, Solution, Matches]:
+    """More keypoints where images hold the map poorly, and the map that these give."""
+    weak = prior.weak_frames()
+    if run.settings.closer.mode == "off" or not weak.any():
+        return seen, solved, along
+    seen = frontend.extract_more(run, seen, weak)
+    along = frontend.match_along_epipolars(run, seen, solved, "adjacent_closer")
+    placed = backend.place(run, seen, prior, "placed_closer", [along], solved)
+    wide = frontend.match_known_points(run, seen, placed, "wide_closer")
+    gates = run.settings.rounds.dense
+    solved = backend.adjust(run, seen, prior, "dense_closer", [along, wide], placed, gates)
+    return seen, solved, along
 
 
 def _without_distractors(
@@ -142,18 +176,16 @@ def _without_distractors(
     coarse: CoarsePoses,
     given: Sequence[Trajectory],
     settings: RefineSettings,
-) -> tuple[FrameSet, dict[str, list[Counts]]]:
+    journal: Journal,
+) -> FrameSet:
     """Frames without what a first solution, plainer than the last, does not explain."""
     direct.check(frames, settings)  # before the first solution, not after
-    aligned = settings.align.model_copy(update={"rounds": 0})
-    families = tuple(name for name in settings.factors if name not in ("photometric", "splat"))
-    plain = settings.model_copy(update={"align": aligned, "factors": families})
     with store.named("first"):
-        line = Line(store, frames, coarse, plain, None)
-        neighbours = _neighbours(line, given)
-        if line.turns_only:
-            return frames, {}
-        solved = _solve(line, neighbours)
-    after, threads = f"first-{line.latest}", line.num_threads
-    frames, counts = merging.after(store, frames, solved, after, threads)
-    return frames, {"distractors": [counts]}
+        run = Run.begin(store, frames, coarse, settings.plainer())
+        prior, world = solve(run, frontend.extract(run), Prior.of(coarse), given)
+    if prior.turning_only:
+        return frames
+    first, threads = f"first-{run.chain.latest[0]}", run.num_threads
+    frames, counts = merging.after(store, frames, world.solution, first, threads)
+    journal.note("distractors", counts)
+    return frames

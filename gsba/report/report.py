@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import json
 import logging
 import math
 import os
@@ -17,7 +16,6 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from gsba.bundle.map_strength import scale_sigmas
 from gsba.geometry import angular_errors, quaternion_from_rotation
 from gsba.store.store import StageRecord, atomic_write
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
@@ -86,61 +84,6 @@ def angular_residuals(reconstruction: Reconstruction) -> np.ndarray:
     )
 
 
-def take_notes(
-    frames: FrameSet,
-    coarse: CoarsePoses,
-    reconstruction: Reconstruction,
-    undone: Sequence[str],
-    frame_weights: np.ndarray,
-    max_scale_sigma: float,
-) -> list[str]:
-    """What the user should know about a run, also logged as warnings.
-
-    Args:
-        undone: stages in which a round of bundle adjustment was undone.
-        frame_weights: (F,) of each frame's pixels, below 1 where they contradict the others.
-        max_scale_sigma: of a step's length over the one before it; above, a place is named.
-    """
-    absent = coarse.sources == PoseSource.NONE
-    filled = np.flatnonzero((coarse.sources != PoseSource.SLAM) & ~absent)
-    lost = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
-    notes = []
-    if absent.all():
-        notes.append("no trajectory: started from the images alone, in units of their own")
-    if coarse.time_offset:
-        notes.append(f"frame times were shifted by {coarse.time_offset:.6f} s")
-    if len(filled):
-        notes.append(f"no SLAM pose, started from neighbours: {_names(frames, filled)}")
-    if len(lost):
-        notes.append(f"matched nothing, held by the trajectory alone: {_names(frames, lost)}")
-    if undone:
-        notes.append(f"rounds were undone in {', '.join(undone)}: they explained less")
-    if len(doubted := np.flatnonzero(frame_weights < 1)):
-        notes.append(f"pixels fit badly and were weighted down: {_names(frames, doubted)}")
-    if len(weak := _weak_places(reconstruction, max_scale_sigma)):
-        notes.append(
-            f"the scale may change here by more than {max_scale_sigma:.2%}, as few points hold it: "
-            f"{_names(frames, weak)}"
-        )
-    for note in notes:
-        logger.warning(note)
-    return notes
-
-
-def _weak_places(reconstruction: Reconstruction, max_scale_sigma: float) -> np.ndarray:
-    """Frames at which images hand the scale on poorly, even after a closer look."""
-    poses, joint = reconstruction.world_T_rigs, reconstruction.joint_errors
-    if joint is None or len(poses) < 3:
-        return np.zeros(0, np.intp)
-    return 1 + np.flatnonzero(scale_sigmas(poses, joint.draws) > max_scale_sigma)
-
-
-def _names(frames: FrameSet, chosen: np.ndarray) -> str:
-    """The first twenty names, and how many more."""
-    names = ", ".join(frames.names[f] for f in chosen[:20])
-    return names if len(chosen) <= 20 else f"{names} and {len(chosen) - 20} more"
-
-
 def build_report(
     *,
     settings: BaseModel,
@@ -165,9 +108,9 @@ def build_report(
         solver: one record for each round, holding its iterations with their cost by family.
         gauge: a sentence on where the refined map sits.
         notes: what the user should know: frames without images, unmatched frames, ...
-        trajectory: the images' judgement of it, see `gsba.trajectory.judgement.describe`.
+        trajectory: the images' judgement of it, see `gsba.report.findings.of_trajectory`.
         moves: of the poses against a splat, see `gsba.splat.refinement.Move`.
-        stitching: the field of directions, see `gsba.bundle.stitching.describe`.
+        stitching: the field of directions, see `gsba.report.findings.of_field`.
     """
     quality = frame_quality(reconstruction)
     stage_rows = [
@@ -209,12 +152,6 @@ def _summary(
         "median_residual_deg": np.median(residuals) if len(residuals) else math.nan,
         "median_residual_deg_coarse": median_residual_deg(reconstruction, coarse.world_T_rigs),
     }
-
-
-def write_report(path: Path, report: Mapping[str, Any]) -> None:
-    """Write a report as valid JSON, atomically."""
-    text = json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-    atomic_write(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def write_poses(

@@ -65,6 +65,11 @@ class SplatResult:
     counts: tuple[Counts, ...]  # of frames: those the splat is trained on are kept
     moves: tuple[Move, ...]
 
+    @property
+    def rounds(self) -> tuple[Round, ...]:
+        """Of the adjustment, the moves' with them."""
+        return self.adjustment.rounds
+
 
 @dataclass(frozen=True, slots=True)
 class _Progress:

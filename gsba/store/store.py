@@ -172,6 +172,32 @@ class RunStore:
         logger.info("%s: %s %.1f s, %.0f MB", record.name, how, record.seconds, record.peak_mb)
 
 
+class Chain:
+    """Stages of which each rests on the one before; `stage` alone goes on.
+
+    Args:
+        store: of the run.
+    """
+
+    def __init__(self, store: RunStore) -> None:
+        self._store = store
+        self.latest: list[str] = []  # name of the last stage; [] before the first
+
+    def stage(
+        self,
+        name: str,
+        settings: object,
+        compute: Callable[[], T],
+        returns: type[T],
+        also: Sequence[str] = (),
+    ) -> T:
+        """As `RunStore.stage`, after the stage before and those named in `also`."""
+        after = [*self.latest, *also]
+        result = self._store.stage(name, settings, compute, returns, after)
+        self.latest = [name]
+        return result
+
+
 class PerFrame(Generic[T]):
     """Results of a per-frame stage: frame name -> record, read from disk whenever asked for.
 

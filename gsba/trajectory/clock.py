@@ -9,7 +9,6 @@ as well, and where it explains the images markedly better.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -168,19 +167,3 @@ def _correction(found: Clock, offset_sigma: float, rate_sigma: float, degrees: l
         f"{found.offset:.3f} +- {offset_sigma:.3f} s at the first frame{rate} "
         f"(disagreement of a step {degrees[0]:.2f} degrees before, {degrees[1]:.2f} after)"
     )
-
-
-def describe(estimate: ClockEstimate) -> dict[str, Any]:
-    """The estimate for the report: seconds, and degrees of a step's rotation."""
-    return {
-        "verdict": estimate.verdict,
-        "offset_s": estimate.clock.offset,
-        "rate": estimate.clock.rate,
-        "found_offset_s": estimate.found.offset,
-        "offset_sigma_s": estimate.offset_sigma,
-        "found_rate": estimate.found.rate,
-        "rate_sigma": estimate.rate_sigma,
-        "disagreement_given_deg": estimate.before_deg,
-        "disagreement_found_deg": estimate.after_deg,
-        "note": estimate.note,
-    }

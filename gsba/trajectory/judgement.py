@@ -8,14 +8,13 @@ trajectory that this contradicts lose their prior, and the start is chained past
 
 import logging
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from gsba.config import PriorSettings, VerifySettings
 from gsba.geometry import inverse, nearest_rotation, pose, rotation_angle
 from gsba.trajectory.steps import Steps, chained, step_lengths
-from gsba.types import CoarsePoses, FrameSet, PoseSource
+from gsba.types import CoarsePoses, PoseSource
 
 logger = logging.getLogger(__name__)
 
@@ -40,6 +39,13 @@ class Trust:
     unseen_steps: np.ndarray  # (F - 1,) bool, the images say nothing: the trajectory alone
     lengths: np.ndarray  # (F - 1,) float64, map units, of the steps
     turning_only: bool  # no two frames have parallax: only rotations can be had
+
+    @classmethod
+    def of_all(cls, world_T_rigs: np.ndarray) -> "Trust":
+        """Of a trajectory (F, 4, 4) that nothing contradicts."""
+        none = np.zeros(max(len(world_T_rigs) - 1, 0), bool)
+        lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
+        return cls(world_T_rigs, none, np.zeros(len(world_T_rigs), bool), none, lengths, False)
 
     @property
     def sound(self) -> bool:
@@ -136,32 +142,6 @@ def leaps(world_T_rigs: np.ndarray, timestamps: np.ndarray) -> np.ndarray:
     speeds = lengths / np.diff(timestamps)
     moving = speeds[speeds > 0]
     return speeds > _LEAP * np.median(moving) if len(moving) else np.zeros(len(speeds), bool)
-
-
-def describe(trust: Trust, frames: FrameSet) -> tuple[dict[str, list[Any]], list[str]]:
-    """The judgement by the names of frames, for the report, and what to note of it."""
-    names = np.array(frames.names)
-
-    def between(chosen: np.ndarray) -> list[Any]:
-        return [[names[f], names[f + 1]] for f in np.flatnonzero(chosen).tolist()]
-
-    false = names[trust.false_frames].tolist()
-    judgement = {
-        "false_frames": false,
-        "false_steps": between(trust.false_steps),
-        "unseen_steps": between(trust.unseen_steps),
-    }
-    notes = []
-    if false:
-        notes.append(f"the images contradict the trajectory at {', '.join(false)}: not believed")
-    if trust.turning_only:
-        notes.append("no frame has parallax to the next: no depth can be had, rotations only")
-    if trust.held_steps.any():
-        steps = ", ".join(f"{a} to {b}" for a, b in between(trust.held_steps))
-        notes.append(f"no images in common, held by the trajectory alone: {steps}")
-    for note in notes:
-        logger.warning(note)
-    return judgement, notes
 
 
 def _disagreement(slam: np.ndarray, found: Steps) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,78 @@
+"""What is believed of the trajectory: what it says itself, and what images add and take away."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from gsba.bundle import prior_factors
+from gsba.bundle.map_strength import MapStrength
+from gsba.config import PriorSettings
+from gsba.loop_closure.merged_map import Registered, side_by_side
+from gsba.trajectory.clock import ClockEstimate
+from gsba.trajectory.joining import Joint
+from gsba.trajectory.judgement import Trust
+from gsba.types import CoarsePoses, PoseSource, Solution
+
+ExtraFactors = Callable[[CoarsePoses], Iterable[gtsam.NonlinearFactor]]
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """What is believed of the trajectory; its factors and the start follow from that."""
+
+    coarse: CoarsePoses  # the trajectory at the frames' times
+    trust: Trust  # which of its steps hold, and where to start instead
+    extra: tuple[gtsam.NonlinearFactor, ...] = ()  # the caller's own factors
+    clock: ClockEstimate | None = None  # None = not checked
+    joints: tuple[Joint, ...] = ()  # of pieces of the trajectory
+    parts: np.ndarray | None = None  # (F,) int64, parts that nothing ties together; None = one
+    merged: Registered | None = None  # parts of the map, joined; None = it never was in parts
+    strength: MapStrength | None = None  # of the map, by images alone; None = not measured
+
+    @classmethod
+    def of(cls, coarse: CoarsePoses, extra_factors: ExtraFactors | None = None) -> "Prior":
+        """The trajectory, believed as it is."""
+        extra = () if extra_factors is None else tuple(extra_factors(coarse))
+        return cls(coarse, Trust.of_all(coarse.world_T_rigs), extra)
+
+    @property
+    def absent(self) -> bool:
+        """Whether there is no trajectory."""
+        return bool((self.coarse.sources == PoseSource.NONE).all())
+
+    @property
+    def turning_only(self) -> bool:
+        """Whether the camera stayed in one place, as its images say."""
+        return self.trust.turning_only
+
+    def weak_frames(self) -> np.ndarray:
+        """Frames (F,) bool at which images hold the map poorly; none before that is measured."""
+        none = np.zeros(len(self.coarse.sources), bool)
+        return none if self.strength is None else self.strength.weak
+
+    def start(self) -> Solution:
+        """The trajectory, chained past its false steps, as a solution without points."""
+        return Solution.without_points(self.trust.world_T_rigs)
+
+    def graph(self, settings: PriorSettings) -> gtsam.NonlinearFactorGraph:
+        """What the trajectory says, as far as it is believed, the gauge, and the caller's factors.
+
+        Args:
+            settings: noise of the trajectory, unless images told it.
+        """
+        trust, strength = self.trust, self.strength
+        whole = trust.false_steps.all()  # then the start is all there is
+        believed = trust.world_T_rigs if whole else self._side_by_side()
+        false, noise = trust.false_steps, None
+        if strength is not None:
+            false, noise = false | strength.held_steps, strength.noise
+        first = trust.world_T_rigs[0]
+        graph = prior_factors.build(believed, settings, false, trust.false_frames, first, noise)
+        for factor in self.extra:
+            graph.add(factor)
+        return graph
+
+    def _side_by_side(self) -> np.ndarray:
+        return side_by_side(self.coarse.world_T_rigs, self.merged)

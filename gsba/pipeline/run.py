@@ -1,0 +1,140 @@
+"""A run: what no stage changes, how a stage is kept, and the journal that the report reads."""
+
+import os
+import uuid
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+from gsba import learned
+from gsba.bundle.adjustment import Problem
+from gsba.camera.rig import CubeRig
+from gsba.config import PriorSettings, RefineSettings
+from gsba.frames import cubemap
+from gsba.frames.panorama import Greys
+from gsba.photometric import direct
+from gsba.pipeline.prior import ExtraFactors, Prior
+from gsba.store.store import Chain, RunStore, fingerprint
+from gsba.types import CoarsePoses, Counts, FrameSet, Round
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Journal:
+    """What stages received, kept and decided; the report reads it, nothing that computes does."""
+
+    counts: dict[str, list[Counts]] = field(default_factory=dict)  # by stage
+    rounds: dict[str, tuple[Round, ...]] = field(default_factory=dict)  # of adjustment, by stage
+    undone: list[str] = field(default_factory=list)  # stages whose result was not taken
+
+    def note(self, name: str, result: object) -> None:
+        """Write down what a stage's result says of itself."""
+        said = result[0] if isinstance(result, tuple) else result
+        counts, rounds = getattr(said, "counts", None), getattr(said, "rounds", ())
+        if isinstance(result, Counts):
+            counts = result
+        if counts is not None:
+            self.counts[name] = [counts] if isinstance(counts, Counts) else list(counts)
+        if rounds:
+            self.rounds[name] = rounds
+
+    def undo(self, name: str) -> None:
+        """Write down that a stage's result was not taken."""
+        self.undone.append(name)
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What no stage changes."""
+
+    store: RunStore
+    chain: Chain  # of stages, each resting on the one before
+    journal: Journal
+    frames: FrameSet  # as read, not straightened
+    settings: RefineSettings
+    rig: CubeRig  # faces that keypoints are found on
+    greys: Greys  # pictures for patches
+    weights: Mapping[str, Path]  # stage -> file of a learned network
+    extra_factors: ExtraFactors | None  # the caller's
+    custom: str | None  # of results that rest on those: never resumed
+    num_threads: int
+
+    @classmethod
+    def begin(
+        cls,
+        store: RunStore,
+        frames: FrameSet,
+        coarse: CoarsePoses,
+        settings: RefineSettings,
+        extra_factors: ExtraFactors | None = None,
+        journal: Journal | None = None,
+    ) -> "Run":
+        """Start a run, or take it up, on these frames and poses.
+
+        Raises:
+            GsbaError: frames that a chosen family cannot use, or weights that are not there.
+        """
+        direct.check(frames, settings)
+        chain = Chain(store)
+        paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
+        start = coarse.world_T_rigs.tolist(), settings.read
+        inputs = [fingerprint(paths), frames.timestamps.tolist(), frames.timed, *start]
+        chain.stage("frames", inputs, lambda: frames, FrameSet)
+        return cls(
+            store=store,
+            chain=chain,
+            journal=journal or Journal(),
+            frames=frames,
+            settings=settings,
+            rig=cubemap.rig_for(frames, settings.cubemap),
+            greys=Greys(frames, settings.align.max_width),
+            weights=learned.find_weights(settings),
+            extra_factors=extra_factors,
+            custom=None if extra_factors is None else uuid.uuid4().hex,
+            num_threads=settings.solver.num_threads or os.cpu_count() or 1,
+        )
+
+    def stage(
+        self,
+        name: str,
+        key: object,
+        compute: Callable[[], T],
+        returns: type[T],
+        *,
+        noted: bool = True,
+    ) -> T:
+        """Result of a stage that rests on the one before it: the stored one, or computed.
+
+        Args:
+            name, key, compute, returns: see `gsba.store.RunStore.stage`.
+            noted: whether the report tells of it.
+        """
+        result = self.chain.stage(name, key, compute, returns)
+        if noted:
+            self.journal.note(name, result)
+        return result
+
+    def problem(self, prior: Prior, noise: PriorSettings | None = None) -> Problem:
+        """What adjustments share while this is believed of the trajectory.
+
+        Args:
+            noise: of the trajectory; None = as in the settings.
+        """
+        graph = prior.graph(noise or self.settings.priors)
+        return Problem(graph, self.rig, self.settings, self.num_threads)
+
+    def matching_key(self) -> list[object]:
+        """Settings that matches rest on."""
+        settings = self.settings
+        files = fingerprint(path for stage, path in self.weights.items() if stage == "matching")
+        how = settings.matching.model_dump(exclude={"weights"}), files
+        return [settings.pairs, how, settings.verify, settings.seed]
+
+    def solving_key(self) -> list[object]:
+        """Settings that solutions rest on."""
+        settings = self.settings
+        relevant = [settings.triangulate, settings.rounds, settings.priors, settings.solver]
+        families = [f for f in settings.factors if f not in ("photometric", "splat")]
+        return [*relevant, families, self.custom]
