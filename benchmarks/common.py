@@ -176,9 +176,9 @@ def write_table(lines: Sequence[str], path: Path | None) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    from gsba.disk import atomic_write
+    from gsba.disk import write_text
 
-    atomic_write(path, lambda file: file.write_text(text))
+    write_text(path, text)
 
 
 if __name__ == "__main__":

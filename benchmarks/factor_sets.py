@@ -27,7 +27,7 @@ from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.demo import make_walk
 from gsba.demo.degrade import degrade
-from gsba.disk import atomic_write
+from gsba.disk import write_text
 from gsba.evaluate.pixels import depth_maps, induced_errors
 from gsba.evaluate.trajectory import evaluate
 from gsba.log import GsbaError
@@ -117,7 +117,7 @@ def run_case(
 ) -> Iterable[Row]:
     """Refine with each set, `aligned` from the stages of `bearing`."""
     truth = read_trajectory(walk / "groundtruth.tum")
-    plain = settings.align.model_copy(update={"rounds": 0})
+    plain = settings.patches.model_copy(update={"rounds": 0})
     sets = {
         "tuned bearing": (load_config(TUNED), out.with_name(f"{out.name}-tuned")),
         "bearing": (settings.model_copy(update={"align": plain}), out),
@@ -205,11 +205,11 @@ def main() -> None:
                     print(row, flush=True)
                     if options.json is not None:
                         text = json.dumps([asdict(row) for row in rows], indent=1)
-                        atomic_write(options.json, lambda file, text=text: file.write_text(text))
+                        write_text(options.json, text)
     table = to_markdown(rows)
     print(table)
     if options.markdown is not None:
-        atomic_write(options.markdown, lambda file: file.write_text(table))
+        write_text(options.markdown, table)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ NUM, WIDTH = 8, 512  # frames of the walk
 SETTINGS = {
     "cubemap": {"face_size": 256},
     "features": {"max_per_face": 400},
-    "align": {"rounds": 0},
+    "patches": {"rounds": 0},
     "export": {"formats": []},
     "solver": {"num_threads": 2},
 }

@@ -28,9 +28,9 @@ from gsba.camera.sphere import bearings_from_erp
 from gsba.config import ExportSettings, SplatSettings
 from gsba.demo import make_walk
 from gsba.demo.people import make_people, paste_people
+from gsba.disk import write_image
 from gsba.evaluate.splats import train_and_measure
 from gsba.evaluate.trajectory import evaluate
-from gsba.export.images import write_image
 from gsba.frames.files import decode
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.common import measure, peak_mb, write_table
 from gsba.camera.rig import CubeRig, owner_faces
-from gsba.config import AlignSettings
+from gsba.config import PatchSettings
 from gsba.frames import panorama
 from gsba.frames.scan import scan
 from gsba.geometry import pose
@@ -77,7 +77,7 @@ def run(folder: Path, num_threads: int) -> dict[str, float]:
     """Align all points of the frames in a folder."""
     frames = scan(folder, None, None, None)
     landmarks, poses, keypoints, rig = make_map(len(frames), frames.width)
-    settings = AlignSettings()
+    settings = PatchSettings()
     greys = panorama.Greys(frames, settings.max_width)
     before = peak_mb()
     sighted = alignment.align(

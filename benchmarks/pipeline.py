@@ -34,7 +34,7 @@ from peer import MODES
 from pipeline_table import DEFAULT, to_markdown, verdicts
 
 from gsba.config import ReadSettings
-from gsba.disk import atomic_write
+from gsba.disk import write_text
 from gsba.evaluate.trajectory import evaluate
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
@@ -61,7 +61,7 @@ WALKS = {"demo_rectangle": ("rectangle", "locked"), "demo_oval": ("oval", "forwa
 FACTOR_SETS = {  # row -> options of `gsba refine`
     "slam": [],  # nothing runs
     "bearing": ["--factors", "bearing"],
-    "bearing-unaligned": ["--factors", "bearing", "--set", "align.rounds=0"],
+    "bearing-unaligned": ["--factors", "bearing", "--set", "patches.rounds=0"],
     "reprojection": ["--factors", "reprojection"],
     "bearing+reprojection": ["--factors", "bearing,reprojection"],
     "no-trajectory": ["--no-trajectory"],
@@ -262,11 +262,11 @@ def main() -> None:
         held &= ok
     if options.json:
         report = json.dumps(table, indent=1) + "\n"
-        atomic_write(options.json, lambda path: path.write_text(report))
+        write_text(options.json, report)
     if options.markdown:
         machines = sorted({row["machine"] for row in table if "machine" in row})
         page = "\n".join(["# gsba refine and its peers\n", f"{'; '.join(machines)}\n", *text])
-        atomic_write(options.markdown, lambda path: path.write_text(page))
+        write_text(options.markdown, page)
     sys.exit(0 if held else 1)
 
 

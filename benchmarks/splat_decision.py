@@ -25,6 +25,7 @@ import numpy as np
 
 from gsba.bundle import adjustment, prior_factors
 from gsba.bundle.optimizer import optimize
+from gsba.camera.rig import CubeRig
 from gsba.evaluate.trajectory import evaluate
 from gsba.splat import refinement
 from gsba.store.store import load_stage
@@ -94,7 +95,7 @@ def poor_frames(case: Case, seed: int) -> Given:
         sigmas_rad=np.where(weak, noise, solved.noise * keypoints.sigmas_rad),
         sqrt_infos=None,
     )
-    rig = refinement.CubeRig(SETTINGS.cubemap.face_size, np.pi / 2)  # bearings ask no face
+    rig = CubeRig(SETTINGS.cubemap.face_size, np.pi / 2)  # bearings ask no face
     priors = prior_factors.build(case.result.coarse.world_T_rigs, SETTINGS.priors)
     problem = adjustment.Problem(priors, rig, SETTINGS, 2)
     block = adjustment.landmark_block(landmarks, keypoints, 1.0, problem)

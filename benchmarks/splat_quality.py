@@ -29,7 +29,7 @@ from common import machine
 
 from gsba.config import RefineSettings, SplatSettings
 from gsba.demo import make_walk
-from gsba.disk import atomic_write
+from gsba.disk import write_text
 from gsba.evaluate.splats import SourceResult, compare, poses_for
 from gsba.log import GsbaError, show_log
 from gsba.pipeline.refine import refine
@@ -42,7 +42,7 @@ from gsba.types import FrameSet
 WALKS = {"demo_rectangle": ("rectangle", "locked"), "demo_oval": ("oval", "forward")}
 REFINED = {
     "default": {},
-    "unaligned": {"align": {"rounds": 0}},
+    "unaligned": {"patches": {"rounds": 0}},
     "splat": {"factors": ("bearing", "splat")},
 }  # row -> settings of `gsba refine`; the first row is the one that targets are about
 SOURCES = ("raw", "unaligned", "default", "splat", "colmap", "truth")
@@ -260,12 +260,12 @@ def _write(options: argparse.Namespace, settings: SplatSettings, report: dict, t
     if options.json:
         content = {"machine": machine(), "settings": settings.model_dump(), "scenes": report}
         lines = json.dumps(content, indent=1) + "\n"
-        atomic_write(options.json, lambda path: path.write_text(lines))
+        write_text(options.json, lines)
     if options.markdown:
         head = f"# Splats on raw, refined, COLMAP's and true poses\n\n{machine()}; faces of "
         head += f"{settings.face_size} px, {settings.iterations} steps, {options.rates} rates.\n"
         page = "\n".join([head, *text])
-        atomic_write(options.markdown, lambda path: path.write_text(page))
+        write_text(options.markdown, page)
 
 
 if __name__ == "__main__":

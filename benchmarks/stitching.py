@@ -54,7 +54,7 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
     """Variants from the points not held out; held-out points aligned under the last."""
     keypoints = load_stage(run, "keypoints", Keypoints)
     start, rig = load_stage(run, "refined1", Solution), cubemap.rig_for(frames, settings.cubemap)
-    greys = panorama.Greys(frames, settings.align.max_width)
+    greys = panorama.Greys(frames, settings.patches.max_width)
     priors = prior_factors.build(start.world_T_rigs, settings.priors)
     used, held = split(start.landmarks, settings.seed)
     none, threads = SphereField.none(), 2
@@ -69,7 +69,7 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
         for number in (1, 2):
             sighted = alignment.align(
                 solved.landmarks, solved.world_T_rigs, observed, solved.noise, greys, rig,
-                f"{name} {number}", aligned, settings.align, threads, field,
+                f"{name} {number}", aligned, settings.patches, threads, field,
             )  # fmt: skip
             there = replace(sighted, keypoints=stitching.corrected(sighted.keypoints, field, rig))
             solved, found = adjustment.adjust_sighted(
@@ -88,7 +88,7 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
     placed = place(last, held.tracks, keypoints, settings)
     sighted = alignment.align(
         placed, last.solved.world_T_rigs, keypoints, start.noise, greys, rig, "held out", None,
-        settings.align, threads, last.field,
+        settings.patches, threads, last.field,
     )  # fmt: skip
     return variants, sighted
 
@@ -159,12 +159,12 @@ def main() -> None:
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
     settings = RefineSettings.model_validate(
-        {"align": {"rounds": 0}, "export": {"formats": ()}, "stitching": {"mode": "auto"}}
+        {"patches": {"rounds": 0}, "export": {"formats": ()}, "stitching": {"mode": "auto"}}
     )
     result = refine(options.frames, options.trajectory, options.out, settings, masks=options.masks)
     settings = RefineSettings()
     variants, sighted = solve(options.out, result.frames, settings)
-    greys = panorama.Greys(result.frames, settings.align.max_width)
+    greys = panorama.Greys(result.frames, settings.patches.max_width)
     images = [SphereImage.of(greys[f][0]) for f in range(len(result.frames))]
     pixel = np.degrees(images[0].pixel_rad)
     lines = [

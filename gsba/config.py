@@ -1,12 +1,35 @@
 """Settings: one frozen model per stage, defaults that run a sensible job with no file."""
 
-from typing import Annotated, Literal
+import logging
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+logger = logging.getLogger(__name__)
+
+RENAMED = {"align": "patches"}  # sections under names of version 0.1, read until 0.3
 _MAX_FACE, _MAX_SEED = 16_384, 2**31 - 1  # pixels: remapping ends at 32,767
 _CutSize = Annotated[int, Field(ge=64, le=_MAX_FACE)]
 _Text = Annotated[str, Field(min_length=1, pattern=r"^[^\x00]*$")]
+
+
+def renamed(tree: Mapping[str, Any], source: str = "settings") -> dict[str, Any]:
+    """A tree of settings with sections under their names of today; says which were not.
+
+    Raises:
+        ValueError: a section under both.
+    """
+    out = dict(tree)
+    for old, new in RENAMED.items():
+        if old in out:
+            if new in out:
+                raise ValueError(f"{old} is the former name of {new}: keep {new} alone")
+            logger.warning(
+                "%s: %s is now called %s; the old name is read for a while", source, old, new
+            )
+            out[new] = out.pop(old)
+    return out
 
 
 class _Settings(BaseModel):
@@ -161,7 +184,7 @@ class RoundSettings(_Settings):
     min_observations: int = Field(default=12, ge=1)  # of a frame, or it counts as unrefined
 
 
-class AlignSettings(_Settings):
+class PatchSettings(_Settings):
     """Patches around the map's points, aligned to every frame that shows them."""
 
     rounds: int = Field(default=2, ge=0)  # of alignment and bundle adjustment; 0 = none
@@ -342,7 +365,7 @@ class RefineSettings(_Settings):
     triangulate: TriangulateSettings = TriangulateSettings()
     priors: PriorSettings = PriorSettings()
     rounds: RoundSettings = RoundSettings()
-    align: AlignSettings = AlignSettings()
+    patches: PatchSettings = PatchSettings()
     stitching: StitchingSettings = StitchingSettings()
     solver: SolverSettings = SolverSettings()
     factors: tuple[Literal["bearing", "reprojection", "photometric", "splat"], ...] = Field(
@@ -356,9 +379,14 @@ class RefineSettings(_Settings):
 
     def plainer(self) -> "RefineSettings":
         """For a first solution: features alone, without patches, pixels or splats."""
-        unaligned = self.align.model_copy(update={"rounds": 0})
+        unaligned = self.patches.model_copy(update={"rounds": 0})
         families = tuple(name for name in self.factors if name not in ("photometric", "splat"))
-        return self.model_copy(update={"align": unaligned, "factors": families})
+        return self.model_copy(update={"patches": unaligned, "factors": families})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _old_names(cls, tree: Any) -> Any:
+        return renamed(tree) if isinstance(tree, Mapping) else tree
 
     @model_validator(mode="after")
     def _geometry_first(self) -> "RefineSettings":

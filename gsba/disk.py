@@ -6,8 +6,12 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gsba.log import GsbaError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 _TEMPORARY = ".gsba-tmp-"  # prefix of files still being written
 
@@ -58,6 +62,23 @@ def write_bytes(path: Path, content: bytes) -> None:
 def write_json(path: Path, content: object) -> None:
     """Write plain values as JSON with finite numbers, atomically; see `atomic_write`."""
     write_text(path, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def write_image(path: Path, image: "np.ndarray", jpeg_quality: int = 95) -> None:
+    """Encode (H, W, 3) RGB or (H, W) uint8 by the suffix of `path`, atomically.
+
+    Raises:
+        GsbaError: a picture that cannot be encoded so, or the disk refuses.
+    """
+    import cv2
+    import numpy as np
+
+    options = [] if path.suffix.lower() == ".png" else [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
+    pixels = np.ascontiguousarray(image[..., ::-1] if image.ndim == 3 else image)
+    done, encoded = cv2.imencode(path.suffix, pixels, options)
+    if not done:
+        raise GsbaError(f"{path}: cannot be encoded")
+    write_bytes(path, encoded.tobytes())
 
 
 def remove_temporaries(folder: Path) -> None:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gsba.camera.rig import RIG_R_FACE
 from gsba.camera.sphere import bearings_from_erp
-from gsba.export.images import write_image
+from gsba.disk import write_image
 from gsba.geometry import inverse, pose
 from gsba.types import FACES, FrameSet, PoseStatus, Reconstruction
 

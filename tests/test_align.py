@@ -11,7 +11,7 @@ from synthetic import bearings_of
 from gsba.bundle import adjustment, prior_factors
 from gsba.bundle.adjustment import Problem
 from gsba.camera.rig import CubeRig
-from gsba.config import AlignSettings, RefineSettings
+from gsba.config import PatchSettings, RefineSettings
 from gsba.frames.panorama import Greys
 from gsba.geometry import inverse, pose
 from gsba.photometric import alignment
@@ -28,7 +28,7 @@ from gsba.types import (
 NUM, WIDTH = 6, 512
 RIG = CubeRig(128, np.pi / 2)
 PIXEL = 2 * np.pi / WIDTH
-SETTINGS = AlignSettings(patch_size=11)
+SETTINGS = PatchSettings(patch_size=11)
 
 
 def _bearings(width: int) -> np.ndarray:
@@ -108,7 +108,7 @@ def _start(
 
 def _run(
     walk: tuple[FrameSet, np.ndarray],
-    settings: AlignSettings = SETTINGS,
+    settings: PatchSettings = SETTINGS,
     sigma_px: float = 0.3,
     aligned: np.ndarray | None = None,
 ) -> Sighted:
@@ -171,7 +171,7 @@ def test_tracks_and_keypoints_belong_together(walk) -> None:
 def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
     frames, world_T_rigs = walk
     landmarks, keypoints = _start(world_T_rigs)
-    settings = RefineSettings(align=SETTINGS)
+    settings = RefineSettings(patches=SETTINGS)
     priors = prior_factors.build(world_T_rigs, settings.priors)
 
     def rotation_errors(solved: Solution) -> np.ndarray:
@@ -240,7 +240,7 @@ def test_points_at_a_centre_and_behind_walls_do_no_harm(walk) -> None:
 
 def test_confirmed_points_are_looked_for_elsewhere(walk) -> None:
     _, keypoints = _start(walk[1])
-    settings = AlignSettings(patch_size=11, min_track_length=4)  # longer than any here
+    settings = PatchSettings(patch_size=11, min_track_length=4)  # longer than any here
     short, confirmed = (
         _run(walk, settings, aligned=aligned)
         for aligned in (None, np.ones(len(keypoints.faces), bool))

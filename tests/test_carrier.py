@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from gsba import refine
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.cli import app
-from gsba.export.images import write_image
+from gsba.disk import write_image
 from gsba.frames.scan import find_panoramas
 from gsba.log import GsbaError
 from gsba.masks.carrier import carrier_mask, find_carrier, write_carrier

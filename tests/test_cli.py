@@ -45,10 +45,11 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]
         def fail(*_: object, **__: object) -> None:
             raise error
 
-        stub = types.ModuleType("gsba.pipeline.refine")
-        stub.refine = stub.load_run = fail  # type: ignore[attr-defined]
-        monkeypatch.setitem(sys.modules, "gsba.pipeline.refine", stub)
-        monkeypatch.setattr(gsba, "pipeline", stub, raising=False)
+        for home, name in (("gsba.pipeline", "refine"), ("gsba.store.finished", "load_run")):
+            stub = types.ModuleType(home)
+            setattr(stub, name, fail)
+            monkeypatch.setitem(sys.modules, home, stub)
+        monkeypatch.setattr(gsba, "pipeline", sys.modules["gsba.pipeline"], raising=False)
 
     return install
 
@@ -89,7 +90,7 @@ def test_wrong_settings_name_the_key() -> None:
     _fails(_gsba("show-config", "--set", "seed=" + "[" * 3000), "not a value that can be read")
     _fails(_gsba("show-config", "--set", 'placement.gps="a\\u0000"'), "placement.gps = ")
     _fails(_gsba("show-config", "--set", "video.width=99999"), "use an even integer >= 64")
-    _fails(_gsba("show-config", "--set", "align.patch_size=8"), "not allowed: must be odd")
+    _fails(_gsba("show-config", "--set", "patches.patch_size=8"), "not allowed: must be odd")
     _fails(_gsba("show-config", "--config", "nowhere.toml"), "cannot read settings nowhere.toml")
     _fails(_gsba("refine", "a", "b", "--out", "c", "--set", "x=1"), "unknown setting x")
     assert not Path("c").exists()
@@ -140,7 +141,7 @@ def test_memory_errors_name_the_stage_and_its_settings(
     _fails(_gsba("export", "run", "--to", "ply"), "(Unable to allocate 4.50 GiB): give smaller")
     error.add_note("align1")
     _fails(_gsba("export", "run", "--to", "ply"), "(stage align1; Unable")
-    _fails(_gsba("export", "run", "--to", "ply"), "lower align.max_width or solver.num_threads")
+    _fails(_gsba("export", "run", "--to", "ply"), "lower patches.max_width or solver.num_threads")
 
 
 def test_messages_are_short_and_printable(pipeline: Callable[[BaseException], None]) -> None:

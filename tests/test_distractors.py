@@ -11,8 +11,8 @@ from tiny_run import SETTINGS, Case, computed_stages
 from gsba import refine
 from gsba.camera.sphere import erp_from_bearings
 from gsba.demo.people import make_people, paste_people
+from gsba.disk import write_image
 from gsba.evaluate.trajectory import evaluate
-from gsba.export.images import write_image
 from gsba.frames.masks import levels_of, load_mask, load_weights
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError

@@ -64,7 +64,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RefineSettings:
     changes = {
         "features": {"extractor": "aliked", "weights": str(tmp_path), "max_per_face": 400},
         "matching": {"matcher": "lightglue", "weights": str(tmp_path)},
-        "align": {"rounds": 0},
+        "patches": {"rounds": 0},
     }
     return RefineSettings.model_validate(SETTINGS.model_dump() | changes)
 

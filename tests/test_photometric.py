@@ -15,11 +15,11 @@ from gsba.bundle.adjustment import Problem
 from gsba.camera.sphere import erp_from_bearings
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.config_file import load_config
-from gsba.export.images import write_image
+from gsba.disk import write_image
 from gsba.frames.masks import levels_of
 from gsba.log import GsbaError
 from gsba.photometric import direct, patches
-from gsba.pipeline.backend import Line
+from gsba.pipeline.run import Run
 from gsba.types import FrameSet
 
 WIDTH = 512
@@ -186,7 +186,7 @@ def test_other_frames_are_refused_before_any_work(case: Case, change: dict, mess
     frames, *_ = _start(case, JOINT)
     direct.check(frames, JOINT)
     with pytest.raises(GsbaError, match=message):
-        Line(None, replace(frames, **change), None, JOINT, None)  # type: ignore[arg-type]
+        Run.begin(None, replace(frames, **change), None, JOINT)  # type: ignore[arg-type]
 
 
 def test_a_small_panorama_has_fewer_levels(case: Case) -> None:

@@ -149,9 +149,9 @@ def test_scale_between_frames_or_points() -> None:
     true = float(np.linalg.norm(_level(result)[30] - _level(result)[2]))
     settings = PlacementSettings(length=true, between=("frame_0002", "frame_0030"))
     placed = place(result, frames, settings)
-    assert placed.unit == "m" and placed.scale == pytest.approx(1 / 0.21, rel=1e-12)
+    assert placed.unit == "m" and placed.similarity.scale == pytest.approx(1 / 0.21, rel=1e-12)
     placed = place(result, frames, PlacementSettings(length=5.0, between=("0,0,0", "0,0.5,0")))
-    assert placed.scale == pytest.approx(10)
+    assert placed.similarity.scale == pytest.approx(10)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2])
@@ -172,7 +172,7 @@ def test_gps_is_exact_and_robust(tmp_path: Path, share: float, named: bool) -> N
     else:
         path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, fixes)
     placed = place(result, frames, PlacementSettings(gps=str(path)))
-    assert placed.scale == pytest.approx(1 / 0.21, rel=1e-6)
+    assert placed.similarity.scale == pytest.approx(1 / 0.21, rel=1e-6)
     assert (placed.unit, placed.up) == ("m", "z") and placed.origin is not None
     assert placed.grounds["gps"]["outliers"] == len(wrong)
     positions = placed.apply(result).world_T_rigs[:, :3, 3]
@@ -187,7 +187,7 @@ def test_gps_noise_averages_out(tmp_path: Path) -> None:
     noisy = _level(result) + np.random.default_rng(6).normal(0, 0.5, (40, 3))
     path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, _geodetic(noisy))
     placed = place(result, frames, PlacementSettings(gps=str(path)))
-    assert placed.scale == pytest.approx(1 / 0.21, rel=0.02)
+    assert placed.similarity.scale == pytest.approx(1 / 0.21, rel=0.02)
     assert placed.grounds["gps"]["rmse_m"] == pytest.approx(0.5 * np.sqrt(3), rel=0.25)
 
 
@@ -234,8 +234,8 @@ def test_truth_with_large_coordinates(tmp_path: Path) -> None:
     true = Placement(Sim3(1 / 0.21, translation=far)).apply(result).world_T_rigs
     write_tum(tmp_path / "truth.tum", Trajectory(frames.timestamps + 0.004, true))
     placed = place(result, frames, PlacementSettings(align=str(tmp_path / "truth.tum")))
-    assert np.abs(placed.translation).max() < 200 and placed.offset[1] == 5_334_600
-    positions = placed.points(result.world_T_rigs[:, :3, 3]) + placed.offset
+    assert np.abs(placed.similarity.translation).max() < 200 and placed.offset[1] == 5_334_600
+    positions = placed.similarity.points(result.world_T_rigs[:, :3, 3]) + placed.offset
     np.testing.assert_allclose(positions, true[:, :3, 3], atol=1e-6)
 
 
@@ -343,8 +343,8 @@ def test_vertical_edges_make_up_exact(tmp_path: Path, tilt_deg: float) -> None:
     error = np.degrees(np.arccos(np.clip(found.up @ turn @ [0, -1, 0], -1, 1)))
     assert error < 0.2  # edges drawn to a fraction of a pixel of 0.35 degrees
     placed = place(result, frames, PlacementSettings(up="auto"))
-    np.testing.assert_allclose(placed.rotation @ found.up, [0, -1, 0], atol=1e-12)
-    assert placed.up == "-y" and placed.scale == 1.0
+    np.testing.assert_allclose(placed.similarity.rotation @ found.up, [0, -1, 0], atol=1e-12)
+    assert placed.up == "-y" and placed.similarity.scale == 1.0
 
 
 def test_without_edges_the_rigs_decide(tmp_path: Path) -> None:

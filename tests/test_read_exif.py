@@ -156,10 +156,10 @@ def test_frames_are_placed_by_their_tags(tmp_path: Path) -> None:
     check(PlacementSettings(gps="exif"), frames)
     placed = place(result, frames, PlacementSettings(gps="exif"))
     assert (placed.unit, placed.up) == ("m", "z")
-    assert placed.scale == pytest.approx(1 / 0.21, rel=1e-4)
+    assert placed.similarity.scale == pytest.approx(1 / 0.21, rel=1e-4)
     assert placed.grounds["gps"]["fixes"] == 38 and placed.grounds["gps"]["outliers"] == 1
     level = _level(result)
-    moved = placed.points(result.world_T_rigs[:, :3, 3])
+    moved = placed.similarity.points(result.world_T_rigs[:, :3, 3])
     assert np.allclose(moved - moved[0], level - level[0], atol=2e-3)  # altitudes are in mm
     assert placed.origin is not None and np.allclose(placed.origin[:2], ORIGIN[:2], atol=1e-3)
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from gsba.config import RefineSettings
+from gsba.disk import write_json
 from gsba.geometry import inverse, pose, rotation_from_quaternion
 from gsba.report.report import (
     build_report,
     frame_quality,
     median_residual_deg,
     write_poses,
-    write_report,
 )
 from gsba.store.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
@@ -107,7 +107,7 @@ def test_report_is_valid_json(tmp_path: Path) -> None:
         solver=[(_Iteration({"bearing": np.float64(2.0), "priors": np.nan}, 1e-4),)],
         gauge="the world and scale of the trajectory",
     )
-    write_report(tmp_path / "report.json", report)
+    write_json(tmp_path / "report.json", report)
     text = (tmp_path / "report.json").read_text(encoding="utf-8")
     back = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert back["summary"]["refined"] == 3 and back["summary"]["frames"] == 4

@@ -26,8 +26,8 @@ from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.cli import app
 from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
-from gsba.placement.placement import Placement
-from gsba.similarity import Sim3, read_placement
+from gsba.placement.placement import Placement, read_placement
+from gsba.similarity import Sim3
 from gsba.splat import Gaussians, write_ply
 from gsba.types import FACES
 
@@ -101,7 +101,7 @@ def test_the_scene_is_placed_as_the_latest_export(run: Path, scene: view.Scene) 
         (scene.splats[0].means, placed.splats[0].means),
         (_positions(scene.coarse_T_rigs), _positions(placed.coarse_T_rigs)),
     ):
-        assert np.allclose(after, PLACED.points(before.astype(np.float64)), atol=1e-5)
+        assert np.allclose(after, PLACED.similarity.points(before.astype(np.float64)), atol=1e-5)
     turned = 2.5**2 * TURN @ scene.splats[0].covariances @ TURN.T
     assert np.allclose(placed.splats[0].covariances, turned, rtol=1e-4, atol=1e-6)
     assert scene.coarse_T_rigs is not None and placed.coarse_T_rigs is not None

@@ -22,7 +22,7 @@ _SOURCE = Path(__file__).parents[1]  # not what lies beside it where packages ar
 _MOST_SHOWN = 1000  # characters of a message
 _MEMORY_OF = {  # settings that the memory of a stage follows, by the beginning of its name
     "features": "cubemap.max_face_size, features.max_per_face or solver.num_threads",
-    "align": "align.max_width or solver.num_threads",
+    "align": "patches.max_width or solver.num_threads",
     "photometric": "photometric.max_width or photometric.targets",
     "splat": "splat.sizes or splat.max_gaussians",
     "export": "export.face_size",

@@ -112,7 +112,7 @@ def evaluate(
         if not splat:
             raise GsbaError("nothing to compare with: give --truth FILE, or --splat")
         return
-    from gsba.disk import atomic_write
+    from gsba.disk import write_text
     from gsba.evaluate.pixels import depth_maps, induced_errors
     from gsba.evaluate.trajectory import evaluate as compare
     from gsba.evaluate.trajectory import format_table
@@ -131,7 +131,7 @@ def evaluate(
         content = errors.to_json() | ({"induced": asdict(induced)} if induced else {})
         content |= {"consistency": claims.to_json()} if claims else {}
         text = json.dumps(content, indent=1) + "\n"
-        atomic_write(json_file, lambda temporary: temporary.write_text(text))
+        write_text(json_file, text)
     typer.echo(format_table({estimate.name: errors}))
     if induced is not None:
         typer.echo(

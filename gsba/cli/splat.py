@@ -8,7 +8,6 @@ import typer
 
 from gsba.cli.app import command
 from gsba.log import GsbaError
-from gsba.splat.pictures import render_faces, render_panorama
 
 if TYPE_CHECKING:
     from gsba.config import SplatSettings
@@ -57,9 +56,10 @@ def render(
     import numpy as np
 
     from gsba.camera.rig import CubeRig
-    from gsba.evaluate.splats import write_image
+    from gsba.disk import write_image
     from gsba.splat import read_ply, scene
     from gsba.splat.backend import choose_backend
+    from gsba.splat.pictures import render_faces, render_panorama
     from gsba.store.finished import load_run
     from gsba.store.folder import claim
     from gsba.types import FACES

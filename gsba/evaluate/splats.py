@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba.config import SplatSettings
-from gsba.disk import atomic_write
+from gsba.disk import write_image, write_text
 from gsba.log import GsbaError
 from gsba.similarity import NoSimilarityError, pose_similarity
 from gsba.splat.backend import Backend
@@ -149,8 +149,8 @@ def _write(
     lines = format_table(results)
     measured = "computed" if with_lpips else NO_LPIPS
     content = {"lpips": measured, "settings": settings.model_dump(), "sources": to_json(results)}
-    atomic_write(out / "table.txt", lambda path: path.write_text(lines + "\n"))
-    atomic_write(out / "results.json", lambda path: path.write_text(json.dumps(content, indent=1)))
+    write_text(out / "table.txt", lines + "\n")
+    write_text(out / "results.json", json.dumps(content, indent=1))
     _write_curves(out / "curves.png", results)
 
 
@@ -187,7 +187,7 @@ def train_and_measure(
         if step // every > max(curve, default=0) // every:
             curve[step] = mean_score(measure(gaussians, held_out, settings, near, backend).values())
             content = {"key": key, "curve": {s: asdict(score) for s, score in curve.items()}}
-            atomic_write(out / "curve.json", lambda path: path.write_text(json.dumps(content)))
+            write_text(out / "curve.json", json.dumps(content))
 
     start = start_cloud(reconstruction, poses, split.training, settings.sh_degree)
     splat = train(start, training, settings, backend, out / "checkpoint.npz", key, watch)
@@ -302,17 +302,3 @@ def _write_curves(path: Path, results: Mapping[str, SourceResult]) -> None:
         cv2.polylines(canvas, [at[:, None]], False, color, 2, cv2.LINE_AA)
         write(name, left + wide + 8, y[-1] + 4, color)
     write_image(path, canvas)
-
-
-def write_image(path: Path, image: np.ndarray) -> None:
-    """Write an RGB image (H, W, 3) uint8, beside and renamed.
-
-    Raises:
-        GsbaError: the disk refuses.
-    """
-    import cv2
-
-    done, encoded = cv2.imencode(path.suffix, image[..., ::-1])
-    if not done:
-        raise GsbaError(f"{path}: cannot be encoded")
-    atomic_write(path, lambda temporary: temporary.write_bytes(encoded.tobytes()))

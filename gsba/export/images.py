@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from gsba.camera.rig import CubeRig
+from gsba.disk import write_image
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.log import GsbaError, track
 from gsba.types import FACES, FrameSet
 
-JPEG_QUALITY = 95
 MIN_FACE_SIZE = 16  # pixels
 _FICLONE = 0x40049409  # of Linux: a file that shares another's blocks until one is written to
 _AT_ONCE = 4  # frames at most: an 8K panorama and its faces take 250 MB
@@ -139,17 +139,6 @@ def _pass_on(source: Path, path: Path, link: bool) -> None:
         fcntl.ioctl(clone, _FICLONE, original.fileno())
         return
     shutil.copyfile(source, path)
-
-
-def write_image(path: Path, image: np.ndarray) -> None:
-    """Encode (H, W, 3) RGB or (H, W) uint8 by the suffix of `path`."""
-    import cv2
-
-    options = [] if path.suffix.lower() == ".png" else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    pixels = image[..., ::-1] if image.ndim == 3 else image
-    encoded = cv2.imencode(path.suffix, np.ascontiguousarray(pixels), options)[1]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(encoded.tobytes())
 
 
 def _write_all(paths: Sequence[Path], images: np.ndarray) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.disk import atomic_write
+from gsba.disk import write_bytes
 from gsba.types import Reconstruction
 
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
@@ -66,4 +66,4 @@ def _write(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     header += [f"property {_PLY_TYPES[c.dtype.str[1:]]} {name}" for name, c in columns.items()]
     text = "\n".join([*header, "end_header\n"])
-    atomic_write(path, lambda temporary: temporary.write_bytes(text.encode() + vertices.tobytes()))
+    write_bytes(path, text.encode() + vertices.tobytes())

@@ -25,11 +25,11 @@ from gsba.types import (
 )
 
 _LOOKS = 3  # places compared for each frame
-_MIN_SHARE = 0.25  # of the matches, to measure a loop at all: consistency decides
-_MIN_GROUP = 3  # loops that must agree
-_RIVAL = 1.5  # by how much a group must outweigh one that contradicts it
+MIN_SHARE = 0.25  # of the matches, to measure a pair at all: consistency decides
+MIN_GROUP = 3  # pairs that must agree
+RIVAL = 1.5  # by how much a group must outweigh one that contradicts it
 _TURN_DEG, _UNSEEN_TURN_DEG = 10.0, 45.0  # of the map between two frames, and per unseen step
-_AGREE_DEG, _AGREE = 2.0, 0.1  # of two loops; part of the median depth
+AGREE_DEG, AGREE = 2.0, 0.1  # of two pairs; part of the median depth
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ def close(context: MatchContext, solved: Solution, unseen: np.ndarray) -> Closed
     looks = looks_of(context.strongest, len(solved.world_T_rigs), settings.seed)
     chosen = candidates(looks, solved, unseen, settings)
     strongest = replace(context, frames=context.strongest)
-    verified = recovery.match_anywhere(strongest, chosen, _MIN_SHARE)
+    verified = recovery.match_anywhere(strongest, chosen, MIN_SHARE)
     loops = _measure(verified, keypoints, solved, settings.seed)
     within = [loop for loop in loops if within_drift(loop, solved, unseen, settings)]
     agreeing = consistent(within, solved, settings.pairs.window)
@@ -134,7 +134,7 @@ def within_drift(
     moved = np.linalg.norm(expected[:3, 3] - poses[loop.f1, :3, 3])
     turned = np.degrees(rotation_angle(expected[:3, :3].T @ poses[loop.f1, :3, :3]))
     allowed = _TURN_DEG + _UNSEEN_TURN_DEG * np.count_nonzero(unseen[loop.f0 : loop.f1])
-    return bool(moved < slack + _AGREE * solved.median_depth() and turned < allowed)
+    return bool(moved < slack + AGREE * solved.median_depth() and turned < allowed)
 
 
 def consistent(loops: list[Loop], solved: Solution, window: int) -> list[Loop]:
@@ -171,7 +171,7 @@ def consistent(loops: list[Loop], solved: Solution, window: int) -> list[Loop]:
             (sum(loops[k].support for k in against if agree.get((j, k))) for j in against),
             default=0,
         )
-        if len(group) >= _MIN_GROUP and weight >= _RIVAL * contrary:
+        if len(group) >= MIN_GROUP and weight >= RIVAL * contrary:
             believed.append(loops[i])
     return believed
 
@@ -183,6 +183,5 @@ def _closes(one: Loop, other: Loop, poses: np.ndarray, depth: float) -> bool:
     around = inverse(one.f0_T_f1) @ back
     turned = rotation_angle(around[:3, :3])
     return bool(
-        turned < np.deg2rad(_AGREE_DEG)
-        and np.linalg.norm(around[:3, 3]) < _AGREE * max(depth, 1e-12)
+        turned < np.deg2rad(AGREE_DEG) and np.linalg.norm(around[:3, 3]) < AGREE * max(depth, 1e-12)
     )

@@ -14,6 +14,7 @@ import numpy as np
 from gsba.geometry import inverse
 from gsba.loop_closure import loops
 from gsba.loop_closure.connectivity import by_size
+from gsba.loop_closure.loops import MIN_SHARE
 from gsba.loop_closure.map_similarity import Meeting, agreeing, measure, refined
 from gsba.loop_closure.merged_map import Registered
 from gsba.loop_closure.pose_graph import Loop
@@ -28,11 +29,9 @@ _LOOKS = 3  # places compared for each frame of a part; twice as many for a fram
 _SAMPLED = 24  # frames of a part that are looked for elsewhere
 _BESIDE = 3  # frames from a break that are compared whatever they look like
 _BEST = 2  # meetings whose surroundings are compared too
-_MIN_SHARE = 0.25  # of the matches, to measure a pair at all: agreement decides
 _MIN_MAP = 3  # frames of a part that is a map
 _BEHIND = 3.0  # times the pace: a frame alone is no further off than that
 _APART = 4.0  # extents between maps that nothing ties together
-_ANYWHERE = Gate(np.pi, 1e3, np.pi)
 
 
 def merge(
@@ -166,7 +165,7 @@ class _Joining:
 
     def _meetings(self, context: MatchContext, chosen: np.ndarray) -> list[Meeting]:
         """What pairs (P, 2) of a frame outside and one inside the map ask for."""
-        verified = recovery.match_anywhere(context, np.sort(chosen, axis=1), _MIN_SHARE)
+        verified = recovery.match_anywhere(context, np.sort(chosen, axis=1), MIN_SHARE)
         outside = set(chosen[:, 0].tolist())
         meetings = []
         for p, (f0, f1) in enumerate(verified.matches.pairs.tolist()):
@@ -233,7 +232,7 @@ class _Joining:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints (m,) of a frame and the points (m, 3) of the map that each may show."""
         nowhere = np.tile(np.eye(4), (len(self.parts), 1, 1))
-        gates = [_ANYWHERE] * len(chosen)
+        gates = [Gate.anywhere()] * len(chosen)
         found = self.context.match(chosen, nowhere, gates, strongest=strongest)
         rows, points = [np.zeros(0, np.int32)], [np.zeros((0, 3))]
         for p, (_, g) in enumerate(chosen.tolist()):

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.geometry import inverse, rotation_angle
+from gsba.loop_closure.loops import AGREE, AGREE_DEG, MIN_GROUP, RIVAL
 from gsba.similarity import Sim3, relative_similarity
 
-_MIN_GROUP, _RIVAL = 3, 1.5  # pairs that must agree, and by how much they outweigh others
-_AGREE_DEG, _AGREE, _AGREE_LOG = 2.0, 0.1, 0.15  # part of the median depth; of scales
+_AGREE_LOG = 0.15  # of scales
 _LOSS_DEG = 0.2  # scale of the robust loss: points of two maps err alike
 
 
@@ -55,8 +55,8 @@ def agreeing(meetings: list[Meeting], poses: np.ndarray, depth: float) -> list[M
     others = ~agree[best]
     contrary = (agree[others][:, others] @ weights[others]).max() if others.any() else 0
     distinct = min(len({m.f for m in group}), len({m.g for m in group}))
-    enough = len(group) >= _MIN_GROUP and distinct >= 2
-    return group if enough and agree[best] @ weights >= _RIVAL * contrary else []
+    enough = len(group) >= MIN_GROUP and distinct >= 2
+    return group if enough and agree[best] @ weights >= RIVAL * contrary else []
 
 
 def _alike(one: Meeting, other: Meeting, poses: np.ndarray, depth: float) -> bool:
@@ -66,7 +66,7 @@ def _alike(one: Meeting, other: Meeting, poses: np.ndarray, depth: float) -> boo
     turned = rotation_angle(first[0, :3, :3].T @ second[0, :3, :3])
     off = np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1).max()
     stretched = abs(np.log(one.move.scale / other.move.scale))
-    near = off < _AGREE * max(depth, 1e-12) and turned < np.deg2rad(_AGREE_DEG)
+    near = off < AGREE * max(depth, 1e-12) and turned < np.deg2rad(AGREE_DEG)
     return bool(near and stretched < _AGREE_LOG)
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsba.disk import atomic_write
+from gsba.disk import write_image
 from gsba.frames import panorama
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp
@@ -133,27 +133,22 @@ def write_carrier(carrier: Carrier, frames: FrameSet, out: Path, merge: bool = T
         the files.
     """
     written = [out / "carrier.png", out / "carrier_check.jpg"]
-    _write_png(written[0], carrier.mask)
+    write_image(written[0], carrier.mask.astype(np.uint8) * 255)
     height, width = carrier.median.shape[:2]
     small = cv2.resize(carrier.mask.astype(np.uint8), (width, height), interpolation=0)
     shown = carrier.median.copy()
     shown[small == 0] = (shown[small == 0] * 0.5 + np.array([128, 0, 60])).astype(np.uint8)
     outlines, _ = cv2.findContours(1 - small, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(shown, outlines, -1, (255, 80, 160), 1)
-    encoded = cv2.imencode(".jpg", shown[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])[1]
-    atomic_write(written[1], lambda path: path.write_bytes(encoded.tobytes()))
+    write_image(written[1], shown, jpeg_quality=88)
     for f, name in enumerate(frames.names):
         own = load_mask(frames, f)
         if merge and (own is not None or carrier.turns.any()):
             found = carrier_mask(carrier, frames, f)
             written.append(out / "merged" / f"{name}.png")
-            _write_png(written[-1], found if own is None else own & found)
+            union = found if own is None else own & found
+            write_image(written[-1], union.astype(np.uint8) * 255)
     return written
-
-
-def _write_png(path: Path, mask: np.ndarray) -> None:
-    encoded = cv2.imencode(".png", mask.astype(np.uint8) * 255)[1]
-    atomic_write(path, lambda temporary: temporary.write_bytes(encoded.tobytes()))
 
 
 def _median_and_change(pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

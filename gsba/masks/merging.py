@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsba.disk import atomic_write
+from gsba.disk import write_bytes, write_image
 from gsba.frames.masks import levels_of, load_mask, load_weights
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
@@ -104,8 +104,8 @@ def after(
             assert known is not None
             return distractor_mask(known[frames.names[f]])
 
-        given = frames, solved.world_T_rigs, solved.landmarks
-        scene = Scene(*given, None if known is None else of)
+        removed = None if known is None else of
+        scene = Scene(frames, solved.world_T_rigs, solved.landmarks, removed)
         return store.per_frame(
             name,
             None,
@@ -198,7 +198,7 @@ def _fit(weights: np.ndarray, width: int) -> np.ndarray:
 def _write_if_new(path: Path, levels: np.ndarray) -> None:
     encoded = cv2.imencode(".png", levels)[1].tobytes()
     if not (path.exists() and path.read_bytes() == encoded):
-        atomic_write(path, lambda temporary: temporary.write_bytes(encoded))
+        write_bytes(path, encoded)
 
 
 def _write_check(path: Path, frames: FrameSet, shares: np.ndarray) -> None:
@@ -219,5 +219,4 @@ def _write_check(path: Path, frames: FrameSet, shares: np.ndarray) -> None:
         place = (6, size[1] - 8)
         cv2.putText(shown, frames.names[f], place, cv2.FONT_HERSHEY_PLAIN, 1, (255, 255, 255))
         rows.append(shown)
-    encoded = cv2.imencode(".jpg", np.concatenate(rows)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
-    atomic_write(path, lambda temporary: temporary.write_bytes(encoded[1].tobytes()))
+    write_image(path, np.concatenate(rows), jpeg_quality=88)

@@ -14,12 +14,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.camera.sphere import bearings_from_erp
-from gsba.disk import atomic_write, disk_errors
+from gsba.disk import disk_errors, write_image
 from gsba.frames import cubemap
 from gsba.frames.files import decode, image_size
 from gsba.log import GsbaError, track
@@ -110,9 +109,7 @@ def _run(command: str, frames: FrameSet, rig: CubeRig, present: list[int], folde
     for f, name in enumerate(track(frames.names, "cutting faces")):
         faces, _ = cubemap.load(frames, f, rig)
         for c in present:
-            encoded = cv2.imencode(".png", faces[c][..., ::-1])[1].tobytes()
-            path = images / f"{name}_{FACES[c]}.png"
-            atomic_write(path, functools.partial(_write, encoded))
+            write_image(images / f"{name}_{FACES[c]}.png", faces[c])
     words = _words(command)
     if any("{image}" in word or "{mask}" in word for word in words):
         for name in track(names, "segmenting"):
@@ -134,10 +131,6 @@ def _run(command: str, frames: FrameSet, rig: CubeRig, present: list[int], folde
                 f"--segment {command}: mask {name} is {width}x{height}, its face is "
                 f"{rig.size}x{rig.size}"
             )
-
-
-def _write(content: bytes, path: Path) -> None:
-    path.write_bytes(content)
 
 
 def _words(command: str) -> list[str]:

@@ -71,7 +71,7 @@ def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     along = np.concatenate([[0], np.cumsum(steps)])
     drifts = settings.pairs.drift * (along[chosen[:, 1]] - along[chosen[:, 0]])
     gates = [
-        _point_gate(np.deg2rad(settings.pairs.loop_deg) + 2 * drift / max(depth, 1e-12))
+        Gate.around_points(np.deg2rad(settings.pairs.loop_deg) + 2 * drift / max(depth, 1e-12))
         for drift in drifts
     ]
     known = solved.points_by_keypoint(keypoints)
@@ -104,7 +104,7 @@ def match_known_points(context: MatchContext, solved: Solution, loops_closed: bo
     chosen = near[near[:, 1] - near[:, 0] > 2]
     if loops_closed:
         chosen = np.concatenate([chosen, loops])
-    gates = [_point_gate(np.deg2rad(settings.point_deg))] * len(chosen)
+    gates = [Gate.around_points(np.deg2rad(settings.point_deg))] * len(chosen)
     known = solved.points_by_keypoint(context.keypoints)
     # Where a point is known this well, no network knows better.
     return context.match(chosen, poses, gates, known, guided_only=True)
@@ -146,11 +146,6 @@ def _replaced(matches: Matches, indices: np.ndarray, others: Matches) -> Matches
     return Matches.of_rows(matches.pairs, rows)
 
 
-def _point_gate(radius_rad: float) -> Gate:
-    """A gate around predicted points only."""
-    return Gate(np.pi, 1.0, np.pi, min(radius_rad, np.pi))
-
-
 def _gate(rotation_deg: float, direction: float, settings: RefineSettings) -> Gate:
     return Gate(np.deg2rad(rotation_deg), direction, np.deg2rad(settings.pairs.max_parallax_deg))
 
@@ -162,6 +157,6 @@ def match_for_rotations(context: MatchContext, world_T_rigs: np.ndarray) -> Matc
     pairs = np.array(chosen, np.int32).reshape(-1, 2)
     still = world_T_rigs.copy()
     still[:, :3, 3] = 0
-    gates = [Gate(np.pi, 1.0, np.pi, np.deg2rad(_ROTATION_DEG))] * len(pairs)
+    gates = [Gate.around_points(np.deg2rad(_ROTATION_DEG))] * len(pairs)
     directions = [context.keypoints.bearings_of(f) for f in range(num)]
     return context.match(pairs, still, gates, directions)

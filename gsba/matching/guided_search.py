@@ -34,6 +34,16 @@ class Gate:
     max_parallax_rad: float  # largest angle between both bearings in one orientation
     point_rad: float = 0.0  # uncertainty of the bearing of a point of known depth
 
+    @classmethod
+    def anywhere(cls) -> "Gate":
+        """Nothing is predicted."""
+        return cls(np.pi, 1e3, np.pi)
+
+    @classmethod
+    def around_points(cls, radius_rad: float) -> "Gate":
+        """Around predicted points only."""
+        return cls(np.pi, 1.0, np.pi, min(radius_rad, np.pi))
+
 
 @dataclass(frozen=True, slots=True)
 class Searchable:

@@ -18,7 +18,6 @@ from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
 
 _PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
 _MANY_LOST = 0.2  # part of the neighbours
-_ANYWHERE = Gate(np.pi, 1e3, np.pi)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +165,7 @@ def match_anywhere(
     nowhere = np.tile(np.eye(4), (len(context.keypoints.starts) - 1, 1, 1))
 
     def match(some: np.ndarray, strongest: bool) -> VerifiedPairs:
-        gates = [_ANYWHERE] * len(some)
+        gates = [Gate.anywhere()] * len(some)
         # Nothing predicts which faces a learned matcher should compare.
         found = context.match(some, nowhere, gates, strongest=strongest, guided_only=True)
         return verified(found, None, None, context)

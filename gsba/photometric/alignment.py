@@ -12,7 +12,7 @@ from factors.patches import ALIGNED, REASONS, PatchSet, Sightings, expect, found
 from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
 from gsba.camera.rig import CubeRig, owner_faces
-from gsba.config import AlignSettings
+from gsba.config import PatchSettings
 from gsba.frames import panorama
 from gsba.log import track
 from gsba.photometric.references import references, views
@@ -48,7 +48,7 @@ def align(
     rig: CubeRig,
     name: str,
     aligned: np.ndarray | None,
-    settings: AlignSettings,
+    settings: PatchSettings,
     num_threads: int,
     field: SphereField = _STRAIGHT,
 ) -> Sighted:
@@ -159,7 +159,7 @@ def _accepted(
     sightings: Sightings,
     seeing: np.ndarray,
     pixel: float,
-    settings: AlignSettings,
+    settings: PatchSettings,
 ) -> tuple[np.ndarray, _Observed, dict[str, int]]:
     """Rows (N,) of the sightings to believe, as observations, and why others fell."""
     bearings, by_shift = found_at(sightings)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from factors.compiled import kernel_and_part
-from gsba.config import AlignSettings
+from gsba.config import PatchSettings
 from gsba.types import Landmarks
 
 _kernel, _part = kernel_and_part()
@@ -27,7 +27,7 @@ def views(
     world_T_rigs: np.ndarray,
     rows: np.ndarray,
     extended: np.ndarray,
-    settings: AlignSettings,
+    settings: PatchSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Frames in which each point is looked for, its reference left out.
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -69,10 +68,16 @@ def place(
 
     def compute() -> Solution:
         found = _tracks(seen, prior, matches)
-        rows, gate = seen.keypoints.rows(found), settings.rounds.dense[-1] * solved.noise
-        observed = seen.keypoints.bearings_rig[rows], seen.keypoints.sigmas_rad[rows]
-        how = gate, settings.triangulate, run.num_threads
-        placed = triangulation.triangulate(found, *observed, solved.world_T_rigs, *how)
+        rows = seen.keypoints.rows(found)
+        placed = triangulation.triangulate(
+            found,
+            seen.keypoints.bearings_rig[rows],
+            seen.keypoints.sigmas_rad[rows],
+            solved.world_T_rigs,
+            settings.rounds.dense[-1] * solved.noise,
+            settings.triangulate,
+            run.num_threads,
+        )
         return replace(solved, landmarks=placed)
 
     return run.stage(name, [run.solving_key()], compute, Solution, noted=False)
@@ -105,9 +110,12 @@ def merge_maps(
     run: Run, seen: Seen, prior: Prior, solved: Solution, parts: np.ndarray
 ) -> tuple[Prior, Solution]:
     """Parts of the map joined where they meet, frames in none of them registered."""
-    trust, times = prior.trust, run.frames.timestamps
-    given = seen.context, solved, parts, trust.held_steps, ~trust.unseen_steps, times
-    compute = partial(map_merging.merge, *given)
+    trust = prior.trust
+
+    def compute() -> Registered:
+        held, shown = trust.held_steps, ~trust.unseen_steps
+        return map_merging.merge(seen.context, solved, parts, held, shown, run.frames.timestamps)
+
     merged = run.stage("registered", run.matching_key(), compute, Registered)
     coarse, trust, joints = follow(merged, prior.coarse, trust, prior.joints)
     apart = connectivity.several(merged.components)
@@ -121,10 +129,20 @@ def measure_strength(run: Run, seen: Seen, prior: Prior, solved: Solution) -> Pr
 
     def compute() -> MapStrength:
         problem = run.problem(prior, settings.faint())
-        known = adjustment.pose_covariances(solved, seen.keypoints, problem, prior.parts)
-        coarse, steps = prior.coarse.world_T_rigs, (~trust.unseen_steps, ~trust.false_steps)
-        how = closer, settings, prior.parts
-        return map_strength.measure(solved.world_T_rigs, *known, coarse, *steps, *how)
+        covariances, joint = adjustment.pose_covariances(
+            solved, seen.keypoints, problem, prior.parts
+        )
+        return map_strength.measure(
+            solved.world_T_rigs,
+            covariances,
+            joint,
+            prior.coarse.world_T_rigs,
+            ~trust.unseen_steps,
+            ~trust.false_steps,
+            closer,
+            settings,
+            prior.parts,
+        )
 
     strength = run.stage("strength", [run.solving_key(), closer], compute, MapStrength)
     return replace(prior, strength=strength)
@@ -144,12 +162,22 @@ def align_patches(run: Run, prior: Prior, world: Map, number: int) -> Map:
 
 def _align(run: Run, world: Map, name: str) -> Sighted:
     """Points observed anew."""
-    settings, solved = run.settings.align, world.solution
+    settings, solved = run.settings.patches, world.solution
 
     def compute() -> Sighted:
-        given = solved.landmarks, solved.world_T_rigs, world.observed, solved.noise
-        how = name, world.aligned, settings, run.num_threads, world.field
-        return alignment.align(*given, run.greys, run.rig, *how)
+        return alignment.align(
+            solved.landmarks,
+            solved.world_T_rigs,
+            world.observed,
+            solved.noise,
+            run.greys,
+            run.rig,
+            name,
+            world.aligned,
+            settings,
+            run.num_threads,
+            world.field,
+        )
 
     return run.stage(name, settings.model_dump(exclude={"rounds"}), compute, Sighted)
 
@@ -180,8 +208,9 @@ def _straighten(run: Run, prior: Prior, world: Map, sighted: Sighted, number: in
         return world
 
     def compute() -> Stitching:
-        given = sighted, world.observed, world.solution, world.field
-        return stitching.estimate(*given, run.problem(prior))
+        return stitching.estimate(
+            sighted, world.observed, world.solution, world.field, run.problem(prior)
+        )
 
     key = [run.solving_key(), settings.stitching, settings.rounds.aligned]
     found = run.stage(name, key, compute, Stitching)
@@ -200,8 +229,8 @@ def refine_photometric(run: Run, prior: Prior, world: Map) -> Map:
     key = [run.solving_key(), run.settings.photometric]
 
     def compute() -> PhotometricResult:
-        given = world.straightened(run.frames), world.keypoints(run.rig), world.solution
-        return direct.refine(*given, run.problem(prior))
+        frames, keypoints = world.straightened(run.frames), world.keypoints(run.rig)
+        return direct.refine(frames, keypoints, world.solution, run.problem(prior))
 
     found = run.stage("photometric", key, compute, PhotometricResult)
     return replace(world, solution=found.adjustment, frame_weights=found.frame_weights)
@@ -216,8 +245,8 @@ def refine_on_splat(run: Run, prior: Prior, world: Map) -> Map:
     def compute() -> SplatResult:
         frames, start = world.straightened(run.frames), digest(key, solved.world_T_rigs.tolist())
         patches = direct.joint(frames, solved, world.frame_weights, settings, run.num_threads)
-        given = frames, world.keypoints(run.rig), solved, run.problem(prior)
-        return refinement.refine(*given, patches, turns, start)
+        keypoints, problem = world.keypoints(run.rig), run.problem(prior)
+        return refinement.refine(frames, keypoints, solved, problem, patches, turns, start)
 
     found = run.stage("splat", key, compute, SplatResult)
     turns.unlink(missing_ok=True)
@@ -228,14 +257,22 @@ def reconstruct(run: Run, seen: Seen, prior: Prior, world: Map) -> Reconstructio
     """Covariances, and everything back in the trajectory's world; of a turn, rotations alone."""
     if prior.turning_only:
         return _reconstruct_rotations(run, seen, prior)
-    least, correction = run.settings.rounds.min_observations, world.straightened(run.frames)
 
     def compute() -> Reconstruction:
-        solved, observed = world.solution, world.keypoints(run.rig)
-        claimed = adjustment.pose_covariances(solved, observed, run.problem(prior), prior.parts)
+        solved, observed, problem = world.solution, world.keypoints(run.rig), run.problem(prior)
+        claimed = adjustment.pose_covariances(solved, observed, problem, prior.parts)
         covariances, joint = common_errors.added(*claimed, solved.world_T_rigs, prior.parts)
-        false, last = prior.trust.false_frames, (correction.correction, prior.parts, joint)
-        return assemble(solved, covariances, observed, prior.coarse, least, false, *last)
+        return assemble(
+            solved,
+            covariances,
+            observed,
+            prior.coarse,
+            run.settings.rounds.min_observations,
+            prior.trust.false_frames,
+            world.straightened(run.frames).correction,
+            prior.parts,
+            joint,
+        )
 
     return run.stage("reconstruction", run.solving_key(), compute, Reconstruction)
 

@@ -60,8 +60,9 @@ def _extract(
 ) -> PerFrame[Features]:
     make = learned.make_extractor(settings.features, run.weights)
     files = [path for stage, path in run.weights.items() if stage == "features"]
-    given = run.store, run.frames, run.rig, settings
-    return extraction.extract(*given, run.num_threads, make, files, name, chosen)
+    return extraction.extract(
+        run.store, run.frames, run.rig, settings, run.num_threads, make, files, name, chosen
+    )
 
 
 def _see(run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str) -> Seen:

@@ -77,10 +77,11 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
     frames, coarse, journal = run.frames, prior.coarse, run.journal
     undone = [n for n, rounds in journal.rounds.items() if not all(r.accepted for r in rounds)]
     undone += [name for name in journal.undone if name not in undone]
-    given = prior.trust, prior.clock, prior.merged, prior.joints
-    trajectory, notes = findings.of_trajectory(*given, frames)
-    told = undone, world.frame_weights, run.settings.closer.max_scale_sigma
-    notes += findings.of_frames(frames, coarse, result, *told)
+    trajectory, notes = findings.of_trajectory(
+        prior.trust, prior.clock, prior.merged, prior.joints, frames
+    )
+    most = run.settings.closer.max_scale_sigma
+    notes += findings.of_frames(frames, coarse, result, undone, world.frame_weights, most)
     report = build_report(
         settings=run.settings,
         frames=frames,

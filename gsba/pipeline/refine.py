@@ -106,7 +106,7 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
         GsbaError: images that do not match, or that contradict the trajectory.
     """
     rounds, families = run.settings.rounds, run.settings.factors
-    patch_rounds = run.settings.align.rounds
+    patch_rounds = run.settings.patches.rounds
     prior, near = frontend.match_neighbours(run, seen, prior, given)
     prior, near = frontend.judge(run, seen, prior, near)
     if prior.turning_only:

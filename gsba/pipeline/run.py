@@ -89,7 +89,7 @@ class Run:
             frames=frames,
             settings=settings,
             rig=cubemap.rig_for(frames, settings.cubemap),
-            greys=Greys(frames, settings.align.max_width),
+            greys=Greys(frames, settings.patches.max_width),
             weights=learned.find_weights(settings),
             extra_factors=extra_factors,
             custom=None if extra_factors is None else uuid.uuid4().hex,

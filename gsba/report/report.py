@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
+from gsba.disk import atomic_write
 from gsba.geometry import angular_errors, quaternion_from_rotation
-from gsba.store.store import StageRecord, atomic_write
+from gsba.store.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
 from gsba.version import __version__
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.disk import atomic_write
+from gsba.disk import write_bytes
 from gsba.log import GsbaError
 from gsba.splat.gaussians import Gaussians
 
@@ -43,7 +43,7 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {num}"]
     header += [f"property float {name}" for name in names]
     text = "\n".join([*header, "end_header\n"])
-    atomic_write(path, lambda temporary: temporary.write_bytes(text.encode() + rows.tobytes()))
+    write_bytes(path, text.encode() + rows.tobytes())
 
 
 def read_ply(path: Path) -> Gaussians:

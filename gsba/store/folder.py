@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gsba.disk import atomic_write, disk_errors, remove_temporaries
+from gsba.disk import disk_errors, remove_temporaries, write_text
 from gsba.log import GsbaError
 from gsba.store.records import RecordError, typed
 from gsba.version import __version__
@@ -93,7 +93,7 @@ def read_marker(root: Path) -> dict[str, Any]:
 def _write_marker(root: Path, origin: Mapping[str, str], wrote: Any) -> None:
     marker = {"gsba": __version__, "origin": origin, "wrote": sorted(wrote)}
     text = json.dumps(marker, indent=1) + "\n"
-    atomic_write(root / MARKER, lambda temporary: temporary.write_text(text))
+    write_text(root / MARKER, text)
 
 
 def _require_ours_or_empty(root: Path) -> None:

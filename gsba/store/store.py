@@ -23,7 +23,7 @@ from typing import Generic, TypeVar
 
 from pydantic import BaseModel
 
-from gsba.disk import atomic_write
+from gsba.disk import write_text
 from gsba.log import GsbaError, track
 from gsba.store.folder import MARKER, STAGES, claim, is_run_folder, open_run_folder
 from gsba.store.records import FORMAT, RecordError, load_record, read_info, save_record, typed
@@ -150,7 +150,7 @@ class RunStore:
         finally:
             record = _measured(name, base, wall, cpu, spent)
             text = json.dumps(dataclasses.asdict(record))
-            atomic_write(folder / "cost.json", lambda temporary: temporary.write_text(text))
+            write_text(folder / "cost.json", text)
         self._note(replace(record, key=digest(base, keys), resumed=not missing))
         return frames
 

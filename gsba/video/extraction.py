@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from gsba.config import VideoSettings
-from gsba.disk import atomic_write, disk_errors, remove_temporaries
+from gsba.disk import disk_errors, remove_temporaries, write_bytes, write_text
 from gsba.frames.times import read_times
 from gsba.log import GsbaError, track
 from gsba.store.records import RecordError, typed
@@ -176,7 +176,7 @@ def _extract(
                 continue
             last = small
         name, image = f"{index:06d}.jpg", _encoded(frame, settings.width)
-        atomic_write(out / name, lambda path, image=image: path.write_bytes(image))
+        write_bytes(out / name, image)
         kept.append(_Kept(name, float(times[index]), index, standing))
         _append(out / _JOURNAL, kept[-1])
     return kept, standing
@@ -248,7 +248,7 @@ def _write_marker(out: Path, video: Path, key: str, counts: Counts | None) -> No
     entries = None if counts is None else asdict(counts)
     marker = {"gsba": __version__, "video": str(video.resolve()), "key": key, "counts": entries}
     text = json.dumps(marker, indent=1, ensure_ascii=False) + "\n"
-    atomic_write(out / MARKER, lambda path: path.write_text(text, encoding="utf-8"))
+    write_text(out / MARKER, text)
 
 
 def _append(path: Path, kept: _Kept) -> None:
@@ -282,4 +282,4 @@ def _read_times(out: Path) -> list[str]:
 
 def _write_times(out: Path, kept: list[_Kept]) -> None:
     rows = "".join(f"{entry.name},{entry.timestamp!r}\n" for entry in kept)
-    atomic_write(out / TIMES, lambda path: path.write_text("name,timestamp\n" + rows))
+    write_text(out / TIMES, "name,timestamp\n" + rows)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba.disk import atomic_write
+from gsba.disk import write_text
 from gsba.log import GsbaError
 from gsba.report.html import pictures, views
 from gsba.report.report import frame_quality, plain
@@ -49,7 +49,7 @@ def write_html(
         "worst": _worst(frames, reconstruction),
     }
     text = _assembled(json.dumps(plain(data, digits=6), allow_nan=False, separators=(",", ":")))
-    atomic_write(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_text(path, text)
 
 
 def _assembled(data: str) -> str:
