@@ -22,7 +22,7 @@ from gsba import refine
 from gsba.config import RefineSettings
 from gsba.demo import make_walk
 from gsba.demo.walk import Heading, WalkPath
-from gsba.evaluate.consistency import Consistency, Statistic, judge
+from gsba.evaluate.consistency import Consistency, Statistic, consistency_of
 from gsba.evaluate.trajectory import evaluate
 from gsba.log import GsbaError
 from gsba.store.finished import load_run
@@ -77,7 +77,7 @@ def measured(case: Case, out: Path) -> tuple[Consistency, float]:
     refine(case.images, case.trajectory, out, settings)
     reconstruction, frames = load_run(out)
     truth = read_trajectory(case.truth)
-    found = judge(reconstruction, frames.timestamps, truth)
+    found = consistency_of(reconstruction, frames.timestamps, truth)
     whole = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
     return found, evaluate(whole, truth).ate.rmse
 

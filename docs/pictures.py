@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 
 from gsba.frames.pixels import load_erp
+from gsba.report.html.figures import viewing_axes
 from gsba.report.html.pictures import picture, worst_frames
-from gsba.report.html.views import viewing_axes
 from gsba.similarity import residuals_of, similarity
 from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory

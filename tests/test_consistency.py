@@ -13,7 +13,13 @@ from synthetic import RIG, make_world
 from gsba.bundle import adjustment, prior_factors
 from gsba.bundle.adjustment import Problem
 from gsba.config import RefineSettings
-from gsba.evaluate.consistency import EXPECTED, Consistency, Statistic, format_consistency, judge
+from gsba.evaluate.consistency import (
+    EXPECTED,
+    Consistency,
+    Statistic,
+    consistency_of,
+    format_consistency,
+)
 from gsba.geometry import pose
 from gsba.log import GsbaError
 from gsba.similarity import Sim3
@@ -83,7 +89,7 @@ def test_errors_as_modelled_are_within_their_intervals() -> None:
     inside = np.zeros(6, int)
     for seed in SEEDS:
         result, truth = _solved(seed)
-        inside += [one.expected for one in _statistics(judge(result, TIMES, truth))]
+        inside += [one.expected for one in _statistics(consistency_of(result, TIMES, truth))]
     assert inside.min() >= LEAST_EXPECTED
 
 
@@ -92,8 +98,8 @@ def test_sigmas_that_are_off_by_two_are_found(factor: float) -> None:
     outside = np.zeros(6, int)
     for seed in SEEDS:
         result, truth = _solved(seed)
-        right = _statistics(judge(result, TIMES, truth))
-        wrong = _statistics(judge(_claiming(result, factor), TIMES, truth))
+        right = _statistics(consistency_of(result, TIMES, truth))
+        wrong = _statistics(consistency_of(_claiming(result, factor), TIMES, truth))
         powers = [1, 1, 2] * 2
         for one, other, power in zip(right, wrong, powers, strict=True):
             assert other.value == pytest.approx(one.value / factor**power, rel=1e-4)
@@ -106,7 +112,7 @@ def test_the_world_and_scale_of_the_truth_do_not_matter() -> None:
     result, truth = _solved(0)
     turn = pose(Rotation.from_rotvec([0.4, -2.0, 1.0]).as_matrix(), np.array([3.0, -40.0, 8.0]))
     moved = Trajectory(TIMES, Sim3.of(7.3, turn).poses(truth.world_T_rigs))
-    here, there = (_statistics(judge(result, TIMES, one)) for one in (truth, moved))
+    here, there = (_statistics(consistency_of(result, TIMES, one)) for one in (truth, moved))
     assert [one.value for one in there] == pytest.approx([one.value for one in here], rel=1e-6)
 
 
@@ -120,7 +126,7 @@ def test_the_world_and_scale_of_the_run_do_not_matter() -> None:
         stretch[:, :, None] * result.pose_covariances * stretch[:, None, :],
         joint.scaled(stretch),
     )
-    here, there = (_statistics(judge(one, TIMES, truth)) for one in (result, moved))
+    here, there = (_statistics(consistency_of(one, TIMES, truth)) for one in (result, moved))
     for one, other in zip(here, there, strict=True):
         assert [other.value, other.low] == pytest.approx([one.value, one.low], rel=1e-4)
 
@@ -147,7 +153,7 @@ def _independent(num: int, seed: int) -> tuple[Reconstruction, Trajectory]:
 def test_the_interval_of_independent_errors_is_that_of_chi_square() -> None:
     num = 40
     result, truth = _independent(num, 0)
-    claims = judge(result, truth.timestamps, truth).absolute
+    claims = consistency_of(result, truth.timestamps, truth).absolute
     assert claims.num == num - 1
     degrees, tail = 6 * (num - 1) - 1, (1 - EXPECTED) / 2
     interval = chi2.ppf([tail, 1 - tail], degrees) / (num - 1)
@@ -160,11 +166,11 @@ def test_the_interval_of_independent_errors_is_that_of_chi_square() -> None:
 def test_steps_are_judged_by_what_neighbours_share() -> None:
     """Errors that all frames share leave the steps as they are: sigmas of steps must say so."""
     result, truth = _solved(0)
-    found = judge(result, TIMES, truth)
+    found = consistency_of(result, TIMES, truth)
     joint = result.joint_errors
     assert joint is not None
     apart = JointErrors(np.zeros_like(joint.neighbours), joint.draws)
-    without = judge(replace(result, joint_errors=apart), TIMES, truth)
+    without = consistency_of(replace(result, joint_errors=apart), TIMES, truth)
     assert without.consecutive is not None and found.consecutive is not None
     assert without.consecutive.nees.value < 0.7 * found.consecutive.nees.value
     assert without.absolute == found.absolute
@@ -176,7 +182,7 @@ def test_frames_without_truth_or_covariance_are_left_out() -> None:
     covariances[5] = np.nan
     kept = np.arange(FRAMES) != 3
     part = Trajectory(TIMES[kept], truth.world_T_rigs[kept])
-    found = judge(replace(result, pose_covariances=covariances), TIMES, part)
+    found = consistency_of(replace(result, pose_covariances=covariances), TIMES, part)
     assert found.consecutive is not None
     assert found.absolute.num == FRAMES - 3 and found.consecutive.num == FRAMES - 5
     assert all(np.isfinite(one.value) for one in _statistics(found))
@@ -184,7 +190,7 @@ def test_frames_without_truth_or_covariance_are_left_out() -> None:
 
 def test_every_other_true_pose_judges_no_steps() -> None:
     result, truth = _solved(0)
-    found = judge(result, TIMES, Trajectory(TIMES[::2], truth.world_T_rigs[::2]))
+    found = consistency_of(result, TIMES, Trajectory(TIMES[::2], truth.world_T_rigs[::2]))
     assert found.consecutive is None and found.absolute.num == FRAMES // 2 - 1
     assert "consecutive" not in format_consistency(found)
     assert found.to_json()["consecutive"] is None
@@ -193,17 +199,17 @@ def test_every_other_true_pose_judges_no_steps() -> None:
 def test_what_cannot_be_judged_is_said() -> None:
     result, truth = _solved(0)
     with pytest.raises(GsbaError, match="no covariances"):
-        judge(replace(result, joint_errors=None), TIMES, truth)
+        consistency_of(replace(result, joint_errors=None), TIMES, truth)
     late = Trajectory(TIMES[1:], truth.world_T_rigs[1:])
     with pytest.raises(GsbaError, match=r"no true pose within 0.01 s of 0.000 s"):
-        judge(result, TIMES, late)
+        consistency_of(result, TIMES, late)
     still = Trajectory(TIMES, np.tile(np.eye(4), (FRAMES, 1, 1)))
     with pytest.raises(GsbaError, match="does not move"):
-        judge(result, TIMES, still)
+        consistency_of(result, TIMES, still)
 
 
 def test_the_table_names_what_is_held() -> None:
     result, truth = _solved(0)
-    text = format_consistency(judge(result, TIMES, truth), "frame{}".format)
+    text = format_consistency(consistency_of(result, TIMES, truth), "frame{}".format)
     assert "frame0 " in text and "frame8 " in text
     assert [line.split()[0] for line in text.splitlines()[1:3]] == ["absolute", "consecutive"]

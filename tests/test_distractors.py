@@ -16,7 +16,7 @@ from gsba.evaluate.trajectory import evaluate
 from gsba.frames.masks import levels_of, load_mask, load_weights
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError
-from gsba.masks.distractors import Scene, distractor_mask, distractor_weights
+from gsba.masks.distractors import StaticScene, distractor_mask, distractor_weights
 from gsba.masks.merging import choose
 from gsba.store.store import load_stage
 from gsba.trajectory.files import read_trajectory
@@ -41,9 +41,9 @@ def _populated(case: Case, folder: Path) -> tuple[FrameSet, np.ndarray]:
     return dataclasses.replace(frames, paths=paths), np.stack(outlines)
 
 
-def _scene(case: Case, frames: FrameSet, known=None) -> Scene:
+def _scene(case: Case, frames: FrameSet, known=None) -> StaticScene:
     solved = load_stage(case.out, "refined1", Solution)
-    return Scene(frames, solved.world_T_rigs, solved.landmarks, known)
+    return StaticScene(frames, solved.world_T_rigs, solved.landmarks, known)
 
 
 def _overlap(found: np.ndarray, true: np.ndarray) -> float:
@@ -81,7 +81,7 @@ def test_frames_that_cannot_be_judged_are_left_alone(case: Case) -> None:
         num_points=5,
     )
     few = dataclasses.replace(few, tracks=few_tracks)
-    alone = Scene(frames, solved.world_T_rigs, few).find(3)
+    alone = StaticScene(frames, solved.world_T_rigs, few).find(3)
     assert "too few frames" in alone.reason and not distractor_mask(alone).any()
 
 

@@ -16,7 +16,7 @@ import pytest
 
 from gsba.camera.sphere import bearings_from_erp
 from gsba.config import RefineSettings
-from gsba.report.html import pictures, residual_sphere, views, write_html
+from gsba.report.html import figures, pictures, residual_sphere, write_html
 from gsba.report.report import build_report
 from gsba.store.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseStatus, Reconstruction
@@ -136,7 +136,7 @@ def test_map_looks_from_above() -> None:
     """The axes are a rotation: level ones first, and up is where the rigs have it."""
     result = scene.reconstruction()
     coarse = CoarsePoses(result.world_T_rigs, np.zeros(scene.NUM_FRAMES, np.uint8), 0.0)
-    found = views.world_map(coarse, result)
+    found = figures.world_map(coarse, result)
     after, positions = np.array(found["after"]), result.world_T_rigs[:, :3, 3]
     gaps, true_gaps = (np.linalg.norm(p[:, None] - p[None], axis=-1) for p in (after, positions))
     np.testing.assert_allclose(gaps, true_gaps, atol=1e-3)
@@ -153,14 +153,14 @@ def test_map_of_a_standing_camera() -> None:
     result = scene.reconstruction()
     poses = np.tile(np.eye(4), (scene.NUM_FRAMES, 1, 1))
     result = dataclasses.replace(result, world_T_rigs=poses)
-    found = views.world_map(CoarsePoses(poses, np.zeros(9, np.uint8), 0.0), result)
+    found = figures.world_map(CoarsePoses(poses, np.zeros(9, np.uint8), 0.0), result)
     assert np.isfinite(found["points"]).all() and not np.any(found["after"])
 
 
 def test_residuals_have_a_direction() -> None:
     """A rig turned to the right and down sees everything too far left and up, by that angle."""
     result = scene.reconstruction()
-    assert np.abs(views.tangent_residuals(result)).max() < 1e-9
+    assert np.abs(figures.tangent_residuals(result)).max() < 1e-9
     rng = np.random.default_rng(2)
     pixels = rng.uniform([0, 0.3], [1, 0.7], (20_000, 2))
     seen = bearings_from_erp(pixels, 1, 1)
@@ -172,11 +172,11 @@ def test_residuals_have_a_direction() -> None:
         observation_frames=np.zeros(len(seen), np.int32),  # at the origin of the world
         observation_bearings=seen,
     )
-    found = views.tangent_residuals(result)
+    found = figures.tangent_residuals(result)
     level = np.hypot(seen[:, 0], seen[:, 2])
     np.testing.assert_allclose(found[:, 0], 0.01 * level, atol=4e-4)
     np.testing.assert_allclose(found[:, 1], 0.02, atol=4e-4)
-    sphere = views.residual_sphere(result)
+    sphere = figures.residual_sphere(result)
     assert sphere["count"].sum() == len(seen) and sphere["median_deg"].shape == (36, 72)
     row = sphere["south_deg"][18]  # just below the horizon
     np.testing.assert_allclose(row, np.degrees(0.02), atol=0.02)
@@ -187,7 +187,7 @@ def test_residuals_have_a_direction() -> None:
 def test_cell_medians() -> None:
     cells = np.array([0, 0, 0, 0, 0, 0, 2, 2, 2, 2, 2, 1])
     values = np.array([6.0, 1, 2, 3, 4, 5, 9, 8, 7, 5, 6, 1])
-    found = views._medians(values, cells, np.bincount(cells, minlength=4))
+    found = figures._medians(values, cells, np.bincount(cells, minlength=4))
     np.testing.assert_array_equal(found, [3.5, np.nan, 7, np.nan])
 
 
@@ -201,7 +201,7 @@ def test_many_frames_share_a_cell() -> None:
         observation_points=np.array([1, 1, 1], np.int32),
         observation_bearings=np.tile([0.0, 0, 1], (3, 1)),
     )
-    found = views.match_matrix(result)
+    found = figures.match_matrix(result)
     cells, step = found["cells"], found["frames_per_cell"]
     assert (step, cells.shape) == (5, (200, 200))
     assert cells[0, 0] == 2 and cells[0, 199] == 2 and cells.sum() == 6

@@ -14,7 +14,7 @@ from gsba.log import GsbaError
 from gsba.splat import adam
 from gsba.splat.backend import CpuBackend, choose_backend
 from gsba.splat.camera import face_camera
-from gsba.splat.density import Limits, Pull, densify, reset_opacity
+from gsba.splat.density import DensityLimits, Pull, densify, reset_opacity
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.metrics import psnr
 from gsba.splat.rasterise import render
@@ -31,7 +31,7 @@ from gsba.splat.train import (
 SIZE = 32
 RIG = CubeRig(SIZE, np.pi / 2)
 SETTINGS = SplatSettings(iterations=320, face_size=SIZE, sh_degree=1, seed=3)
-LIMITS = Limits(2e-4, 0.1, 1.0, 5e-3, 1000)
+LIMITS = DensityLimits(2e-4, 0.1, 1.0, 5e-3, 1000)
 
 
 def scene() -> tuple[Gaussians, Views]:

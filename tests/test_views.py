@@ -4,7 +4,7 @@ import numpy as np
 
 from gsba.config import PatchSettings
 from gsba.geometry import pose
-from gsba.photometric.references import references, views
+from gsba.photometric.references import references, visible_frames
 from gsba.types import Counts, Landmarks, Tracks
 
 ALL = np.ones(1, bool)
@@ -31,23 +31,30 @@ def test_views_are_similar_and_never_the_reference() -> None:
     x = np.array([0, 1, 2, 3, 4, 30.0])
     landmarks = _landmarks([[2, 0, 4]], [[1, 2, 3]])
     settings = PatchSettings(max_angle_deg=20, max_views=10)
-    points, frames = views(landmarks, _poses(x), np.array([1]), ALL, settings)
+    points, frames = visible_frames(landmarks, _poses(x), np.array([1]), ALL, settings)
     assert list(points) == [0, 0] and list(frames) == [1, 3]  # 0 and 4 are 27 degrees off
     settings = PatchSettings(max_angle_deg=30, max_views=10)
-    assert set(views(landmarks, _poses(x), np.array([1]), ALL, settings)[1]) == {0, 1, 3, 4}
+    assert set(visible_frames(landmarks, _poses(x), np.array([1]), ALL, settings)[1]) == {
+        0,
+        1,
+        3,
+        4,
+    }
 
 
 def test_revisits_are_views_whatever_their_time() -> None:
     x = np.array([0, 1, 2, 50, 51, 1.1])
     landmarks = _landmarks([[1, 0, 4]], [[0, 1, 2]])
-    _, frames = views(landmarks, _poses(x), np.array([1]), ALL, PatchSettings(near_frames=3))
+    _, frames = visible_frames(
+        landmarks, _poses(x), np.array([1]), ALL, PatchSettings(near_frames=3)
+    )
     assert set(frames) == {0, 2, 5}
 
 
 def test_limits_hold() -> None:
     x = np.linspace(0, 1, 12)
     landmarks = _landmarks([[0.5, 0, 4], [0.5, 0, 5]], [[3, 5, 7], [4, 6]])
-    points, frames = views(
+    points, frames = visible_frames(
         landmarks, _poses(x), np.array([1, 4]), np.array([True, False]), PatchSettings(max_views=5)
     )
     assert np.count_nonzero(points == 0) == 5
@@ -56,5 +63,7 @@ def test_limits_hold() -> None:
 
 def test_a_point_at_a_centre_is_looked_for_nowhere_else() -> None:
     landmarks = _landmarks([[1, 0, 0]], [[0, 1, 2]])
-    _, frames = views(landmarks, _poses(np.arange(4.0)), np.array([1]), ALL, PatchSettings())
+    _, frames = visible_frames(
+        landmarks, _poses(np.arange(4.0)), np.array([1]), ALL, PatchSettings()
+    )
     assert 3 not in frames

@@ -144,12 +144,12 @@ def evaluate(
 
 def _consistency(run: Path, truth: "Trajectory") -> "tuple[Consistency | None, str]":
     """How the covariances of a run compare with its errors, and that or why not in words."""
-    from gsba.evaluate.consistency import format_consistency, judge
+    from gsba.evaluate.consistency import consistency_of, format_consistency
     from gsba.store.finished import load_run
 
     try:
         reconstruction, frames = load_run(run)
-        found = judge(reconstruction, frames.timestamps, truth)
+        found = consistency_of(reconstruction, frames.timestamps, truth)
     except GsbaError as error:
         return None, f"covariances cannot be judged: {error}"
     return found, "\ncovariances\n" + format_consistency(found, frames.names.__getitem__)

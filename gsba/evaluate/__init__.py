@@ -1,1 +1,20 @@
-"""Room."""
+"""How good a run is: against the truth, by its own covariances, and by splats trained on it.
+
+Takes trajectories, a finished run, depth, or held-out frames.
+Gives errors, their table, and JSON. `gsba.evaluate.splats` is imported by its own name.
+"""
+
+from gsba.evaluate.consistency import Consistency, consistency_of, format_consistency
+from gsba.evaluate.pixels import InducedErrors, induced_errors
+from gsba.evaluate.trajectory import TrajectoryErrors, evaluate, format_table
+
+__all__ = [
+    "Consistency",
+    "InducedErrors",
+    "TrajectoryErrors",
+    "consistency_of",
+    "evaluate",
+    "format_consistency",
+    "format_table",
+    "induced_errors",
+]

@@ -113,7 +113,7 @@ class _Judge:
         return Claims(len(self.rows), *three)
 
 
-def judge(
+def consistency_of(
     reconstruction: Reconstruction,
     timestamps: np.ndarray,
     truth: Trajectory,

@@ -1,4 +1,8 @@
-"""Datasets for other programs: COLMAP, nerfstudio, PLY, TUM."""
+"""Datasets for other programs: COLMAP, nerfstudio, PLY, TUM.
+
+Takes a result, its frames, and where it is placed.
+Gives a folder that the consumer reads as it is.
+"""
 
 from gsba.export.formats import ExportFormat, export
 from gsba.export.ply import write_points

@@ -1,7 +1,7 @@
 """Learned keypoints and matchers (extra `learned`), behind the same interfaces as our own.
 
-Nothing is bundled: weights are their authors', under their own licences (`weights`). Networks come
-from kornia and transformers; imported only when one is used.
+Takes weights, which are their authors', under their own licences: nothing is bundled.
+Gives an extractor or a matcher; networks come from kornia and transformers, imported when used.
 """
 
 from gsba.learned.extractor import LearnedExtractor, make_extractor

@@ -69,7 +69,7 @@ def distractor_mask(found: Distractors) -> np.ndarray:
     return distractor_weights(found) == 0
 
 
-class Scene:
+class StaticScene:
     """A solved map, ready to be asked frame by frame, from any thread.
 
     Small pictures are kept in memory up to a limit; the rest is read again.

@@ -17,7 +17,7 @@ from gsba.frames.masks import levels_of, load_mask, load_weights
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
 from gsba.masks.carrier import Carrier, carrier_mask, find_carrier, write_carrier
-from gsba.masks.distractors import Distractors, Scene, distractor_mask, distractor_weights
+from gsba.masks.distractors import Distractors, StaticScene, distractor_mask, distractor_weights
 from gsba.masks.segmentation import Segment, load_segmented, segmented
 from gsba.store.store import PerFrame, RunStore, fingerprint
 from gsba.types import Counts, FrameSet, Solution
@@ -105,7 +105,7 @@ def after(
             return distractor_mask(known[frames.names[f]])
 
         removed = None if known is None else of
-        scene = Scene(frames, solved.world_T_rigs, solved.landmarks, removed)
+        scene = StaticScene(frames, solved.world_T_rigs, solved.landmarks, removed)
         return store.per_frame(
             name,
             None,

@@ -32,15 +32,15 @@ def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
     # The strongest keypoints are enough to find a pair's geometry, at a tenth of the cost.
     found = context.match(chosen, world_T_rigs, [gate] * len(chosen), strongest=True)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
-    judge = partial(
-        verification.judge,
+    agreeing = partial(
+        verification.agree_with_prior,
         keypoints=context.keypoints,
         prior_f0_T_f1s=f0_T_f1s,
         position_sigmas=np.zeros(len(chosen)),
         settings=settings.verify,
     )
     estimates = _estimates(found, context)
-    neighbours = judge(found, estimates)
+    neighbours = agreeing(found, estimates)
     scarce = np.diff(found.offsets) < settings.pairs.scarce_matches
     steps = chosen[:, 1] - chosen[:, 0] == 1
     doubtful = steps & (_shares(found, neighbours) < settings.pairs.least_agreement)
@@ -50,7 +50,7 @@ def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
     again = context.match(chosen[rows], world_T_rigs, [gate] * len(rows))
     for p, estimate in zip(rows, _estimates(again, context), strict=True):
         estimates[p] = estimate
-    return judge(_replaced(found, rows, again), estimates)
+    return agreeing(_replaced(found, rows, again), estimates)
 
 
 def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:

@@ -35,10 +35,12 @@ def verify(
         num_threads: pairs verified at a time.
     """
     estimates = estimate(matches, keypoints, settings, seed, num_threads)
-    return judge(matches, estimates, keypoints, prior_f0_T_f1s, position_sigmas, settings)
+    return agree_with_prior(
+        matches, estimates, keypoints, prior_f0_T_f1s, position_sigmas, settings
+    )
 
 
-def judge(
+def agree_with_prior(
     matches: Matches,
     estimates: Sequence[Estimate | None],
     keypoints: Keypoints,

@@ -15,7 +15,7 @@ from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import PatchSettings
 from gsba.frames import panorama
 from gsba.log import track
-from gsba.photometric.references import references, views
+from gsba.photometric.references import references, visible_frames
 from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
 
 _WINDOW = 0.6  # standard deviation of the patch's window, part of half a patch
@@ -76,7 +76,7 @@ def align(
     rows = references(landmarks, world_T_rigs)
     hosts = landmarks.tracks.frames[rows].astype(np.int64)
     extended = _extended(landmarks, keypoints, aligned, settings.min_track_length)
-    points, seeing = views(landmarks, world_T_rigs, rows, extended, settings)
+    points, seeing = visible_frames(landmarks, world_T_rigs, rows, extended, settings)
     placed = landmarks.points_world, world_T_rigs[hosts]
     origins, spreads, planes = _patches(*placed, greys.width, field)
     at, across = _carried(landmarks.points_world[points], planes[points], world_T_rigs[seeing])

@@ -22,7 +22,7 @@ def references(landmarks: Landmarks, world_T_rigs: np.ndarray) -> np.ndarray:
     return out
 
 
-def views(
+def visible_frames(
     landmarks: Landmarks,
     world_T_rigs: np.ndarray,
     rows: np.ndarray,

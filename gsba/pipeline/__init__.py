@@ -1,6 +1,13 @@
-"""A run, from frames and a coarse trajectory to refined poses, a cloud and datasets."""
+"""A run: `refine` calls it, `solve` is the method, the other files are its chapters.
 
+Takes frames, a coarse trajectory, settings and a folder.
+Gives refined poses, a cloud, datasets and a report.
+"""
+
+from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
+from gsba.pipeline.prior import Prior
 from gsba.pipeline.refine import refine, solve
+from gsba.pipeline.run import Run
 
-__all__ = ["RunResult", "refine", "solve"]
+__all__ = ["Map", "Prior", "Run", "RunResult", "refine", "solve"]

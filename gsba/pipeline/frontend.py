@@ -125,7 +125,9 @@ def _match_neighbours(run: Run, seen: Seen, prior: Prior, name: str) -> Verified
     return run.stage(name, run.matching_key(), compute, VerifiedPairs)
 
 
-def judge(run: Run, seen: Seen, prior: Prior, near: VerifiedPairs) -> tuple[Prior, VerifiedPairs]:
+def judge_trajectory(
+    run: Run, seen: Seen, prior: Prior, near: VerifiedPairs
+) -> tuple[Prior, VerifiedPairs]:
     """The trajectory without what images contradict; neighbours once more where it misled.
 
     Raises:

@@ -108,7 +108,7 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     rounds, families = run.settings.rounds, run.settings.factors
     patch_rounds = run.settings.patches.rounds
     prior, near = frontend.match_neighbours(run, seen, prior, given)
-    prior, near = frontend.judge(run, seen, prior, near)
+    prior, near = frontend.judge_trajectory(run, seen, prior, near)
     if prior.turning_only:
         return prior, Map.of(prior.start(), seen.keypoints)
     start = prior.start()

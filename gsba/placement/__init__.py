@@ -1,1 +1,20 @@
-"""Room."""
+"""Where the world of a run goes: upright, to scale, on the earth, onto true poses.
+
+Takes a finished result, and gravity, a length, GPS or a trajectory.
+Gives a `Placement`, which moves poses, points and covariances.
+"""
+
+from gsba.placement.exif import read_exif_gps
+from gsba.placement.gps import GpsFixes, local_from_geodetic, read_gps
+from gsba.placement.placement import Placement, check, place, read_placement
+
+__all__ = [
+    "GpsFixes",
+    "Placement",
+    "check",
+    "local_from_geodetic",
+    "place",
+    "read_exif_gps",
+    "read_gps",
+    "read_placement",
+]

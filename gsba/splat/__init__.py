@@ -1,4 +1,8 @@
-"""Gaussian splats: render, train and measure them."""
+"""Gaussian splats: rendered, trained, scored, and poses refined against them.
+
+Takes posed frames and a cloud.
+Gives Gaussians, pictures and scores, or the map refined by what a splat shows.
+"""
 
 from gsba.splat.camera import FaceCamera, face_camera
 from gsba.splat.gaussians import Gaussians, from_cloud

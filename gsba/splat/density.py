@@ -37,7 +37,7 @@ class Pull:
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class DensityLimits:
     """Thresholds of the density control."""
 
     pull: float  # mean gradient from which on a Gaussian is densified, image half-widths
@@ -48,7 +48,11 @@ class Limits:
 
 
 def densify(
-    gaussians: Gaussians, moments: Moments, pull: Pull, limits: Limits, rng: np.random.Generator
+    gaussians: Gaussians,
+    moments: Moments,
+    pull: Pull,
+    limits: DensityLimits,
+    rng: np.random.Generator,
 ) -> tuple[Gaussians, Moments, bool]:
     """Clone small and split large Gaussians that are pulled at, then prune.
 

@@ -19,7 +19,7 @@ from gsba.log import GsbaError, track
 from gsba.splat import adam
 from gsba.splat.backend import Backend
 from gsba.splat.camera import FaceCamera
-from gsba.splat.density import Limits, Pull, densify, reset_opacity
+from gsba.splat.density import DensityLimits, Pull, densify, reset_opacity
 from gsba.splat.gaussians import Gaussians, num_parameters
 from gsba.splat.lesson import Lesson
 from gsba.store.records import RecordError, load_record, read_info, save_record
@@ -285,7 +285,7 @@ class Trainer:
 
     def _densify(self, state: State, step: int) -> tuple[Gaussians, adam.Moments]:
         settings = self.settings
-        limits = Limits(
+        limits = DensityLimits(
             pull=settings.densify_pull,
             clone_scale=settings.densify_scale * self.extent,
             max_scale=settings.max_scale * self.extent if step > self.times.reset_every else None,

@@ -1,1 +1,31 @@
-"""Room."""
+"""The coarse trajectory: its files, its clock, its pieces, and what images say of its steps.
+
+Takes files of other programs, frames' times, and relative poses that images show.
+Gives a pose for every frame, and which steps to believe.
+"""
+
+from gsba.trajectory.association import associate, matched_in_time, without_trajectory
+from gsba.trajectory.clock import Clock, ClockEstimate
+from gsba.trajectory.files import read_trajectory, write_tum
+from gsba.trajectory.joining import Joint
+from gsba.trajectory.judgement import Trust
+from gsba.trajectory.keyframes import follow_keyframes
+from gsba.trajectory.restarts import associate_pieces, split_restarts
+from gsba.trajectory.steps import Steps, image_steps
+
+__all__ = [
+    "Clock",
+    "ClockEstimate",
+    "Joint",
+    "Steps",
+    "Trust",
+    "associate",
+    "associate_pieces",
+    "follow_keyframes",
+    "image_steps",
+    "matched_in_time",
+    "read_trajectory",
+    "split_restarts",
+    "without_trajectory",
+    "write_tum",
+]

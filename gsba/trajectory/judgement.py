@@ -109,7 +109,7 @@ def judge(
         lengths[found.directed, None] * found.f_T_nexts[found.directed, :3, 3]
     )
     named = false_frames(
-        wrong, slam, chosen, own, limits(slam, seen, known & found.directed, verify)
+        wrong, slam, chosen, own, outlier_limits(slam, seen, known & found.directed, verify)
     )
     return Trust(start, wrong, named, unseen, lengths, False)
 
@@ -165,7 +165,7 @@ def _chain(world_T_rigs: np.ndarray, chosen: np.ndarray, own: np.ndarray) -> np.
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class OutlierLimits:
     """Disagreement of two frames' relative pose with the images that sets it apart."""
 
     rotation: float  # radians
@@ -174,9 +174,9 @@ class Limits:
     noise_offset: float  # the same of its position, map units
 
 
-def limits(
+def outlier_limits(
     slam: np.ndarray, images: np.ndarray, judged: np.ndarray, settings: VerifySettings
-) -> Limits:
+) -> OutlierLimits:
     """What sets a frame apart: more than the settings allow, and than the rest is off.
 
     A trajectory that drifts quickly contradicts the images in many steps, each by about as much;
@@ -192,7 +192,7 @@ def limits(
     turned = rotation_angle(np.swapaxes(slam[:, :3, :3], 1, 2) @ images[:, :3, :3])
     off = np.linalg.norm(slam[:, :3, 3] - images[:, :3, 3], axis=1)
     usual = [float(np.quantile(x[judged], _QUIET)) if judged.any() else 0.0 for x in (turned, off)]
-    return Limits(
+    return OutlierLimits(
         np.deg2rad(settings.max_rotation_deg),
         float(np.sin(np.deg2rad(settings.max_direction_deg))),
         _NOISE * usual[0],
@@ -205,7 +205,7 @@ def false_frames(
     slam: np.ndarray,
     chosen: np.ndarray,
     own: np.ndarray,
-    limits: Limits,
+    limits: OutlierLimits,
 ) -> np.ndarray:
     """Frames (F,) whose own pose is false: the fewest whose absence explains the false steps.
 
@@ -241,7 +241,7 @@ def false_frames(
     return named
 
 
-def _agree(theirs: np.ndarray, images: np.ndarray, a: int, b: int, limits: Limits) -> bool:
+def _agree(theirs: np.ndarray, images: np.ndarray, a: int, b: int, limits: OutlierLimits) -> bool:
     """Whether a trajectory's relative pose of two frames fits the steps of the images."""
     one, other = inverse(theirs[a]) @ theirs[b], inverse(images[a]) @ images[b]
     turned = rotation_angle(one[:3, :3].T @ other[:3, :3])

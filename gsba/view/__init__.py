@@ -1,4 +1,8 @@
-"""A finished run to walk around in, in the browser."""
+"""A finished run to walk around in, in the browser.
+
+Takes the folder of a run.
+Gives a page on a local port, until it is stopped.
+"""
 
 from gsba.view.display import View
 from gsba.view.scene import Scene, Splat, faces_of, load_scene

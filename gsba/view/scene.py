@@ -11,7 +11,7 @@ from gsba.frames import cubemap
 from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement, read_placement
-from gsba.report.html.views import viewing_axes
+from gsba.report.html.figures import viewing_axes
 from gsba.splat.gaussians import SH_CONSTANT, Gaussians
 from gsba.splat.ply import read_ply
 from gsba.store.finished import load_run

@@ -1,6 +1,10 @@
-"""report.html: a run as one self-contained page."""
+"""report.html: a run as one self-contained page.
 
+Takes the report, the result and its frames.
+Gives one file with its figures and pictures inside.
+"""
+
+from gsba.report.html.figures import residual_sphere
 from gsba.report.html.page import write_html
-from gsba.report.html.views import residual_sphere
 
 __all__ = ["residual_sphere", "write_html"]

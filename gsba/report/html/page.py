@@ -11,7 +11,7 @@ import numpy as np
 
 from gsba.disk import write_text
 from gsba.log import GsbaError
-from gsba.report.html import pictures, views
+from gsba.report.html import figures, pictures
 from gsba.report.report import frame_quality, plain
 from gsba.types import CoarsePoses, FrameSet, Reconstruction
 
@@ -40,11 +40,11 @@ def write_html(
     data = {
         "run": path.resolve().parent.name,
         "report": {name: value for name, value in report.items() if name != "residual_sphere"},
-        "map": views.world_map(coarse, reconstruction),
+        "map": figures.world_map(coarse, reconstruction),
         "frames": _frames(frames, coarse, reconstruction),
-        "matches": views.match_matrix(reconstruction),
+        "matches": figures.match_matrix(reconstruction),
         "sphere": report["residual_sphere"],
-        "field": views.field_sphere(reconstruction.correction),
+        "field": figures.field_sphere(reconstruction.correction),
         "erp_width": frames.panorama_width,
         "worst": _worst(frames, reconstruction),
     }
@@ -67,7 +67,7 @@ def _frames(
 ) -> dict[str, Any]:
     """Columns over the frames."""
     quality = frame_quality(reconstruction)
-    moved, turned = views.displacements(coarse, reconstruction)
+    moved, turned = figures.displacements(coarse, reconstruction)
     return {
         "name": frames.names,
         "time": frames.timestamps,

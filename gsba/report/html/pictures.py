@@ -9,7 +9,7 @@ import numpy as np
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.frames.pixels import load_erp, load_faces
-from gsba.report.html.views import tangent_residuals
+from gsba.report.html.figures import tangent_residuals
 from gsba.report.report import frame_quality
 from gsba.types import FACES, FrameSet, Reconstruction
 
