@@ -193,7 +193,7 @@ def pixels_of(bearings: np.ndarray, width: int) -> np.ndarray:
 
 
 def over_poles(image: np.ndarray, rows: int) -> np.ndarray:
-    """An image (H, 2 H) with `rows` more beyond either pole, where the sphere goes on."""
+    """An image (H, 2 H[, C]) with `rows` more beyond either pole, where the sphere goes on."""
     half = image.shape[1] // 2
     above = np.roll(image[:rows][::-1], half, axis=1)
     below = np.roll(image[-rows:][::-1], half, axis=1)

@@ -1,8 +1,8 @@
 """gsba: pixel-true camera poses for 360-degree video.
 
-The public names below are imported when first used, so that `import gsba` stays light. Exporters
-and trajectory errors are modules of their own: `from gsba.export import export`,
-`from gsba.evaluate.trajectory import evaluate`.
+The public names below are imported when first used, so that `import gsba` stays light. Every room
+of the package lists its own: `from gsba.export import export`, `from gsba.evaluate import
+evaluate`; docs/architecture.md shows them all.
 """
 
 from importlib import import_module
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from gsba.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from gsba.bundle.prior_factors import X
     from gsba.config import RefineSettings
     from gsba.config_file import load_config
     from gsba.log import GsbaError
@@ -20,12 +21,13 @@ if TYPE_CHECKING:
     from gsba.pipeline.refine import refine
     from gsba.store.finished import load_run
 
-__all__ = ["GsbaError", "RefineSettings", "RunResult", "load_config", "load_run", "refine"]
+__all__ = ["GsbaError", "RefineSettings", "RunResult", "X", "load_config", "load_run", "refine"]
 
 _HOMES = {
     "GsbaError": "gsba.log",
     "RefineSettings": "gsba.config",
     "RunResult": "gsba.pipeline.outputs",
+    "X": "gsba.bundle.prior_factors",
     "load_config": "gsba.config_file",
     "load_run": "gsba.store.finished",
     "refine": "gsba.pipeline.refine",

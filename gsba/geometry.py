@@ -1,4 +1,4 @@
-"""Closed-form geometry: equirectangular pixels, rotations, poses, Sim(3)."""
+"""Closed-form geometry: rotations, poses, steps between them, angles of rays."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Equirectangular pixels and the bearings that they show."""
+"""Equirectangular pixels, the bearings that they show, and what lies beyond a picture's border."""
 
 import numpy as np
 
@@ -25,3 +25,15 @@ def erp_from_bearings(bearings: np.ndarray, width: int, height: int) -> np.ndarr
     u = width * (np.arctan2(x, z) / (2 * np.pi) + 0.5)
     v = height * (0.5 + np.arctan2(y, np.hypot(x, z)) / np.pi)
     return np.stack([u, v], axis=-1)
+
+
+def around_seam(image: np.ndarray, columns: int) -> np.ndarray:
+    """A panorama (h, 2h[, C]) with columns from beyond the seam on either side."""
+    return np.concatenate([image[:, -columns:], image, image[:, :columns]], axis=1)
+
+
+def around_sphere(image: np.ndarray, pad: int) -> np.ndarray:
+    """A panorama (h, 2h[, C]) padded by what lies beyond seam and poles on the sphere."""
+    from factors.patch_windows import over_poles
+
+    return around_seam(over_poles(image, pad), pad)

@@ -4,20 +4,11 @@ import functools
 
 import numpy as np
 
-from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings
 
 PAD = 4  # pixels of wrap-around: the support of bicubic sampling, and more
 _COARSE = 256  # width of the grid that a field is evaluated on; it turns over 18 degrees or more
 _BAND = 256  # rows of which coordinates are held in double precision
-
-
-def wrapped(erp: np.ndarray) -> np.ndarray:
-    """Pad by what lies beyond the border on the sphere: the other side of seam and poles."""
-    half = erp.shape[1] // 2
-    above = np.roll(erp[:PAD][::-1], half, axis=1)
-    below = np.roll(erp[-PAD:][::-1], half, axis=1)
-    tall = np.concatenate([above, erp, below], axis=0)
-    return np.concatenate([tall[:, -PAD:], tall, tall[:, :PAD]], axis=1)
 
 
 def straightened(erp: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
@@ -35,9 +26,11 @@ def straightened(erp: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
     height, width = erp.shape[:2]
     maps = _maps(correction, width, height)
     if erp.dtype == bool:
-        nearest = cv2.remap(wrapped(erp.astype(np.uint8)), maps[0], maps[1], cv2.INTER_NEAREST)
+        nearest = cv2.remap(
+            around_sphere(erp.astype(np.uint8), PAD), maps[0], maps[1], cv2.INTER_NEAREST
+        )
         return nearest > 0
-    return cv2.remap(wrapped(erp), maps[0], maps[1], cv2.INTER_LANCZOS4)
+    return cv2.remap(around_sphere(erp, PAD), maps[0], maps[1], cv2.INTER_LANCZOS4)
 
 
 @functools.lru_cache(maxsize=1)
@@ -45,7 +38,7 @@ def _maps(correction: tuple[float, ...], width: int, height: int) -> np.ndarray:
     """Places (2, H, W) float32 in the padded panorama, OpenCV pixels."""
     import cv2
 
-    offsets = wrapped(_offsets(correction))
+    offsets = around_sphere(_offsets(correction), PAD)
     out = np.empty((2, height, width), np.float32)
     columns, scale = np.arange(width) + 0.5, offsets.shape[1] - 2 * PAD
     for first in range(0, height, _BAND):

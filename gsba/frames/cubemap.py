@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from gsba.camera.rig import CubeRig
-from gsba.camera.sphere import erp_from_bearings
-from gsba.camera.straighten import PAD, wrapped
+from gsba.camera.sphere import around_sphere, erp_from_bearings
+from gsba.camera.straighten import PAD
 from gsba.config import CubemapSettings
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp, load_faces
@@ -66,7 +66,7 @@ def cut(erp: np.ndarray, rig: CubeRig) -> np.ndarray:
     height = width // 2
     if width < erp.shape[1]:
         erp = cv2.resize(erp, (width, height), interpolation=cv2.INTER_AREA)
-    padded = wrapped(erp)
+    padded = around_sphere(erp, PAD)
     maps = _face_maps(rig, width, height)
     return np.stack(
         [
@@ -85,7 +85,7 @@ def _dense_enough(width: int, rig: CubeRig) -> int:
 def cut_mask(mask: np.ndarray, rig: CubeRig) -> np.ndarray:
     """Nearest-neighbour faces (6, size, size) of an ERP mask (H, 2H), bool or float32 weights."""
     height, width = mask.shape
-    padded = wrapped(mask.astype(np.uint8) if mask.dtype == bool else mask)
+    padded = around_sphere(mask.astype(np.uint8) if mask.dtype == bool else mask, PAD)
     maps = _face_maps(rig, width, height)
     faces = [cv2.remap(padded, u, v, cv2.INTER_NEAREST) for u, v in maps]
     return np.stack(faces).astype(mask.dtype)

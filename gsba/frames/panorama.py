@@ -56,11 +56,6 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
     return _fit(grey, width), None if whole else fit_mask(usable, width)
 
 
-def wrapped(image: np.ndarray, columns: int) -> np.ndarray:
-    """A panorama (h, 2h[, C]) with columns from beyond the seam on either side."""
-    return np.concatenate([image[:, -columns:], image, image[:, :columns]], axis=1)
-
-
 class Greys:
     """Grey panoramas of frames that are read again and again: the first ones stay in memory."""
 

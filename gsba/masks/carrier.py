@@ -17,8 +17,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from gsba.camera.sphere import around_seam
 from gsba.disk import write_image
-from gsba.frames import panorama
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
@@ -34,7 +34,7 @@ _LEAST_TURN = np.deg2rad(2.0)  # less is the noise of finding turns
 _LEAST_GAIN = 1.05  # of how well pixels stay: what turning must bring to be believed
 _LEAST_FOUND = 0.95  # of the carrier found without it
 _WRAP = 64  # pixels over the seam
-_wrapped = partial(panorama.wrapped, columns=_WRAP)
+_wrapped = partial(around_seam, columns=_WRAP)
 _SURE = 0.25  # of the world's typical change: below it, a pixel is fixed
 _SURE_LEVELS = (2.0, 5.0)  # bounds on that, grey levels
 _STANDING_LEVELS = 3.0  # typical change of a world that does not move

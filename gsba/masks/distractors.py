@@ -16,7 +16,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import around_seam, bearings_from_erp, erp_from_bearings
 from gsba.frames import panorama
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp
@@ -46,7 +46,7 @@ _GROWN = 5  # pixels: the rim is blurred, and a splat shows what is left of it
 _MOST = 0.35  # of a picture: more is a wrong pose, or light that changed
 _LEVELS = 15  # of a weight that is kept
 _WRAP = 32  # pixels over the seam
-_wrapped = partial(panorama.wrapped, columns=_WRAP)
+_wrapped = partial(around_seam, columns=_WRAP)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import correlate1d
 
 from factors.patch_windows import PatchTable, over_poles, patch_axes, pixel_grid
-from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import around_seam, bearings_from_erp, erp_from_bearings
 from gsba.config import PhotometricSettings
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp
@@ -71,8 +71,8 @@ def candidates(grey: np.ndarray, usable: np.ndarray, settings: PhotometricSettin
     height, width = grey.shape
     latitude = np.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
     size = (settings.size, settings.size)
-    across = cv2.Scharr(_ring(grey), cv2.CV_32F, 1, 0)[:, 1:-1] / (32 * np.cos(latitude))
-    down = cv2.Scharr(_ring(grey), cv2.CV_32F, 0, 1)[:, 1:-1] / 32
+    across = cv2.Scharr(around_seam(grey, 1), cv2.CV_32F, 1, 0)[:, 1:-1] / (32 * np.cos(latitude))
+    down = cv2.Scharr(around_seam(grey, 1), cv2.CV_32F, 0, 1)[:, 1:-1] / 32
     xx, xy, yy = (
         cv2.boxFilter(product.astype(np.float32), -1, size)
         for product in (across * across, across * down, down * down)
@@ -108,11 +108,6 @@ def _cells(width: int, height: int, spacing_deg: float) -> tuple[np.ndarray, np.
     cell = (firsts[ring][:, None] + column).ravel()
     order = np.argsort(cell, kind="stable")
     return order, np.flatnonzero(np.diff(cell[order], prepend=-1))
-
-
-def _ring(image: np.ndarray) -> np.ndarray:
-    """An image with one column of wrap-around at either side."""
-    return np.concatenate([image[:, -1:], image, image[:, :1]], axis=1)
 
 
 def lay_planes(

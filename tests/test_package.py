@@ -1,11 +1,9 @@
-"""Who may import whom, and how long files and functions may be."""
+"""The package as a whole: what importing it costs, its public names, how long its files are."""
 
 import ast
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
-from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -13,7 +11,6 @@ import pytest
 import gsba
 
 ROOT = Path(__file__).parents[1]
-FACTORS_MAY_USE = {"factors", "gtsam", "numba", "numpy", "scipy"}
 HEAVY = {
     "av",
     "cv2",
@@ -30,62 +27,12 @@ HEAVY = {
 
 FILES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
-    for folder in ("gsba", "factors", "benchmarks")
+    for folder in ("gsba", "factors")
     for path in sorted((ROOT / folder).rglob("*.py"))
 }
 
 
-def _package(module: str) -> str:
-    """The part of a module's name that has a floor: `export` of `gsba.export.colmap`."""
-    top, _, rest = module.partition(".")
-    return rest.partition(".")[0] if top == "gsba" else top
-
-
-def _statements(node: ast.AST) -> Iterator[ast.AST]:
-    """All nodes, without what only type checkers see."""
-    for child in ast.iter_child_nodes(node):
-        if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
-            continue
-        yield child
-        yield from _statements(child)
-
-
-def _imports(module: str) -> set[str]:
-    """Names of all modules a module imports, anywhere in it; ours down to the file."""
-    found = set()
-    for node in _statements(ast.parse(FILES[module].read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{module}: imports are absolute"
-            inner = {f"{node.module}.{alias.name}" for alias in node.names}
-            modules = inner & FILES.keys()
-            found |= modules
-            if inner - modules:
-                found.add(str(node.module))
-    return found
-
-
-IMPORTS = {module: _imports(module) for module in FILES}
-OURS = {module: names & FILES.keys() - {module} for module, names in IMPORTS.items()}
-
-
-def test_factors_stand_alone() -> None:
-    for module, names in IMPORTS.items():
-        if _package(module) == "factors":
-            used = {name.partition(".")[0] for name in names}
-            foreign = used - FACTORS_MAY_USE - sys.stdlib_module_names
-            assert not foreign, f"{module} imports {foreign}"
-
-
-def test_there_are_no_cycles() -> None:
-    try:
-        TopologicalSorter(OURS).prepare()
-    except CycleError as error:
-        pytest.fail(f"import cycle: {' -> '.join(error.args[1])}")
-
-
-@pytest.mark.parametrize("module", [name for name in FILES if _package(name) != "benchmarks"])
+@pytest.mark.parametrize("module", FILES)
 def test_files_and_functions_stay_short(module: str) -> None:
     text = FILES[module].read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 600, f"{module} is two things"
