@@ -4,7 +4,7 @@ A kernel that calls another compiled function is answered by whichever copy of t
 loaded first: the function's own while kernels are being compiled, the kernel's, or that of another
 kernel, once they come from the cache. Each copy is optimised where it stands, so they may round
 differently. Parts are therefore inlined, and kernels leave no sums or products of arrays to numpy.
-`tests/test_compiled.py` holds both.
+`tests/factors/test_compiled.py` holds both.
 
 Compiling takes half a minute in all, in which nothing else seems to happen: the log says so.
 """

@@ -2,7 +2,7 @@
 
 A stretch of training stays on the device: parameters and moments travel to it and back once.
 The authors of this file have run gsplat 1.5.3's Python side, on its own PyTorch versions of its
-CUDA kernels (tests/test_splat_gsplat.py), but not yet those kernels.
+CUDA kernels (tests/splat/test_gsplat.py), but not yet those kernels.
 """
 
 import os

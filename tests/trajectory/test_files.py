@@ -15,7 +15,7 @@ from gsba.log import GsbaError
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
-SHARED = Path(__file__).parents[2] / "shared" / "data"
+SHARED = Path(__file__).parents[3] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="no ../shared/data")
 
 TUM = ["0 1 2 3 0 0 0 1", "0.5 2 2 3 0 0 0.6 0.8", "1 3 2 3 0 0 0 -1"]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
+from walk_on_earth import ORIGIN, frame_set, geodetic_of, level_metres, walk_result
 
 from gsba.camera.sphere import bearings_from_erp
 from gsba.cli import app
@@ -23,57 +24,7 @@ from gsba.placement.gps import local_from_geodetic, read_gps
 from gsba.placement.placement import Placement, place
 from gsba.similarity import Sim3, level_similarity, robust_similarity, similarity
 from gsba.trajectory.files import read_trajectory, write_tum
-from gsba.types import FrameSet, Reconstruction, Trajectory
-
-ORIGIN = np.array([48.137, 11.575, 520.0])
-
-
-def _frames(num: int = scene.NUM_FRAMES) -> FrameSet:
-    names = tuple(f"frame_{f:04d}" for f in range(num))
-    paths = tuple((Path(name),) for name in names)
-    return FrameSet(names, paths, np.arange(num) * 0.5, "erp", (), 512, 256, (None,) * num)
-
-
-def _result(num: int = 40, straight: bool = False) -> Reconstruction:
-    """A walk in a world turned, scaled and shifted at random against level metres."""
-    rng = np.random.default_rng(3)
-    t = np.linspace(0, 1, num)
-    path = np.column_stack([30 * t, 8 * np.sin(7 * t) * (not straight), 1.5 + 0.2 * np.cos(9 * t)])
-    if straight:
-        path[:, 2] = 1.5
-    poses = pose(Rotation.from_rotvec(rng.normal(0, 0.3, (num, 3))).as_matrix(), path)
-    base = scene.reconstruction()
-    keep = base.observation_frames < 0
-    world = dataclasses.replace(
-        base,
-        world_T_rigs=poses,
-        pose_covariances=np.tile(np.diag([1.0, 2, 3, 4, 5, 6]) * 1e-6, (num, 1, 1)),
-        pose_statuses=np.zeros(num, np.uint8),
-        observation_points=base.observation_points[keep],
-        observation_frames=base.observation_frames[keep],
-        observation_bearings=base.observation_bearings[keep],
-        observation_sigmas=base.observation_sigmas[keep],
-    )
-    turn = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
-    return Placement(Sim3(0.21, turn, np.array([3.0, -2.0, 5.0]))).apply(world)
-
-
-def _level(result: Reconstruction) -> np.ndarray:
-    """True level metres of the frames of `_result`: the inverse of what was done there."""
-    turn = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
-    return (result.world_T_rigs[:, :3, 3] - [3.0, -2.0, 5.0]) @ turn / 0.21
-
-
-def _geodetic(local: np.ndarray) -> np.ndarray:
-    """Latitude, longitude, altitude of metres east, north, up: Newton on the forward formula."""
-    found = np.tile(ORIGIN, (len(local), 1))
-    for _ in range(6):
-        off = local - local_from_geodetic(found, ORIGIN)
-        metres = 111_320.0
-        found += np.column_stack(
-            [off[:, 1] / metres, off[:, 0] / metres / np.cos(np.deg2rad(ORIGIN[0])), off[:, 2]]
-        )
-    return found
+from gsba.types import FrameSet, Trajectory
 
 
 def _gps_csv(path: Path, times: Sequence[float] | np.ndarray, fixes: np.ndarray) -> Path:
@@ -145,8 +96,8 @@ def test_every_export_says_what_was_done(tmp_path: Path) -> None:
 
 
 def test_scale_between_frames_or_points() -> None:
-    result, frames = _result(), _frames(40)
-    true = float(np.linalg.norm(_level(result)[30] - _level(result)[2]))
+    result, frames = walk_result(), frame_set(40)
+    true = float(np.linalg.norm(level_metres(result)[30] - level_metres(result)[2]))
     settings = PlacementSettings(length=true, between=("frame_0002", "frame_0030"))
     placed = place(result, frames, settings)
     assert placed.unit == "m" and placed.similarity.scale == pytest.approx(1 / 0.21, rel=1e-12)
@@ -157,9 +108,9 @@ def test_scale_between_frames_or_points() -> None:
 @pytest.mark.parametrize("share", [0.0, 0.2])
 @pytest.mark.parametrize("named", [False, True])
 def test_gps_is_exact_and_robust(tmp_path: Path, share: float, named: bool) -> None:
-    result, frames = _result(), _frames(40)
-    local = _level(result)
-    fixes = _geodetic(local + np.array([200.0, -100.0, 30.0]))
+    result, frames = walk_result(), frame_set(40)
+    local = level_metres(result)
+    fixes = geodetic_of(local + np.array([200.0, -100.0, 30.0]))
     wrong = np.random.default_rng(4).choice(40, round(40 * share), replace=False)
     fixes[wrong] += np.random.default_rng(5).normal(0, [1e-3, 1e-3, 60], (len(wrong), 3))
     if named:
@@ -183,9 +134,9 @@ def test_gps_is_exact_and_robust(tmp_path: Path, share: float, named: bool) -> N
 
 
 def test_gps_noise_averages_out(tmp_path: Path) -> None:
-    result, frames = _result(), _frames(40)
-    noisy = _level(result) + np.random.default_rng(6).normal(0, 0.5, (40, 3))
-    path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, _geodetic(noisy))
+    result, frames = walk_result(), frame_set(40)
+    noisy = level_metres(result) + np.random.default_rng(6).normal(0, 0.5, (40, 3))
+    path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, geodetic_of(noisy))
     placed = place(result, frames, PlacementSettings(gps=str(path)))
     assert placed.similarity.scale == pytest.approx(1 / 0.21, rel=0.02)
     assert placed.grounds["gps"]["rmse_m"] == pytest.approx(0.5 * np.sqrt(3), rel=0.25)
@@ -229,7 +180,7 @@ def test_robust_similarity_without_outliers_is_least_squares() -> None:
 
 
 def test_truth_with_large_coordinates(tmp_path: Path) -> None:
-    result, frames = _result(), _frames(40)
+    result, frames = walk_result(), frame_set(40)
     far = np.array([691_234.5, 5_334_567.25, 540.0])
     true = Placement(Sim3(1 / 0.21, translation=far)).apply(result).world_T_rigs
     write_tum(tmp_path / "truth.tum", Trajectory(frames.timestamps + 0.004, true))
@@ -240,7 +191,7 @@ def test_truth_with_large_coordinates(tmp_path: Path) -> None:
 
 
 def test_truth_of_a_straight_walk_takes_the_roll_from_orientations(tmp_path: Path) -> None:
-    result, frames = _result(straight=True), _frames(40)
+    result, frames = walk_result(straight=True), frame_set(40)
     turn = Rotation.from_rotvec([1.0, 0.3, -0.4]).as_matrix()
     true = Placement(Sim3(7.0, turn, np.ones(3))).apply(result).world_T_rigs
     write_tum(tmp_path / "truth.tum", Trajectory(frames.timestamps, true))
@@ -254,13 +205,13 @@ def test_a_stuck_receiver_is_refused(
 ) -> None:
     upright = Placement(up="-y")
     monkeypatch.setattr("gsba.placement.placement._upright", lambda *_: upright)
-    result, frames = _result(), _frames(40)
+    result, frames = walk_result(), frame_set(40)
     path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, np.tile(ORIGIN, (40, 1)))
     settings = PlacementSettings(gps=str(path), up=up)  # type: ignore[arg-type]
     with pytest.raises(GsbaError, match="all 40 positions are the same: the receiver was stuck"):
         place(result, frames, settings)
     rng = np.random.default_rng(11)
-    path = _gps_csv(path, frames.timestamps, _geodetic(rng.normal(0, 2, (40, 3))))
+    path = _gps_csv(path, frames.timestamps, geodetic_of(rng.normal(0, 2, (40, 3))))
     with pytest.raises(GsbaError, match=r"gps.csv: its positions and the frames' have nothing"):
         place(result, frames, settings)
 
@@ -276,15 +227,15 @@ def test_a_stuck_receiver_is_refused(
 )
 def test_extreme_placements_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(GsbaError, match=message):
-        place(_result(), _frames(40), PlacementSettings(**settings))
+        place(walk_result(), frame_set(40), PlacementSettings(**settings))
 
 
 def test_times_that_are_only_an_order_place_nothing(tmp_path: Path) -> None:
-    result, frames = _result(), dataclasses.replace(_frames(40), timed=False)
+    result, frames = walk_result(), dataclasses.replace(frame_set(40), timed=False)
     write_tum(tmp_path / "t.tum", Trajectory(frames.timestamps, result.world_T_rigs))
     with pytest.raises(GsbaError, match="nothing says when frames were taken"):
         place(result, frames, PlacementSettings(align=str(tmp_path / "t.tum")))
-    path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, _geodetic(_level(result)))
+    path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, geodetic_of(level_metres(result)))
     with pytest.raises(GsbaError, match="nothing says when frames were taken"):
         place(result, frames, PlacementSettings(gps=str(path)))
 
@@ -336,7 +287,7 @@ def test_vertical_edges_make_up_exact(tmp_path: Path, tilt_deg: float) -> None:
     tilt = Rotation.from_rotvec([np.deg2rad(tilt_deg), 0, 0]).as_matrix()
     frames, rotations = _posts(tmp_path / "frames", tilt)
     turn = Rotation.from_rotvec([0.5, 1.0, -0.4]).as_matrix()
-    result = _result(len(frames))
+    result = walk_result(len(frames))
     result = dataclasses.replace(result, world_T_rigs=pose(turn @ rotations, np.zeros((6, 3))))
     found = gravity.estimate(result, frames)
     assert found is not None and found.num_edges >= 40
@@ -380,13 +331,13 @@ def test_without_edges_the_rigs_decide(tmp_path: Path) -> None:
 def test_bad_gps_files(tmp_path: Path, content: str, message: str) -> None:
     (tmp_path / "gps.csv").write_text(content)
     with pytest.raises(GsbaError) as failure:
-        place(_result(), _frames(40), PlacementSettings(gps=str(tmp_path / "gps.csv")))
+        place(walk_result(), frame_set(40), PlacementSettings(gps=str(tmp_path / "gps.csv")))
     assert message in str(failure.value) and "\n" not in str(failure.value)
 
 
 def test_positions_on_a_line_leave_a_roll_open(tmp_path: Path) -> None:
-    result, frames = _result(straight=True), _frames(40)
-    path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, _geodetic(_level(result)))
+    result, frames = walk_result(straight=True), frame_set(40)
+    path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, geodetic_of(level_metres(result)))
     with pytest.raises(GsbaError, match="lie on a line: add --up auto"):
         place(result, frames, PlacementSettings(gps=str(path)))
 
@@ -396,7 +347,7 @@ def _gsba(*arguments: object) -> Result:
 
 
 def test_bad_options(tmp_path: Path) -> None:
-    result, frames = _result(), _frames(40)
+    result, frames = walk_result(), frame_set(40)
     truth = tmp_path / "t.tum"
     write_tum(truth, Trajectory(frames.timestamps + 100, result.world_T_rigs))
     for settings, message in (

@@ -14,7 +14,7 @@ from textwrap import dedent
 import pytest
 from numba.core.dispatcher import Dispatcher
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 MODULES = sorted(
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
     for folder in ("factors", "gsba")

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from test_placement import ORIGIN, _frames, _geodetic, _level, _result
 from typer.testing import CliRunner
+from walk_on_earth import ORIGIN, frame_set, geodetic_of, level_metres, walk_result
 
 from gsba.cli import app
 from gsba.config import PlacementSettings, RefineSettings
@@ -86,7 +86,7 @@ def _jpeg(path: Path, tiff: bytes | None) -> Path:
 
 
 def _set(folder: Path, fixes: Sequence[tuple[float, float, float | None] | None]) -> FrameSet:
-    base = _frames(len(fixes))
+    base = frame_set(len(fixes))
     paths = [
         _jpeg(folder / f"{name}.jpg", _tiff(fix, "<>"[f % 2]))
         for f, (name, fix) in enumerate(zip(base.names, fixes, strict=True))
@@ -148,8 +148,8 @@ def test_what_pillow_writes_is_read(tmp_path: Path) -> None:
 
 
 def test_frames_are_placed_by_their_tags(tmp_path: Path) -> None:
-    result = _result()
-    fixes: list = [tuple(map(float, fix)) for fix in _geodetic(_level(result))]
+    result = walk_result()
+    fixes: list = [tuple(map(float, fix)) for fix in geodetic_of(level_metres(result))]
     fixes[3] = fixes[17] = None
     fixes[20] = (48.2, 11.6, 600.0)  # a false one
     frames = _set(tmp_path, fixes)
@@ -158,7 +158,7 @@ def test_frames_are_placed_by_their_tags(tmp_path: Path) -> None:
     assert (placed.unit, placed.up) == ("m", "z")
     assert placed.similarity.scale == pytest.approx(1 / 0.21, rel=1e-4)
     assert placed.grounds["gps"]["fixes"] == 38 and placed.grounds["gps"]["outliers"] == 1
-    level = _level(result)
+    level = level_metres(result)
     moved = placed.similarity.points(result.world_T_rigs[:, :3, 3])
     assert np.allclose(moved - moved[0], level - level[0], atol=2e-3)  # altitudes are in mm
     assert placed.origin is not None and np.allclose(placed.origin[:2], ORIGIN[:2], atol=1e-3)
@@ -181,7 +181,7 @@ def test_too_few_positions_are_one_line(tmp_path: Path) -> None:
         frames = _set(tmp_path, fixes)
         for fails in (
             lambda frames=frames: check(PlacementSettings(gps="exif"), frames),
-            lambda frames=frames: place(_result(), frames, PlacementSettings(gps="exif")),
+            lambda frames=frames: place(walk_result(), frames, PlacementSettings(gps="exif")),
         ):
             with pytest.raises(GsbaError, match=message):
                 fails()

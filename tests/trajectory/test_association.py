@@ -15,7 +15,7 @@ from gsba.trajectory.association import associate
 from gsba.trajectory.files import read_trajectory
 from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
 
-SHARED = Path(__file__).parents[2] / "shared" / "data"
+SHARED = Path(__file__).parents[3] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="no ../shared/data")
 SLAM, INTERPOLATED, EXTRAPOLATED, _ = PoseSource
 SPEED, RATE = np.array([0.5, -0.1, 1.0]), np.array([0.02, 0.1, -0.05])  # units/s, rad/s

@@ -1,0 +1,64 @@
+"""A walk in a world of its own, and where it is on the earth."""
+
+import dataclasses
+from pathlib import Path
+
+import export_scene as scene
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gsba.geometry import pose
+from gsba.placement.gps import local_from_geodetic
+from gsba.placement.placement import Placement
+from gsba.similarity import Sim3
+from gsba.types import FrameSet, Reconstruction
+
+ORIGIN = np.array([48.137, 11.575, 520.0])
+
+
+def frame_set(num: int = scene.NUM_FRAMES) -> FrameSet:
+    names = tuple(f"frame_{f:04d}" for f in range(num))
+    paths = tuple((Path(name),) for name in names)
+    return FrameSet(names, paths, np.arange(num) * 0.5, "erp", (), 512, 256, (None,) * num)
+
+
+def walk_result(num: int = 40, straight: bool = False) -> Reconstruction:
+    """A walk in a world turned, scaled and shifted at random against level metres."""
+    rng = np.random.default_rng(3)
+    t = np.linspace(0, 1, num)
+    path = np.column_stack([30 * t, 8 * np.sin(7 * t) * (not straight), 1.5 + 0.2 * np.cos(9 * t)])
+    if straight:
+        path[:, 2] = 1.5
+    poses = pose(Rotation.from_rotvec(rng.normal(0, 0.3, (num, 3))).as_matrix(), path)
+    base = scene.reconstruction()
+    keep = base.observation_frames < 0
+    world = dataclasses.replace(
+        base,
+        world_T_rigs=poses,
+        pose_covariances=np.tile(np.diag([1.0, 2, 3, 4, 5, 6]) * 1e-6, (num, 1, 1)),
+        pose_statuses=np.zeros(num, np.uint8),
+        observation_points=base.observation_points[keep],
+        observation_frames=base.observation_frames[keep],
+        observation_bearings=base.observation_bearings[keep],
+        observation_sigmas=base.observation_sigmas[keep],
+    )
+    turn = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+    return Placement(Sim3(0.21, turn, np.array([3.0, -2.0, 5.0]))).apply(world)
+
+
+def level_metres(result: Reconstruction) -> np.ndarray:
+    """True level metres of the frames of `walk_result`: the inverse of what was done there."""
+    turn = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+    return (result.world_T_rigs[:, :3, 3] - [3.0, -2.0, 5.0]) @ turn / 0.21
+
+
+def geodetic_of(local: np.ndarray) -> np.ndarray:
+    """Latitude, longitude, altitude of metres east, north, up: Newton on the forward formula."""
+    found = np.tile(ORIGIN, (len(local), 1))
+    for _ in range(6):
+        off = local - local_from_geodetic(found, ORIGIN)
+        metres = 111_320.0
+        found += np.column_stack(
+            [off[:, 1] / metres, off[:, 0] / metres / np.cos(np.deg2rad(ORIGIN[0])), off[:, 2]]
+        )
+    return found
