@@ -59,7 +59,7 @@ def refine(
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         fresh: forget an earlier run in `out`.
-        extra_factors: makes factors of your own on the keys graph.X(frame); they join every
+        extra_factors: makes factors of your own on the keys gsba.X(frame); they join every
             bundle adjustment (and those are then never resumed).
 
     Raises:
@@ -107,26 +107,31 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     """
     rounds, families = run.settings.rounds, run.settings.factors
     patch_rounds = run.settings.patches.rounds
+    # Neighbours in time, and what they say of the trajectory and its clock.
     prior, near = frontend.match_neighbours(run, seen, prior, given)
     prior, near = frontend.judge_trajectory(run, seen, prior, near)
     if prior.turning_only:
         return prior, Map.of(prior.start(), seen.keypoints)
+    # A chain of relative poses, then all that neighbours have in common.
     start = prior.start()
     solved = backend.adjust(run, seen, prior, "chain", [near.matches], start, rounds.chain)
     along = frontend.match_along_epipolars(run, seen, solved)
     known = frontend.match_known_points(run, seen, solved, "near", loops_closed=False)
     solved = backend.adjust(run, seen, prior, "dense", [along, known], solved, rounds.dense)
+    # One map, its loops closed; closer looks where images hold it poorly.
     prior, solved, (along, known) = _merge_maps(run, seen, prior, near, solved, (along, known))
     prior, solved, loops = frontend.close_loops(run, seen, prior, solved)
     matches = [along, known, loops]
     solved = backend.adjust(run, seen, prior, "closed", matches, solved, rounds.loops)
     prior = backend.measure_strength(run, seen, prior, solved)
     seen, solved, along = _look_closer(run, seen, prior, solved, along)
+    # The map matched anew from itself.
     for n in range(1, rounds.map_passes + 1):
         wide = frontend.match_known_points(run, seen, solved, f"everywhere{n}")
         name, final = f"refined{n}", n == rounds.map_passes and patch_rounds == 0
         matches = [along, wide]
         solved = backend.adjust(run, seen, prior, name, matches, solved, rounds.refined, final)
+    # Below a pixel: patches, pixels, splats.
     world = Map.of(solved, seen.keypoints)
     for n in range(1, patch_rounds + 1):
         world = backend.align_patches(run, prior, world, n)
