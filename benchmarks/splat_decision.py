@@ -32,14 +32,7 @@ from gsba.store.store import load_stage
 from gsba.types import Keypoints, Solution, Tracks, Trajectory
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from splat_moves import (  # type: ignore[import-not-found]
-    HARMS,
-    Given,
-    harmed,
-    run,
-    settings_for,
-    spoiled,
-)
+from splat_moves import HARMS, Given, harmed, run, settings_for, spoiled  # type: ignore[import-not-found]
 from tiny_run import SETTINGS, Case, make_case  # type: ignore[import-not-found]
 
 KINDS: dict[str, dict[str, str]] = {

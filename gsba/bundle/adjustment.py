@@ -20,15 +20,7 @@ from gsba.bundle import prior_factors, triangulation
 from gsba.bundle.optimizer import marginal_covariances, optimize
 from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.config import RefineSettings, SolverSettings
-from gsba.types import (
-    JointErrors,
-    Keypoints,
-    Landmarks,
-    Round,
-    Sighted,
-    Solution,
-    Tracks,
-)
+from gsba.types import JointErrors, Keypoints, Landmarks, Round, Sighted, Solution, Tracks
 
 logger = logging.getLogger(__name__)
 

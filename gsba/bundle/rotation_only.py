@@ -13,14 +13,7 @@ import numpy as np
 from factors import tangent_basis
 from gsba.bundle.reconstruction import assemble
 from gsba.geometry import pose
-from gsba.types import (
-    CoarsePoses,
-    Keypoints,
-    PoseStatus,
-    Reconstruction,
-    Solution,
-    Tracks,
-)
+from gsba.types import CoarsePoses, Keypoints, PoseStatus, Reconstruction, Solution, Tracks
 
 logger = logging.getLogger(__name__)
 

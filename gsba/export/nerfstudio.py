@@ -15,13 +15,7 @@ from typing import Any
 import numpy as np
 
 from gsba.camera.rig import RIG_R_FACE
-from gsba.export.images import (
-    face_size_for,
-    has_masks,
-    suffix_of,
-    write_faces,
-    write_panoramas,
-)
+from gsba.export.images import face_size_for, has_masks, suffix_of, write_faces, write_panoramas
 from gsba.export.ply import write_splat_points
 from gsba.types import FACES, FrameSet, Reconstruction
 

@@ -17,12 +17,7 @@ from gsba.loop_closure.retrieval import looks_of
 from gsba.matching import recovery
 from gsba.matching.guided_search import MatchContext
 from gsba.similarity import relative_map
-from gsba.types import (
-    Counts,
-    Keypoints,
-    Solution,
-    VerifiedPairs,
-)
+from gsba.types import Counts, Keypoints, Solution, VerifiedPairs
 
 _LOOKS = 3  # places compared for each frame
 MIN_SHARE = 0.25  # of the matches, to measure a pair at all: consistency decides

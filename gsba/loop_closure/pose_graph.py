@@ -7,9 +7,7 @@ import numpy as np
 
 from gsba.bundle.prior_factors import X
 from gsba.geometry import inverse
-from gsba.types import (
-    Solution,
-)
+from gsba.types import Solution
 
 _STEP_DEG, _STEP = 0.2, 0.02  # noise of a confirmed step; of its position, typical lengths
 _LOOP_DEG, _LOOP = 0.3, 0.05  # the same of a loop

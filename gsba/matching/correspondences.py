@@ -8,11 +8,7 @@ from gsba.config import RefineSettings
 from gsba.geometry import inverse
 from gsba.matching import pairs, verification
 from gsba.matching.guided_search import Gate, MatchContext
-from gsba.types import (
-    Matches,
-    Solution,
-    VerifiedPairs,
-)
+from gsba.types import Matches, Solution, VerifiedPairs
 
 _ROTATION_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # frames between those matched
 _ROTATION_DEG = 2.0  # around where a chain of turns sees a keypoint

@@ -30,15 +30,7 @@ from gsba.pipeline.run import Run
 from gsba.splat import refinement
 from gsba.splat.refinement import SplatResult
 from gsba.store.store import digest
-from gsba.types import (
-    Keypoints,
-    Matches,
-    Reconstruction,
-    Sighted,
-    Solution,
-    Tracks,
-    VerifiedPairs,
-)
+from gsba.types import Keypoints, Matches, Reconstruction, Sighted, Solution, Tracks, VerifiedPairs
 
 
 def adjust(

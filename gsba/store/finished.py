@@ -7,10 +7,7 @@ import numpy as np
 
 from gsba.log import GsbaError
 from gsba.store.store import load_stage
-from gsba.types import (
-    FrameSet,
-    Reconstruction,
-)
+from gsba.types import FrameSet, Reconstruction
 
 
 def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:

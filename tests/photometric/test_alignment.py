@@ -15,15 +15,7 @@ from gsba.config import PatchSettings, RefineSettings
 from gsba.frames.panorama import Greys
 from gsba.geometry import inverse, pose
 from gsba.photometric import alignment
-from gsba.types import (
-    Counts,
-    FrameSet,
-    Keypoints,
-    Landmarks,
-    Sighted,
-    Solution,
-    Tracks,
-)
+from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Sighted, Solution, Tracks
 
 NUM, WIDTH = 6, 512
 RIG = CubeRig(128, np.pi / 2)

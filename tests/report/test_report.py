@@ -11,12 +11,7 @@ import pytest
 from gsba.config import RefineSettings
 from gsba.disk import write_json
 from gsba.geometry import inverse, pose, rotation_from_quaternion
-from gsba.report.report import (
-    build_report,
-    frame_quality,
-    median_residual_deg,
-    write_poses,
-)
+from gsba.report.report import build_report, frame_quality, median_residual_deg, write_poses
 from gsba.store.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
 

@@ -18,15 +18,7 @@ from gsba.splat.density import DensityLimits, Pull, densify, reset_opacity
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.metrics import psnr
 from gsba.splat.rasterise import render
-from gsba.splat.train import (
-    Views,
-    advance,
-    begin,
-    extent_of,
-    most_gaussians,
-    times_for,
-    train,
-)
+from gsba.splat.train import Views, advance, begin, extent_of, most_gaussians, times_for, train
 
 SIZE = 32
 RIG = CubeRig(SIZE, np.pi / 2)
