@@ -112,7 +112,7 @@ def verified(
     sigmas: np.ndarray | None,
     context: MatchContext,
 ) -> VerifiedPairs:
-    """Matches whose geometry holds: see `verify.run`."""
+    """Matches whose geometry holds: see `verification.verify`."""
     settings, threads = context.settings, context.num_threads
     return verification.verify(
         found, context.keypoints, f0_T_f1s, sigmas, settings.verify, settings.seed, threads
