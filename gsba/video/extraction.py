@@ -48,7 +48,7 @@ class _Kept:
 
 
 def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = False) -> Counts:
-    """Write frames of an equirectangular video to a folder that `gsba.read.scan` understands.
+    """Write frames of an equirectangular video to a folder that `gsba.frames.scan` understands.
 
     Times count from the first frame shown; they are the container's presentation times, whatever
     the frame rate does. A call that was interrupted goes on where it stopped.
