@@ -1,6 +1,12 @@
 """Factors for 360-degree bundle adjustment on GTSAM: reference factors, batched blocks."""
 
-from factors.bearing import BearingFactor, BearingTerm, bearing_residuals, tangent_basis
+from factors.bearing import (
+    BearingFactor,
+    BearingTerm,
+    LensBearingFactor,
+    bearing_residuals,
+    tangent_basis,
+)
 from factors.block import Block, PoseSystem
 from factors.check import jacobian_errors
 from factors.landmarks import LandmarkBlock
@@ -23,6 +29,7 @@ __all__ = [
     "Block",
     "FaceCameras",
     "LandmarkBlock",
+    "LensBearingFactor",
     "PatchPixels",
     "PatchSet",
     "PatchTable",

@@ -111,6 +111,13 @@ def whitened_residual(obs, o, dx, dy, dz):
 
 
 @_part
+def _seen_residual(obs, o, x, y, z):
+    """As `whitened_residual`, the point being at (x, y, z) as seen from the rig's own centre."""
+    origin = obs.origins[o]
+    return whitened_residual(obs, o, x - origin[0], y - origin[1], z - origin[2])
+
+
+@_part
 def rig_vector(pose, point):
     """Components of a world point seen from the rig, in the rig frame: world_R_rig^T (X - t)."""
     x, y, z = point[0] - pose[9], point[1] - pose[10], point[2] - pose[11]
@@ -184,7 +191,7 @@ def _point_normal(obs, j, point, poses, normal):
     for o in range(obs.offsets[j], obs.offsets[j + 1]):
         pose = poses[obs.frames[o]]
         dx, dy, dz = rig_vector(pose, point)
-        valid, r0, r1, a0, a1, a2, b0, b1, b2 = whitened_residual(obs, o, dx, dy, dz)
+        valid, r0, r1, a0, a1, a2, b0, b1, b2 = _seen_residual(obs, o, dx, dy, dz)
         rho, w = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)
         cost += rho
         if valid:
@@ -256,7 +263,7 @@ def eliminate_range(
                 num += 1
             pose = poses[f]
             dx, dy, dz = rig_vector(pose, point)
-            valid, r0, r1, a0, a1, a2, b0, b1, b2 = whitened_residual(obs, o, dx, dy, dz)
+            valid, r0, r1, a0, a1, a2, b0, b1, b2 = _seen_residual(obs, o, dx, dy, dz)
             rho, w = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)
             costs[obs.families[o]] += rho
             cost += rho
@@ -284,7 +291,7 @@ def _substituted_step(obs, j, point, poses, steps, normal):
     for o in range(obs.offsets[j], obs.offsets[j + 1]):
         pose, step = poses[obs.frames[o]], steps[obs.frames[o]]
         dx, dy, dz = rig_vector(pose, point)
-        valid, r0, r1, a0, a1, a2, b0, b1, b2 = whitened_residual(obs, o, dx, dy, dz)
+        valid, r0, r1, a0, a1, a2, b0, b1, b2 = _seen_residual(obs, o, dx, dy, dz)
         if not valid:
             continue
         w = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)[1]
@@ -347,4 +354,4 @@ def residuals_range(first, last, obs, points, poses, residuals, valid):
     for j in range(first, last):
         for o in range(obs.offsets[j], obs.offsets[j + 1]):
             dx, dy, dz = rig_vector(poses[obs.frames[o]], points[j])
-            valid[o], residuals[o, 0], residuals[o, 1] = whitened_residual(obs, o, dx, dy, dz)[:3]
+            valid[o], residuals[o, 0], residuals[o, 1] = _seen_residual(obs, o, dx, dy, dz)[:3]

@@ -21,6 +21,7 @@ class Observations(NamedTuple):
     families: np.ndarray  # (O,) uint8, whose cost it counts to
     measurements: np.ndarray  # (O, 3): unit bearing, rig frame | u, v in pixels, row of cameras
     whiteners: np.ndarray  # (O, 3): [s00, s01, s11] of the upper triangular 2x2 sqrt information
+    origins: np.ndarray  # (O, 3): where the ray starts, rig frame, map units
     cameras: np.ndarray  # (C, 12): [rig_R_face row-major (9), focal, principal u, v in pixels]
     longest: int  # most observations of one landmark
     loss: int  # code of the robust loss
@@ -62,6 +63,11 @@ class Term(Protocol):
         """(C, 12) rows as in Observations, which the measurements count from 0."""
         ...
 
+    @property
+    def origins_rig(self) -> np.ndarray | None:
+        """(O, 3) rows as in Observations; None = the rig's own centre."""
+        ...
+
 
 def sort_observations(
     terms: Sequence[Term], num_frames: int, num_points: int, loss: RobustLoss
@@ -100,6 +106,7 @@ def sort_observations(
         families=np.zeros(len(order), dtype=np.uint8),
         measurements=np.empty((len(order), 3)),
         whiteners=np.empty((len(order), 3)),
+        origins=np.zeros((len(order), 3)),
         cameras=np.concatenate([np.zeros((0, 12)), *(term.cameras() for term in terms)]),
         longest=int(np.diff(offsets).max(initial=0)),
         loss=loss.code,
@@ -111,6 +118,8 @@ def sort_observations(
         obs.kinds[rows], obs.families[rows] = term.kind, names.index(term.name)
         obs.measurements[rows] = term.measurements()
         obs.whiteners[rows] = term.whiteners()
+        if term.origins_rig is not None:
+            obs.origins[rows] = term.origins_rig
         if len(term.cameras()):
             obs.measurements[rows, 2] += num_cameras
             num_cameras += len(term.cameras())
@@ -138,6 +147,9 @@ def check_term(term: Term, num_frames: int, num_points: int) -> None:
         raise ValueError(f"term {term.name!r}: point index out of range 0..{num_points - 1}")
     if not np.all(np.isfinite(rows)):
         raise ValueError(f"term {term.name!r}: measurements must be finite")
+    origins = term.origins_rig
+    if origins is not None and not (origins.shape == (len(rows), 3) and np.isfinite(origins).all()):
+        raise ValueError(f"term {term.name!r}: origins must be finite, ({len(rows)}, 3)")
     num_cameras = len(term.cameras())
     if num_cameras and not (rows[:, 2].min() >= 0 and rows[:, 2].max() < num_cameras):
         raise ValueError(f"term {term.name!r}: face index out of range 0..{num_cameras - 1}")

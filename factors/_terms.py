@@ -7,13 +7,15 @@ import numpy as np
 
 
 def rig_vectors(
-    world_T_rigs: np.ndarray, points_world: np.ndarray
+    world_T_rigs: np.ndarray, points_world: np.ndarray, origins_rig: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points seen from their rigs, `d = world_R_rig^T (X - rig_in_world)`.
+    """Points seen from their rigs, `d = world_R_rig^T (X - rig_in_world) - origin`.
 
     Args:
         world_T_rigs: (N, 4, 4) float64.
         points_world: (N, 3) float64, world.
+        origins_rig: (N, 3) rig frame, where each ray starts; None = the rig's centre. By these,
+            the Jacobian of d is minus one.
 
     Returns:
         d (N, 3) in the rig frame, its Jacobians by the pose (N, 3, 6), a right perturbation
@@ -26,7 +28,7 @@ def rig_vectors(
     by_pose[:, 1, 0], by_pose[:, 1, 2] = d[:, 2], -d[:, 0]
     by_pose[:, 2, 0], by_pose[:, 2, 1] = -d[:, 1], d[:, 0]
     by_pose[:, :, 3:] = -np.eye(3)
-    return d, by_pose, rig_R_world
+    return d if origins_rig is None else d - origins_rig, by_pose, rig_R_world
 
 
 def pose_rows(values: gtsam.Values, keys: Sequence[int]) -> np.ndarray:

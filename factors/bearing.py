@@ -34,7 +34,10 @@ def tangent_basis(bearings: np.ndarray) -> np.ndarray:
 
 
 def bearing_residuals(
-    world_T_rigs: np.ndarray, points_world: np.ndarray, bearings_rig: np.ndarray
+    world_T_rigs: np.ndarray,
+    points_world: np.ndarray,
+    bearings_rig: np.ndarray,
+    origins_rig: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Tangent-plane residuals of bearings and their Jacobians.
 
@@ -42,13 +45,15 @@ def bearing_residuals(
         world_T_rigs: (N, 4, 4) float64, pose that sees each observation.
         points_world: (N, 3) float64, world.
         bearings_rig: (N, 3) float64, unit, measured, rig frame.
+        origins_rig: (N, 3) float64, rig frame, where each ray starts; None = the rig's centre.
+            The Jacobian by them is minus that by the point, times world_R_rig.
 
     Returns:
         residuals (N, 2) in radians along `tangent_basis(bearings_rig)`, Jacobians by the pose
         (N, 2, 6) and by the point (N, 2, 3). Zero Jacobians exactly opposite the measurement;
         at the rig's centre, where there is no direction, also the residual (pi, 0).
     """
-    d, d_pose, d_point = rig_vectors(world_T_rigs, points_world)
+    d, d_pose, d_point = rig_vectors(world_T_rigs, points_world, origins_rig)
     axes = tangent_basis(bearings_rig)
     xy = np.einsum("nij,nj->ni", axes, d)
     z = np.einsum("nj,nj->n", bearings_rig, d)
@@ -83,6 +88,8 @@ class BearingTerm:
     sigmas_rad: np.ndarray | float = 1.0  # () or (O,) radians, per axis
     sqrt_infos: np.ndarray | None = None  # (O, 2, 2) 1/rad on tangent_basis; replaces sigmas_rad
     name: str = "bearing"
+    origins_rig: np.ndarray | None = None  # (O, 3) map units, rig frame: where each ray starts,
+    # the centre of its lens; None = the rig\'s own centre
 
     kind = BEARING
 
@@ -118,3 +125,37 @@ def BearingFactor(
         return bearing_residuals(world_T_rig, point, measured)
 
     return custom_factor(pose_key, point_key, noise_model, residual)
+
+
+def LensBearingFactor(
+    pose_key: int,
+    point_key: int,
+    centre_key: int,
+    bearing_rig: np.ndarray,
+    noise_model: gtsam.noiseModel.Base,
+    sign: float = 1.0,
+) -> gtsam.CustomFactor:
+    """One bearing seen through a lens beside the rig's centre: the reference for lens centres.
+
+    Args:
+        pose_key, point_key: keys of a Pose3 `world_T_rig` and of a Point3.
+        centre_key: of a Point3, the front lens in the rig frame, map units.
+        bearing_rig: (3,) unit, rig frame.
+        noise_model: of dimension 2, radians on `tangent_basis(bearing_rig)`, robust or not.
+        sign: 1 for the front lens, -1 for one as far behind the rig's centre.
+    """
+    measured = np.asarray(bearing_rig, dtype=np.float64)[None]
+
+    def error(_factor, values: gtsam.Values, jacobians) -> np.ndarray:
+        world_T_rig = values.atPose3(pose_key).matrix()[None]
+        origin = sign * values.atPoint3(centre_key)[None]
+        residuals, by_pose, by_point = bearing_residuals(
+            world_T_rig, values.atPoint3(point_key)[None], measured, origin
+        )
+        if jacobians is not None:
+            by_centre = -sign * by_point[0] @ world_T_rig[0, :3, :3]
+            for n, jacobian in enumerate((by_pose[0], by_point[0], by_centre)):
+                jacobians[n] = np.asfortranarray(jacobian)
+        return residuals[0]
+
+    return gtsam.CustomFactor(noise_model, [pose_key, point_key, centre_key], error)

@@ -185,6 +185,7 @@ class LandmarkBlock:
             families=obs.families[rows],
             measurements=obs.measurements[rows],
             whiteners=obs.whiteners[rows],
+            origins=obs.origins[rows],
         )
         keys = [self.pose_keys[f] for f in global_frames]
         num = len(keys)

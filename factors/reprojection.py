@@ -30,6 +30,7 @@ def reprojection_residuals(
     pixels: np.ndarray,
     faces: np.ndarray,
     cameras: FaceCameras,
+    origins_rig: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Pixel residuals (predicted minus measured) and their Jacobians.
 
@@ -38,13 +39,14 @@ def reprojection_residuals(
         points_world: (N, 3) float64, world.
         pixels: (N, 2) float64, measured (u, v), corner origin.
         faces: (N,) int, row of `cameras`.
+        origins_rig: (N, 3) float64, rig frame, where each ray starts; None = the rig's centre.
 
     Returns:
         residuals (N, 2) pixels, Jacobians by the pose (N, 2, 6) and by the point (N, 2, 3), and
         `in_front (N,)` bool. Behind its face a point gets zero Jacobians and the constant
         residual (2 focal, 2 focal), as in GTSAM's projection factors.
     """
-    d, d_pose, d_point = rig_vectors(world_T_rigs, points_world)
+    d, d_pose, d_point = rig_vectors(world_T_rigs, points_world, origins_rig)
     face_R_rigs = np.swapaxes(np.asarray(cameras.rig_R_faces, dtype=np.float64)[faces], 1, 2)
     focals = np.asarray(cameras.focals, dtype=np.float64)[faces]
     local = np.einsum("nij,nj->ni", face_R_rigs, d)
@@ -73,6 +75,8 @@ class ReprojectionTerm:
     sigmas_px: np.ndarray | float = 1.0  # () or (O,) pixels, per axis
     sqrt_infos: np.ndarray | None = None  # (O, 2, 2) 1/pixel; replaces sigmas_px
     name: str = "reprojection"
+    origins_rig: np.ndarray | None = None  # (O, 3) map units, rig frame: where each ray starts,
+    # the centre of its lens; None = the rig\'s own centre
 
     kind = REPROJECTION
 
