@@ -23,6 +23,7 @@ from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
 from gsba import refine
 from gsba.bundle import adjustment, prior_factors, stitching, triangulation
+from gsba.bundle.shared_parameters import of_points
 from gsba.config import RefineSettings
 from gsba.frames import cubemap, panorama
 from gsba.geometry import angular_errors
@@ -47,7 +48,7 @@ class Variant:
 def split(landmarks: Landmarks, seed: int) -> tuple[Landmarks, Landmarks]:
     """Points to solve with, and points held out."""
     held = np.random.default_rng(seed).random(landmarks.tracks.num_points) < SHARE
-    return stitching._of_points(landmarks, ~held), stitching._of_points(landmarks, held)
+    return of_points(landmarks, ~held), of_points(landmarks, held)
 
 
 def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[Variant], Sighted]:

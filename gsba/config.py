@@ -212,6 +212,53 @@ class PatchSettings(_Settings):
         return size
 
 
+# What makers and owners say of cameras: millimetres between the lenses' centres with a standard
+# deviation, and milliseconds from the first row to the last one; None = not known.
+CAMERAS: dict[str, tuple[tuple[float, float], float | None]] = {
+    "dji-osmo-360": ((25.0, 1.5), 24.0),
+    "gopro-max": ((30.0, 3.0), None),
+    "insta360-one-rs-1inch": ((40.0, 2.0), None),
+    "insta360-x3": ((23.0, 1.5), None),
+    "insta360-x5": ((32.0, 1.0), 11.8),
+}
+_READOUT_SIGMA = 0.1  # of a duration that is said, part of it: modes of a camera differ
+_Way = Literal["+x", "-x", "+y", "-y"]
+
+
+class CameraSettings(_Settings):
+    """Two lenses back to back, each with a centre of its own, read row by row."""
+
+    model: Literal["auto", "central", "two_lens"] = "auto"  # auto: two lenses where they predict
+    # what they were not found from; panoramas only
+    name: Literal[tuple(CAMERAS)] | None = None  # type: ignore[valid-type]  # for what is said of it
+    min_gain: float = Field(
+        default=0.01, ge=0, lt=1
+    )  # share of the robust cost of unseen observations that two centres must take off
+    seam_deg: float = Field(default=4.0, ge=0, le=20)  # from the seam: pictures blended, left out
+    baseline_mm: float | None = Field(
+        default=None, ge=2, le=200
+    )  # between the lenses, as the maker says: tells the metric scale
+    readout_ms: float | None = Field(default=None, gt=0, le=200)  # first row to last, as is said
+    sweep: tuple[_Way, _Way] | None = None  # which way rows of the front and of the back lens are
+    # read, x right and y down in the panorama's middle; None = found
+
+    def baseline(self) -> tuple[float, float] | None:
+        """Metres between the lenses, and their standard deviation."""
+        if self.baseline_mm is not None:
+            return 1e-3 * self.baseline_mm, 0.0
+        if self.name is None:
+            return None
+        length, sigma = CAMERAS[self.name][0]
+        return 1e-3 * length, 1e-3 * sigma
+
+    def readout(self) -> tuple[float, float] | None:
+        """Seconds of the readout as is said, and their standard deviation."""
+        said = self.readout_ms
+        if said is None and self.name is not None:
+            said = CAMERAS[self.name][1]
+        return None if said is None else (1e-3 * said, 1e-3 * _READOUT_SIGMA * said)
+
+
 class StitchingSettings(_Settings):
     """What stitching bends, found as a smooth field on the sphere that all frames share."""
 
@@ -345,7 +392,8 @@ class PlacementSettings(_Settings):
     """Where the exported world is: upright, to scale, on the earth; the run itself stays put."""
 
     up: Literal["auto", "none"] = "none"  # auto: gravity from rigs and vertical edges
-    length: float | None = Field(default=None, gt=0)  # metres between the two of `between`
+    length: Annotated[float, Field(gt=0)] | Literal["lens"] | None = None  # metres between the two
+    # of `between`, or by the distance between the lenses
     between: tuple[str, str] | None = None  # frames by name, or points "x,y,z" of the run's world
     gps: _Text | None = None  # file of positions, or "exif": metres, east-north-up
     align: _Text | None = None  # TUM file of true poses: its world and unit
@@ -366,6 +414,7 @@ class RefineSettings(_Settings):
     priors: PriorSettings = PriorSettings()
     rounds: RoundSettings = RoundSettings()
     patches: PatchSettings = PatchSettings()
+    camera: CameraSettings = CameraSettings()
     stitching: StitchingSettings = StitchingSettings()
     solver: SolverSettings = SolverSettings()
     factors: tuple[Literal["bearing", "reprojection", "photometric", "splat"], ...] = Field(
@@ -377,10 +426,19 @@ class RefineSettings(_Settings):
     placement: PlacementSettings = PlacementSettings()
     seed: int = Field(default=0, ge=0, le=_MAX_SEED)
 
+    def direct_families(self) -> tuple[str, ...]:
+        """Those that compare pixels of whole frames."""
+        return tuple(name for name in self.factors if name in ("photometric", "splat"))
+
+    def untimed(self) -> "RefineSettings":
+        """Without what is said in seconds, for frames whose times are no more than an order."""
+        camera = self.camera.model_copy(update={"name": None, "readout_ms": None})
+        return self.model_copy(update={"camera": camera})
+
     def plainer(self) -> "RefineSettings":
         """For a first solution: features alone, without patches, pixels or splats."""
         unaligned = self.patches.model_copy(update={"rounds": 0})
-        families = tuple(name for name in self.factors if name not in ("photometric", "splat"))
+        families = tuple(name for name in self.factors if name not in self.direct_families())
         return self.model_copy(update={"patches": unaligned, "factors": families})
 
     @model_validator(mode="before")

@@ -52,6 +52,15 @@ def inverse(a_T_b: np.ndarray) -> np.ndarray:
     return pose(b_R_a, -np.einsum("...ij,...j->...i", b_R_a, a_T_b[..., :3, 3]))
 
 
+def moved_to(world_T_rigs: np.ndarray, origins_rig: np.ndarray | None) -> np.ndarray:
+    """Poses (O, 4, 4) moved to where rays start, (O, 3) in the rig frame; None = as they are."""
+    if origins_rig is None:
+        return world_T_rigs
+    moved = world_T_rigs.copy()
+    moved[:, :3, 3] += np.einsum("oij,oj->oi", world_T_rigs[:, :3, :3], origins_rig)
+    return moved
+
+
 def angular_errors(
     world_T_rigs: np.ndarray, points_world: np.ndarray, bearings_rig: np.ndarray
 ) -> np.ndarray:

@@ -139,6 +139,16 @@ class Keypoints:
     colors: np.ndarray  # (N, 3) uint8, RGB
     sqrt_infos: np.ndarray | None = None  # (N, 2, 2) 1/rad on the bearings' tangent_basis: the
     # square-root information where noise depends on the direction; None = 1 / sigmas_rad
+    origins_rig: np.ndarray | None = None  # (N, 3) float64, rig frame, map units: where each ray
+    # starts; None = the rig's centre
+
+    def origins_of(self, rows: np.ndarray) -> np.ndarray | None:
+        """Where the rays of some rows (O,) start, (O, 3); None = the rig's centre."""
+        return None if self.origins_rig is None else self.origins_rig[rows]
+
+    def frames(self) -> np.ndarray:
+        """Frame (N,) of each."""
+        return np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
 
     def bearings_of(self, frame: int) -> np.ndarray:
         """Bearings (K, 3) of one frame."""
@@ -231,6 +241,13 @@ class Tracks:
     def hosts(self) -> np.ndarray:
         """First frame (J,) that sees each point: the one it goes with."""
         return self.frames[np.searchsorted(self.points, np.arange(self.num_points))]
+
+    def of(self, points: np.ndarray, rows: np.ndarray | None = None) -> "Tracks":
+        """Points `points (J,)` bool alone, renumbered; of their observations `rows (O,)` bool."""
+        kept = points[self.points] if rows is None else points[self.points] & rows
+        numbers = (np.cumsum(points) - 1).astype(np.int32)[self.points[kept]]
+        num = int(np.count_nonzero(points))
+        return Tracks(numbers, self.frames[kept], self.keypoints[kept], num)
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,6 +386,10 @@ class Reconstruction:
     components: np.ndarray | None = None  # (F,) int32, map that each frame is in, 0 = the largest:
     # nothing ties one map to another, each has a world of its own; None = there is one
     joint_errors: JointErrors | None = None  # those whose own covariances are above; None = none
+    observation_origins: np.ndarray | None = None  # (O, 3) float64, rig frame, map units: where
+    # each ray starts; None = the rig's centre
+    lens_baseline: tuple[float, float] | None = None  # between two lenses, map units, and its
+    # standard deviation; None = there is one
 
     def largest_map(self) -> np.ndarray:
         """Frames (F',) int64 of the largest map: those that are exported."""
@@ -384,6 +405,7 @@ class Reconstruction:
         number[rows] = np.arange(len(rows))
         seen = number[self.observation_frames] >= 0
         points, which = np.unique(self.observation_points[seen], return_inverse=True)
+        origins = self.observation_origins
         return replace(
             self,
             world_T_rigs=self.world_T_rigs[rows],
@@ -396,6 +418,7 @@ class Reconstruction:
             observation_frames=number[self.observation_frames[seen]].astype(np.int32),
             observation_bearings=self.observation_bearings[seen],
             observation_sigmas=self.observation_sigmas[seen],
+            observation_origins=None if origins is None else origins[seen],
             components=None,
             joint_errors=self.joint_errors and self.joint_errors.taken(rows),
         )

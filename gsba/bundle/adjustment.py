@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 _LEAST = 1e-3  # times its claimed sigma: no observation is better than that
 _WIDE = 20.0  # gate in sigmas for observations whose noise is not known yet
-_DRAWS = 500  # errors of all poses, that tell how those of different ones belong together
+DRAWS = 500  # errors of all poses, that tell how those of different ones belong together
 _REDUNDANT = 0.1  # least share of residual dimensions left over by the unknowns
 
 
@@ -73,7 +73,9 @@ def calibrate(sighted: Sighted, before: Solution, settings: RefineSettings) -> S
     tracks, keypoints = sighted.tracks, sighted.keypoints
     rows, poses = keypoints.rows(tracks), before.world_T_rigs
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
-    placed = triangulation.triangulate(tracks, bearings, sigmas, poses, _WIDE, settings.triangulate)
+    placed = triangulation.triangulate(
+        tracks, bearings, sigmas, poses, _WIDE, settings.triangulate, 1, keypoints.origins_of(rows)
+    )
     factors = np.ones(len(keypoints.faces))
     for group in (sighted.aligned, ~sighted.aligned):
         chosen = group[keypoints.rows(placed.tracks)]
@@ -114,7 +116,11 @@ def adjust(
     settings = problem.settings
     rows = keypoints.rows(tracks)
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
-    shared = {"settings": settings.triangulate, "num_threads": problem.num_threads}
+    shared = {
+        "settings": settings.triangulate,
+        "num_threads": problem.num_threads,
+        "origins_rig": keypoints.origins_of(rows),
+    }
     place = partial(triangulation.triangulate, tracks, bearings, sigmas, **shared)
     last_gate = gates[-1] * noise
     support = len(place(world_T_rigs, last_gate).tracks)
@@ -159,12 +165,13 @@ def landmark_block(
     rig, settings = problem.rig, problem.settings
     tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
     share = noise * np.sqrt(len({"bearing", "reprojection"} & set(settings.factors)))
-    terms = []
+    terms, origins = [], keypoints.origins_of(rows)
     if "bearing" in settings.factors:
         sigmas, infos = share * keypoints.sigmas_rad[rows], keypoints.sqrt_infos
         roots = None if infos is None else infos[rows] / share
         bearings = keypoints.bearings_rig[rows]
-        terms.append(BearingTerm(tracks.frames, tracks.points, bearings, sigmas, roots))
+        term = BearingTerm(tracks.frames, tracks.points, bearings, sigmas, roots)
+        terms.append(replace(term, origins_rig=origins))
     if "reprojection" in settings.factors:
         bearings, faces = keypoints.bearings_rig[rows], keypoints.faces[rows]
         cosines = np.einsum("oi,oi->o", bearings, RIG_R_FACE[faces, :, 2])
@@ -172,9 +179,8 @@ def landmark_block(
         num = len(RIG_R_FACE)
         cameras = FaceCameras(RIG_R_FACE, np.full(num, rig.focal), np.full((num, 2), rig.principal))
         pixels = keypoints.pixels[rows]
-        terms.append(
-            ReprojectionTerm(tracks.frames, tracks.points, pixels, faces, cameras, sigmas_px)
-        )
+        term = ReprojectionTerm(tracks.frames, tracks.points, pixels, faces, cameras, sigmas_px)
+        terms.append(replace(term, origins_rig=origins))
     return LandmarkBlock(
         [prior_factors.X(f) for f in range(len(keypoints.starts) - 1)],
         landmarks.points_world,
@@ -196,7 +202,7 @@ def pose_covariances(
     held.push_back(prior_factors.fixed_scale(solved.world_T_rigs, components))
     keys = [prior_factors.X(f) for f in range(len(solved.world_T_rigs))]
     values = values_of(solved.world_T_rigs)
-    return marginal_covariances(held, [block], values, keys, _DRAWS, problem.settings.seed)
+    return marginal_covariances(held, [block], values, keys, DRAWS, problem.settings.seed)
 
 
 def _noise(
@@ -217,6 +223,8 @@ def _noise(
     points, bearings = landmarks.points_world[tracks.points], keypoints.bearings_rig[rows]
     world_T_rig = world_T_rigs[tracks.frames]
     offsets = np.einsum("oji,oj->oi", world_T_rig[:, :3, :3], points - world_T_rig[:, :3, 3])
+    if keypoints.origins_rig is not None:
+        offsets -= keypoints.origins_rig[rows]
     residuals = np.einsum("oij,oj->oi", tangent_basis(bearings), offsets)
     residuals /= np.linalg.norm(offsets, axis=1, keepdims=True)  # sines: the angles are small
     unknowns = 3 * landmarks.tracks.num_points + 6 * len(world_T_rigs)

@@ -165,6 +165,7 @@ def marginal_covariances(
     keys: Sequence[int],
     num_draws: int = 0,
     seed: int = 0,
+    beside: Sequence[int] = (),
 ) -> tuple[np.ndarray, JointErrors]:
     """Marginal covariances of Pose3 variables, and what their errors have in common.
 
@@ -174,9 +175,10 @@ def marginal_covariances(
         keys: (F,) keys of Pose3 variables, in the order of the path.
         num_draws: errors drawn of all poses at once.
         seed: of these.
+        beside: (B,) keys of other variables, of at most six dimensions: their covariances follow.
 
     Returns:
-        (F, 6, 6) float64, [rotation rad, translation], rig frame, and joint errors. NaN for a pose
+        (F + B, 6, 6) float64, [rotation rad, translation], rig frame, and joint errors. NaN for one
         that nothing constrains, and for all where the rest is singular (the gauge is not fixed).
     """
     num = len(keys)
@@ -185,7 +187,9 @@ def marginal_covariances(
     found = system.covariances(num_draws, np.random.default_rng(seed))
     if found is None:
         nothing = np.full((num_draws, num, 6), np.nan, np.float32)
-        return np.full((num, 6, 6), np.nan), JointErrors(np.full((num - 1, 6, 6), np.nan), nothing)
+        return np.full((num + len(beside), 6, 6), np.nan), JointErrors(
+            np.full((num - 1, 6, 6), np.nan), nothing
+        )
     inverse, between, drawn = found
-    rows = [system.first_block[key] for key in keys]
-    return inverse[rows], JointErrors(between, drawn[:, rows].astype(np.float32))
+    rows = [system.first_block[key] for key in (*keys, *beside)]
+    return inverse[rows], JointErrors(between, drawn[:, rows[:num]].astype(np.float32))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsba.geometry import angular_errors
+from gsba.geometry import angular_errors, furthest, moved_to
 from gsba.log import GsbaError
 from gsba.similarity import NoSimilarityError, Sim3, pose_similarity
 from gsba.types import (
@@ -46,8 +46,7 @@ def assemble(
     Raises:
         GsbaError: not where the trajectory has its frames, or residuals that no solution leaves.
     """
-    world_T_rigs, landmarks = adjustment.world_T_rigs, adjustment.landmarks
-    seen = adjustment.observations()
+    landmarks, seen = adjustment.landmarks, adjustment.observations()
     refined = seen >= min_observations
     known = refined & (coarse.sources == PoseSource.SLAM)
     if false_frames is not None:
@@ -57,8 +56,9 @@ def assemble(
     rows = keypoints.rows(landmarks.tracks)
     points = landmarks.tracks.points
     lengths = np.bincount(points, minlength=len(landmarks.points_world))
-    bearings = keypoints.bearings_rig[rows]
-    poses = world_T_rigs[landmarks.tracks.frames]
+    bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
+    origins = keypoints.origins_of(rows)
+    poses = moved_to(adjustment.world_T_rigs[landmarks.tracks.frames], origins)
     errors = angular_errors(poses, landmarks.points_world[points], bearings)
     _require_small(errors)
     channels = keypoints.colors[rows].T
@@ -73,11 +73,19 @@ def assemble(
         points,
         landmarks.tracks.frames,
         bearings,
-        adjustment.noise * keypoints.sigmas_rad[rows],
+        adjustment.noise * sigmas,
         correction,
         components,
         joint_errors and joint_errors.scaled(stretch),
+        None if origins is None else stretch[landmarks.tracks.frames, 3:] * origins,
     )
+
+
+def world_scale(solved: Solution, result: Reconstruction) -> float:
+    """Unit of a solution in the world of the result that was assembled from it."""
+    rows = result.largest_map()
+    lengths = [furthest(T[rows, :3, 3])[1] for T in (solved.world_T_rigs, result.world_T_rigs)]
+    return lengths[1] / lengths[0] if lengths[0] > 0 else 1.0
 
 
 def _require_small(errors: np.ndarray) -> None:

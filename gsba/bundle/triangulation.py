@@ -5,6 +5,7 @@ import numpy as np
 from factors.compiled import kernel_and_part
 from factors.threads import balanced_ranges, run_in_threads
 from gsba.config import TriangulateSettings
+from gsba.geometry import moved_to
 from gsba.types import Counts, Landmarks, Tracks
 
 _kernel, _part = kernel_and_part()
@@ -19,6 +20,7 @@ def triangulate(
     max_error_sigmas: float,
     settings: TriangulateSettings,
     num_threads: int = 1,
+    origins_rig: np.ndarray | None = None,
 ) -> Landmarks:
     """Triangulate every track and drop what does not fit.
 
@@ -34,10 +36,12 @@ def triangulate(
         max_error_sigmas: gate on the angle between observation and point, in sigmas.
         settings: limits on parallax and track length.
         num_threads: that share the tracks.
+        origins_rig: (O, 3) rig frame, where each ray starts; None = the rig's centre.
     """
     starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
-    rays = np.einsum("oij,oj->oi", world_T_rigs[tracks.frames, :3, :3], bearings_rig)
-    centres = world_T_rigs[tracks.frames, :3, 3]
+    world_T_lenses = moved_to(world_T_rigs[tracks.frames], origins_rig)
+    rays = np.einsum("oij,oj->oi", world_T_lenses[:, :3, :3], bearings_rig)
+    centres = world_T_lenses[:, :3, 3]
     points = np.zeros((tracks.num_points, 3))
     inliers = np.zeros(len(rays), np.int64)
     parallaxes = np.zeros(tracks.num_points)
@@ -54,14 +58,7 @@ def triangulate(
     short = lengths < settings.min_track_length
     flat = ~short & (parallaxes < np.deg2rad(settings.min_parallax_deg))
     kept = ~short & ~flat
-    rows = np.flatnonzero(inliers.astype(bool) & kept[tracks.points])
-    renumbered = np.cumsum(kept) - 1
-    survivors = Tracks(
-        renumbered[tracks.points[rows]].astype(np.int32),
-        tracks.frames[rows],
-        tracks.keypoints[rows],
-        int(kept.sum()),
-    )
+    survivors = tracks.of(kept, inliers.astype(bool))
     counts = Counts(
         tracks.num_points,
         survivors.num_points,

@@ -77,6 +77,10 @@ def refine(
     timestamps: Annotated[
         Path | None, typer.Option(help="Times of the frames.", metavar="FILE")
     ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(help="Its name, for what is said of it: insta360-x5, ...", metavar="NAME"),
+    ] = None,
     fps: Annotated[
         float | None,
         typer.Option(help="Frames per second, from time 0; of a video: frames kept per second."),
@@ -92,6 +96,8 @@ def refine(
     if keyframes is not None and no_trajectory:
         raise GsbaError("--keyframes go with the TRAJECTORY of the same run")
     overrides = [*_networks(weights, accept_noncommercial, download), *(overrides or ())]
+    if camera is not None:
+        overrides = [*overrides, f'camera.name="{camera}"']
     settings = _settings(config, overrides, factors)
     from gsba import pipeline
 

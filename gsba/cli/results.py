@@ -24,6 +24,19 @@ if TYPE_CHECKING:
     from gsba.types import Trajectory
 
 
+Length = Annotated[
+    str | None,
+    typer.Option(
+        help="Metres between the two of --between; lens: by the distance between the lenses.",
+        metavar="LENGTH",
+    ),
+]
+Millimetres = Annotated[
+    float | None,
+    typer.Option(help="Millimetres between the lenses, for --scale lens.", metavar="MM"),
+]
+
+
 @command
 def export(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
@@ -38,9 +51,8 @@ def export(
     ] = None,
     face_size: Annotated[int | None, typer.Option(help="Pixels of a cube face.")] = None,
     up: Annotated[str, typer.Option(help="auto: turn the world upright; none: leave it.")] = "none",
-    scale: Annotated[
-        float | None, typer.Option(help="Metres between the two of --between.", metavar="LENGTH")
-    ] = None,
+    scale: Length = None,
+    baseline: Millimetres = None,
     between: Annotated[
         tuple[str, str] | None,
         typer.Option(help="Two frames, or points x,y,z of the run's world.", metavar="A B"),
@@ -66,18 +78,36 @@ def export(
 
     if to not in list(ExportFormat):
         raise GsbaError(f"--to {to} is not known: use one of {', '.join(ExportFormat)}")
-    asked = {"up": up, "length": scale, "between": between, "gps": gps, "align": align}
+    asked = {"up": up, "length": _length(scale), "between": between, "gps": gps, "align": align}
     settings = validated({"placement": asked, "export": {"face_size": face_size}}).placement
     from gsba.placement.placement import place
     from gsba.store.finished import load_run
 
     reconstruction, frames, *_ = load_run(run)
     folder = out or run / to
-    placement = place(reconstruction, frames, settings)
+    said = _baseline(run, baseline) if scale == "lens" else None
+    placement = place(reconstruction, frames, settings, said)
     write(reconstruction, frames, folder, ExportFormat(to), face_size, placement, link)
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
     typer.echo(f"{to}: {folder}")
+
+
+def _baseline(run: Path, millimetres: float | None) -> tuple[float, float] | None:
+    """Metres between the lenses and their standard deviation: as given, or as the run was told."""
+    from gsba.config_file import load_config, validated
+
+    if millimetres is None:
+        return load_config(run / "config.toml").camera.baseline()
+    return validated({"camera": {"baseline_mm": millimetres}}).camera.baseline()
+
+
+def _length(text: str | None) -> float | str | None:
+    """A length as it is given; what is no number is left to the settings to refuse."""
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return text
 
 
 @command

@@ -78,9 +78,15 @@ def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
 
 def match_along_epipolars(context: MatchContext, solved: Solution) -> Matches:
     """Match neighbours in time again, along the epipolar lines of poses that are nearly right."""
-    poses, refined = solved.world_T_rigs, context.settings.pairs.refined
+    poses, settings = solved.world_T_rigs, context.settings
+    refined = settings.pairs.refined
     chosen = pairs.adjacent(len(poses))
-    gates = [_gate(refined.rotation_deg, refined.direction, context.settings)] * len(chosen)
+    lengths = np.linalg.norm(poses[chosen[:, 1], :3, 3] - poses[chosen[:, 0], :3, 3], axis=1)
+    apart = 2 * float(np.linalg.norm(context.lenses.centre))  # a ray may start at either lens
+    gates = [
+        _gate(refined.rotation_deg, refined.direction + apart / max(length, 1e-12), settings)
+        for length in lengths
+    ]
     return context.match(chosen, poses, gates)
 
 

@@ -7,13 +7,14 @@ never compared: this is the speed, and the defence against repeated structure.
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from threading import Lock
 from typing import Protocol
 
 import numpy as np
 
+from gsba.camera.lens import Lenses
 from gsba.camera.rig import RIG_R_FACE, owner_faces
 from gsba.config import MatchingSettings, RefineSettings
 from gsba.geometry import inverse
@@ -33,6 +34,7 @@ class Gate:
     direction: float  # tangent of the uncertainty of the translation direction
     max_parallax_rad: float  # largest angle between both bearings in one orientation
     point_rad: float = 0.0  # uncertainty of the bearing of a point of known depth
+    lenses: Lenses = field(default_factory=Lenses)  # of the frame that looks for known points
 
     @classmethod
     def anywhere(cls) -> "Gate":
@@ -141,7 +143,7 @@ def match_pair(
         Rows(first.bearings, first.descriptors, first.tails),
         Rows(second.bearings @ rotation.T, second.descriptors, second.tails),
         Cells(second.starts, second.centres @ rotation.T, second.radii),
-        _targets(f0_T_f1, points_f0, first.keypoints),
+        _targets(f0_T_f1, points_f0, first.keypoints, gate.lenses),
         points_f0 is not None,
         direction,
         limits,
@@ -165,7 +167,7 @@ def within_gate(
     return passes(
         first.bearings_rig[pairs[:, 0]].astype(np.float32),
         second.bearings_rig[pairs[:, 1]].astype(np.float32) @ rotation.T,
-        _targets(f0_T_f1, points_f0, pairs[:, 0]),
+        _targets(f0_T_f1, points_f0, pairs[:, 0], gate.lenses),
         points_f0 is not None,
         direction,
         limits,
@@ -189,13 +191,17 @@ def _limits(
 
 
 def _targets(
-    f0_T_f1: np.ndarray, points_f0: np.ndarray | None, keypoints: np.ndarray
+    f0_T_f1: np.ndarray, points_f0: np.ndarray | None, keypoints: np.ndarray, lenses: Lenses
 ) -> np.ndarray:
     """Directions (n, 3) float32 from frame 1, in frame 0's axes, of the points of keypoints (n,)
     of frame 0; NaN where unknown."""
     if points_f0 is None:
         return np.full((len(keypoints), 3), np.nan, np.float32)
     offsets = points_f0[keypoints] - f0_T_f1[:3, 3]
+    if lenses:
+        rotation = f0_T_f1[:3, :3]
+        seen = offsets @ rotation
+        offsets = offsets - lenses.origins(seen, np.zeros(len(seen), int)) @ rotation.T
     lengths = np.linalg.norm(offsets, axis=1, keepdims=True)
     return (offsets / np.maximum(lengths, 1e-12)).astype(np.float32)
 
@@ -285,6 +291,7 @@ class MatchContext:
     settings: RefineSettings  # of pairs, matching and verification
     num_threads: int  # pairs matched at a time
     matcher: Matcher = guided  # compares two frames
+    lenses: Lenses = field(default_factory=Lenses)  # that keypoints are seen through
 
     def match(
         self,
@@ -297,6 +304,11 @@ class MatchContext:
         guided_only: bool = False,
     ) -> Matches:
         """Match frame pairs as `match` does, on demand by guided search whatever the matcher."""
+        if self.lenses:
+            gates = [
+                replace(gate, lenses=self.lenses.of_frame(int(f1)))
+                for gate, (_, f1) in zip(gates, pairs, strict=True)
+            ]
         frames = self.strongest if strongest else self.frames
         how = self.settings.matching, self.num_threads
         matcher = guided if guided_only else self.matcher

@@ -11,6 +11,7 @@ from factors import tangent_basis
 from factors.patches import ALIGNED, REASONS, PatchSet, Sightings, expect, found_at
 from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
+from gsba.camera.lens import Lenses
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import PatchSettings
 from gsba.frames import panorama
@@ -25,6 +26,7 @@ _TOLERANCE = 0.02  # of the last step, pixels
 _LEAST_SIGMA = 0.03  # pixels: what sampling and a plane for the surface cost the best of patches
 
 _STRAIGHT = SphereField.none()
+_ONE_CENTRE = Lenses()
 
 _Mask: TypeAlias = np.ndarray | None  # (H, 2H) bool, True = use
 
@@ -51,6 +53,7 @@ def align(
     settings: PatchSettings,
     num_threads: int,
     field: SphereField = _STRAIGHT,
+    lenses: Lenses = _ONE_CENTRE,
 ) -> Sighted:
     """Observe every point anew, in the frames that should show it.
 
@@ -69,6 +72,7 @@ def align(
         settings: limits and sizes.
         num_threads: frames worked on at a time.
         field: of the camera; keypoints are as observed, the map as corrected.
+        lenses: that see the points; nothing is looked for where two pictures are blended.
 
     Returns:
         Tracks of aligned observations, and of former ones where a point was not aligned.
@@ -76,11 +80,9 @@ def align(
     rows = references(landmarks, world_T_rigs)
     hosts = landmarks.tracks.frames[rows].astype(np.int64)
     extended = _extended(landmarks, keypoints, aligned, settings.min_track_length)
-    points, seeing = visible_frames(landmarks, world_T_rigs, rows, extended, settings)
-    placed = landmarks.points_world, world_T_rigs[hosts]
-    origins, spreads, planes = _patches(*placed, greys.width, field)
-    at, across = _carried(landmarks.points_world[points], planes[points], world_T_rigs[seeing])
-    sightings = expect(points, field.observed(at), across)
+    origins, spreads, seeing, sightings = _expected(
+        landmarks, world_T_rigs, rows, extended, greys.width, settings, field, lenses
+    )
     reach = _SEARCH * settings.max_shift_px
     sigmas = settings.affine_sigma, settings.grey_sigma
     patches = PatchSet(len(hosts), settings.patch_size, _WINDOW, *sigmas)
@@ -96,13 +98,42 @@ def align(
     kept, found, dropped = _accepted(patches, sightings, seeing, 2 * np.pi / greys.width, settings)
     at_hosts = _at_hosts(patches, sightings, kept, hosts, origins, spreads)
     former = _former(landmarks, keypoints, noise, [found, at_hosts], greys.num_frames)
-    counts = Counts(len(points), len(found.points), "observations", dropped)
+    counts = Counts(len(seeing), len(found.points), "observations", dropped)
     colors = keypoints.colors[keypoints.rows(landmarks.tracks)[rows]]
     return _pack([found, at_hosts, former], colors, greys.num_frames, rig, counts)
 
 
+def _expected(
+    landmarks: Landmarks,
+    world_T_rigs: np.ndarray,
+    rows: np.ndarray,
+    extended: np.ndarray,
+    width: int,
+    settings: PatchSettings,
+    field: SphereField,
+    lenses: Lenses,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Sightings]:
+    """Patches (directions (J, 3) and axes (J, 3, 2)) in their hosts, and where frames (R,) should
+    show them."""
+    hosts = landmarks.tracks.frames[rows].astype(np.int64)
+    points, seeing = visible_frames(landmarks, world_T_rigs, rows, extended, settings)
+    places = landmarks.points_world
+    origins, spreads, planes = _patches(places, world_T_rigs[hosts], hosts, width, field, lenses)
+    at, across = _carried(places[points], planes[points], world_T_rigs[seeing], seeing, lenses)
+    if lenses:
+        blended = lenses.blended(origins, hosts)[points] | lenses.blended(at, seeing)
+        clear = ~blended
+        points, seeing, at, across = points[clear], seeing[clear], at[clear], across[clear]
+    return origins, spreads, seeing, expect(points, field.observed(at), across)
+
+
 def _patches(
-    points_world: np.ndarray, world_T_hosts: np.ndarray, width: int, field: SphereField
+    points_world: np.ndarray,
+    world_T_hosts: np.ndarray,
+    hosts: np.ndarray,
+    width: int,
+    field: SphereField,
+    lenses: Lenses,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Plane patches that face their hosts, one panorama pixel to a step.
 
@@ -112,6 +143,8 @@ def _patches(
     """
     offsets = points_world - world_T_hosts[:, :3, 3]
     local = np.einsum("jba,jb->ja", world_T_hosts[:, :3, :3], offsets)
+    if lenses:
+        local = lenses.seeing(local, hosts)
     depths = np.linalg.norm(local, axis=1)
     origins = field.observed(local / np.maximum(depths, 1e-300)[:, None])
     spreads = 2 * np.pi / width * np.swapaxes(tangent_basis(origins), 1, 2)
@@ -120,11 +153,17 @@ def _patches(
 
 
 def _carried(
-    points_world: np.ndarray, planes_world: np.ndarray, world_T_rigs: np.ndarray
+    points_world: np.ndarray,
+    planes_world: np.ndarray,
+    world_T_rigs: np.ndarray,
+    frames: np.ndarray,
+    lenses: Lenses,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Plane patches (points (O, 3) and axes (O, 3, 2)) in their rigs' frames, at unit distance."""
     rotations = world_T_rigs[:, :3, :3]
     origins = np.einsum("oba,ob->oa", rotations, points_world - world_T_rigs[:, :3, 3])
+    if lenses:
+        origins = lenses.seeing(origins, frames)
     spreads = np.einsum("oba,obc->oac", rotations, planes_world)
     distances = np.maximum(np.linalg.norm(origins, axis=1), 1e-300)
     return origins / distances[:, None], spreads / distances[:, None, None]

@@ -334,7 +334,14 @@ def _adjusted(
     rows = keypoints.rows(tracks)
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
     placed = triangulation.triangulate(
-        tracks, bearings, sigmas, poses, gate * solved.noise, settings.triangulate, num_threads
+        tracks,
+        bearings,
+        sigmas,
+        poses,
+        gate * solved.noise,
+        settings.triangulate,
+        num_threads,
+        keypoints.origins_of(rows),
     )
     after = replace(solved, world_T_rigs=poses, landmarks=placed)
     accepted &= after.carries(solved, least)

@@ -7,15 +7,23 @@ import numpy as np
 
 from gsba.bundle import (
     adjustment,
+    camera_system,
     common_errors,
+    lens_axes,
+    lens_centres,
     map_strength,
+    readout,
     rotation_only,
     stitching,
     tracks,
     triangulation,
 )
+from gsba.bundle.camera_system import CameraCovariances
+from gsba.bundle.lens_axes import LensAxes
+from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of
 from gsba.bundle.map_strength import MapStrength
-from gsba.bundle.reconstruction import assemble
+from gsba.bundle.readout import Readout
+from gsba.bundle.reconstruction import assemble, world_scale
 from gsba.bundle.stitching import Stitching
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, map_merging
@@ -30,7 +38,19 @@ from gsba.pipeline.run import Run
 from gsba.splat import refinement
 from gsba.splat.refinement import SplatResult
 from gsba.store.store import digest
-from gsba.types import Keypoints, Matches, Reconstruction, Sighted, Solution, Tracks, VerifiedPairs
+from gsba.types import (
+    Keypoints,
+    Landmarks,
+    Matches,
+    Reconstruction,
+    Sighted,
+    Solution,
+    Tracks,
+    VerifiedPairs,
+)
+
+_CAMERA_ROUNDS = 3  # of what aligned patches say of the camera, and the adjustment under it
+_WIDE = 30.0  # gate in standard deviations of observations that a wrong camera threw off
 
 
 def adjust(
@@ -69,16 +89,122 @@ def place(
             settings.rounds.dense[-1] * solved.noise,
             settings.triangulate,
             run.num_threads,
+            seen.keypoints.origins_of(rows),
         )
         return replace(solved, landmarks=placed)
 
     return run.stage(name, [run.solving_key()], compute, Solution, noted=False)
 
 
+def guess_axes(
+    run: Run, seen: Seen, prior: Prior, name: str, matches: Sequence[Matches], solved: Solution
+) -> LensAxes:
+    """Which way two lenses would look, from matches as they came."""
+
+    def compute() -> LensAxes:
+        placed, loose = _widely_placed(run, seen, prior, matches, solved, _WIDE)
+        return lens_axes.guess(placed, seen.keypoints, loose, seen.lenses, run.problem(prior))
+
+    return run.stage(name, _camera_key(run), compute, LensAxes, noted=False)
+
+
+def find_lenses(
+    run: Run, seen: Seen, prior: Prior, name: str, matches: Sequence[Matches], solved: Solution
+) -> LensCentres:
+    """Where the lenses are, from matches that no solution has chosen among."""
+
+    def compute() -> LensCentres:
+        gate = run.settings.rounds.gate_scale if seen.lenses else _WIDE
+        placed, loose = _widely_placed(run, seen, prior, matches, solved, gate)
+        return lens_centres.estimate(placed, seen.keypoints, loose, seen.lenses, run.problem(prior))
+
+    return run.stage(name, _camera_key(run), compute, LensCentres)
+
+
+def find_stitch_radius(
+    run: Run, seen: Seen, prior: Prior, name: str, matches: Sequence[Matches], solved: Solution
+) -> StitchRadius:
+    """How far away panoramas take things to be, from the same under two lenses."""
+
+    def compute() -> StitchRadius:
+        gate = run.settings.rounds.gate_scale
+        placed, loose = _widely_placed(run, seen, prior, matches, solved, gate)
+        shown, problem = seen.shown.bearings_rig, run.problem(prior)
+        return lens_centres.stitched_for(placed, seen.keypoints, shown, loose, seen.lenses, problem)
+
+    return run.stage(name, _camera_key(run), compute, StitchRadius, noted=False)
+
+
+def find_readout(
+    run: Run, seen: Seen, prior: Prior, name: str, matches: Sequence[Matches], solved: Solution
+) -> Readout:
+    """How long rows are read and which way, from the same."""
+
+    def compute() -> Readout:
+        gate = run.settings.rounds.gate_scale
+        placed, loose = _widely_placed(run, seen, prior, matches, solved, gate)
+        shown, times, problem = seen.shown.bearings_rig, run.frames.timestamps, run.problem(prior)
+        return readout.estimate(placed, seen.keypoints, shown, loose, seen.lenses, times, problem)
+
+    return run.stage(name, _camera_key(run), compute, Readout)
+
+
+def settle_camera(
+    run: Run,
+    seen: Seen,
+    prior: Prior,
+    name: str,
+    matches: Sequence[Matches],
+    solved: Solution,
+    camera: Readout,
+) -> Readout:
+    """The camera that was found, from the same, and each frame's own motion and axes."""
+
+    def compute() -> Readout:
+        gate = run.settings.rounds.gate_scale
+        placed, loose = _widely_placed(run, seen, prior, matches, solved, gate)
+        loose, shown = replace(loose, landmarks=placed), seen.shown.bearings_rig
+        times, problem = run.frames.timestamps, run.problem(prior)
+        return camera_system.step(loose, seen.keypoints, shown, camera, times, problem)
+
+    return run.stage(name, _camera_key(run), compute, Readout, noted=False)
+
+
+def _camera_key(run: Run) -> list[object]:
+    camera = run.settings.camera
+    said = camera.model_dump(exclude={"name", "baseline_mm", "readout_ms"}), camera.readout()
+    return [run.solving_key(), said, run.settings.seed]
+
+
+def _widely_placed(
+    run: Run,
+    seen: Seen,
+    prior: Prior,
+    matches: Sequence[Matches],
+    solved: Solution,
+    gate: float,
+) -> tuple[Landmarks, Solution]:
+    """Points of matches with all within a gate in sigmas, and poses as unsure as that is wide."""
+    settings, found = run.settings, _tracks(seen, prior, matches)
+    rows = seen.keypoints.rows(found)
+    placed = triangulation.triangulate(
+        found,
+        seen.keypoints.bearings_rig[rows],
+        seen.keypoints.sigmas_rad[rows],
+        solved.world_T_rigs,
+        gate * solved.noise,
+        settings.triangulate,
+        run.num_threads,
+        seen.keypoints.origins_of(rows),
+    )
+    return placed, replace(solved, noise=solved.noise * gate / settings.rounds.gate_scale)
+
+
 def _tracks(seen: Seen, prior: Prior, matches: Sequence[Matches]) -> Tracks:
     """Tracks that matches make, within parts that nothing ties together yet."""
     tied = [connectivity.within(some, prior.parts) for some in matches]
-    return tracks.build(tied, np.diff(seen.keypoints.starts))
+    found = tracks.build(tied, np.diff(seen.keypoints.starts))
+    return seen.lenses.clear(found, seen.keypoints)
 
 
 def scattered(run: Run, prior: Prior, near: VerifiedPairs, solved: Solution) -> np.ndarray | None:
@@ -146,10 +272,26 @@ def align_patches(run: Run, prior: Prior, world: Map, number: int) -> Map:
     The map stays as it was where that explains less.
     """
     sighted = _align(run, world, f"align{number}")
-    better = _adjust_aligned(run, prior, world, sighted, f"aligned{number}")
+    better = _adjust_under_lenses(run, prior, world, sighted, number)
     if better is None:
         return world
     return _straighten(run, prior, better, sighted, number)
+
+
+def _adjust_under_lenses(
+    run: Run, prior: Prior, world: Map, sighted: Sighted, number: int
+) -> Map | None:
+    """Bundle adjustment of aligned observations, the camera found from them beside it."""
+    name = f"aligned{number}"
+    if not world.lenses:
+        return _adjust_aligned(run, prior, world, sighted, name)
+    for n in range(_CAMERA_ROUNDS):
+        seen = _see_anew(run, prior, world, sighted, name, n)
+        better = _adjust_aligned(run, prior, seen, sighted, f"{name}_{n}" if n else name)
+        if better is None:
+            return world if n else None
+        world = better
+    return world
 
 
 def _align(run: Run, world: Map, name: str) -> Sighted:
@@ -169,9 +311,56 @@ def _align(run: Run, world: Map, name: str) -> Sighted:
             settings,
             run.num_threads,
             world.field,
+            world.lenses,
         )
 
     return run.stage(name, settings.model_dump(exclude={"rounds"}), compute, Sighted)
+
+
+def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, number: int) -> Map:
+    """The map with the camera that aligned patches ask for; its poses are yet to follow."""
+
+    def placed_under(seeing: Map) -> tuple[Solution, Keypoints]:
+        there = replace(sighted, keypoints=seeing.rays(sighted.keypoints, run.rig))
+        there = adjustment.calibrate(there, world.solution, run.settings)
+        rows = there.keypoints.rows(there.tracks)
+        placed = triangulation.triangulate(
+            there.tracks,
+            there.keypoints.bearings_rig[rows],
+            there.keypoints.sigmas_rad[rows],
+            world.solution.world_T_rigs,
+            run.settings.rounds.aligned[0],
+            run.settings.triangulate,
+            run.num_threads,
+            there.keypoints.origins_of(rows),
+        )
+        return replace(world.solution, noise=1.0, landmarks=placed), there.keypoints
+
+    def axes() -> LensAxes:
+        solved, keypoints = placed_under(world)
+        problem = run.problem(prior)
+        return lens_axes.loosened(solved.landmarks, keypoints, solved, world.lenses, problem)
+
+    shown = stitching.corrected(sighted.keypoints, world.field, run.rig).bearings_rig
+    times = run.frames.timestamps
+
+    def rows() -> Readout:
+        solved, keypoints = placed_under(world)
+        around, problem = solved.landmarks, run.problem(prior)
+        return readout.estimate(around, keypoints, shown, solved, world.lenses, times, problem)
+
+    def settle() -> Readout:
+        solved, keypoints = placed_under(world)
+        problem = run.problem(prior)
+        return camera_system.step(solved, keypoints, shown, world.seeing(), times, problem)
+
+    key = _camera_key(run)
+    if number == 0 and world.lenses.twists is None:
+        world = world.read(run.stage(f"readout_{name}", key, rows, Readout))
+    if number == 1 and world.lenses.axes is None:  # the rest has settled
+        found = run.stage(f"axes_{name}", key, axes, LensAxes)
+        world = replace(world, axes=found).read(replace(world.seeing(), lenses=found.lenses))
+    return world.read(run.stage(f"camera_{name}_{number}", key, settle, Readout, noted=False))
 
 
 def _adjust_aligned(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str) -> Map | None:
@@ -179,8 +368,7 @@ def _adjust_aligned(run: Run, prior: Prior, world: Map, sighted: Sighted, name: 
     gates = run.settings.rounds.aligned
 
     def compute() -> tuple[Solution, Keypoints]:
-        corrected = stitching.corrected(sighted.keypoints, world.field, run.rig)
-        there = replace(sighted, keypoints=corrected)
+        there = replace(sighted, keypoints=world.rays(sighted.keypoints, run.rig))
         solved, found = adjustment.adjust_sighted(there, world.solution, run.problem(prior), gates)
         return solved, stitching.with_noise_of(sighted.keypoints, found)
 
@@ -201,7 +389,12 @@ def _straighten(run: Run, prior: Prior, world: Map, sighted: Sighted, number: in
 
     def compute() -> Stitching:
         return stitching.estimate(
-            sighted, world.observed, world.solution, world.field, run.problem(prior)
+            sighted,
+            world.observed,
+            world.solution,
+            world.field,
+            run.problem(prior),
+            world.lenses,
         )
 
     key = [run.solving_key(), settings.stitching, settings.rounds.aligned]
@@ -245,6 +438,29 @@ def refine_on_splat(run: Run, prior: Prior, world: Map) -> Map:
     return replace(world, solution=found.adjustment, moves=found.moves)
 
 
+def measure_camera(run: Run, prior: Prior, world: Map) -> Map:
+    """How well poses and camera are known beside each other."""
+    if world.centres is None or not world.lenses:
+        return world
+
+    def compute() -> CameraCovariances:
+        straight = stitching.corrected(world.observed, world.field, run.rig)
+        return camera_system.covariances(
+            world.solution,
+            world.lenses.seen(straight),
+            straight.bearings_rig,
+            world.seeing(),
+            run.frames.timestamps,
+            run.problem(prior),
+            prior.parts,
+        )
+
+    found = run.stage("camera", _camera_key(run), compute, CameraCovariances, noted=False)
+    centres = replace(world.centres, covariance=found.centre)
+    read = replace(world.seeing(), readout_sigma=found.readout_sigma)
+    return replace(world, centres=centres, covariances=found).read(read)
+
+
 def reconstruct(run: Run, seen: Seen, prior: Prior, world: Map) -> Reconstruction:
     """Covariances, and everything back in the trajectory's world; of a turn, rotations alone."""
     if prior.turning_only:
@@ -252,9 +468,12 @@ def reconstruct(run: Run, seen: Seen, prior: Prior, world: Map) -> Reconstructio
 
     def compute() -> Reconstruction:
         solved, observed, problem = world.solution, world.keypoints(run.rig), run.problem(prior)
-        claimed = adjustment.pose_covariances(solved, observed, problem, prior.parts)
+        if world.covariances is None:
+            claimed = adjustment.pose_covariances(solved, observed, problem, prior.parts)
+        else:
+            claimed = world.covariances.poses, world.covariances.joint
         covariances, joint = common_errors.added(*claimed, solved.world_T_rigs, prior.parts)
-        return assemble(
+        result = assemble(
             solved,
             covariances,
             observed,
@@ -265,6 +484,10 @@ def reconstruct(run: Run, seen: Seen, prior: Prior, world: Map) -> Reconstructio
             prior.parts,
             joint,
         )
+        if not world.lenses or world.centres is None:
+            return result
+        baseline = baseline_of(world.centres, world_scale(solved, result))
+        return replace(result, lens_baseline=baseline)
 
     return run.stage("reconstruction", run.solving_key(), compute, Reconstruction)
 

@@ -1,12 +1,13 @@
 """The front end of a run: keypoints as bearings, their matches, and what these say of the start."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
 from gsba import learned
+from gsba.camera.lens import Lenses
 from gsba.config import RefineSettings
 from gsba.features import detection, extraction
 from gsba.frames import panorama
@@ -31,12 +32,19 @@ class Seen:
     """What was found in the frames."""
 
     features: tuple[PerFrame[Features], ...]  # (F,) stage that holds each frame's
+    shown: Keypoints  # of all frames, where pictures show them
     context: MatchContext  # what matches them
+    lenses: Lenses = field(default_factory=Lenses)  # that its keypoints are seen through
 
     @property
     def keypoints(self) -> Keypoints:
-        """Of all frames, as bearings."""
+        """Of all frames, as rays of the lenses."""
         return self.context.keypoints
+
+    def through(self, lenses: Lenses) -> "Seen":
+        """The same, its keypoints as rays that start at these lenses."""
+        context = replace(self.context, keypoints=lenses.seen(self.shown), lenses=lenses)
+        return replace(self, context=context, lenses=lenses)
 
 
 def extract(run: Run) -> Seen:
@@ -52,7 +60,7 @@ def extract_more(run: Run, seen: Seen, weak: np.ndarray) -> Seen:
     settings = run.settings.model_copy(update={"features": enlarged})
     found = _extract(run, settings, "features_closer", weak)
     each = [found if more else before for more, before in zip(weak, seen.features, strict=True)]
-    return _see(run, "keypoints_closer", each, "features_closer")
+    return _see(run, "keypoints_closer", each, "features_closer").through(seen.lenses)
 
 
 def _extract(
@@ -75,15 +83,16 @@ def _see(run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str) -
     def gather() -> Keypoints:
         return detection.gather(map(load, range(len(frames))))
 
+    keypoints = run.chain.stage(name, None, gather, Keypoints, also=[stage])
     context = MatchContext(
         SearchableFrames(load),
         SearchableFrames(load, settings.pairs.strongest_per_face),
-        run.chain.stage(name, None, gather, Keypoints, also=[stage]),
+        keypoints,
         settings,
         run.num_threads,
         learned.make_matcher(settings, run.weights, run.rig.size),
     )
-    return Seen(tuple(found), context)
+    return Seen(tuple(found), keypoints, context)
 
 
 def match_neighbours(

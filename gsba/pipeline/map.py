@@ -6,7 +6,12 @@ import numpy as np
 
 from factors.sphere_field import SphereField
 from gsba.bundle import stitching
+from gsba.bundle.camera_system import CameraCovariances
+from gsba.bundle.lens_axes import LensAxes
+from gsba.bundle.lens_centres import LensCentres, StitchRadius
+from gsba.bundle.readout import Readout
 from gsba.bundle.stitching import Stitching
+from gsba.camera.lens import Lenses
 from gsba.camera.rig import CubeRig
 from gsba.splat.refinement import Move
 from gsba.types import FrameSet, Keypoints, Solution
@@ -21,21 +26,55 @@ class Map:
     frame_weights: np.ndarray  # (F,) float64, of each frame's pixels; below 1 they are doubted
     aligned: np.ndarray | None = None  # (N,) bool, observations that patches have confirmed
     stitching: Stitching | None = None  # with the field that corrects them; None = not looked for
+    centres: LensCentres | None = None  # of the lenses that see them; None = not looked for
+    axes: LensAxes | None = None  # where these look; None = not looked for
+    radius: StitchRadius | None = None  # what panoramas are stitched for; None = not looked for
+    readout: Readout | None = None  # how lenses are read; None = not looked for
+    covariances: CameraCovariances | None = None  # with these unknown beside the poses
     moves: tuple[Move, ...] = ()  # of the poses against a splat
 
     @classmethod
-    def of(cls, solution: Solution, keypoints: Keypoints) -> "Map":
-        """A solution of keypoints as features found them."""
-        return cls(solution, keypoints, np.ones(len(solution.world_T_rigs)))
+    def of(
+        cls,
+        solution: Solution,
+        keypoints: Keypoints,
+        centres: LensCentres | None = None,
+    ) -> "Map":
+        """A solution of keypoints as features found them, and the lenses it was solved with."""
+        weights = np.ones(len(solution.world_T_rigs))
+        return cls(solution, keypoints, weights, centres=centres)
+
+    def read(self, readout: Readout) -> "Map":
+        """The same seen by another camera."""
+        if self.centres is None:
+            return self
+        lenses = readout.lenses
+        centres = replace(self.centres, lenses=lenses, found=lenses.centre)
+        return replace(self, centres=centres, readout=readout)
 
     @property
     def field(self) -> SphereField:
         """What is known of what stitching bends."""
         return SphereField.none() if self.stitching is None else self.stitching.field
 
+    @property
+    def lenses(self) -> Lenses:
+        """What sees the observations."""
+        return Lenses() if self.centres is None else self.centres.lenses
+
+    def seeing(self) -> Readout:
+        """The camera."""
+        if self.readout is None:
+            return Readout(self.lenses, reason="not looked for")
+        return replace(self.readout, lenses=self.lenses)
+
     def keypoints(self, rig: CubeRig) -> Keypoints:
-        """What it is made of, where it really points."""
-        return stitching.corrected(self.observed, self.field, rig)
+        """What it is made of: where it really points, and from where."""
+        return self.rays(self.observed, rig)
+
+    def rays(self, keypoints: Keypoints, rig: CubeRig) -> Keypoints:
+        """Keypoints as observed, where they really point, and from where."""
+        return self.lenses.seen(stitching.corrected(keypoints, self.field, rig))
 
     def straightened(self, frames: FrameSet) -> FrameSet:
         """The frames, read without what stitching bends."""

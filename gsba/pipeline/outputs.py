@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from gsba.bundle.reconstruction import world_scale
 from gsba.config_file import to_toml
 from gsba.disk import write_json, write_text
 from gsba.export import ExportFormat, export, write_points
@@ -12,6 +13,7 @@ from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
 from gsba.placement.placement import Placement, place
 from gsba.report import findings
+from gsba.report.camera_findings import of_camera
 from gsba.report.html import residual_sphere, write_html
 from gsba.report.report import build_report, plain, write_poses
 from gsba.trajectory.files import write_tum
@@ -60,7 +62,7 @@ def write(run: Run, prior: Prior, world: Map, result: Reconstruction) -> RunResu
     write_poses(out / "poses.csv", frames, coarse, result)
     write_points(out / "points.ply", main)
     write_text(out / "config.toml", to_toml(settings))
-    placement = place(main, shown, settings.placement)
+    placement = place(main, shown, settings.placement, settings.camera.baseline())
     for name in settings.export.formats:
         _export(run, ExportFormat(name), main, shown, placement)
     report = _report(run, prior, world, result)
@@ -80,6 +82,22 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
     trajectory, notes = findings.of_trajectory(
         prior.trust, prior.clock, prior.merged, prior.joints, frames
     )
+    camera = None
+    if world.centres is not None:
+        camera, more = of_camera(
+            world.centres,
+            world.readout,
+            world.axes,
+            world.radius,
+            world.covariances,
+            world_scale(world.solution, result),
+            run.settings.camera,
+            frames.timed,
+        )
+        left_out = run.settings.direct_families() if world.lenses else ()
+        if left_out:
+            more.append(f"{' and '.join(left_out)} left out: they take a frame for one view point")
+        notes += more
     most = run.settings.closer.max_scale_sigma
     notes += findings.of_frames(frames, coarse, result, undone, world.frame_weights, most)
     report = build_report(
@@ -95,6 +113,7 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
         trajectory=trajectory,
         moves=world.moves,
         stitching=world.stitching and findings.of_field(world.stitching),
+        camera=camera,
     )
     report["residual_sphere"] = plain(residual_sphere(result), digits=4)
     return report

@@ -1,11 +1,14 @@
 """A run from frames and a coarse trajectory to refined poses, a cloud and datasets."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from gsba import video
+from gsba.camera.lens import Lenses
 from gsba.config import RefineSettings
 from gsba.frames.scan import scan
 from gsba.loop_closure import connectivity
@@ -21,6 +24,8 @@ from gsba.pipeline.run import Journal, Run
 from gsba.placement.placement import check
 from gsba.store.store import RunStore
 from gsba.types import CoarsePoses, FrameSet, Matches, Solution, Trajectory, VerifiedPairs
+
+_CAMERA_ROUNDS = 2  # of all that is to know of it, and the adjustment under it
 
 __all__ = ["RunResult", "refine", "solve"]
 
@@ -67,7 +72,7 @@ def refine(
     """
     frames, out = Path(frames), Path(out)
     settings, origin = settings or RefineSettings(), {"frames": frames}
-    check(settings.placement)
+    check(settings.placement, baseline=settings.camera.baseline())
     chosen = merging.choose(masks, segment)
     origin |= inputs.trajectory_files(trajectory, keyframes)
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
@@ -75,7 +80,7 @@ def refine(
         inputs.extract_frames(out, origin, settings, fps, fresh)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     frame_set = scan(frames, timestamps, fps, chosen.given, order_suffices=not given)
-    check(settings.placement, frame_set)
+    check(settings.placement, frame_set, settings.camera.baseline())
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh) as store:
         frame_set, journal = merging.before(store, frame_set, chosen), Journal()
@@ -105,13 +110,13 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     Raises:
         GsbaError: images that do not match, or that contradict the trajectory.
     """
-    rounds, families = run.settings.rounds, run.settings.factors
+    rounds, families = run.settings.rounds, run.settings.direct_families()
     patch_rounds = run.settings.patches.rounds
     # Neighbours in time, and what they say of the trajectory and its clock.
     prior, near = frontend.match_neighbours(run, seen, prior, given)
     prior, near = frontend.judge_trajectory(run, seen, prior, near)
     if prior.turning_only:
-        return prior, Map.of(prior.start(), seen.keypoints)
+        return prior, Map.of(prior.start(), seen.shown)
     # A chain of relative poses, then all that neighbours have in common.
     start = prior.start()
     solved = backend.adjust(run, seen, prior, "chain", [near.matches], start, rounds.chain)
@@ -123,6 +128,8 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     prior, solved, loops = frontend.close_loops(run, seen, prior, solved)
     matches = [along, known, loops]
     solved = backend.adjust(run, seen, prior, "closed", matches, solved, rounds.loops)
+    seen, world = _find_camera(run, seen, prior, matches, solved)
+    solved = world.solution
     prior = backend.measure_strength(run, seen, prior, solved)
     seen, solved, along = _look_closer(run, seen, prior, solved, along)
     # The map matched anew from itself.
@@ -132,14 +139,16 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
         matches = [along, wide]
         solved = backend.adjust(run, seen, prior, name, matches, solved, rounds.refined, final)
     # Below a pixel: patches, pixels, splats.
-    world = Map.of(solved, seen.keypoints)
+    world = replace(world, solution=solved, observed=seen.shown)
     for n in range(1, patch_rounds + 1):
         world = backend.align_patches(run, prior, world, n)
+    if world.lenses:  # pixels of whole frames are compared as views from one point
+        families = ()
     if "photometric" in families:
         world = backend.refine_photometric(run, prior, world)
     if "splat" in families:
         world = backend.refine_on_splat(run, prior, world)
-    return prior, world
+    return prior, backend.measure_camera(run, prior, world)
 
 
 def _merge_maps(
@@ -157,6 +166,38 @@ def _merge_maps(
     prior, solved = backend.merge_maps(run, seen, prior, solved, parts)
     along = frontend.match_along_epipolars(run, seen, solved, "adjacent2")
     return prior, solved, (along, connectivity.within(matches[1], parts))
+
+
+def _find_camera(
+    run: Run, seen: Seen, prior: Prior, matches: Sequence[Matches], solved: Solution
+) -> tuple[Seen, Map]:
+    """Lenses and readout, before gates take what tells of them; and the map that these give."""
+    settings = run.settings
+    if settings.camera.model == "central" or not run.frames.panoramic:
+        return seen, Map.of(solved, seen.shown)
+    looking = seen.through(Lenses())
+    guess = backend.guess_axes(run, looking, prior, "axes", matches, solved)
+    band, better, gates = np.deg2rad(settings.camera.seam_deg), solved, settings.rounds.loops
+    looking = seen.through(replace(guess.lenses, band_rad=float(band)))
+    for n in range(2):  # at first some part of the sequence may be bent against them
+        found = backend.find_lenses(run, looking, prior, f"lenses{n}", matches, better)
+        if not found.lenses:
+            return seen, Map.of(solved, seen.shown, found)
+        looking = seen.through(found.lenses)
+        better = backend.adjust(run, looking, prior, f"lensed{n}", matches, better, gates)
+        gates = settings.rounds.dense
+    radius = backend.find_stitch_radius(run, looking, prior, "stitch_radius", matches, better)
+    if not radius.reason:
+        looking = seen.through(radius.lenses)
+        better = backend.adjust(run, looking, prior, "lensed2", matches, better, gates)
+    read = backend.find_readout(run, looking, prior, "readout", matches, better)
+    for n in range(_CAMERA_ROUNDS):
+        looking = seen.through(read.lenses)
+        read = backend.settle_camera(run, looking, prior, f"camera{n}", matches, better, read)
+        looking = seen.through(read.lenses)
+        better = backend.adjust(run, looking, prior, f"settled{n}", matches, better, gates)
+    world = replace(Map.of(better, seen.shown, found), axes=guess, radius=radius)
+    return looking, world.read(read)
 
 
 def _look_closer(

@@ -13,6 +13,7 @@ from gsba.camera.rig import CubeRig
 from gsba.config import PriorSettings, RefineSettings
 from gsba.frames import cubemap
 from gsba.frames.panorama import Greys
+from gsba.log import GsbaError
 from gsba.photometric import direct
 from gsba.pipeline.prior import ExtraFactors, Prior
 from gsba.store.store import Chain, RunStore, fingerprint
@@ -77,6 +78,8 @@ class Run:
             GsbaError: frames that a chosen family cannot use, or weights that are not there.
         """
         direct.check(frames, settings)
+        if settings.camera.model == "two_lens" and not frames.panoramic:
+            raise GsbaError("camera.model = two_lens is for panoramas: cube faces hide the seam")
         chain = Chain(store)
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
         start = coarse.world_T_rigs.tolist(), settings.read
@@ -123,7 +126,8 @@ class Run:
             noise: of the trajectory; None = as in the settings.
         """
         graph = prior.graph(noise or self.settings.priors)
-        return Problem(graph, self.rig, self.settings, self.num_threads)
+        settings = self.settings if self.frames.timed else self.settings.untimed()
+        return Problem(graph, self.rig, settings, self.num_threads)
 
     def matching_key(self) -> list[object]:
         """Settings that matches rest on."""

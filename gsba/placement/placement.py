@@ -42,6 +42,7 @@ _SCALES = (1e-12, 1e12)  # that a run may be placed at; others are slips
 _FURTHEST = 1e12  # from the origin, in the placed unit
 _FAR = 1e4  # coordinates beyond lose digits as float32: an offset is kept apart
 _STUCK_M = 1e-3  # extent of positions, metres: a receiver that works scatters by more
+_MOST_SIGMA = 0.1  # of a scale by the lenses, part of it
 _LEVEL_SPREAD = 0.02  # of a path's second extent to its first: below, positions leave a roll open
 
 
@@ -73,13 +74,16 @@ class Placement:
         """A reconstruction in its place; angles, and what the images say, stay as they are."""
         poses, move = reconstruction.world_T_rigs, self.similarity
         stretch = np.array([1.0, 1, 1, *[move.scale] * 3])  # rig axes do not turn
-        joint = reconstruction.joint_errors
+        joint, origins = reconstruction.joint_errors, reconstruction.observation_origins
+        lenses = reconstruction.lens_baseline
         return dataclasses.replace(
             reconstruction,
             world_T_rigs=move.poses(poses),
             points_world=move.points(reconstruction.points_world),
             pose_covariances=reconstruction.pose_covariances * stretch[:, None] * stretch,
             joint_errors=joint and joint.scaled(np.tile(stretch, (len(poses), 1))),
+            observation_origins=None if origins is None else move.scale * origins,
+            lens_baseline=lenses and (move.scale * lenses[0], move.scale * lenses[1]),
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -134,7 +138,10 @@ def read_placement(path: Path) -> Placement:
 
 
 def place(
-    reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    settings: PlacementSettings,
+    baseline: tuple[float, float] | None = None,
 ) -> Placement:
     """Where the settings want the world of a run.
 
@@ -145,12 +152,13 @@ def place(
             the unit becomes the metre. `gps` gives metres east, north and up; together with `up` it
             decides heading, scale and place only; "exif" takes the positions in the pictures.
             `align` gives the world of the true poses.
+        baseline: metres between the lenses and their standard deviation, for a length of "lens".
 
     Raises:
         GsbaError: settings that exclude one another, or data that do not suffice.
     """
-    check(settings)
-    placement = _placement(reconstruction, frames, settings)
+    check(settings, baseline=baseline)
+    placement = _placement(reconstruction, frames, settings, baseline)
     placed = placement.similarity.points(reconstruction.world_T_rigs[:, :3, 3])
     far = np.abs(placed).max(initial=0)
     scale = placement.similarity.scale
@@ -163,7 +171,10 @@ def place(
 
 
 def _placement(
-    reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    settings: PlacementSettings,
+    baseline: tuple[float, float] | None,
 ) -> Placement:
     """What the settings ask for, however odd."""
     if settings.align is not None:
@@ -173,6 +184,8 @@ def _placement(
         placement = _upright(reconstruction, frames)
     if settings.gps is not None:
         return _on_earth(reconstruction, frames, Path(settings.gps), placement)
+    if settings.length == "lens":
+        return _by_lenses(reconstruction, baseline, placement)
     if settings.length is not None and settings.between is not None:
         first, second = (_point(end, reconstruction, frames) for end in settings.between)
         distance = float(np.linalg.norm(second - first))
@@ -184,12 +197,21 @@ def _placement(
     return placement
 
 
-def check(settings: PlacementSettings, frames: FrameSet | None = None) -> None:
+def check(
+    settings: PlacementSettings,
+    frames: FrameSet | None = None,
+    baseline: tuple[float, float] | None = None,
+) -> None:
     """Raise GsbaError for settings that exclude one another and for files that cannot be read.
 
     With `frames`, those of a run, also for pictures without the positions that are asked for.
     """
-    if (settings.length is None) != (settings.between is None):
+    if settings.length == "lens" and baseline is None:
+        raise GsbaError(
+            "--scale lens needs to know how far apart the lenses are: refine with --camera NAME or "
+            "--set camera.baseline_mm=MM, or export with --baseline MM (an Insta360 X5 has 32)"
+        )
+    if isinstance(settings.length, float) != (settings.between is not None):
         raise GsbaError("--scale LENGTH and --between A B need one another")
     ways = [settings.length is not None, settings.gps is not None, settings.align is not None]
     if sum(ways) > 1:
@@ -221,6 +243,44 @@ def _upright(reconstruction: Reconstruction, frames: FrameSet) -> Placement:
     }
     rotation = _least_turn(gravity.up, _UP_WORLD)
     return Placement(Sim3(rotation=rotation), up="-y", grounds={"gravity": grounds})
+
+
+def metres_per_unit(
+    lenses: tuple[float, float], baseline: tuple[float, float]
+) -> tuple[float, float]:
+    """Metric scale and its standard deviation, by what lies between two lenses.
+
+    Args:
+        lenses: map units, and their standard deviation.
+        baseline: metres, and their standard deviation.
+    """
+    scale = baseline[0] / lenses[0]
+    return scale, scale * float(np.hypot(lenses[1] / lenses[0], baseline[1] / baseline[0]))
+
+
+def _by_lenses(
+    reconstruction: Reconstruction, baseline: tuple[float, float] | None, placement: Placement
+) -> Placement:
+    """Metres, by what the maker says is between the lenses."""
+    if reconstruction.lens_baseline is None:
+        raise GsbaError(
+            "--scale lens: the run found no two lenses (report.json says why, under camera): "
+            "scale it by --scale LENGTH --between A B"
+        )
+    assert baseline is not None  # see check
+    scale, sigma = metres_per_unit(reconstruction.lens_baseline, baseline)
+    if not sigma < _MOST_SIGMA * scale:
+        raise GsbaError(
+            f"--scale lens: the distance between the lenses tells the scale to "
+            f"{100 * sigma / scale:.0f} % only; {100 * _MOST_SIGMA:.0f} % are needed"
+        )
+    grounds = {"baseline_m": baseline[0], "scale_sigma": sigma}
+    return dataclasses.replace(
+        placement,
+        similarity=dataclasses.replace(placement.similarity, scale=scale),
+        unit="m",
+        grounds={**placement.grounds, "lens": grounds},
+    )
 
 
 def _least_turn(source: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -178,8 +178,8 @@ def of_frames(
         notes.append(f"pixels fit badly and were weighted down: {_names(frames, doubted)}")
     if len(weak := _weak_places(reconstruction, max_scale_sigma)):
         notes.append(
-            f"the scale may change here by more than {max_scale_sigma:.2%}, as few points hold it: "
-            f"{_names(frames, weak)}"
+            f"the scale may change here by more than {max_scale_sigma:.2%}, as images hold it "
+            f"loosely: {_names(frames, weak)}"
         )
     for note in notes:
         logger.warning(note)

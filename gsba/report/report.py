@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from gsba.disk import atomic_write
-from gsba.geometry import angular_errors, quaternion_from_rotation
+from gsba.geometry import angular_errors, moved_to, quaternion_from_rotation
 from gsba.store.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
 from gsba.version import __version__
@@ -63,7 +63,8 @@ def median_residual_deg(reconstruction: Reconstruction, world_T_rigs: np.ndarray
     frames, points = reconstruction.observation_frames, reconstruction.observation_points
     if len(frames) == 0:
         return math.nan
-    rotations, centres = world_T_rigs[frames, :3, :3], world_T_rigs[frames, :3, 3]
+    lenses = moved_to(world_T_rigs[frames], reconstruction.observation_origins)
+    rotations, centres = lenses[:, :3, :3], lenses[:, :3, 3]
     rays = np.einsum("oij,oj->oi", rotations, reconstruction.observation_bearings)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # off the ray
     shape = len(reconstruction.points_world)
@@ -78,8 +79,9 @@ def median_residual_deg(reconstruction: Reconstruction, world_T_rigs: np.ndarray
 
 def angular_residuals(reconstruction: Reconstruction) -> np.ndarray:
     """Angles (O,) in radians between each observed bearing and the direction to its point."""
+    poses = reconstruction.world_T_rigs[reconstruction.observation_frames]
     return angular_errors(
-        reconstruction.world_T_rigs[reconstruction.observation_frames],
+        moved_to(poses, reconstruction.observation_origins),
         reconstruction.points_world[reconstruction.observation_points],
         reconstruction.observation_bearings,
     )
@@ -99,6 +101,7 @@ def build_report(
     trajectory: Mapping[str, Any] | None = None,
     moves: Sequence[object] = (),
     stitching: Mapping[str, Any] | None = None,
+    camera: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Content of report.json: plain values only.
 
@@ -112,6 +115,7 @@ def build_report(
         trajectory: the images' judgement of it, see `gsba.report.findings.of_trajectory`.
         moves: of the poses against a splat, see `gsba.splat.refinement.Move`.
         stitching: the field of directions, see `gsba.report.findings.of_field`.
+        camera: where its lenses are, see `gsba.report.findings.of_camera`.
     """
     quality = frame_quality(reconstruction)
     stage_rows = [
@@ -125,6 +129,7 @@ def build_report(
         "notes": notes,
         "trajectory": trajectory,
         "stitching": stitching,
+        **({} if camera is None else {"camera": camera}),
         "stages": stage_rows,
         "solver": solver,
         "splat": moves,

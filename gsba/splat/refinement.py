@@ -311,6 +311,7 @@ class _Turns:
             self._gate() * self.solved.noise,
             self.settings.triangulate,
             self.problem.num_threads,
+            self.keypoints.origins_of(rows),
         )
 
     def _gate(self) -> float:

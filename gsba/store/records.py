@@ -15,7 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
@@ -204,11 +204,17 @@ def _decode_sequence(tree: Any, hint: Any, archive: zipfile.ZipFile | None) -> A
 
 def _decode_dataclass(tree: Any, cls: type[T], archive: zipfile.ZipFile | None) -> T:
     names = {entry.name for entry in fields(cls)}  # type: ignore[arg-type]
-    if not isinstance(tree, dict) or set(tree) != names:
+    younger = {entry.name for entry in fields(cls) if _has_default(entry)}  # type: ignore[arg-type]
+    if not isinstance(tree, dict) or not names - younger <= set(tree) <= names:
         where = f"{archive.filename}: " if archive is not None else ""
         raise RecordError(f"{where}not a {cls.__name__} of this version")
     hints = typing.get_type_hints(cls)
-    return cls(**{name: _decode(tree[name], hints[name], archive) for name in names})
+    return cls(**{name: _decode(value, hints[name], archive) for name, value in tree.items()})
+
+
+def _has_default(entry: Field) -> bool:
+    """Whether records written before the field was there can be read."""
+    return entry.default is not MISSING or entry.default_factory is not MISSING
 
 
 def _require(condition: bool, tree: Any, hint: Any) -> None:

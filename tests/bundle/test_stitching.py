@@ -11,6 +11,7 @@ from factors.sphere_field import SphereField, num_harmonics
 from gsba.bundle import adjustment, prior_factors, stitching
 from gsba.bundle.adjustment import Problem
 from gsba.bundle.optimizer import optimize
+from gsba.bundle.shared_parameters import PARTS, parts_of
 from gsba.bundle.stitching import Stitching, corrected, with_noise_of
 from gsba.camera.sphere import bearings_from_erp
 from gsba.camera.straighten import straightened
@@ -94,8 +95,8 @@ def test_a_straight_camera_is_left_alone() -> None:
 
 def test_parts_do_not_share_points() -> None:
     _, before, _, _ = _found(False)
-    parts = stitching._parts(before.landmarks)
-    assert len(parts) == stitching.PARTS
+    parts = parts_of(before.landmarks)
+    assert len(parts) == PARTS
     assert sum(part.tracks.num_points for part in parts) == before.landmarks.tracks.num_points
     means = [np.mean(part.tracks.frames) for part in parts]
     assert np.all(np.diff(means) > 0)

@@ -105,6 +105,26 @@ def test_scale_between_frames_or_points() -> None:
     assert placed.similarity.scale == pytest.approx(10)
 
 
+def test_scale_by_the_distance_between_lenses() -> None:
+    asked, frames = PlacementSettings(length="lens"), frame_set(40)
+    result = dataclasses.replace(walk_result(), lens_baseline=(0.01, 0.0004))
+    placed = place(result, frames, asked, (0.032, 0.00096))
+    assert placed.unit == "m" and placed.similarity.scale == pytest.approx(3.2)
+    assert placed.grounds["lens"]["scale_sigma"] == pytest.approx(0.05 * 3.2)  # 4 and 3 percent
+    assert placed.apply(result).lens_baseline == pytest.approx((0.032, 0.00128))
+    refused = {
+        "found no two lenses": (walk_result(), (0.032, 0.001)),
+        "how far apart the lenses are": (result, None),
+        "to 20 % only; 10 % are needed": (
+            dataclasses.replace(result, lens_baseline=(0.01, 0.002)),
+            (0.032, 0.0),
+        ),
+    }
+    for message, (given, baseline) in refused.items():
+        with pytest.raises(GsbaError, match=message):
+            place(given, frames, asked, baseline)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.2])
 @pytest.mark.parametrize("named", [False, True])
 def test_gps_is_exact_and_robust(tmp_path: Path, share: float, named: bool) -> None:

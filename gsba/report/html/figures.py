@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from gsba.camera.sphere import bearings_from_erp
-from gsba.geometry import rotation_angle
+from gsba.geometry import moved_to, rotation_angle
 from gsba.types import CoarsePoses, Reconstruction
 
 _MAX_POINTS = 4000  # of the cloud, on the map
@@ -153,7 +153,8 @@ def _axes(bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def tangent_residuals(reconstruction: Reconstruction) -> np.ndarray:
     """Predicted minus observed direction (O, 2), radians east and south on the sphere."""
-    poses = reconstruction.world_T_rigs[reconstruction.observation_frames]
+    frames = reconstruction.observation_frames
+    poses = moved_to(reconstruction.world_T_rigs[frames], reconstruction.observation_origins)
     offsets = reconstruction.points_world[reconstruction.observation_points] - poses[:, :3, 3]
     predicted = np.einsum("oji,oj->oi", poses[:, :3, :3], offsets)
     predicted /= np.maximum(np.linalg.norm(predicted, axis=1, keepdims=True), 1e-12)

@@ -53,10 +53,12 @@ def picture(frames: FrameSet, reconstruction: Reconstruction, f: int) -> dict[st
 
 def _of_rows(reconstruction: Reconstruction, rows: np.ndarray) -> np.ndarray:
     """Tangent residuals (N, 2) of some observations."""
+    origins = reconstruction.observation_origins
     chosen = dataclasses.replace(
         reconstruction,
         observation_points=reconstruction.observation_points[rows],
         observation_frames=reconstruction.observation_frames[rows],
+        observation_origins=None if origins is None else origins[rows],
         observation_bearings=reconstruction.observation_bearings[rows],
     )
     return tangent_residuals(chosen)

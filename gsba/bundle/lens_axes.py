@@ -1,0 +1,188 @@
+"""Which way the lenses look: as their panorama does, or below one that a stabiliser turned.
+
+A stabilised panorama keeps its heading while the camera turns below it: the lenses' axes are then
+those of the walk, up to how the camera is held, and what each frame's points say beside it.
+"""
+
+import logging
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gsba.bundle import shared_parameters
+from gsba.bundle.adjustment import Problem
+from gsba.bundle.frame_parameters import models_of, part_gains
+from gsba.bundle.shared_parameters import (
+    PARTS,
+    SharedModel,
+    Weighted,
+    by_origin,
+    drawn,
+    parts_of,
+)
+from gsba.camera.lens import Lenses
+from gsba.types import Counts, Keypoints, Landmarks, Solution
+
+logger = logging.getLogger(__name__)
+
+_MOST = 60_000  # observations that axes are found from
+_FIRST = 20_000  # the same of a first guess
+_YAWS = np.deg2rad([0.0, 45, 90, 135])  # of the axis that carries both lenses: a line
+_CLEARLY = 1.5  # times the gain of axes that are the rig's, or these are
+TURNS = np.deg2rad([0.5, 1.5, 5.0])  # of frames' axes about where they were, standard deviation
+_STANDING = 0.1  # part of a typical step, below which a frame goes nowhere
+
+
+@dataclass(frozen=True, slots=True)
+class LensAxes:
+    """Where the lenses of each frame look."""
+
+    lenses: Lenses  # with axes, if they are not the rig's
+    gains: np.ndarray  # (PARTS,) float64, share of the robust cost of each part, of the sequence or
+    # of its points, that lenses with these axes take off as others have them
+    reason: str  # why they are taken for the rig's, or for fixed ones; empty if not
+    counts: Counts  # of observations
+
+
+def guess(
+    landmarks: Landmarks, keypoints: Keypoints, solved: Solution, so_far: Lenses, problem: Problem
+) -> LensAxes:
+    """Lenses with axes that explain most with two centres: the rig's, turned ones, or the walk's.
+
+    Args:
+        landmarks: points and their observations.
+        keypoints: of these, as seen from one centre.
+        solved: the map's poses, and the noise of its observations.
+        so_far: one centre; `band_rad` is kept.
+        problem: loss, settings.
+    """
+    used = drawn(landmarks, _FIRST, problem.settings.seed)
+    frames = keypoints.frames()
+    tried = [replace(so_far, axes=axes) for axes in _candidates(solved.world_T_rigs)]
+    alone = replace(problem, num_threads=1)
+
+    def by_centres(rows: np.ndarray, by_start: np.ndarray) -> np.ndarray:
+        columns = []
+        for under in tried:
+            of = keypoints.bearings_rig[rows], frames[rows]
+            clear = ~under.blended(*of)
+            columns.append(clear[:, None, None] * under.by_centre(by_start, *of))
+        return np.concatenate(columns, axis=2)
+
+    def model(part: Landmarks) -> SharedModel:
+        return shared_parameters.model_of(part, keypoints, solved, alone, by_centres)
+
+    with ThreadPoolExecutor(problem.num_threads) as pool:
+        systems = list(pool.map(model, parts_of(used)))
+    counts = Counts(len(landmarks.tracks), len(used.tracks), "observations")
+    if not systems:
+        return LensAxes(so_far, np.full(PARTS, np.nan), "too few points", counts)
+    gains = np.array([_gains(systems, slice(3 * k, 3 * k + 3)) for k in range(len(tried))])
+    means = gains.mean(axis=1)
+    best = int(np.argmax(means))
+    logger.info("lens axes: gains %s %%", (100 * means).round(2).tolist())
+    found = means[best] > _CLEARLY * max(float(means[0]), 0.0) and np.all(gains[best] > 0)
+    if best == 0 or not found or means[best] < problem.settings.camera.min_gain:
+        return LensAxes(so_far, gains[0], "they look as the panorama does", counts)
+    return LensAxes(tried[best], gains[best], "", counts)
+
+
+def loosened(
+    landmarks: Landmarks, keypoints: Keypoints, solved: Solution, so_far: Lenses, problem: Problem
+) -> LensAxes:
+    """Axes of each frame's own, the rig's yet, if turning them by some points predicts others.
+
+    Args:
+        landmarks: points and their observations.
+        keypoints: of these, as rays of the lenses so far.
+        solved: the map's poses, solved under these, and the noise of its observations.
+        so_far: two lenses whose axes are the rig's.
+        problem: loss, settings.
+    """
+    used = drawn(landmarks, _MOST, problem.settings.seed)
+    counts = Counts(len(landmarks.tracks), len(used.tracks), "observations")
+    frames, num = keypoints.frames(), len(solved.world_T_rigs)
+
+    def by_axes(seen: Weighted) -> np.ndarray:
+        there, bearings = frames[seen.rows], keypoints.bearings_rig[seen.rows]
+        rotations = solved.world_T_rigs[there, :3, :3]
+        by_start = by_origin(seen, rotations, bearings, so_far.nearness)
+        return so_far.by_centre(by_start, bearings, there) @ by_turn(so_far)
+
+    models = models_of(used, keypoints, solved, problem, by_axes)
+    tried = [part_gains(models, np.zeros((num, 2)), np.full(2, width)) for width in TURNS]
+    gains = max(tried, key=lambda trial: float(trial.mean()))
+    logger.info("lens axes: %s %% of unseen points' cost", (100 * gains).round(2).tolist())
+    if np.any(gains <= 0) or gains.mean() < problem.settings.camera.min_gain:
+        return LensAxes(so_far, gains, "turning them does not predict unseen points", counts)
+    return LensAxes(replace(so_far, axes=np.tile(np.eye(3), (num, 1, 1))), gains, "", counts)
+
+
+def turned(lenses: Lenses, turns: np.ndarray) -> Lenses:
+    """The lenses turned by turns (F, 2) rad about x and y of their frame, then level again.
+
+    The front one's centre is on their axis then: it is there that they look.
+    """
+    assert lenses.axes is not None
+    vectors = np.column_stack([turns, np.zeros(len(turns))])
+    length = float(np.linalg.norm(lenses.centre))
+    moved = lenses.axes @ Rotation.from_rotvec(vectors).as_matrix() @ (lenses.centre / length)
+    return replace(lenses, axes=upright(moved), centre=np.array([0.0, 0, length]))
+
+
+def by_turn(lenses: Lenses) -> np.ndarray:
+    """Jacobian (3, 2) of the centre by turns of the lenses about x and y of their frame."""
+    return np.cross(np.eye(3)[:2], lenses.centre).T
+
+
+def upright(directions: np.ndarray) -> np.ndarray:
+    """Axes (F, 3, 3) whose z is a direction (F, 3), and whose x is as level as it can be."""
+    z = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    x = np.cross([0.0, 1, 0], z)
+    vertical = np.linalg.norm(x, axis=1) < 1e-3
+    x[vertical] = [1.0, 0, 0]
+    y = np.cross(z, x)
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    return np.stack([np.cross(y, z), y, z], axis=2)
+
+
+def _gains(systems: list[SharedModel], which: slice) -> np.ndarray:
+    """Share of its cost that each part gains by the centre that the others give."""
+    gains = []
+    for p in range(PARTS):
+        others = systems[:p] + systems[p + 1 :]
+        gradient = np.sum([part.gradient[which] for part in others], axis=0)
+        hessian = np.sum([part.hessian[which, which] for part in others], axis=0)
+        step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(3), gradient)
+        own = systems[p]
+        slope = own.gradient[which] + 0.5 * own.hessian[which, which] @ step
+        gains.append(-step @ slope / own.cost)
+    return np.array(gains)
+
+
+def _candidates(world_T_rigs: np.ndarray) -> list[np.ndarray]:
+    """Axes (F, 3, 3) that are tried, those of the rig first."""
+    fixed = np.tile([0.0, 0, 1], (len(world_T_rigs), 1))
+    return [
+        upright(directions @ Rotation.from_rotvec([0, yaw, 0]).as_matrix().T)
+        for directions in (fixed, _headings(world_T_rigs))
+        for yaw in _YAWS
+    ]
+
+
+def _headings(world_T_rigs: np.ndarray) -> np.ndarray:
+    """Level directions (F, 3) in which each rig goes, in its frame; of the nearest that does."""
+    num = len(world_T_rigs)
+    before, after = np.maximum(np.arange(num) - 1, 0), np.minimum(np.arange(num) + 1, num - 1)
+    moved = world_T_rigs[after, :3, 3] - world_T_rigs[before, :3, 3]
+    lengths = np.linalg.norm(moved, axis=1)
+    going = np.flatnonzero(lengths > _STANDING * np.median(lengths))
+    if not len(going):
+        return np.tile([0.0, 0, 1], (num, 1))
+    nearest = going[np.abs(np.arange(num)[:, None] - going).argmin(axis=1)]
+    local = np.einsum("fji,fj->fi", world_T_rigs[:, :3, :3], moved[nearest])
+    local[:, 1] = 0
+    local[np.linalg.norm(local, axis=1) == 0] = [0, 0, 1]
+    return local / np.linalg.norm(local, axis=1, keepdims=True)

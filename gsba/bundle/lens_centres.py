@@ -1,0 +1,187 @@
+"""The lenses' centres, found by the map: what crosses the seam, and how near and far things move.
+
+Points of the front half of the sphere are seen from one place, those of the back half from another.
+Found as what other shared parameters are: looked for where most parts of the sequence gain by what
+the others give, and believed where each does once the map was adjusted with it.
+"""
+
+import logging
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factors.bearing import tangent_basis
+from gsba.bundle.adjustment import Problem
+from gsba.bundle.shared_parameters import PARTS, SharedModel, drawn, model_of, parts_of
+from gsba.camera.lens import Lenses
+from gsba.types import Counts, Keypoints, Landmarks, Solution
+
+logger = logging.getLogger(__name__)
+
+_MOST = 60_000  # observations that centres are found from
+_SIGNIFICANT = 5.0  # standard deviations from one centre, or there is one
+
+
+@dataclass(frozen=True, slots=True)
+class LensCentres:
+    """Where the lenses are, as a map says."""
+
+    lenses: Lenses  # one centre: none was taken
+    found: np.ndarray  # (3,) float64, front lens in the rig, map units, taken or not
+    covariance: np.ndarray  # (3, 3) float64, poses and points adjusted with it
+    part_gains: np.ndarray  # (PARTS,) float64, share of the robust cost of each part of the
+    # sequence that the centre which other parts give takes off
+    reason: str  # why none was taken; empty if one was
+    counts: Counts  # of observations
+
+
+@dataclass(frozen=True, slots=True)
+class StitchRadius:
+    """How far away panoramas take things to be."""
+
+    lenses: Lenses  # with nearness, if it was taken
+    nearness: float  # 1 / map units, inverse of the radius, taken or not
+    sigma: float
+    part_gains: np.ndarray  # (PARTS,) float64, share of the robust cost of each part of the
+    # sequence that what other parts give takes off, beside centres alone
+    reason: str  # why none was taken; empty if one was
+
+
+def estimate(
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    solved: Solution,
+    so_far: Lenses,
+    problem: Problem,
+) -> LensCentres:
+    """Find the lenses' centres from a map, poses and points adjusted with them.
+
+    Args:
+        landmarks: points and their observations.
+        keypoints: of these, as rays under the lenses so far.
+        solved: the map's poses, solved under these, and the noise of its observations.
+        so_far: centres that the rays start at; `band_rad` is kept.
+        problem: priors, loss, settings.
+    """
+    chosen = problem.settings.camera
+    used = drawn(landmarks, _MOST, problem.settings.seed)
+    counts = Counts(len(landmarks.tracks), len(used.tracks), "observations")
+    frames = keypoints.frames()
+    alone, nothing = replace(problem, num_threads=1), np.full(PARTS, np.nan)
+
+    def by_centre(rows: np.ndarray, by_origin: np.ndarray) -> np.ndarray:
+        return so_far.by_centre(by_origin, keypoints.bearings_rig[rows], frames[rows])
+
+    def model(part: Landmarks) -> SharedModel:
+        return model_of(part, keypoints, solved, alone, by_centre)
+
+    with ThreadPoolExecutor(problem.num_threads) as pool:
+        systems = list(pool.map(model, parts_of(used)))
+    if not systems:
+        unknown = np.full((3, 3), np.nan)
+        why = "too few points to tell one lens from the other"
+        return LensCentres(so_far, so_far.centre, unknown, nothing, why, counts)
+    hessian = np.array(sum(part.hessian for part in systems))
+    covariance = np.linalg.inv(hessian + 1e-9 * np.trace(hessian) * np.eye(3))
+    covariance /= float(np.mean([part.curvature for part in systems]))
+    found = so_far.centre + _step(systems)
+    around = [part.around(so_far.centre) for part in systems]  # as if there were one centre
+    gains = np.array(
+        [
+            part.gain(so_far.centre + _step(systems[:p] + systems[p + 1 :]))
+            for p, part in enumerate(around)
+        ]
+    )
+    shares = gains / np.array([part.cost for part in around])
+    strength = float(np.sqrt(found @ np.linalg.solve(covariance, found)))
+    reason = ""
+    if chosen.model == "auto":
+        needed = PARTS if so_far else PARTS - 1  # a wrong camera bends some part, too
+        if np.count_nonzero(gains > 0) < needed or shares.mean() < chosen.min_gain:
+            reason = "it does not predict parts of the sequence that it was not found from"
+        elif strength < _SIGNIFICANT:
+            reason = f"one centre is as likely: {strength:.1f} standard deviations"
+    where, untaken = np.array2string(found, precision=5), reason and f"; not taken: {reason}"
+    gained = 100 * float(shares.mean())
+    logger.info("lens centres: %s, %.1f %% of unseen parts' cost%s", where, gained, untaken)
+    taken = replace(so_far, centre=np.zeros(3) if reason else found)
+    return LensCentres(taken, found, covariance, shares, reason, counts)
+
+
+def baseline_of(centres: LensCentres, scale: float) -> tuple[float, float]:
+    """Distance between the lenses at a scale of the map, and its standard deviation."""
+    length = float(np.linalg.norm(centres.found))
+    along = centres.found / max(length, 1e-300)
+    sigma = float(np.sqrt(along @ centres.covariance @ along))
+    return 2 * scale * length, 2 * scale * sigma
+
+
+def stitched_for(
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    shown: np.ndarray,
+    solved: Solution,
+    so_far: Lenses,
+    problem: Problem,
+) -> StitchRadius:
+    """Find the radius that panoramas are stitched for, centres, poses and points adjusted with it.
+
+    Args:
+        landmarks: points and their observations.
+        keypoints: of these, as rays of two lenses, stitched at infinity.
+        shown: (N, 3) directions of the keypoints in their pictures.
+        solved: the map's poses, solved under these, and the noise of its observations.
+        so_far: the lenses.
+        problem: loss, settings.
+    """
+    used, frames = drawn(landmarks, _MOST, problem.settings.seed), keypoints.frames()
+    alone = replace(problem, num_threads=1)
+
+    def by_both(rows: np.ndarray, by_origin: np.ndarray) -> np.ndarray:
+        directions, there = shown[rows], frames[rows]
+        starts = so_far.origins(directions, there)
+        by_near = by_nearness(keypoints.bearings_rig[rows], starts)
+        return np.concatenate([so_far.by_centre(by_origin, directions, there), by_near], axis=2)
+
+    def model(part: Landmarks) -> SharedModel:
+        return model_of(part, keypoints, solved, alone, by_both)
+
+    with ThreadPoolExecutor(problem.num_threads) as pool:
+        systems = list(pool.map(model, parts_of(used)))
+    if not systems:
+        return StitchRadius(so_far, 0.0, np.nan, np.full(PARTS, np.nan), "too few points")
+    found = _step(systems)
+    hessian = np.array(sum(part.hessian for part in systems))
+    bend = float(np.mean([part.curvature for part in systems]))
+    sigma = float(np.sqrt(np.linalg.inv(hessian)[3, 3] / bend))
+    gains = []
+    for p, part in enumerate(systems):
+        others = systems[:p] + systems[p + 1 :]
+        without = part.gain(_step([each.first(3) for each in others]))
+        gains.append((part.gain(_step(others)) - without) / part.cost)
+    nearness, gains = float(found[3]), np.array(gains)
+    logger.info("stitched for a nearness of %.3f (sigma %.3f)", nearness, sigma)
+    reason = ""
+    if np.any(gains <= 0) or nearness < _SIGNIFICANT * sigma:
+        reason = "as well stitched at infinity"
+    taken = replace(so_far, centre=so_far.centre + found[:3], nearness=nearness)
+    return StitchRadius(so_far if reason else taken, nearness, sigma, gains, reason)
+
+
+def by_nearness(bearings_rig: np.ndarray, origins_rig: np.ndarray) -> np.ndarray:
+    """Jacobian (O, 2, 1) of residuals of bearings (O, 3) by the nearness they are stitched for.
+
+    Args:
+        bearings_rig: of the rays.
+        origins_rig: (O, 3) where they start.
+    """
+    return tangent_basis(bearings_rig) @ origins_rig[:, :, None]
+
+
+def _step(systems: list[SharedModel]) -> np.ndarray:
+    """Change of the parameters (K,) that the parts ask for."""
+    gradient = np.array(sum(part.gradient for part in systems))
+    hessian = np.array(sum(part.hessian for part in systems))
+    hessian *= float(np.mean([part.curvature for part in systems]))
+    return -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(len(hessian)), gradient)

@@ -1,0 +1,140 @@
+"""Motion during the readout of a frame: whether rows are read one after another, and which way.
+
+Each lens is read in a way of its own: a ray's time follows from its row. The duration that makes
+what frames move meanwhile their velocity is found as other parameters that all frames share, and
+believed where it predicts; `camera_system` then finds each frame's own motion.
+"""
+
+import logging
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+import numpy as np
+
+from gsba.bundle.adjustment import Problem
+from gsba.bundle.shared_parameters import PARTS, SharedModel, drawn, model_of, parts_of
+from gsba.camera.lens import Lenses
+from gsba.config import CameraSettings
+from gsba.types import Counts, Keypoints, Landmarks, Solution
+
+logger = logging.getLogger(__name__)
+
+_MOST = 60_000  # observations that it is found from
+_SIGNIFICANT = 4.0  # standard deviations of the duration, or none was found
+_OWN_TURN = np.deg2rad(0.12)  # rotation during a readout, standard deviation per axis
+_UNTURNED = np.deg2rad(0.005)  # the same where a stabiliser took it out of every row
+_OWN_MOVE = 0.3  # the same of a translation about what velocities say, part of a typical one
+_AXES = np.eye(3)[:2]
+
+
+@dataclass(frozen=True, slots=True)
+class Readout:
+    """How frames move while they are read."""
+
+    lenses: Lenses  # with sweeps and twists, if they were taken
+    readout_s: float = float("nan")  # from first to last row; NaN = not known
+    readout_sigma: float = float("nan")
+    own_sigmas: np.ndarray | None = None  # (6,) float64, of what frames move beside their velocity,
+    # as found, [rotation rad, translation map units]; None = not found yet
+    gains: np.ndarray = field(default_factory=lambda: np.full(PARTS, np.nan))  # (PARTS,) float64,
+    # share of the robust cost of each part that the duration which other parts give takes off
+    reason: str = ""  # why none was taken; empty if one was
+    counts: Counts = field(default_factory=lambda: Counts(0, 0, "observations"))
+
+
+def estimate(
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    shown: np.ndarray,
+    solved: Solution,
+    lenses: Lenses,
+    timestamps: np.ndarray,
+    problem: Problem,
+) -> Readout:
+    """Find how long the readout takes and which way rows are read, frames moving by velocity.
+
+    Args:
+        landmarks: points and their observations.
+        keypoints: of these, as rays of the lenses.
+        shown: (N, 3) directions of the keypoints in their pictures: these tell rows.
+        solved: poses under these, and the noise of observations.
+        lenses: read at one instant so far.
+        timestamps: (F,) seconds, whose differences give velocities.
+        problem: loss, settings.
+    """
+    alone = replace(problem, num_threads=1)  # parts run side by side
+    used = drawn(landmarks, _MOST, problem.settings.seed)
+    counts = Counts(len(landmarks.tracks), len(used.tracks), "observations")
+    motion = velocities(solved.world_T_rigs, timestamps)
+    ways, frames = _ways(problem.settings.camera), keypoints.frames()
+    times = np.stack([lenses.fractions(shown, frames, way) for way in ways], axis=1)
+
+    def by_duration(rows: np.ndarray, by_origin: np.ndarray) -> np.ndarray:
+        moved = np.einsum("oij,oj->oi", by_origin, motion[frames[rows], 3:])
+        return moved[:, :, None] * times[rows, None, :]
+
+    def model(part: Landmarks) -> SharedModel:
+        return model_of(part, keypoints, solved, alone, by_duration)
+
+    with ThreadPoolExecutor(problem.num_threads) as pool:
+        systems = list(pool.map(model, parts_of(used)))
+    if not systems:
+        return Readout(lenses, reason="too few points to tell rows apart", counts=counts)
+    durations, sigmas, gains = _durations(systems)
+    best = int(np.argmax(gains.sum(axis=0)))
+    duration, sigma = float(durations[best]), float(sigmas[best])
+    sign = -1.0 if duration < 0 else 1.0  # rows are read the other way
+    found = Readout(lenses, abs(duration), sigma, gains=gains[:, best], counts=counts)
+    logger.info("readout: %.2f ms (sigma %.2f)", 1e3 * abs(duration), 1e3 * sigma)
+    if np.any(found.gains <= 0) or abs(duration) < _SIGNIFICANT * sigma:
+        return replace(found, reason="motion during the readout does not predict unseen parts")
+    if problem.settings.camera.sweep is not None and duration < 0:
+        return replace(found, reason="rows are read the other way than camera.sweep says")
+    twists = abs(duration) * motion
+    return replace(found, lenses=replace(lenses, sweeps=sign * ways[best], twists=twists))
+
+
+def own_sigmas(found: Readout, motion: np.ndarray) -> np.ndarray:
+    """Standard deviations (6,) of what frames move meanwhile beside their velocities (F, 6)."""
+    if found.own_sigmas is not None:
+        return found.own_sigmas
+    likely = found.readout_s * np.linalg.norm(motion[:, 3:], axis=1)
+    move = max(_OWN_MOVE * float(np.median(likely)), 1e-12)
+    turn = _OWN_TURN if found.lenses.axes is None else _UNTURNED
+    return np.repeat([turn, move], 3)
+
+
+def velocities(world_T_rigs: np.ndarray, timestamps: np.ndarray) -> np.ndarray:
+    """Mean velocity (F, 6) around each frame, [0 rad/s, translation per s], rig frame.
+
+    Between frames a walk turns to and fro: rotations say nothing of those during a readout.
+    """
+    before = np.maximum(np.arange(len(timestamps)) - 1, 0)
+    after = np.minimum(np.arange(len(timestamps)) + 1, len(timestamps) - 1)
+    span = (timestamps[after] - timestamps[before])[:, None]
+    moved = world_T_rigs[after, :3, 3] - world_T_rigs[before, :3, 3]
+    local = np.einsum("fji,fj->fi", world_T_rigs[:, :3, :3], moved)
+    return np.hstack([np.zeros_like(local), local / span])
+
+
+def _durations(systems: list[SharedModel]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Duration and its deviation (W,) for each way of reading alone, and what each part gains
+    (PARTS, W), as a share of its cost, by what the others say."""
+    gradients = np.array([part.gradient for part in systems])
+    curvatures = np.array([np.diagonal(part.hessian) for part in systems])
+    costs = np.array([part.cost for part in systems])
+    total, curved = gradients.sum(axis=0), np.maximum(curvatures.sum(axis=0), 1e-300)
+    others = -(total - gradients) / np.maximum(curved - curvatures, 1e-300)
+    gains = -(gradients * others + 0.5 * curvatures * others**2)
+    bend = float(np.mean([part.curvature for part in systems]))
+    return -total / curved / bend, (bend * curved) ** -0.5, gains / costs[:, None]
+
+
+def _ways(camera: CameraSettings) -> list[np.ndarray]:
+    """Ways (2, 3) in which the two lenses can be read, up to both reversed."""
+    if camera.sweep is not None:
+        named = {"+x": _AXES[0], "-x": -_AXES[0], "+y": _AXES[1], "-y": -_AXES[1]}
+        return [np.array([named[way] for way in camera.sweep])]
+    back = [sign * axis for axis in _AXES for sign in (1.0, -1.0)]
+    return [np.array(way) for way in product(_AXES, back)]

@@ -1,0 +1,161 @@
+"""Two lenses back to back, read row by row: which one saw a bearing, from where, and when.
+
+A 360-degree camera has two fisheyes whose centres are some centimetres apart. A panorama stitched
+at infinity shows each direction as the lens that faces it saw it: a ray that starts at that lens.
+One stitched for a radius shows what is as far from the camera's middle where it would be seen from
+there: the ray goes from the lens to that place.
+Rows of each fisheye are read one after another, while the camera moves: a ray of a frame belongs to
+the pose of its row, which a twist over the readout carries to the pose of the frame's middle.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from gsba.types import Keypoints, Tracks
+
+_HALF_FOV = np.deg2rad(100.0)  # of a fisheye that fills its sensor: the first and the last row
+_SETTLED = 3  # passes after which a row's time no longer changes where a point is seen
+
+
+def _centre() -> np.ndarray:
+    return np.zeros(3)
+
+
+@dataclass(frozen=True, slots=True)
+class Lenses:
+    """The camera of a sequence. One centre, one instant by default.
+
+    The lenses' frame has its origin in the rig's centre, and z along the front lens's axis.
+    """
+
+    centre: np.ndarray = field(default_factory=_centre)  # (3,) float64, of the front lens in the
+    # lenses' frame, map units; the other one is as far behind the rig's centre
+    nearness: float = 0.0  # 1 / map units, inverse of the radius that panoramas are stitched for
+    band_rad: float = 0.0  # from the seam, within which a picture is of neither lens alone
+    sweeps: np.ndarray | None = None  # (2, 3) float64, unit, lenses' frame: the way in which rows
+    # of the front and of the back lens are read; None = all at one instant
+    twists: np.ndarray | None = None  # (F, 6) float64, motion of each frame from its first row to
+    # its last one, [rotation rad, translation map units], rig frame; None = none
+    axes: np.ndarray | None = None  # (F, 3, 3) float64, rig_R_lenses of each frame, where a
+    # stabiliser turned the panorama above them; None = they are the rig's
+
+    def __bool__(self) -> bool:
+        return bool(self.centre.any())
+
+    def own(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Directions (N, 3) in the rig frames of frames (N,), in the lenses' frame."""
+        if self.axes is None:
+            return directions
+        return np.einsum("nji,nj->ni", self.axes[frames], directions)
+
+    def origins(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Centres (N, 3) of the lenses that face directions (N, 3), both in the rig frame."""
+        signs = facing(self.own(directions, frames))[:, None]
+        if self.axes is None:
+            return signs * self.centre
+        return signs * (self.axes[frames] @ self.centre)
+
+    def by_centre(
+        self, by_origin: np.ndarray, directions: np.ndarray, frames: np.ndarray
+    ) -> np.ndarray:
+        """Jacobians (N, D, 3) by the centre, from those by where rays start, in the rig frames."""
+        signs = facing(self.own(directions, frames))[:, None, None]
+        return signs * (by_origin if self.axes is None else by_origin @ self.axes[frames])
+
+    def fractions(
+        self, directions: np.ndarray, frames: np.ndarray, sweeps: np.ndarray | None = None
+    ) -> np.ndarray:
+        """When frames (N,) read unit directions (N, 3), part of the readout, (N,), 0 = its middle.
+
+        A lens is taken to be equidistant: what it is not, twists take up.
+        """
+        sweeps = self.sweeps if sweeps is None else sweeps
+        if sweeps is None:
+            return np.zeros(len(directions))
+        own = self.own(directions, frames)
+        across = own[:, :2]
+        radii = np.linalg.norm(across, axis=1)
+        angles = np.arctan2(radii, np.abs(own[:, 2]))
+        lens = (own[:, 2] < 0).astype(int)
+        along = np.einsum("ni,ni->n", across, np.asarray(sweeps)[lens, :2])
+        return angles / (2 * _HALF_FOV) * along / np.maximum(radii, 1e-12)
+
+    def rays(self, directions: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Directions and starts (N, 3) of what frames (N,) show in directions (N, 3), rig frame
+        in the middle of the readout."""
+        origins, seen = self.origins(directions, frames), directions
+        if self.nearness:
+            seen = directions - self.nearness * origins
+            seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+        if self.twists is None:
+            return seen, origins
+        moved = self.fractions(directions, frames)[:, None] * self.twists[frames]
+        turn = _rotations(moved[:, :3])
+        turned = np.einsum("nij,nj->ni", turn, seen)
+        return turned, np.einsum("nij,nj->ni", turn, origins) + moved[:, 3:]
+
+    def seeing(self, points_rig: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Points (N, 3), rig frame in the middle of the readout, as the lens of frames (N,) that
+        faces each has them: vectors (N, 3) along the directions in which they are shown."""
+        vectors = self._shown(points_rig, frames)
+        if self.twists is None:
+            return vectors
+        for _ in range(_SETTLED):
+            units = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+            moved = self.fractions(units, frames)[:, None] * self.twists[frames]
+            back = np.swapaxes(_rotations(moved[:, :3]), 1, 2)
+            local = np.einsum("nij,nj->ni", back, points_rig - moved[:, 3:])
+            vectors = self._shown(local, frames)
+        return vectors
+
+    def _shown(self, points: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Points (N, 3) along where a stitcher puts the directions that their lens sees them in."""
+        origins = self.origins(points, frames)
+        vectors = points - origins
+        if not self.nearness:
+            return vectors
+        lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+        units, near = vectors / np.maximum(lengths, 1e-300), self.nearness * origins
+        along = np.sum(near * units, axis=1, keepdims=True)
+        left = 1 + along**2 - np.sum(near**2, axis=1, keepdims=True)
+        return lengths * (near + (np.sqrt(np.maximum(left, 0)) - along) * units)
+
+    def blended(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Whether directions (N, 3) lie where both lenses' pictures are blended in frames (N,)."""
+        lengths = np.linalg.norm(directions, axis=1)
+        return np.abs(self.own(directions, frames)[:, 2]) < np.sin(self.band_rad) * lengths
+
+    def seen(self, keypoints: Keypoints) -> Keypoints:
+        """Keypoints as rays that start at their lens, at the pose of the frame's middle."""
+        if not self:
+            return keypoints
+        directions, origins = self.rays(keypoints.bearings_rig, keypoints.frames())
+        return replace(keypoints, bearings_rig=directions, origins_rig=origins)
+
+    def clear(self, tracks: Tracks, keypoints: Keypoints) -> Tracks:
+        """Tracks without the observations where both lenses are blended."""
+        if not self.band_rad:
+            return tracks
+        bearings = keypoints.bearings_rig[keypoints.rows(tracks)]
+        every = np.ones(tracks.num_points, bool)
+        return tracks.of(every, ~self.blended(bearings, tracks.frames))
+
+    def of_frame(self, frame: int) -> "Lenses":
+        """The same for one frame alone, which is then number 0."""
+        one = slice(frame, frame + 1)
+        axes = None if self.axes is None else self.axes[one]
+        twists = None if self.twists is None else self.twists[one]
+        return replace(self, axes=axes, twists=twists)
+
+
+def facing(directions: np.ndarray) -> np.ndarray:
+    """1 for directions (N, 3) in the lenses' frame that the front lens faces, -1 for the others."""
+    return np.where(directions[:, 2] >= 0, 1.0, -1.0)
+
+
+def _rotations(vectors: np.ndarray) -> np.ndarray:
+    """Rotations (N, 3, 3) of small rotation vectors (N, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(vectors).as_matrix()

@@ -1,0 +1,126 @@
+"""What was found of the camera, for report.json, and what to note of it."""
+
+from typing import Any
+
+import numpy as np
+
+from gsba.bundle.camera_system import CameraCovariances
+from gsba.bundle.lens_axes import LensAxes
+from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of
+from gsba.bundle.readout import Readout
+from gsba.config import CameraSettings
+from gsba.placement.placement import metres_per_unit
+
+_CONTRADICTS = 3.0  # standard deviations between what is said of a camera and what images say
+
+
+def of_camera(
+    centres: LensCentres,
+    readout: Readout | None,
+    axes: LensAxes | None,
+    radius: StitchRadius | None,
+    known: CameraCovariances | None,
+    scale: float,
+    settings: CameraSettings,
+    timed: bool,
+) -> tuple[dict[str, Any], list[str]]:
+    """Where the lenses are, where they look and how they are read.
+
+    Args:
+        centres: as the map has them.
+        readout, axes, radius: the same; None = not looked for.
+        known: how well; None = one centre is as likely.
+        scale: of the map's unit in the world of the result.
+        settings: what is said of the camera.
+        timed: whether times of frames are known; if not, milliseconds are not.
+
+    Returns:
+        Lengths are in map units of the result; `metres_per_unit` rests on what is said.
+    """
+    found, covariance = scale * centres.found, scale**2 * centres.covariance
+    length, sigma = baseline_of(centres, scale)
+    said = {
+        "taken": bool(centres.lenses),
+        "reason": centres.reason,
+        "front_lens": found,
+        "front_lens_sigmas": np.sqrt(np.diagonal(covariance)),
+        "baseline": length,
+        "baseline_sigma": sigma,
+        "gain_of_unseen_parts": centres.part_gains,
+    }
+    notes, baseline = [], settings.baseline()
+    if not centres.lenses:
+        if baseline is not None:
+            notes.append(f"two lenses were not found, and tell no scale: {centres.reason}")
+        return said, notes
+    notes.append(
+        f"these panoramas are of two lenses {length:.5g} map units apart (sigma {sigma:.1g})"
+    )
+    if baseline is not None:
+        metres, of_metres = metres_per_unit((length, sigma), baseline)
+        said |= {"metres_per_unit": metres, "metres_per_unit_sigma": of_metres}
+        notes.append(_scale_note(metres, of_metres, baseline[0]))
+    if axes is not None:
+        said["turned_below_panorama"] = centres.lenses.axes is not None
+        said["gain_of_axes"] = axes.gains
+        if centres.lenses.axes is not None:
+            notes.append("the lenses turn below the panoramas: a stabiliser was on")
+    if radius is not None:
+        said["stitch_radius"] = _of_radius(radius, centres.lenses.nearness, known, scale)
+        if centres.lenses.nearness:
+            notes.append(
+                f"stitched for a radius of {scale / centres.lenses.nearness:.3g} map units"
+            )
+    if readout is not None:
+        said["readout"] = _of_readout(readout, timed)
+        if timed:
+            notes += _readout_notes(readout, settings)
+    return said, notes
+
+
+def _scale_note(metres: float, sigma: float, baseline: float) -> str:
+    return (
+        f"one map unit is {metres:.4g} m (sigma {100 * sigma / metres:.2g} %), the lenses "
+        f"{1e3 * baseline:g} mm apart"
+    )
+
+
+def _of_radius(
+    radius: StitchRadius, nearness: float, known: CameraCovariances | None, scale: float
+) -> dict[str, Any]:
+    sigma = radius.sigma if known is None else known.nearness_sigma
+    return {
+        "taken": not radius.reason,
+        "reason": radius.reason,
+        "inverse": (nearness or radius.nearness) / scale,
+        "inverse_sigma": (sigma if nearness else radius.sigma) / scale,
+        "gain_of_unseen_parts": radius.part_gains,
+    }
+
+
+def _of_readout(found: Readout, timed: bool) -> dict[str, Any]:
+    taken = found.lenses.twists is not None
+    return {
+        "taken": taken,
+        "reason": found.reason,
+        "ms": 1e3 * found.readout_s if timed else None,
+        "ms_sigma": 1e3 * found.readout_sigma if timed else None,
+        "rows_run_along": found.lenses.sweeps if taken else None,
+        "gain_of_unseen_parts": found.gains,
+    }
+
+
+def _readout_notes(found: Readout, settings: CameraSettings) -> list[str]:
+    """What the images say of the readout, and whether it is what was said."""
+    if found.lenses.twists is None:
+        return []
+    notes = [
+        f"rows are read in {1e3 * found.readout_s:.1f} ms (sigma {1e3 * found.readout_sigma:.1g}), "
+        "frames moving meanwhile"
+    ]
+    said = settings.readout()
+    if said is not None:
+        off = abs(found.readout_s - said[0])
+        if off > _CONTRADICTS * np.hypot(found.readout_sigma, said[1]):
+            notes.append(f"{1e3 * said[0]:g} ms were expected: is it the camera that is named?")
+    return notes

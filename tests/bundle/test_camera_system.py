@@ -1,0 +1,79 @@
+"""The camera as variables of the graph: their covariances beside the poses'."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from lens_world import motion, placed, problem_of, seen_through, solved_under, times
+from scipy.sparse import csr_matrix
+from synthetic import loop_walk
+
+from factors.quadratic_block import QuadraticBlock
+from factors.reduced import ReducedSystem
+from gsba.bundle import adjustment, camera_system
+from gsba.bundle.readout import Readout
+from gsba.camera.lens import Lenses
+from gsba.similarity import pose_similarity
+from gsba.types import Solution
+
+CENTRE, BAND, READOUT_S = np.array([0.004, -0.003, 0.05]), np.deg2rad(4), 0.03
+SWEEPS = np.array([[-1.0, 0, 0], [0, 1.0, 0]])
+LENSES = Lenses(CENTRE, 0.2, BAND, SWEEPS, motion(loop_walk(24), READOUT_S))
+
+
+def _settled(camera: Lenses, known: Readout, seed: int = 0, rounds: int = 5):
+    world, shown = seen_through(camera, seed)
+    solved, problem = Solution.without_points(world.world_T_rigs), problem_of(world)
+    for _ in range(rounds):
+        solved, keypoints, tracks = solved_under(world, shown, known.lenses, solved)
+        there = replace(solved, landmarks=placed(solved, keypoints, tracks))
+        given = there, keypoints, shown.bearings_rig, known, times(24), problem
+        known = camera_system.step(*given)
+    return world, known, given
+
+
+def test_all_of_a_camera_is_found_from_a_start_that_is_off() -> None:
+    start = replace(LENSES, centre=0.8 * CENTRE, nearness=0.1, twists=0.7 * LENSES.twists)
+    world, found, given = _settled(LENSES, Readout(start, 0.7 * READOUT_S))
+    scale = pose_similarity(given[0].world_T_rigs, world.world_T_rigs).scale
+    np.testing.assert_allclose(scale * found.lenses.centre, CENTRE, atol=0.001)
+    assert found.lenses.nearness / scale == pytest.approx(0.2, abs=0.03)
+    assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
+
+
+def test_covariances_are_those_of_errors_and_wider_than_of_a_known_camera() -> None:
+    errors = []
+    for seed in range(4):
+        world, _, given = _settled(LENSES, Readout(LENSES, READOUT_S), seed, 4)
+        measured = camera_system.covariances(*given)
+        scale = pose_similarity(given[0].world_T_rigs, world.world_T_rigs).scale
+        off = scale * given[3].lenses.centre - CENTRE
+        errors.append(off / (scale * np.sqrt(np.diagonal(measured.centre))))
+        errors.append([(given[3].readout_s - READOUT_S) / measured.readout_sigma])
+    spread = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+    assert 0.5 < spread < 2.0  # of 16
+    alone, _ = adjustment.pose_covariances(given[0], given[1], given[5])
+    ratio = np.trace(measured.poses[1:], axis1=1, axis2=2) / np.trace(alone[1:], axis1=1, axis2=2)
+    assert (ratio > 1).all()
+
+
+def test_a_quadratic_block_is_what_it_was_made_of() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(18, 18))
+    hessian, gradient = root.T @ root, rng.normal(size=18)
+    keys, values = [3, 1, 2], gtsam.Values()
+    for key in keys:
+        values.insert(key, np.zeros(6))
+    block = QuadraticBlock(keys, csr_matrix(hessian), gradient, 2.0)
+    system = ReducedSystem(gtsam.NonlinearFactorGraph(), [block], values)
+    assert system.linearize(values) == {"quadratic": 2.0}
+    steps = system.solve(0.0)
+    assert steps is not None
+    expected = -np.linalg.solve(hessian, gradient)
+    np.testing.assert_allclose(steps.ravel(), expected)
+    least = 2.0 + 0.5 * gradient @ expected
+    assert block.propose(values, steps) == pytest.approx(least)
+    found = system.covariances(0, rng)
+    assert found is not None
+    np.testing.assert_allclose(found[0][1], np.linalg.inv(hessian)[6:12, 6:12])

@@ -1,0 +1,132 @@
+"""Lens centres from a map: found where there are two, believed nowhere else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lens_world import SETTINGS, SIGMA, placed, problem_of, seen_through, solved_under, turned
+from scipy.optimize import least_squares
+from scipy.sparse import lil_matrix
+from synthetic import World
+
+from factors import bearing_residuals
+from gsba.bundle import adjustment, lens_centres
+from gsba.bundle.lens_centres import LensCentres
+from gsba.camera.lens import Lenses
+from gsba.config import CameraSettings
+from gsba.similarity import pose_similarity
+from gsba.types import Keypoints, Solution, Tracks
+
+CENTRE = np.array([0.004, -0.003, 0.05])
+BAND = np.deg2rad(4)
+
+
+def _found(world: World, shown: Keypoints, rounds: int = 5) -> tuple[LensCentres, Solution]:
+    lenses, start = Lenses(band_rad=BAND), Solution.without_points(world.world_T_rigs)
+    solved, keypoints, tracks = solved_under(world, shown, lenses, start)
+    found = None
+    for _ in range(rounds):
+        landmarks = placed(solved, keypoints, tracks)
+        found = lens_centres.estimate(landmarks, keypoints, solved, lenses, problem_of(world))
+        if not found.lenses:
+            break
+        lenses = found.lenses
+        solved, keypoints, tracks = solved_under(world, shown, lenses, solved)
+    assert found is not None
+    return found, solved
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_lenses_are_found(seed: int) -> None:
+    world, shown = seen_through(Lenses(CENTRE, band_rad=BAND), seed)
+    found, solved = _found(world, shown)
+    assert not found.reason and (found.part_gains > 0.2).all()
+    scale = pose_similarity(solved.world_T_rigs, world.world_T_rigs).scale  # no image knows it
+    sigmas = scale * np.sqrt(np.diagonal(found.covariance))
+    off = np.abs(scale * found.found - CENTRE)
+    assert (off < 4 * sigmas).all() and sigmas.max() < 0.02 * CENTRE[2]
+    assert solved.noise < 1.3  # times the noise that there is
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_one_centre_is_not_taken_for_two(seed: int) -> None:
+    world, shown = seen_through(Lenses(), seed)
+    found, _ = _found(world, shown)
+    sigmas = np.sqrt(np.diagonal(found.covariance))
+    assert found.reason and not found.lenses
+    assert (np.abs(found.found) < 4 * sigmas).all()
+
+
+def test_what_is_asked_for_is_taken_and_too_little_is_named() -> None:
+    world, shown = seen_through(Lenses(), 0)
+    camera = CameraSettings(model="two_lens")
+    solved, keypoints, tracks = solved_under(
+        world, shown, Lenses(band_rad=BAND), Solution.without_points(world.world_T_rigs)
+    )
+    problem = problem_of(world)
+    asked = SETTINGS.model_copy(update={"camera": camera})
+    landmarks, lenses = placed(solved, keypoints, tracks), Lenses(band_rad=BAND)
+    given = landmarks, keypoints, solved, lenses
+    taken = lens_centres.estimate(*given, replace(problem, settings=asked))
+    assert taken.lenses and not taken.reason
+    rows = np.flatnonzero(tracks.points < 30)
+    some = Tracks(tracks.points[rows], tracks.frames[rows], tracks.keypoints[rows], 30)
+    none = lens_centres.estimate(placed(solved, keypoints, some), *given[1:], problem)
+    assert none.reason.startswith("too few points") and not none.lenses
+
+
+def test_a_step_is_that_of_an_independent_solver() -> None:
+    """Poses, points and the centre by SciPy's sparse least squares, without a robust loss."""
+    world, shown = seen_through(Lenses(CENTRE, band_rad=BAND), 7)
+    few = world.tracks.points < 220
+    few &= ~world.false
+    tracks = Tracks(
+        world.tracks.points[few], world.tracks.frames[few], world.tracks.keypoints[few], 220
+    )
+    plain = SETTINGS.model_copy(
+        update={
+            "solver": SETTINGS.solver.model_copy(
+                update={"loss": "none", "relative_tolerance": 1e-10}
+            ),
+            "camera": CameraSettings(model="two_lens"),
+        }
+    )
+    world = replace(world, tracks=tracks)
+    problem = replace(problem_of(world), settings=plain)
+    lenses, solved = Lenses(band_rad=BAND), Solution.without_points(world.world_T_rigs)
+    for _ in range(6):
+        keypoints = lenses.seen(shown)
+        clear = lenses.clear(tracks, keypoints)
+        solved = adjustment.adjust(clear, keypoints, solved, problem, (60.0,))
+        landmarks = solved.landmarks
+        lenses = lens_centres.estimate(
+            landmarks, keypoints, replace(solved, noise=1.0), lenses, problem
+        ).lenses
+    used = landmarks.tracks
+    bearings = shown.bearings_rig[shown.rows(used)]
+    signs = np.where(bearings[:, 2] >= 0, 1.0, -1.0)
+    num_f, num_j = len(world.world_T_rigs), used.num_points
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        poses = solved.world_T_rigs.copy()
+        steps = np.vstack([np.zeros(6), x[: 6 * (num_f - 1)].reshape(-1, 6)])
+        poses[:, :3, 3] += np.einsum("fij,fj->fi", poses[:, :3, :3], steps[:, 3:])
+        poses[:, :3, :3] = poses[:, :3, :3] @ turned(steps[:, :3])
+        points = landmarks.points_world + x[6 * (num_f - 1) : -3].reshape(-1, 3)
+        origins = signs[:, None] * x[-3:]
+        found = bearing_residuals(poses[used.frames], points[used.points], bearings, origins)[0]
+        scale = np.linalg.norm(poses[num_f // 2, :3, 3] - poses[0, :3, 3])
+        held = np.linalg.norm(solved.world_T_rigs[num_f // 2, :3, 3] - poses[0, :3, 3])
+        return np.concatenate([found.ravel() / SIGMA, [1e5 * (scale - held)]])
+
+    pattern = lil_matrix((2 * len(used) + 1, 6 * (num_f - 1) + 3 * num_j + 3), dtype=int)
+    for o, (f, j) in enumerate(zip(used.frames, used.points, strict=True)):
+        if f:
+            pattern[2 * o : 2 * o + 2, 6 * (f - 1) : 6 * f] = 1
+        start = 6 * (num_f - 1) + 3 * j
+        pattern[2 * o : 2 * o + 2, start : start + 3] = 1
+        pattern[2 * o : 2 * o + 2, -3:] = 1
+    pattern[-1, 6 * (num_f // 2 - 1) : 6 * (num_f // 2)] = 1
+    start = np.concatenate([np.zeros(6 * (num_f - 1) + 3 * num_j), lenses.centre])
+    there = least_squares(residuals, start, jac_sparsity=pattern, x_scale="jac", method="trf").x
+    np.testing.assert_allclose(lenses.centre, there[-3:], atol=2e-4)

@@ -1,0 +1,59 @@
+"""Motion during the readout: found with its duration and way, believed where it predicts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lens_world import motion, placed, problem_of, seen_through, solved_under, times
+from synthetic import loop_walk
+
+from gsba.bundle import camera_system, readout
+from gsba.bundle.readout import Readout
+from gsba.camera.lens import Lenses
+from gsba.types import Solution
+
+LENSES, READOUT_S = Lenses(np.array([0.0, 0.0, 0.05]), band_rad=np.deg2rad(4)), 0.03
+SWEEPS = np.array([[-1.0, 0, 0], [0, 1.0, 0]])
+TWISTS = motion(loop_walk(24), READOUT_S)
+
+
+def _found(camera: Lenses, seed: int, rounds: int = 5) -> tuple[Readout, float]:
+    world, shown = seen_through(camera, seed)
+    start, moments = Solution.without_points(world.world_T_rigs), times(len(world.world_T_rigs))
+    solved, keypoints, tracks = solved_under(world, shown, LENSES, start)
+    around, problem = placed(solved, keypoints, tracks), problem_of(world)
+    known = keypoints, shown.bearings_rig
+    found = readout.estimate(around, *known, solved, LENSES, moments, problem)
+    for _ in range(0 if found.reason else rounds):
+        solved, keypoints, tracks = solved_under(world, shown, found.lenses, solved)
+        there = replace(solved, landmarks=placed(solved, keypoints, tracks))
+        rays = keypoints, shown.bearings_rig
+        found = camera_system.step(there, *rays, found, moments, problem)
+    return found, solved.noise
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_duration_way_and_each_frames_motion_are_found(seed: int) -> None:
+    found, noise = _found(replace(LENSES, sweeps=SWEEPS, twists=TWISTS), seed)
+    assert not found.reason and (found.gains > 0).all()
+    np.testing.assert_allclose(found.lenses.sweeps, SWEEPS)
+    assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
+    assert found.lenses.twists is not None
+    off = found.lenses.twists - TWISTS
+    before = np.sqrt(np.mean(TWISTS**2, axis=0))
+    left = np.sqrt(np.mean(off**2, axis=0)) / before
+    assert left[:3].max() < 0.4 and left[3:].max() < 0.3
+    assert noise < 1.1
+
+
+def test_how_far_frames_own_motion_is_spread_is_found() -> None:
+    found, _ = _found(replace(LENSES, sweeps=SWEEPS, twists=TWISTS), 0)
+    own = TWISTS - READOUT_S * readout.velocities(loop_walk(24), times(24))
+    assert found.own_sigmas is not None
+    np.testing.assert_allclose(found.own_sigmas, np.sqrt(np.mean(own**2, axis=0)), rtol=0.4)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_frames_of_one_instant_have_none(seed: int) -> None:
+    found, _ = _found(LENSES, seed)
+    assert found.reason and found.lenses.twists is None

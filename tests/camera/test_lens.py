@@ -1,0 +1,117 @@
+"""Two lenses, read row by row: where rays start, and where points are shown."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic import RIG, unit
+
+from gsba.camera.lens import Lenses
+from gsba.camera.rig import owner_faces
+from gsba.types import Keypoints, Tracks
+
+RNG = np.random.default_rng(0)
+SWEEPS = np.array([[1.0, 0, 0], [0, -1.0, 0]])
+FRAMES = RNG.integers(0, 5, 400)
+TWISTS = RNG.normal(0, 1, (5, 6)) * np.repeat([0.004, 0.03], 3)
+AXES = Rotation.from_rotvec(RNG.normal(size=(5, 3))).as_matrix()
+TWO = Lenses(np.array([0.001, -0.002, 0.04]), band_rad=np.deg2rad(4))
+LENSES = {
+    "two centres": TWO,
+    "read row by row": replace(TWO, sweeps=SWEEPS, twists=TWISTS),
+    "turned below the panorama": replace(TWO, sweeps=SWEEPS, twists=TWISTS, axes=AXES),
+    "stitched for a radius": replace(TWO, nearness=0.3),
+    "all of it": Lenses(TWO.centre, 0.3, TWO.band_rad, SWEEPS, TWISTS, AXES),
+}
+
+
+@pytest.mark.parametrize("lenses", LENSES.values(), ids=LENSES)
+def test_a_point_lies_on_the_ray_of_where_it_is_shown(lenses: Lenses) -> None:
+    points = RNG.uniform(0.5, 8, (400, 1)) * unit(RNG.normal(size=(400, 3)))
+    clear = ~lenses.blended(points, FRAMES)
+    points, frames = points[clear], FRAMES[clear]
+    shown = unit(lenses.seeing(points, frames))
+    directions, origins = lenses.rays(shown, frames)
+    along = np.einsum("ni,ni->n", points - origins, directions)
+    off = points - origins - along[:, None] * directions
+    np.testing.assert_allclose(off, 0, atol=1e-6)  # a row's time is settled in three passes
+    assert (along > 0).all()
+
+
+def test_rows_of_a_lens_are_read_from_edge_to_edge() -> None:
+    lenses, one = Lenses(np.array([0, 0, 0.1]), sweeps=SWEEPS), np.zeros(3, int)
+    edge = np.deg2rad(89.999)
+    rim = np.array([[np.sin(edge), 0, np.cos(edge)], [-np.sin(edge), 0, np.cos(edge)]])
+    np.testing.assert_allclose(
+        lenses.fractions(rim, one[:2]), [0.45, -0.45], atol=1e-4
+    )  # of 200 degrees
+    back = np.array([[0, -np.sin(edge), -np.cos(edge)], [0, 0, -1.0], [0, 0, 1.0]])
+    np.testing.assert_allclose(lenses.fractions(back, one), [0.45, 0, 0], atol=1e-4)
+    assert not Lenses().fractions(rim, one[:2]).any()
+
+
+def test_each_lens_sees_from_its_side_and_neither_at_the_seam() -> None:
+    lenses, angle = TWO, np.deg2rad([86.1, 85.9, 94.1, 93.9])
+    directions = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
+    frames = np.zeros(4, int)
+    assert lenses.blended(directions, frames).tolist() == [True, False, False, True]
+    _, origins = lenses.rays(directions, frames)
+    np.testing.assert_allclose(origins, np.outer([1, 1, -1, -1], lenses.centre))
+
+
+def test_axes_turn_the_lenses_of_their_frame() -> None:
+    turned, frames = replace(TWO, axes=AXES), np.repeat([2, 4], 50)
+    directions = unit(RNG.normal(size=(100, 3)))
+    own = np.einsum("nji,nj->ni", AXES[frames], directions)
+    expected = np.einsum("nij,nj->ni", AXES[frames], TWO.origins(own, frames))
+    np.testing.assert_allclose(turned.origins(directions, frames), expected)
+    alone = turned.of_frame(4)
+    at = frames == 4
+    zero = np.zeros(np.count_nonzero(at), int)
+    np.testing.assert_allclose(alone.origins(directions[at], zero), expected[at])
+
+
+def test_a_stitcher_is_right_at_its_radius() -> None:
+    """What is as far from the rig's centre as panoramas are stitched for shows no parallax."""
+    radius = 3.0
+    lenses, frames = replace(TWO, nearness=1 / radius), np.zeros(50, int)
+    directions = unit(RNG.normal(size=(50, 3)))
+    shown = unit(lenses.seeing(radius * directions, frames))
+    clear = ~lenses.blended(directions, frames)
+    np.testing.assert_allclose(shown[clear], directions[clear], atol=1e-12)
+
+
+def test_jacobians_by_the_centre_are_numerical_ones() -> None:
+    lenses, frames = replace(TWO, axes=AXES), RNG.integers(0, 5, 40)
+    directions = unit(RNG.normal(size=(40, 3)))
+    found = lenses.by_centre(np.tile(np.eye(3), (40, 1, 1)), directions, frames)
+    for k, step in enumerate(1e-3 * np.eye(3)):
+        moved = replace(lenses, centre=lenses.centre + step).origins(directions, frames)
+        numeric = (moved - lenses.origins(directions, frames)) / 1e-3
+        np.testing.assert_allclose(found[:, :, k], numeric, atol=1e-9)
+
+
+def _keypoints(bearings: np.ndarray) -> Keypoints:
+    faces, num = owner_faces(bearings), len(bearings)
+    grey = np.full((num, 3), 128, np.uint8)
+    starts = np.array([0, num // 2, num])
+    return Keypoints(starts, RIG.project(bearings, faces), faces, bearings, np.ones(num), grey)
+
+
+def test_one_centre_changes_nothing() -> None:
+    keypoints = _keypoints(unit(RNG.normal(size=(10, 3))))
+    tracks = Tracks(np.arange(10), np.repeat([0, 1], 5), np.tile(np.arange(5), 2), 10)
+    assert not Lenses() and Lenses().seen(keypoints) is keypoints
+    assert Lenses().clear(tracks, keypoints) is tracks
+
+
+def test_tracks_lose_what_is_blended() -> None:
+    bearings = unit(np.column_stack([np.ones(10), np.zeros(10), np.linspace(-0.5, 0.5, 10)]))
+    keypoints, lenses = _keypoints(bearings), TWO
+    tracks = Tracks(np.arange(10), np.repeat([0, 1], 5), np.tile(np.arange(5), 2), 10)
+    kept = lenses.clear(tracks, keypoints)
+    assert kept.num_points == 10 and kept.points.tolist() == [0, 1, 2, 3, 6, 7, 8, 9]
+    seen = lenses.seen(keypoints)
+    assert seen.origins_rig is not None
+    np.testing.assert_allclose(seen.origins_rig[:, 2], np.repeat([-0.04, 0.04], 5))

@@ -1,0 +1,105 @@
+"""A rendered walk with a camera of two lenses: found, and better for it than one view point."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_run import SETTINGS
+
+from gsba.camera.sphere import bearings_from_erp
+from gsba.config import PlacementSettings, RefineSettings
+from gsba.demo import make_walk
+from gsba.demo.render import render_erp
+from gsba.demo.walk import walk_poses
+from gsba.evaluate import TrajectoryErrors, evaluate
+from gsba.log import GsbaError
+from gsba.pipeline import refine
+from gsba.pipeline.run import Run
+from gsba.placement.placement import place
+from gsba.store.finished import load_run
+from gsba.trajectory.files import read_trajectory
+from gsba.types import FrameSet
+
+BASELINE, NUM_FRAMES, WIDTH = 0.05, 16, 768
+WALK_SETTINGS = SETTINGS.model_copy(update={"patches": RefineSettings().patches})
+
+
+def _through_lenses(scene, world_T_rig: np.ndarray, axis: np.ndarray, shape: tuple[int, int]):
+    """A panorama stitched at infinity: each direction from the lens that faces it."""
+    halves = []
+    for sign in (1, -1):
+        lens = world_T_rig.copy()
+        lens[:3, 3] += sign * 0.5 * BASELINE * world_T_rig[:3, :3] @ axis
+        halves.append(render_erp(scene, lens, *shape))
+    centres = np.meshgrid(*(np.arange(pixels) + 0.5 for pixels in shape))
+    ahead = bearings_from_erp(np.stack(centres, axis=-1), *shape) @ axis > 0
+    return np.where(ahead[..., None], *halves)
+
+
+def _fixed(scene, world_T_rig: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The lenses look as the panorama does."""
+    return _through_lenses(scene, world_T_rig, np.array([0.0, 0, 1]), (width, height))
+
+
+def _stabilised(scene, world_T_rig: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The lenses look along the walk, a little down, below a panorama that keeps its heading."""
+    positions = walk_poses("rectangle", "locked", NUM_FRAMES, 0).world_T_rigs[:, :3, 3]
+    f = int(np.linalg.norm(positions - world_T_rig[:3, 3], axis=1).argmin())
+    ahead = positions[(f + 1) % NUM_FRAMES] - positions[f - 1]
+    axis = world_T_rig[:3, :3].T @ ahead / np.linalg.norm(ahead) + np.array([0, 0.1, 0])
+    return _through_lenses(scene, world_T_rig, axis / np.linalg.norm(axis), (width, height))
+
+
+def _walk(out: Path, camera, heading: str):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gsba.demo.render.render_erp", camera)
+        return make_walk(out, "rectangle", heading, NUM_FRAMES, WIDTH)
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory):
+    return _walk(tmp_path_factory.mktemp("lenses") / "walk", _fixed, "forward")
+
+
+def _refine(walk, out: Path, **camera) -> tuple[dict, TrajectoryErrors]:
+    settings = WALK_SETTINGS.model_dump() | {"camera": camera}
+    refine(walk.frames_dir, walk.slam_path, out, RefineSettings.model_validate(settings))
+    report = json.loads((out / "report.json").read_text())
+    errors = evaluate(read_trajectory(out / "trajectory.tum"), read_trajectory(walk.truth_path))
+    return report, errors
+
+
+def test_a_camera_of_two_lenses_is_found_and_gives_the_scale(walk, tmp_path: Path) -> None:
+    report, errors = _refine(walk, tmp_path / "two", baseline_mm=50.0)
+    camera = report["camera"]
+    assert camera["taken"] and camera["reason"] == "" and not camera["readout"]["taken"]
+    assert errors.scale * camera["baseline"] == pytest.approx(BASELINE, rel=0.02)
+    assert camera["metres_per_unit"] == pytest.approx(errors.scale, rel=0.02)  # 1 unit = 1 m here
+    assert any(note.startswith("one map unit is") for note in report["notes"])
+    placed = place(*load_run(tmp_path / "two"), PlacementSettings(length="lens"), (0.05, 0.0))
+    assert placed.similarity.scale == pytest.approx(camera["metres_per_unit"])
+    assert placed.unit == "m"
+    _, central = _refine(walk, tmp_path / "one", model="central")
+    assert errors.ate.rmse < 0.1 * central.ate.rmse  # a hundredth
+    assert errors.rpe_rotation_deg.rmse < 0.3 * central.rpe_rotation_deg.rmse  # a twentieth
+
+
+def test_lenses_that_turn_below_a_stabilised_panorama_are_found(tmp_path: Path) -> None:
+    walk = _walk(tmp_path / "walk", _stabilised, "locked")
+    report, errors = _refine(walk, tmp_path / "two")
+    camera = report["camera"]
+    assert camera["taken"] and camera["turned_below_panorama"]
+    assert any("stabiliser" in note for note in report["notes"])
+    assert errors.scale * camera["baseline"] == pytest.approx(BASELINE, rel=0.03)
+    _, central = _refine(walk, tmp_path / "one", model="central")
+    assert errors.ate.rmse < 0.2 * central.ate.rmse
+
+
+def test_cube_faces_cannot_be_of_two_lenses() -> None:
+    one = (Path("a.jpg"),) * 6
+    names = ("front", "right", "back", "left", "up", "down")
+    frames = FrameSet(("a",), (one,), np.zeros(1), "cube", names, 64, 64, (None,))
+    settings = RefineSettings.model_validate({"camera": {"model": "two_lens"}})
+    with pytest.raises(GsbaError, match="two_lens is for panoramas"):
+        Run.begin(None, frames, None, settings)  # type: ignore[arg-type]
