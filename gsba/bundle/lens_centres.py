@@ -20,6 +20,8 @@ from gsba.types import Counts, Keypoints, Landmarks, Solution
 logger = logging.getLogger(__name__)
 
 _MOST = 60_000  # observations that centres are found from
+_OF_MODEL = 0.005  # of the distance between lenses: its error where residuals promise none, as
+# measured on rendered walks (benchmarks/results/camera.md)
 _SIGNIFICANT = 5.0  # standard deviations from one centre, or there is one
 
 
@@ -114,7 +116,7 @@ def baseline_of(centres: LensCentres, scale: float) -> tuple[float, float]:
     length = float(np.linalg.norm(centres.found))
     along = centres.found / max(length, 1e-300)
     sigma = float(np.sqrt(along @ centres.covariance @ along))
-    return 2 * scale * length, 2 * scale * sigma
+    return 2 * scale * length, 2 * scale * float(np.hypot(sigma, _OF_MODEL * length))
 
 
 def stitched_for(

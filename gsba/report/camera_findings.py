@@ -37,13 +37,12 @@ def of_camera(
     Returns:
         Lengths are in map units of the result; `metres_per_unit` rests on what is said.
     """
-    found, covariance = scale * centres.found, scale**2 * centres.covariance
     length, sigma = baseline_of(centres, scale)
     said = {
         "taken": bool(centres.lenses),
         "reason": centres.reason,
-        "front_lens": found,
-        "front_lens_sigmas": np.sqrt(np.diagonal(covariance)),
+        "front_lens": scale * centres.found,
+        "front_lens_sigmas": scale * np.sqrt(np.diagonal(centres.covariance)),
         "baseline": length,
         "baseline_sigma": sigma,
         "gain_of_unseen_parts": centres.part_gains,
@@ -65,12 +64,11 @@ def of_camera(
         said["gain_of_axes"] = axes.gains
         if centres.lenses.axes is not None:
             notes.append("the lenses turn below the panoramas: a stabiliser was on")
+    nearness = centres.lenses.nearness
     if radius is not None:
-        said["stitch_radius"] = _of_radius(radius, centres.lenses.nearness, known, scale)
-        if centres.lenses.nearness:
-            notes.append(
-                f"stitched for a radius of {scale / centres.lenses.nearness:.3g} map units"
-            )
+        said["stitch_radius"] = _of_radius(radius, nearness, known, scale)
+    if nearness:
+        notes.append(f"they are stitched for a radius of {scale / nearness:.3g} map units")
     if readout is not None:
         said["readout"] = _of_readout(readout, timed)
         if timed:
