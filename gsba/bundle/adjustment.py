@@ -71,11 +71,8 @@ def calibrate(sighted: Sighted, before: Solution, settings: RefineSettings) -> S
     poses are adjusted.
     """
     tracks, keypoints = sighted.tracks, sighted.keypoints
-    rows, poses = keypoints.rows(tracks), before.world_T_rigs
-    bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
-    placed = triangulation.triangulate(
-        tracks, bearings, sigmas, poses, _WIDE, settings.triangulate, 1, keypoints.origins_of(rows)
-    )
+    poses = before.world_T_rigs
+    placed = triangulation.place(tracks, keypoints, poses, _WIDE, settings.triangulate)
     factors = np.ones(len(keypoints.faces))
     for group in (sighted.aligned, ~sighted.aligned):
         chosen = group[keypoints.rows(placed.tracks)]

@@ -38,20 +38,19 @@ class FrameModel:
         """Decrease of the cost by a step of all of them."""
         return float(-step @ (self.normal.gradient + 0.5 * (self.normal.hessian @ step)))
 
-    def step(self, off: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
+    def step(self, sigmas: np.ndarray) -> np.ndarray:
         """Change of poses and parameters (F * (6 + K),).
 
         Args:
-            off: (F, K) what the parameters are from where they are drawn to.
-            sigmas: (K,) how strongly; 0 = they stay as they are.
+            sigmas: (K,) how strongly the parameters are drawn to what they are; 0 = they stay.
         """
-        num, hessian = 6 * len(off), self.curvature * self.normal.hessian
+        num_frames = len(self.normal.gradient) // (6 + len(sigmas))
+        num, hessian = 6 * num_frames, self.curvature * self.normal.hessian
         damped = hessian.diagonal()[:num]
         held = np.where(damped > 0, _POSE_DAMPING * damped, 1.0)
-        weights = np.tile(np.maximum(sigmas, 1e-12) ** -2.0, len(off))
+        weights = np.tile(np.maximum(sigmas, 1e-12) ** -2.0, num_frames)
         matrix = hessian + diags(np.concatenate([held, weights]))
-        pull = np.concatenate([np.zeros(num), weights * off.ravel()])
-        return -splu(matrix.tocsc()).solve(self.normal.gradient + pull)
+        return -splu(matrix.tocsc()).solve(self.normal.gradient)
 
 
 def models_of(
@@ -92,13 +91,13 @@ def summed(models: Sequence[FrameModel]) -> FrameModel:
     return FrameModel(total, float(np.mean([model.curvature for model in models])))
 
 
-def part_gains(models: Sequence[FrameModel], off: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
+def part_gains(models: Sequence[FrameModel], sigmas: np.ndarray) -> np.ndarray:
     """Share of its cost that each part gains by the parameters that the others give, poses too."""
     gains = []
     for p, part in enumerate(models):
         others = summed([model for q, model in enumerate(models) if q != p])
-        without = others.step(np.zeros_like(off), np.zeros_like(sigmas))
-        gains.append((part.gain(others.step(off, sigmas)) - part.gain(without)) / part.normal.cost)
+        without = part.gain(others.step(np.zeros_like(sigmas)))
+        gains.append((part.gain(others.step(sigmas)) - without) / part.normal.cost)
     return np.array(gains)
 
 

@@ -5,7 +5,6 @@ those of the walk, up to how the camera is held, and what each frame's points sa
 """
 
 import logging
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +19,6 @@ from gsba.bundle.shared_parameters import (
     Weighted,
     by_origin,
     drawn,
-    parts_of,
 )
 from gsba.camera.lens import Lenses
 from gsba.types import Counts, Keypoints, Landmarks, Solution
@@ -58,10 +56,8 @@ def guess(
         so_far: one centre; `band_rad` is kept.
         problem: loss, settings.
     """
-    used = drawn(landmarks, _FIRST, problem.settings.seed)
     frames = keypoints.frames()
     tried = [replace(so_far, axes=axes) for axes in _candidates(solved.world_T_rigs)]
-    alone = replace(problem, num_threads=1)
 
     def by_centres(rows: np.ndarray, by_start: np.ndarray) -> np.ndarray:
         columns = []
@@ -71,15 +67,13 @@ def guess(
             columns.append(clear[:, None, None] * under.by_centre(by_start, *of))
         return np.concatenate(columns, axis=2)
 
-    def model(part: Landmarks) -> SharedModel:
-        return shared_parameters.model_of(part, keypoints, solved, alone, by_centres)
-
-    with ThreadPoolExecutor(problem.num_threads) as pool:
-        systems = list(pool.map(model, parts_of(used)))
-    counts = Counts(len(landmarks.tracks), len(used.tracks), "observations")
+    systems, counts = shared_parameters.models_of(
+        landmarks, _FIRST, keypoints, solved, problem, by_centres
+    )
     if not systems:
         return LensAxes(so_far, np.full(PARTS, np.nan), "too few points", counts)
-    gains = np.array([_gains(systems, slice(3 * k, 3 * k + 3)) for k in range(len(tried))])
+    starts = range(0, 3 * len(tried), 3)
+    gains = np.array([_gains([part.of(slice(k, k + 3)) for part in systems]) for k in starts])
     means = gains.mean(axis=1)
     best = int(np.argmax(means))
     logger.info("lens axes: gains %s %%", (100 * means).round(2).tolist())
@@ -112,7 +106,7 @@ def loosened(
         return so_far.by_centre(by_start, bearings, there) @ by_turn(so_far)
 
     models = models_of(used, keypoints, solved, problem, by_axes)
-    tried = [part_gains(models, np.zeros((num, 2)), np.full(2, width)) for width in TURNS]
+    tried = [part_gains(models, np.full(2, width)) for width in TURNS]
     gains = max(tried, key=lambda trial: float(trial.mean()))
     logger.info("lens axes: %s %% of unseen points' cost", (100 * gains).round(2).tolist())
     if np.any(gains <= 0) or gains.mean() < problem.settings.camera.min_gain:
@@ -148,17 +142,15 @@ def upright(directions: np.ndarray) -> np.ndarray:
     return np.stack([np.cross(y, z), y, z], axis=2)
 
 
-def _gains(systems: list[SharedModel], which: slice) -> np.ndarray:
+def _gains(systems: list[SharedModel]) -> np.ndarray:
     """Share of its cost that each part gains by the centre that the others give."""
     gains = []
-    for p in range(PARTS):
+    for p, own in enumerate(systems):
         others = systems[:p] + systems[p + 1 :]
-        gradient = np.sum([part.gradient[which] for part in others], axis=0)
-        hessian = np.sum([part.hessian[which, which] for part in others], axis=0)
+        gradient = np.sum([part.gradient for part in others], axis=0)
+        hessian = np.sum([part.hessian for part in others], axis=0)
         step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(3), gradient)
-        own = systems[p]
-        slope = own.gradient[which] + 0.5 * own.hessian[which, which] @ step
-        gains.append(-step @ slope / own.cost)
+        gains.append(own.gain(step) / own.cost)
     return np.array(gains)
 
 

@@ -6,14 +6,13 @@ the others give, and believed where each does once the map was adjusted with it.
 """
 
 import logging
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from factors.bearing import tangent_basis
 from gsba.bundle.adjustment import Problem
-from gsba.bundle.shared_parameters import PARTS, SharedModel, drawn, model_of, parts_of
+from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of
 from gsba.camera.lens import Lenses
 from gsba.types import Counts, Keypoints, Landmarks, Solution
 
@@ -67,21 +66,14 @@ def estimate(
         problem: priors, loss, settings.
     """
     chosen = problem.settings.camera
-    used = drawn(landmarks, _MOST, problem.settings.seed)
-    counts = Counts(len(landmarks.tracks), len(used.tracks), "observations")
     frames = keypoints.frames()
-    alone, nothing = replace(problem, num_threads=1), np.full(PARTS, np.nan)
 
     def by_centre(rows: np.ndarray, by_origin: np.ndarray) -> np.ndarray:
         return so_far.by_centre(by_origin, keypoints.bearings_rig[rows], frames[rows])
 
-    def model(part: Landmarks) -> SharedModel:
-        return model_of(part, keypoints, solved, alone, by_centre)
-
-    with ThreadPoolExecutor(problem.num_threads) as pool:
-        systems = list(pool.map(model, parts_of(used)))
+    systems, counts = models_of(landmarks, _MOST, keypoints, solved, problem, by_centre)
     if not systems:
-        unknown = np.full((3, 3), np.nan)
+        unknown, nothing = np.full((3, 3), np.nan), np.full(PARTS, np.nan)
         why = "too few points to tell one lens from the other"
         return LensCentres(so_far, so_far.centre, unknown, nothing, why, counts)
     hessian = np.array(sum(part.hessian for part in systems))
@@ -137,8 +129,7 @@ def stitched_for(
         so_far: the lenses.
         problem: loss, settings.
     """
-    used, frames = drawn(landmarks, _MOST, problem.settings.seed), keypoints.frames()
-    alone = replace(problem, num_threads=1)
+    frames = keypoints.frames()
 
     def by_both(rows: np.ndarray, by_origin: np.ndarray) -> np.ndarray:
         directions, there = shown[rows], frames[rows]
@@ -146,11 +137,7 @@ def stitched_for(
         by_near = by_nearness(keypoints.bearings_rig[rows], starts)
         return np.concatenate([so_far.by_centre(by_origin, directions, there), by_near], axis=2)
 
-    def model(part: Landmarks) -> SharedModel:
-        return model_of(part, keypoints, solved, alone, by_both)
-
-    with ThreadPoolExecutor(problem.num_threads) as pool:
-        systems = list(pool.map(model, parts_of(used)))
+    systems, _ = models_of(landmarks, _MOST, keypoints, solved, problem, by_both)
     if not systems:
         return StitchRadius(so_far, 0.0, np.nan, np.full(PARTS, np.nan), "too few points")
     found = _step(systems)
@@ -160,7 +147,7 @@ def stitched_for(
     gains = []
     for p, part in enumerate(systems):
         others = systems[:p] + systems[p + 1 :]
-        without = part.gain(_step([each.first(3) for each in others]))
+        without = part.gain(_step([each.of(slice(3)) for each in others]))
         gains.append((part.gain(_step(others)) - without) / part.cost)
     nearness, gains = float(found[3]), np.array(gains)
     logger.info("stitched for a nearness of %.3f (sigma %.3f)", nearness, sigma)

@@ -6,14 +6,13 @@ believed where it predicts; `camera_system` then finds each frame's own motion.
 """
 
 import logging
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
 
 from gsba.bundle.adjustment import Problem
-from gsba.bundle.shared_parameters import PARTS, SharedModel, drawn, model_of, parts_of
+from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
 from gsba.types import Counts, Keypoints, Landmarks, Solution
@@ -63,9 +62,6 @@ def estimate(
         timestamps: (F,) seconds, whose differences give velocities.
         problem: loss, settings.
     """
-    alone = replace(problem, num_threads=1)  # parts run side by side
-    used = drawn(landmarks, _MOST, problem.settings.seed)
-    counts = Counts(len(landmarks.tracks), len(used.tracks), "observations")
     motion = velocities(solved.world_T_rigs, timestamps)
     ways, frames = _ways(problem.settings.camera), keypoints.frames()
     times = np.stack([lenses.fractions(shown, frames, way) for way in ways], axis=1)
@@ -74,11 +70,7 @@ def estimate(
         moved = np.einsum("oij,oj->oi", by_origin, motion[frames[rows], 3:])
         return moved[:, :, None] * times[rows, None, :]
 
-    def model(part: Landmarks) -> SharedModel:
-        return model_of(part, keypoints, solved, alone, by_duration)
-
-    with ThreadPoolExecutor(problem.num_threads) as pool:
-        systems = list(pool.map(model, parts_of(used)))
+    systems, counts = models_of(landmarks, _MOST, keypoints, solved, problem, by_duration)
     if not systems:
         return Readout(lenses, reason="too few points to tell rows apart", counts=counts)
     durations, sigmas, gains = _durations(systems)

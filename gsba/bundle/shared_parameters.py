@@ -6,6 +6,7 @@ believed only if they predict what they were not found from.
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from scipy.sparse.linalg import splu
 from factors.bearing import bearing_residuals, tangent_basis
 from factors.robust import RobustLoss
 from gsba.bundle.adjustment import Problem, landmark_block, values_of
-from gsba.types import Keypoints, Landmarks, Solution, Tracks
+from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
 
 PARTS = 4  # of the sequence: each is predicted by what the others give
 _LEAST_FRAMES = 2 * PARTS
@@ -40,10 +41,9 @@ class SharedModel:
         slope = self.gradient[:num] + 0.5 * self.hessian[:num, :num] @ parameters
         return float(-parameters @ slope)
 
-    def first(self, num: int) -> "SharedModel":
-        """The model over the first parameters alone, the rest none."""
-        gradient, hessian = self.gradient[:num], self.hessian[:num, :num]
-        return replace(self, gradient=gradient, hessian=hessian)
+    def of(self, which: slice) -> "SharedModel":
+        """The model over some of the parameters, the rest none."""
+        return replace(self, gradient=self.gradient[which], hessian=self.hessian[which, which])
 
     def around(self, parameters: np.ndarray) -> "SharedModel":
         """The model around none of one around these first parameters."""
@@ -123,6 +123,32 @@ def weighted(
     curvature = 1 + float(np.sum(bent)) / max(float(np.sum(weights)), 1e-300)
     roots = np.sqrt(weights)[:, None, None] * roots / solved.noise
     return Weighted(rows, residuals, by_pose, by_point, roots, max(curvature, _LEAST_CURVATURE))
+
+
+def models_of(
+    landmarks: Landmarks,
+    most: int,
+    keypoints: Keypoints,
+    solved: Solution,
+    problem: Problem,
+    by_shared: Callable[[np.ndarray, np.ndarray], np.ndarray],
+) -> tuple[list[SharedModel], Counts]:
+    """Models of the cost of each part of the sequence, by at most so many observations.
+
+    Args: see `model_of`.
+
+    Returns:
+        (PARTS) models, none where there is too little; and how many observations they rest on.
+    """
+    used = drawn(landmarks, most, problem.settings.seed)
+    alone = replace(problem, num_threads=1)  # parts run side by side
+
+    def model(part: Landmarks) -> SharedModel:
+        return model_of(part, keypoints, solved, alone, by_shared)
+
+    with ThreadPoolExecutor(problem.num_threads) as pool:
+        models = list(pool.map(model, parts_of(used)))
+    return models, Counts(len(landmarks.tracks), len(used.tracks), "observations")
 
 
 def model_of(

@@ -1,7 +1,7 @@
 """What the camera's calibration and stitching bend: a field fixed to the rig, found by the map."""
 
 import logging
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,10 +10,10 @@ from factors.bearing import tangent_basis
 from factors.sphere_field import SphereField, degrees_of, harmonics, num_harmonics
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import Problem
-from gsba.bundle.shared_parameters import PARTS, SharedModel, drawn, model_of, parts_of
+from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import CubeRig, owner_faces
-from gsba.types import Counts, Keypoints, Landmarks, Round, Sighted, Solution
+from gsba.types import Counts, Keypoints, Round, Sighted, Solution
 
 logger = logging.getLogger(__name__)
 
@@ -121,29 +121,22 @@ def _systems(
     now: Stitching, most: int, max_degree: int, problem: Problem, lenses: Lenses
 ) -> tuple[list[SharedModel], Counts]:
     """Models of the cost of each part of the sequence; none where there is too little."""
-    landmarks = drawn(now.adjustment.landmarks, most, problem.settings.seed)
-    counts = Counts(len(now.adjustment.landmarks.tracks), len(landmarks.tracks), "observations")
-    there = lenses.seen(corrected(now.keypoints, now.field, problem.rig))
-    alone = replace(problem, num_threads=1)  # parts run side by side
-
-    def model(part: Landmarks) -> SharedModel:
-        return _system(part, now, there, max_degree, alone)
-
-    with ThreadPoolExecutor(problem.num_threads) as pool:
-        return list(pool.map(model, parts_of(landmarks))), counts
+    there, solved = lenses.seen(corrected(now.keypoints, now.field, problem.rig)), now.adjustment
+    by_field = _by_field(now.keypoints, there, max_degree)
+    models, counts = models_of(solved.landmarks, most, there, solved, problem, by_field)
+    return [model.around(now.field.coefficients) for model in models], counts
 
 
-def _system(
-    landmarks: Landmarks, now: Stitching, there: Keypoints, max_degree: int, problem: Problem
-) -> SharedModel:
-    """Model of the robust cost of some points over a field, `there` corrected by the one so far."""
+def _by_field(
+    keypoints: Keypoints, there: Keypoints, max_degree: int
+) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Jacobian of residuals by a field, as in `model_of`, where it takes keypoints to `there`."""
 
     def by_field(rows: np.ndarray, _: np.ndarray) -> np.ndarray:
-        basis = harmonics(now.keypoints.bearings_rig[rows], max_degree)
+        basis = harmonics(keypoints.bearings_rig[rows], max_degree)
         return -tangent_basis(there.bearings_rig[rows]) @ basis
 
-    model = model_of(landmarks, there, now.adjustment, problem, by_field)
-    return model.around(now.field.coefficients)
+    return by_field
 
 
 def _fitted(systems: list[SharedModel], degree: int, spread: float) -> np.ndarray:

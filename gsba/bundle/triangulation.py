@@ -6,7 +6,7 @@ from factors.compiled import kernel_and_part
 from factors.threads import balanced_ranges, run_in_threads
 from gsba.config import TriangulateSettings
 from gsba.geometry import moved_to
-from gsba.types import Counts, Landmarks, Tracks
+from gsba.types import Counts, Keypoints, Landmarks, Tracks
 
 _kernel, _part = kernel_and_part()
 _MAX_HYPOTHESES = 12  # pairs of observations tried per track
@@ -66,6 +66,28 @@ def triangulate(
         {"observations disagree": int(short.sum()), "parallax too small": int(flat.sum())},
     )
     return Landmarks(points[kept], survivors, counts)
+
+
+def place(
+    tracks: Tracks,
+    keypoints: Keypoints,
+    world_T_rigs: np.ndarray,
+    max_error_sigmas: float,
+    settings: TriangulateSettings,
+    num_threads: int = 1,
+) -> Landmarks:
+    """As `triangulate`, the observations being the tracks' own keypoints."""
+    rows = keypoints.rows(tracks)
+    return triangulate(
+        tracks,
+        keypoints.bearings_rig[rows],
+        keypoints.sigmas_rad[rows],
+        world_T_rigs,
+        max_error_sigmas,
+        settings,
+        num_threads,
+        keypoints.origins_of(rows),
+    )
 
 
 @_kernel

@@ -331,18 +331,8 @@ def _adjusted(
     tracks, least = solved.landmarks.tracks, settings.rounds.min_observations
     gate = solved.rounds[-1].gate_sigmas if solved.rounds else np.inf
     poses = adjustment.poses_of(result.values, len(solved.world_T_rigs))
-    rows = keypoints.rows(tracks)
-    bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
-    placed = triangulation.triangulate(
-        tracks,
-        bearings,
-        sigmas,
-        poses,
-        gate * solved.noise,
-        settings.triangulate,
-        num_threads,
-        keypoints.origins_of(rows),
-    )
+    limit = gate * solved.noise
+    placed = triangulation.place(tracks, keypoints, poses, limit, settings.triangulate, num_threads)
     after = replace(solved, world_T_rigs=poses, landmarks=placed)
     accepted &= after.carries(solved, least)
     support = len(placed.tracks)

@@ -79,17 +79,13 @@ def place(
     settings = run.settings
 
     def compute() -> Solution:
-        found = _tracks(seen, prior, matches)
-        rows = seen.keypoints.rows(found)
-        placed = triangulation.triangulate(
-            found,
-            seen.keypoints.bearings_rig[rows],
-            seen.keypoints.sigmas_rad[rows],
+        placed = triangulation.place(
+            _tracks(seen, prior, matches),
+            seen.keypoints,
             solved.world_T_rigs,
             settings.rounds.dense[-1] * solved.noise,
             settings.triangulate,
             run.num_threads,
-            seen.keypoints.origins_of(rows),
         )
         return replace(solved, landmarks=placed)
 
@@ -102,7 +98,7 @@ def guess_axes(
     """Which way two lenses would look, from matches as they came."""
 
     def compute() -> LensAxes:
-        placed, loose = _widely_placed(run, seen, prior, matches, solved, _WIDE)
+        placed, loose = _widely_placed(run, seen, prior, matches, solved)
         return lens_axes.guess(placed, seen.keypoints, loose, seen.lenses, run.problem(prior))
 
     return run.stage(name, _camera_key(run), compute, LensAxes, noted=False)
@@ -114,8 +110,7 @@ def find_lenses(
     """Where the lenses are, from matches that no solution has chosen among."""
 
     def compute() -> LensCentres:
-        gate = run.settings.rounds.gate_scale if seen.lenses else _WIDE
-        placed, loose = _widely_placed(run, seen, prior, matches, solved, gate)
+        placed, loose = _widely_placed(run, seen, prior, matches, solved)
         return lens_centres.estimate(placed, seen.keypoints, loose, seen.lenses, run.problem(prior))
 
     return run.stage(name, _camera_key(run), compute, LensCentres)
@@ -127,8 +122,7 @@ def find_stitch_radius(
     """How far away panoramas take things to be, from the same under two lenses."""
 
     def compute() -> StitchRadius:
-        gate = run.settings.rounds.gate_scale
-        placed, loose = _widely_placed(run, seen, prior, matches, solved, gate)
+        placed, loose = _widely_placed(run, seen, prior, matches, solved)
         shown, problem = seen.shown.bearings_rig, run.problem(prior)
         return lens_centres.stitched_for(placed, seen.keypoints, shown, loose, seen.lenses, problem)
 
@@ -141,8 +135,7 @@ def find_readout(
     """How long rows are read and which way, from the same."""
 
     def compute() -> Readout:
-        gate = run.settings.rounds.gate_scale
-        placed, loose = _widely_placed(run, seen, prior, matches, solved, gate)
+        placed, loose = _widely_placed(run, seen, prior, matches, solved)
         shown, times, problem = seen.shown.bearings_rig, run.frames.timestamps, run.problem(prior)
         return readout.estimate(placed, seen.keypoints, shown, loose, seen.lenses, times, problem)
 
@@ -161,8 +154,7 @@ def settle_camera(
     """The camera that was found, from the same, and each frame's own motion and axes."""
 
     def compute() -> Readout:
-        gate = run.settings.rounds.gate_scale
-        placed, loose = _widely_placed(run, seen, prior, matches, solved, gate)
+        placed, loose = _widely_placed(run, seen, prior, matches, solved)
         loose, shown = replace(loose, landmarks=placed), seen.shown.bearings_rig
         times, problem = run.frames.timestamps, run.problem(prior)
         return camera_system.step(loose, seen.keypoints, shown, camera, times, problem)
@@ -177,25 +169,21 @@ def _camera_key(run: Run) -> list[object]:
 
 
 def _widely_placed(
-    run: Run,
-    seen: Seen,
-    prior: Prior,
-    matches: Sequence[Matches],
-    solved: Solution,
-    gate: float,
+    run: Run, seen: Seen, prior: Prior, matches: Sequence[Matches], solved: Solution
 ) -> tuple[Landmarks, Solution]:
-    """Points of matches with all within a gate in sigmas, and poses as unsure as that is wide."""
-    settings, found = run.settings, _tracks(seen, prior, matches)
-    rows = seen.keypoints.rows(found)
-    placed = triangulation.triangulate(
-        found,
-        seen.keypoints.bearings_rig[rows],
-        seen.keypoints.sigmas_rad[rows],
+    """Points of matches with all within a gate, and poses as unsure as that is wide.
+
+    Observations that one centre threw off are far: the gate is wide until there are two.
+    """
+    settings = run.settings
+    gate = settings.rounds.gate_scale if seen.lenses else _WIDE
+    placed = triangulation.place(
+        _tracks(seen, prior, matches),
+        seen.keypoints,
         solved.world_T_rigs,
         gate * solved.noise,
         settings.triangulate,
         run.num_threads,
-        seen.keypoints.origins_of(rows),
     )
     return placed, replace(solved, noise=solved.noise * gate / settings.rounds.gate_scale)
 
@@ -320,24 +308,21 @@ def _align(run: Run, world: Map, name: str) -> Sighted:
 def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, number: int) -> Map:
     """The map with the camera that aligned patches ask for; its poses are yet to follow."""
 
-    def placed_under(seeing: Map) -> tuple[Solution, Keypoints]:
-        there = replace(sighted, keypoints=seeing.rays(sighted.keypoints, run.rig))
+    def placed_anew() -> tuple[Solution, Keypoints]:
+        there = replace(sighted, keypoints=world.rays(sighted.keypoints, run.rig))
         there = adjustment.calibrate(there, world.solution, run.settings)
-        rows = there.keypoints.rows(there.tracks)
-        placed = triangulation.triangulate(
+        placed = triangulation.place(
             there.tracks,
-            there.keypoints.bearings_rig[rows],
-            there.keypoints.sigmas_rad[rows],
+            there.keypoints,
             world.solution.world_T_rigs,
             run.settings.rounds.aligned[0],
             run.settings.triangulate,
             run.num_threads,
-            there.keypoints.origins_of(rows),
         )
         return replace(world.solution, noise=1.0, landmarks=placed), there.keypoints
 
     def axes() -> LensAxes:
-        solved, keypoints = placed_under(world)
+        solved, keypoints = placed_anew()
         problem = run.problem(prior)
         return lens_axes.loosened(solved.landmarks, keypoints, solved, world.lenses, problem)
 
@@ -345,12 +330,12 @@ def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, n
     times = run.frames.timestamps
 
     def rows() -> Readout:
-        solved, keypoints = placed_under(world)
+        solved, keypoints = placed_anew()
         around, problem = solved.landmarks, run.problem(prior)
         return readout.estimate(around, keypoints, shown, solved, world.lenses, times, problem)
 
     def settle() -> Readout:
-        solved, keypoints = placed_under(world)
+        solved, keypoints = placed_anew()
         problem = run.problem(prior)
         return camera_system.step(solved, keypoints, shown, world.seeing(), times, problem)
 

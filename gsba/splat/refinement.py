@@ -301,17 +301,13 @@ class _Turns:
 
     def _placed(self, world_T_rigs: np.ndarray) -> Landmarks:
         """The map's points under other poses."""
-        tracks = self.solved.landmarks.tracks
-        rows = self.keypoints.rows(tracks)
-        return triangulation.triangulate(
-            tracks,
-            self.keypoints.bearings_rig[rows],
-            self.keypoints.sigmas_rad[rows],
+        return triangulation.place(
+            self.solved.landmarks.tracks,
+            self.keypoints,
             world_T_rigs,
             self._gate() * self.solved.noise,
             self.settings.triangulate,
             self.problem.num_threads,
-            self.keypoints.origins_of(rows),
         )
 
     def _gate(self) -> float:

@@ -11,7 +11,7 @@ from factors.sphere_field import SphereField, num_harmonics
 from gsba.bundle import adjustment, prior_factors, stitching
 from gsba.bundle.adjustment import Problem
 from gsba.bundle.optimizer import optimize
-from gsba.bundle.shared_parameters import PARTS, parts_of
+from gsba.bundle.shared_parameters import PARTS, SharedModel, model_of, parts_of
 from gsba.bundle.stitching import Stitching, corrected, with_noise_of
 from gsba.camera.sphere import bearings_from_erp
 from gsba.camera.straighten import straightened
@@ -136,16 +136,20 @@ def test_model_predicts_the_cost() -> None:
         poses = adjustment.poses_of(result.values, len(world.world_T_rigs))
         return Solution(poses, landmarks, 1.0, ()), block.error(result.values)
 
+    def modelled(field: SphereField, solution: Solution) -> SharedModel:
+        there = corrected(keypoints, field, RIG)
+        by_field = stitching._by_field(keypoints, there, 3)
+        model = model_of(landmarks, there, solution, problem, by_field)
+        return model.around(field.coefficients)
+
     before, cost = solved(SphereField.none())
-    now = Stitching(SphereField.none(), before, keypoints, 0, np.zeros(4), Counts(0, 0, "o"))
-    system = stitching._system(landmarks, now, keypoints, 3, problem)
+    system = modelled(SphereField.none(), before)
     assert system.cost == pytest.approx(cost, rel=0.02)  # poses are at their best already
     field = SphereField(stitching._fitted([system], 3, 1e-2))
     after, least = solved(field)
     assert system.gain(field.coefficients) == pytest.approx(cost - least, rel=0.02)
     assert least < 0.1 * cost
-    later, there = replace(now, field=field, adjustment=after), corrected(keypoints, field, RIG)
-    again = stitching._system(landmarks, later, there, 3, problem)
+    again = modelled(field, after)
     assert again.cost == pytest.approx(cost, rel=0.05)  # extrapolated back to no field
 
 
