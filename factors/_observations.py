@@ -5,6 +5,7 @@ from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from factors.robust import RobustLoss
 
@@ -124,6 +125,30 @@ def sort_observations(
             obs.measurements[rows, 2] += num_cameras
             num_cameras += len(term.cameras())
     return obs, order, point_order
+
+
+def covisible_pairs(
+    offsets: np.ndarray, frames: np.ndarray, num_frames: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Frame pairs f < g that see a landmark in common, as sorted CSR rows.
+
+    Args:
+        offsets (J + 1,), frames (O,): observations by landmark.
+
+    Returns:
+        starts (F + 1,) and columns (P,), int64.
+    """
+    num_points = len(offsets) - 1
+    owners = np.repeat(np.arange(num_points), np.diff(offsets))
+    ones = np.ones(len(owners), dtype=np.float32)
+    seen = csr_matrix((ones, (frames, owners)), shape=(num_frames, num_points))
+    shared = (seen @ seen.T).tocsr()
+    shared.sort_indices()
+    rows = np.repeat(np.arange(num_frames), np.diff(shared.indptr))
+    upper = shared.indices > rows
+    starts = np.zeros(num_frames + 1, dtype=np.int64)
+    np.cumsum(np.bincount(rows[upper], minlength=num_frames), out=starts[1:])
+    return starts, shared.indices[upper].astype(np.int64)
 
 
 def check_term(term: Term, num_frames: int, num_points: int) -> None:

@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 
 from factors._kernels import eliminate_range, polish_range, residuals_range
-from factors._observations import Term, check_term, sort_observations
+from factors._observations import Term, check_term, covisible_pairs, sort_observations
 from factors._terms import pose_rows
 from factors.block import PoseSystem
 from factors.reduced_factor import reduced_factor
@@ -68,7 +68,9 @@ class LandmarkBlock:
             self.terms, len(self.pose_keys), len(points), self.loss
         )
         self._points = points[self._point_order]
-        self._row_starts, self._columns = self._covisibility()
+        self._row_starts, self._columns = covisible_pairs(
+            self._obs.offsets, self._obs.frames, len(self.pose_keys)
+        )
         rows = np.repeat(np.arange(len(self.pose_keys)), np.diff(self._row_starts))
         self.pairs = np.column_stack([rows, self._columns]).astype(np.int64)
         self._trial: tuple[np.ndarray, np.ndarray] | None = None
@@ -250,24 +252,6 @@ class LandmarkBlock:
         run_in_threads(work, len(ranges), self.num_threads)
         self._trial = points, costs
         return float(costs.sum())
-
-    def _covisibility(self) -> tuple[np.ndarray, np.ndarray]:
-        """CSR rows of the frame pairs f < g that see a landmark in common."""
-        from scipy.sparse import csr_matrix
-
-        num_f, obs = len(self.pose_keys), self._obs
-        owners = np.repeat(np.arange(len(self._points)), np.diff(obs.offsets))
-        seen = csr_matrix(
-            (np.ones(len(owners), dtype=np.float32), (obs.frames, owners)),
-            shape=(num_f, len(self._points)),
-        )
-        shared = (seen @ seen.T).tocsr()
-        shared.sort_indices()
-        rows = np.repeat(np.arange(num_f), np.diff(shared.indptr))
-        upper = shared.indices > rows
-        starts = np.zeros(num_f + 1, dtype=np.int64)
-        np.cumsum(np.bincount(rows[upper], minlength=num_f), out=starts[1:])
-        return starts, shared.indices[upper].astype(np.int64)
 
     def _named(self, costs: np.ndarray) -> dict[str, float]:
         return {name: float(cost) for name, cost in zip(self.families, costs, strict=True)}

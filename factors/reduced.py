@@ -133,11 +133,16 @@ class ReducedSystem:
         return costs
 
     def covariances(
-        self, num_draws: int, rng: np.random.Generator
+        self, num_draws: int, rng: np.random.Generator, damping: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Blocks of H^-1 at the linearization point, and draws from it; None if singular.
 
         A block that nothing constrains is NaN and does not count.
+
+        Args:
+            num_draws: D.
+            rng: of these.
+            damping: part of the diagonal that is added to it.
 
         Returns:
             (N, 6, 6) those on the diagonal, (P, 6, 6) those between the first blocks of `pairs`,
@@ -145,6 +150,7 @@ class ReducedSystem:
         """
         idle = np.logical_not(np.any(self._diagonal, axis=(1, 2)))
         diagonal = np.where(idle[:, None, None], np.eye(DIM), self._diagonal)
+        np.einsum("nii->ni", diagonal)[:] *= 1 + damping
         if not self._cholesky.factorize(diagonal, self._off_diagonal):
             return None
         inverse, between = self._cholesky.inverse_blocks(self._asked)

@@ -241,6 +241,28 @@ class CameraSettings(_Settings):
     readout_ms: float | None = Field(default=None, gt=0, le=200)  # first row to last, as is said
     sweep: tuple[_Way, _Way] | None = None  # which way rows of the front and of the back lens are
     # read, x right and y down in the panorama's middle; None = found
+    stitch_radius_m: Annotated[float, Field(gt=0, allow_inf_nan=False)] | Literal["far"] | None = (
+        None  # at which both lenses' pictures meet; None = found
+    )
+
+    @model_validator(mode="after")
+    def _measured(self) -> "CameraSettings":
+        if isinstance(self.stitch_radius_m, float) and self.baseline() is None:
+            raise ValueError(
+                "stitch_radius_m is in metres, which only the distance between the lenses tells: "
+                "give camera.baseline_mm or camera.name as well"
+            )
+        return self
+
+    def nearness(self, front: float) -> float | None:
+        """Inverse of the stitch radius as is said, the front lens `front` from the middle.
+
+        In what that is given in; None = nothing is said.
+        """
+        baseline = self.baseline()
+        if not isinstance(self.stitch_radius_m, float) or baseline is None:
+            return None if self.stitch_radius_m is None else 0.0
+        return baseline[0] / (2 * front * self.stitch_radius_m)
 
     def baseline(self) -> tuple[float, float] | None:
         """Metres between the lenses, and their standard deviation."""

@@ -10,7 +10,7 @@ from gsba.bundle import adjustment, prior_factors, triangulation
 from gsba.bundle.adjustment import Problem
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import owner_faces
-from gsba.config import RefineSettings
+from gsba.config import CameraSettings, RefineSettings
 from gsba.geometry import inverse
 from gsba.types import Keypoints, Landmarks, Solution, Tracks
 
@@ -55,9 +55,10 @@ def times(num_frames: int) -> np.ndarray:
     return INTERVAL_S * np.arange(num_frames)
 
 
-def problem_of(world: World) -> Problem:
+def problem_of(world: World, camera: CameraSettings | None = None) -> Problem:
     priors = prior_factors.build(world.world_T_rigs, SETTINGS.priors)
-    return Problem(priors, RIG, SETTINGS, 2)
+    settings = SETTINGS.model_copy(update={"camera": camera or SETTINGS.camera})
+    return Problem(priors, RIG, settings, 2)
 
 
 def solved_under(

@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.sparse import csr_matrix, hstack
+from scipy.sparse import csr_matrix
 
+from factors.cholesky import DIM
 from factors.quadratic_block import QuadraticBlock
 from factors.reduced import ReducedSystem
 from gsba.bundle import lens_axes, prior_factors, readout
@@ -19,7 +20,7 @@ from gsba.bundle.adjustment import DRAWS, Problem, values_of
 from gsba.bundle.lens_centres import by_nearness
 from gsba.bundle.optimizer import marginal_covariances
 from gsba.bundle.readout import Readout
-from gsba.bundle.shared_parameters import Normal, by_origin, sparse, weighted, without_points
+from gsba.bundle.shared_parameters import by_origin, weighted, without_points
 from gsba.types import JointErrors, Keypoints, Solution
 
 A = gtsam.symbol_shorthand.A  # turn (2,) rad of a frame's lenses, about x and y of their frame
@@ -40,7 +41,71 @@ class CameraCovariances:
     joint: JointErrors  # what the poses' errors have in common
     centre: np.ndarray  # (3, 3) float64, of the front lens
     readout_sigma: float  # s; NaN = no readout was taken
-    nearness_sigma: float  # 1 / map units; NaN = stitched at infinity
+    nearness_sigma: float  # 1 / map units; NaN = stitched at infinity, or as settings say
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSystem:
+    """A map and its camera, to be adjusted together."""
+
+    solved: Solution  # poses, points, noise
+    keypoints: Keypoints  # of its observations, as rays of the camera so far
+    shown: np.ndarray  # (N, 3) their directions in the pictures: these tell rows
+    seeing: Readout  # the camera so far
+    timestamps: np.ndarray  # (F,) seconds
+    problem: Problem  # priors, loss
+
+    def step(self) -> Readout:
+        """The camera that bearings ask for, poses and points adjusted with it."""
+        camera, num = _linearized(self), len(self.solved.world_T_rigs)
+        lenses, found = self.seeing.lenses, self.seeing
+        variances = None
+        for _ in range(1 if lenses.twists is None else _SPREADS):
+            system = camera.system(self.problem.priors)
+            steps = system.solve(_DAMPING)
+            if steps is None:
+                return self.seeing
+            if lenses.twists is not None:
+                if variances is None:  # they hardly change with what is typical
+                    variances = _own_variances(camera, system)
+                camera = _spread_anew(camera, system, steps, variances)
+
+        def of(symbol: Callable[[int], int], count: int, dim: int) -> np.ndarray:
+            return steps[[system.first_block[symbol(f)] for f in range(count)], :dim]
+
+        lenses = replace(lenses, centre=lenses.centre + of(C, 1, 3)[0])
+        if camera.values.exists(N(0)):
+            lenses = replace(lenses, nearness=max(lenses.nearness + float(of(N, 1, 1)[0, 0]), 0.0))
+        elif lenses.nearness:
+            said = self.problem.settings.camera.nearness(float(np.linalg.norm(lenses.centre)))
+            lenses = replace(lenses, nearness=said)
+        if lenses.twists is not None:
+            motion = readout.velocities(self.solved.world_T_rigs, self.timestamps)
+            longer, own = float(of(D, 1, 1)[0, 0]), of(W, num, 6)
+            lenses = replace(lenses, twists=lenses.twists + longer * motion + own)
+            duration, sigmas = self.seeing.readout_s + longer, camera.own[0].sigmas
+            found = replace(found, readout_s=duration, own_sigmas=sigmas)
+        if lenses.axes is not None:
+            lenses = lens_axes.turned(lenses, of(A, num, 2))
+        return replace(found, lenses=lenses)
+
+    def covariances(self, components: np.ndarray | None = None) -> CameraCovariances:
+        """Marginal covariances with the first pose and the extent of each map held fixed.
+
+        Args:
+            components: (F,) map of each frame; None = there is one.
+        """
+        camera, num = _linearized(self), len(self.solved.world_T_rigs)
+        graph = camera.graph(self.problem.priors)
+        graph.push_back(prior_factors.fixed_scale(self.solved.world_T_rigs, components))
+        beside = [key for key in (C(0), D(0), N(0)) if camera.values.exists(key)]
+        seed, poses = self.problem.settings.seed, camera.keys[:num]
+        found, joint = marginal_covariances(
+            graph, [camera.block()], camera.values, poses, DRAWS, seed, beside
+        )
+        sigmas = {key: float(np.sqrt(found[num + i, 0, 0])) for i, key in enumerate(beside)}
+        shared = sigmas.get(D(0), np.nan), sigmas.get(N(0), np.nan)
+        return CameraCovariances(found[:num], joint, found[num, :3, :3], *shared)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +122,10 @@ class _Camera:
     """Poses and camera as variables of a graph."""
 
     values: gtsam.Values  # the camera's are changes of what it is
-    keys: list[int]
-    normal: Normal  # of the bearings, six coordinates for each of keys
+    keys: list[int]  # those of frames' variables by kind, then shared ones
+    hessian: csr_matrix  # of the bearings, six coordinates for each of keys
+    gradient: np.ndarray
+    cost: float
     curvature: float  # of the robust loss, see `SharedModel`
     own: tuple[_Own, ...]
     longer: tuple[float, float] | None  # s, what is said of the readout's change, and its sigma
@@ -77,154 +144,107 @@ class _Camera:
 
     def block(self, stretch: float = 1.0) -> QuadraticBlock:
         """What bearings say of them, its curvature stretched."""
-        normal = self.normal
-        return QuadraticBlock(self.keys, stretch * normal.hessian, normal.gradient, normal.cost)
+        return QuadraticBlock(self.keys, stretch * self.hessian, self.gradient, self.cost)
+
+    def system(self, priors: gtsam.NonlinearFactorGraph) -> ReducedSystem:
+        """Both, linearized."""
+        blocks = [self.block(self.curvature)]
+        system = ReducedSystem(self.graph(priors), blocks, self.values)
+        system.linearize(self.values)
+        return system
 
 
-def step(
-    solved: Solution,
-    keypoints: Keypoints,
-    shown: np.ndarray,
-    seeing: Readout,
-    timestamps: np.ndarray,
-    problem: Problem,
-) -> Readout:
-    """The camera that bearings ask for, poses and points adjusted with it.
-
-    Args:
-        solved: poses, points, noise.
-        keypoints: of its observations, as rays of the camera so far.
-        shown: (N, 3) their directions in the pictures: these tell rows.
-        seeing: the camera so far.
-        timestamps: (F,) seconds.
-        problem: priors, loss.
-    """
-    camera = _linearized(solved, keypoints, shown, seeing, timestamps, problem)
-    num, lenses, found = len(solved.world_T_rigs), seeing.lenses, seeing
-    for _ in range(1 if lenses.twists is None else _SPREADS):
-        system = ReducedSystem(
-            camera.graph(problem.priors), [camera.block(camera.curvature)], camera.values
-        )
-        system.linearize(camera.values)
-        steps = system.solve(_DAMPING)
-        if steps is None:
-            return seeing
-        if lenses.twists is not None:
-            camera = _spread_anew(camera, system, steps)
-
-    def of(symbol: Callable[[int], int], count: int, dim: int) -> np.ndarray:
-        return steps[[system.first_block[symbol(f)] for f in range(count)], :dim]
-
-    lenses = replace(lenses, centre=lenses.centre + of(C, 1, 3)[0])
-    if lenses.nearness:
-        lenses = replace(lenses, nearness=max(lenses.nearness + float(of(N, 1, 1)[0, 0]), 0.0))
-    if lenses.twists is not None:
-        motion = readout.velocities(solved.world_T_rigs, timestamps)
-        longer, own = float(of(D, 1, 1)[0, 0]), of(W, num, 6)
-        lenses = replace(lenses, twists=lenses.twists + longer * motion + own)
-        duration, sigmas = seeing.readout_s + longer, camera.own[0].sigmas
-        found = replace(seeing, readout_s=duration, own_sigmas=sigmas)
-    if lenses.axes is not None:
-        lenses = lens_axes.turned(lenses, of(A, num, 2))
-    return replace(found, lenses=lenses)
+def _own_variances(camera: _Camera, system: ReducedSystem) -> np.ndarray:
+    """Variances (F, 6) of frames' own motion."""
+    inverse = system.covariances(0, np.random.default_rng(0), _DAMPING)
+    if inverse is None:
+        return np.zeros_like(camera.own[0].off)
+    return np.einsum("fii->fi", inverse[0][_rows(camera.own[0], system)])
 
 
-def _spread_anew(camera: _Camera, system: ReducedSystem, steps: np.ndarray) -> _Camera:
+def _spread_anew(
+    camera: _Camera, system: ReducedSystem, steps: np.ndarray, variances: np.ndarray
+) -> _Camera:
     """The same with frames' own motion as widely spread as it turned out to be.
 
     By one step of expectation and maximisation: squares of the deviations plus their variances.
     """
     own = camera.own[0]
-    rows = [system.first_block[own.symbol(f)] for f in range(len(own.off))]
-    inverse = system.covariances(0, np.random.default_rng(0))
-    if inverse is None:
-        return camera
-    squares = (own.off + steps[rows]) ** 2 + np.einsum("fii->fi", inverse[0][rows])
+    squares = (own.off + steps[_rows(own, system)]) ** 2 + variances
     spread = replace(own, sigmas=np.sqrt(np.mean(squares, axis=0)))
     return replace(camera, own=(spread, *camera.own[1:]))
 
 
-def covariances(
-    solved: Solution,
-    keypoints: Keypoints,
-    shown: np.ndarray,
-    seeing: Readout,
-    timestamps: np.ndarray,
-    problem: Problem,
-    components: np.ndarray | None = None,
-) -> CameraCovariances:
-    """Marginal covariances with the first pose and the extent of each map held fixed.
-
-    Args: see `step`.
-        components: (F,) map of each frame; None = there is one.
-    """
-    camera = _linearized(solved, keypoints, shown, seeing, timestamps, problem)
-    graph, num = camera.graph(problem.priors), len(solved.world_T_rigs)
-    graph.push_back(prior_factors.fixed_scale(solved.world_T_rigs, components))
-    beside = [key for key in (C(0), D(0), N(0)) if camera.values.exists(key)]
-    seed, poses = problem.settings.seed, camera.keys[:num]
-    found, joint = marginal_covariances(
-        graph, [camera.block()], camera.values, poses, DRAWS, seed, beside
-    )
-    sigmas = {key: float(np.sqrt(found[num + i, 0, 0])) for i, key in enumerate(beside)}
-    shared = sigmas.get(D(0), np.nan), sigmas.get(N(0), np.nan)
-    return CameraCovariances(found[:num], joint, found[num, :3, :3], *shared)
+def _rows(own: _Own, system: ReducedSystem) -> list[int]:
+    """Block of each frame's variable."""
+    return [system.first_block[own.symbol(f)] for f in range(len(own.off))]
 
 
-def _linearized(
-    solved: Solution,
-    keypoints: Keypoints,
-    shown: np.ndarray,
-    seeing: Readout,
-    timestamps: np.ndarray,
-    problem: Problem,
-) -> _Camera:
-    lenses, num = seeing.lenses, len(solved.world_T_rigs)
-    tracks = solved.landmarks.tracks
-    seen = weighted(solved.landmarks, keypoints, solved, problem)
-    frames, directions = tracks.frames, shown[seen.rows]
-    rotations, bearings = solved.world_T_rigs[frames, :3, :3], keypoints.bearings_rig[seen.rows]
+def _linearized(given: CameraSystem) -> _Camera:
+    solved, seeing, lenses = given.solved, given.seeing, given.seeing.lenses
+    num, tracks = len(solved.world_T_rigs), solved.landmarks.tracks
+    seen = weighted(solved.landmarks, given.keypoints, solved, given.problem)
+    frames, directions = tracks.frames, given.shown[seen.rows]
+    rotations = solved.world_T_rigs[frames, :3, :3]
+    bearings = given.keypoints.bearings_rig[seen.rows]
     by_start = by_origin(seen, rotations, bearings, lenses.nearness)
     by_centre = lenses.by_centre(by_start, directions, frames)
-    values, owned = values_of(solved.world_T_rigs), list[_Own]()
-    keys, columns = [prior_factors.X(f) for f in range(num)], [(seen.by_pose, frames, num)]
-
-    def shared(key: int, jacobians: np.ndarray) -> None:
-        values.insert(key, np.zeros(jacobians.shape[2]))
-        keys.append(key)
-        columns.append((jacobians, np.zeros(len(frames), np.int64), 1))
-
-    def own(
-        symbol: Callable[[int], int], jacobians: np.ndarray, off: np.ndarray, sigmas: np.ndarray
-    ) -> None:
-        for f in range(num):
-            values.insert(symbol(f), np.zeros(len(sigmas)))
-            keys.append(symbol(f))
-        owned.append(_Own(symbol, off, sigmas))
-        columns.append((jacobians, frames, num))
-
-    shared(C(0), by_centre)
+    own, shared, by_frame = list[_Own](), list[tuple[int, np.ndarray]](), [seen.by_pose]
     if lenses.nearness:
-        shared(N(0), by_nearness(bearings, lenses.origins(directions, frames)))
+        by_near = by_nearness(bearings, lenses.origins(directions, frames))
+        if given.problem.settings.camera.stitch_radius_m is None:
+            shared.append((N(0), by_near))
+        else:  # metres: in map units it goes with the distance between the lenses
+            by_centre = (
+                by_centre - by_near * lenses.nearness / np.sum(lenses.centre**2) * lenses.centre
+            )
+    shared.insert(0, (C(0), by_centre))
     if lenses.twists is not None:
-        velocities = readout.velocities(solved.world_T_rigs, timestamps)
+        velocities = readout.velocities(solved.world_T_rigs, given.timestamps)
         times = lenses.fractions(directions, frames)[:, None, None]
-        shared(D(0), times * (seen.by_pose @ velocities[frames, :, None]))
+        shared.append((D(0), times * (seen.by_pose @ velocities[frames, :, None])))
         off = lenses.twists - seeing.readout_s * velocities
-        own(W, times * seen.by_pose, off, readout.own_sigmas(seeing, velocities))
+        own.append(_Own(W, off, readout.own_sigmas(seeing, velocities)))
+        by_frame.append(times * seen.by_pose)
     if lenses.axes is not None:
-        widths = np.full(2, lens_axes.TURNS[-1])
-        own(A, by_centre @ lens_axes.by_turn(lenses), np.zeros((num, 2)), widths)
-    whole = [_six(seen.roots @ part, rows, count) for part, rows, count in columns]
-    normal = without_points(seen, tracks, csr_matrix(hstack(whole)))
-    said, longer = problem.settings.camera.readout(), None
+        own.append(_Own(A, np.zeros((num, 2)), np.full(2, lens_axes.TURNS[-1])))
+        by_frame.append(by_centre @ lens_axes.by_turn(lenses))
+    values = values_of(solved.world_T_rigs)
+    keys = [prior_factors.X(f) for f in range(num)]
+    for each in own:
+        for f in range(num):
+            values.insert(each.symbol(f), np.zeros(len(each.sigmas)))
+            keys.append(each.symbol(f))
+    for key, part in shared:
+        values.insert(key, np.zeros(part.shape[2]))
+        keys.append(key)
+    system = without_points(
+        seen, tracks, num, np.concatenate(by_frame, axis=2),
+        np.concatenate([part for _, part in shared], axis=2),
+    )  # fmt: skip
+    places = _places(num, [part.shape[2] for part in by_frame], [p.shape[2] for _, p in shared])
+    found, size = system.hessian.tocoo(), DIM * len(keys)
+    rows, columns = found.coords
+    hessian = csr_matrix((found.data, (places[rows], places[columns])), shape=(size, size))
+    gradient = np.zeros(size)
+    gradient[places] = system.gradient
+    said, longer = given.problem.settings.camera.readout(), None
     if said is not None and values.exists(D(0)):
         longer = said[0] - seeing.readout_s, said[1]
-    return _Camera(values, keys, normal, seen.curvature, tuple(owned), longer)
+    curvature, own = seen.curvature, tuple(own)
+    return _Camera(values, keys, hessian, gradient, system.cost, curvature, own, longer)
 
 
-def _six(jacobians: np.ndarray, columns: np.ndarray, num: int) -> csr_matrix:
-    """Jacobians (O, 2, D) by variables of D coordinates, of six with the last ones idle."""
-    padded = np.zeros((len(jacobians), 2, 6))
-    padded[:, :, : jacobians.shape[2]] = jacobians
-    return sparse(padded, columns, num)
+def _places(num_frames: int, own: list[int], shared: list[int]) -> np.ndarray:
+    """Where each variable of a `LinearSystem` lies among variables of six coordinates each.
+
+    Args:
+        own: dimensions of each kind of variable that frames have.
+        shared: those of each that all frames have.
+    """
+    starts = DIM * num_frames * np.arange(len(own))
+    first = np.concatenate([start + np.arange(dim) for start, dim in zip(starts, own, strict=True)])
+    of_frames = first + DIM * np.arange(num_frames)[:, None]
+    after = DIM * (num_frames * len(own) + np.arange(len(shared)))
+    beside = [start + np.arange(dim) for start, dim in zip(after, shared, strict=True)]
+    return np.concatenate([of_frames.ravel(), *beside])

@@ -9,20 +9,19 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_matrix, diags, hstack
+from scipy.sparse import diags_array as diags
 from scipy.sparse.linalg import splu
 
+from factors.elimination import LinearSystem
 from gsba.bundle.adjustment import Problem
 from gsba.bundle.shared_parameters import (
     PARTS,
-    Normal,
     Weighted,
     of_points,
-    sparse,
     weighted,
     without_points,
 )
-from gsba.types import Keypoints, Landmarks, Solution, Tracks
+from gsba.types import Keypoints, Landmarks, Solution
 
 _POSE_DAMPING = 1e-4  # of the poses' information, against the map's free similarity
 
@@ -31,12 +30,12 @@ _POSE_DAMPING = 1e-4  # of the poses' information, against the map's free simila
 class FrameModel:
     """Second-order model of some points' cost over poses and K parameters of each frame."""
 
-    normal: Normal  # (F * (6 + K)) variables, poses first; by the weights of the robust loss
+    system: LinearSystem  # 6 + K variables of each frame, its pose first; by robust weights
     curvature: float  # of that loss, part of its weights'
 
     def gain(self, step: np.ndarray) -> float:
         """Decrease of the cost by a step of all of them."""
-        return float(-step @ (self.normal.gradient + 0.5 * (self.normal.hessian @ step)))
+        return float(-step @ (self.system.gradient + 0.5 * (self.system.hessian @ step)))
 
     def step(self, sigmas: np.ndarray) -> np.ndarray:
         """Change of poses and parameters (F * (6 + K),).
@@ -44,13 +43,12 @@ class FrameModel:
         Args:
             sigmas: (K,) how strongly the parameters are drawn to what they are; 0 = they stay.
         """
-        num_frames = len(self.normal.gradient) // (6 + len(sigmas))
-        num, hessian = 6 * num_frames, self.curvature * self.normal.hessian
-        damped = hessian.diagonal()[:num]
-        held = np.where(damped > 0, _POSE_DAMPING * damped, 1.0)
-        weights = np.tile(np.maximum(sigmas, 1e-12) ** -2.0, num_frames)
-        matrix = hessian + diags(np.concatenate([held, weights]))
-        return -splu(matrix.tocsc()).solve(self.normal.gradient)
+        hessian = self.curvature * self.system.hessian
+        held = _POSE_DAMPING * hessian.diagonal().reshape(-1, 6 + len(sigmas))
+        held[held <= 0] = 1.0
+        held[:, 6:] = np.maximum(sigmas, 1e-12) ** -2.0
+        matrix = hessian + diags(held.ravel())
+        return -splu(matrix.tocsc()).solve(self.system.gradient)
 
 
 def models_of(
@@ -74,7 +72,9 @@ def models_of(
     def model(part: int) -> FrameModel:
         some = of_points(landmarks, drawn % PARTS == part)
         seen = weighted(some, keypoints, solved, problem)
-        return _model(some.tracks, seen, by_parameters(seen), len(solved.world_T_rigs))
+        by_frame = np.concatenate([seen.by_pose, by_parameters(seen)], axis=2)
+        system = without_points(seen, some.tracks, len(solved.world_T_rigs), by_frame)
+        return FrameModel(system, seen.curvature)
 
     with ThreadPoolExecutor(problem.num_threads) as pool:
         return list(pool.map(model, range(PARTS)))
@@ -82,11 +82,11 @@ def models_of(
 
 def summed(models: Sequence[FrameModel]) -> FrameModel:
     """The model of all their points."""
-    normals = [model.normal for model in models]
-    total = Normal(
-        sum(normal.cost for normal in normals),
-        np.sum([normal.gradient for normal in normals], axis=0),
-        csr_matrix(sum(normal.hessian for normal in normals)),
+    systems = [model.system for model in models]
+    total = LinearSystem(
+        sum(system.cost for system in systems),
+        np.sum([system.gradient for system in systems], axis=0),
+        sum(system.hessian for system in systems[1:]) + systems[0].hessian,
     )
     return FrameModel(total, float(np.mean([model.curvature for model in models])))
 
@@ -97,15 +97,5 @@ def part_gains(models: Sequence[FrameModel], sigmas: np.ndarray) -> np.ndarray:
     for p, part in enumerate(models):
         others = summed([model for q, model in enumerate(models) if q != p])
         without = part.gain(others.step(np.zeros_like(sigmas)))
-        gains.append((part.gain(others.step(sigmas)) - without) / part.normal.cost)
+        gains.append((part.gain(others.step(sigmas)) - without) / part.system.cost)
     return np.array(gains)
-
-
-def _model(
-    tracks: Tracks, seen: Weighted, by_parameters: np.ndarray, num_frames: int
-) -> FrameModel:
-    poses = sparse(seen.roots @ seen.by_pose, tracks.frames, num_frames)
-    own = sparse(seen.roots @ by_parameters, tracks.frames, num_frames)
-    return FrameModel(
-        without_points(seen, tracks, csr_matrix(hstack([poses, own]))), seen.curvature
-    )

@@ -121,6 +121,8 @@ def stitched_for(
 ) -> StitchRadius:
     """Find the radius that panoramas are stitched for, centres, poses and points adjusted with it.
 
+    Where settings say it, that is it.
+
     Args:
         landmarks: points and their observations.
         keypoints: of these, as rays of two lenses, stitched at infinity.
@@ -129,6 +131,10 @@ def stitched_for(
         so_far: the lenses.
         problem: loss, settings.
     """
+    said = problem.settings.camera.nearness(float(np.linalg.norm(so_far.centre)))
+    if said is not None:
+        reason, unknown = "" if said else "camera.stitch_radius_m says so", np.full(PARTS, np.nan)
+        return StitchRadius(replace(so_far, nearness=said), said, 0.0, unknown, reason)
     frames = keypoints.frames()
 
     def by_both(rows: np.ndarray, by_origin: np.ndarray) -> np.ndarray:

@@ -10,10 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_matrix, diags
+from scipy.sparse import diags_array as diags
 from scipy.sparse.linalg import splu
 
 from factors.bearing import bearing_residuals, tangent_basis
+from factors.elimination import LinearSystem, eliminate
 from factors.robust import RobustLoss
 from gsba.bundle.adjustment import Problem, landmark_block, values_of
 from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
@@ -22,7 +23,6 @@ PARTS = 4  # of the sequence: each is predicted by what the others give
 _LEAST_FRAMES = 2 * PARTS
 _LEAST_POINTS = 50  # of a part
 _POSE_DAMPING = 1e-4  # of the poses' information, against the map's free similarity
-_POINT_DAMPING = 1e-9
 _LEAST_CURVATURE = 0.3  # or a step would go further than its model holds
 
 
@@ -170,40 +170,50 @@ def model_of(
     """
     seen = weighted(landmarks, keypoints, solved, problem)
     by_origin = -seen.by_point @ solved.world_T_rigs[landmarks.tracks.frames, :3, :3]
-    model = _reduced(
-        landmarks.tracks,
-        len(solved.world_T_rigs),
-        np.einsum("oij,oj->oi", seen.roots, seen.residuals),
-        seen.roots @ seen.by_pose,
-        seen.roots @ seen.by_point,
-        seen.roots @ by_shared(seen.rows, by_origin),
+    num = len(solved.world_T_rigs)
+    system = without_points(
+        seen, landmarks.tracks, num, seen.by_pose, by_shared(seen.rows, by_origin)
     )
-    return replace(model, curvature=seen.curvature)
+    return _without_poses(system, num, seen.curvature)
 
 
-def _reduced(
+def _without_poses(system: LinearSystem, num_frames: int, curvature: float) -> SharedModel:
+    """Eliminate poses as well."""
+    num = 6 * num_frames
+    of_poses, across = system.hessian[:num, :num], system.hessian[:num, num:].toarray()
+    diagonal = of_poses.diagonal()
+    damping = diags(np.where(diagonal > 0, _POSE_DAMPING * diagonal, 1.0))
+    right = np.column_stack([across, system.gradient[:num]])
+    coupled = right.T @ splu((of_poses + damping).tocsc()).solve(right)
+    return SharedModel(
+        system.cost - 0.5 * float(coupled[-1, -1]),
+        system.gradient[num:] - coupled[:-1, -1],
+        system.hessian[num:, num:].toarray() - coupled[:-1, :-1],
+        curvature,
+    )
+
+
+def without_points(
+    seen: Weighted,
     tracks: Tracks,
     num_frames: int,
-    residuals: np.ndarray,
-    by_pose: np.ndarray,
-    by_point: np.ndarray,
-    by_shared: np.ndarray,
-) -> SharedModel:
-    """Eliminate points, then poses, from weighted residuals (O, 2) and their Jacobians."""
-    num = len(tracks)
-    right = np.concatenate([by_shared, residuals[:, :, None]], axis=2).reshape(2 * num, -1)
-    poses = sparse(by_pose, tracks.frames, num_frames)
-    points = sparse(by_point, tracks.points, tracks.num_points)
-    blocks = _inverted(by_point, tracks)
-    rest = right - points @ (blocks @ (points.T @ right))  # what points cannot take up
-    among = (points.T @ poses).tocsr()
-    of_poses = (poses.T @ poses - among.T @ blocks @ among).tocsc()
-    curvature = of_poses.diagonal()
-    idle = curvature <= 0
-    of_poses = of_poses + diags(np.where(idle, 1.0, _POSE_DAMPING * curvature), format="csc")
-    coupled = poses.T @ rest
-    inner = right.T @ rest - coupled.T @ splu(of_poses.tocsc()).solve(coupled)
-    return SharedModel(0.5 * float(inner[-1, -1]), inner[:-1, -1], inner[:-1, :-1])
+    by_frame: np.ndarray,
+    by_shared: np.ndarray | None = None,
+) -> LinearSystem:
+    """Normal equations of bearings with the points eliminated.
+
+    Args:
+        seen, tracks: the bearings.
+        num_frames: F.
+        by_frame: Jacobian (O, 2, K) of residuals by K variables of their frames.
+        by_shared: Jacobian (O, 2, S) by variables of all frames; None = there are none.
+    """
+    residuals = np.einsum("oij,oj->oi", seen.roots, seen.residuals)
+    shared = np.zeros((len(residuals), 2, 0)) if by_shared is None else seen.roots @ by_shared
+    of_point, of_frame = seen.roots @ seen.by_point, seen.roots @ by_frame
+    return eliminate(
+        num_frames, tracks.frames, tracks.points, residuals, of_point, of_frame, shared
+    )
 
 
 def by_origin(
@@ -218,51 +228,3 @@ def by_origin(
         nearness: see `Lenses`.
     """
     return -seen.by_point @ world_R_rigs + nearness * tangent_basis(bearings_rig)
-
-
-@dataclass(frozen=True, slots=True)
-class Normal:
-    """Second-order model of some bearings' cost over variables, their points eliminated."""
-
-    cost: float  # as it is
-    gradient: np.ndarray  # (K,)
-    hessian: csr_matrix  # (K, K)
-
-
-def without_points(seen: Weighted, tracks: Tracks, columns: csr_matrix) -> Normal:
-    """Eliminate points from weighted bearings whose whitened Jacobian is columns (2 O, K)."""
-    by_point = seen.roots @ seen.by_point
-    residuals = np.einsum("oij,oj->oi", seen.roots, seen.residuals).ravel()
-    points = sparse(by_point, tracks.points, tracks.num_points)
-    blocks = _inverted(by_point, tracks)
-    among, pulled = (points.T @ columns).tocsr(), points.T @ residuals
-    return Normal(
-        0.5 * float(residuals @ residuals - pulled @ (blocks @ pulled)),
-        columns.T @ residuals - among.T @ (blocks @ pulled),
-        csr_matrix(columns.T @ columns - among.T @ blocks @ among),
-    )
-
-
-def _inverted(by_point: np.ndarray, tracks: Tracks) -> csr_matrix:
-    """Inverse of the points' own normal equations, along the diagonal."""
-    normal = np.zeros((tracks.num_points, 3, 3))
-    np.add.at(normal, tracks.points, np.einsum("oki,okj->oij", by_point, by_point))
-    traces = np.trace(normal, axis1=1, axis2=2)[:, None, None]
-    return _block_diagonal(np.linalg.inv(normal + (_POINT_DAMPING * traces + 1e-200) * np.eye(3)))
-
-
-def sparse(jacobians: np.ndarray, columns: np.ndarray, num: int) -> csr_matrix:
-    """Jacobians (O, 2, D) by the variables `columns (O,)` of D entries, of `num`, as one matrix."""
-    count, _, dim = jacobians.shape
-    at = dim * columns[:, None, None].astype(np.int64) + np.arange(dim)
-    at = np.broadcast_to(at, jacobians.shape).ravel()
-    starts = np.arange(0, jacobians.size + 1, dim)
-    return csr_matrix((jacobians.ravel(), at, starts), shape=(2 * count, dim * num))
-
-
-def _block_diagonal(blocks: np.ndarray) -> csr_matrix:
-    """Blocks (J, 3, 3) along the diagonal of one matrix."""
-    num = len(blocks)
-    at = 3 * np.arange(num)[:, None, None] + np.broadcast_to(np.arange(3), (3, 3))
-    starts = np.arange(0, 9 * num + 1, 3)
-    return csr_matrix((blocks.ravel(), at.ravel(), starts), shape=(3 * num, 3 * num))

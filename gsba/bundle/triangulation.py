@@ -57,15 +57,24 @@ def triangulate(
     lengths = np.add.reduceat(inliers, starts[:-1]) if len(rays) else np.zeros(0, int)
     short = lengths < settings.min_track_length
     flat = ~short & (parallaxes < np.deg2rad(settings.min_parallax_deg))
-    kept = ~short & ~flat
+    dropped = {"observations disagree": short, "parallax too small": flat}
+    if origins_rig is not None:
+        inside = _within_camera(tracks, inliers > 0, points, centres, origins_rig)
+        dropped["within the camera"] = inside & ~short & ~flat
+    kept = ~np.any(list(dropped.values()), axis=0)
     survivors = tracks.of(kept, inliers.astype(bool))
-    counts = Counts(
-        tracks.num_points,
-        survivors.num_points,
-        "tracks",
-        {"observations disagree": int(short.sum()), "parallax too small": int(flat.sum())},
-    )
+    numbers = {reason: int(flag.sum()) for reason, flag in dropped.items()}
+    counts = Counts(tracks.num_points, survivors.num_points, "tracks", numbers)
     return Landmarks(points[kept], survivors, counts)
+
+
+def _within_camera(
+    tracks: Tracks, seen: np.ndarray, points: np.ndarray, centres: np.ndarray, origins: np.ndarray
+) -> np.ndarray:
+    """Points (J,) nearer to a lens that has seen them than that is to the camera's middle."""
+    distances = np.linalg.norm(points[tracks.points] - centres, axis=1)
+    near = seen & (distances < np.linalg.norm(origins, axis=1))
+    return np.bincount(tracks.points, near, len(points)) > 0
 
 
 def place(

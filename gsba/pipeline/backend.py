@@ -7,7 +7,6 @@ import numpy as np
 
 from gsba.bundle import (
     adjustment,
-    camera_system,
     common_errors,
     lens_axes,
     lens_centres,
@@ -18,7 +17,7 @@ from gsba.bundle import (
     tracks,
     triangulation,
 )
-from gsba.bundle.camera_system import CameraCovariances
+from gsba.bundle.camera_system import CameraCovariances, CameraSystem
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of
 from gsba.bundle.map_strength import MapStrength
@@ -157,7 +156,7 @@ def settle_camera(
         placed, loose = _widely_placed(run, seen, prior, matches, solved)
         loose, shown = replace(loose, landmarks=placed), seen.shown.bearings_rig
         times, problem = run.frames.timestamps, run.problem(prior)
-        return camera_system.step(loose, seen.keypoints, shown, camera, times, problem)
+        return CameraSystem(loose, seen.keypoints, shown, camera, times, problem).step()
 
     return run.stage(name, _camera_key(run), compute, Readout, noted=False)
 
@@ -337,7 +336,7 @@ def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, n
     def settle() -> Readout:
         solved, keypoints = placed_anew()
         problem = run.problem(prior)
-        return camera_system.step(solved, keypoints, shown, world.seeing(), times, problem)
+        return CameraSystem(solved, keypoints, shown, world.seeing(), times, problem).step()
 
     key = _camera_key(run)
     if number == 0 and world.lenses.twists is None:
@@ -400,7 +399,7 @@ def refine_photometric(run: Run, prior: Prior, world: Map) -> Map:
 
     def compute() -> PhotometricResult:
         frames, keypoints = world.straightened(run.frames), world.keypoints(run.rig)
-        return direct.refine(frames, keypoints, world.solution, run.problem(prior))
+        return direct.refine(frames, keypoints, world.solution, run.problem(prior), world.lenses)
 
     found = run.stage("photometric", key, compute, PhotometricResult)
     return replace(world, solution=found.adjustment, frame_weights=found.frame_weights)
@@ -430,15 +429,15 @@ def measure_camera(run: Run, prior: Prior, world: Map) -> Map:
 
     def compute() -> CameraCovariances:
         straight = stitching.corrected(world.observed, world.field, run.rig)
-        return camera_system.covariances(
+        system = CameraSystem(
             world.solution,
             world.lenses.seen(straight),
             straight.bearings_rig,
             world.seeing(),
             run.frames.timestamps,
             run.problem(prior),
-            prior.parts,
         )
+        return system.covariances(prior.parts)
 
     found = run.stage("camera", _camera_key(run), compute, CameraCovariances, noted=False)
     centres = replace(world.centres, covariance=found.centre)

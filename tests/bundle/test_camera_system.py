@@ -11,9 +11,11 @@ from synthetic import loop_walk
 
 from factors.quadratic_block import QuadraticBlock
 from factors.reduced import ReducedSystem
-from gsba.bundle import adjustment, camera_system
+from gsba.bundle import adjustment
+from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.readout import Readout
 from gsba.camera.lens import Lenses
+from gsba.config import CameraSettings
 from gsba.similarity import pose_similarity
 from gsba.types import Solution
 
@@ -22,14 +24,20 @@ SWEEPS = np.array([[-1.0, 0, 0], [0, 1.0, 0]])
 LENSES = Lenses(CENTRE, 0.2, BAND, SWEEPS, motion(loop_walk(24), READOUT_S))
 
 
-def _settled(camera: Lenses, known: Readout, seed: int = 0, rounds: int = 5):
+def _settled(
+    camera: Lenses,
+    known: Readout,
+    seed: int = 0,
+    rounds: int = 5,
+    said: CameraSettings | None = None,
+):
     world, shown = seen_through(camera, seed)
-    solved, problem = Solution.without_points(world.world_T_rigs), problem_of(world)
+    solved, problem = Solution.without_points(world.world_T_rigs), problem_of(world, said)
     for _ in range(rounds):
         solved, keypoints, tracks = solved_under(world, shown, known.lenses, solved)
         there = replace(solved, landmarks=placed(solved, keypoints, tracks))
         given = there, keypoints, shown.bearings_rig, known, times(24), problem
-        known = camera_system.step(*given)
+        known = CameraSystem(*given).step()
     return world, known, given
 
 
@@ -42,11 +50,25 @@ def test_all_of_a_camera_is_found_from_a_start_that_is_off() -> None:
     assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
 
 
+def test_a_stitch_radius_that_is_said_goes_with_the_lenses() -> None:
+    """Both pictures meet 5 m away, the lenses are as far apart as they are said to be."""
+    front = float(np.linalg.norm(CENTRE))
+    said = CameraSettings(baseline_mm=2e3 * front, stitch_radius_m=1 / LENSES.nearness)
+    start = replace(LENSES, centre=0.8 * CENTRE, nearness=LENSES.nearness / 0.8)
+    world, found, given = _settled(LENSES, Readout(start, READOUT_S), said=said)
+    scale = pose_similarity(given[0].world_T_rigs, world.world_T_rigs).scale
+    length = float(np.linalg.norm(found.lenses.centre))
+    assert found.lenses.nearness * length == pytest.approx(LENSES.nearness * front)
+    np.testing.assert_allclose(scale * found.lenses.centre, CENTRE, atol=0.001)
+    measured = CameraSystem(*given).covariances()
+    assert np.isnan(measured.nearness_sigma) and np.isfinite(measured.readout_sigma)
+
+
 def test_covariances_are_those_of_errors_and_wider_than_of_a_known_camera() -> None:
     errors = []
     for seed in range(4):
         world, _, given = _settled(LENSES, Readout(LENSES, READOUT_S), seed, 4)
-        measured = camera_system.covariances(*given)
+        measured = CameraSystem(*given).covariances()
         scale = pose_similarity(given[0].world_T_rigs, world.world_T_rigs).scale
         off = scale * given[3].lenses.centre - CENTRE
         errors.append(off / (scale * np.sqrt(np.diagonal(measured.centre))))

@@ -8,7 +8,8 @@ from lens_world import placed, problem_of, seen_through, solved_under, times
 from scipy.spatial.transform import Rotation
 from synthetic import loop_walk
 
-from gsba.bundle import camera_system, lens_axes, lens_centres
+from gsba.bundle import lens_axes, lens_centres
+from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.lens_axes import upright
 from gsba.bundle.readout import Readout
 from gsba.camera.lens import Lenses
@@ -56,7 +57,7 @@ def test_axes_below_a_stabilised_panorama_are_found(seed: int) -> None:
         solved, keypoints, tracks = solved_under(world, shown, camera.lenses, solved)
         there = replace(solved, landmarks=placed(solved, keypoints, tracks))
         rays = keypoints, shown.bearings_rig
-        camera = camera_system.step(there, *rays, camera, times(NUM), problem)
+        camera = CameraSystem(there, *rays, camera, times(NUM), problem).step()
     assert camera.lenses.axes is not None
     assert np.median(_off_deg(camera.lenses.axes, truth)) < 1
     scale = pose_similarity(solved.world_T_rigs, world.world_T_rigs).scale  # no image knows it

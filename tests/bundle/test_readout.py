@@ -7,7 +7,8 @@ import pytest
 from lens_world import motion, placed, problem_of, seen_through, solved_under, times
 from synthetic import loop_walk
 
-from gsba.bundle import camera_system, readout
+from gsba.bundle import readout
+from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.readout import Readout
 from gsba.camera.lens import Lenses
 from gsba.types import Solution
@@ -28,7 +29,7 @@ def _found(camera: Lenses, seed: int, rounds: int = 5) -> tuple[Readout, float]:
         solved, keypoints, tracks = solved_under(world, shown, found.lenses, solved)
         there = replace(solved, landmarks=placed(solved, keypoints, tracks))
         rays = keypoints, shown.bearings_rig
-        found = camera_system.step(there, *rays, found, moments, problem)
+        found = CameraSystem(there, *rays, found, moments, problem).step()
     return found, solved.noise
 
 

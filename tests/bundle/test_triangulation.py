@@ -89,6 +89,21 @@ def test_points_need_parallax(distance: float, kept: int) -> None:
     assert found.counts.dropped["parallax too small"] == 1 - kept
 
 
+@pytest.mark.parametrize(("distance", "kept"), [(0.1, 1), (0.03, 0)])
+def test_a_point_within_the_camera_is_none(distance: float, kept: int) -> None:
+    """So far before the front lens of the first frame, which is 0.05 before the middle."""
+    world_T_rigs, lens = np.stack([np.eye(4)] * 2), np.array([0, 0, 0.05])
+    world_T_rigs[1, 0, 3] = -0.1
+    lenses_T = world_T_rigs.copy()
+    lenses_T[:, :3, 3] += lens
+    bearings = _observe(lens + np.array([[0, 0, distance]]), lenses_T)
+    found = triangulation.triangulate(
+        _all_see_all(2, 1), bearings, np.full(2, SIGMA), world_T_rigs, 8.0, SETTINGS, 1,
+        np.stack([lens] * 2),
+    )  # fmt: skip
+    assert found.counts.kept == kept and found.counts.dropped["within the camera"] == 1 - kept
+
+
 def test_a_standing_camera_makes_no_points() -> None:
     rng = np.random.default_rng(2)
     world_T_rigs = np.stack([np.eye(4)] * 5)
