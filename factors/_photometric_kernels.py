@@ -1,6 +1,7 @@
 """Compiled pass over the observations of patches: sample, normalise, differentiate.
 
-Poses are rows `(12,)` = `[world_R_rig row-major (9), rig_in_world (3)]`. A patch is a plane seen
+Poses are rows `(12,)` = `[world_R_rig row-major (9), rig_in_world (3)]`, or those of the lenses
+that hosts and targets see patches through. A patch is a plane seen
 from its host: with its bearing m and tangent axes e1, e2 as rows of `axes`, the points along
 `m + x e1 + y e2` have the inverse depth `theta . (1, x, y)` (in units of that vector), so that a
 target sees them along
@@ -33,7 +34,7 @@ class PatchData(NamedTuple):
     """All patches of a block and their observations, sorted by patch."""
 
     hosts: np.ndarray  # (P,) int32, row of the poses
-    axes: np.ndarray  # (P, 3, 3) float64, rows bearing, e1, e2 in the host's rig frame
+    axes: np.ndarray  # (P, 3, 3) float64, rows bearing, e1, e2 in the host's frame
     templates: np.ndarray  # (P, N) float32, normalised as observations are
     scales: np.ndarray  # (P,) float64, residual of a unit difference of normalised patches, sigmas
     offsets: np.ndarray  # (P + 1,) int64: patch p owns observations offsets[p]:offsets[p + 1]
@@ -238,11 +239,13 @@ def _gauss_newton(Z, template, scale, norm, dims, weight, G, g):
 
 
 @_kernel
-def observe_range(first, last, data, planes, poses, dims, hessians, gradients, errors):
+def observe_range(
+    first, last, data, planes, host_poses, target_poses, dims, hessians, gradients, errors
+):  # fmt: skip
     """Model every observation of the patches first..last.
 
     Args:
-        planes (P, 3), poses (F, 12): where.
+        planes (P, 3), host_poses (P, 12), target_poses (O, 12): where.
         dims: 9 for the whole tangent, 3 for the plane alone, 0 for the errors alone.
         hessians (O, 9, 9), gradients (O, 9): written in their first `dims`, robust weights and
             those of the observations included; zero for what is left out or lost.
@@ -260,7 +263,7 @@ def observe_range(first, last, data, planes, poses, dims, hessians, gradients, e
                 gradients[o, :dims] = 0.0
             if data.weights[o] <= 0:
                 continue
-            _relative(poses[data.hosts[p]], poses[data.targets[o]], A, c)
+            _relative(host_poses[p], target_poses[o], A, c)
             if not _look(data, p, o, planes[p], A, c, dims, Z):
                 continue
             norm = _normalise(Z, 9, data.floor)

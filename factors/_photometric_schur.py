@@ -32,6 +32,28 @@ def _to_poses(host, target, by_host, by_target):
 
 
 @_part
+def _through(view, J):
+    """Rows J (6, 6) by right steps of the pose of a lens, turned into rows by those of its rig.
+
+    A step (w, v) of the rig is (R^T w, R^T (v + w x t)) of a lens at view = [R | t].
+    """
+    turned = np.empty(6)
+    for r in range(6):
+        for i in range(3):
+            turned[i] = (
+                J[r, 0] * view[3 * i] + J[r, 1] * view[3 * i + 1] + J[r, 2] * view[3 * i + 2]
+            )
+            turned[3 + i] = (
+                J[r, 3] * view[3 * i] + J[r, 4] * view[3 * i + 1] + J[r, 5] * view[3 * i + 2]
+            )
+        x, y, z = turned[3], turned[4], turned[5]
+        J[r, 0] = turned[0] + view[10] * z - view[11] * y
+        J[r, 1] = turned[1] + view[11] * x - view[9] * z
+        J[r, 2] = turned[2] + view[9] * y - view[10] * x
+        J[r, 3], J[r, 4], J[r, 5] = x, y, z
+
+
+@_part
 def _invert(V, out):
     """Inverse of a symmetric positive definite 3x3, damped by 1e-12 of its trace."""
     eps = 1e-12 * (V[0, 0] + V[1, 1] + V[2, 2]) + 1e-200
@@ -126,12 +148,15 @@ def _reduce(
 
 @_kernel
 def eliminate_range(
-    first, last, hosts, offsets, targets, poses, hessians, gradients, priors, row_starts, columns,
-    diagonal, off_diagonal, gradient, couplings, inverses, plane_gradients,
+    first, last, hosts, offsets, targets, host_poses, target_poses, host_views, target_views,
+    hessians, gradients, priors, row_starts, columns, diagonal, off_diagonal, gradient, couplings,
+    inverses, plane_gradients,
 ):  # fmt: skip
     """Add patches first..last, their planes eliminated, to a reduced pose system.
 
     Args:
+        host_poses (P, 12), target_poses (O, 12): from which patches are seen, rows as poses are.
+        host_views (P, 12), target_views (O, 12): of those, in their rigs.
         hessians (O, 9, 9), gradients (O, 9): models of the observations in their own tangents.
         priors (P, 6): weights (3) on the plane, then its gradient (3).
         row_starts (F + 1,), columns (Q,): frame pairs i < k as sorted CSR rows.
@@ -155,7 +180,9 @@ def eliminate_range(
         for i in range(num):
             o = offsets[p] + i
             target, G, g = targets[o], hessians[o], gradients[o]
-            _to_poses(poses[host], poses[target], by_host, by_target)
+            _to_poses(host_poses[p], target_poses[o], by_host, by_target)
+            _through(host_views[p], by_host)
+            _through(target_views[o], by_target)
             _add_product(by_host, G, by_host, diagonal[host])
             _add_product(by_target, G, by_target, diagonal[target])
             block[:] = 0.0

@@ -41,6 +41,18 @@ def pose_rows(values: gtsam.Values, keys: Sequence[int]) -> np.ndarray:
     return out
 
 
+def matrix_rows(a_T_bs: np.ndarray) -> np.ndarray:
+    """(N, 12) rows like those of poses, of transforms (N, 4, 4)."""
+    return np.hstack([a_T_bs[:, :3, :3].reshape(-1, 9), a_T_bs[:, :3, 3]])
+
+
+def moved_rows(rows: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """Rows (N, 12) of poses, each followed by the transform of a row of views (N, 12)."""
+    turns, own = rows[:, :9].reshape(-1, 3, 3), views[:, :9].reshape(-1, 3, 3)
+    moved = np.einsum("nij,nj->ni", turns, views[:, 9:]) + rows[:, 9:]
+    return np.hstack([np.einsum("nij,njk->nik", turns, own).reshape(-1, 9), moved])
+
+
 def whitener_rows(
     num: int, sigmas: np.ndarray | float, sqrt_infos: np.ndarray | None
 ) -> np.ndarray:

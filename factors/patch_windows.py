@@ -18,16 +18,32 @@ _MOST_ZOOM = 2.0  # change of a patch's size between host and target, either way
 
 
 @dataclass(frozen=True, slots=True)
+class PatchViews:
+    """From where, and how turned, a rig's lenses have what its panorama shows of patches.
+
+    Held while poses are solved: a patch that moves to the other lens is another observation.
+    """
+
+    rig_T_hosts: np.ndarray  # (P, 4, 4) float64, what hosts show, as rays of their rigs
+    rig_T_targets: np.ndarray  # (O, 4, 4) float64, what targets show
+
+    def of(self, rows: np.ndarray, observations: np.ndarray) -> "PatchViews":
+        """Those of some patches (p,) and of observations (O,) bool."""
+        return PatchViews(self.rig_T_hosts[rows], self.rig_T_targets[observations])
+
+
+@dataclass(frozen=True, slots=True)
 class PatchTable:
     """Patches and the frames that should show them."""
 
     hosts: np.ndarray  # (P,) int, frame whose pixels are the template
-    bearings_rig: np.ndarray  # (P, 3) float64, unit, centre in the host's rig frame
+    bearings_rig: np.ndarray  # (P, 3) float64, unit, centre in the host's rig frame, as pictured
     planes: np.ndarray  # (P, 3) float64, 1 / map units: inverse depth and slopes, see `planes_from`
     plane_sigmas: np.ndarray  # (P, 3) float64, 1 / map units, of the prior on `planes`; inf = none
     offsets: np.ndarray  # (P + 1,) int64: patch p owns targets[offsets[p]:offsets[p + 1]]
     targets: np.ndarray  # (O,) int, frames, never the host and none twice for a patch
     grid: np.ndarray  # (N, 2) float64, pixels on the tangent plane of the bearing
+    views: "PatchViews | None" = None  # of rigs whose lenses have centres of their own
 
     def __len__(self) -> int:
         return len(self.hosts)
@@ -36,6 +52,16 @@ class PatchTable:
     def owners(self) -> np.ndarray:
         """(O,) patch of every observation."""
         return np.repeat(np.arange(len(self)), np.diff(self.offsets))
+
+    def world_T_hosts(self, world_T_rigs: np.ndarray) -> np.ndarray:
+        """Poses (P, 4, 4) from which hosts see their patches."""
+        world_T_hosts = world_T_rigs[self.hosts]
+        return world_T_hosts if self.views is None else world_T_hosts @ self.views.rig_T_hosts
+
+    def world_T_targets(self, world_T_rigs: np.ndarray) -> np.ndarray:
+        """Poses (O, 4, 4) from which targets see them."""
+        world_T_targets = world_T_rigs[self.targets]
+        return world_T_targets if self.views is None else world_T_targets @ self.views.rig_T_targets
 
     def select(self, observations: np.ndarray) -> "tuple[PatchTable, np.ndarray]":
         """The table of some observations (O,) bool, and the patches (p,) that have any.
@@ -52,6 +78,7 @@ class PatchTable:
             plane_sigmas=self.plane_sigmas[rows],
             offsets=np.concatenate([[0], np.cumsum(counts[rows])]),
             targets=self.targets[observations],
+            views=None if self.views is None else self.views.of(rows, observations),
         )
         return part, rows
 
@@ -69,6 +96,9 @@ class PatchTable:
             "plane_sigmas": (self.plane_sigmas, (num, 3)),
             "offsets": (self.offsets, (num + 1,)),
         }
+        if self.views is not None:
+            wanted["rig_T_hosts"] = (self.views.rig_T_hosts, (num, 4, 4))
+            wanted["rig_T_targets"] = (self.views.rig_T_targets, (len(self.targets), 4, 4))
         for name, (array, shape) in wanted.items():
             if np.shape(array) != shape:
                 raise ValueError(f"{name} of {num} patches must be {shape}, not {np.shape(array)}")
@@ -147,10 +177,11 @@ def patch_spans(
 ) -> np.ndarray:
     """Vectors (R, 3, 3), rows: to the centre, and per tangent along e1 and e2.
 
-    In the targets' rig frames, of observations `rows (R,)`, times the inverse depth.
+    As the targets' panoramas show them, of observations `rows (R,)`, times the inverse depth.
     """
     owners = table.owners[rows]
-    host, target = world_T_rigs[table.hosts[owners]], world_T_rigs[table.targets[rows]]
+    host = table.world_T_hosts(world_T_rigs)[owners]
+    target = table.world_T_targets(world_T_rigs)[rows]
     target_R_host = np.einsum("rji,rjk->rik", target[:, :3, :3], host[:, :3, :3])
     c = np.einsum("rji,rj->ri", target[:, :3, :3], host[:, :3, 3] - target[:, :3, 3])
     spans = np.einsum("rij,rkj->rki", target_R_host, patch_axes(table.bearings_rig)[owners])
@@ -174,8 +205,9 @@ def poor_views(
     area = np.einsum("oi,oi->o", np.cross(spans[:, 1], spans[:, 2]), middle) / length**3
     normals = np.einsum("pk,pki->pi", planes, patch_axes(table.bearings_rig))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.einsum("oij,oj->oi", world_T_rigs[table.hosts[owners], :3, :3], normals[owners])
-    rays = np.einsum("oij,oj->oi", world_T_rigs[table.targets, :3, :3], middle)
+    hosts = table.world_T_hosts(world_T_rigs)[owners]
+    normals = np.einsum("oij,oj->oi", hosts[:, :3, :3], normals[owners])
+    rays = np.einsum("oij,oj->oi", table.world_T_targets(world_T_rigs)[:, :3, :3], middle)
     cosine = np.einsum("oi,oi->o", normals, rays) / length
     return {
         "behind": ~np.all(inverse_depths > 0, axis=0)[owners],

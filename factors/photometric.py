@@ -10,7 +10,7 @@ import numpy as np
 
 from factors._photometric_kernels import DIMS, PatchData, observe_range
 from factors._photometric_schur import eliminate_range
-from factors._terms import pose_rows
+from factors._terms import matrix_rows, moved_rows, pose_rows
 from factors.block import PoseSystem
 from factors.patch_windows import PatchPixels, covisible_frames, patch_axes, poor_views
 from factors.reduced_factor import reduced_factor
@@ -90,6 +90,7 @@ class PhotometricBlock:
             pixels.pixels(), pixels.starts, pixels.windows, table.grid, pixels.width, floor,
             self.loss.code, float(self.loss.scale),
         )  # fmt: skip
+        self._set_views()
         self._prior_weights = 1.0 / table.plane_sigmas**2
         self._set_pairs()
 
@@ -128,9 +129,9 @@ class PhotometricBlock:
         diagonal, gradient = np.zeros((num_f, 6, 6)), np.zeros((num_f, 6))
         off_diagonal = np.zeros((len(self._columns), 6, 6))
         eliminate_range(
-            0, num_p, data.hosts, data.offsets, data.targets, poses, hessians, gradients, priors,
-            self._row_starts, self._columns, diagonal, off_diagonal, gradient, couplings, inverses,
-            downs,
+            0, num_p, data.hosts, data.offsets, data.targets, *self._seen_from(poses), *self._views,
+            hessians, gradients, priors, self._row_starts, self._columns, diagonal, off_diagonal,
+            gradient, couplings, inverses, downs,
         )  # fmt: skip
         self._schur = couplings, inverses, downs
         return PoseSystem(diagonal, off_diagonal, gradient, {FAMILY: float(self._costs.sum())})
@@ -220,6 +221,7 @@ class PhotometricBlock:
             starts=data.starts[observations],
             windows=data.windows[observations],
         )
+        part._set_views()
         part._set_pairs()
         return part
 
@@ -266,10 +268,12 @@ class PhotometricBlock:
         size = num_o if dims else 0
         hessians, gradients = np.empty((size, DIMS, DIMS)), np.empty((size, DIMS))
         errors = np.empty(num_o)
-        ranges = balanced_ranges(self.table.offsets, _LEAST_RUN)
+        ranges, seen_from = balanced_ranges(self.table.offsets, _LEAST_RUN), self._seen_from(poses)
 
         def work(i: int) -> None:
-            observe_range(*ranges[i], self._data, planes, poses, dims, hessians, gradients, errors)
+            observe_range(
+                *ranges[i], self._data, planes, *seen_from, dims, hessians, gradients, errors
+            )
 
         run_in_threads(work, len(ranges), self.num_threads)
         return (hessians, gradients), errors
@@ -328,6 +332,24 @@ class PhotometricBlock:
         room = (1 - _LEAST_SHARE) * planes[:, 0]
         share = np.minimum(1.0, room / np.maximum(-steps[:, 0], 1e-300))
         return planes + share[:, None] * np.where(np.isfinite(steps), steps, 0.0)
+
+    def _seen_from(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (P, 12) that patches are hosted from, (O, 12) that they are observed from."""
+        seen_from = poses[self._data.hosts], poses[self._data.targets]
+        if self.table.views is None:
+            return seen_from
+        return moved_rows(seen_from[0], self._views[0]), moved_rows(seen_from[1], self._views[1])
+
+    def _set_views(self) -> None:
+        """Those of `table.views` as rows, or rows that do nothing."""
+        views, table = self.table.views, self.table
+        if views is None:
+            nothing = matrix_rows(np.eye(4)[None])
+            self._views = tuple(
+                np.repeat(nothing, n, axis=0) for n in (len(table), len(table.targets))
+            )
+        else:
+            self._views = matrix_rows(views.rig_T_hosts), matrix_rows(views.rig_T_targets)
 
     def _set_pairs(self) -> None:
         """Frame pairs that share a patch, and a state without a linearization."""

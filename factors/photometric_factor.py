@@ -38,6 +38,8 @@ def photometric_residuals(
     template: np.ndarray,
     image: Sampled,
     floor: float = 0.25,
+    rig_T_host: np.ndarray | None = None,
+    rig_T_target: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Residual of each pixel of a patch in one target, in grey values of the host's patch.
 
@@ -49,6 +51,7 @@ def photometric_residuals(
         template: (N,) grey values in the host.
         image: the target's.
         floor: see `normalised`.
+        rig_T_host, rig_T_target: (4, 4) of the lens that sees the patch; None = the rig itself.
 
     Returns:
         residuals (N,), Jacobians by the host's pose (N, 6), the target's pose (N, 6), both right
@@ -56,7 +59,15 @@ def photometric_residuals(
     """
     wanted, contrast = normalised(template, floor)
     weights = np.column_stack([np.ones(len(grid)), grid])
-    target_T_host = np.linalg.inv(world_T_target) @ world_T_host
+    of_host, of_target = (
+        gtsam.Pose3(np.eye(4) if view is None else view) for view in (rig_T_host, rig_T_target)
+    )
+    target_T_host = (
+        gtsam.Pose3(world_T_target)
+        .compose(of_target)
+        .between(gtsam.Pose3(world_T_host).compose(of_host))
+        .matrix()
+    )
     A, c = target_T_host[:3, :3], target_T_host[:3, 3]
     rays = weights @ axes  # in the host's rig frame
     turned, near = rays @ A.T, weights @ plane
@@ -71,6 +82,8 @@ def photometric_residuals(
     by_host = np.hstack([np.cross(rays, slopes @ A), near[:, None] * (slopes @ A)])
     by_target = np.hstack([np.cross(slopes, directions), -near[:, None] * slopes])
     by_plane = (slopes @ c)[:, None] * weights
+    by_host = by_host @ of_host.inverse().AdjointMap()
+    by_target = by_target @ of_target.inverse().AdjointMap()
     return contrast * (seen - wanted), through(by_host), through(by_target), through(by_plane)
 
 
@@ -85,6 +98,8 @@ def PhotometricFactor(
     noise_model: gtsam.noiseModel.Base,
     slopes: np.ndarray | None = None,
     floor: float = 0.25,
+    rig_T_host: np.ndarray | None = None,
+    rig_T_target: np.ndarray | None = None,
 ) -> gtsam.CustomFactor:
     """One patch in one target as an ordinary GTSAM factor.
 
@@ -92,7 +107,8 @@ def PhotometricFactor(
         host_key, target_key: keys of Pose3 `world_T_rig`.
         plane_key: key of a Point3, the plane (inverse depth and slopes), or, where `slopes` are
             given, of a double, the inverse depth alone.
-        axes, grid, template, image, floor: as for `photometric_residuals`.
+        axes, grid, template, image, floor, rig_T_host, rig_T_target: as for
+            `photometric_residuals`.
         noise_model: of dimension N, grey values, robust or not.
         slopes: (2,) of the plane per inverse depth, held fixed; zeros face the host.
     """
@@ -102,7 +118,7 @@ def PhotometricFactor(
         plane = values.atPoint3(plane_key) if shape is None else values.atDouble(plane_key) * shape
         residuals, by_host, by_target, by_plane = photometric_residuals(
             values.atPose3(host_key).matrix(), values.atPose3(target_key).matrix(), plane, axes,
-            grid, template, image, floor,
+            grid, template, image, floor, rig_T_host, rig_T_target,
         )  # fmt: skip
         if jacobians is not None:
             jacobians[0] = np.asfortranarray(by_host)

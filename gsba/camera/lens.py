@@ -12,10 +12,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from gsba.geometry import pose
 from gsba.types import Keypoints, Tracks
 
 _HALF_FOV = np.deg2rad(100.0)  # of a fisheye that fills its sensor: the first and the last row
-_SETTLED = 3  # passes after which a row's time no longer changes where a point is seen
+_SETTLED = 4  # passes after which a row's time no longer changes where a point is seen
 
 
 def _centre() -> np.ndarray:
@@ -94,6 +95,22 @@ class Lenses:
         turn = _rotations(moved[:, :3])
         turned = np.einsum("nij,nj->ni", turn, seen)
         return turned, np.einsum("nij,nj->ni", turn, origins) + moved[:, 3:]
+
+    def views(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Transforms (N, 4, 4), rig_T_view, of what frames (N,) show around unit directions (N, 3).
+
+        A view has it in the same directions as the picture, from where the rays start. By how much
+        a stitch radius magnifies is left out.
+        """
+        bent, starts = replace(self, twists=None).rays(directions, frames)
+        axes = np.cross(directions, bent)
+        sines = np.linalg.norm(axes, axis=1, keepdims=True)
+        turns = _rotations(axes * (np.arcsin(np.minimum(sines, 1)) / np.maximum(sines, 1e-300)))
+        if self.twists is not None:
+            moved = self.fractions(directions, frames)[:, None] * self.twists[frames]
+            later = _rotations(moved[:, :3])
+            turns, starts = later @ turns, np.einsum("nij,nj->ni", later, starts) + moved[:, 3:]
+        return pose(turns, starts)
 
     def seeing(self, points_rig: np.ndarray, frames: np.ndarray) -> np.ndarray:
         """Points (N, 3), rig frame in the middle of the readout, as the lens of frames (N,) that

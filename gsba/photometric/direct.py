@@ -13,6 +13,7 @@ from factors.sphere_image import SphereImage
 from gsba.bundle import adjustment, prior_factors, triangulation
 from gsba.bundle.adjustment import Problem
 from gsba.bundle.optimizer import OptimizeResult, optimize
+from gsba.camera.lens import Lenses
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.frames.masks import load_weights
 from gsba.log import GsbaError, track
@@ -63,6 +64,7 @@ def refine(
     keypoints: Keypoints,
     start: Solution,
     problem: Problem,
+    lenses: Lenses | None = None,
 ) -> PhotometricResult:
     """Refine a solved map by the grey values of patches, level after level.
 
@@ -71,11 +73,14 @@ def refine(
         keypoints: of all frames.
         start: the solved map.
         problem: priors, families, loss, solver, patches.
+        lenses: what the panoramas are stitched from; None = one view point.
     """
     solved, counts, settings = start, [], problem.settings
     weights, residuals = np.ones(len(frames)), np.full(len(frames), np.nan)
     for level in settings.photometric.levels:
-        pixels, trust, found = _patches(frames, solved, level, settings, problem.num_threads)
+        pixels, trust, found = _patches(
+            frames, solved, level, settings, problem.num_threads, lenses or Lenses()
+        )
         counts += found
         if pixels is None:
             logger.warning("no patch is seen twice at level %d: left as it was", level)
@@ -85,7 +90,12 @@ def refine(
 
 
 def _patches(
-    frames: FrameSet, solved: Solution, level: int, settings: RefineSettings, num_threads: int
+    frames: FrameSet,
+    solved: Solution,
+    level: int,
+    settings: RefineSettings,
+    num_threads: int,
+    lenses: Lenses,
 ) -> tuple[PatchPixels | None, np.ndarray, list[Counts]]:
     """Pixels of the patches and observations that are good enough, if any; weights; the counts."""
     chosen, world_T_rigs = settings.photometric, solved.world_T_rigs
@@ -96,10 +106,15 @@ def _patches(
         usable = patches.coarser(usable, len(usable) // len(grey))
         bearings.append(patches.candidates(grey, usable, chosen))
         width, level = grey.shape[1], len(greys) - 1  # a small panorama has fewer
-    table, counts = patches.table_of(bearings, world_T_rigs, solved.landmarks, width, chosen)
+    landmarks = solved.landmarks
+    table, counts = patches.table_of(bearings, world_T_rigs, landmarks, width, chosen, lenses)
     num, dropped = len(table.targets), {}
     left = np.ones(num, bool)
-    for reason, flag in poor_views(table, world_T_rigs, table.planes).items():
+    poor = poor_views(table, world_T_rigs, table.planes)
+    if lenses:
+        shown = patch_spans(table, world_T_rigs, table.planes, np.arange(num))[:, 0]
+        poor["between the lenses"] = lenses.blended(shown, table.targets)
+    for reason, flag in poor.items():
         dropped[reason] = int(np.count_nonzero(flag & left))
         left &= ~flag
     table, _ = table.select(left)
@@ -235,7 +250,7 @@ def joint(
     if "photometric" not in settings.factors:
         return []
     level = settings.photometric.levels[-1]
-    pixels, trust, _ = _patches(frames, solved, level, settings, num_threads)
+    pixels, trust, _ = _patches(frames, solved, level, settings, num_threads, Lenses())
     if pixels is None:
         return []
     start = make_block(pixels, trust, settings, num_threads)

@@ -1,12 +1,14 @@
 """Patches for photometric refinement: spread over the sphere, depth from the map, seen nearby."""
 
 import functools
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from scipy.ndimage import correlate1d
 
-from factors.patch_windows import PatchTable, over_poles, patch_axes, pixel_grid
+from factors.patch_windows import PatchTable, PatchViews, over_poles, patch_axes, pixel_grid
+from gsba.camera.lens import Lenses
 from gsba.camera.sphere import around_seam, bearings_from_erp, erp_from_bearings
 from gsba.config import PhotometricSettings
 from gsba.frames.masks import load_mask
@@ -163,6 +165,7 @@ def table_of(
     landmarks: Landmarks,
     width: int,
     settings: PhotometricSettings,
+    lenses: Lenses,
 ) -> tuple[PatchTable, Counts]:
     """Patches of all frames with planes from the map, and the frames near each host.
 
@@ -171,6 +174,7 @@ def table_of(
         world_T_rigs: (F, 4, 4) solved poses.
         landmarks: the solved map.
         width: of the panoramas that patches are sampled from, pixels.
+        lenses: what the panoramas are stitched from.
     """
     tracks = landmarks.tracks
     positions = world_T_rigs[:, :3, 3]
@@ -178,9 +182,11 @@ def table_of(
     received = 0
     for f, found in enumerate(bearings):
         received += len(found)
+        found = found[~lenses.blended(found, np.full(len(found), f))]
         seen = landmarks.points_world[tracks.points[tracks.frames == f]]
         points_rig = (seen - positions[f]) @ world_T_rigs[f, :3, :3]
-        laid, clear = lay_planes(found, points_rig, settings)
+        shown = lenses.seeing(points_rig, np.full(len(points_rig), f))
+        laid, clear = lay_planes(found, shown, settings)
         distances = np.linalg.norm(positions - positions[f], axis=1)
         distances[f] = np.inf
         near = np.argsort(distances, kind="stable")[: min(settings.targets, len(positions) - 1)]
@@ -199,8 +205,24 @@ def table_of(
         np.concatenate(targets).ravel(),
         pixel_grid(settings.size, 2 * np.pi / width),
     )
+    if lenses:
+        table = replace(table, views=views_of(table, world_T_rigs, lenses))
     dropped = {"no clear depth": received - len(plane)}
     return table, Counts(received, len(plane), "patches", dropped)
+
+
+def views_of(table: PatchTable, world_T_rigs: np.ndarray, lenses: Lenses) -> PatchViews:
+    """How lenses see the patches of a table, and the places where these are laid."""
+    rig_T_hosts = lenses.views(table.bearings_rig, table.hosts)
+    world_T_hosts = (world_T_rigs[table.hosts] @ rig_T_hosts)[table.owners]
+    centres = (table.bearings_rig / table.planes[:, :1])[table.owners, :, None]
+    points = (world_T_hosts[:, :3, :3] @ centres)[:, :, 0] + world_T_hosts[:, :3, 3]
+    world_T_targets = world_T_rigs[table.targets]
+    away = points - world_T_targets[:, :3, 3]
+    local = np.einsum("oji,oj->oi", world_T_targets[:, :3, :3], away)
+    shown = lenses.seeing(local, table.targets)
+    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+    return PatchViews(rig_T_hosts, lenses.views(shown, table.targets))
 
 
 def values_at(image: np.ndarray, directions: np.ndarray) -> np.ndarray:

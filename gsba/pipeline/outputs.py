@@ -94,9 +94,8 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
             run.settings.camera,
             frames.timed,
         )
-        left_out = run.settings.direct_families() if world.lenses else ()
-        if left_out:
-            more.append(f"{' and '.join(left_out)} left out: they take a frame for one view point")
+        if "splat" in run.settings.factors and world.lenses:
+            more.append("splat left out: it takes a frame for one view point")
         notes += more
     most = run.settings.closer.max_scale_sigma
     notes += findings.of_frames(frames, coarse, result, undone, world.frame_weights, most)

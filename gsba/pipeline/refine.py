@@ -142,11 +142,9 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     world = replace(world, solution=solved, observed=seen.shown)
     for n in range(1, patch_rounds + 1):
         world = backend.align_patches(run, prior, world, n)
-    if world.lenses:  # pixels of whole frames are compared as views from one point
-        families = ()
     if "photometric" in families:
         world = backend.refine_photometric(run, prior, world)
-    if "splat" in families:
+    if "splat" in families and not world.lenses:  # it is rendered as seen from one point
         world = backend.refine_on_splat(run, prior, world)
     return prior, backend.measure_camera(run, prior, world)
 

@@ -26,17 +26,35 @@ LENSES = {
 }
 
 
+def _away_from_the_seam(lenses: Lenses, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) of which no near one comes to lie on its other side, and their frames (N,)."""
+    rng, wide = np.random.default_rng(seed), replace(lenses, band_rad=np.deg2rad(15))
+    points = rng.uniform(0.5, 8, (400, 1)) * unit(rng.normal(size=(400, 3)))
+    clear = ~wide.blended(points, FRAMES)
+    return points[clear], FRAMES[clear]
+
+
 @pytest.mark.parametrize("lenses", LENSES.values(), ids=LENSES)
 def test_a_point_lies_on_the_ray_of_where_it_is_shown(lenses: Lenses) -> None:
-    points = RNG.uniform(0.5, 8, (400, 1)) * unit(RNG.normal(size=(400, 3)))
-    clear = ~lenses.blended(points, FRAMES)
-    points, frames = points[clear], FRAMES[clear]
+    points, frames = _away_from_the_seam(lenses, 2)
     shown = unit(lenses.seeing(points, frames))
     directions, origins = lenses.rays(shown, frames)
     along = np.einsum("ni,ni->n", points - origins, directions)
     off = points - origins - along[:, None] * directions
-    np.testing.assert_allclose(off, 0, atol=1e-6)  # a row's time is settled in three passes
+    np.testing.assert_allclose(off, 0, atol=1e-6)  # a row's time is settled in four passes
     assert (along > 0).all()
+
+
+@pytest.mark.parametrize("lenses", LENSES.values(), ids=LENSES)
+def test_a_view_has_things_where_the_picture_shows_them(lenses: Lenses) -> None:
+    points, frames = _away_from_the_seam(lenses, 1)
+    shown = unit(lenses.seeing(points, frames))
+    view_T_rigs = np.linalg.inv(lenses.views(shown, frames))
+    aside = points * (1 + 5e-4 * np.random.default_rng(3).normal(size=points.shape))
+    for where, tolerance in ((points, 1e-6), (aside, 3e-5)):  # rows differ, and magnification
+        seen = (view_T_rigs[:, :3, :3] @ where[:, :, None])[:, :, 0] + view_T_rigs[:, :3, 3]
+        expected = unit(lenses.seeing(where, frames))
+        np.testing.assert_allclose(unit(seen), expected, atol=tolerance)
 
 
 def test_rows_of_a_lens_are_read_from_edge_to_edge() -> None:
@@ -61,8 +79,9 @@ def test_each_lens_sees_from_its_side_and_neither_at_the_seam() -> None:
 
 
 def test_axes_turn_the_lenses_of_their_frame() -> None:
+    rng = np.random.default_rng(0)
     turned, frames = replace(TWO, axes=AXES), np.repeat([2, 4], 50)
-    directions = unit(RNG.normal(size=(100, 3)))
+    directions = unit(rng.normal(size=(100, 3)))
     own = np.einsum("nji,nj->ni", AXES[frames], directions)
     expected = np.einsum("nij,nj->ni", AXES[frames], TWO.origins(own, frames))
     np.testing.assert_allclose(turned.origins(directions, frames), expected)
@@ -74,17 +93,19 @@ def test_axes_turn_the_lenses_of_their_frame() -> None:
 
 def test_a_stitcher_is_right_at_its_radius() -> None:
     """What is as far from the rig's centre as panoramas are stitched for shows no parallax."""
+    rng = np.random.default_rng(0)
     radius = 3.0
     lenses, frames = replace(TWO, nearness=1 / radius), np.zeros(50, int)
-    directions = unit(RNG.normal(size=(50, 3)))
+    directions = unit(rng.normal(size=(50, 3)))
     shown = unit(lenses.seeing(radius * directions, frames))
     clear = ~lenses.blended(directions, frames)
     np.testing.assert_allclose(shown[clear], directions[clear], atol=1e-12)
 
 
 def test_jacobians_by_the_centre_are_numerical_ones() -> None:
-    lenses, frames = replace(TWO, axes=AXES), RNG.integers(0, 5, 40)
-    directions = unit(RNG.normal(size=(40, 3)))
+    rng = np.random.default_rng(0)
+    lenses, frames = replace(TWO, axes=AXES), rng.integers(0, 5, 40)
+    directions = unit(rng.normal(size=(40, 3)))
     found = lenses.by_centre(np.tile(np.eye(3), (40, 1, 1)), directions, frames)
     for k, step in enumerate(1e-3 * np.eye(3)):
         moved = replace(lenses, centre=lenses.centre + step).origins(directions, frames)
@@ -100,7 +121,8 @@ def _keypoints(bearings: np.ndarray) -> Keypoints:
 
 
 def test_one_centre_changes_nothing() -> None:
-    keypoints = _keypoints(unit(RNG.normal(size=(10, 3))))
+    rng = np.random.default_rng(0)
+    keypoints = _keypoints(unit(rng.normal(size=(10, 3))))
     tracks = Tracks(np.arange(10), np.repeat([0, 1], 5), np.tile(np.arange(5), 2), 10)
     assert not Lenses() and Lenses().seen(keypoints) is keypoints
     assert Lenses().clear(tracks, keypoints) is tracks

@@ -9,7 +9,7 @@ from photometric_world import BallWorld, CodedImage, make_ball_world, table_of
 from synthetic import unit
 
 from factors import RobustLoss, jacobian_errors
-from factors.patch_windows import PatchPixels, patch_axes, planes_from
+from factors.patch_windows import PatchPixels, PatchTable, PatchViews, patch_axes, planes_from
 from factors.photometric import _LEAST_RUN, FAMILY, PhotometricBlock
 from factors.photometric_factor import PhotometricFactor, photometric_residuals
 from factors.sphere_image import SphereImage
@@ -40,8 +40,31 @@ def reference(world: BallWorld, patch: int, o: int, loss: RobustLoss, **options)
         patch_axes(table.bearings_rig[patch : patch + 1])[0], table.grid,
         world.pixels.templates[patch].astype(float), CodedImage(world.images[table.targets[o]]),
         noise,
+        **views_of(table, patch, o),
         **options,
     )  # fmt: skip
+
+
+def views_of(table: PatchTable, patch: int, o: int) -> dict[str, np.ndarray]:
+    if table.views is None:
+        return {}
+    hosts, targets = table.views.rig_T_hosts, table.views.rig_T_targets
+    return {"rig_T_host": hosts[patch], "rig_T_target": targets[o]}
+
+
+def through_lenses(world: BallWorld, seed: int = 0) -> BallWorld:
+    """The same images, of rigs whose cameras each patch sees from beside the middle and turned."""
+    rng, table = np.random.default_rng(seed), world.pixels.table
+
+    def views(num: int) -> np.ndarray:
+        steps = rng.normal(size=(num, 6)) * np.repeat([0.02, 0.05], 3)
+        return np.array([gtsam.Pose3.Expmap(step).matrix() for step in steps])
+
+    seen = PatchViews(views(len(table)), views(len(table.targets)))
+    pixels = PatchPixels(replace(table, views=seen), world.world_T_rigs, world.pixels.width, 30.0)
+    for f, image in enumerate(world.images):
+        pixels.take(f, image)
+    return replace(world, pixels=pixels)
 
 
 def reference_graph(world: BallWorld, loss: RobustLoss) -> gtsam.NonlinearFactorGraph:
@@ -108,8 +131,19 @@ def test_jacobians(bearing: tuple[float, ...], spread: float) -> None:
     assert max(jacobian_errors(factor, depth, STEP).values()) < 1e-5
 
 
-def test_block_costs_what_the_reference_factors_do() -> None:
+def test_jacobians_through_lenses() -> None:
+    world = through_lenses(make_ball_world(1, 2, 8))
+    values, table = world.values(), world.pixels.table
+    for patch in range(len(table)):
+        values.insert(PLANE + patch, table.planes[patch])
+        factor = reference(world, patch, int(table.offsets[patch]), RobustLoss())
+        assert max(jacobian_errors(factor, values, STEP).values()) < 1e-5
+
+
+@pytest.mark.parametrize("lenses", [False, True])
+def test_block_costs_what_the_reference_factors_do(lenses: bool) -> None:
     world = make_ball_world(2, 3, 20)
+    world = through_lenses(world) if lenses else world
     block = block_of(world)
     assert block.counted.all() and not any(block.dropped.values())
     values = world.values(moved(world, 0, 3e-3, 0.01))
@@ -121,8 +155,10 @@ def test_block_costs_what_the_reference_factors_do() -> None:
     assert block.linearize(values).costs[FAMILY] == pytest.approx(expected, rel=1e-5)
 
 
-def test_gradient_is_that_of_the_eliminated_cost() -> None:
+@pytest.mark.parametrize("lenses", [False, True])
+def test_gradient_is_that_of_the_eliminated_cost(lenses: bool) -> None:
     world = make_ball_world(3, 3, 25)
+    world = through_lenses(world) if lenses else world
     block = block_of(world, RobustLoss())
     poses = moved(world, 1, 1e-3, 4e-3)
     block.polish(world.values(poses), 100)

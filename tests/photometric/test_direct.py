@@ -10,8 +10,10 @@ from photometric_world import Texture, render
 from synthetic import unit
 from tiny_run import SETTINGS, Case, computed_stages
 
+from factors.patch_windows import PatchTable, patch_spans, pixel_grid, planes_from
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import Problem
+from gsba.camera.lens import Lenses
 from gsba.camera.sphere import erp_from_bearings
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.config_file import load_config
@@ -84,6 +86,28 @@ def test_a_map_without_points_near_gives_no_depth() -> None:
     assert np.count_nonzero(clear) < 10
 
 
+def test_lenses_see_patches_where_they_show_their_points() -> None:
+    """From 200 random bearings of three frames, of planes that face them."""
+    rng = np.random.default_rng(5)
+    lenses = Lenses(np.array([0.001, 0, 0.04]), 0.2, np.deg2rad(4))
+    world_T_rigs = np.stack([gtsam.Pose3.Expmap(0.2 * rng.normal(size=6)).matrix() for _ in "123"])
+    hosts, bearings = rng.integers(0, 3, 200), unit(rng.normal(size=(200, 3)))
+    planes = planes_from(bearings, rng.uniform(1, 5, 200))
+    table = PatchTable(
+        hosts, bearings, planes, np.ones((200, 3)), np.arange(201), (hosts + 1) % 3,
+        pixel_grid(5, 0.01),
+    )  # fmt: skip
+    seen = replace(table, views=patches.views_of(table, world_T_rigs, lenses))
+    shown = unit(patch_spans(seen, world_T_rigs, planes, np.arange(200))[:, 0])
+    rays, starts = lenses.rays(bearings, hosts)
+    # as far along the ray as the plane is from the lens
+    local = starts + rays / planes[:, :1]
+    to = np.linalg.inv(world_T_rigs[table.targets]) @ world_T_rigs[hosts]
+    points = np.einsum("nij,nj->ni", to[:, :3, :3], local) + to[:, :3, 3]
+    expected = unit(lenses.seeing(points, table.targets))
+    np.testing.assert_allclose(shown, expected, atol=1e-9)
+
+
 @pytest.fixture(scope="module")
 def joint(case: Case, tmp_path_factory: pytest.TempPathFactory):
     """The case's run, taken further by the photometric family."""
@@ -145,8 +169,8 @@ def test_observations_weigh_what_both_masks_say(case: Case, tmp_path: Path) -> N
     half[:, : frames.width // 2] = 0.5
     write_image(tmp_path / "half.png", levels_of(half))
     masked = replace(frames, mask_paths=(tmp_path / "half.png",) * len(frames))
-    plain, ones, _ = direct._patches(frames, solved, 0, settings, 1)
-    pixels, trust, _ = direct._patches(masked, solved, 0, settings, 1)
+    plain, ones, _ = direct._patches(frames, solved, 0, settings, 1, Lenses())
+    pixels, trust, _ = direct._patches(masked, solved, 0, settings, 1, Lenses())
     assert plain is not None and pixels is not None and (ones == 1).all()
     table = pixels.table
     points = table.bearings_rig / table.planes[:, :1]  # planes that face their hosts
