@@ -5,8 +5,9 @@
 A WALK is a folder of panoramas with exact truth: `images/` with timestamps.csv, `groundtruth.tum`,
 `slam.tum` (spoiled from the truth where it is absent) and, to judge what is found of the camera,
 `calibration.json` with the lenses' `rig_T_lens`, `readout_s` and `stitch_radius`. Each is refined
-as one view point (`central`) and as the images have it (`auto`, the baseline given), with every
-seed, and by the peer's spherical incremental mode. Errors are root mean squares.
+as one view point (`central`) and as the images have it (`auto`, the baseline given; the same with
+the photometric family), with every seed, and by the peer's spherical incremental mode. Errors are
+root mean squares.
 """
 
 import argparse
@@ -34,6 +35,11 @@ from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
 TIMEOUT_S = 3600.0
+WAYS = {
+    "central": ["--set", "camera.model=central"],
+    "auto": [],
+    "auto, photometric": ["--factors", "bearing,photometric"],
+}  # -> options
 COLUMNS = (
     ("ate", "ATE 1e-3", 1e3, ".2f"),
     ("rpe", "RPE 1e-3", 1e3, ".2f"),
@@ -111,12 +117,11 @@ def rows_of(walk: Path, work: Path, seeds: list[int], peer: bool) -> list[tuple[
     truth, seen = read_trajectory(case.truth), digest(sorted(case.images.iterdir()))
     assert case.trajectory is not None
     found: list[tuple[str, list[dict]]] = []
-    for model in ("central", "auto"):
+    for name, own in WAYS.items():
         outcomes = []
         for seed in seeds:
-            run = work / walk.name / f"{model}-{seed}"
-            options = [str(case.trajectory), "--set", f"seed={seed}"]
-            options += ["--set", f"camera.model={model}"]
+            run = work / walk.name / f"{name.replace(', ', '-')}-{seed}"
+            options = [str(case.trajectory), "--set", f"seed={seed}", *own]
             if camera.get("baseline"):
                 options += ["--set", f"camera.baseline_mm={1e3 * camera['baseline']}"]
             key = {"code": code_digest(), "frames": seen, "options": options}
@@ -131,7 +136,7 @@ def rows_of(walk: Path, work: Path, seeds: list[int], peer: bool) -> list[tuple[
                     TIMEOUT_S,
                 )
             )
-        found.append((model, outcomes))
+        found.append((name, outcomes))
     if peer:
         out = work / walk.name / "peer"
         script = Path(__file__).with_name("peer.py")
@@ -176,7 +181,8 @@ def main() -> None:
                 if "reason" in row:
                     print(f"{walk.name} {name}: {row['reason']}")
             taken = [row.get("errors", {}).get("taken") for row in outcomes]
-            times = f"{sum(map(bool, taken))} of {len(taken)}" if name == "auto" else "–"
+            sure = name not in WAYS or name == "central"
+            times = "–" if sure else f"{sum(map(bool, taken))} of {len(taken)}"
             cells = [cell(outcomes, key, factor, form) for key, _, factor, form in COLUMNS]
             lines.append(f"| `{walk.name}` | {name} | {times} | {' | '.join(cells)} |")
             print(lines[-1], flush=True)
