@@ -381,6 +381,8 @@ class ExportSettings(_Settings):
     face_size: int | None = Field(
         default=None, ge=16, le=_MAX_FACE
     )  # pixels; None = a quarter of the panorama's width
+    images: Literal["faces", "cube"] = "faces"  # faces: of one lens each where two are known;
+    # cube: as seen from one centre
 
 
 class SplatSettings(_Settings):

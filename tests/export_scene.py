@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gsba.camera.lens import Lenses
 from gsba.camera.rig import RIG_R_FACE
 from gsba.camera.sphere import bearings_from_erp
 from gsba.disk import write_image
@@ -92,10 +93,23 @@ def _panoramas() -> np.ndarray:
     return np.stack([picture(directions, seen) for seen in bearings(poses())])
 
 
-def panoramas(folder: Path, suffix: str = ".png", masked: bool = False) -> FrameSet:
+def shown_by(lenses: Lenses) -> np.ndarray:
+    """Directions (F, J, 3) in which panoramas of two lenses show POINTS."""
+    local = (POINTS - poses()[:, None, :3, 3]) @ poses()[:, :3, :3]
+    frames = np.repeat(np.arange(NUM_FRAMES), len(POINTS))
+    shown = lenses.seeing(local.reshape(-1, 3), frames).reshape(local.shape)
+    return shown / np.linalg.norm(shown, axis=-1, keepdims=True)
+
+
+def panoramas(
+    folder: Path, suffix: str = ".png", masked: bool = False, lenses: Lenses | None = None
+) -> FrameSet:
     """Write the panoramas, and masks that hide the lower fifth of the sphere."""
-    names = tuple(f"frame_{f:04d}" for f in range(NUM_FRAMES))
-    for name, image in zip(names, _panoramas(), strict=True):
+    names, images = tuple(f"frame_{f:04d}" for f in range(NUM_FRAMES)), _panoramas()
+    if lenses is not None:
+        directions = bearings_from_erp(_grid(WIDTH, HEIGHT), WIDTH, HEIGHT)
+        images = np.stack([picture(directions, seen) for seen in shown_by(lenses)])
+    for name, image in zip(names, images, strict=True):
         write_image(folder / f"{name}{suffix}", image)
     mask_path = None
     if masked:
@@ -136,16 +150,21 @@ def cube_frames(folder: Path, size: int = 128) -> FrameSet:
     )
 
 
-def assert_blob(image: np.ndarray, pixel: np.ndarray, color: np.ndarray) -> bool:
+def assert_blob(
+    image: np.ndarray, pixel: np.ndarray, color: np.ndarray, focal: float | None = None
+) -> bool:
     """Check that a blob of this RGB colour is centred within 0.3 px of `pixel`, corner origin.
+
+    The focal length is that of a square face of 90 degrees unless it is given.
 
     Returns whether there was anything to check: False where the blob is cut by the border.
     That leaves room for interpolation, 8 bits, and the perspective of a blob's spread (0.15 px
     together), not for pixels counted from another origin.
     """
-    reach = int(np.ceil(4 * BLOB_RAD * image.shape[0] / 2))
+    reach = int(np.ceil(4 * BLOB_RAD * (focal or image.shape[0] / 2)))
     column, row = np.floor(pixel).astype(int)
-    if min(row, column) < reach or max(row, column) >= image.shape[0] - reach:
+    height, width = image.shape[:2]
+    if min(row, column) < reach or row >= height - reach or column >= width - reach:
         return False
     window = image[row - reach : row + reach + 1, column - reach : column + reach + 1]
     contrast = np.abs(window.astype(float) - 30).sum(axis=-1)

@@ -158,12 +158,25 @@ class Lenses:
         every = np.ones(tracks.num_points, bool)
         return tracks.of(every, ~self.blended(bearings, tracks.frames))
 
+    def scaled(self, scale: float) -> "Lenses":
+        """The same in a unit of which a map unit has `scale`."""
+        twists = None if self.twists is None else self.twists * np.repeat([1.0, scale], 3)
+        return replace(
+            self, centre=scale * self.centre, nearness=self.nearness / scale, twists=twists
+        )
+
+    def taken(self, rows: np.ndarray) -> "Lenses":
+        """The same of some frames (F',)."""
+        axes = None if self.axes is None else self.axes[rows]
+        twists = None if self.twists is None else self.twists[rows]
+        return replace(self, axes=axes, twists=twists)
+
     def of_frame(self, frame: int) -> "Lenses":
         """The same for one frame alone, which is then number 0."""
-        one = slice(frame, frame + 1)
-        axes = None if self.axes is None else self.axes[one]
-        twists = None if self.twists is None else self.twists[one]
-        return replace(self, axes=axes, twists=twists)
+        return self.taken(np.array([frame]))
+
+
+ONE_CENTRE = Lenses()
 
 
 def facing(directions: np.ndarray) -> np.ndarray:

@@ -50,6 +50,13 @@ def export(
         Path | None, typer.Option(help="Folder to write; RUN/FORMAT by default.")
     ] = None,
     face_size: Annotated[int | None, typer.Option(help="Pixels of a cube face.")] = None,
+    images: Annotated[
+        str,
+        typer.Option(
+            help="faces: of one lens each where two are known; cube: as from one centre.",
+            metavar="faces|cube",
+        ),
+    ] = "faces",
     up: Annotated[str, typer.Option(help="auto: turn the world upright; none: leave it.")] = "none",
     scale: Length = None,
     baseline: Millimetres = None,
@@ -79,15 +86,18 @@ def export(
     if to not in list(ExportFormat):
         raise GsbaError(f"--to {to} is not known: use one of {', '.join(ExportFormat)}")
     asked = {"up": up, "length": _length(scale), "between": between, "gps": gps, "align": align}
-    settings = validated({"placement": asked, "export": {"face_size": face_size}}).placement
+    dataset = {"face_size": face_size, "images": images}
+    settings = validated({"placement": asked, "export": dataset}).placement
+    from gsba.camera.lens import ONE_CENTRE
     from gsba.placement.placement import place
-    from gsba.store.finished import load_run
+    from gsba.store.finished import load_lenses, load_run
 
     reconstruction, frames, *_ = load_run(run)
+    lenses = load_lenses(run, reconstruction) if images == "faces" else ONE_CENTRE
     folder = out or run / to
     said = _baseline(run, baseline) if scale == "lens" else None
     placement = place(reconstruction, frames, settings, said)
-    write(reconstruction, frames, folder, ExportFormat(to), face_size, placement, link)
+    write(reconstruction, frames, folder, ExportFormat(to), face_size, placement, link, lenses)
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
     typer.echo(f"{to}: {folder}")

@@ -2,8 +2,9 @@
 
 Three layouts:
 
-* `colmap`: six PINHOLE faces in one rig, `images/front/NAME.jpg`, `masks/front/NAME.jpg.png`,
-  `sparse/0`, and `rig_config.json` for COLMAP's own tools.
+* `colmap`: PINHOLE faces in one rig, `images/front/NAME.jpg`, `masks/front/NAME.jpg.png`,
+  `sparse/0`, and `rig_config.json` for COLMAP's own tools: six of one centre, or the ten of
+  `gsba.export.views` where two lenses are known.
 * `colmap-flat`: the same cameras, `images/NAME_front.jpg`. For trainers that resolve images by
   their base name. `sparse/0/points3D.ply` is INRIA's start cloud, and `sparse/0/test.txt` lists all
   faces of every eighth frame: holding out single faces would leave their siblings in the training.
@@ -14,31 +15,33 @@ Image f * C + c + 1 is face c of frame f, point j + 1 is point j.
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from gsba.camera.rig import RIG_R_FACE
+from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.sphere import erp_from_bearings
-from gsba.export.images import face_size_for, suffix_of, write_faces, write_panoramas
+from gsba.export.images import face_size_for, suffix_of, write_panoramas, write_views
 from gsba.export.ply import write_splat_points
+from gsba.export.views import View, seen_from_lenses, views_for
 from gsba.geometry import inverse, quaternion_from_rotation
 from gsba.log import GsbaError
-from gsba.types import FACES, FrameSet, Reconstruction
+from gsba.types import FrameSet, Reconstruction
 
 TEST_EVERY = 8  # frames, as the trainers' own hold-out
 
 
 @dataclass(frozen=True, slots=True)
-class Sensors:
-    """Concentric, equal cameras of one rig."""
+class Sensor:
+    """A camera of the rig."""
 
     model: str  # COLMAP's name
     width: int  # pixels
     height: int  # pixels
     params: tuple[float, ...]  # as the model wants them, corner origin
-    rig_R_sensors: np.ndarray  # (C, 3, 3) float64
+    rig_T_sensor: np.ndarray  # (4, 4) float64
 
 
 def write_colmap(
@@ -47,15 +50,16 @@ def write_colmap(
     frames: FrameSet,
     face_size: int | None,
     link: bool = False,
+    lenses: Lenses = ONE_CENTRE,
 ) -> None:
     """Write the rig layout into `partial`."""
-    size, faces = face_size_for(frames, face_size), frames.faces or FACES
-    names = [[f"{face}/{_file(frames, f)}" for face in faces] for f in range(len(frames))]
-    sensors = _pinholes(faces, size)
-    write_model(partial / "sparse" / "0", reconstruction, sensors, names)
-    text = json.dumps(_rig_config(sensors, faces), indent=1) + "\n"
+    views = views_for(frames, face_size_for(frames, face_size), lenses)
+    names = [[f"{view.name}/{_file(frames, f)}" for view in views] for f in range(len(frames))]
+    seen, sensors = seen_from_lenses(reconstruction, lenses), list(map(_pinhole, views))
+    write_model(partial / "sparse" / "0", seen, sensors, names)
+    text = json.dumps(_rig_config(sensors, views), indent=1) + "\n"
     (partial / "rig_config.json").write_text(text)
-    _write_named_faces(partial, frames, size, names, link)
+    _write_named_views(partial, frames, views, names, link, lenses)
 
 
 def write_colmap_flat(
@@ -64,21 +68,23 @@ def write_colmap_flat(
     frames: FrameSet,
     face_size: int | None,
     link: bool = False,
+    lenses: Lenses = ONE_CENTRE,
 ) -> None:
     """Write the layout with unique base names into `partial`."""
-    size, faces = face_size_for(frames, face_size), frames.faces or FACES
+    views = views_for(frames, face_size_for(frames, face_size), lenses)
     names = [
-        [f"{name}_{face}{suffix_of(frames, f)}" for face in faces]
+        [f"{name}_{view.name}{suffix_of(frames, f)}" for view in views]
         for f, name in enumerate(frames.names)
     ]
     model = partial / "sparse" / "0"
-    write_model(model, reconstruction, _pinholes(faces, size), names)
+    seen = seen_from_lenses(reconstruction, lenses)
+    write_model(model, seen, list(map(_pinhole, views)), names)
     write_splat_points(
         model / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
     )
     held_out = [name for of_frame in names[::TEST_EVERY] for name in of_frame]
     (model / "test.txt").write_text("\n".join(held_out) + "\n")
-    _write_named_faces(partial, frames, size, names, link)
+    _write_named_views(partial, frames, views, names, link, lenses)
 
 
 def write_colmap_erp(
@@ -88,9 +94,9 @@ def write_colmap_erp(
     if not frames.panoramic:
         raise GsbaError("colmap-erp needs panoramas, these frames are cube faces: use colmap")
     size = (frames.width, frames.height)
-    sensors = Sensors("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), np.eye(3)[None])
+    sensor = Sensor("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), np.eye(4))
     names = [_file(frames, f) for f in range(len(frames))]
-    write_model(partial / "sparse" / "0", reconstruction, sensors, [[name] for name in names])
+    write_model(partial / "sparse" / "0", reconstruction, [sensor], [[name] for name in names])
     write_panoramas(
         frames,
         lambda f: partial / "images" / names[f],
@@ -100,7 +106,7 @@ def write_colmap_erp(
 
 
 def write_model(
-    folder: Path, reconstruction: Reconstruction, sensors: Sensors, names: list[list[str]]
+    folder: Path, reconstruction: Reconstruction, sensors: Sequence[Sensor], names: list[list[str]]
 ) -> None:
     """Write rigs, cameras, frames, images and points3D in binary.
 
@@ -112,18 +118,19 @@ def write_model(
     """
     import pycolmap
 
-    num_sensors = len(sensors.rig_R_sensors)
+    num_sensors = len(sensors)
     model = pycolmap.Reconstruction()
-    ids = [_add_camera(model, sensors, c + 1) for c in range(num_sensors)]
+    ids = [_add_camera(model, sensor, c + 1) for c, sensor in enumerate(sensors)]
     rig = pycolmap.Rig(rig_id=1)
     rig.add_ref_sensor(ids[0])
-    ref_R_rig = sensors.rig_R_sensors[0].T
+    rig_T_ref = sensors[0].rig_T_sensor
     for c in range(1, num_sensors):
-        sensor_R_ref = sensors.rig_R_sensors[c].T @ ref_R_rig.T
-        rig.add_sensor(ids[c], pycolmap.Rigid3d(pycolmap.Rotation3d(sensor_R_ref), np.zeros(3)))
+        rig.add_sensor(ids[c], _rigid(inverse(sensors[c].rig_T_sensor) @ rig_T_ref))
     model.add_rig(rig)
 
-    which, pixels = _project(sensors, reconstruction.observation_bearings)
+    which, pixels = _project(
+        sensors, reconstruction.observation_bearings, reconstruction.observation_origins
+    )
     images = reconstruction.observation_frames * np.int64(num_sensors) + which
     order = np.argsort(images, kind="stable")
     starts = np.searchsorted(images[order], np.arange(len(names) * num_sensors + 1))
@@ -132,12 +139,8 @@ def write_model(
 
     rigs_T_world = inverse(reconstruction.world_T_rigs)
     for f, of_frame in enumerate(names):
-        ref_R_world = ref_R_rig @ rigs_T_world[f, :3, :3]
-        ref_from_world = pycolmap.Rigid3d(
-            pycolmap.Rotation3d(ref_R_world), ref_R_rig @ rigs_T_world[f, :3, 3]
-        )
         frame = pycolmap.Frame(frame_id=f + 1, rig_id=1)
-        frame.rig_from_world = ref_from_world
+        frame.rig_from_world = _rigid(inverse(rig_T_ref) @ rigs_T_world[f])
         first = f * num_sensors
         for c in range(num_sensors):
             frame.add_data_id(pycolmap.data_t(ids[c], first + c + 1))
@@ -155,15 +158,21 @@ def write_model(
     model.write_binary(folder)
 
 
-def _add_camera(model, sensors: Sensors, camera_id: int):
-    """Add one of the equal cameras; returns its sensor id."""
+def _rigid(a_T_b: np.ndarray):
+    import pycolmap
+
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(a_T_b[:3, :3]), a_T_b[:3, 3])
+
+
+def _add_camera(model, sensor: Sensor, camera_id: int):
+    """Add a camera; returns its sensor id."""
     import pycolmap
 
     camera = pycolmap.Camera(
-        model=sensors.model,
-        width=sensors.width,
-        height=sensors.height,
-        params=sensors.params,
+        model=sensor.model,
+        width=sensor.width,
+        height=sensor.height,
+        params=sensor.params,
         camera_id=camera_id,
     )
     model.add_camera(camera)
@@ -186,37 +195,47 @@ def _add_points(
     model.update_point_3d_errors()
 
 
-def _project(sensors: Sensors, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sensor (O,) that looks nearest along each bearing (O, 3), and the pixel (O, 2) there."""
-    if sensors.model == "EQUIRECTANGULAR":
-        pixels = erp_from_bearings(bearings, sensors.width, sensors.height)
+def _project(
+    sensors: Sequence[Sensor], bearings: np.ndarray, origins: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sensor (O,) that sees each bearing (O, 3) from its origin, and the pixel (O, 2) there.
+
+    Of those on the origin's side of the rig the one in which it is furthest from the border.
+    """
+    if sensors[0].model == "EQUIRECTANGULAR":
+        pixels = erp_from_bearings(bearings, sensors[0].width, sensors[0].height)
         return np.zeros(len(bearings), np.int64), pixels
-    which = np.argmax(bearings @ sensors.rig_R_sensors[:, :, 2].T, axis=1)
-    local = np.einsum("oji,oj->oi", sensors.rig_R_sensors[which], bearings)
-    focal, _, cx, cy = sensors.params
-    return which, focal * local[:, :2] / local[:, 2:] + [cx, cy]
+    found, off = np.empty((len(sensors), len(bearings), 2)), np.empty((len(sensors), len(bearings)))
+    for c, sensor in enumerate(sensors):
+        local = bearings @ sensor.rig_T_sensor[:3, :3]
+        depths = np.where(local[:, 2:] > 0, local[:, 2:], np.nan)
+        found[c] = sensor.params[:2] * local[:, :2] / depths + sensor.params[2:]
+        half = np.array([sensor.width, sensor.height]) / 2
+        off[c] = np.abs(found[c] / half - 1).max(axis=1)
+        if origins is not None:
+            off[c, origins[:, 2] * sensor.rig_T_sensor[2, 3] < 0] = np.nan  # the other lens
+    which = np.argmin(np.where(np.isnan(off), np.inf, off), axis=0)
+    return which, found[which, np.arange(len(bearings))]
 
 
-def _pinholes(faces: tuple[str, ...], size: int) -> Sensors:
-    half = size / 2
-    rig_R_faces = RIG_R_FACE[[FACES.index(face) for face in faces]]
-    return Sensors("PINHOLE", size, size, (half, half, half, half), rig_R_faces)
+def _pinhole(view: View) -> Sensor:
+    params = (view.focal, view.focal, *view.principal)
+    return Sensor("PINHOLE", view.width, view.height, params, view.rig_T_view)
 
 
-def _rig_config(sensors: Sensors, faces: tuple[str, ...]) -> list[dict]:
+def _rig_config(sensors: Sequence[Sensor], views: Sequence[View]) -> list[dict]:
     """The rig as `colmap rig_configurator` reads it; rotations are cam_from_rig, wxyz."""
-    camera = {"camera_model_name": sensors.model, "camera_params": sensors.params}
-    configs = [{"image_prefix": f"{faces[0]}/", "ref_sensor": True, **camera}]
-    for face, rig_R_face in zip(faces[1:], sensors.rig_R_sensors[1:], strict=True):
-        rotation = quaternion_from_rotation(rig_R_face.T @ sensors.rig_R_sensors[0])
-        configs.append(
-            {
-                "image_prefix": f"{face}/",
-                "cam_from_rig_rotation": rotation.tolist(),
-                "cam_from_rig_translation": [0.0, 0.0, 0.0],
-                **camera,
-            }
-        )
+    configs = []
+    for sensor, view in zip(sensors, views, strict=True):
+        config: dict[str, object] = {"image_prefix": f"{view.name}/"}
+        if not configs:
+            config["ref_sensor"] = True
+        else:
+            cam_T_ref = inverse(sensor.rig_T_sensor) @ sensors[0].rig_T_sensor
+            config["cam_from_rig_rotation"] = quaternion_from_rotation(cam_T_ref[:3, :3]).tolist()
+            config["cam_from_rig_translation"] = cam_T_ref[:3, 3].tolist()
+        config |= {"camera_model_name": sensor.model, "camera_params": sensor.params}
+        configs.append(config)
     return [{"cameras": configs}]
 
 
@@ -224,14 +243,20 @@ def _file(frames: FrameSet, f: int) -> str:
     return f"{frames.names[f]}{suffix_of(frames, f)}"
 
 
-def _write_named_faces(
-    partial: Path, frames: FrameSet, size: int, names: list[list[str]], link: bool
+def _write_named_views(
+    partial: Path,
+    frames: FrameSet,
+    views: tuple[View, ...],
+    names: list[list[str]],
+    link: bool,
+    lenses: Lenses,
 ) -> None:
-    faces = frames.faces or FACES
-    write_faces(
+    place = {view.name: c for c, view in enumerate(views)}
+    write_views(
         frames,
-        size,
-        lambda f, face: partial / "images" / names[f][faces.index(face)],
-        lambda f, face: partial / "masks" / f"{names[f][faces.index(face)]}.png",
+        views,
+        lenses,
+        lambda f, view: partial / "images" / names[f][place[view]],
+        lambda f, view: partial / "masks" / f"{names[f][place[view]]}.png",
         link,
     )

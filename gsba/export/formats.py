@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.export.folder import output_folder
 from gsba.placement.placement import Placement
 from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
@@ -32,6 +33,7 @@ def export(
     face_size: int | None = None,
     placement: Placement | None = None,
     link: bool = False,
+    lenses: Lenses = ONE_CENTRE,
 ) -> None:
     """Write a reconstruction in another program's format, all frames of it.
 
@@ -45,6 +47,7 @@ def export(
         placement: where to put the world; None = where the run has it. `transform.json` states it.
         link: hard links to the frames where these leave unchanged, not copies: who edits one edits
             the other.
+        lenses: of the frames, in the unit of the reconstruction: faces are of one lens each then.
 
     Raises:
         GsbaError: `out` is in use, the format does not fit the frames, or the disk refuses;
@@ -60,7 +63,8 @@ def export(
     placement = placement or Placement()
     reconstruction = placement.apply(reconstruction)
     with output_folder(out, to.value) as partial:
-        _write(partial, reconstruction, frames, to, face_size, placement.up == "z", link)
+        seen_by = lenses.scaled(placement.similarity.scale)
+        _write(partial, reconstruction, frames, to, face_size, placement.up == "z", link, seen_by)
         placement.write(partial / "transform.json")
     logger.info(
         "%s: %d frames, %d points, in %s", to, len(frames), len(reconstruction.points_world), out
@@ -75,18 +79,21 @@ def _write(
     face_size: int | None,
     z_up: bool,
     link: bool,
+    lenses: Lenses,
 ) -> None:
     from gsba.export import colmap, nerfstudio, ply
 
     match to:
         case ExportFormat.COLMAP:
-            colmap.write_colmap(partial, reconstruction, frames, face_size, link)
+            colmap.write_colmap(partial, reconstruction, frames, face_size, link, lenses)
         case ExportFormat.COLMAP_FLAT:
-            colmap.write_colmap_flat(partial, reconstruction, frames, face_size, link)
+            colmap.write_colmap_flat(partial, reconstruction, frames, face_size, link, lenses)
         case ExportFormat.COLMAP_ERP:
             colmap.write_colmap_erp(partial, reconstruction, frames, link)
         case ExportFormat.NERFSTUDIO:
-            nerfstudio.write_nerfstudio(partial, reconstruction, frames, face_size, z_up, link)
+            nerfstudio.write_nerfstudio(
+                partial, reconstruction, frames, face_size, z_up, link, lenses
+            )
         case ExportFormat.PLY:
             ply.write_splat_points(
                 partial / "points3D.ply", reconstruction.points_world, reconstruction.point_colors

@@ -17,8 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.lens import Lenses
 from gsba.camera.rig import CubeRig
 from gsba.disk import write_image
+from gsba.export.views import View, ViewCutter
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.log import GsbaError, track
@@ -89,8 +91,55 @@ def write_faces(
         if has_masks(frames):
             _write_face_masks(frames, f, rig, [mask_path(f, face) for face in faces], faces)
 
+    _of_all_frames(write, len(frames))
+
+
+def write_views(
+    frames: FrameSet,
+    views: tuple[View, ...],
+    lenses: Lenses,
+    image_path: Callable[[int, str], Path],
+    mask_path: Callable[[int, str], Path],
+    link: bool = False,
+) -> None:
+    """Write every view of every frame, and its mask where the frames have masks.
+
+    Args:
+        frames: panoramas, or faces of which the missing ones stay missing.
+        views: of `gsba.export.views.views_for`.
+        lenses: of these frames.
+        image_path: file of the image, by frame index and view name.
+        mask_path: file of the mask (PNG, 0 = ignore, 255 = use).
+        link: hard links to images that leave unchanged.
+    """
+    if lenses and frames.panoramic:
+        _write_lens_faces(frames, views, lenses, image_path, mask_path)
+    else:
+        write_faces(frames, views[0].width, image_path, mask_path, link)
+
+
+def _write_lens_faces(
+    frames: FrameSet,
+    views: tuple[View, ...],
+    lenses: Lenses,
+    image_path: Callable[[int, str], Path],
+    mask_path: Callable[[int, str], Path],
+) -> None:
+    def write(f: int) -> None:
+        cutter = ViewCutter(views, lenses, f)
+        _write_all([image_path(f, view.name) for view in views], cutter.cut(load_erp(frames, f)))
+        if has_masks(frames):
+            mask = load_mask(frames, f)
+            whole = np.ones((frames.height, frames.width), bool) if mask is None else mask
+            cut = [part.astype(np.uint8) * 255 for part in cutter.cut_mask(whole)]
+            _write_all([mask_path(f, view.name) for view in views], cut)
+
+    _of_all_frames(write, len(frames))
+
+
+def _of_all_frames(write: Callable[[int], None], num_frames: int) -> None:
     with ThreadPoolExecutor(min(os.cpu_count() or 1, _AT_ONCE)) as pool:
-        running = [pool.submit(write, f) for f in range(len(frames))]
+        running = [pool.submit(write, f) for f in range(num_frames)]
         try:
             for future in track(running, "cutting faces"):
                 future.result()
@@ -141,7 +190,7 @@ def _pass_on(source: Path, path: Path, link: bool) -> None:
     shutil.copyfile(source, path)
 
 
-def _write_all(paths: Sequence[Path], images: np.ndarray) -> None:
+def _write_all(paths: Sequence[Path], images: Sequence[np.ndarray] | np.ndarray) -> None:
     for path, image in zip(paths, images, strict=True):
         write_image(path, image)
 

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from gsba.camera.rig import RIG_R_FACE
-from gsba.export.images import face_size_for, has_masks, suffix_of, write_faces, write_panoramas
+from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.export.images import face_size_for, has_masks, suffix_of, write_panoramas, write_views
 from gsba.export.ply import write_splat_points
-from gsba.types import FACES, FrameSet, Reconstruction
+from gsba.export.views import View, seen_from_lenses, views_for
+from gsba.types import FrameSet, Reconstruction
 
 NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 _CV_R_GL = np.diag([1.0, -1, -1])  # OpenGL camera axes in our camera axes
@@ -32,6 +33,7 @@ def write_nerfstudio(
     face_size: int | None,
     z_up: bool = False,
     link: bool = False,
+    lenses: Lenses = ONE_CENTRE,
 ) -> None:
     """Write faces, cloud and transforms.json into `partial`; for panoramas the ERP variant too.
 
@@ -40,8 +42,9 @@ def write_nerfstudio(
     out_R_world = np.eye(3) if z_up else NERFSTUDIO_R_WORLD
     points = reconstruction.points_world @ out_R_world.T
     write_splat_points(partial / _CLOUD, points, reconstruction.point_colors)
-    size = face_size_for(frames, face_size)
-    _write_face_dataset(partial, reconstruction, frames, size, out_R_world, link)
+    views = views_for(frames, face_size_for(frames, face_size), lenses)
+    seen = seen_from_lenses(reconstruction, lenses)
+    _write_face_dataset(partial, seen, frames, views, out_R_world, link, lenses)
     if frames.panoramic:
         _write_erp_dataset(partial, reconstruction, frames, out_R_world, link)
 
@@ -50,9 +53,10 @@ def _write_face_dataset(
     partial: Path,
     reconstruction: Reconstruction,
     frames: FrameSet,
-    size: int,
+    views: tuple[View, ...],
     out_R_world: np.ndarray,
     link: bool,
+    lenses: Lenses,
 ) -> None:
     def image(f: int, face: str) -> str:
         return f"images/{frames.names[f]}_{face}{suffix_of(frames, f)}"
@@ -60,21 +64,24 @@ def _write_face_dataset(
     def mask(f: int, face: str) -> str:
         return f"masks/{frames.names[f]}_{face}.png"
 
-    half = size / 2
     # OPENCV without distortion is a pinhole, under the one name that all readers know.
-    camera = {"camera_model": "OPENCV", "fl_x": half, "fl_y": half, "cx": half, "cy": half}
-    camera |= {"w": size, "h": size, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+    camera = {"camera_model": "OPENCV", **_intrinsics(views[0])}
+    camera |= {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
     entries = []
     for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
-        for face in frames.faces or FACES:
-            entry = _entry(image(f, face), out_R_world, world_T_rig, RIG_R_FACE[FACES.index(face)])
+        for view in views:
+            world_T_view = world_T_rig @ view.rig_T_view
+            entry = _entry(image(f, view.name), out_R_world, world_T_view)
+            if lenses:  # views differ
+                entry |= _intrinsics(view)
             if has_masks(frames):
-                entry["mask_path"] = mask(f, face)
+                entry["mask_path"] = mask(f, view.name)
             entries.append(entry)
     _write_transforms(partial / "transforms.json", camera, entries, len(frames), out_R_world)
-    write_faces(
+    write_views(
         frames,
-        size,
+        views,
+        lenses,
         lambda f, face: partial / image(f, face),
         lambda f, face: partial / mask(f, face),
         link,
@@ -99,7 +106,7 @@ def _write_erp_dataset(
     camera |= {"cx": width / 2, "cy": height / 2, "w": width, "h": height}
     entries = []
     for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
-        entry = _entry(image(f), out_R_world, world_T_rig, np.eye(3))
+        entry = _entry(image(f), out_R_world, world_T_rig)
         if has_masks(frames):
             entry["mask_path"] = mask(f)
         entries.append(entry)
@@ -107,13 +114,17 @@ def _write_erp_dataset(
     write_panoramas(frames, lambda f: partial / image(f), lambda f: partial / mask(f), link)
 
 
-def _entry(
-    file_path: str, out_R_world: np.ndarray, world_T_rig: np.ndarray, rig_R_camera: np.ndarray
-) -> dict[str, Any]:
+def _intrinsics(view: View) -> dict[str, Any]:
+    cx, cy = view.principal
+    lengths = {"fl_x": view.focal, "fl_y": view.focal, "cx": cx, "cy": cy}
+    return {**lengths, "w": view.width, "h": view.height}
+
+
+def _entry(file_path: str, out_R_world: np.ndarray, world_T_camera: np.ndarray) -> dict[str, Any]:
     """A frame of transforms.json; its matrix maps OpenGL camera axes to nerfstudio's world."""
     matrix = np.eye(4)
-    matrix[:3, :3] = out_R_world @ world_T_rig[:3, :3] @ rig_R_camera @ _CV_R_GL
-    matrix[:3, 3] = out_R_world @ world_T_rig[:3, 3]
+    matrix[:3, :3] = out_R_world @ world_T_camera[:3, :3] @ _CV_R_GL
+    matrix[:3, 3] = out_R_world @ world_T_camera[:3, 3]
     return {"file_path": file_path, "transform_matrix": matrix.tolist()}
 
 

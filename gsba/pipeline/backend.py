@@ -24,6 +24,7 @@ from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.readout import Readout
 from gsba.bundle.reconstruction import assemble, world_scale
 from gsba.bundle.stitching import Stitching
+from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.merged_map import Registered, follow
@@ -474,6 +475,14 @@ def reconstruct(run: Run, seen: Seen, prior: Prior, world: Map) -> Reconstructio
         return replace(result, lens_baseline=baseline)
 
     return run.stage("reconstruction", run.solving_key(), compute, Reconstruction)
+
+
+def keep_lenses(run: Run, world: Map, result: Reconstruction) -> Lenses:
+    """The lenses of a map in the unit of the result that it became, for later exports."""
+    if not world.lenses:
+        return ONE_CENTRE
+    scale = world_scale(world.solution, result)
+    return run.stage("lenses", [], lambda: world.lenses.scaled(scale), Lenses, noted=False)
 
 
 def _reconstruct_rotations(run: Run, seen: Seen, prior: Prior) -> Reconstruction:

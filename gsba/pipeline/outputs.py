@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from gsba.bundle.reconstruction import world_scale
+from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config_file import to_toml
 from gsba.disk import write_json, write_text
 from gsba.export import ExportFormat, export, write_points
@@ -49,8 +50,12 @@ class RunResult:
     report: dict[str, Any]  # the content of report.json
 
 
-def write(run: Run, prior: Prior, world: Map, result: Reconstruction) -> RunResult:
-    """Poses, cloud, report and datasets; of several maps that nothing ties together the largest."""
+def write(run: Run, prior: Prior, world: Map, result: Reconstruction, lenses: Lenses) -> RunResult:
+    """Poses, cloud, report and datasets; of several maps that nothing ties together the largest.
+
+    Args:
+        lenses: in the result's unit.
+    """
     store, settings, coarse = run.store, run.settings, prior.coarse
     frames, out, rows = world.straightened(run.frames), store.root, result.largest_map()
     main, shown = result.taken(rows), frames.taken(rows)
@@ -64,7 +69,7 @@ def write(run: Run, prior: Prior, world: Map, result: Reconstruction) -> RunResu
     write_text(out / "config.toml", to_toml(settings))
     placement = place(main, shown, settings.placement, settings.camera.baseline())
     for name in settings.export.formats:
-        _export(run, ExportFormat(name), main, shown, placement)
+        _export(run, ExportFormat(name), main, shown, placement, lenses.taken(rows))
     report = _report(run, prior, world, result)
     write_json(out / "report.json", report)
     page = report | {"frames": [report["frames"][f] for f in rows]}
@@ -119,16 +124,23 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
 
 
 def _export(
-    run: Run, to: ExportFormat, main: Reconstruction, shown: FrameSet, placement: Placement
+    run: Run,
+    to: ExportFormat,
+    main: Reconstruction,
+    shown: FrameSet,
+    placement: Placement,
+    lenses: Lenses,
 ) -> None:
     folder, name = run.store.root / to.value, f"export-{to.value}"
     if not folder.exists():
         run.store.forget(name)
-    size = run.settings.export.face_size
+    size, images = run.settings.export.face_size, run.settings.export.images
+    seen_by = lenses if images == "faces" else ONE_CENTRE
 
     def compute() -> Counts:
-        export(main, shown, folder, to, size, placement)
+        export(main, shown, folder, to, size, placement, lenses=seen_by)
         return Counts(len(run.frames), len(shown), "frames")
 
-    run.store.stage(name, [size, placement.to_json()], compute, Counts, run.chain.latest)
+    key = [size, placement.to_json(), *(["of one lens"] if seen_by else [])]
+    run.store.stage(name, key, compute, Counts, run.chain.latest)
     run.store.claim(folder)

@@ -90,7 +90,8 @@ def refine(
         seen, prior = frontend.extract(run), Prior.of(coarse, extra_factors)
         prior, world = solve(run, seen, prior, given)
         result = backend.reconstruct(run, seen, prior, world)
-        return outputs.write(run, prior, world, result)
+        lenses = backend.keep_lenses(run, world, result)
+        return outputs.write(run, prior, world, result, lenses)
 
 
 def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tuple[Prior, Map]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.log import GsbaError
 from gsba.store.store import load_stage
 from gsba.types import FrameSet, Reconstruction
@@ -30,6 +31,18 @@ def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:
     if not (np.isfinite(shown.timestamps).all() and (np.diff(shown.timestamps) > 0).all()):
         raise GsbaError(f"{out}: its frames are in no order of time: refine again with --fresh")
     return main, shown
+
+
+def load_lenses(out: Path, main: Reconstruction) -> Lenses:
+    """What the frames of a finished run's largest map are stitched from, in that map's unit.
+
+    Raises:
+        GsbaError: the run found two lenses, and does not hold them.
+    """
+    if main.lens_baseline is None:
+        return ONE_CENTRE
+    lenses = load_stage(out, "lenses", Lenses)
+    return lenses.taken(load_stage(out, "reconstruction", Reconstruction).largest_map())
 
 
 def _fit_together(reconstruction: Reconstruction, frames: FrameSet) -> bool:

@@ -1,0 +1,188 @@
+"""The pinhole cameras that a dataset's images are of: cube faces, or faces of one lens each.
+
+A panorama of two lenses has no one place that all of it is seen from. Faces of one lens have:
+front and back whole, and what each lens has on its four sides, each with its lens's centre in the
+rig and nothing of where both pictures are blended. They are cut as the lens would have had them
+with all rows read in the middle of the exposure, as far as that is a turn; their rig's axes are the
+lenses', which a stabiliser may have turned below the panorama.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from gsba.camera.lens import Lenses
+from gsba.camera.rig import RIG_R_FACE
+from gsba.camera.sphere import around_sphere, erp_from_bearings
+from gsba.camera.straighten import PAD
+from gsba.geometry import pose
+from gsba.types import FACES, FrameSet, Reconstruction
+
+_FAR = 1e9  # map units: from there both lenses see alike
+_NODES = 33  # across a face: what lenses bend turns over tens of degrees
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A pinhole camera in the rig of a dataset."""
+
+    name: str
+    width: int  # pixels
+    height: int  # pixels
+    focal: float  # pixels
+    principal: tuple[float, float]  # pixels, corner origin
+    rig_R_view: np.ndarray  # (3, 3) float64
+    centre: np.ndarray  # (3,) float64, rig frame, unit of the poses
+
+    @property
+    def rig_T_view(self) -> np.ndarray:
+        """(4, 4) float64."""
+        return pose(self.rig_R_view, self.centre)
+
+    def rays(self, pixels: np.ndarray) -> np.ndarray:
+        """Unit directions (..., 3), rig frame, of pixels (..., 2)."""
+        xy = (pixels - self.principal) / self.focal
+        rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
+        return rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ self.rig_R_view.T
+
+
+def cube_views(faces: tuple[str, ...], size: int) -> tuple[View, ...]:
+    """Faces of `size` pixels and 90 degrees, of one centre."""
+    half = size / 2
+    return tuple(
+        View(face, size, size, half, (half, half), RIG_R_FACE[FACES.index(face)], np.zeros(3))
+        for face in faces
+    )
+
+
+def lens_views(lenses: Lenses, size: int) -> tuple[View, ...]:
+    """Ten views of two lenses, with pixels as large as those of cube faces of `size`."""
+    views = []
+    for whole in cube_views(FACES, size):
+        axis = whole.rig_R_view[:, 2]
+        if axis[2] != 0:
+            views.append(replace(whole, centre=axis[2] * lenses.centre))
+            continue
+        for lens, sign in (("front", 1.0), ("back", -1.0)):
+            side = _side(axis, np.array([0, 0, sign]), size, lenses.band_rad)
+            views.append(replace(side, name=f"{whole.name}_{lens}", centre=sign * lenses.centre))
+    return tuple(views)
+
+
+def _side(axis: np.ndarray, ahead: np.ndarray, size: int, band_rad: float) -> View:
+    """What a lens that looks ahead has on the side of an axis, from its whole face to the band.
+
+    The principal point is in its middle: some trainers know of no other.
+    """
+    towards, along = _side_extents(band_rad)
+    short, long = 2 * int(size / 2 * towards), 2 * int(np.ceil(size / 2 * along))
+    tilt = np.pi / 4 + np.arctan(short / size)  # begins where the whole face ends
+    forward = np.cos(tilt) * ahead + np.sin(tilt) * axis
+    seamwards = np.cos(tilt) * axis - np.sin(tilt) * ahead
+    if axis[0]:  # beside it, upright
+        down = np.array([0.0, 1, 0])
+        right, width, height = np.cross(down, forward), short, long
+    else:
+        down = seamwards * np.sign(axis[1])
+        right, width, height = np.cross(down, forward), long, short
+    turn = np.column_stack([right, down, forward])
+    return View("", width, height, size / 2, (width / 2, height / 2), turn, np.zeros(3))
+
+
+def _side_extents(band_rad: float) -> tuple[float, float]:
+    """Half the extents of a side view towards and along the seam, tangents.
+
+    It begins where the whole face ends, 45 degrees from its lens's axis, and its corners end at the
+    band; along the seam it meets its neighbours on the diagonals between them.
+    """
+
+    def along_at(half: float) -> float:
+        tilt = np.pi / 4 + half
+        angles = np.linspace(np.pi / 4, np.pi / 2, 181)  # from the lens's axis, on a diagonal
+        beside, ahead = np.sin(angles) / np.sqrt(2), np.cos(angles)
+        depth = beside * np.sin(tilt) + ahead * np.cos(tilt)
+        inside = beside * np.cos(tilt) - ahead * np.sin(tilt) <= depth * np.tan(half)
+        return float((beside / depth)[inside].max())
+
+    low, high = 0.0, np.pi / 8
+    for _ in range(40):
+        half = (low + high) / 2
+        tilt, towards, along = np.pi / 4 + half, np.tan(half), along_at(half)
+        corner = np.cos(tilt) - towards * np.sin(tilt)  # along the lens's axis
+        clear = corner > np.sin(band_rad) * np.sqrt(1 + towards**2 + along**2)
+        low, high = (half, high) if clear else (low, half)
+    return float(np.tan(low)), along_at(low)
+
+
+def seen_from_lenses(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
+    """The same with rigs whose axes are the lenses'."""
+    if lenses.axes is None:
+        return reconstruction
+    turns = lenses.axes[reconstruction.observation_frames]
+    turned = reconstruction.world_T_rigs.copy()
+    turned[:, :3, :3] = turned[:, :3, :3] @ lenses.axes
+    origins = reconstruction.observation_origins
+    return replace(
+        reconstruction,
+        world_T_rigs=turned,
+        observation_bearings=np.einsum("oji,oj->oi", turns, reconstruction.observation_bearings),
+        observation_origins=None if origins is None else np.einsum("oji,oj->oi", turns, origins),
+    )
+
+
+class ViewCutter:
+    """Cuts the views of one frame out of panoramas of it."""
+
+    def __init__(self, views: tuple[View, ...], lenses: Lenses, frame: int) -> None:
+        """Where each view's pixels are pictured, frame `frame` of the lenses."""
+        self._views, self._offsets = views, [_offsets(view, lenses, frame) for view in views]
+        self._turn = np.eye(3) if lenses.axes is None else lenses.axes[frame]
+
+    def cut(self, erp: np.ndarray) -> list[np.ndarray]:
+        """Images (height, width[, C]) uint8, bicubic, of a panorama (H, 2 H[, C]) uint8."""
+        density = 2 * np.pi * self._views[0].focal
+        width = erp.shape[1]
+        if width > 1.5 * density:  # finer detail would alias
+            width = 2 * round(density / 2)
+            erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
+        return self._sampled(erp, cv2.INTER_CUBIC)
+
+    def cut_mask(self, mask: np.ndarray) -> list[np.ndarray]:
+        """Masks (height, width) bool of one (H, 2 H) bool."""
+        found = self._sampled(mask.astype(np.uint8), cv2.INTER_NEAREST)
+        return [part > 0 for part in found]
+
+    def _sampled(self, image: np.ndarray, how: int) -> list[np.ndarray]:
+        height, width = image.shape[:2]
+        padded, parts = around_sphere(image, PAD), []
+        for view, offsets in zip(self._views, self._offsets, strict=True):
+            centres = np.arange(view.width) + 0.5, np.arange(view.height) + 0.5
+            pixels = np.stack(np.meshgrid(*centres), axis=-1)
+            places = pixels * ((_NODES - 1) / np.array([view.width, view.height]))
+            places = places.astype(np.float32)
+            moved = cv2.remap(
+                offsets, places[..., 0], places[..., 1], cv2.INTER_CUBIC,
+                borderMode=cv2.BORDER_REPLICATE,
+            )  # fmt: skip
+            shown = view.rays(pixels) @ self._turn.T + moved
+            maps = (erp_from_bearings(shown, width, height) - 0.5 + PAD).astype(np.float32)
+            parts.append(cv2.remap(padded, maps[..., 0], maps[..., 1], how))
+        return parts
+
+
+def _offsets(view: View, lenses: Lenses, frame: int) -> np.ndarray:
+    """From rays to where panoramas show them, (N, N, 3) float32, corner to corner of a view."""
+    places = np.linspace(0, [view.width, view.height], _NODES)
+    rays = view.rays(np.stack(np.meshgrid(*places.T), axis=-1)).reshape(-1, 3)
+    turned = rays if lenses.axes is None else rays @ lenses.axes[frame].T
+    shown = lenses.seeing(_FAR * turned, np.full(len(rays), frame))
+    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+    return (shown - turned).reshape(_NODES, _NODES, 3).astype(np.float32)
+
+
+def views_for(frames: FrameSet, size: int, lenses: Lenses) -> tuple[View, ...]:
+    """What a dataset of frames is made of, faces of `size` pixels."""
+    if lenses and frames.panoramic:
+        return lens_views(lenses, size)
+    return cube_views(frames.faces or FACES, size)
