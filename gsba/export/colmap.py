@@ -4,7 +4,7 @@ Three layouts:
 
 * `colmap`: PINHOLE faces in one rig, `images/front/NAME.jpg`, `masks/front/NAME.jpg.png`,
   `sparse/0`, and `rig_config.json` for COLMAP's own tools: six of one centre, or the ten of
-  `gsba.export.views` where two lenses are known.
+  `gsba.camera.views` where two lenses are known.
 * `colmap-flat`: the same cameras, `images/NAME_front.jpg`. For trainers that resolve images by
   their base name. `sparse/0/points3D.ply` is INRIA's start cloud, and `sparse/0/test.txt` lists all
   faces of every eighth frame: holding out single faces would leave their siblings in the training.
@@ -23,9 +23,9 @@ import numpy as np
 
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.sphere import erp_from_bearings
+from gsba.camera.views import View, seen_from_lenses, views_for
 from gsba.export.images import face_size_for, suffix_of, write_panoramas, write_views
 from gsba.export.ply import write_splat_points
-from gsba.export.views import View, seen_from_lenses, views_for
 from gsba.geometry import inverse, quaternion_from_rotation
 from gsba.log import GsbaError
 from gsba.types import FrameSet, Reconstruction

@@ -19,8 +19,8 @@ import numpy as np
 
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import CubeRig
+from gsba.camera.views import View, ViewCutter
 from gsba.disk import write_image
-from gsba.export.views import View, ViewCutter
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.log import GsbaError, track
@@ -106,7 +106,7 @@ def write_views(
 
     Args:
         frames: panoramas, or faces of which the missing ones stay missing.
-        views: of `gsba.export.views.views_for`.
+        views: of `gsba.camera.views.views_for`.
         lenses: of these frames.
         image_path: file of the image, by frame index and view name.
         mask_path: file of the mask (PNG, 0 = ignore, 255 = use).

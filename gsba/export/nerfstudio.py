@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.camera.views import View, seen_from_lenses, views_for
 from gsba.export.images import face_size_for, has_masks, suffix_of, write_panoramas, write_views
 from gsba.export.ply import write_splat_points
-from gsba.export.views import View, seen_from_lenses, views_for
 from gsba.types import FrameSet, Reconstruction
 
 NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])

@@ -12,8 +12,8 @@ from export_scene import NUM_FRAMES, POINTS, assert_blob, panoramas, reconstruct
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.lens import Lenses
+from gsba.camera.views import lens_views
 from gsba.export import ExportFormat, export
-from gsba.export.views import lens_views
 from gsba.placement.placement import Placement
 from gsba.similarity import Sim3
 from gsba.types import Reconstruction

@@ -1,4 +1,4 @@
-"""The pinhole cameras that a dataset's images are of: cube faces, or faces of one lens each.
+"""The pinhole cameras that panoramas are cut into: cube faces, or faces of one lens each.
 
 A panorama of two lenses has no one place that all of it is seen from. Faces of one lens have:
 front and back whole, and what each lens has on its four sides, each with its lens's centre in the
@@ -68,6 +68,23 @@ def lens_views(lenses: Lenses, size: int) -> tuple[View, ...]:
             side = _side(axis, np.array([0, 0, sign]), size, lenses.band_rad)
             views.append(replace(side, name=f"{whole.name}_{lens}", centre=sign * lenses.centre))
     return tuple(views)
+
+
+def square_views(lenses: Lenses, size: int) -> tuple[View, ...]:
+    """Ten whole faces of `size` pixels: those of the sides once for each lens, see `own_part`."""
+    views = []
+    for whole in cube_views(FACES, size):
+        ahead = whole.rig_R_view[2, 2]
+        for sign in (1.0, -1.0) if ahead == 0 else (ahead,):
+            views.append(replace(whole, centre=sign * lenses.centre))
+    return tuple(views)
+
+
+def own_part(view: View, band_rad: float) -> np.ndarray:
+    """Pixels (height, width) bool that the lens of a view sees, clear of the band."""
+    centres = np.arange(view.width) + 0.5, np.arange(view.height) + 0.5
+    rays = view.rays(np.stack(np.meshgrid(*centres), axis=-1))
+    return rays[..., 2] * np.sign(view.centre[2]) > np.sin(band_rad)
 
 
 def _side(axis: np.ndarray, ahead: np.ndarray, size: int, band_rad: float) -> View:

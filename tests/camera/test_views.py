@@ -1,0 +1,93 @@
+"""Views of one lens: what they show is what a pinhole camera at that lens would."""
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gsba.camera.lens import Lenses
+from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.camera.views import View, ViewCutter, lens_views, own_part, square_views
+from gsba.demo.gallery import build_gallery
+from gsba.demo.render import render_erp
+from gsba.demo.walk import walk_poses
+from gsba.geometry import pose
+
+WIDTH, SIZE = 1024, 160
+SHAPE = WIDTH, WIDTH // 2
+AXES = Rotation.from_rotvec([[0.2, -0.3, 0.1]]).as_matrix()
+TURNED = Lenses(np.array([0.0, 0.01, 0.06]), band_rad=np.deg2rad(4), axes=AXES)
+RIG = walk_poses("rectangle", "locked", 20, 0).world_T_rigs[4]
+VIEWS = {view.name: view for view in lens_views(TURNED, SIZE)}
+
+
+@cache
+def _gallery():
+    return build_gallery()
+
+
+def _render(world_T_camera: np.ndarray) -> np.ndarray:
+    return np.asarray(render_erp(_gallery(), world_T_camera, *SHAPE), np.float32)
+
+
+def _lens(view: View) -> np.ndarray:
+    """Pose of a view in the world."""
+    world_T_lenses = RIG @ pose(AXES[0], np.zeros(3))
+    return world_T_lenses @ view.rig_T_view
+
+
+@cache
+def _panorama() -> np.ndarray:
+    """Each direction as the lens that faces it has it."""
+    centres = np.meshgrid(*(np.arange(pixels) + 0.5 for pixels in SHAPE))
+    own = bearings_from_erp(np.stack(centres, axis=-1), *SHAPE) @ AXES[0]
+    halves = []
+    for sign in (1, -1):
+        lens = RIG.copy()
+        lens[:3, 3] += sign * RIG[:3, :3] @ AXES[0] @ TURNED.centre
+        halves.append(_render(lens))
+    return np.where(own[..., 2:] > 0, *halves).clip(0, 255).astype(np.uint8)
+
+
+def _seen(view: View, world_T_view: np.ndarray) -> np.ndarray:
+    """What a pinhole camera at a pose sees: a panorama that looks along it, about its middle."""
+    centres = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    flat = (np.stack(centres, axis=-1) - view.principal) / view.focal
+    rays = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1)
+    at = (erp_from_bearings(rays, *SHAPE) - 0.5).astype(np.float32)
+    return cv2.remap(_render(world_T_view), at[..., 0], at[..., 1], cv2.INTER_CUBIC)
+
+
+def _blurred(image: np.ndarray) -> np.ndarray:
+    return cv2.GaussianBlur(np.asarray(image, np.float32), (0, 0), 1.5)
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_a_view_is_what_its_lens_sees(name: str) -> None:
+    view = VIEWS[name]
+    (found,) = ViewCutter((view,), TURNED, 0).cut(_panorama())
+    middle = _lens(view)
+    middle[:3, 3] = RIG[:3, 3]
+    exact, central = _seen(view, _lens(view)), _seen(view, middle)
+    off, elsewhere = (
+        float(np.abs(_blurred(found) - _blurred(other)).mean()) for other in (exact, central)
+    )
+    assert off < 1.0 and elsewhere > 4 * off  # of 255: interpolation aside, the same
+
+
+def test_square_views_share_the_sphere_among_both_lenses() -> None:
+    views = square_views(TURNED, 64)
+    parts = [own_part(view, TURNED.band_rad) for view in views]
+    assert len(views) == 10 and parts[0].all()
+    for view, part in zip(views, parts, strict=True):
+        opposite = [
+            other
+            for twin, other in zip(views, parts, strict=True)
+            if twin.name == view.name and twin is not view
+        ]
+        assert len(opposite) == (view.name not in ("front", "back"))
+        assert not any((part & other).any() for other in opposite)
+        if opposite:
+            assert 0.85 < (part | opposite[0]).mean() < 1  # all but the band
