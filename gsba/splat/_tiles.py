@@ -134,32 +134,37 @@ def count_tiles(splats, reach2, num_rows, num_columns, counts, begin, end):
 def fill_tiles(splats, reach2, order, offsets, num_rows, num_columns, starts, owners, entries):
     """List each tile's splats from near to far: a counting sort of what comes in depth order.
 
+    What `count_tiles` has counted is kept to: where both kernels round an ellipse's border to
+    different sides of a pixel, an entry that has no room is left out, one too many has no row.
+
     Args:
         order: splats by depth.
         offsets: (N + 1,) a splat's entries are offsets[g]..offsets[g + 1] - 1, tile after tile.
         starts: (tiles + 1,) filled: tile t owns rows starts[t]..starts[t + 1] - 1 of the lists.
-        owners, entries: (E,) filled: splat and entry of each row.
+        owners, entries: (E,) filled: splat and entry of each row; the last may stay as they are.
     """
     tiles = np.empty(len(entries), np.int32)
     starts[:] = 0
     for g in order:
-        e = offsets[g]
-        if offsets[g + 1] > e:
+        e, end = offsets[g], offsets[g + 1]
+        if end > e:
             top, bottom = _tile_rows(splats[g], reach2[g], num_rows)
             for row in range(top, bottom):
                 first, last = _tile_columns(splats[g], reach2[g], row, num_columns)
-                for column in range(first, last):
+                for column in range(first, min(last, first + end - e)):
                     tiles[e] = row * num_columns + column
                     starts[tiles[e] + 1] += 1
                     e += 1
+        tiles[e:end] = -1
     for t in range(len(starts) - 1):
         starts[t + 1] += starts[t]
     cursor = starts[:-1].copy()
     for g in order:
         for e in range(offsets[g], offsets[g + 1]):
-            row = cursor[tiles[e]]
-            owners[row], entries[row] = g, e
-            cursor[tiles[e]] += 1
+            if tiles[e] >= 0:
+                row = cursor[tiles[e]]
+                owners[row], entries[row] = g, e
+                cursor[tiles[e]] += 1
 
 
 @_part

@@ -4,10 +4,13 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from tiny_run import SETTINGS
+from typer.testing import CliRunner
 
 from gsba.camera.sphere import bearings_from_erp
+from gsba.cli import app
 from gsba.config import PlacementSettings, RefineSettings
 from gsba.demo import make_walk
 from gsba.demo.render import render_erp
@@ -17,7 +20,7 @@ from gsba.log import GsbaError
 from gsba.pipeline import refine
 from gsba.pipeline.run import Run
 from gsba.placement.placement import place
-from gsba.store.finished import load_run
+from gsba.store.finished import load_lenses, load_run
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet
 
@@ -80,9 +83,30 @@ def test_a_camera_of_two_lenses_is_found_and_gives_the_scale(walk, tmp_path: Pat
     placed = place(*load_run(tmp_path / "two"), PlacementSettings(length="lens"), (0.05, 0.0))
     assert placed.similarity.scale == pytest.approx(camera["metres_per_unit"])
     assert placed.unit == "m"
+    _export_both(tmp_path / "two", errors.scale)
     _, central = _refine(walk, tmp_path / "one", model="central")
+    assert not load_lenses(tmp_path / "one", load_run(tmp_path / "one")[0])
     assert errors.ate.rmse < 0.1 * central.ate.rmse  # a hundredth
     assert errors.rpe_rotation_deg.rmse < 0.3 * central.rpe_rotation_deg.rmse  # a twentieth
+
+
+def _export_both(run: Path, scale: float) -> None:
+    """Faces of one lens each unless a cube is asked for."""
+    lenses = load_lenses(run, load_run(run)[0])
+    assert 2 * scale * np.linalg.norm(lenses.centre) == pytest.approx(BASELINE, rel=0.02)
+    for images, number in ((), 10), (("--images", "cube"), 6):
+        call = ["-q", "export", str(run), "--to", "colmap", "--face-size", "64", *images]
+        result = CliRunner().invoke(app, call)
+        assert result.exit_code == 0, result.output
+        assert len(list((run / "colmap/images").iterdir())) == number
+        centres = {}
+        for image in pycolmap.Reconstruction(run / "colmap/sparse/0").images.values():
+            centres.setdefault(image.frame_id, []).append(image.projection_center())
+        apart = [np.ptp(np.array(found), axis=0) for found in centres.values()]
+        lengths = scale * np.linalg.norm(apart, axis=1)
+        np.testing.assert_allclose(lengths, BASELINE if number == 10 else 0, rtol=0.02, atol=1e-9)
+    wrong = CliRunner().invoke(app, ["export", str(run), "--to", "colmap", "--images", "ball"])
+    assert wrong.exit_code == 1 and "export.images" in wrong.output
 
 
 def test_lenses_that_turn_below_a_stabilised_panorama_are_found(tmp_path: Path) -> None:

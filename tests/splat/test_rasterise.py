@@ -163,6 +163,30 @@ def test_gradients_of_a_torch_reference() -> None:
         assert np.abs(ours - expected).max() < 1e-4 * np.abs(expected).max()
 
 
+@pytest.mark.parametrize("off", [-1, 1])
+def test_a_border_that_two_kernels_round_apart_does_no_harm(off: int) -> None:
+    """The last splat touches one tile more or less than was counted: no list is overrun."""
+    gaussians, camera = scene(3, 60, 6.0)
+    tape, across = render(gaussians, camera)[1], -(-SIZE // _tiles.TILE)
+    seen = np.flatnonzero(tape.reach2)
+    order = seen[np.argsort(tape.splats[seen, 9], kind="stable")]
+    last = int(np.flatnonzero(np.diff(tape.offsets) > 1)[-1])
+    offsets = tape.offsets.copy()
+    offsets[last + 1 :] += off
+    num = int(offsets[-1])
+    owners, entries = np.full(num + 8, -7, np.int32), np.full(num + 8, -7, np.int64)
+    starts = np.empty(across * across + 1, np.int64)
+    _tiles.fill_tiles(
+        tape.splats, tape.reach2, order, offsets, across, across, starts, owners[:num],
+        entries[:num],
+    )  # fmt: skip
+    rows = int(starts[-1])
+    assert rows == num - max(off, 0)
+    assert (owners[rows:] == -7).all() and (entries[rows:] == -7).all()
+    spare = {int(offsets[last + 1]) - 1} if off > 0 else set()
+    assert set(entries[:rows].tolist()) == set(range(num)) - spare
+
+
 def test_nothing_in_sight_is_black() -> None:
     gaussians, camera = scene(0, 10)
     behind = camera.face_in_world - 5 * camera.world_R_face[:, 2]
