@@ -56,44 +56,6 @@ def has_masks(frames: FrameSet) -> bool:
     return any(path is not None for path in frames.mask_paths)
 
 
-def write_faces(
-    frames: FrameSet,
-    size: int,
-    image_path: Callable[[int, str], Path],
-    mask_path: Callable[[int, str], Path],
-    link: bool = False,
-) -> None:
-    """Write every face of every frame, and its mask where the frames have masks.
-
-    Args:
-        frames: panoramas, or faces of which the missing ones stay missing.
-        size: pixels of a face; its field of view is 90 degrees.
-        image_path: file of the image, by frame index and face name.
-        mask_path: file of the mask (PNG, 0 = ignore, 255 = use).
-        link: hard links to images that leave unchanged.
-    """
-    rig, faces = CubeRig(size, np.pi / 2), frames.faces or FACES
-
-    def write(f: int) -> None:
-        paths = [image_path(f, face) for face in faces]
-        if frames.panoramic:
-            from gsba.frames.cubemap import cut
-
-            _write_all(paths, cut(load_erp(frames, f), rig))
-        elif size == frames.width and all(
-            source.suffix == path.suffix
-            for source, path in zip(frames.paths[f], paths, strict=True)
-        ):
-            for source, path in zip(frames.paths[f], paths, strict=True):
-                _pass_on(source, path, link)
-        else:
-            _write_all(paths, _resized(load_faces(frames, f), size))
-        if has_masks(frames):
-            _write_face_masks(frames, f, rig, [mask_path(f, face) for face in faces], faces)
-
-    _of_all_frames(write, len(frames))
-
-
 def write_views(
     frames: FrameSet,
     views: tuple[View, ...],
@@ -115,7 +77,36 @@ def write_views(
     if lenses and frames.panoramic:
         _write_lens_faces(frames, views, lenses, image_path, mask_path)
     else:
-        write_faces(frames, views[0].width, image_path, mask_path, link)
+        _write_cube_faces(frames, views[0].width, image_path, mask_path, link)
+
+
+def _write_cube_faces(
+    frames: FrameSet,
+    size: int,
+    image_path: Callable[[int, str], Path],
+    mask_path: Callable[[int, str], Path],
+    link: bool,
+) -> None:
+    rig, faces = CubeRig(size, np.pi / 2), frames.faces or FACES
+
+    def write(f: int) -> None:
+        paths = [image_path(f, face) for face in faces]
+        if frames.panoramic:
+            from gsba.frames.cubemap import cut
+
+            _write_all(paths, cut(load_erp(frames, f), rig))
+        elif size == frames.width and all(
+            source.suffix == path.suffix
+            for source, path in zip(frames.paths[f], paths, strict=True)
+        ):
+            for source, path in zip(frames.paths[f], paths, strict=True):
+                _pass_on(source, path, link)
+        else:
+            _write_all(paths, _resized(load_faces(frames, f), size))
+        if has_masks(frames):
+            _write_face_masks(frames, f, rig, [mask_path(f, face) for face in faces], faces)
+
+    _of_all_frames(write, len(frames))
 
 
 def _write_lens_faces(
