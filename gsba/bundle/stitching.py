@@ -11,7 +11,7 @@ from factors.sphere_field import SphereField, degrees_of, harmonics, num_harmoni
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import Problem
 from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of
-from gsba.camera.lens import Lenses
+from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.types import Counts, Keypoints, Round, Sighted, Solution
 
@@ -22,8 +22,6 @@ _SPREADS = (1e-4, 3e-4, 1e-3, 3e-3)  # radians: a priori, of coefficients of deg
 _GOOD_ENOUGH = 0.95  # of the best gain: the smoothest field that reaches it is taken
 _MOST = 60_000  # observations that a field is found from
 _PROBE = 20_000, 4  # observations and degree of a first look: half the gain must show there
-
-_ONE_CENTRE = Lenses()
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +69,7 @@ def estimate(
     before: Solution,
     field: SphereField,
     problem: Problem,
-    lenses: Lenses = _ONE_CENTRE,
+    lenses: Lenses = ONE_CENTRE,
 ) -> Stitching:
     """Find the field, by cross-validation over parts of the sequence, and solve the map with it.
 

@@ -34,7 +34,6 @@ class View:
     principal: tuple[float, float]  # pixels, corner origin
     rig_R_view: np.ndarray  # (3, 3) float64
     centre: np.ndarray  # (3,) float64, rig frame, unit of the poses
-    lens: int = 0  # 1 = front, -1 = back, 0 = the camera has one centre
 
     @property
     def rig_T_view(self) -> np.ndarray:
@@ -63,32 +62,12 @@ def lens_views(lenses: Lenses, size: int) -> tuple[View, ...]:
     for whole in cube_views(FACES, size):
         axis = whole.rig_R_view[:, 2]
         if axis[2] != 0:
-            views.append(_of_lens(whole, int(axis[2]), lenses))
+            views.append(replace(whole, centre=axis[2] * lenses.centre))
             continue
-        for name, lens in (("front", 1), ("back", -1)):
-            side = _side(axis, np.array([0, 0, lens]), size, lenses.band_rad)
-            views.append(_of_lens(replace(side, name=f"{whole.name}_{name}"), lens, lenses))
+        for lens, sign in (("front", 1.0), ("back", -1.0)):
+            side = _side(axis, np.array([0, 0, sign]), size, lenses.band_rad)
+            views.append(replace(side, name=f"{whole.name}_{lens}", centre=sign * lenses.centre))
     return tuple(views)
-
-
-def square_views(lenses: Lenses, size: int) -> tuple[View, ...]:
-    """Ten whole faces of `size` pixels: those of the sides once for each lens, see `own_part`."""
-    views = []
-    for whole in cube_views(FACES, size):
-        ahead = int(whole.rig_R_view[2, 2])
-        views += [_of_lens(whole, lens, lenses) for lens in ((ahead,) if ahead else (1, -1))]
-    return tuple(views)
-
-
-def _of_lens(view: View, lens: int, lenses: Lenses) -> View:
-    return replace(view, lens=lens, centre=lens * lenses.centre)
-
-
-def own_part(view: View, band_rad: float) -> np.ndarray:
-    """Pixels (height, width) bool that the lens of a view sees, clear of the band."""
-    centres = np.arange(view.width) + 0.5, np.arange(view.height) + 0.5
-    rays = view.rays(np.stack(np.meshgrid(*centres), axis=-1))
-    return rays[..., 2] * view.lens > np.sin(band_rad)
 
 
 def _side(axis: np.ndarray, ahead: np.ndarray, size: int, band_rad: float) -> View:

@@ -53,10 +53,10 @@ def export(
     images: Annotated[
         str,
         typer.Option(
-            help="faces: of one lens each where two are known; cube: as from one centre.",
-            metavar="faces|cube",
+            help="cube: six faces of one centre; lenses: ten of one lens each, if known.",
+            metavar="cube|lenses",
         ),
-    ] = "faces",
+    ] = "cube",
     up: Annotated[str, typer.Option(help="auto: turn the world upright; none: leave it.")] = "none",
     scale: Length = None,
     baseline: Millimetres = None,
@@ -93,7 +93,7 @@ def export(
     from gsba.store.finished import load_lenses, load_run
 
     reconstruction, frames, *_ = load_run(run)
-    lenses = load_lenses(run, reconstruction) if images == "faces" else ONE_CENTRE
+    lenses = load_lenses(run, reconstruction) if images == "lenses" else ONE_CENTRE
     folder = out or run / to
     said = _baseline(run, baseline) if scale == "lens" else None
     placement = place(reconstruction, frames, settings, said)

@@ -109,7 +109,7 @@ def _compare(
     from gsba.evaluate.splats import compare, poses_for
     from gsba.splat.backend import choose_backend
     from gsba.splat.lpips import Lpips
-    from gsba.store.finished import load_lenses, load_run
+    from gsba.store.finished import load_run
     from gsba.store.folder import claim
 
     lpips = Lpips(lpips_weights) if lpips_weights else None
@@ -117,8 +117,7 @@ def _compare(
     sources = {"refined": reconstruction.world_T_rigs}
     sources |= {name: poses_for(frames, trajectory) for name, trajectory in others.items()}
     renderer = choose_backend(settings.backend)
-    lenses = load_lenses(run, reconstruction)
-    results = compare(reconstruction, frames, sources, settings, renderer, out, lpips, lenses)
+    results = compare(reconstruction, frames, sources, settings, renderer, out, lpips)
     claim(run.resolve(), out.resolve())
     return results
 

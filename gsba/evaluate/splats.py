@@ -9,12 +9,11 @@ and walls along them are worth some 0.2 dB that no pose has earned.
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import SplatSettings
 from gsba.disk import write_image, write_text
 from gsba.log import GsbaError
@@ -81,7 +80,6 @@ def compare(
     backend: Backend,
     out: Path,
     lpips: Distance | None = None,
-    lenses: Lenses = ONE_CENTRE,
 ) -> dict[str, SourceResult]:
     """Train and measure a splat for each source of poses; resumes what is done.
 
@@ -95,7 +93,6 @@ def compare(
         backend: the renderer.
         out: folder to write.
         lpips: distance of images for the last measurement; None = leave it out.
-        lenses: of the run's frames, in its unit: faces are of one lens each then.
 
     Raises:
         GsbaError: too few frames have a pose in every source, or a training fails.
@@ -107,19 +104,16 @@ def compare(
     own = reconstruction.world_T_rigs[usable]
     sources = {name: _beside(poses, usable, own) for name, poses in sources.items()}
     faces = [
-        load_faces(frames, part, settings.face_size, lenses)
-        for part in (split.training, split.held_out)
+        load_faces(frames, part, settings.face_size) for part in (split.training, split.held_out)
     ]
     results, splats = {}, {}
     for name, poses in sources.items():
         logger.info("splat on %s poses, %d frames", name, len(split.training))
-        training, held_out = (
-            make_views(*cut, poses[part], lenses.taken(part))
-            for cut, part in zip(faces, (split.training, split.held_out), strict=True)
+        training = make_views(*faces[0], poses[split.training])
+        held_out = make_views(*faces[1], poses[split.held_out])
+        key = digest(
+            fingerprint([p[0] for p in frames.paths]), poses.tolist(), settings, backend.name
         )
-        files = fingerprint([p[0] for p in frames.paths])
-        seen_by = [np.asarray(part).tolist() for part in astuple(lenses)] if lenses else []
-        key = digest(files, poses.tolist(), settings, backend.name, *seen_by)
         splats[name], results[name] = train_and_measure(
             reconstruction,
             frames,
@@ -134,9 +128,8 @@ def compare(
             lpips,
         )
     _write(out, results, settings, lpips is not None)
-    captured = load_faces(frames, split.held_out, settings.face_size) if lenses else faces[1]
     _write_pictures(
-        out / "pictures", frames, split, captured[0], sources, splats, settings, backend
+        out / "pictures", frames, split, faces[1][0], sources, splats, settings, backend
     )
     return results
 

@@ -11,7 +11,7 @@ from factors import tangent_basis
 from factors.patches import ALIGNED, REASONS, PatchSet, Sightings, expect, found_at
 from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
-from gsba.camera.lens import Lenses
+from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import PatchSettings
 from gsba.frames import panorama
@@ -26,7 +26,6 @@ _TOLERANCE = 0.02  # of the last step, pixels
 _LEAST_SIGMA = 0.03  # pixels: what sampling and a plane for the surface cost the best of patches
 
 _STRAIGHT = SphereField.none()
-_ONE_CENTRE = Lenses()
 
 _Mask: TypeAlias = np.ndarray | None  # (H, 2H) bool, True = use
 
@@ -53,7 +52,7 @@ def align(
     settings: PatchSettings,
     num_threads: int,
     field: SphereField = _STRAIGHT,
-    lenses: Lenses = _ONE_CENTRE,
+    lenses: Lenses = ONE_CENTRE,
 ) -> Sighted:
     """Observe every point anew, in the frames that should show it.
 

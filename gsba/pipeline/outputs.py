@@ -135,7 +135,7 @@ def _export(
     if not folder.exists():
         run.store.forget(name)
     size, images = run.settings.export.face_size, run.settings.export.images
-    seen_by = lenses if images == "faces" else ONE_CENTRE
+    seen_by = lenses if images == "lenses" else ONE_CENTRE
 
     def compute() -> Counts:
         export(main, shown, folder, to, size, placement, lenses=seen_by)

@@ -22,11 +22,6 @@ class FaceCamera:
         return np.concatenate([self.world_R_face.T.ravel(), self.face_in_world, tail])
 
 
-def view_camera(world_T_view: np.ndarray, size: int) -> FaceCamera:
-    """Camera of a square view of 90 degrees and `size` pixels at a pose (4, 4)."""
-    return FaceCamera(world_T_view[:3, :3].copy(), world_T_view[:3, 3].copy(), size, 0.5 * size)
-
-
 def rig_cameras(world_T_rig: np.ndarray, rig: CubeRig) -> list[FaceCamera]:
     """Cameras of all faces of a rig, in FACES order; see `face_camera`."""
     return [face_camera(world_T_rig, face, rig) for face in range(len(RIG_R_FACE))]

@@ -5,19 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.bundle import triangulation
-from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig
-from gsba.camera.views import ViewCutter, cube_views, own_part, square_views
 from gsba.config import SplatSettings, TriangulateSettings
 from gsba.frames import cubemap
-from gsba.frames.masks import load_mask
-from gsba.frames.pixels import load_erp
-from gsba.geometry import pose
 from gsba.log import GsbaError, track
-from gsba.splat.camera import view_camera
+from gsba.splat.camera import face_camera
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.train import Views, extent_of
-from gsba.types import FACES, FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
+from gsba.types import FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
 
 _GATE = np.deg2rad(3.0)  # of an observation under poses that may have drifted
 _MAX_TIMES = 8  # samples of a panorama along a pixel of a face, at most
@@ -53,17 +48,12 @@ def refined_frames(reconstruction: Reconstruction) -> np.ndarray:
     return reconstruction.pose_statuses == PoseStatus.REFINED
 
 
-def load_faces(
-    frames: FrameSet, which: np.ndarray, size: int, lenses: Lenses = ONE_CENTRE
-) -> tuple[np.ndarray, np.ndarray]:
+def load_faces(frames: FrameSet, which: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Faces of some frames, 90 degrees wide.
 
     Returns:
-        Images (N W, size, size, 3) uint8 RGB, frame after frame, and where they count, bool. N = 6
-        faces in FACES order, or the ten of `square_views` where lenses of the frames are given.
+        Images (6 W, size, size, 3) uint8 RGB, frame after frame, and where they count, bool.
     """
-    if lenses:
-        return _load_lens_faces(frames, which, size, lenses)
     rig = CubeRig(size, np.pi / 2)
     images = np.empty((len(which), 6, size, size, 3), np.uint8)
     use = np.ones((len(which), 6, size, size), bool)
@@ -72,34 +62,6 @@ def load_faces(
         if mask is not None:
             use[i] = mask
     return images.reshape(-1, size, size, 3), use.reshape(-1, size, size)
-
-
-def _load_lens_faces(
-    frames: FrameSet, which: np.ndarray, size: int, lenses: Lenses
-) -> tuple[np.ndarray, np.ndarray]:
-    import cv2
-
-    views = square_views(lenses, _oversampled(frames, size))
-    own = np.stack([own_part(view, lenses.band_rad) for view in square_views(lenses, size)])
-    images = np.empty((len(which), len(views), size, size, 3), np.uint8)
-    use = np.tile(own, (len(which), 1, 1, 1))
-    for i, f in enumerate(track(which, "cutting faces", total=len(which))):
-        cutter, mask = ViewCutter(views, lenses, int(f)), load_mask(frames, int(f))
-        for k, face in enumerate(cutter.cut(load_erp(frames, int(f)))):
-            images[i, k] = cv2.resize(face, (size, size), interpolation=cv2.INTER_AREA)
-        if mask is not None:
-            for k, part in enumerate(cutter.cut_mask(mask)):
-                share = cv2.resize(
-                    part.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA
-                )
-                use[i, k] &= share > 0.999
-    return images.reshape(-1, size, size, 3), use.reshape(-1, size, size)
-
-
-def _oversampled(frames: FrameSet, size: int) -> int:
-    """A multiple of the size of a face that is about as dense as panoramas."""
-    times = -(-frames.width / (np.pi * size) // 1)  # until no denser in the middle
-    return int(np.clip(times, 1, _MAX_TIMES)) * size
 
 
 def cut_faces(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.ndarray | None]:
@@ -116,7 +78,8 @@ def cut_faces(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, n
     if not frames.panoramic:
         whole = cubemap.native_rig(frames)
     else:
-        whole = replace(rig, size=_oversampled(frames, rig.size))
+        times = -(-frames.width / (2 * np.pi) // rig.focal)  # until no denser in the middle
+        whole = replace(rig, size=int(np.clip(times, 1, _MAX_TIMES)) * rig.size)
     images, mask = cubemap.load(frames, frame, whole)
     if whole.size == rig.size:
         return images, mask
@@ -129,30 +92,19 @@ def cut_faces(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, n
     return images, np.stack(shares) > 0.999
 
 
-def make_views(
-    images: np.ndarray, use: np.ndarray, world_T_rigs: np.ndarray, lenses: Lenses = ONE_CENTRE
-) -> Views:
+def make_views(images: np.ndarray, use: np.ndarray, world_T_rigs: np.ndarray) -> Views:
     """Pose faces, dropping those with nothing to see.
 
     Args:
         images, use: of `load_faces`.
         world_T_rigs: (W, 4, 4) of their frames.
-        lenses: of these W frames, if `load_faces` was given lenses.
     """
-    size = images.shape[1]
-    views = square_views(lenses, size) if lenses else cube_views(FACES, size)
-    if lenses.axes is not None:
-        turns = pose(lenses.axes, np.zeros((len(lenses.axes), 3)))
-        world_T_rigs = world_T_rigs @ turns
+    rig = CubeRig(images.shape[1], np.pi / 2)
     seen = np.flatnonzero(use.any(axis=(1, 2)))
-    frames, which = np.divmod(seen, len(views))
-    cameras = [
-        view_camera(world_T_rigs[f] @ views[k].rig_T_view, size)
-        for f, k in zip(frames, which, strict=True)
-    ]
+    cameras = [face_camera(world_T_rigs[v // 6], int(v % 6), rig) for v in seen]
     if len(seen) < len(images):
         images, use = images[seen], use[seen]
-    return Views(cameras, images, None if use.all() else use, frames)
+    return Views(cameras, images, None if use.all() else use, seen // 6)
 
 
 def place_points(

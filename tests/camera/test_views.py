@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
-from gsba.camera.views import View, ViewCutter, lens_views, own_part, square_views
+from gsba.camera.views import View, ViewCutter, lens_views
 from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
@@ -75,19 +75,3 @@ def test_a_view_is_what_its_lens_sees(name: str) -> None:
         float(np.abs(_blurred(found) - _blurred(other)).mean()) for other in (exact, central)
     )
     assert off < 1.0 and elsewhere > 4 * off  # of 255: interpolation aside, the same
-
-
-def test_square_views_share_the_sphere_among_both_lenses() -> None:
-    views = square_views(TURNED, 64)
-    parts = [own_part(view, TURNED.band_rad) for view in views]
-    assert len(views) == 10 and parts[0].all()
-    for view, part in zip(views, parts, strict=True):
-        opposite = [
-            other
-            for twin, other in zip(views, parts, strict=True)
-            if twin.name == view.name and twin is not view
-        ]
-        assert len(opposite) == (view.name not in ("front", "back"))
-        assert not any((part & other).any() for other in opposite)
-        if opposite:
-            assert 0.85 < (part | opposite[0]).mean() < 1  # all but the band

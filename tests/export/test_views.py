@@ -103,7 +103,7 @@ def test_views_hold_all_but_what_is_blended(band_deg: float) -> None:
         np.testing.assert_allclose(view.rig_R_view.T @ view.rig_R_view, np.eye(3), atol=1e-12)
         assert np.linalg.det(view.rig_R_view) == pytest.approx(1)
         corners = np.array([[0, 0], [view.width, 0], [0, view.height], [view.width, view.height]])
-        along = view.rays(corners.astype(float))[:, 2] * view.lens
+        along = view.rays(corners.astype(float))[:, 2] * np.sign(view.centre[2])
         assert along.min() > np.sin(lenses.band_rad)
         assert view.principal == (view.width / 2, view.height / 2)  # some trainers know no other
         local = rays @ view.rig_R_view

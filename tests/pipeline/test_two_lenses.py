@@ -91,10 +91,10 @@ def test_a_camera_of_two_lenses_is_found_and_gives_the_scale(walk, tmp_path: Pat
 
 
 def _export_both(run: Path, scale: float) -> None:
-    """Faces of one lens each unless a cube is asked for."""
+    """Six faces of one centre, or those of one lens each where these are asked for."""
     lenses = load_lenses(run, load_run(run)[0])
     assert 2 * scale * np.linalg.norm(lenses.centre) == pytest.approx(BASELINE, rel=0.02)
-    for images, number in ((), 10), (("--images", "cube"), 6):
+    for images, number in (("--images", "lenses"), 10), ((), 6):
         call = ["-q", "export", str(run), "--to", "colmap", "--face-size", "64", *images]
         result = CliRunner().invoke(app, call)
         assert result.exit_code == 0, result.output
