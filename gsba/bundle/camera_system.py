@@ -65,10 +65,13 @@ class CameraSystem:
             steps = system.solve(_DAMPING)
             if steps is None:
                 return self.seeing
-            if lenses.twists is not None:
-                if variances is None:  # they hardly change with what is typical
-                    variances = _own_variances(camera, system)
-                camera = _spread_anew(camera, system, steps, variances)
+            if lenses.twists is None:
+                continue
+            if variances is None:  # they hardly change with what is typical
+                variances = _own_variances(camera, system)
+            if variances is None:
+                return self.seeing
+            camera = _spread_anew(camera, system, steps, variances)
 
         def of(symbol: Callable[[int], int], count: int, dim: int) -> np.ndarray:
             return steps[[system.first_block[symbol(f)] for f in range(count)], :dim]
@@ -154,11 +157,11 @@ class _Camera:
         return system
 
 
-def _own_variances(camera: _Camera, system: ReducedSystem) -> np.ndarray:
-    """Variances (F, 6) of frames' own motion."""
+def _own_variances(camera: _Camera, system: ReducedSystem) -> np.ndarray | None:
+    """Variances (F, 6) of frames' own motion; None where the system is singular."""
     inverse = system.covariances(0, np.random.default_rng(0), _DAMPING)
     if inverse is None:
-        return np.zeros_like(camera.own[0].off)
+        return None
     return np.einsum("fii->fi", inverse[0][_rows(camera.own[0], system)])
 
 

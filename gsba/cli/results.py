@@ -35,6 +35,13 @@ Millimetres = Annotated[
     float | None,
     typer.Option(help="Millimetres between the lenses, for --scale lens.", metavar="MM"),
 ]
+Images = Annotated[
+    str,
+    typer.Option(
+        help="cube: six faces of one centre; lenses: ten of one lens each, where two were found.",
+        metavar="cube|lenses",
+    ),
+]
 
 
 @command
@@ -50,13 +57,7 @@ def export(
         Path | None, typer.Option(help="Folder to write; RUN/FORMAT by default.")
     ] = None,
     face_size: Annotated[int | None, typer.Option(help="Pixels of a cube face.")] = None,
-    images: Annotated[
-        str,
-        typer.Option(
-            help="cube: six faces of one centre; lenses: ten of one lens each, if known.",
-            metavar="cube|lenses",
-        ),
-    ] = "cube",
+    images: Images = "cube",
     up: Annotated[str, typer.Option(help="auto: turn the world upright; none: leave it.")] = "none",
     scale: Length = None,
     baseline: Millimetres = None,
@@ -94,6 +95,8 @@ def export(
 
     reconstruction, frames, *_ = load_run(run)
     lenses = load_lenses(run, reconstruction) if images == "lenses" else ONE_CENTRE
+    if images == "lenses" and not lenses:
+        raise GsbaError(f"{run}: no two lenses were found: export it without --images lenses")
     folder = out or run / to
     said = _baseline(run, baseline) if scale == "lens" else None
     placement = place(reconstruction, frames, settings, said)

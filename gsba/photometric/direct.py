@@ -13,7 +13,7 @@ from factors.sphere_image import SphereImage
 from gsba.bundle import adjustment, prior_factors, triangulation
 from gsba.bundle.adjustment import Problem
 from gsba.bundle.optimizer import OptimizeResult, optimize
-from gsba.camera.lens import Lenses
+from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.frames.masks import load_weights
 from gsba.log import GsbaError, track
@@ -64,7 +64,7 @@ def refine(
     keypoints: Keypoints,
     start: Solution,
     problem: Problem,
-    lenses: Lenses | None = None,
+    lenses: Lenses = ONE_CENTRE,
 ) -> PhotometricResult:
     """Refine a solved map by the grey values of patches, level after level.
 
@@ -73,13 +73,13 @@ def refine(
         keypoints: of all frames.
         start: the solved map.
         problem: priors, families, loss, solver, patches.
-        lenses: what the panoramas are stitched from; None = one view point.
+        lenses: what the panoramas are stitched from.
     """
     solved, counts, settings = start, [], problem.settings
     weights, residuals = np.ones(len(frames)), np.full(len(frames), np.nan)
     for level in settings.photometric.levels:
         pixels, trust, found = _patches(
-            frames, solved, level, settings, problem.num_threads, lenses or Lenses()
+            frames, solved, level, settings, problem.num_threads, lenses
         )
         counts += found
         if pixels is None:
@@ -250,7 +250,7 @@ def joint(
     if "photometric" not in settings.factors:
         return []
     level = settings.photometric.levels[-1]
-    pixels, trust, _ = _patches(frames, solved, level, settings, num_threads, Lenses())
+    pixels, trust, _ = _patches(frames, solved, level, settings, num_threads, ONE_CENTRE)
     if pixels is None:
         return []
     start = make_block(pixels, trust, settings, num_threads)

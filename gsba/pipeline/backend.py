@@ -164,8 +164,8 @@ def settle_camera(
 
 def _camera_key(run: Run) -> list[object]:
     camera = run.settings.camera
-    said = camera.model_dump(exclude={"name", "baseline_mm", "readout_ms"}), camera.readout()
-    return [run.solving_key(), said, run.settings.seed]
+    said = camera.model_dump(exclude={"name", "baseline_mm", "readout_ms"})
+    return [run.solving_key(), said, camera.readout(), camera.nearness(1.0), run.settings.seed]
 
 
 def _widely_placed(

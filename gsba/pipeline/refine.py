@@ -90,8 +90,7 @@ def refine(
         seen, prior = frontend.extract(run), Prior.of(coarse, extra_factors)
         prior, world = solve(run, seen, prior, given)
         result = backend.reconstruct(run, seen, prior, world)
-        lenses = backend.keep_lenses(run, world, result)
-        return outputs.write(run, prior, world, result, lenses)
+        return outputs.write(run, prior, world, result, backend.keep_lenses(run, world, result))
 
 
 def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tuple[Prior, Map]:
