@@ -20,8 +20,9 @@ from gsba.cli.splat import (
 from gsba.log import GsbaError
 
 if TYPE_CHECKING:
+    from gsba.camera.lens import Lenses
     from gsba.evaluate.consistency import Consistency
-    from gsba.types import Trajectory
+    from gsba.types import Reconstruction, Trajectory
 
 
 Length = Annotated[
@@ -89,14 +90,11 @@ def export(
     asked = {"up": up, "length": _length(scale), "between": between, "gps": gps, "align": align}
     dataset = {"face_size": face_size, "images": images}
     settings = validated({"placement": asked, "export": dataset}).placement
-    from gsba.camera.lens import ONE_CENTRE
     from gsba.placement.placement import place
-    from gsba.store.finished import load_lenses, load_run
+    from gsba.store.finished import load_run
 
     reconstruction, frames, *_ = load_run(run)
-    lenses = load_lenses(run, reconstruction) if images == "lenses" else ONE_CENTRE
-    if images == "lenses" and not lenses:
-        raise GsbaError(f"{run}: no two lenses were found: export it without --images lenses")
+    lenses = _lenses(run, reconstruction, images)
     folder = out or run / to
     said = _baseline(run, baseline) if scale == "lens" else None
     placement = place(reconstruction, frames, settings, said)
@@ -104,6 +102,20 @@ def export(
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
     typer.echo(f"{to}: {folder}")
+
+
+def _lenses(run: Path, reconstruction: "Reconstruction", images: str) -> "Lenses":
+    """What images are cut as seen from: one centre, or the lenses that the run found."""
+    from gsba.camera.lens import ONE_CENTRE
+
+    if images != "lenses":
+        return ONE_CENTRE
+    from gsba.store.finished import load_lenses
+
+    lenses = load_lenses(run, reconstruction)
+    if not lenses:
+        raise GsbaError(f"{run}: no two lenses were found: export it without --images lenses")
+    return lenses
 
 
 def _baseline(run: Path, millimetres: float | None) -> tuple[float, float] | None:
