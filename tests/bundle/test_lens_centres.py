@@ -57,6 +57,23 @@ def test_one_centre_is_not_taken_for_two(seed: int) -> None:
     assert (np.abs(found.found) < 4 * sigmas).all()
 
 
+class ThreeLenses:
+    """Level, a third of the way round from one another, as in cameras for broadcasts."""
+
+    def seeing(self, points_rig: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Points (N, 3) from the lens that faces each."""
+        yaw = np.deg2rad([0.0, 120, 240])
+        centres = 0.05 * np.column_stack([np.sin(yaw), 0 * yaw, np.cos(yaw)])
+        return points_rig - centres[np.argmax(points_rig @ centres.T, axis=1)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_three_lenses_are_not_taken_for_two(seed: int) -> None:
+    found, solved = _found(*seen_through(ThreeLenses(), seed))  # type: ignore[arg-type]
+    assert found.reason.startswith("it does not predict") and not found.lenses
+    assert np.isfinite(solved.world_T_rigs).all()
+
+
 def test_what_is_asked_for_is_taken_and_too_little_is_named() -> None:
     world, shown = seen_through(Lenses(), 0)
     camera = CameraSettings(model="two_lens")
