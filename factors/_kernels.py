@@ -314,33 +314,32 @@ def _span_of_point(by_point, lo, hi, damping, Q):
 
 
 @_part
+def _add_row(row, r, q, H, g, W):
+    """Add a row of a Jacobian: its normal equations, and its part in what the landmark takes up."""
+    for k in range(len(g)):
+        a = row[k]
+        g[k] += a * r
+        W[0, k] += q[0] * a
+        W[1, k] += q[1] * a
+        W[2, k] += q[2] * a
+        for c in range(len(g)):
+            H[k, c] += a * row[c]
+
+
+@_part
 def _add_linear(residuals, own, common, Q, H, g, T, W, shared, shared_gradient, V, b):
-    """Add an observation's normal equations, and its part in what the landmark takes up."""
+    """Add an observation, by what its frame has and by what all have; returns its cost."""
     cost = 0.0
     for i in range(2):
-        r, q0, q1, q2 = residuals[i], Q[i, 0], Q[i, 1], Q[i, 2]
+        r, q = residuals[i], Q[i]
         cost += 0.5 * r * r
-        b[0] += q0 * r
-        b[1] += q1 * r
-        b[2] += q2 * r
+        for d in range(3):
+            b[d] += q[d] * r
+        _add_row(own[i], r, q, H, g, W)
+        _add_row(common[i], r, q, shared, shared_gradient, V)
         for k in range(len(g)):
-            a = own[i, k]
-            g[k] += a * r
-            W[0, k] += q0 * a
-            W[1, k] += q1 * a
-            W[2, k] += q2 * a
-            for c in range(len(g)):
-                H[k, c] += a * own[i, c]
             for c in range(len(shared)):
-                T[k, c] += a * common[i, c]
-        for k in range(len(shared)):
-            a = common[i, k]
-            shared_gradient[k] += a * r
-            V[0, k] += q0 * a
-            V[1, k] += q1 * a
-            V[2, k] += q2 * a
-            for c in range(len(shared)):
-                shared[k, c] += a * common[i, c]
+                T[k, c] += own[i, k] * common[i, c]
     return cost
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from factors.bearing import tangent_basis
 from gsba.bundle.adjustment import Problem
-from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of
+from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of, summed
 from gsba.camera.lens import Lenses
 from gsba.types import Counts, Keypoints, Landmarks, Solution
 
@@ -76,9 +76,9 @@ def estimate(
         unknown, nothing = np.full((3, 3), np.nan), np.full(PARTS, np.nan)
         why = "too few points to tell one lens from the other"
         return LensCentres(so_far, so_far.centre, unknown, nothing, why, counts)
-    hessian = np.array(sum(part.hessian for part in systems))
-    covariance = np.linalg.inv(hessian + 1e-9 * np.trace(hessian) * np.eye(3))
-    covariance /= float(np.mean([part.curvature for part in systems]))
+    total = summed(systems)
+    damping = 1e-9 * np.trace(total.hessian) * np.eye(3)
+    covariance = np.linalg.inv(total.hessian + damping) / total.curvature
     found = so_far.centre + _step(systems)
     around = [part.around(so_far.centre) for part in systems]  # as if there were one centre
     gains = np.array(
@@ -146,10 +146,8 @@ def stitched_for(
     systems, _ = models_of(landmarks, _MOST, keypoints, solved, problem, by_both)
     if not systems:
         return StitchRadius(so_far, 0.0, np.nan, np.full(PARTS, np.nan), "too few points")
-    found = _step(systems)
-    hessian = np.array(sum(part.hessian for part in systems))
-    bend = float(np.mean([part.curvature for part in systems]))
-    sigma = float(np.sqrt(np.linalg.inv(hessian)[3, 3] / bend))
+    found, total = _step(systems), summed(systems)
+    sigma = float(np.sqrt(np.linalg.inv(total.hessian)[3, 3] / total.curvature))
     gains = []
     for p, part in enumerate(systems):
         others = systems[:p] + systems[p + 1 :]
@@ -176,7 +174,7 @@ def by_nearness(bearings_rig: np.ndarray, origins_rig: np.ndarray) -> np.ndarray
 
 def _step(systems: list[SharedModel]) -> np.ndarray:
     """Change of the parameters (K,) that the parts ask for."""
-    gradient = np.array(sum(part.gradient for part in systems))
-    hessian = np.array(sum(part.hessian for part in systems))
-    hessian *= float(np.mean([part.curvature for part in systems]))
-    return -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(len(hessian)), gradient)
+    total = summed(systems)
+    hessian = total.curvature * total.hessian
+    damping = 1e-9 * np.trace(hessian) * np.eye(len(hessian))
+    return -np.linalg.solve(hessian + damping, total.gradient)

@@ -5,7 +5,7 @@ Sums of other parts' models give parameters, and the part itself says what they 
 believed only if they predict what they were not found from.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -56,6 +56,16 @@ class SharedModel:
             self.hessian,
             self.curvature,
         )
+
+
+def summed(models: Sequence[SharedModel]) -> SharedModel:
+    """The model of several parts."""
+    return SharedModel(
+        float(sum(model.cost for model in models)),
+        np.array(sum(model.gradient for model in models)),
+        np.array(sum(model.hessian for model in models)),
+        float(np.mean([model.curvature for model in models])),
+    )
 
 
 def drawn(landmarks: Landmarks, most: int, seed: int) -> Landmarks:

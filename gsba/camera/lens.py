@@ -91,10 +91,9 @@ class Lenses:
             seen /= np.linalg.norm(seen, axis=1, keepdims=True)
         if self.twists is None:
             return seen, origins
-        moved = self.fractions(directions, frames)[:, None] * self.twists[frames]
-        turn = _rotations(moved[:, :3])
-        turned = np.einsum("nij,nj->ni", turn, seen)
-        return turned, np.einsum("nij,nj->ni", turn, origins) + moved[:, 3:]
+        turns, moves = self._moved(directions, frames)
+        turned = np.einsum("nij,nj->ni", turns, seen)
+        return turned, np.einsum("nij,nj->ni", turns, origins) + moves
 
     def views(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
         """Transforms (N, 4, 4), rig_T_view, of what frames (N,) show around unit directions (N, 3).
@@ -107,9 +106,8 @@ class Lenses:
         sines = np.linalg.norm(axes, axis=1, keepdims=True)
         turns = _rotations(axes * (np.arcsin(np.minimum(sines, 1)) / np.maximum(sines, 1e-300)))
         if self.twists is not None:
-            moved = self.fractions(directions, frames)[:, None] * self.twists[frames]
-            later = _rotations(moved[:, :3])
-            turns, starts = later @ turns, np.einsum("nij,nj->ni", later, starts) + moved[:, 3:]
+            later, moves = self._moved(directions, frames)
+            turns, starts = later @ turns, np.einsum("nij,nj->ni", later, starts) + moves
         return pose(turns, starts)
 
     def seeing(self, points_rig: np.ndarray, frames: np.ndarray) -> np.ndarray:
@@ -120,11 +118,17 @@ class Lenses:
             return vectors
         for _ in range(_SETTLED):
             units = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
-            moved = self.fractions(units, frames)[:, None] * self.twists[frames]
-            back = np.swapaxes(_rotations(moved[:, :3]), 1, 2)
-            local = np.einsum("nij,nj->ni", back, points_rig - moved[:, 3:])
+            turns, moves = self._moved(units, frames)
+            local = np.einsum("nij,nj->ni", np.swapaxes(turns, 1, 2), points_rig - moves)
             vectors = self._shown(local, frames)
         return vectors
+
+    def _moved(self, directions: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How frames (N,) turn (N, 3, 3) and move (N, 3) from their middle to the rows of unit
+        directions (N, 3)."""
+        assert self.twists is not None
+        moved = self.fractions(directions, frames)[:, None] * self.twists[frames]
+        return _rotations(moved[:, :3]), moved[:, 3:]
 
     def _shown(self, points: np.ndarray, frames: np.ndarray) -> np.ndarray:
         """Points (N, 3) along where a stitcher puts the directions that their lens sees them in."""

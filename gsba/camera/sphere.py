@@ -27,6 +27,12 @@ def erp_from_bearings(bearings: np.ndarray, width: int, height: int) -> np.ndarr
     return np.stack([u, v], axis=-1)
 
 
+def dense_enough(width: int, focal: float) -> int:
+    """Width to average a panorama down to for pinhole images: detail beyond theirs aliases."""
+    density = 2 * np.pi * focal  # panorama width at which pixels are as dense as in their middle
+    return 2 * round(density / 2) if width > 1.5 * density else width
+
+
 def around_seam(image: np.ndarray, columns: int) -> np.ndarray:
     """A panorama (h, 2h[, C]) with columns from beyond the seam on either side."""
     return np.concatenate([image[:, -columns:], image, image[:, :columns]], axis=1)

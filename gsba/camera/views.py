@@ -14,7 +14,7 @@ import numpy as np
 
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import RIG_R_FACE
-from gsba.camera.sphere import around_sphere, erp_from_bearings
+from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings
 from gsba.camera.straighten import PAD
 from gsba.geometry import pose
 from gsba.types import FACES, FrameSet, Reconstruction
@@ -141,10 +141,8 @@ class ViewCutter:
 
     def cut(self, erp: np.ndarray) -> list[np.ndarray]:
         """Images (height, width[, C]) uint8, bicubic, of a panorama (H, 2 H[, C]) uint8."""
-        density = 2 * np.pi * self._views[0].focal
-        width = erp.shape[1]
-        if width > 1.5 * density:  # finer detail would alias
-            width = 2 * round(density / 2)
+        width = dense_enough(erp.shape[1], self._views[0].focal)
+        if width < erp.shape[1]:
             erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
         return self._sampled(erp, cv2.INTER_CUBIC)
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from gsba.camera.rig import CubeRig
-from gsba.camera.sphere import around_sphere, erp_from_bearings
+from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings
 from gsba.camera.straighten import PAD
 from gsba.config import CubemapSettings
 from gsba.frames.masks import load_mask
@@ -42,7 +42,7 @@ def load(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.nda
     mask = load_mask(frames, frame)
     masks = None if mask is None else cut_mask(mask, rig)
     if frames.panoramic:
-        width = _dense_enough(frames.width, rig)
+        width = dense_enough(frames.width, rig.focal)
         return cut(load_erp(frames, frame, width=width), rig), masks
     images = np.zeros((len(FACES), rig.size, rig.size, 3), np.uint8)
     present = [FACES.index(name) for name in frames.faces]
@@ -62,7 +62,7 @@ def cut(erp: np.ndarray, rig: CubeRig) -> np.ndarray:
     Returns:
         (6, size, size[, C]) uint8, in FACES order.
     """
-    width = _dense_enough(erp.shape[1], rig)
+    width = dense_enough(erp.shape[1], rig.focal)
     height = width // 2
     if width < erp.shape[1]:
         erp = cv2.resize(erp, (width, height), interpolation=cv2.INTER_AREA)
@@ -74,12 +74,6 @@ def cut(erp: np.ndarray, rig: CubeRig) -> np.ndarray:
             for face in range(len(FACES))
         ]
     )
-
-
-def _dense_enough(width: int, rig: CubeRig) -> int:
-    """Width to average a panorama down to: detail beyond the faces' resolution aliases."""
-    density = 2 * np.pi * rig.focal  # panorama width at which pixels are as dense as the face's
-    return 2 * round(density / 2) if width > 1.5 * density else width
 
 
 def cut_mask(mask: np.ndarray, rig: CubeRig) -> np.ndarray:

@@ -1,7 +1,8 @@
 """The back end of a run: from matches to poses and points, and what refines these further."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -40,7 +41,6 @@ from gsba.splat.refinement import SplatResult
 from gsba.store.store import digest
 from gsba.types import (
     Keypoints,
-    Landmarks,
     Matches,
     Reconstruction,
     Sighted,
@@ -48,6 +48,8 @@ from gsba.types import (
     Tracks,
     VerifiedPairs,
 )
+
+T = TypeVar("T")
 
 _CAMERA_ROUNDS = 3  # of what aligned patches say of the camera, and the adjustment under it
 _WIDE = 30.0  # gate in standard deviations of observations that a wrong camera threw off
@@ -97,11 +99,11 @@ def guess_axes(
 ) -> LensAxes:
     """Which way two lenses would look, from matches as they came."""
 
-    def compute() -> LensAxes:
-        placed, loose = _widely_placed(run, seen, prior, matches, solved)
-        return lens_axes.guess(placed, seen.keypoints, loose, seen.lenses, run.problem(prior))
+    def found(wide: Solution) -> LensAxes:
+        problem = run.problem(prior)
+        return lens_axes.guess(wide.landmarks, seen.keypoints, wide, seen.lenses, problem)
 
-    return run.stage(name, _camera_key(run), compute, LensAxes, noted=False)
+    return _of_matches(run, seen, prior, name, matches, solved, found, LensAxes)
 
 
 def find_lenses(
@@ -109,11 +111,11 @@ def find_lenses(
 ) -> LensCentres:
     """Where the lenses are, from matches that no solution has chosen among."""
 
-    def compute() -> LensCentres:
-        placed, loose = _widely_placed(run, seen, prior, matches, solved)
-        return lens_centres.estimate(placed, seen.keypoints, loose, seen.lenses, run.problem(prior))
+    def found(wide: Solution) -> LensCentres:
+        problem = run.problem(prior)
+        return lens_centres.estimate(wide.landmarks, seen.keypoints, wide, seen.lenses, problem)
 
-    return run.stage(name, _camera_key(run), compute, LensCentres)
+    return _of_matches(run, seen, prior, name, matches, solved, found, LensCentres, noted=True)
 
 
 def find_stitch_radius(
@@ -121,12 +123,12 @@ def find_stitch_radius(
 ) -> StitchRadius:
     """How far away panoramas take things to be, from the same under two lenses."""
 
-    def compute() -> StitchRadius:
-        placed, loose = _widely_placed(run, seen, prior, matches, solved)
+    def found(wide: Solution) -> StitchRadius:
         shown, problem = seen.shown.bearings_rig, run.problem(prior)
-        return lens_centres.stitched_for(placed, seen.keypoints, shown, loose, seen.lenses, problem)
+        given = wide.landmarks, seen.keypoints, shown, wide, seen.lenses, problem
+        return lens_centres.stitched_for(*given)
 
-    return run.stage(name, _camera_key(run), compute, StitchRadius, noted=False)
+    return _of_matches(run, seen, prior, name, matches, solved, found, StitchRadius)
 
 
 def find_readout(
@@ -134,12 +136,12 @@ def find_readout(
 ) -> Readout:
     """How long rows are read and which way, from the same."""
 
-    def compute() -> Readout:
-        placed, loose = _widely_placed(run, seen, prior, matches, solved)
+    def found(wide: Solution) -> Readout:
         shown, times, problem = seen.shown.bearings_rig, run.frames.timestamps, run.problem(prior)
-        return readout.estimate(placed, seen.keypoints, shown, loose, seen.lenses, times, problem)
+        given = wide.landmarks, seen.keypoints, shown, wide, seen.lenses, times, problem
+        return readout.estimate(*given)
 
-    return run.stage(name, _camera_key(run), compute, Readout)
+    return _of_matches(run, seen, prior, name, matches, solved, found, Readout, noted=True)
 
 
 def settle_camera(
@@ -153,39 +155,52 @@ def settle_camera(
 ) -> Readout:
     """The camera that was found, from the same, and each frame's own motion and axes."""
 
-    def compute() -> Readout:
-        placed, loose = _widely_placed(run, seen, prior, matches, solved)
-        loose, shown = replace(loose, landmarks=placed), seen.shown.bearings_rig
-        times, problem = run.frames.timestamps, run.problem(prior)
-        return CameraSystem(loose, seen.keypoints, shown, camera, times, problem).step()
+    def found(wide: Solution) -> Readout:
+        shown, times, problem = seen.shown.bearings_rig, run.frames.timestamps, run.problem(prior)
+        return CameraSystem(wide, seen.keypoints, shown, camera, times, problem).step()
 
-    return run.stage(name, _camera_key(run), compute, Readout, noted=False)
+    return _of_matches(run, seen, prior, name, matches, solved, found, Readout)
+
+
+def _of_matches(
+    run: Run,
+    seen: Seen,
+    prior: Prior,
+    name: str,
+    matches: Sequence[Matches],
+    solved: Solution,
+    found: Callable[[Solution], T],
+    returns: type[T],
+    *,
+    noted: bool = False,
+) -> T:
+    """What is found of the camera from points of matches with all within a gate.
+
+    Observations that one centre threw off are far: the gate is wide until there are two, and
+    poses count as unsure as it is wide.
+    """
+    settings = run.settings
+    gate = settings.rounds.gate_scale if seen.lenses else _WIDE
+
+    def compute() -> T:
+        placed = triangulation.place(
+            _tracks(seen, prior, matches),
+            seen.keypoints,
+            solved.world_T_rigs,
+            gate * solved.noise,
+            settings.triangulate,
+            run.num_threads,
+        )
+        noise = solved.noise * gate / settings.rounds.gate_scale
+        return found(replace(solved, landmarks=placed, noise=noise))
+
+    return run.stage(name, _camera_key(run), compute, returns, noted=noted)
 
 
 def _camera_key(run: Run) -> list[object]:
     camera = run.settings.camera
     said = camera.model_dump(exclude={"name", "baseline_mm", "readout_ms"})
     return [run.solving_key(), said, camera.readout(), camera.nearness(1.0), run.settings.seed]
-
-
-def _widely_placed(
-    run: Run, seen: Seen, prior: Prior, matches: Sequence[Matches], solved: Solution
-) -> tuple[Landmarks, Solution]:
-    """Points of matches with all within a gate, and poses as unsure as that is wide.
-
-    Observations that one centre threw off are far: the gate is wide until there are two.
-    """
-    settings = run.settings
-    gate = settings.rounds.gate_scale if seen.lenses else _WIDE
-    placed = triangulation.place(
-        _tracks(seen, prior, matches),
-        seen.keypoints,
-        solved.world_T_rigs,
-        gate * solved.noise,
-        settings.triangulate,
-        run.num_threads,
-    )
-    return placed, replace(solved, noise=solved.noise * gate / settings.rounds.gate_scale)
 
 
 def _tracks(seen: Seen, prior: Prior, matches: Sequence[Matches]) -> Tracks:
