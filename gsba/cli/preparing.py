@@ -11,7 +11,7 @@ from gsba.log import GsbaError
 
 @command
 def extract(
-    video: Annotated[Path, typer.Argument(help="Equirectangular (2:1) video.")],
+    video: Annotated[Path, typer.Argument(help="Video, 2:1 or raw of two fisheyes.")],
     out: Annotated[Path, typer.Option(help="Folder of the frames.", metavar="FRAMES")],
     fps: Annotated[float | None, typer.Option(help="Frames kept per second; 1 if unsaid.")] = None,
     every: Annotated[int | None, typer.Option(help="Keep one frame of so many.")] = None,

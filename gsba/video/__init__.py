@@ -1,7 +1,7 @@
 """360-degree video to frames: exact presentation times, the sharpest of each window.
 
-Takes a 2:1 video.
-Gives a folder of frames with their times.
+Takes a 2:1 video, or the raw one of two fisheyes: two tracks, two files or side by side.
+Gives a folder of frames with their times, of raw videos one of each lens.
 """
 
 from gsba.video.extraction import extract

@@ -1,18 +1,21 @@
 """Choose frames of a video and write them as images with their exact times.
 
 `FRAMES/NNNNNN.jpg` is frame NNNNNN of the video, counted from 0; `timestamps.csv` gives the seconds
-since the first one. `extract.json` says what was asked for, so that the same call resumes and
-another one does not mix its frames in.
+since the first one. Of raw recordings, `FRAMES/front/NNNNNN.jpg` and `FRAMES/back/NNNNNN.jpg` are
+what the two lenses saw at one instant, chosen together, and NNNNNN counts frames of the front one.
+`extract.json` says what was asked for, so that the same call resumes and another one does not mix
+its frames in.
 """
 
 import csv
 import json
 import logging
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,8 +28,17 @@ from gsba.store.store import digest, fingerprint
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Counts
 from gsba.version import __version__
-from gsba.video.likeness import apparent_motion_deg, miniature, sharpness
-from gsba.video.timeline import Timeline, bgr, decode, luma, read_timeline
+from gsba.video.likeness import apparent_motion_deg, lens_interior, miniature, sharpness
+from gsba.video.recording import (
+    EXACT_S,
+    LENSES,
+    Picture,
+    Recording,
+    check_lengths,
+    files_of,
+    read_recording,
+    shots,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -34,7 +46,6 @@ MARKER = "extract.json"
 TIMES = "timestamps.csv"
 _JOURNAL = "extract.partial.csv"  # what is there so far; gone when all is
 _JPEG_QUALITY = 95
-_EXACT = 1e-6  # seconds: closer times are equal
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,15 +59,16 @@ class _Kept:
 
 
 def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = False) -> Counts:
-    """Write frames of an equirectangular video to a folder that `gsba.frames.scan` understands.
+    """Write frames of a 360-degree video to a folder that `gsba.frames.scan` understands.
 
     Times count from the first frame shown; they are the container's presentation times, whatever
     the frame rate does. A call that was interrupted goes on where it stopped.
 
     Args:
-        video: H.264, H.265 or whatever else FFmpeg decodes, 2:1.
+        video: H.264, H.265 or whatever else FFmpeg decodes: 2:1, or raw of two lenses (see
+            `gsba.video.recording`), either file of a pair.
         out: folder of the frames, made if missing.
-        settings: which frames, and at what size.
+        settings: which frames, and at what size (of raw recordings: of one lens's picture).
         replace: put up with another extraction in `out`, and replace it.
 
     Returns:
@@ -72,25 +84,27 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
         raise GsbaError(f"{video}: is a folder; give a video (frames need no extraction)")
     if not video.is_file():
         raise GsbaError(f"{video}: no such file")
-    key = digest(__version__, settings, fingerprint([video, trajectory]))
+    key = digest(__version__, settings, fingerprint([*files_of(video), trajectory]))
     done = _take_over(out, key, replace)
     if done is not None:
         logger.info("%s: %d frames, extracted before", out, done.kept)
         return done
-    timeline = read_timeline(video)
-    if settings.width is not None and settings.width > timeline.width:
-        raise GsbaError(f"--width {settings.width}: {video} has only {timeline.width} pixels")
-    windows, received = _windows(video, timeline, settings)
-    _check_end(video, timeline, settings.to_s)
-    _write_marker(out, video, key, None)
-    before = _read_journal(out)
-    after, standing = _extract(video, timeline, windows, out, settings, before)
+    recording = read_recording(video)
+    if settings.width is not None and settings.width > recording.width:
+        raise GsbaError(f"--width {settings.width}: {video} has only {recording.width} pixels")
+    windows, received = _windows(video, recording, settings)
+    _check_end(video, recording, settings.to_s)
+    for note in recording.notes:
+        logger.info("%s", note)
+    _write_marker(out, video, key, None, recording.lenses)
+    before = _read_journal(out, recording.lenses)
+    after, standing = _extract(recording, windows, out, settings, before)
     kept = before + after
     if not kept:
         raise GsbaError(f"{video}: none of its pictures could be decoded; copy it again")
     counts = _counts(received, windows, kept, standing)
     _write_times(out, kept)
-    _write_marker(out, video, key, counts)
+    _write_marker(out, video, key, counts, recording.lenses)
     (out / _JOURNAL).unlink(missing_ok=True)
     why = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
     logger.info("%s: kept %d of %d frames (%s)", out, counts.kept, received, why or "all")
@@ -98,12 +112,13 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
 
 
 def _windows(
-    video: Path, timeline: Timeline, settings: VideoSettings
+    video: Path, recording: Recording, settings: VideoSettings
 ) -> tuple[list[np.ndarray], int]:
     """Groups of frame indices of which one each is kept, and how many frames are in the range."""
-    times = timeline.times
+    times = recording.times
     low, high = settings.from_s or 0.0, np.inf if settings.to_s is None else settings.to_s
-    inside = np.flatnonzero((times >= low - _EXACT) & (times <= high + _EXACT))
+    within = (times >= low - EXACT_S) & (times <= high + EXACT_S)
+    inside = np.flatnonzero(within & recording.shown)
     if not len(inside):
         raise GsbaError(
             f"{video}: no frame between {low:g} and {high:g} s; it lasts {times[-1]:.3f} s"
@@ -113,7 +128,7 @@ def _windows(
     if settings.every is not None:
         slots = np.arange(len(inside)) // settings.every
     else:
-        slots = np.floor((times[inside] - low + _EXACT) * settings.fps).astype(np.int64)
+        slots = np.floor((times[inside] - low + EXACT_S) * settings.fps).astype(np.int64)
     groups = np.split(inside, np.flatnonzero(np.diff(slots)) + 1)
     return (groups if settings.sharpest else [group[:1] for group in groups]), len(inside)
 
@@ -127,7 +142,7 @@ def _nearest_to(path: Path, times: np.ndarray, inside: np.ndarray) -> list[np.nd
     before = np.maximum(after - 1, 0)
     earlier = entries - times[inside[before]] <= times[inside[after]] - entries
     nearest = inside[np.where(earlier, before, after)]
-    met = np.abs(times[nearest] - entries) <= 0.5 * interval + _EXACT
+    met = np.abs(times[nearest] - entries) <= 0.5 * interval + EXACT_S
     if not met.any():
         raise GsbaError(
             f"{path}: none of its times ({entries[0]:.3f} to {entries[-1]:.3f} s) is that of a "
@@ -138,18 +153,21 @@ def _nearest_to(path: Path, times: np.ndarray, inside: np.ndarray) -> list[np.nd
     return [np.array([index]) for index in np.unique(nearest[met])]
 
 
-def _check_end(video: Path, timeline: Timeline, to_s: float | None) -> None:
-    last = float(timeline.times[-1])
-    if timeline.is_cut_short and (to_s is None or to_s > last + _EXACT):
+def _check_end(video: Path, recording: Recording, to_s: float | None) -> None:
+    last = float(recording.times[recording.shown][-1])
+    if to_s is not None and to_s <= last + EXACT_S:
+        return
+    check_lengths(recording)
+    if all(timeline.is_cut_short for timeline in recording.timelines):
+        claimed = recording.timelines[0].claimed_s
         raise GsbaError(
-            f"{video}: claims to last {timeline.claimed_s:.1f} s, but its pictures end at "
+            f"{video}: claims to last {claimed:.1f} s, but its pictures end at "
             f"{last:.3f} s: truncated; copy it again, or pass --to {last:.3f} to use what is there"
         )
 
 
 def _extract(
-    video: Path,
-    timeline: Timeline,
+    recording: Recording,
     windows: list[np.ndarray],
     out: Path,
     settings: VideoSettings,
@@ -160,48 +178,64 @@ def _extract(
     Returns:
         the frames kept, and how many of all windows were left out because the camera stood.
     """
-    times, kept, last = timeline.times, list[_Kept](), None
+    times, kept, last = recording.times, list[_Kept](), None
     standing = before[-1].standing if before else 0
     todo = [window for window in windows if not before or window[0] > before[-1].index]
     skip_standing = settings.standing_deg > 0 and settings.at is None
     if before and todo and skip_standing:
-        for _, frame in decode(video, timeline, [before[-1].index]):
-            last = miniature(luma(frame))
-    best = _best_of_each(decode(video, timeline, _flat(todo)), todo, settings.sharpest)
-    for index, frame in track(best, "extracting frames", len(todo)):
+        for _, pictures in shots(recording, [before[-1].index]):
+            last = _small(pictures)
+    best = _best_of_each(shots(recording, _flat(todo)), todo, settings.sharpest)
+    for index, pictures in track(best, "extracting frames", len(todo)):
         if skip_standing:
-            small = miniature(luma(frame))
-            if last is not None and apparent_motion_deg(last, small) < settings.standing_deg:
+            small = _small(pictures)
+            if last is not None and _motion_deg(last, small, recording) < settings.standing_deg:
                 standing += 1
                 continue
             last = small
-        name, image = f"{index:06d}.jpg", _encoded(frame, settings.width)
-        write_bytes(out / name, image)
+        name, images = f"{index:06d}.jpg", [_encoded(each, settings.width) for each in pictures]
+        for folder, image in zip(_folders(out, recording.lenses), images, strict=True):
+            write_bytes(folder / name, image)
         kept.append(_Kept(name, float(times[index]), index, standing))
         _append(out / _JOURNAL, kept[-1])
     return kept, standing
 
 
 def _best_of_each(
-    frames: Iterable[tuple[int, Any]], windows: list[np.ndarray], sharpest: bool
-) -> Iterator[tuple[int, Any]]:
-    """The sharpest, or only, decoded frame of each window."""
+    frames: Iterable[tuple[int, tuple[Picture, ...]]], windows: list[np.ndarray], sharpest: bool
+) -> Iterator[tuple[int, tuple[Picture, ...]]]:
+    """The sharpest, or only, decoded frame of each window; of two lenses, by the mean of both."""
     window_of = {int(index): w for w, window in enumerate(windows) for index in window}
     for _, group in groupby(frames, key=lambda item: window_of[item[0]]):
-        yield max(group, key=lambda item: sharpness(luma(item[1])) if sharpest else 0.0)
+        yield max(group, key=lambda item: _sharpness(item[1]) if sharpest else 0.0)
+
+
+def _sharpness(pictures: tuple[Picture, ...]) -> float:
+    return sum(sharpness(picture.luma()) for picture in pictures) / len(pictures)
+
+
+def _small(pictures: tuple[Picture, ...]) -> np.ndarray:
+    """Miniature of a panorama, or of two lenses side by side, which is as wide."""
+    return miniature(np.concatenate([picture.luma() for picture in pictures], axis=1))
+
+
+def _motion_deg(before: np.ndarray, after: np.ndarray, recording: Recording) -> float:
+    looked_at = lens_interior(after.shape[0]) if recording.lenses else None
+    return apparent_motion_deg(before, after, looked_at)
 
 
 def _flat(windows: list[np.ndarray]) -> list[int]:
     return [int(index) for window in windows for index in window]
 
 
-def _encoded(frame: Any, width: int | None) -> bytes:
+def _encoded(picture: Picture, width: int | None) -> bytes:
     """A decoded picture as JPEG, narrower if asked."""
     import cv2
 
-    pixels = bgr(frame)
+    pixels = picture.bgr()
     if width is not None and width != pixels.shape[1]:
-        pixels = cv2.resize(pixels, (width, width // 2), interpolation=cv2.INTER_AREA)
+        height = width * pixels.shape[0] // pixels.shape[1]
+        pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
     return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
 
 
@@ -227,11 +261,13 @@ def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
     try:
         marker = json.loads((out / MARKER).read_text(encoding="utf-8"))
         counts = typed(marker["counts"], Counts | None)  # type: ignore[arg-type]
+        lenses = LENSES if "lenses" in marker else ()
         same = marker["key"] == key
     except (OSError, ValueError, TypeError, KeyError, RecursionError, RecordError):
         raise GsbaError(f"{out} is not empty and no extraction: choose another --out") from None
     written = _read_times(out)
-    if same and (counts is None or all((out / n).is_file() for n in written)):
+    folders = _folders(out, lenses)
+    if same and (counts is None or all((f / n).is_file() for f in folders for n in written)):
         return counts
     if not same and not replace:
         raise GsbaError(
@@ -239,14 +275,37 @@ def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
             "--fresh to replace it"
         )
     with disk_errors(out):
-        for name in [*written, *(k.name for k in _read_journal(out)), TIMES, _JOURNAL, MARKER]:
-            (out / Path(name).name).unlink(missing_ok=True)
+        names = [*written, *(kept.name for kept in _read_journal(out, lenses))]
+        _remove_images(out, lenses, names)
+        for name in (TIMES, _JOURNAL, MARKER):
+            (out / name).unlink(missing_ok=True)
     return None
 
 
-def _write_marker(out: Path, video: Path, key: str, counts: Counts | None) -> None:
+def _folders(out: Path, lenses: Sequence[str]) -> list[Path]:
+    """Where the pictures of one instant go."""
+    return [out / lens for lens in lenses] or [out]
+
+
+def _remove_images(out: Path, lenses: Sequence[str], names: Sequence[str]) -> None:
+    for folder in _folders(out, lenses):
+        for name in names:
+            (folder / Path(name).name).unlink(missing_ok=True)
+    for folder in (out / lens for lens in lenses):
+        for path in list(folder.glob("*.jpg")):
+            if re.fullmatch(r"\d{6,}", path.stem):  # of one lens alone, when a call was killed
+                path.unlink()
+        with suppress(OSError):  # missing, or of use to somebody
+            folder.rmdir()
+
+
+def _write_marker(
+    out: Path, video: Path, key: str, counts: Counts | None, lenses: Sequence[str]
+) -> None:
     entries = None if counts is None else asdict(counts)
     marker = {"gsba": __version__, "video": str(video.resolve()), "key": key, "counts": entries}
+    if lenses:
+        marker["lenses"] = list(lenses)
     text = json.dumps(marker, indent=1, ensure_ascii=False) + "\n"
     write_text(out / MARKER, text)
 
@@ -256,7 +315,7 @@ def _append(path: Path, kept: _Kept) -> None:
         csv.writer(file).writerow([kept.name, repr(kept.timestamp), kept.index, kept.standing])
 
 
-def _read_journal(out: Path) -> list[_Kept]:
+def _read_journal(out: Path, lenses: Sequence[str]) -> list[_Kept]:
     """Frames an interrupted call has written; a row cut off by a crash is none."""
     try:
         text = (out / _JOURNAL).read_text(encoding="utf-8")
@@ -266,7 +325,7 @@ def _read_journal(out: Path) -> list[_Kept]:
     try:
         for row in csv.reader(text[: text.rfind("\n") + 1].splitlines()):
             entry = _Kept(row[0], float(row[1]), int(row[2]), int(row[3]))
-            if not (out / entry.name).is_file():
+            if not all((folder / entry.name).is_file() for folder in _folders(out, lenses)):
                 break
             kept.append(entry)
     except (ValueError, IndexError, csv.Error) as error:

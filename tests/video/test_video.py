@@ -15,7 +15,7 @@ from gsba.frames.scan import scan
 from gsba.log import GsbaError
 from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory
-from gsba.video import extract, extraction, is_video
+from gsba.video import extract, extraction
 from gsba.video.likeness import apparent_motion_deg, miniature, sharpness
 
 av = pytest.importorskip("av", reason="PyAV is not installed")
@@ -302,32 +302,6 @@ def test_other_shapes_are_refused(tmp_path: Path, size: tuple[int, int], message
     pictures = [_world(i, *size) for i in range(3)]
     video = _encode(tmp_path / "v.mp4", pictures, _steady(3))
     _fails(_gsba("extract", video, "--out", tmp_path / "f"), message)
-
-
-def test_raw_fisheyes_are_refused(tmp_path: Path) -> None:
-    v, u = np.ogrid[:HEIGHT, :WIDTH]
-    outside = np.hypot(u % HEIGHT - HEIGHT / 2, v - HEIGHT / 2) > HEIGHT / 2
-    picture = _world()
-    picture[np.broadcast_to(outside, picture.shape[:2])] = 0
-    video = _encode(tmp_path / "v.mp4", [picture] * 3, _steady(3))
-    _fails(_gsba("extract", video, "--out", tmp_path / "f"), "raw dual-fisheye; stitch it")
-    night = [(_world() // 8).astype(np.uint8)] * 3  # dark all over is no pair of circles
-    extract(_encode(tmp_path / "n.mp4", night, _steady(3)), tmp_path / "n", VideoSettings(every=1))
-
-
-def test_one_stream_a_lens_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "v.insv"
-    with av.open(str(path), "w", format="mp4") as container:
-        streams = [container.add_stream("libx264", rate=30) for _ in range(2)]
-        for stream in streams:
-            stream.width = stream.height = HEIGHT
-            stream.pix_fmt = "yuv420p"
-        for stream in streams:
-            frame = av.VideoFrame.from_ndarray(_world(0, HEIGHT, HEIGHT), format="rgb24")
-            container.mux(stream.encode(frame))
-            container.mux(stream.encode())
-    assert is_video(path)
-    _fails(_gsba("extract", path, "--out", tmp_path / "f"), "2 video streams of 128x128: a raw")
 
 
 def test_broken_files_are_one_line(film: Path, tmp_path: Path) -> None:

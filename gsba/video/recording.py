@@ -1,0 +1,324 @@
+"""What a recording shows at each instant: a stitched panorama, or what each of two lenses saw.
+
+Raw recordings of two fisheyes come as one file with a track for each lens, as two files with `_00_`
+and `_10_` in their names, or as one track with both circles side by side. These layouts follow
+public descriptions (OpenSpeleo/insta360-rs, docs/INSV_FORMAT.md; insta.pk360.de on file types): no
+maker's file was at hand. The first track, `_00_` and the left circle are taken for the front lens;
+pictures stay turned as the camera stores them.
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsba.log import GsbaError
+from gsba.video.timeline import Timeline, Track, bgr, decode, luma, read_timeline, track_sizes
+
+LENSES = ("front", "back")
+EXACT_S = 1e-6  # closer times are equal
+
+_STITCH = "stitch it in the camera's app and export an equirectangular (2:1) video"
+_NAMED = ("00", "10")  # between underscores in the names of a front and of a back lens's file
+_NEARLY = 1.1  # longer side over the shorter, up to which a picture is nearly square
+_SHORT = 0.1  # part of the longer track's duration that the shorter may lack
+_LOOKED_AT = 5  # frames in which two circles side by side are looked for
+_SEVERAL = 2  # of them that must show such
+_DARK, _LIT = 32, 40  # grey levels: around image circles, and inside
+_OUTSIDE, _INSIDE = 0.58, 0.42  # radii in heights: beyond circles, those of 200 degrees too, which
+# the frame cuts off; well within
+_ROWS = 0.25  # part of the rows with corners in which circles show beside black ones
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A panorama, or what one lens saw; converted when asked for."""
+
+    frame: Any  # av.VideoFrame
+    place: tuple[slice, slice]  # rows and columns of it in the frame
+
+    def luma(self) -> np.ndarray:
+        """Brightness (H, W) uint8."""
+        return np.ascontiguousarray(luma(self.frame)[self.place])
+
+    def bgr(self) -> np.ndarray:
+        """Colours (H, W, 3) uint8 BGR."""
+        return np.ascontiguousarray(bgr(self.frame)[self.place])
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A video, or two, as instants: numbered and timed as the frames of the first track are."""
+
+    tracks: tuple[Track, ...]  # (1), or (2) of front and back lens
+    timelines: tuple[Timeline, ...]  # of the tracks
+    places: tuple[tuple[slice, slice], ...]  # of a panorama in a frame, or of two lenses' pictures
+    width: int  # pixels across a picture
+    shown: np.ndarray  # (N,) bool, instants of which every track has a frame
+    partners: np.ndarray  # (N,) int64, frame of the last track at instants that are `shown`
+    notes: tuple[str, ...] = ()  # what the video was taken for, and what of it is left out
+
+    @property
+    def times(self) -> np.ndarray:
+        """Seconds (N,) float64 since the first frame of the first track."""
+        return self.timelines[0].times
+
+    @property
+    def lenses(self) -> tuple[str, ...]:
+        """Names of the lenses whose pictures these are; () for panoramas."""
+        return LENSES if len(self.places) > 1 else ()
+
+
+def files_of(video: Path) -> tuple[Path, ...]:
+    """The files of a recording of which one is given: it alone, or the front and the back lens's.
+
+    Raises:
+        GsbaError: no video, or of a layout that is not read.
+    """
+    if video.suffix.lower() == ".360":
+        raise GsbaError(
+            f"{video}: is a cube map in GoPro's layout, no fisheyes: export an equirectangular "
+            "(2:1) video from GoPro Player"
+        )
+    pair = _named_pair(video)
+    if pair is None or not all(path.is_file() for path in pair):
+        return (video,)
+    sizes = track_sizes(video)
+    return pair if len(sizes) == 1 and _is_nearly_square(sizes[0]) else (video,)
+
+
+def read_recording(video: Path) -> Recording:
+    """Find out what a video shows, and when.
+
+    Raises:
+        GsbaError: no video, neither a panorama nor of two lenses, or of lenses that do not match.
+    """
+    files = files_of(video)
+    size, *others = track_sizes(files[0])
+    if len(files) == 2:
+        _check_pair(files, size)
+        note = f"{files[0]}: raw, of the front lens; of the back one is {files[1]}"
+        return _of_two_tracks((Track(files[0]), Track(files[1])), size, note)
+    if others:
+        _check_tracks(video, [size, *others])
+        note = f"{video}: raw, two tracks of {size[0]}x{size[1]}: front lens, back lens"
+        return _of_two_tracks((Track(video), Track(video, 1)), size, note)
+    _check_panorama(video, size)
+    return _of_one_track(Track(video), size)
+
+
+def shots(recording: Recording, chosen: Sequence[int]) -> Iterator[tuple[int, tuple[Picture, ...]]]:
+    """Yield (instant, its pictures) of chosen instants in order; damaged ones are left out.
+
+    Args:
+        chosen: ascending instants that are `shown`.
+    """
+    frames = decode(recording.tracks[0], recording.timelines[0], chosen)
+    if len(recording.tracks) == 1:
+        for index, frame in frames:
+            yield index, tuple(Picture(frame, place) for place in recording.places)
+        return
+    partners = recording.partners[list(chosen)].tolist()
+    instants = dict(zip(partners, chosen, strict=True))
+    others = decode(recording.tracks[1], recording.timelines[1], partners)
+    other = next(others, None)
+    for index, frame in frames:
+        while other is not None and instants[other[0]] < index:
+            other = next(others, None)
+        if other is None:
+            return
+        if instants[other[0]] == index:
+            pair = zip((frame, other[1]), recording.places, strict=True)
+            yield index, tuple(Picture(each, place) for each, place in pair)
+
+
+def check_lengths(recording: Recording) -> None:
+    """Refuse lenses of which one was recorded for a clearly shorter time.
+
+    Raises:
+        GsbaError: so it is.
+    """
+    lasting = [float(line.times[-1]) + line.interval_s for line in recording.timelines]
+    if min(lasting) >= (1 - _SHORT) * max(lasting):
+        return
+    short, long = int(np.argmin(lasting)), int(np.argmax(lasting))
+    end = recording.times[recording.shown][-1]
+    raise GsbaError(
+        f"{recording.tracks[short].path}: the {LENSES[short]} lens's pictures last "
+        f"{lasting[short]:.3f} s, the {LENSES[long]} one's {lasting[long]:.3f} s: one is cut "
+        f"short; copy it again, or pass --to {end:.3f} to use what both show"
+    )
+
+
+def _named_pair(video: Path) -> tuple[Path, Path] | None:
+    """Paths of a front and of a back lens's file, of which `video` is named as one; else None."""
+    found = list(re.finditer(rf"(?<=_)({'|'.join(_NAMED)})(?=_)", video.name))
+    if not found:
+        return None
+    start, end = found[-1].span()
+    front, back = (video.with_name(video.name[:start] + n + video.name[end:]) for n in _NAMED)
+    return front, back
+
+
+def _is_nearly_square(size: tuple[int, int]) -> bool:
+    return 0 < max(size) <= _NEARLY * min(size)
+
+
+def _check_pair(files: tuple[Path, ...], size: tuple[int, int]) -> None:
+    """Refuse two files that are no two lenses."""
+    front, back = files
+    if (sizes := track_sizes(back)) != [size]:
+        shapes = " and ".join(f"{width}x{height}" for width, height in sizes)
+        raise GsbaError(
+            f"{back}: is {shapes}, but {front.name}, the front lens's file, {size[0]}x{size[1]}: "
+            f"no pair; copy both again from the camera, or {_STITCH}"
+        )
+
+
+def _check_tracks(video: Path, sizes: list[tuple[int, int]]) -> None:
+    """Refuse several tracks that are no two lenses."""
+    (width, height), shapes = sizes[0], " and ".join(f"{w}x{h}" for w, h in sizes)
+    if len(sizes) > 2:
+        raise GsbaError(
+            f"{video}: holds {len(sizes)} video tracks, {shapes}; of two lenses there are two: "
+            f"{_STITCH}"
+        )
+    if sizes[0] != sizes[1]:
+        raise GsbaError(
+            f"{video}: holds video tracks of {shapes}; those of two lenses are of one size: "
+            f"{_STITCH}"
+        )
+    if width == 2 * height:
+        raise GsbaError(
+            f"{video}: holds two video tracks that are 2:1 each ({shapes}), so stitched twice: "
+            f"keep one (ffmpeg -i {video.name} -map 0:v:0 -c copy ONE.mp4)"
+        )
+    if not _is_nearly_square(sizes[0]):
+        raise GsbaError(
+            f"{video}: holds two video tracks of {width}x{height}, neither fisheyes (square) nor "
+            f"a panorama (2:1): {_STITCH}"
+        )
+
+
+def _check_panorama(video: Path, size: tuple[int, int]) -> None:
+    """Refuse what is not 2:1."""
+    width, height = size
+    if width == 2 * height and height > 0:
+        return
+    pair = _named_pair(video) if _is_nearly_square(size) else None
+    if pair is not None:
+        other = pair[0] if video.name == pair[1].name else pair[1]
+        raise GsbaError(
+            f"{video}: is {width}x{height}, one lens of a raw dual-fisheye recording, but "
+            f"{other.name} is not beside it: copy the other lens's file there, or {_STITCH}"
+        )
+    if width == height and height > 0:
+        raise GsbaError(
+            f"{video}: is {width}x{height}, square: one lens of a raw dual-fisheye recording, or "
+            f"a stereo pair; {_STITCH}"
+        )
+    raise GsbaError(
+        f"{video}: is {width}x{height}; an equirectangular video is 2:1. If it is raw "
+        f"dual-fisheye or a flat cut of the recording, {_STITCH}"
+    )
+
+
+def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
+    """Panoramas, or two lenses side by side."""
+    timeline = read_timeline(track)
+    num, side = len(timeline.ticks), size[1]
+    circles, notes = _shows_circles(track, timeline)
+    places = ((slice(None), slice(None)),)
+    if circles:
+        places = (slice(None), slice(side)), (slice(None), slice(side, None))
+    width = side if circles else size[0]
+    everything = np.ones(num, bool), np.arange(num)
+    return Recording((track,), (timeline,), places, width, *everything, notes)
+
+
+def _of_two_tracks(tracks: tuple[Track, Track], size: tuple[int, int], note: str) -> Recording:
+    """Pair the frames of two lenses by when they are shown."""
+    front, back = read_timeline(tracks[0]), read_timeline(tracks[1])
+    ahead = int(back.ticks[0]) * back.tick_s - int(front.ticks[0]) * front.tick_s
+    ours, theirs = front.times, back.times + float(ahead)
+    nearest = _nearest(theirs, ours)
+    mutual = _nearest(ours, theirs)[nearest] == np.arange(len(ours))
+    within = 0.5 * min(front.interval_s, back.interval_s) - EXACT_S
+    shown = mutual & (np.abs(theirs[nearest] - ours) < within)
+    where = " and ".join(dict.fromkeys(str(track.path) for track in tracks))
+    if not shown.any():
+        raise GsbaError(
+            f"{where}: the lenses share no times (front 0 to {ours[-1]:.3f} s, back "
+            f"{theirs[0]:.3f} to {theirs[-1]:.3f} s): not one recording; copy it again from the "
+            "camera"
+        )
+    notes, num = [note], int(shown.sum())
+    if num < max(len(ours), len(theirs)):
+        notes.append(
+            f"{where}: {len(ours) + len(theirs) - 2 * num} instants left out that one lens alone "
+            f"shows ({len(ours) - num} front, {len(theirs) - num} back)"
+        )
+    side = min(size)
+    top, left = (size[1] - side) // 2, (size[0] - side) // 2
+    if max(size) > side:
+        notes.append(f"{where}: pictures are cut to {side}x{side} around their middle")
+    place = (slice(top, top + side), slice(left, left + side))
+    return Recording(tracks, (front, back), (place, place), side, shown, nearest, tuple(notes))
+
+
+def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Index of the nearest of ascending times to each that is wanted, the earlier of two."""
+    after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(wanted - times[before]) <= np.abs(times[after] - wanted), before, after)
+
+
+def _shows_circles(track: Track, timeline: Timeline) -> tuple[bool, tuple[str, ...]]:
+    """Whether 2:1 frames are two image circles side by side, by their black corners; notes on it.
+
+    A panorama may be black above and below, but then it is black in whole rows; circles are lit in
+    rows whose corners are black. Frames that are dark all over say nothing.
+    """
+    num = len(timeline.ticks)
+    middle = num // 2
+    others = {(2 * i + 1) * num // (2 * _LOOKED_AT) for i in range(_LOOKED_AT)} - {middle}
+    seen = lit = 0
+    for part in ([middle], sorted(others)):  # the middle one settles it for most panoramas
+        for _, frame in decode(track, timeline, part):
+            corners_black, rows = _circles(luma(frame))
+            if not corners_black:
+                return False, ()
+            seen, lit = seen + 1, lit + (rows >= _ROWS)
+    if not seen:
+        return False, ()
+    if lit < min(_SEVERAL, seen):
+        return False, (f"{track.path}: black corners, but around no circles: taken for a panorama",)
+    note = (
+        f"{track.path}: raw, two fisheyes side by side, front left and back right: corners black "
+        f"around circles that are not, in {lit} of {seen} frames looked at"
+    )
+    return True, (note,)
+
+
+def _circles(grey: np.ndarray) -> tuple[bool, float]:
+    """What speaks for two image circles in a 2:1 picture (H, 2H) uint8.
+
+    Returns:
+        whether all around them is black, and in which part of the rows they are lit beside it.
+    """
+    height, width = grey.shape
+    v, u = np.ogrid[:height, :width]
+    radius = np.hypot(np.mod(u + 0.5, height) - height / 2, v + 0.5 - height / 2)
+    outside, inside = radius > _OUTSIDE * height, radius < _INSIDE * height
+    rows = np.flatnonzero(outside.any(axis=1) & inside.any(axis=1))
+    if not len(rows):
+        return False, 0.0
+    black = bool(np.percentile(grey[outside], 90) < _DARK)
+    lit = [
+        np.median(grey[row, inside[row]]) > _LIT and grey[row, outside[row]].mean() < _DARK
+        for row in rows
+    ]
+    return black, float(np.mean(lit))

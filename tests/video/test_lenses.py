@@ -1,0 +1,401 @@
+"""Raw videos of two fisheyes made here: two tracks, two files, side by side; what is refused."""
+
+import json
+import logging
+from fractions import Fraction
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from gsba.cli import app
+from gsba.config import RefineSettings, VideoSettings
+from gsba.log import GsbaError
+from gsba.pipeline.inputs import extract_frames
+from gsba.store.store import RunStore
+from gsba.video import extract, extraction, is_video
+from gsba.video.recording import read_recording
+
+av = pytest.importorskip("av", reason="PyAV is not installed")
+
+SIDE, BITS = 96, 6
+TICK = Fraction(1, 90_000)
+EVERY = VideoSettings(every=1, standing_deg=0)
+Track = tuple[list[np.ndarray], list[int]]  # pictures, and the ticks at which they are shown
+
+
+def _texture(seed: int, height: int, width: int) -> np.ndarray:
+    """Smooth noise (height, width, 3) uint8 that is nowhere black."""
+    noise = np.random.default_rng(seed).normal(size=(height, width, 3))
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    return np.clip(140 + 30 * smooth / smooth.std(), 60, 255).astype(np.uint8)
+
+
+def _radius(height: int = SIDE, width: int = SIDE) -> np.ndarray:
+    v, u = np.ogrid[:height, :width]
+    return np.hypot(u + 0.5 - width / 2, v + 0.5 - height / 2)
+
+
+def _lens(name: str, index: int, blur: float = 0.0, shift: int | None = None) -> np.ndarray:
+    """What a lens saw: its image circle, in it the instant as bits and the lens as a patch."""
+    texture = np.roll(
+        _texture(name == "back", SIDE, SIDE), 2 * index if shift is None else shift, 1
+    )
+    picture = texture.copy()
+    for bit in range(BITS):
+        picture[42:54, 12 + 12 * bit : 24 + 12 * bit] = 255 * (index >> bit & 1)
+    picture[60:72, 42:54] = 255 * (name == "front")
+    if blur:
+        picture = cv2.GaussianBlur(picture, (0, 0), blur)
+    picture[_radius() > SIDE / 2] = 0
+    return picture
+
+
+def _read(path: Path) -> tuple[str, int]:
+    """Lens and instant that a picture shows."""
+    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    scale = grey.shape[0] / SIDE
+    cells = [grey[int(48 * scale), int((18 + 12 * bit) * scale)] for bit in range(BITS)]
+    lens = "front" if grey[int(66 * scale), int(48 * scale)] > 128 else "back"
+    return lens, sum(int(cell > 128) << bit for bit, cell in enumerate(cells))
+
+
+def _encode(path: Path, *tracks: Track, container_format: str | None = None) -> Path:
+    with av.open(str(path), "w", format=container_format) as container:
+        streams = []
+        for pictures, _ in tracks:
+            stream = container.add_stream("libx264", rate=30, options={"crf": "12"})
+            stream.height, stream.width = pictures[0].shape[:2]
+            stream.pix_fmt, stream.gop_size = "yuv420p", 12
+            stream.time_base = stream.codec_context.time_base = TICK
+            streams.append(stream)
+        for stream, (pictures, ticks) in zip(streams, tracks, strict=True):
+            for picture, tick in zip(pictures, ticks, strict=True):
+                frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+                frame.pts, frame.time_base = int(tick), TICK
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+    return path
+
+
+def _steady(num: int) -> list[int]:
+    return [3000 * i for i in range(num)]
+
+
+def _seen(name: str, indices: list[int] | range, ticks: list[int], ahead: int = 0) -> Track:
+    """A lens's track of some instants, each at its tick."""
+    return [_lens(name, i) for i in indices], [ticks[i] + ahead for i in indices]
+
+
+def _beside(front: np.ndarray, back: np.ndarray) -> np.ndarray:
+    return np.concatenate([front, back], axis=1)
+
+
+def _times(folder: Path) -> dict[str, float]:
+    rows = (folder / "timestamps.csv").read_text().splitlines()
+    assert rows[0] == "name,timestamp"
+    return {name: float(time) for name, time in (row.split(",") for row in rows[1:])}
+
+
+def _check_shown(folder: Path, indices: list[int], ticks: list[int]) -> None:
+    """The folder holds both lenses' pictures of just these instants, at their times."""
+    times = _times(folder)
+    assert list(times) == [f"{i:06d}.jpg" for i in indices]
+    expected = (np.array(ticks)[indices] - ticks[0]) / 90_000
+    np.testing.assert_allclose(list(times.values()), expected, atol=1e-9)
+    for lens in ("front", "back"):
+        paths = sorted((folder / lens).iterdir())
+        assert [path.name for path in paths] == list(times)
+        assert [_read(path) for path in paths] == [(lens, i) for i in indices]
+    left = {path.name for path in folder.iterdir()}
+    assert left == {"front", "back", "timestamps.csv", "extract.json"}
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One file with a track for each lens, 40 instants at 30 fps."""
+    path = tmp_path_factory.mktemp("film") / "VID_20240101_120000_00_001.insv"
+    tracks = [_seen(lens, range(40), _steady(40)) for lens in ("front", "back")]
+    return _encode(path, *tracks, container_format="mp4")
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_two_tracks(tmp_path: Path, suffix: str) -> None:
+    """Variable frame rate, a start not at zero: equal names show one instant at its time."""
+    rng = np.random.default_rng(1)
+    ticks = (90 * (np.cumsum(rng.integers(20, 60, 40)) + 700)).tolist()
+    tracks = [_seen(lens, range(40), ticks) for lens in ("front", "back")]
+    video = _encode(tmp_path / f"v.{suffix}", *tracks)
+    counts = extract(video, tmp_path / "frames", VideoSettings(every=3, standing_deg=0))
+    assert (counts.received, counts.kept) == (40, 14)
+    _check_shown(tmp_path / "frames", list(range(0, 40, 3)), ticks)
+
+
+def test_tracks_out_of_step(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Frames pair by time, not by number: a lens late by a third of a frame, some frames gone."""
+    front = [i for i in range(40) if i not in (7, 20)]
+    back = [i for i in range(40) if i not in (5, 6, 20, 31)]
+    ticks = _steady(40)
+    tracks = _seen("front", front, ticks), _seen("back", back, ticks, 1000)
+    video = _encode(tmp_path / "v.mp4", *tracks)
+    with caplog.at_level(logging.INFO):
+        counts = extract(video, tmp_path / "frames", EVERY)
+    both = [i for i in front if i in back]
+    assert counts.received == counts.kept == len(both)
+    paths = [sorted((tmp_path / "frames" / lens).iterdir()) for lens in ("front", "back")]
+    assert [path.name for path in paths[0]] == [path.name for path in paths[1]]
+    assert [_read(path) for path in paths[0]] == [("front", i) for i in both]
+    assert [_read(path) for path in paths[1]] == [("back", i) for i in both]
+    np.testing.assert_allclose(
+        list(_times(tmp_path / "frames").values()), np.array(both) / 30, atol=1e-9
+    )
+    assert "4 instants left out that one lens alone shows (3 front, 1 back)" in caplog.text
+    assert "two tracks of 96x96: front lens, back lens" in caplog.text
+
+
+@pytest.mark.parametrize("given", ["_00_", "_10_"])
+def test_two_files(tmp_path: Path, given: str) -> None:
+    ticks = _steady(20)
+    for mark, lens in (("_00_", "front"), ("_10_", "back")):
+        path = tmp_path / f"VID_20200101_101010{mark}007.insv"
+        _encode(path, _seen(lens, range(20), ticks), container_format="mp4")
+    video = tmp_path / f"VID_20200101_101010{given}007.insv"
+    assert is_video(video)
+    extract(video, tmp_path / "frames", VideoSettings(fps=6, standing_deg=0))
+    _check_shown(tmp_path / "frames", [0, 5, 10, 15], ticks)
+
+
+def test_the_other_file_counts_for_what_was_extracted(tmp_path: Path) -> None:
+    paths = [tmp_path / f"v{mark}1.mp4" for mark in ("_00_", "_10_")]
+    for path, lens in zip(paths, ("front", "back"), strict=True):
+        _encode(path, _seen(lens, range(8), _steady(8)))
+    extract(paths[0], tmp_path / "frames", EVERY)
+    extract(paths[1], tmp_path / "frames", EVERY)  # the same
+    _encode(paths[1], _seen("back", range(1, 9), _steady(9), -3000))
+    with pytest.raises(GsbaError, match="another extraction"):
+        extract(paths[0], tmp_path / "frames", EVERY)
+
+
+def test_a_panorama_named_like_one_of_a_pair_is_a_panorama(tmp_path: Path) -> None:
+    panorama = [_texture(i, SIDE, 2 * SIDE) for i in range(4)]
+    for mark in ("_00_", "_10_"):
+        _encode(tmp_path / f"v{mark}1.mp4", (panorama, _steady(4)))
+    extract(tmp_path / "v_00_1.mp4", tmp_path / "frames", EVERY)
+    assert (tmp_path / "frames/000003.jpg").is_file()
+    assert "lenses" not in json.loads((tmp_path / "frames/extract.json").read_text())
+
+
+def test_side_by_side(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    pictures = [_beside(_lens("front", i), _lens("back", i)) for i in range(20)]
+    pictures[10] = np.zeros_like(pictures[10])  # dark for a moment
+    video = _encode(tmp_path / "v.insv", (pictures, _steady(20)), container_format="mp4")
+    with caplog.at_level(logging.INFO):
+        extract(video, tmp_path / "frames", VideoSettings(every=3, standing_deg=0))
+    _check_shown(tmp_path / "frames", list(range(0, 20, 3)), _steady(20))
+    assert "two fisheyes side by side, front left and back right" in caplog.text
+
+
+@pytest.mark.parametrize("radius", [0.46, 0.55])
+def test_circles_smaller_and_larger_than_the_frame(tmp_path: Path, radius: float) -> None:
+    lens = _texture(0, SIDE, SIDE)
+    lens[_radius() > radius * SIDE] = 0
+    video = _encode(tmp_path / "v.mp4", ([_beside(lens, lens)] * 6, _steady(6)))
+    assert read_recording(video).lenses == ("front", "back")
+
+
+def _panorama(kind: str, index: int) -> np.ndarray:
+    picture = np.roll(_texture(0, SIDE, 2 * SIDE), 2 * index, axis=1)
+    if kind == "nadir":
+        picture[-SIDE // 4 :] = 0
+    elif kind == "bands":  # a stitched field of view of 100 degrees up and down
+        picture[: 2 * SIDE // 9] = picture[-2 * SIDE // 9 :] = 0
+    elif kind == "night":
+        picture //= 8
+    elif kind == "all but once" and index != 6:
+        picture = _beside(_lens("front", index), _lens("back", index))
+    return picture
+
+
+@pytest.mark.parametrize("kind", ["nadir", "bands", "night", "all but once"])
+def test_black_parts_make_no_fisheyes(tmp_path: Path, kind: str) -> None:
+    pictures = [_panorama(kind, i) for i in range(12)]
+    video = _encode(tmp_path / "v.mp4", (pictures, _steady(12)))
+    assert read_recording(video).lenses == ()
+    extract(video, tmp_path / "frames", EVERY)
+    assert cv2.imread(str(tmp_path / "frames/000004.jpg")).shape == (SIDE, 2 * SIDE, 3)
+
+
+def test_sharpness_is_that_of_both_lenses(tmp_path: Path) -> None:
+    """One lens is sharpest at the first instant, the other far sharper at the second."""
+    front = [_lens("front", i, blur) for i, blur in enumerate((0, 1.0, 3.0))]
+    back = [_lens("back", i, blur) for i, blur in enumerate((3.0, 0, 3.0))]
+    video = _encode(tmp_path / "v.mp4", (front, _steady(3)), (back, _steady(3)))
+    extract(video, tmp_path / "frames", VideoSettings(every=3, sharpest=True))
+    assert _read(tmp_path / "frames/front/000001.jpg") == ("front", 1)
+    assert _read(tmp_path / "frames/back/000001.jpg") == ("back", 1)
+    assert len(_times(tmp_path / "frames")) == 1
+
+
+def test_a_standing_camera_is_left_out(tmp_path: Path) -> None:
+    shifts = [2 * min(i, 10) + 2 * max(i - 30, 0) for i in range(42)]
+    tracks = []
+    for lens in ("front", "back"):
+        pictures = [_lens(lens, 0, shift=shift) for shift in shifts]
+        tracks.append((pictures, _steady(42)))
+    video = _encode(tmp_path / "v.mp4", *tracks)
+    counts = extract(video, tmp_path / "frames", VideoSettings(every=1))
+    assert counts.dropped["while the camera stood"] == 20
+    kept = [int(name[:6]) for name in _times(tmp_path / "frames")]
+    assert kept == [*range(11), *range(31, 42)]
+
+
+def test_range_and_width(film: Path, tmp_path: Path) -> None:
+    settings = VideoSettings(every=5, from_s=0.5, to_s=1.0, width=64, standing_deg=0)
+    extract(film, tmp_path / "frames", settings)
+    _check_shown(tmp_path / "frames", [15, 20, 25, 30], _steady(40))
+    assert cv2.imread(str(tmp_path / "frames/back/000015.jpg")).shape == (64, 64, 3)
+    with pytest.raises(GsbaError, match="has only 96 pixels"):
+        extract(film, tmp_path / "wide", VideoSettings(width=128))
+
+
+def test_nearly_square_pictures_are_cut_square(tmp_path: Path) -> None:
+    tracks = []
+    for lens in ("front", "back"):
+        pictures = [cv2.copyMakeBorder(_lens(lens, i), 0, 0, 4, 4, 0) for i in range(6)]
+        tracks.append((pictures, _steady(6)))
+    video = _encode(tmp_path / "v.mp4", *tracks)
+    extract(video, tmp_path / "frames", EVERY)
+    _check_shown(tmp_path / "frames", list(range(6)), _steady(6))
+    assert cv2.imread(str(tmp_path / "frames/front/000000.jpg")).shape == (SIDE, SIDE, 3)
+
+
+def test_an_interrupted_extraction_goes_on(
+    film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = VideoSettings(every=4, sharpest=True)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    extract(film, whole, settings)
+    write, calls = extraction.write_bytes, []
+
+    def fail_at_sixth(path: Path, content: bytes) -> None:
+        calls.append(path)
+        if len(calls) == 6:  # the front lens of the third frame is there, the back one is not
+            raise KeyboardInterrupt
+        write(path, content)
+
+    monkeypatch.setattr(extraction, "write_bytes", fail_at_sixth)
+    with pytest.raises(KeyboardInterrupt):
+        extract(film, parts, settings)
+    assert (
+        len(list((parts / "front").iterdir())) == 3 and len(list((parts / "back").iterdir())) == 2
+    )
+    other = tmp_path / "other"
+    (other / "front").parent.mkdir()
+    for path in [p for p in parts.rglob("*") if p.is_file()]:
+        (other / path.relative_to(parts)).parent.mkdir(exist_ok=True)
+        (other / path.relative_to(parts)).write_bytes(path.read_bytes())
+    extract(film, parts, settings)
+    assert len(calls) == 6 + 16  # 20 in all: the first two frames are not done again
+    for path in [p for p in whole.rglob("*") if p.is_file()]:
+        assert (parts / path.relative_to(whole)).read_bytes() == path.read_bytes(), path
+    extract(film, parts, settings)  # complete: nothing to do
+    assert len(calls) == 6 + 16
+    extract(film, other, VideoSettings(every=20, standing_deg=0), replace=True)
+    _check_shown(other, [0, 20], _steady(40))  # nothing of the interrupted call is left
+
+
+def test_raw_and_stitched_extractions_replace_each_other(film: Path, tmp_path: Path) -> None:
+    panorama = [_texture(i, SIDE, 2 * SIDE) for i in range(4)]
+    stitched = _encode(tmp_path / "v.mp4", (panorama, _steady(4)))
+    out = tmp_path / "frames"
+    extract(film, out, VideoSettings(every=10))
+    with pytest.raises(GsbaError, match="another extraction"):
+        extract(stitched, out, EVERY)
+    extract(stitched, out, EVERY, replace=True)
+    assert not (out / "front").exists() and len(list(out.glob("*.jpg"))) == 4
+    extract(film, out, VideoSettings(every=10), replace=True)
+    assert not list(out.glob("*.jpg")) and len(list((out / "back").iterdir())) == 4
+    (out / "back" / "000010.jpg").unlink()  # taken away: made again
+    extract(film, out, VideoSettings(every=10))
+    assert len(list((out / "back").iterdir())) == 4
+
+
+def test_frames_of_a_run(film: Path, tmp_path: Path) -> None:
+    run, settings = tmp_path / "run", RefineSettings(video=VideoSettings(every=10))
+    extract_frames(run, {"frames": film}, settings, None, False)
+    _check_shown(run / "frames", [0, 10, 20, 30], _steady(40))
+    with RunStore(run, {"frames": film}, fresh=True):
+        assert not (run / "frames").exists()  # all of it was claimed
+
+
+def _gsba(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def _fails(result: Result, message: str) -> None:
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: "), result.stderr
+    assert message in lines[0], lines[0]
+    assert result.exit_code == 1
+
+
+def _of_size(width: int, height: int, num: int = 4) -> Track:
+    return [_texture(i, height, width) for i in range(num)], _steady(num)
+
+
+@pytest.mark.parametrize(
+    ("tracks", "message"),
+    [
+        ([_of_size(96, 96), _of_size(64, 64)], "tracks of 96x96 and 64x64; those of two lenses"),
+        ([_of_size(128, 64), _of_size(128, 64)], "2:1 each (128x64 and 128x64), so stitched twice"),
+        ([_of_size(160, 64), _of_size(160, 64)], "neither fisheyes (square) nor a panorama (2:1)"),
+        ([_of_size(96, 96)] * 3, "holds 3 video tracks"),
+    ],
+)
+def test_other_tracks_are_refused(tmp_path: Path, tracks: list[Track], message: str) -> None:
+    video = _encode(tmp_path / "v.mp4", *tracks)
+    _fails(_gsba("extract", video, "--out", tmp_path / "f"), message)
+
+
+def test_lenses_that_do_not_match_are_refused(tmp_path: Path) -> None:
+    out = ("--out", tmp_path / "f")
+    front, ticks = _seen("front", range(20), _steady(60)), _steady(60)
+    later = ([_lens("back", i) for i in range(20)], ticks[30:50])
+    video = _encode(tmp_path / "later.mp4", front, later)
+    _fails(_gsba("extract", video, *out), "the lenses share no times (front 0 to 0.633 s, back 1.0")
+    video = _encode(tmp_path / "short.mp4", front, _seen("back", range(17), ticks))
+    result = _gsba("extract", video, *out)
+    _fails(
+        result, "the back lens's pictures last 0.567 s, the front one's 0.667 s: one is cut short"
+    )
+    _fails(result, "pass --to 0.533")
+    assert _gsba("extract", video, *out, "--to", 0.533, "--every", 4).exit_code == 0
+    video = _encode(tmp_path / "alike.mp4", front, _seen("back", range(18), ticks))
+    assert _gsba("extract", video, "--out", tmp_path / "g").exit_code == 0
+
+
+def test_files_that_do_not_match_are_refused(tmp_path: Path) -> None:
+    out = ("--out", tmp_path / "f")
+    front, back = tmp_path / "v_00_1.insv", tmp_path / "v_10_1.insv"
+    _encode(front, _seen("front", range(20), _steady(20)), container_format="mp4")
+    _fails(_gsba("extract", front, *out), "v_10_1.insv is not beside it: copy the other lens's")
+    _encode(back, _of_size(64, 64, 20), container_format="mp4")
+    _fails(
+        _gsba("extract", front, *out), "v_10_1.insv: is 64x64, but v_00_1.insv, the front lens's"
+    )
+    _fails(_gsba("extract", back, *out), "v_10_1.insv: is 64x64, but v_00_1.insv, the front lens's")
+    _encode(back, _seen("back", range(10), _steady(20)), container_format="mp4")
+    _fails(_gsba("extract", front, *out), "v_10_1.insv: the back lens's pictures last 0.333 s")
+    back.write_bytes(b"no video")
+    _fails(_gsba("extract", front, *out), "v_10_1.insv: cannot be read as video")
+    front.unlink()
+    _encode(back, _seen("back", range(4), _steady(4)), container_format="mp4")
+    _fails(_gsba("extract", back, *out), "v_00_1.insv is not beside it")
+
+
+def test_a_cube_map_is_refused(tmp_path: Path) -> None:
+    video = _encode(tmp_path / "GS010001.360", *[_of_size(128, 48)] * 2, container_format="mp4")
+    assert is_video(video)
+    _fails(_gsba("extract", video, "--out", tmp_path / "f"), "is a cube map in GoPro's layout")
