@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,6 +11,7 @@ from gsba.log import GsbaError
 
 if TYPE_CHECKING:
     from gsba.config import RefineSettings
+    from gsba.demo.two_lenses import TwoLenses
 
 Config = Annotated[Path | None, typer.Option(help="TOML file of settings.", metavar="FILE")]
 Overrides = Annotated[
@@ -133,30 +134,60 @@ def demo(
     frames: Annotated[int, typer.Option(help="Frames of the walk.")] = 40,
     width: Annotated[int, typer.Option(help="Pixels across a panorama.")] = 1024,
     seed: Annotated[int, typer.Option(help="Of the walk's wobble, noise and drift.")] = 0,
+    camera: Annotated[
+        str, typer.Option(help="ideal, or two-lens: as those on sale, rows read one after another.")
+    ] = "ideal",
 ) -> None:
     """Render a walk with exact truth, spoil its trajectory as SLAM would, refine and compare."""
-    from gsba.config import RefineSettings
+    from gsba.config import CameraSettings, RefineSettings
     from gsba.demo import make_walk
     from gsba.evaluate.trajectory import evaluate as compare
     from gsba.evaluate.trajectory import format_table
     from gsba.trajectory.files import read_trajectory
 
-    walk = make_walk(out / "walk", path, heading, frames, width, seed)  # type: ignore[arg-type]
-    run = out / "run"
+    walk = make_walk(out / "walk", path, heading, frames, width, seed, camera=camera)  # type: ignore[arg-type]
+    run, central = out / "run", out / "run-central"
     from gsba import pipeline
 
-    pipeline.refine(walk.frames_dir, walk.slam_path, run, RefineSettings(), fresh=True)
+    runs = {"after": (run, RefineSettings())}
+    if walk.lenses is not None:
+        one = RefineSettings(camera=CameraSettings(model="central"))
+        runs = {"one centre": (central, one), "two lenses": (run, RefineSettings())}
     truth = read_trajectory(walk.truth_path)
-    rows = {
-        "before": compare(read_trajectory(walk.slam_path), truth),
-        "after": compare(read_trajectory(run / "trajectory.tum"), truth),
-    }
-    summary = json.loads((run / "report.json").read_text())["summary"]
-    residuals = (summary["median_residual_deg_coarse"], summary["median_residual_deg"])
+    rows = {"before": compare(read_trajectory(walk.slam_path), truth)}
+    residuals, report = [], {}
+    for name, (folder, settings) in runs.items():
+        pipeline.refine(walk.frames_dir, walk.slam_path, folder, settings, fresh=True)
+        rows[name] = compare(read_trajectory(folder / "trajectory.tum"), truth)
+        report = json.loads((folder / "report.json").read_text())
+        residuals.append(report["summary"]["median_residual_deg"])
+    residuals.insert(0, report["summary"]["median_residual_deg_coarse"])
     pixels = [f"{degrees * width / 360:.3f}" for degrees in residuals]
     typer.echo(format_table(rows, extra={"reproj. px": pixels}))
-    typer.echo(
-        f"Frames, trajectories and truth in {out / 'walk'}, the run with its model in {run}."
+    where = f"the run with its model in {run}"
+    if walk.lenses is not None:
+        typer.echo(_found_lenses(report["camera"], rows["two lenses"].scale, walk.lenses))
+        where += f", as seen from one centre in {central}"
+    typer.echo(f"Frames, trajectories and truth in {out / 'walk'}, {where}.")
+
+
+def _found_lenses(found: dict[str, Any], scale: float, lenses: "TwoLenses") -> str:
+    """One line on what a run found of its camera, beside what that is.
+
+    Args:
+        found: `camera` of report.json.
+        scale: units of the truth, metres, per map unit.
+    """
+    if not found["taken"]:
+        return f"Two lenses were not found: {found['reason']}."
+    apart, sigma = (1e3 * scale * found[key] for key in ("baseline", "baseline_sigma"))
+    line = f"Found: lenses {apart:.2f} mm apart (sigma {sigma:.2f}; true {1e3 * lenses.baseline:g})"
+    readout = found["readout"]
+    if not readout["taken"]:
+        return f"{line}, no rows read one after another: {readout['reason']}."
+    return (
+        f"{line}, rows read in {readout['ms']:.2f} ms (sigma {readout['ms_sigma']:.2f}; "
+        f"true {1e3 * lenses.readout_s:g})."
     )
 
 

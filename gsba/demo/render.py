@@ -1,4 +1,6 @@
-"""Equirectangular pictures of a scene, anti-aliased."""
+"""Equirectangular pictures of a scene, anti-aliased, from one point or through a moving lens."""
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,13 +11,24 @@ from gsba.demo.sampling import albedo_at, light_at
 # tells four levels of coverage apart along either axis.
 EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))
 EXPOSURE = 1.1  # of the tone curve 1 - exp(-EXPOSURE * radiance)
+_MARGIN = 3  # pixels beyond what a lens shows whose faces are needed, or more
+
+
+class Eye(NamedTuple):
+    """What looks at the scene: rays in directions of the rig, each at the time of its row."""
+
+    world_T_eyes: np.ndarray  # (K, 3, 4) float64, rotations of the rig and positions of the eye,
+    # evenly spaced from the first row's time to the last one's; one: all rows at one instant
+    facing: float = 1.0  # whose sensor it is: 1 looks along the rig's z, -1 the other way
+    sweep: tuple[float, float] = (-1.0, 0.0)  # rig's x and y, unit: the way in which rows are read
+    half_fov: float = np.pi  # rad, from the axis to the first and to the last row
+    bend: tuple[float, float] = (0.0, 0.0)  # a point at angle a is a + bend[0] a^3 + bend[1] a^5
+    # from the picture's middle, up to scale
+    least: float = -2.0  # of facing * z of unit directions that are drawn; -2 draws all
 
 
 def render_erp(scene: Scene, world_T_rig: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Equirectangular picture of the scene, filtered over each pixel.
-
-    Inside a face the texture filter covers the pixel; where faces meet, four rays with a quarter
-    of the filter each do.
+    """Equirectangular picture of the scene from one point, filtered over each pixel.
 
     Args:
         world_T_rig: (4, 4) float64, rotation and position of the panorama.
@@ -24,49 +37,104 @@ def render_erp(scene: Scene, world_T_rig: np.ndarray, width: int, height: int) -
     Returns:
         (height, width, 3) float32, RGB, 0..255, black where nothing is hit.
     """
-    world_R_rig = np.ascontiguousarray(world_T_rig[:3, :3], dtype=np.float64)
-    rig_in_world = np.ascontiguousarray(world_T_rig[:3, 3], dtype=np.float64)
-    faces = np.empty((height, width), dtype=np.int64)
-    image = np.empty((height, width, 3), dtype=np.float32)
-    in_bands(_find_faces, height, scene, world_R_rig, rig_in_world, faces)
-    in_bands(_shade, height, scene, world_R_rig, rig_in_world, faces, image)
+    return render_eye(scene, Eye(world_T_rig[None, :3]), width, height)
+
+
+def render_eye(scene: Scene, eye: Eye, width: int, height: int) -> np.ndarray:
+    """What an eye contributes to an equirectangular picture, filtered over each pixel.
+
+    Inside a face the texture filter covers the pixel; where faces meet, four rays with a quarter
+    of the filter each do.
+
+    Args:
+        width, height: pixels, width = 2 height.
+
+    Returns:
+        (height, width, 3) float32, RGB, 0..255, black where nothing is hit or drawn.
+    """
+    eye = eye._replace(world_T_eyes=np.ascontiguousarray(eye.world_T_eyes, dtype=np.float64))
+    faces = np.full((height, width), -1, dtype=np.int64)
+    image = np.zeros((height, width, 3), dtype=np.float32)
+    in_bands(_find_faces, height, scene, eye, faces)
+    in_bands(_shade, height, scene, eye, faces, image)
     return image
 
 
 @kernel
-def _find_faces(start, stop, scene, R, o, faces):
+def _find_faces(start, stop, scene, eye, faces):
     """Face at each pixel's centre, -1 for none, into rows of faces (H, W)."""
     height, width = faces.shape
     step = np.pi / height
-    o = (o[0], o[1], o[2])
+    least = eye.least - _MARGIN * step
     for row in range(start, stop):
         for column in range(width):
             x, y, z = _direction((column + 0.5) * step - np.pi, np.pi / 2 - (row + 0.5) * step)
-            faces[row, column] = nearest(scene, o, _rotate(R, x, y, z), np.inf)[1]
+            if eye.facing * z >= least:
+                R, o = _pose(eye, x, y, z)
+                faces[row, column] = nearest(scene, o, _rotate(R, x, y, z), np.inf)[1]
 
 
 @kernel
-def _shade(start, stop, scene, R, o, faces, image):
+def _shade(start, stop, scene, eye, faces, image):
     """Colours of rows of image (H, W, 3)."""
     height, width = faces.shape
     step = np.pi / height
-    o = (o[0], o[1], o[2])
     for row in range(start, stop):
         for column in range(width):
             longitude, latitude = (column + 0.5) * step - np.pi, np.pi / 2 - (row + 0.5) * step
+            if eye.facing * _direction(longitude, latitude)[2] < eye.least:
+                continue
             if _uniform(faces, row, column):
-                color = _color(scene, R, o, longitude, latitude, step, faces[row, column])
+                color = _color(scene, eye, longitude, latitude, step, faces[row, column])
                 red, green, blue = color
             else:
                 red, green, blue = 0.0, 0.0, 0.0
                 for k in range(4):
                     x, y = step * EDGE_SAMPLES[k][0], step * EDGE_SAMPLES[k][1]
-                    color = _color(scene, R, o, longitude + x, latitude + y, step / 2, -1)
+                    color = _color(scene, eye, longitude + x, latitude + y, step / 2, -1)
                     red, green, blue = red + color[0], green + color[1], blue + color[2]
                 red, green, blue = red / 4, green / 4, blue / 4
             image[row, column, 0] = red
             image[row, column, 1] = green
             image[row, column, 2] = blue
+
+
+@part
+def _pose(eye, x, y, z):
+    """Rotation (9 numbers, row by row) and position (3) of the eye when it reads (x, y, z)."""
+    T, last = eye.world_T_eyes, len(eye.world_T_eyes) - 1
+    k, f = 0, 0.0
+    if last > 0:
+        across = np.sqrt(x * x + y * y)
+        angle = np.arctan2(across, eye.facing * z)
+        radius = _radius(eye, angle) / _radius(eye, eye.half_fov)
+        along = (x * eye.sweep[0] + y * eye.sweep[1]) / max(across, 1e-12)
+        at = min(max((0.5 + 0.5 * radius * along) * last, 0.0), float(last))
+        k = min(int(at), last - 1)
+        f = at - k
+    n = min(k + 1, last)
+    return (
+        T[k, 0, 0] + f * (T[n, 0, 0] - T[k, 0, 0]),
+        T[k, 0, 1] + f * (T[n, 0, 1] - T[k, 0, 1]),
+        T[k, 0, 2] + f * (T[n, 0, 2] - T[k, 0, 2]),
+        T[k, 1, 0] + f * (T[n, 1, 0] - T[k, 1, 0]),
+        T[k, 1, 1] + f * (T[n, 1, 1] - T[k, 1, 1]),
+        T[k, 1, 2] + f * (T[n, 1, 2] - T[k, 1, 2]),
+        T[k, 2, 0] + f * (T[n, 2, 0] - T[k, 2, 0]),
+        T[k, 2, 1] + f * (T[n, 2, 1] - T[k, 2, 1]),
+        T[k, 2, 2] + f * (T[n, 2, 2] - T[k, 2, 2]),
+    ), (
+        T[k, 0, 3] + f * (T[n, 0, 3] - T[k, 0, 3]),
+        T[k, 1, 3] + f * (T[n, 1, 3] - T[k, 1, 3]),
+        T[k, 2, 3] + f * (T[n, 2, 3] - T[k, 2, 3]),
+    )
+
+
+@part
+def _radius(eye, angle):
+    """How far from the picture's middle an angle from the axis is seen, up to scale."""
+    square = angle * angle
+    return angle * (1 + square * (eye.bend[0] + square * eye.bend[1]))
 
 
 @part
@@ -83,9 +151,9 @@ def _uniform(faces, row, column):
 @part
 def _rotate(R, x, y, z):
     return (
-        R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
-        R[1, 0] * x + R[1, 1] * y + R[1, 2] * z,
-        R[2, 0] * x + R[2, 1] * y + R[2, 2] * z,
+        R[0] * x + R[1] * y + R[2] * z,
+        R[3] * x + R[4] * y + R[5] * z,
+        R[6] * x + R[7] * y + R[8] * z,
     )
 
 
@@ -96,10 +164,11 @@ def _direction(longitude, latitude):
 
 
 @part
-def _color(scene, R, o, longitude, latitude, step, known):
+def _color(scene, eye, longitude, latitude, step, known):
     """Colour (3), 0..255, of the square of angle `step` at this ray, on face `known` if >= 0."""
     cy, sy = np.cos(longitude), np.sin(longitude)
     cp, sp = np.cos(latitude), np.sin(latitude)
+    R, o = _pose(eye, cp * sy, -sp, cp * cy)
     d = _rotate(R, cp * sy, -sp, cp * cy)
     if known >= 0:
         t, q = face_distance(scene, known, o, d, np.inf), known

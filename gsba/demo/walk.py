@@ -3,6 +3,7 @@
 import csv
 import logging
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -12,6 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from gsba.camera.sphere import bearings_from_erp
 from gsba.demo.degrade import degrade
+from gsba.demo.two_lenses import TwoLenses
 from gsba.geometry import pose
 from gsba.log import GsbaError, track
 from gsba.trajectory.files import write_tum
@@ -19,6 +21,7 @@ from gsba.types import Trajectory
 
 WalkPath = Literal["rectangle", "oval", "open"]
 Heading = Literal["locked", "forward"]
+Camera = Literal["ideal", "two-lens"]
 
 FRAMES_PER_SECOND = 2.0
 EYE_HEIGHT = 1.5  # units above the floor
@@ -39,6 +42,7 @@ class DemoWalk:
     frames_dir: Path  # NNNNNN.jpg and timestamps.csv
     truth_path: Path  # TUM, exact poses, world of the gallery
     slam_path: Path  # TUM, degraded poses, world of the first frame and a scale of its own
+    lenses: TwoLenses | None  # what the camera is; None = one centre, one instant
 
 
 def make_walk(
@@ -49,6 +53,7 @@ def make_walk(
     width: int = 1024,
     seed: int = 0,
     depth: bool = False,
+    camera: Camera = "ideal",
 ) -> DemoWalk:
     """Render a walk into the folder `out`, replacing a walk that is there.
 
@@ -60,20 +65,26 @@ def make_walk(
         seed: of the hand's wobble, the noise and the drift.
         depth: also write depth/NNNNNN.npz with `range`, (width / 8, width / 4) float32: distance
             along the ray through each pixel of that size, 0 where nothing is hit.
+        camera: "ideal" sees all from one point at one instant, "two-lens" as the cameras on sale
+            do (`TwoLenses`; also writes calibration.json). Truth is the same: the middle of the
+            exposure, midway between the lenses.
 
     Raises:
         GsbaError: an argument is out of range, or `out` holds something else.
     """
     from gsba.demo.gallery import build_gallery
 
-    _check(out, path, heading, num_frames, width, seed)
+    _check(out, path, heading, camera, num_frames, width, seed)
+    lenses = TwoLenses() if camera == "two-lens" else None
     partial = out.with_name(f".{out.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     (partial / "images").mkdir(parents=True)
     truth = walk_poses(path, heading, num_frames, seed)
     scene = build_gallery()
     logger.info("gallery of %d faces, %d frames of %d px", len(scene.corners), num_frames, width)
-    _write_frames(partial, scene, truth, width, seed)
+    _write_frames(partial, scene, truth, width, seed, lenses)
+    if lenses is not None:
+        lenses.write(partial / "calibration.json")
     if depth:
         _write_depth(partial / "depth", scene, truth, width // 4)
     write_tum(partial / "groundtruth.tum", truth)
@@ -81,7 +92,7 @@ def make_walk(
     if out.exists():
         shutil.rmtree(out)
     partial.rename(out)
-    return DemoWalk(out / "images", out / "groundtruth.tum", out / "slam.tum")
+    return DemoWalk(out / "images", out / "groundtruth.tum", out / "slam.tum", lenses)
 
 
 def walk_poses(path: WalkPath, heading: Heading, num_frames: int, seed: int) -> Trajectory:
@@ -165,18 +176,18 @@ def _rotations(axis: int, angles: np.ndarray | float) -> np.ndarray:
     return Rotation.from_rotvec(np.atleast_1d(angles)[:, None] * np.eye(3)[axis]).as_matrix()
 
 
-def _write_frames(out: Path, scene, truth: Trajectory, width: int, seed: int) -> None:
+def _write_frames(
+    out: Path, scene, truth: Trajectory, width: int, seed: int, lenses: TwoLenses | None
+) -> None:
     """JPEGs with exposure and noise, and their times."""
     import cv2
-
-    from gsba.demo.render import render_erp
 
     rng = np.random.default_rng([seed, 1])
     exposures = 1 + EXPOSURE_SWING * np.tanh(_wobble(rng, len(truth.timestamps)))
     names = [f"{f:06d}.jpg" for f in range(len(exposures))]
-    frames = zip(names, truth.world_T_rigs, exposures, strict=True)
-    for name, world_T_rig, exposure in track(frames, "rendering the walk", total=len(names)):
-        image = exposure * render_erp(scene, world_T_rig, width, width // 2)
+    frames = zip(names, _pictures(scene, truth, width, seed, lenses), exposures, strict=True)
+    for name, picture, exposure in track(frames, "rendering the walk", total=len(names)):
+        image = exposure * picture
         image += NOISE * rng.standard_normal(image.shape, dtype=np.float32)
         bgr = np.clip(image[..., ::-1] + 0.5, 0, 255).astype(np.uint8)
         quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
@@ -186,6 +197,22 @@ def _write_frames(out: Path, scene, truth: Trajectory, width: int, seed: int) ->
         rows = csv.writer(file)
         rows.writerow(["name", "timestamp"])
         rows.writerows((name, f"{t:.6f}") for name, t in zip(names, truth.timestamps, strict=True))
+
+
+def _pictures(
+    scene, truth: Trajectory, width: int, seed: int, lenses: TwoLenses | None
+) -> Iterator[np.ndarray]:
+    """Panoramas (width / 2, width, 3) float32 of the frames, one after another."""
+    from gsba.demo.gait import poses_during
+    from gsba.demo.render import render_erp
+    from gsba.demo.two_lenses import render_stitched
+
+    if lenses is None:
+        for world_T_rig in truth.world_T_rigs:
+            yield render_erp(scene, world_T_rig, width, width // 2)
+        return
+    for world_T_rigs in poses_during(truth, lenses.readout_s, seed):
+        yield render_stitched(scene, world_T_rigs, lenses, width, width // 2)
 
 
 def _write_depth(folder: Path, scene, truth: Trajectory, width: int) -> None:
@@ -200,8 +227,15 @@ def _write_depth(folder: Path, scene, truth: Trajectory, width: int) -> None:
         np.savez_compressed(folder / f"{f:06d}.npz", range=depth)
 
 
-def _check(out: Path, path: str, heading: str, num_frames: int, width: int, seed: int) -> None:
-    for value, allowed, what in ((path, WalkPath, "path"), (heading, Heading, "heading")):
+def _check(
+    out: Path, path: str, heading: str, camera: str, num_frames: int, width: int, seed: int
+) -> None:
+    choices = (
+        (path, WalkPath, "path"),
+        (heading, Heading, "heading"),
+        (camera, Camera, "camera"),
+    )
+    for value, allowed, what in choices:
         if value not in get_args(allowed):
             raise GsbaError(f"{what} {value!r} is none of {', '.join(get_args(allowed))}")
     if seed < 0:

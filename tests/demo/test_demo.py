@@ -1,18 +1,26 @@
 """The demo's walk: geometry of its renderer, its files, its SLAM-like errors."""
 
 import csv
+import json
+from dataclasses import replace
 from itertools import islice
 
 import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+from gsba.camera.lens import Lenses
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.cli import app
+from gsba.cli.refining import _found_lenses
 from gsba.demo import degrade, make_walk
+from gsba.demo.gait import KNOTS, poses_during
 from gsba.demo.mesh import MeshBuilder
 from gsba.demo.raycast import ranges
 from gsba.demo.render import render_erp
+from gsba.demo.two_lenses import SWEEP, TwoLenses, render_stitched
 from gsba.demo.walk import walk_poses
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.log import GsbaError
@@ -66,18 +74,26 @@ def test_known_points_appear_where_they_project(width):
     scene, points = _checkers()
     errors = []
     for world_T_rig in _views():
-        image = render_erp(scene, world_T_rig, width, width // 2).mean(axis=2)
+        image = render_erp(scene, world_T_rig, width, width // 2)
         points_rig = (points - world_T_rig[:3, 3]) @ world_T_rig[:3, :3]
-        expected = erp_from_bearings(points_rig, width, width // 2)
-        found = cv2.cornerSubPix(
-            image.astype(np.uint8),
-            np.ascontiguousarray(np.round(expected - 0.5)[:, None], dtype=np.float32),
-            (4, 4),
-            (-1, -1),
-            (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4),
-        )
-        errors.append(found[:, 0] + 0.5 - expected)
-    errors = np.concatenate(errors)  # the finder's own noise is 0.05 px, on ideal images too
+        errors.append(_off(image, erp_from_bearings(points_rig, width, width // 2)))
+    _assert_hits(np.concatenate(errors))
+
+
+def _off(image, expected):
+    """By how much (N, 2) the centres of checkerboards lie beside expected pixels (N, 2)."""
+    found = cv2.cornerSubPix(
+        image.mean(axis=2).astype(np.uint8),
+        np.ascontiguousarray(np.round(expected - 0.5)[:, None], dtype=np.float32),
+        (4, 4),
+        (-1, -1),
+        (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4),
+    )
+    return found[:, 0] + 0.5 - expected
+
+
+def _assert_hits(errors):
+    """Errors (24, 2), or some less, are the finder's noise: 0.05 px, on ideal images too."""
     assert np.abs(errors).max() < 0.25
     assert np.median(np.linalg.norm(errors, axis=1)) < 0.1
     assert np.abs(errors.mean(axis=0)).max() < 0.04  # 0.05 / sqrt(24), thrice
@@ -196,7 +212,14 @@ def test_walk_is_reproducible_and_replaces_only_walks(walk, tmp_path):
 
 @pytest.mark.parametrize(
     "setting",
-    [{"path": "spiral"}, {"heading": "up"}, {"num_frames": 2}, {"width": 32}, {"width": 257}],
+    [
+        {"path": "spiral"},
+        {"heading": "up"},
+        {"camera": "pinhole"},
+        {"num_frames": 2},
+        {"width": 32},
+        {"width": 257},
+    ],
 )
 def test_walk_refuses_bad_settings(tmp_path, setting):
     with pytest.raises(GsbaError):
@@ -269,3 +292,160 @@ def test_jumps_and_lost_frames():
     jump = largest_step_error(jumpy.world_T_rigs)
     assert jump > 0.25  # half a step of 0.65
     assert jump > 2 * largest_step_error(calm.world_T_rigs[kept])
+
+
+STILL = TwoLenses(readout_s=0.0, gains=(1.0, 1.0))
+
+
+def _ahead(width):
+    """Angles from the seam towards the front (H, W), degrees."""
+    bearings = bearings_from_erp(_grid(width), width, width // 2)
+    return np.degrees(np.arcsin(bearings[..., 2]))
+
+
+def _at_lens(world_T_rig, side):
+    """The pose of the front (1) or back (-1) lens, axes of the rig."""
+    offset = side * 0.5 * STILL.baseline * np.array([0, 0, 1.0])
+    return world_T_rig @ pose(np.eye(3), offset)
+
+
+def test_two_lenses_in_one_place_at_one_instant_are_ideal():
+    scene, _ = _checkers()
+    one_place = replace(STILL, baseline=0.0)
+    for world_T_rig in _views():
+        ideal = render_erp(scene, world_T_rig, 256, 128)
+        frozen = np.broadcast_to(world_T_rig, (KNOTS, 4, 4))
+        for world_T_rigs in (world_T_rig[None], frozen):
+            image = render_stitched(scene, world_T_rigs, one_place, 256, 128)
+            np.testing.assert_array_equal(image, ideal)
+
+
+def test_each_half_is_of_its_lens_and_the_seam_of_both():
+    scene, _ = _checkers()
+    world_T_rig, width = next(_views()), 256
+    camera = replace(STILL, gains=(1.25, 0.75))
+    image = render_stitched(scene, world_T_rig[None], camera, width, width // 2)
+    front, back = (
+        gain * render_erp(scene, _at_lens(world_T_rig, side), width, width // 2)
+        for side, gain in ((1, 1.25), (-1, 0.75))
+    )
+    ahead, band = _ahead(width), camera.band_deg
+    np.testing.assert_allclose(image[ahead > band], front[ahead > band], rtol=1e-6)
+    np.testing.assert_allclose(image[ahead < -band], back[ahead < -band], rtol=1e-6)
+    within = np.abs(ahead) < band
+    share = (0.5 + 0.5 * ahead[within] / band)[:, None]
+    mixed = share * front[within] + (1 - share) * back[within]
+    np.testing.assert_allclose(image[within], mixed, atol=1e-3)
+    assert np.abs(front - back)[within].max() > 30  # there is something to blend
+
+
+def _seen_from(local, turn, move, camera):
+    """Points (N, 3) of the rig where a rig that turns and moves meanwhile shows them, (N, 3)."""
+    sides = np.sign(local[:, 2:])
+    seen, ends = local, np.radians(camera.half_fov_deg)
+    for _ in range(10):
+        across = np.linalg.norm(seen[:, :2], axis=1)
+        angles = np.arctan2(across, sides[:, 0] * seen[:, 2])
+        radii, last = (
+            a + camera.bend[0] * a**3 + camera.bend[1] * a**5 for a in (angles, np.float64(ends))
+        )
+        rows = (0.5 * radii / last * (seen[:, :2] @ SWEEP) / across)[:, None]
+        undone = Rotation.from_rotvec(-rows * turn)
+        seen = undone.apply(local - rows * move) - sides * [0, 0, camera.baseline / 2]
+    return seen
+
+
+@pytest.mark.parametrize("bend", [(0.0, 0.0), TwoLenses().bend])
+def test_rows_are_read_one_after_another_from_their_lens(bend):
+    scene, points = _checkers()
+    camera, width = replace(STILL, baseline=0.1, bend=bend), 1024
+    turn, move = np.radians([1.0, -2.0, 1.5]), np.array([0.15, -0.05, 0.1])  # in a readout
+    after = np.linspace(-0.5, 0.5, 65)[:, None]
+    moved = pose(Rotation.from_rotvec(after * turn).as_matrix(), after * move)
+    lenses = Lenses(
+        np.array([0, 0, camera.baseline / 2]),
+        sweeps=np.tile([*SWEEP, 0.0], (2, 1)),
+        twists=np.concatenate([turn, move])[None],
+    )
+    errors, shifts = [], []
+    for world_T_rig in _views():
+        image = render_stitched(scene, world_T_rig @ moved, camera, width, width // 2)
+        local = (points - world_T_rig[:3, 3]) @ world_T_rig[:3, :3]
+        local = local[np.abs(local[:, 2]) > 0.2 * np.linalg.norm(local, axis=1)]  # of one lens
+        seen = _seen_from(local, turn, move, camera)
+        expected = erp_from_bearings(seen, width, width // 2)
+        if not any(bend):  # what a run takes lenses to be
+            assumed = lenses.seeing(local, np.zeros(len(local), int))
+            by_model = erp_from_bearings(assumed, width, width // 2)
+            np.testing.assert_allclose(by_model, expected, atol=1e-3)
+        errors.append(_off(image, expected))
+        shifts.append(expected - erp_from_bearings(local, width, width // 2))
+    _assert_hits(np.concatenate(errors))
+    assert np.linalg.norm(np.concatenate(shifts), axis=1).max() > 5  # pixels, from one centre
+
+
+def test_frames_move_while_they_are_read_and_are_true_in_the_middle():
+    still = poses_during(TRUTH, 0.0, 0)
+    np.testing.assert_array_equal(still[:, 0], TRUTH.world_T_rigs)
+    world_T_rigs = poses_during(TRUTH, 0.012, 0)
+    assert world_T_rigs.shape == (40, KNOTS, 4, 4)
+    np.testing.assert_allclose(world_T_rigs[:, KNOTS // 2], TRUTH.world_T_rigs, atol=1e-12)
+    moves = inverse(world_T_rigs[:, 0]) @ world_T_rigs[:, -1]
+    speeds = np.linalg.norm(moves[:, :3, 3], axis=1) / 0.012
+    assert speeds.min() > 1.0 and speeds.max() < 1.8  # 1.3 along the path, and steps
+    turns = Rotation.from_matrix(moves[:, :3, :3]).as_rotvec(degrees=True)
+    assert 0.05 < np.sqrt(np.mean(turns**2)) < 0.2
+    assert np.abs(turns.mean(axis=0)).max() < 0.05  # to and fro
+    np.testing.assert_array_equal(world_T_rigs, poses_during(TRUTH, 0.012, 0))
+    assert not np.allclose(world_T_rigs, poses_during(TRUTH, 0.012, 1), atol=1e-5)
+
+
+def test_a_camera_of_two_lenses_walks_the_same_way(walk, tmp_path):
+    assert walk.lenses is None
+    two, again = (
+        make_walk(tmp_path / name, num_frames=FRAMES, width=WIDTH, seed=3, camera="two-lens")
+        for name in ("two", "again")
+    )
+    assert two.lenses == TwoLenses()
+    for ours, ideal in ((two.truth_path, walk.truth_path), (two.slam_path, walk.slam_path)):
+        assert ours.read_bytes() == ideal.read_bytes()
+    known = json.loads((two.truth_path.parent / "calibration.json").read_text())
+    front, back = (np.array(known["lenses"][name]["rig_T_lens"]) for name in ("front", "back"))
+    assert front[2, 3] - back[2, 3] == pytest.approx(TwoLenses().baseline)
+    for lens, ahead in ((front, 1), (back, -1)):
+        np.testing.assert_allclose(lens[:3, 1:3].T, [[*SWEEP, 0], [0, 0, ahead]])
+        assert np.linalg.det(lens) == pytest.approx(1)
+    name = "000002.jpg"
+    assert (two.frames_dir / name).read_bytes() == (again.frames_dir / name).read_bytes()
+    images = [cv2.imread(str(each.frames_dir / name)) for each in (walk, two)]
+    ideal, ours = (cv2.blur(np.asarray(image), (9, 9)).astype(float) for image in images)
+    ratio, ahead = (ours + 1).mean(axis=2) / (ideal + 1).mean(axis=2), _ahead(WIDTH)
+    assert np.median(ratio[ahead > 10]) == pytest.approx(1.03, abs=0.01)
+    assert np.median(ratio[ahead < -10]) == pytest.approx(0.97, abs=0.01)
+
+
+def test_demo_compares_one_centre_with_two_lenses(tmp_path):
+    few = ["--frames", "3", "--width", "256", "--out", str(tmp_path / "demo")]
+    result = CliRunner().invoke(app, ["-q", "demo", "--camera", "two-lens", *few])
+    assert result.exit_code == 0, result.output
+    starts = [line[:12].strip() for line in result.stdout.splitlines()]
+    assert starts[2:5] == ["before", "one centre", "two lenses"]
+    assert "Two lenses were not found: too few points" in result.stdout  # of three frames
+    for run in ("run", "run-central"):
+        assert (tmp_path / "demo" / run / "trajectory.tum").is_file()
+    wrong = CliRunner().invoke(app, ["demo", "--camera", "nonsense", "--out", str(tmp_path / "x")])
+    assert wrong.exit_code == 1
+    assert wrong.stderr == "error: camera 'nonsense' is none of ideal, two-lens\n"
+    assert [p.name for p in tmp_path.iterdir()] == ["demo"]
+
+
+def test_demo_says_what_was_found_beside_what_is_true():
+    found = {"taken": True, "baseline": 0.016, "baseline_sigma": 1e-4}
+    still = found | {"readout": {"taken": False, "reason": "all stood still"}}
+    assert _found_lenses(still, 2.0, TwoLenses()) == (
+        "Found: lenses 32.00 mm apart (sigma 0.20; true 32), "
+        "no rows read one after another: all stood still."
+    )
+    read = found | {"readout": {"taken": True, "ms": 12.3, "ms_sigma": 0.2}}
+    line = _found_lenses(read, 2.0, TwoLenses())
+    assert line.endswith("true 32), rows read in 12.30 ms (sigma 0.20; true 12).")

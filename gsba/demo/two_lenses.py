@@ -1,0 +1,94 @@
+"""The walk as a 360-degree camera takes it: two lenses, read row by row, stitched at infinity."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gsba.camera.sphere import bearings_from_erp
+
+if TYPE_CHECKING:
+    from gsba.demo.raycast import Scene
+    from gsba.demo.render import Eye
+
+SWEEP = (-1.0, 0.0)  # rig's x and y: rows of either sensor, mounted on its side, are read that way
+
+
+@dataclass(frozen=True, slots=True)
+class TwoLenses:
+    """Two fisheyes back to back along the rig's z, as an Insta360 X5 has them.
+
+    The gallery's unit is a metre: its ceiling is 3.8 units high, and 1.3 of them are walked in a
+    second.
+    """
+
+    baseline: float = 0.032  # units between the lenses' centres
+    readout_s: float = 0.012  # from the first row to the last one
+    gains: tuple[float, float] = (1.03, 0.97)  # exposure of the front and of the back lens
+    band_deg: float = 4.0  # from the seam, within which both pictures are blended
+    half_fov_deg: float = 100.0  # from a lens's axis to the first and to the last row
+    bend: tuple[float, float] = (-0.025, 0.0018)  # a point at angle a is a + bend[0] a^3 +
+    # bend[1] a^5 from the picture's middle, up to scale (Kannala-Brandt)
+
+    def write(self, path: Path) -> None:
+        """What its maker would know, as JSON."""
+        lenses = {}
+        for name, side, turn in (("front", 1.0, np.eye(3)), ("back", -1.0, np.diag([-1.0, 1, -1]))):
+            rig_T_lens = np.eye(4)
+            # Rows are read along a lens's y, which is SWEEP.
+            rig_T_lens[:3, :3] = turn @ np.array([[0, -side, 0], [side, 0, 0], [0, 0, 1]])
+            rig_T_lens[2, 3] = side * self.baseline / 2
+            lenses[name] = {"rig_T_lens": rig_T_lens.tolist(), "k": list(self.bend)}
+        content = {
+            "model": "kannala-brandt: r = f (th + k1 th^3 + k2 th^5), rows along y",
+            "half_fov_deg": self.half_fov_deg,
+            "readout_s": self.readout_s,
+            "stitch_radius": None,
+            "seam_band_deg": self.band_deg,
+            "lenses": lenses,
+        }
+        path.write_text(json.dumps(content, indent=1) + "\n")
+
+
+def render_stitched(
+    scene: "Scene", world_T_rigs: np.ndarray, camera: TwoLenses, width: int, height: int
+) -> np.ndarray:
+    """Equirectangular picture of what both lenses see, each in the directions that it faces.
+
+    Args:
+        world_T_rigs: (K, 4, 4) float64, poses from the first row to the last one; the rig's centre
+            is in the middle between the lenses.
+        width, height: pixels, width = 2 height.
+
+    Returns:
+        (height, width, 3) float32, RGB, 0..255 times the gains, black where nothing is hit.
+    """
+    from gsba.demo.render import render_eye
+
+    band = np.radians(camera.band_deg)
+    front, back = (
+        gain * render_eye(scene, _eye(world_T_rigs, camera, side), width, height)
+        for side, gain in zip((1.0, -1.0), camera.gains, strict=True)
+    )
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    ahead = bearings_from_erp(np.stack([u, v], axis=-1), width, height)[..., 2]
+    share = np.clip(0.5 + np.arcsin(np.clip(ahead, -1, 1)) / (2 * band), 0, 1)
+    return back + share[..., None].astype(np.float32) * (front - back)
+
+
+def _eye(world_T_rigs: np.ndarray, camera: TwoLenses, side: float) -> "Eye":
+    """The lens in front (side 1) or behind (-1)."""
+    from gsba.demo.render import Eye
+
+    world_T_eyes = world_T_rigs[:, :3].copy()
+    world_T_eyes[:, :, 3] += side * camera.baseline / 2 * world_T_rigs[:, :3, 2]
+    return Eye(
+        world_T_eyes,
+        side,
+        SWEEP,
+        float(np.radians(camera.half_fov_deg)),
+        camera.bend,
+        -float(np.sin(np.radians(camera.band_deg))),
+    )
