@@ -381,8 +381,8 @@ class ExportSettings(_Settings):
     face_size: int | None = Field(
         default=None, ge=16, le=_MAX_FACE
     )  # pixels; None = a quarter of the panorama's width
-    images: Literal["cube", "lenses"] = "cube"  # six faces as seen from one centre, or ten of one
-    # lens each where two are known
+    images: Literal["auto", "cube", "lenses"] = "auto"  # six faces as seen from one centre, or ten
+    # of one lens each where two are known; auto: those of raw fisheyes
 
 
 class SplatSettings(_Settings):

@@ -37,15 +37,33 @@ class Counts:
 
 
 @dataclass(frozen=True, slots=True)
+class Fisheye:
+    """One lens of a raw pair (Kannala and Brandt, PAMI 2006), at an angle theta from its axis:
+
+    r = focal (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9) pixels from `principal`.
+    """
+
+    width: int  # pixels of its picture
+    height: int  # pixels
+    focal: float  # pixels per radian in the middle
+    principal: tuple[float, float]  # pixels, corner origin
+    radial: tuple[float, float, float, float]  # k1 to k4
+    rotation: tuple[float, float, float]  # rotation vector of rig_R_lens, radians
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # in the rig, metres; all 0 = not known
+
+
+@dataclass(frozen=True, slots=True)
 class FrameSet:
     """The captured frames on disk, in time order. No pixels are held."""
 
     names: tuple[str, ...]  # (F,) unique, without folder or extension
-    paths: tuple[tuple[Path, ...], ...]  # (F,)(1) for "erp", (F,)(len(faces)) for "cube"
+    paths: tuple[tuple[Path, ...], ...]  # (F,)(1) for "erp", (F,)(2) for "fisheye": front and
+    # back, (F,)(len(faces)) for "cube"
     timestamps: np.ndarray  # (F,) float64, seconds, strictly increasing
-    layout: str  # "erp" (2:1 equirectangular) or "cube" (one 90-degree image per face)
-    faces: tuple[str, ...]  # faces present, in FACES order; () for "erp"
-    width: int  # pixels of one image (ERP or face)
+    layout: str  # "erp" (2:1 equirectangular), "fisheye" (one image per lens, read as a panorama)
+    # or "cube" (one 90-degree image per face)
+    faces: tuple[str, ...]  # faces present, in FACES order; () for panoramas
+    width: int  # pixels of one image (panorama or face)
     height: int  # pixels
     mask_paths: tuple[Path | None, ...]  # (F,) ERP masks, white = use; None = use all
     correction: tuple[float, ...] = ()  # of what stitching bends: coefficients of a
@@ -53,14 +71,16 @@ class FrameSet:
     timed: bool = (
         True  # whether timestamps are times; else nothing gave them, and only order counts
     )
+    fisheyes: tuple[Fisheye, Fisheye] | None = None  # front and back, by which panoramas are cut
+    # out of "fisheye" frames
 
     def __len__(self) -> int:
         return len(self.names)
 
     @property
     def panoramic(self) -> bool:
-        """Whether a frame is one equirectangular image, not several faces."""
-        return self.layout == "erp"
+        """Whether a frame is read as one equirectangular image, not as several faces."""
+        return self.layout != "cube"
 
     @property
     def panorama_width(self) -> int:
@@ -390,6 +410,7 @@ class Reconstruction:
     # each ray starts; None = the rig's centre
     lens_baseline: tuple[float, float] | None = None  # between two lenses, map units, and its
     # standard deviation; None = there is one
+    fisheyes: tuple[Fisheye, Fisheye] | None = None  # of raw pairs, as found: see FrameSet
 
     def largest_map(self) -> np.ndarray:
         """Frames (F',) int64 of the largest map: those that are exported."""

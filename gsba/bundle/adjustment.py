@@ -176,6 +176,8 @@ def landmark_block(
         num = len(RIG_R_FACE)
         cameras = FaceCameras(RIG_R_FACE, np.full(num, rig.focal), np.full((num, 2), rig.principal))
         pixels = keypoints.pixels[rows]
+        if origins is not None:  # rays of lenses are elsewhere than where the faces show them
+            pixels = rig.project(bearings, faces)
         term = ReprojectionTerm(tracks.frames, tracks.points, pixels, faces, cameras, sigmas_px)
         terms.append(replace(term, origins_rig=origins))
     return LandmarkBlock(

@@ -15,7 +15,7 @@ from scipy.sparse import csr_matrix
 from factors.cholesky import DIM
 from factors.quadratic_block import QuadraticBlock
 from factors.reduced import ReducedSystem
-from gsba.bundle import lens_axes, prior_factors, readout
+from gsba.bundle import lens_axes, prior_factors, readout, self_calibration
 from gsba.bundle.adjustment import DRAWS, Problem, values_of
 from gsba.bundle.lens_centres import by_nearness
 from gsba.bundle.optimizer import marginal_covariances
@@ -24,11 +24,15 @@ from gsba.bundle.shared_parameters import by_origin, weighted, without_points
 from gsba.types import JointErrors, Keypoints, Solution
 
 A = gtsam.symbol_shorthand.A  # turn (2,) rad of a frame's lenses, about x and y of their frame
+B = gtsam.symbol_shorthand.B  # turn (3,) rad of the back lens of raw pairs in the rig
 C = gtsam.symbol_shorthand.C  # the front lens's centre (3,), lenses' frame, map units
 D = gtsam.symbol_shorthand.D  # duration (1,) of the readout, s
+F = gtsam.symbol_shorthand.F  # relative focal length and principal point (3,) of a lens
+K = gtsam.symbol_shorthand.K  # radial terms (4,) of a lens
 N = gtsam.symbol_shorthand.N  # nearness (1,) that panoramas are stitched for, 1 / map units
 W = gtsam.symbol_shorthand.W  # own motion (6,) of a frame, beside that of its velocity
 
+_OF_LENSES = (F(0), 3), (K(0), 4), (F(1), 3), (K(1), 4), (B(0), 3)  # as `self_calibration` has them
 _DAMPING = 1e-6
 _SPREADS = 4  # passes over how widely frames' own motion is spread
 
@@ -42,6 +46,8 @@ class CameraCovariances:
     centre: np.ndarray  # (3, 3) float64, of the front lens
     readout_sigma: float  # s; NaN = no readout was taken
     nearness_sigma: float  # 1 / map units; NaN = stitched at infinity, or as settings say
+    lens_sigmas: np.ndarray | None = None  # (FREE,) of what lenses of raw pairs are; None = they
+    # are as calibrated
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +96,9 @@ class CameraSystem:
             found = replace(found, readout_s=duration, own_sigmas=sigmas)
         if lenses.axes is not None:
             lenses = lens_axes.turned(lenses, of(A, num, 2))
+        if lenses.fisheyes is not None:
+            each = [steps[system.first_block[key], :dim] for key, dim in _OF_LENSES]
+            lenses = self_calibration.moved(lenses, np.concatenate(each))
         return replace(found, lenses=lenses)
 
     def covariances(self, components: np.ndarray | None = None) -> CameraCovariances:
@@ -101,14 +110,20 @@ class CameraSystem:
         camera, num = _linearized(self), len(self.solved.world_T_rigs)
         graph = camera.graph(self.problem.priors)
         graph.push_back(prior_factors.fixed_scale(self.solved.world_T_rigs, components))
-        beside = [key for key in (C(0), D(0), N(0)) if camera.values.exists(key)]
+        every = C(0), D(0), N(0), *(key for key, _ in _OF_LENSES)
+        beside = [key for key in every if camera.values.exists(key)]
         seed, poses = self.problem.settings.seed, camera.keys[:num]
         found, joint = marginal_covariances(
             graph, [camera.block()], camera.values, poses, DRAWS, seed, beside
         )
-        sigmas = {key: float(np.sqrt(found[num + i, 0, 0])) for i, key in enumerate(beside)}
-        shared = sigmas.get(D(0), np.nan), sigmas.get(N(0), np.nan)
-        return CameraCovariances(found[:num], joint, found[num, :3, :3], *shared)
+        sigmas = {key: np.sqrt(np.diagonal(found[num + i])) for i, key in enumerate(beside)}
+        nothing = np.array([np.nan])
+        readout_sigma, of_nearness = (float(sigmas.get(key, nothing)[0]) for key in (D(0), N(0)))
+        lenses = None
+        if self.seeing.lenses.fisheyes is not None:
+            lenses = np.concatenate([sigmas[key][:dim] for key, dim in _OF_LENSES])
+        centre = found[num, :3, :3]
+        return CameraCovariances(found[:num], joint, centre, readout_sigma, of_nearness, lenses)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +147,7 @@ class _Camera:
     curvature: float  # of the robust loss, see `SharedModel`
     own: tuple[_Own, ...]
     longer: tuple[float, float] | None  # s, what is said of the readout's change, and its sigma
+    off: np.ndarray | None  # (FREE,) what lenses of raw pairs are from what they were calibrated as
 
     def graph(self, priors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
         """What is believed of them beside the bearings."""
@@ -139,6 +155,11 @@ class _Camera:
         if self.longer is not None:
             model = gtsam.noiseModel.Diagonal.Sigmas(np.array([self.longer[1]]))
             graph.add(gtsam.PriorFactorVector(D(0), np.array([self.longer[0]]), model))
+        if self.off is not None:
+            spread = dict(_of_lenses(self_calibration.SPREAD))
+            for key, off in _of_lenses(self.off):
+                model = gtsam.noiseModel.Diagonal.Sigmas(spread[key])
+                graph.add(gtsam.PriorFactorVector(key, -off, model))
         for own in self.own:
             model = gtsam.noiseModel.Diagonal.Sigmas(own.sigmas)
             for f, off in enumerate(own.off):
@@ -202,12 +223,16 @@ def _linearized(given: CameraSystem) -> _Camera:
                 by_centre - by_near * lenses.nearness / np.sum(lenses.centre**2) * lenses.centre
             )
     shared.insert(0, (C(0), by_centre))
+    off = None
+    if lenses.fisheyes is not None:
+        off = self_calibration.from_calibrated(lenses)
+        shared += _of_lenses(self_calibration.by_lenses(bearings, directions, lenses))
     if lenses.twists is not None:
         velocities = readout.velocities(solved.world_T_rigs, given.timestamps)
         times = lenses.fractions(directions, frames)[:, None, None]
         shared.append((D(0), times * (seen.by_pose @ velocities[frames, :, None])))
-        off = lenses.twists - seeing.readout_s * velocities
-        own.append(_Own(W, off, readout.own_sigmas(seeing, velocities)))
+        beside = lenses.twists - seeing.readout_s * velocities
+        own.append(_Own(W, beside, readout.own_sigmas(seeing, velocities)))
         by_frame.append(times * seen.by_pose)
     if lenses.axes is not None:
         own.append(_Own(A, np.zeros((num, 2)), np.full(2, lens_axes.TURNS[-1])))
@@ -235,7 +260,14 @@ def _linearized(given: CameraSystem) -> _Camera:
     if said is not None and values.exists(D(0)):
         longer = said[0] - seeing.readout_s, said[1]
     curvature, own = seen.curvature, tuple(own)
-    return _Camera(values, keys, hessian, gradient, system.cost, curvature, own, longer)
+    return _Camera(values, keys, hessian, gradient, system.cost, curvature, own, longer, off)
+
+
+def _of_lenses(columns: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    """What is said (..., FREE) of raw lenses, by the variables that it is said of."""
+    ends = np.cumsum([dim for _, dim in _OF_LENSES])[:-1]
+    parts = np.split(columns, ends, axis=-1)
+    return [(key, part) for (key, _), part in zip(_OF_LENSES, parts, strict=True)]
 
 
 def _places(num_frames: int, own: list[int], shared: list[int]) -> np.ndarray:

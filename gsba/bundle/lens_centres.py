@@ -90,7 +90,7 @@ def estimate(
     shares = gains / np.array([part.cost for part in around])
     strength = float(np.sqrt(found @ np.linalg.solve(covariance, found)))
     reason = ""
-    if chosen.model == "auto":
+    if chosen.model == "auto" and so_far.cut_by is None:  # raw pairs are of two
         needed = PARTS if so_far else PARTS - 1  # a wrong camera bends some part, too
         if np.count_nonzero(gains > 0) < needed or shares.mean() < chosen.min_gain:
             reason = "it does not predict parts of the sequence that it was not found from"

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsba.bundle.adjustment import Problem
 from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of
-from gsba.camera.lens import Lenses
+from gsba.camera.lens import Lenses, rows_run
 from gsba.config import CameraSettings
 from gsba.types import Counts, Keypoints, Landmarks, Solution
 
@@ -63,7 +63,7 @@ def estimate(
         problem: loss, settings.
     """
     motion = velocities(solved.world_T_rigs, timestamps)
-    ways, frames = _ways(problem.settings.camera), keypoints.frames()
+    ways, frames = _ways(problem.settings.camera, lenses), keypoints.frames()
     times = np.stack([lenses.fractions(shown, frames, way) for way in ways], axis=1)
 
     def by_duration(rows: np.ndarray, by_origin: np.ndarray) -> np.ndarray:
@@ -123,8 +123,11 @@ def _durations(systems: list[SharedModel]) -> tuple[np.ndarray, np.ndarray, np.n
     return -total / curved / bend, (bend * curved) ** -0.5, gains / costs[:, None]
 
 
-def _ways(camera: CameraSettings) -> list[np.ndarray]:
+def _ways(camera: CameraSettings, lenses: Lenses) -> list[np.ndarray]:
     """Ways (2, 3) in which the two lenses can be read, up to both reversed."""
+    if lenses.cut_by is not None:
+        down, reversed_back = rows_run(lenses.cut_by), np.array([[1.0], [-1.0]])
+        return [down, reversed_back * down]
     if camera.sweep is not None:
         named = {"+x": _AXES[0], "-x": -_AXES[0], "+y": _AXES[1], "-y": -_AXES[1]}
         return [np.array([named[way] for way in camera.sweep])]

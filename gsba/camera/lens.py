@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from gsba.camera.fisheye import Pair, pixels_of, recalibrated, rotation_of
 from gsba.geometry import pose
 from gsba.types import Keypoints, Tracks
 
@@ -40,9 +41,11 @@ class Lenses:
     # its last one, [rotation rad, translation map units], rig frame; None = none
     axes: np.ndarray | None = None  # (F, 3, 3) float64, rig_R_lenses of each frame, where a
     # stabiliser turned the panorama above them; None = they are the rig's
+    cut_by: Pair | None = None  # what panoramas of raw pairs were cut by; None = they came as such
+    fisheyes: Pair | None = None  # what the lenses of raw pairs were found to be; None = cut_by
 
     def __bool__(self) -> bool:
-        return bool(self.centre.any())
+        return bool(self.centre.any()) or self.fisheyes is not None
 
     def own(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
         """Directions (N, 3) in the rig frames of frames (N,), in the lenses' frame."""
@@ -69,11 +72,17 @@ class Lenses:
     ) -> np.ndarray:
         """When frames (N,) read unit directions (N, 3), part of the readout, (N,), 0 = its middle.
 
-        A lens is taken to be equidistant: what it is not, twists take up.
+        Of raw pairs rows are known. Else a lens is taken to be equidistant: what it is not, twists
+        take up.
         """
         sweeps = self.sweeps if sweeps is None else sweeps
         if sweeps is None:
             return np.zeros(len(directions))
+        if self.cut_by is not None:
+            lens, pixels = pixels_of(self.cut_by, directions)
+            heights = np.array([one.height for one in self.cut_by])[lens]
+            down = rows_run(self.cut_by)
+            return np.sign(np.sum(down * sweeps, axis=1))[lens] * (pixels[:, 1] / heights - 0.5)
         own = self.own(directions, frames)
         across = own[:, :2]
         radii = np.linalg.norm(across, axis=1)
@@ -85,7 +94,7 @@ class Lenses:
     def rays(self, directions: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Directions and starts (N, 3) of what frames (N,) show in directions (N, 3), rig frame
         in the middle of the readout."""
-        origins, seen = self.origins(directions, frames), directions
+        origins, seen = self.origins(directions, frames), self.calibrated(directions)
         if self.nearness:
             seen = directions - self.nearness * origins
             seen /= np.linalg.norm(seen, axis=1, keepdims=True)
@@ -123,6 +132,12 @@ class Lenses:
             vectors = self._shown(local, frames)
         return vectors
 
+    def calibrated(self, directions: np.ndarray) -> np.ndarray:
+        """Where pixels of directions (N, 3) in the panoramas are by the lenses."""
+        if self.cut_by is None or self.fisheyes is None:
+            return directions
+        return recalibrated(directions, self.cut_by, self.fisheyes)
+
     def _moved(self, directions: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How frames (N,) turn (N, 3, 3) and move (N, 3) from their middle to the rows of unit
         directions (N, 3)."""
@@ -134,6 +149,10 @@ class Lenses:
         """Points (N, 3) along where a stitcher puts the directions that their lens sees them in."""
         origins = self.origins(points, frames)
         vectors = points - origins
+        if self.cut_by is not None and self.fisheyes is not None:
+            lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+            units = vectors / np.maximum(lengths, 1e-300)
+            return lengths * recalibrated(units, self.fisheyes, self.cut_by)
         if not self.nearness:
             return vectors
         lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -169,6 +188,10 @@ class Lenses:
             self, centre=scale * self.centre, nearness=self.nearness / scale, twists=twists
         )
 
+    def cut_anew(self) -> "Lenses":
+        """The same of panoramas that are cut by what the lenses of raw pairs were found to be."""
+        return replace(self, cut_by=self.fisheyes or self.cut_by, fisheyes=None)
+
     def taken(self, rows: np.ndarray) -> "Lenses":
         """The same of some frames (F',)."""
         axes = None if self.axes is None else self.axes[rows]
@@ -186,6 +209,11 @@ ONE_CENTRE = Lenses()
 def facing(directions: np.ndarray) -> np.ndarray:
     """1 for directions (N, 3) in the lenses' frame that the front lens faces, -1 for the others."""
     return np.where(directions[:, 2] >= 0, 1.0, -1.0)
+
+
+def rows_run(pair: Pair) -> np.ndarray:
+    """The way (2, 3) in which rows of the two lenses follow one another, rig frame."""
+    return np.array([rotation_of(lens)[:, 1] for lens in pair])
 
 
 def _rotations(vectors: np.ndarray) -> np.ndarray:

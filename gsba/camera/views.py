@@ -7,11 +7,13 @@ with all rows read in the middle of the exposure, as far as that is a turn; thei
 lenses', which a stabiliser may have turned below the panorama.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from gsba.camera.fisheye import project
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import RIG_R_FACE
 from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings
@@ -20,6 +22,7 @@ from gsba.geometry import pose
 from gsba.types import FACES, FrameSet, Reconstruction
 
 _FAR = 1e9  # map units: from there both lenses see alike
+_DENSE = 1.5  # times as many pixels as a view: beyond it, detail aliases
 _NODES = 33  # across a face: what lenses bend turns over tens of degrees
 
 
@@ -138,6 +141,7 @@ class ViewCutter:
         """Where each view's pixels are pictured, frame `frame` of the lenses."""
         self._views, self._offsets = views, [_offsets(view, lenses, frame) for view in views]
         self._turn = np.eye(3) if lenses.axes is None else lenses.axes[frame]
+        self._cut_by, self._front = lenses.cut_by, lenses.centre[2]
 
     def cut(self, erp: np.ndarray) -> list[np.ndarray]:
         """Images (height, width[, C]) uint8, bicubic, of a panorama (H, 2 H[, C]) uint8."""
@@ -145,6 +149,29 @@ class ViewCutter:
         if width < erp.shape[1]:
             erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
         return self._sampled(erp, cv2.INTER_CUBIC)
+
+    def cut_raw(self, pictures: list[np.ndarray]) -> list[np.ndarray]:
+        """As `cut`, straight from the pictures (h, w[, C]) uint8 of both lenses of a raw pair."""
+        assert self._cut_by is not None
+        parts = []
+        for view, shown in zip(self._views, self._shown(), strict=True):
+            number = int(view.centre[2] * self._front < 0)
+            lens, picture = self._cut_by[number], pictures[number]
+            places = project(lens, shown)
+            share = min(_DENSE * view.focal / lens.focal, 1.0)
+            if share * _DENSE < 1:
+                picture = cv2.resize(
+                    picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA
+                )
+                places = places * (np.array(picture.shape[1::-1]) / (lens.width, lens.height))
+            maps = (places - 0.5).astype(np.float32)
+            parts.append(
+                cv2.remap(
+                    picture, maps[..., 0], maps[..., 1], cv2.INTER_CUBIC,
+                    borderMode=cv2.BORDER_REPLICATE,
+                )
+            )  # fmt: skip
+        return parts
 
     def cut_mask(self, mask: np.ndarray) -> list[np.ndarray]:
         """Masks (height, width) bool of one (H, 2 H) bool."""
@@ -154,6 +181,13 @@ class ViewCutter:
     def _sampled(self, image: np.ndarray, how: int) -> list[np.ndarray]:
         height, width = image.shape[:2]
         padded, parts = around_sphere(image, PAD), []
+        for shown in self._shown():
+            maps = (erp_from_bearings(shown, width, height) - 0.5 + PAD).astype(np.float32)
+            parts.append(cv2.remap(padded, maps[..., 0], maps[..., 1], how))
+        return parts
+
+    def _shown(self) -> Iterator[np.ndarray]:
+        """Where panoramas show the pixels of each view, directions (height, width, 3)."""
         for view, offsets in zip(self._views, self._offsets, strict=True):
             centres = np.arange(view.width) + 0.5, np.arange(view.height) + 0.5
             pixels = np.stack(np.meshgrid(*centres), axis=-1)
@@ -163,10 +197,7 @@ class ViewCutter:
                 offsets, places[..., 0], places[..., 1], cv2.INTER_CUBIC,
                 borderMode=cv2.BORDER_REPLICATE,
             )  # fmt: skip
-            shown = view.rays(pixels) @ self._turn.T + moved
-            maps = (erp_from_bearings(shown, width, height) - 0.5 + PAD).astype(np.float32)
-            parts.append(cv2.remap(padded, maps[..., 0], maps[..., 1], how))
-        return parts
+            yield view.rays(pixels) @ self._turn.T + moved
 
 
 def _offsets(view: View, lenses: Lenses, frame: int) -> np.ndarray:

@@ -48,6 +48,13 @@ Masks = Annotated[
         metavar="PATH",
     ),
 ]
+Camera = Annotated[
+    str | None,
+    typer.Option(help="Its name, for what is said of it: insta360-x5, ...", metavar="NAME"),
+]
+Calibration = Annotated[
+    Path | None, typer.Option(help="Of the lenses of raw fisheyes.", metavar="FILE")
+]
 Segment = Annotated[
     str | None,
     typer.Option(help="Your own masks of faces: called with IMAGES MASKS.", metavar="COMMAND"),
@@ -57,7 +64,8 @@ Segment = Annotated[
 @command
 def refine(
     frames: Annotated[
-        Path, typer.Argument(help="Folder of 2:1 panoramas or of cube faces, or a 2:1 video.")
+        Path,
+        typer.Argument(help="Folder of 2:1 panoramas, raw fisheyes or cube faces, or a video."),
     ],
     out: Annotated[Path, typer.Option(help="Folder of the run.", metavar="RUN")],
     trajectory: Annotated[
@@ -78,10 +86,8 @@ def refine(
     timestamps: Annotated[
         Path | None, typer.Option(help="Times of the frames.", metavar="FILE")
     ] = None,
-    camera: Annotated[
-        str | None,
-        typer.Option(help="Its name, for what is said of it: insta360-x5, ...", metavar="NAME"),
-    ] = None,
+    camera: Camera = None,
+    calibration: Calibration = None,
     fps: Annotated[
         float | None,
         typer.Option(help="Frames per second, from time 0; of a video: frames kept per second."),
@@ -112,6 +118,7 @@ def refine(
         segment=segment,
         timestamps=timestamps,
         fps=fps,
+        calibration=calibration,
         fresh=fresh,
     )
     typer.echo(_summary(out))

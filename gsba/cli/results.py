@@ -22,7 +22,7 @@ from gsba.log import GsbaError
 if TYPE_CHECKING:
     from gsba.camera.lens import Lenses
     from gsba.evaluate.consistency import Consistency
-    from gsba.types import Reconstruction, Trajectory
+    from gsba.types import FrameSet, Reconstruction, Trajectory
 
 
 Length = Annotated[
@@ -39,8 +39,9 @@ Millimetres = Annotated[
 Images = Annotated[
     str,
     typer.Option(
-        help="cube: six faces of one centre; lenses: ten of one lens each, where two were found.",
-        metavar="cube|lenses",
+        help="cube: six faces of one centre; lenses: ten of one lens each, where two were found; "
+        "auto: those of raw fisheyes.",
+        metavar="auto|cube|lenses",
     ),
 ]
 
@@ -58,7 +59,7 @@ def export(
         Path | None, typer.Option(help="Folder to write; RUN/FORMAT by default.")
     ] = None,
     face_size: Annotated[int | None, typer.Option(help="Pixels of a cube face.")] = None,
-    images: Images = "cube",
+    images: Images = "auto",
     up: Annotated[str, typer.Option(help="auto: turn the world upright; none: leave it.")] = "none",
     scale: Length = None,
     baseline: Millimetres = None,
@@ -94,7 +95,7 @@ def export(
     from gsba.store.finished import load_run
 
     reconstruction, frames, *_ = load_run(run)
-    lenses = _lenses(run, reconstruction, images)
+    lenses = _lenses(run, reconstruction, frames, images)
     folder = out or run / to
     said = _baseline(run, baseline) if scale == "lens" else None
     placement = place(reconstruction, frames, settings, said)
@@ -104,16 +105,19 @@ def export(
     typer.echo(f"{to}: {folder}")
 
 
-def _lenses(run: Path, reconstruction: "Reconstruction", images: str) -> "Lenses":
+def _lenses(
+    run: Path, reconstruction: "Reconstruction", frames: "FrameSet", images: str
+) -> "Lenses":
     """What images are cut as seen from: one centre, or the lenses that the run found."""
     from gsba.camera.lens import ONE_CENTRE
+    from gsba.export import of_one_lens
 
-    if images != "lenses":
+    if not of_one_lens(images, frames):
         return ONE_CENTRE
     from gsba.store.finished import load_lenses
 
     lenses = load_lenses(run, reconstruction)
-    if not lenses:
+    if not lenses and images == "lenses":
         raise GsbaError(f"{run}: no two lenses were found: export it without --images lenses")
     return lenses
 

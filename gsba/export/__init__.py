@@ -5,6 +5,7 @@ Gives a folder that the consumer reads as it is.
 """
 
 from gsba.export.formats import ExportFormat, export
+from gsba.export.images import of_one_lens
 from gsba.export.ply import write_points
 
-__all__ = ["ExportFormat", "export", "write_points"]
+__all__ = ["ExportFormat", "export", "of_one_lens", "write_points"]

@@ -21,6 +21,7 @@ from gsba.camera.lens import Lenses
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import View, ViewCutter
 from gsba.disk import write_image
+from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.log import GsbaError, track
@@ -43,6 +44,11 @@ def face_size_for(frames: FrameSet, face_size: int | None) -> int:
     if face_size < MIN_FACE_SIZE:
         raise GsbaError(f"face size {face_size} is too small: use {MIN_FACE_SIZE} pixels or more")
     return face_size
+
+
+def of_one_lens(images: str, frames: FrameSet) -> bool:
+    """Whether faces are to be of one lens each, as `export.images` says it."""
+    return images == "lenses" or (images == "auto" and frames.fisheyes is not None)
 
 
 def suffix_of(frames: FrameSet, f: int) -> str:
@@ -118,12 +124,14 @@ def _write_lens_faces(
 ) -> None:
     def write(f: int) -> None:
         cutter = ViewCutter(views, lenses, f)
-        _write_all([image_path(f, view.name) for view in views], cutter.cut(load_erp(frames, f)))
+        raw = frames.fisheyes is not None
+        cut = cutter.cut_raw(load_raw(frames, f)) if raw else cutter.cut(load_erp(frames, f))
+        _write_all([image_path(f, view.name) for view in views], cut)
         if has_masks(frames):
             mask = load_mask(frames, f)
             whole = np.ones((frames.height, frames.width), bool) if mask is None else mask
-            cut = [part.astype(np.uint8) * 255 for part in cutter.cut_mask(whole)]
-            _write_all([mask_path(f, view.name) for view in views], cut)
+            masks = [part.astype(np.uint8) * 255 for part in cutter.cut_mask(whole)]
+            _write_all([mask_path(f, view.name) for view in views], masks)
 
     _of_all_frames(write, len(frames))
 
@@ -146,7 +154,7 @@ def write_panoramas(
 ) -> None:
     """Copy every panorama, and write its mask where the frames have masks.
 
-    Panoramas that are corrected are written anew.
+    Panoramas that are corrected, and those of raw pairs, are written anew.
 
     Args:
         frames: panoramas.
@@ -155,7 +163,7 @@ def write_panoramas(
         link: hard links instead of copies.
     """
     for f in track(range(len(frames)), "copying panoramas"):
-        if frames.correction:
+        if frames.correction or frames.fisheyes:
             write_image(image_path(f), load_erp(frames, f))
         else:
             _pass_on(frames.paths[f][0], image_path(f), link)

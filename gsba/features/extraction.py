@@ -1,6 +1,7 @@
 """Features of every frame of a run, stored frame by frame."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -51,5 +52,6 @@ def extract(
         frame: fingerprint([*frames.paths[f], frames.mask_paths[f]]) for frame, f in index.items()
     }
     relevant = chosen.model_dump(exclude={"weights", "accept_noncommercial", "download"})
-    key = [settings.cubemap, relevant, fingerprint(files)]
+    cut = [] if frames.fisheyes is None else [list(map(asdict, frames.fisheyes))]
+    key = [settings.cubemap, relevant, fingerprint(files), *cut]
     return store.per_frame(name, key, inputs, compute, Features, num_threads=num_threads)

@@ -9,7 +9,7 @@ from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings
 from gsba.camera.straighten import PAD
 from gsba.config import CubemapSettings
-from gsba.frames.masks import load_mask
+from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.types import FACES, FrameSet
 
@@ -39,7 +39,7 @@ def native_rig(frames: FrameSet, most: int | None = None) -> CubeRig:
 
 def load(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.ndarray | None]:
     """Faces (6, size, size, 3) uint8 RGB of a frame and where they may be used, bool or None."""
-    mask = load_mask(frames, frame)
+    mask = load_usable(frames, frame)
     masks = None if mask is None else cut_mask(mask, rig)
     if frames.panoramic:
         width = dense_enough(frames.width, rig.focal)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba.camera.straighten import straightened
+from gsba.frames.dual_fisheye import clear_of_seam
 from gsba.frames.files import IMAGE_SUFFIXES, decode, image_size, is_image
 from gsba.log import GsbaError
 from gsba.types import FrameSet
@@ -61,6 +62,15 @@ def load_mask(frames: FrameSet, f: int) -> np.ndarray | None:
         return None
     usable = levels > _UNUSED
     return straightened(usable, frames.correction) if frames.correction else usable
+
+
+def load_usable(frames: FrameSet, f: int) -> np.ndarray | None:
+    """As `load_mask`, and of raw pairs without what lies on the seam between the lenses."""
+    mask = load_mask(frames, f)
+    if frames.fisheyes is None:
+        return mask
+    clear = clear_of_seam(frames.height)
+    return clear if mask is None else mask & clear
 
 
 def load_weights(frames: FrameSet, f: int) -> np.ndarray | None:

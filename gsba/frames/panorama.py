@@ -7,7 +7,7 @@ import numpy as np
 
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.camera.sphere import bearings_from_erp
-from gsba.frames.masks import load_mask
+from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.types import FACES, FrameSet
 
@@ -35,7 +35,7 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
     Returns:
         (width / 2, width) uint8 grey; (width / 2, width) bool or None, True = use.
     """
-    mask = load_mask(frames, frame)
+    mask = load_usable(frames, frame)
     if frames.panoramic:
         grey = load_erp(frames, frame, gray=True, width=width)
         return grey, None if mask is None else fit_mask(mask, width)

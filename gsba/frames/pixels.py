@@ -1,8 +1,9 @@
-"""Pixels of a frame: its panorama, or its cube faces."""
+"""Pixels of a frame: its panorama, of whatever it is made, or its cube faces."""
 
 import numpy as np
 
 from gsba.camera.straighten import straightened
+from gsba.frames.dual_fisheye import load_joined
 from gsba.frames.files import decode
 from gsba.types import FrameSet
 
@@ -22,6 +23,8 @@ def load_erp(frames: FrameSet, f: int, gray: bool = False, width: int | None = N
 
     if not frames.panoramic:
         raise ValueError("load_erp needs equirectangular frames")
+    if frames.fisheyes is not None:
+        return load_joined(frames, f, gray, min(width or frames.width, frames.width))
     erp = decode(frames.paths[f][0], (frames.width, frames.height), gray, at_least=width)
     if width is not None and width < erp.shape[1]:
         erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)

@@ -10,8 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.fisheye import Pair
+from gsba.frames.dual_fisheye import width_of
 from gsba.frames.files import image_size, is_image
 from gsba.frames.masks import find_masks
+from gsba.frames.raw_pairs import find_pairs, lenses_of
 from gsba.frames.times import frame_times
 from gsba.log import GsbaError, track
 from gsba.types import FACES, FrameSet
@@ -43,11 +46,14 @@ def scan(
     fps: float | None = None,
     masks: Path | None = None,
     order_suffices: bool = False,
+    calibration: Path | None = None,
 ) -> FrameSet:
     """Frames of a folder, in time order, checked by their headers; no pixel is decoded.
 
     The folder holds equirectangular images, or cube faces: subfolders `front`, `right`, ... with
-    equal names, or files `NAME_front.jpg`, ...; up and down may be absent from all frames.
+    equal names, or files `NAME_front.jpg`, ...; up and down may be absent from all frames. Or it
+    holds raw fisheyes: subfolders `front` and `back` alone (or `lens0` and `lens1`), or files
+    `..._00_...` and `..._10_...`.
 
     Args:
         folder: JPEG or PNG images; other files are ignored.
@@ -56,6 +62,7 @@ def scan(
         fps: frames per second of these files in name order.
         masks: one ERP mask for all frames, or a folder with one for each; white = use.
         order_suffices: where nothing gives times, name order stands in for them.
+        calibration: of the lenses of raw fisheyes, see `gsba.camera.calibration`.
 
     Raises:
         GsbaError: naming the first file or frame that cannot be used.
@@ -83,7 +90,10 @@ def scan(
         raise GsbaError(f"frames '{a}' and '{b}' have the same time {times[same[0]]!r}")
     paths = tuple(found[name] for name in names)
     width, height = _common_size(paths, layout)
-    erp_size = (width, height) if layout == "erp" else None
+    fisheyes = _lenses(Path(folder), layout, paths, calibration)
+    if fisheyes is not None:
+        width, height = width_of(fisheyes), width_of(fisheyes) // 2
+    erp_size = None if layout == "cube" else (width, height)
     return FrameSet(
         names=tuple(names),
         paths=_absolute(paths),
@@ -94,7 +104,22 @@ def scan(
         height=height,
         mask_paths=find_masks(masks, names, erp_size),
         timed=timed,
+        fisheyes=fisheyes,
     )
+
+
+def _lenses(
+    folder: Path, layout: str, paths: Sequence[tuple[Path, ...]], calibration: Path | None
+) -> Pair | None:
+    """What the lenses of raw fisheyes are; None = there are none."""
+    if layout == "fisheye":
+        return lenses_of(folder, paths, calibration)
+    if calibration is not None:
+        raise GsbaError(
+            f"{calibration}: a calibration is for raw fisheyes, but {folder} holds "
+            f"{'panoramas' if layout == 'erp' else 'cube faces'}"
+        )
+    return None
 
 
 def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
@@ -105,7 +130,7 @@ def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
     """
     layout, _, found = _find_frames(Path(folder))
     if layout != "erp":
-        raise GsbaError(f"{folder}: holds cube faces; panoramas are wanted here")
+        raise GsbaError(f"{folder}: holds no panoramas; these are wanted here")
     names = sorted(found, key=_natural)
     _check_names(Path(folder), names)
     paths = tuple(found[name] for name in names)
@@ -141,6 +166,9 @@ def _absolute(paths: Sequence[Sequence[Path]]) -> tuple[tuple[Path, ...], ...]:
 def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Path, ...]]]:
     """Layout, faces, and the images of each frame by name."""
     entries = _entries(folder)
+    pairs = find_pairs(folder)
+    if pairs is not None:
+        return "fisheye", (), dict(pairs)
     images = [path for path in entries if is_image(path) and path.is_file()]
     subfolders = {
         path.name.lower(): path

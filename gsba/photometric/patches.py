@@ -11,7 +11,7 @@ from factors.patch_windows import PatchTable, PatchViews, over_poles, patch_axes
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import around_seam, bearings_from_erp, erp_from_bearings
 from gsba.config import PhotometricSettings
-from gsba.frames.masks import load_mask
+from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp
 from gsba.types import Counts, FrameSet, Landmarks
 
@@ -34,7 +34,7 @@ def pyramid(
     """
     grey = cv2.cvtColor(load_erp(frames, frame), cv2.COLOR_RGB2GRAY).astype(np.float32)
     usable = (grey > _DARK) & (grey < _BRIGHT)
-    mask = load_mask(frames, frame)
+    mask = load_usable(frames, frame)
     if mask is not None:
         usable &= mask
     while grey.shape[1] > settings.max_width and _divides(grey):

@@ -14,6 +14,7 @@ from gsba.bundle import (
     map_strength,
     readout,
     rotation_only,
+    self_calibration,
     stitching,
     tracks,
     triangulation,
@@ -24,6 +25,7 @@ from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of
 from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.readout import Readout
 from gsba.bundle.reconstruction import assemble, world_scale
+from gsba.bundle.self_calibration import SelfCalibration
 from gsba.bundle.stitching import Stitching
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.log import GsbaError
@@ -52,6 +54,8 @@ from gsba.types import (
 T = TypeVar("T")
 
 _CAMERA_ROUNDS = 3  # of what aligned patches say of the camera, and the adjustment under it
+_CALIBRATIONS = 10  # the same of raw lenses, at most
+_CALIBRATED = np.deg2rad(0.001)  # change of what their pixels show that is no more worth another
 _WIDE = 30.0  # gate in standard deviations of observations that a wrong camera threw off
 
 
@@ -104,6 +108,19 @@ def guess_axes(
         return lens_axes.guess(wide.landmarks, seen.keypoints, wide, seen.lenses, problem)
 
     return _of_matches(run, seen, prior, name, matches, solved, found, LensAxes)
+
+
+def calibrate(
+    run: Run, seen: Seen, prior: Prior, name: str, matches: Sequence[Matches], solved: Solution
+) -> SelfCalibration:
+    """What the lenses of raw pairs are, from matches that no solution has chosen among."""
+
+    def found(wide: Solution) -> SelfCalibration:
+        shown, problem = seen.shown.bearings_rig, run.problem(prior)
+        given = wide.landmarks, seen.keypoints, shown, wide, seen.lenses, problem
+        return self_calibration.estimate(*given)
+
+    return _of_matches(run, seen, prior, name, matches, solved, found, SelfCalibration)
 
 
 def find_lenses(
@@ -288,12 +305,14 @@ def _adjust_under_lenses(
     name = f"aligned{number}"
     if not world.lenses:
         return _adjust_aligned(run, prior, world, sighted, name)
-    for n in range(_CAMERA_ROUNDS):
+    for n in range(_CALIBRATIONS):
         seen = _see_anew(run, prior, world, sighted, name, n)
         better = _adjust_aligned(run, prior, seen, sighted, f"{name}_{n}" if n else name)
         if better is None:
             return world if n else None
-        world = better
+        done, world = self_calibration.apart(world.lenses, better.lenses) < _CALIBRATED, better
+        if n + 1 >= _CAMERA_ROUNDS and done:
+            break
     return world
 
 
@@ -354,10 +373,20 @@ def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, n
         problem = run.problem(prior)
         return CameraSystem(solved, keypoints, shown, world.seeing(), times, problem).step()
 
+    def lenses() -> SelfCalibration:
+        solved, keypoints = placed_anew()
+        around, problem = solved.landmarks, run.problem(prior)
+        return self_calibration.estimate(around, keypoints, shown, solved, world.lenses, problem)
+
     key = _camera_key(run)
     if number == 0 and world.lenses.twists is None:
         world = world.read(run.stage(f"readout_{name}", key, rows, Readout))
-    if number == 1 and world.lenses.axes is None:  # the rest has settled
+    raw = run.frames.fisheyes is not None
+    if number == 1 and raw and world.lenses.fisheyes is None:  # the rest has settled
+        known = run.stage(f"calibrated_{name}", key, lenses, SelfCalibration)
+        world = replace(world, calibrated=known)
+        world = world.read(replace(world.seeing(), lenses=known.lenses))
+    if number == 1 and not raw and world.lenses.axes is None:
         found = run.stage(f"axes_{name}", key, axes, LensAxes)
         world = replace(world, axes=found).read(replace(world.seeing(), lenses=found.lenses))
     return world.read(run.stage(f"camera_{name}_{number}", key, settle, Readout, noted=False))
@@ -384,7 +413,7 @@ def _straighten(run: Run, prior: Prior, world: Map, sighted: Sighted, number: in
     """The map with what stitching bends taken out, where all frames share it."""
     name, settings = f"stitching{number}", run.settings
     looked_for = number == 1 or world.field
-    if settings.stitching.mode == "off" or not run.frames.panoramic or not looked_for:
+    if settings.stitching.mode == "off" or run.frames.layout != "erp" or not looked_for:
         return world
 
     def compute() -> Stitching:
@@ -468,6 +497,7 @@ def reconstruct(run: Run, seen: Seen, prior: Prior, world: Map) -> Reconstructio
 
     def compute() -> Reconstruction:
         solved, observed, problem = world.solution, world.keypoints(run.rig), run.problem(prior)
+        frames = world.straightened(run.frames)
         if world.covariances is None:
             claimed = adjustment.pose_covariances(solved, observed, problem, prior.parts)
         else:
@@ -480,10 +510,11 @@ def reconstruct(run: Run, seen: Seen, prior: Prior, world: Map) -> Reconstructio
             prior.coarse,
             run.settings.rounds.min_observations,
             prior.trust.false_frames,
-            world.straightened(run.frames).correction,
+            frames.correction,
             prior.parts,
             joint,
         )
+        result = replace(result, fisheyes=frames.fisheyes)
         if not world.lenses or world.centres is None:
             return result
         baseline = baseline_of(world.centres, world_scale(solved, result))
@@ -496,8 +527,8 @@ def keep_lenses(run: Run, world: Map, result: Reconstruction) -> Lenses:
     """The lenses of a map in the unit of the result that it became, for later exports."""
     if not world.lenses:
         return ONE_CENTRE
-    scale = world_scale(world.solution, result)
-    return run.stage("lenses", [], lambda: world.lenses.scaled(scale), Lenses, noted=False)
+    lenses = world.lenses.scaled(world_scale(world.solution, result)).cut_anew()
+    return run.stage("lenses", [], lambda: lenses, Lenses, noted=False)
 
 
 def _reconstruct_rotations(run: Run, seen: Seen, prior: Prior) -> Reconstruction:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba import video
+from gsba.camera.calibration import read_calibration
 from gsba.config import RefineSettings
 from gsba.frames.times import check_fps
 from gsba.log import GsbaError
@@ -57,6 +58,18 @@ def coarse_poses(
         logger.warning("the trajectory only turns: positions come from the images alone")
         return without_trajectory(frames)
     return coarse
+
+
+def with_baseline(settings: RefineSettings, calibration: Path | None) -> RefineSettings:
+    """Settings with the distance between the lenses that a calibration says, unless they say it."""
+    if calibration is None:
+        return settings
+    front, back = (np.array(lens.centre) for lens in read_calibration(calibration))
+    millimetres = 1e3 * float(np.linalg.norm(front - back))
+    if settings.camera.baseline() is not None or not millimetres:
+        return settings
+    camera = settings.camera.model_copy(update={"baseline_mm": millimetres})
+    return settings.model_copy(update={"camera": camera})
 
 
 def extract_frames(

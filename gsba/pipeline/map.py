@@ -10,6 +10,7 @@ from gsba.bundle.camera_system import CameraCovariances
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius
 from gsba.bundle.readout import Readout
+from gsba.bundle.self_calibration import SelfCalibration
 from gsba.bundle.stitching import Stitching
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import CubeRig
@@ -29,6 +30,7 @@ class Map:
     centres: LensCentres | None = None  # of the lenses that see them; None = not looked for
     axes: LensAxes | None = None  # where these look; None = not looked for
     radius: StitchRadius | None = None  # what panoramas are stitched for; None = not looked for
+    calibrated: SelfCalibration | None = None  # of raw pairs; None = not looked for
     readout: Readout | None = None  # how lenses are read; None = not looked for
     covariances: CameraCovariances | None = None  # with these unknown beside the poses
     moves: tuple[Move, ...] = ()  # of the poses against a splat
@@ -77,5 +79,7 @@ class Map:
         return self.lenses.seen(stitching.corrected(keypoints, self.field, rig))
 
     def straightened(self, frames: FrameSet) -> FrameSet:
-        """The frames, read without what stitching bends."""
-        return replace(frames, correction=tuple(self.field.coefficients.tolist()))
+        """The frames, read without what stitching bends, raw pairs by what their lenses are."""
+        fisheyes = self.lenses.fisheyes or frames.fisheyes
+        correction = tuple(self.field.coefficients.tolist())
+        return replace(frames, correction=correction, fisheyes=fisheyes)

@@ -5,14 +5,17 @@ from pathlib import Path
 from typing import Any
 
 from gsba.bundle.reconstruction import world_scale
+from gsba.camera.calibration import calibration_json
+from gsba.camera.fisheye import Pair
 from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.disk import write_json, write_text
-from gsba.export import ExportFormat, export, write_points
+from gsba.export import ExportFormat, export, of_one_lens, write_points
 from gsba.pipeline.map import Map
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
-from gsba.placement.placement import Placement, place
+from gsba.placement.placement import Placement, metres_per_unit, place
 from gsba.report import findings
 from gsba.report.camera_findings import of_camera
 from gsba.report.html import residual_sphere, write_html
@@ -28,6 +31,7 @@ _OWN_GAUGE = (
     "no trajectory: the first frame's axes, and the median step of the start as the unit; "
     "covariances hold the first pose and the distance to the frame furthest from it"
 )
+CALIBRATION = "calibration.json"
 _OUTPUTS = (
     "trajectory.tum",
     "coarse.tum",
@@ -67,6 +71,9 @@ def write(run: Run, prior: Prior, world: Map, result: Reconstruction, lenses: Le
     write_poses(out / "poses.csv", frames, coarse, result)
     write_points(out / "points.ply", main)
     write_text(out / "config.toml", to_toml(settings))
+    (out / CALIBRATION).unlink(missing_ok=True)
+    if shown.fisheyes is not None:
+        write_json(out / CALIBRATION, _calibration(shown.fisheyes, world, result, lenses, settings))
     placement = place(main, shown, settings.placement, settings.camera.baseline())
     for name in settings.export.formats:
         _export(run, ExportFormat(name), main, shown, placement, lenses.taken(rows))
@@ -74,9 +81,22 @@ def write(run: Run, prior: Prior, world: Map, result: Reconstruction, lenses: Le
     write_json(out / "report.json", report)
     page = report | {"frames": [report["frames"][f] for f in rows]}
     write_html(out / "report.html", shown, start, main, page)
-    for name in _OUTPUTS:
+    for name in (*_OUTPUTS, CALIBRATION):
         store.claim(out / name)
     return RunResult(out, frames, coarse, result, report)
+
+
+def _calibration(
+    pair: Pair, world: Map, result: Reconstruction, lenses: Lenses, settings: RefineSettings
+) -> dict[str, Any]:
+    """The content of calibration.json: raw lenses as found, for another run."""
+    baseline, metres = settings.camera.baseline(), None
+    if baseline is not None and result.lens_baseline is not None:
+        metres = metres_per_unit(result.lens_baseline, baseline)[0]
+    read = world.seeing()
+    more = {"readout_s": read.readout_s} if read.lenses.twists is not None else {}
+    centre = lenses.centre * (1.0 if metres is None else metres)
+    return calibration_json(pair, centre, "map" if metres is None else "m", more)
 
 
 def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[str, Any]:
@@ -135,7 +155,7 @@ def _export(
     if not folder.exists():
         run.store.forget(name)
     size, images = run.settings.export.face_size, run.settings.export.images
-    seen_by = lenses if images == "lenses" else ONE_CENTRE
+    seen_by = lenses if of_one_lens(images, shown) else ONE_CENTRE
 
     def compute() -> Counts:
         export(main, shown, folder, to, size, placement, lenses=seen_by)

@@ -1,15 +1,20 @@
 """A run from frames and a coarse trajectory to refined poses, a cloud and datasets."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from gsba import video
+from gsba.bundle import self_calibration
+from gsba.camera.fisheye import Pair
 from gsba.camera.lens import Lenses
 from gsba.config import RefineSettings
+from gsba.frames.dual_fisheye import SEAM
 from gsba.frames.scan import scan
 from gsba.loop_closure import connectivity
 from gsba.masks import merging
@@ -25,6 +30,12 @@ from gsba.placement.placement import check
 from gsba.store.store import RunStore
 from gsba.types import CoarsePoses, FrameSet, Matches, Solution, Trajectory, VerifiedPairs
 
+logger = logging.getLogger(__name__)
+
+_PASSES = 3  # over raw pairs, from the pictures
+_RECUT = np.deg2rad(0.03)  # change of what their pixels show that is worth another
+_CALIBRATIONS = 4  # of raw lenses, and the map matched anew under them, at most
+_CALIBRATED = np.deg2rad(0.01)  # change of what pixels show that is no more worth another
 _CAMERA_ROUNDS = 2  # of all that is to know of it, and the adjustment under it
 
 __all__ = ["RunResult", "refine", "solve"]
@@ -42,6 +53,7 @@ def refine(
     segment: Segment | None = None,
     timestamps: Path | None = None,
     fps: float | None = None,
+    calibration: Path | None = None,
     fresh: bool = False,
     extra_factors: ExtraFactors | None = None,
 ) -> RunResult:
@@ -51,7 +63,7 @@ def refine(
     depends on it.
 
     Args:
-        frames: folder of 2:1 panoramas or of cube faces, or a video, for `out`/frames.
+        frames: folder of 2:1 panoramas, raw fisheyes or cube faces, or a video, for `out`/frames.
         trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig. Several are pieces of one run
             on one clock, and the first one's world is kept. None = start from the images alone:
             the first step's length is the unit and the first frame the world.
@@ -63,6 +75,7 @@ def refine(
         segment: a command or a callable that masks faces; see `gsba.masks.segmentation.segmented`.
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
+        calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
         fresh: forget an earlier run in `out`.
         extra_factors: makes factors of your own on the keys gsba.X(frame); they join every
             bundle adjustment (and those are then never resumed).
@@ -71,15 +84,15 @@ def refine(
         GsbaError: an input or setting that cannot be used.
     """
     frames, out = Path(frames), Path(out)
-    settings, origin = settings or RefineSettings(), {"frames": frames}
+    settings = inputs.with_baseline(settings or RefineSettings(), calibration)
     check(settings.placement, baseline=settings.camera.baseline())
     chosen = merging.choose(masks, segment)
-    origin |= inputs.trajectory_files(trajectory, keyframes)
+    origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
     if video.is_video(frames):
         inputs.extract_frames(out, origin, settings, fps, fresh)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
-    frame_set = scan(frames, timestamps, fps, chosen.given, order_suffices=not given)
+    frame_set = scan(frames, timestamps, fps, chosen.given, not given, calibration)
     check(settings.placement, frame_set, settings.camera.baseline())
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh) as store:
@@ -87,10 +100,37 @@ def refine(
         if chosen.distractors:
             frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
         run = Run.begin(store, frame_set, coarse, settings, extra_factors, journal)
-        seen, prior = frontend.extract(run), Prior.of(coarse, extra_factors)
-        prior, world = solve(run, seen, prior, given)
+        run, seen, prior, world = _solve_raw(run, Prior.of(coarse, extra_factors), given)
         result = backend.reconstruct(run, seen, prior, world)
         return outputs.write(run, prior, world, result, backend.keep_lenses(run, world, result))
+
+
+def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run, Seen, Prior, Map]:
+    """The method; raw pairs anew, cut by what their lenses turned out to be, where that is far off.
+
+    Returns:
+        The run that it was in the end, its keypoints, and what `solve` gives.
+    """
+    known = [run.settings.model_dump(exclude={"export", "placement"}), run.custom]
+    counts, frames = dict(run.journal.counts), run.frames
+    for n in range(_PASSES):
+        name, after, better = f"recalibrated{n}", run.chain.latest, None
+        if frames.fisheyes is not None:
+            better = run.store.stored(name, known, Pair, after)
+        if better is None:
+            seen = frontend.extract(run)
+            believed, world = solve(run, seen, prior, given)
+            off = self_calibration.apart(world.lenses, replace(world.lenses, fisheyes=None))
+            if off < _RECUT or n == _PASSES - 1:
+                return run, seen, believed, world
+            better = world.straightened(frames).fisheyes
+            assert better is not None
+            run.store.stage(name, known, partial(self_calibration.now, world.lenses), Pair, after)
+            logger.info("lenses are %.3f deg from what they were: all anew", np.rad2deg(off))
+        frames, again = replace(frames, fisheyes=better), Journal(dict(counts))
+        settings, extra = run.settings, run.extra_factors
+        run = Run.begin(run.store, frames, prior.coarse, settings, extra, again)
+    raise AssertionError
 
 
 def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tuple[Prior, Map]:
@@ -173,6 +213,8 @@ def _find_camera(
     settings = run.settings
     if settings.camera.model == "central" or not run.frames.panoramic:
         return seen, Map.of(solved, seen.shown)
+    if run.frames.fisheyes is not None:
+        return _find_raw_camera(run, seen, prior, matches, solved)
     looking = seen.through(Lenses())
     guess = backend.guess_axes(run, looking, prior, "axes", matches, solved)
     band, better, gates = np.deg2rad(settings.camera.seam_deg), solved, settings.rounds.loops
@@ -188,14 +230,53 @@ def _find_camera(
     if not radius.reason:
         looking = seen.through(radius.lenses)
         better = backend.adjust(run, looking, prior, "lensed2", matches, better, gates)
-    read = backend.find_readout(run, looking, prior, "readout", matches, better)
-    for n in range(_CAMERA_ROUNDS):
-        looking = seen.through(read.lenses)
-        read = backend.settle_camera(run, looking, prior, f"camera{n}", matches, better, read)
-        looking = seen.through(read.lenses)
-        better = backend.adjust(run, looking, prior, f"settled{n}", matches, better, gates)
     world = replace(Map.of(better, seen.shown, found), axes=guess, radius=radius)
-    return looking, world.read(read)
+    return _settle_camera(run, looking, prior, matches, world, "settled")
+
+
+def _find_raw_camera(
+    run: Run, seen: Seen, prior: Prior, matches: Sequence[Matches], solved: Solution
+) -> tuple[Seen, Map]:
+    """As `_find_camera`, of raw pairs: where their lenses are, and what they are."""
+    looking = seen.through(Lenses(band_rad=float(SEAM), cut_by=run.frames.fisheyes))
+    better, gates = solved, run.settings.rounds.loops
+    for n in range(2):
+        found = backend.find_lenses(run, looking, prior, f"lenses{n}", matches, better)
+        looking = seen.through(found.lenses)
+        better = backend.adjust(run, looking, prior, f"lensed{n}", matches, better, gates)
+        gates = run.settings.rounds.dense
+    world = Map.of(better, seen.shown, found)
+    looking, world = _settle_camera(run, looking, prior, matches, world, "settled")
+    known = backend.calibrate(run, looking, prior, "calibrated", matches, world.solution)
+    world = replace(world, calibrated=known)
+    for n in range(0 if known.reason else _CALIBRATIONS):
+        world = world.read(replace(world.seeing(), lenses=known.lenses)) if n == 0 else world
+        looking, better = seen.through(world.lenses), world.solution
+        better = backend.adjust(run, looking, prior, f"recalibrated{n}", matches, better, gates)
+        along = frontend.match_along_epipolars(run, looking, better, f"adjacent_raw{n}")
+        wide = frontend.match_known_points(run, looking, better, f"wide_raw{n}")
+        world, matches = replace(world, solution=better), [along, wide]
+        before = world.lenses
+        looking, world = _settle_camera(run, looking, prior, matches, world, f"calibrated{n}")
+        if self_calibration.apart(before, world.lenses) < _CALIBRATED:
+            break
+    return looking, world
+
+
+def _settle_camera(
+    run: Run, looking: Seen, prior: Prior, matches: Sequence[Matches], world: Map, name: str
+) -> tuple[Seen, Map]:
+    """All that is known of the camera found together, how rows are read first."""
+    gates, solved, read = run.settings.rounds.dense, world.solution, world.seeing()
+    if read.lenses.twists is None:
+        read = backend.find_readout(run, looking, prior, f"{name}_readout", matches, solved)
+    for n in range(_CAMERA_ROUNDS):
+        looking = looking.through(read.lenses)
+        key = f"{name}_camera{n}"
+        read = backend.settle_camera(run, looking, prior, key, matches, solved, read)
+        looking = looking.through(read.lenses)
+        solved = backend.adjust(run, looking, prior, f"{name}{n}", matches, solved, gates)
+    return looking, replace(world, solution=solved).read(read)
 
 
 def _look_closer(

@@ -3,7 +3,7 @@
 import os
 import uuid
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
@@ -84,6 +84,7 @@ class Run:
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
         start = coarse.world_T_rigs.tolist(), settings.read
         inputs = [fingerprint(paths), frames.timestamps.tolist(), frames.timed, *start]
+        inputs += map(asdict, frames.fisheyes or ())
         chain.stage("frames", inputs, lambda: frames, FrameSet)
         return cls(
             store=store,

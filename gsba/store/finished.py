@@ -21,7 +21,8 @@ def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:
     frames = load_stage(out, "frames", FrameSet)
     if not _fit_together(reconstruction, frames):
         raise GsbaError(f"{out}: its results do not fit together: refine again with --fresh")
-    frames = replace(frames, correction=reconstruction.correction)
+    fisheyes = reconstruction.fisheyes or frames.fisheyes
+    frames = replace(frames, correction=reconstruction.correction, fisheyes=fisheyes)
     main, shown = (
         reconstruction.taken(reconstruction.largest_map()),
         frames.taken(reconstruction.largest_map()),

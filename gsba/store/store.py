@@ -154,6 +154,14 @@ class RunStore:
         self._note(replace(record, key=digest(base, keys), resumed=not missing))
         return frames
 
+    def stored(
+        self, name: str, settings: object, returns: type[T], after: Sequence[str] = ()
+    ) -> T | None:
+        """What `stage` would find stored; None where it would compute."""
+        key = self._key(name, settings, after)
+        found = _load_if_current(_stage_path(self.root, self._prefix + name), key, returns)
+        return None if found is None else found[0]
+
     def forget(self, name: str) -> None:
         """Drop the stored result of a stage, so that it is computed again."""
         _stage_path(self.root, name).unlink(missing_ok=True)

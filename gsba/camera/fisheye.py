@@ -1,0 +1,132 @@
+"""Two raw fisheyes as parts of one panorama: where directions of the rig are in their pictures.
+
+Each direction is seen by the lens that faces it, as `gsba.camera.lens` has it: the front one ahead
+of the rig, the back one behind. What a lens is thought to be may change after panoramas were cut:
+then a direction that these show is one pixel of a fisheye, and that has another direction.
+"""
+
+import numpy as np
+
+from gsba.types import Fisheye
+
+Pair = tuple[Fisheye, Fisheye]  # front, back
+
+PARAMETERS = 10  # of a lens: relative focal length, principal point (2) in parts of the focal
+# length, radial terms (4), turn (3) in the rig
+_NEWTON = 8  # steps to an angle: the last ones change nothing
+
+
+def rotation_of(lens: Fisheye) -> np.ndarray:
+    """rig_R_lens (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(lens.rotation).as_matrix()
+
+
+def project(lens: Fisheye, directions: np.ndarray) -> np.ndarray:
+    """Pixels (..., 2), corner origin, of vectors (..., 3) in the rig frame."""
+    local = directions @ rotation_of(lens)
+    across = np.hypot(local[..., 0], local[..., 1])
+    radii = lens.focal * _bent(lens, np.arctan2(across, local[..., 2]))[0]
+    away = local[..., :2] / np.maximum(across, 1e-300)[..., None]
+    return np.asarray(lens.principal) + radii[..., None] * away
+
+
+def unproject(lens: Fisheye, pixels: np.ndarray) -> np.ndarray:
+    """Unit directions (..., 3) in the rig frame of pixels (..., 2), corner origin."""
+    away = (pixels - np.asarray(lens.principal)) / lens.focal
+    radii = np.hypot(away[..., 0], away[..., 1])
+    angles = radii.copy()
+    for _ in range(_NEWTON):
+        bent, slope = _bent(lens, angles)
+        angles = np.clip(angles - (bent - radii) / np.maximum(slope, 0.1), 0, np.pi)
+    across = (np.sin(angles) / np.maximum(radii, 1e-300))[..., None] * away
+    return np.concatenate([across, np.cos(angles)[..., None]], axis=-1) @ rotation_of(lens).T
+
+
+def by_parameters(lens: Fisheye, directions: np.ndarray) -> np.ndarray:
+    """How the directions of fixed pixels change with the lens, (N, 3, PARAMETERS).
+
+    Args:
+        lens: as it is.
+        directions: (N, 3) unit, rig frame, of the pixels.
+    """
+    turn = rotation_of(lens)
+    local = directions @ turn
+    across = np.hypot(local[:, 0], local[:, 1])
+    angles = np.arctan2(across, local[:, 2])
+    bent, slope = _bent(lens, angles)
+    away = local[:, :2] / np.maximum(across, 1e-300)[:, None]
+    beside = np.stack([-away[:, 1], away[:, 0]], axis=1)
+    powers = angles[:, None] ** np.array([3, 5, 7, 9])
+    by_angle = np.concatenate([-bent[:, None], -away, -powers], axis=1) / slope[:, None]
+    around = np.zeros_like(by_angle)  # sine of the angle times the turn about the axis
+    shrunk = np.divide(across, bent, out=np.ones_like(bent), where=bent > 1e-9)
+    around[:, 1:3] = -beside * shrunk[:, None]
+    outwards = np.concatenate([np.cos(angles)[:, None] * away, -across[:, None]], axis=1)
+    sideways = np.concatenate([beside, np.zeros((len(beside), 1))], axis=1)
+    moved = outwards[:, :, None] * by_angle[:, None] + sideways[:, :, None] * around[:, None]
+    return np.concatenate([np.einsum("ij,njk->nik", turn, moved), -_cross(directions)], axis=2)
+
+
+def changed(lens: Fisheye, step: np.ndarray) -> Fisheye:
+    """A lens after a step (PARAMETERS,) of what `by_parameters` differentiates by."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_rotvec(step[7:]) * Rotation.from_rotvec(lens.rotation)
+    x, y = np.asarray(lens.principal) + lens.focal * step[1:3]
+    k1, k2, k3, k4 = np.asarray(lens.radial) + step[3:7]
+    a, b, c = turn.as_rotvec()
+    return Fisheye(
+        lens.width,
+        lens.height,
+        float(lens.focal * np.exp(step[0])),
+        (float(x), float(y)),
+        (float(k1), float(k2), float(k3), float(k4)),
+        (float(a), float(b), float(c)),
+        lens.centre,
+    )
+
+
+def difference(lens: Fisheye, before: Fisheye) -> np.ndarray:
+    """Step (PARAMETERS,) by which `changed` makes a lens of another one."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_rotvec(lens.rotation) * Rotation.from_rotvec(before.rotation).inv()
+    away = (np.asarray(lens.principal) - before.principal) / before.focal
+    radial = np.asarray(lens.radial) - before.radial
+    return np.array([np.log(lens.focal / before.focal), *away, *radial, *turn.as_rotvec()])
+
+
+def pixels_of(pair: Pair, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lens (...,), 0 or 1, that faces directions (..., 3), and their pixels (..., 2) in it."""
+    lens = (directions[..., 2] < 0).astype(int)
+    both = np.stack([project(one, directions) for one in pair])
+    return lens, np.where(lens[..., None] == 0, both[0], both[1])
+
+
+def recalibrated(directions: np.ndarray, before: Pair, after: Pair) -> np.ndarray:
+    """Where pixels are by other lenses than those that their directions (N, 3) are by."""
+    out = np.empty_like(directions)
+    behind = directions[:, 2] < 0
+    for part, old, new in zip((~behind, behind), before, after, strict=True):
+        out[part] = unproject(new, project(old, directions[part]))
+    return out
+
+
+def _bent(lens: Fisheye, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance from the principal point in focal lengths, and its derivative, at angles."""
+    squares = angles * angles
+    bent, slope = np.zeros_like(angles), np.zeros_like(angles)
+    for power, k in zip((9, 7, 5, 3, 1), (*lens.radial[::-1], 1.0), strict=True):
+        bent, slope = bent * squares + k, slope * squares + power * k
+    return bent * angles, slope
+
+
+def _cross(vectors: np.ndarray) -> np.ndarray:
+    """Matrices (N, 3, 3) whose product with another vector is the cross product."""
+    out = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
+    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = z, -y, x
+    return out

@@ -1,0 +1,87 @@
+"""Panoramas of raw pairs: each direction from the lens that faces it, nothing blended."""
+
+import functools
+
+import cv2
+import numpy as np
+
+from gsba.camera.fisheye import Pair, project
+from gsba.camera.sphere import bearings_from_erp
+from gsba.frames.files import decode
+from gsba.types import FrameSet
+
+_BAND = 256  # rows of which coordinates are held in double precision
+SEAM = np.deg2rad(1.5)  # from it, within which what lies in a window is of both lenses
+
+
+def width_of(pair: Pair) -> int:
+    """Pixels across a panorama as dense as the middle of a fisheye."""
+    return 16 * round(2 * np.pi * max(lens.focal for lens in pair) / 16)
+
+
+def load_raw(frames: FrameSet, f: int, gray: bool = False) -> list[np.ndarray]:
+    """Pictures (h, w[, 3]) uint8 of both lenses of frame f, as they are on disk."""
+    assert frames.fisheyes is not None
+    return [
+        decode(path, (lens.width, lens.height), gray)
+        for path, lens in zip(frames.paths[f], frames.fisheyes, strict=True)
+    ]
+
+
+def load_joined(frames: FrameSet, f: int, gray: bool, width: int) -> np.ndarray:
+    """Panorama (width / 2, width[, 3]) uint8 of frame f, by what its lenses are taken for."""
+    assert frames.fisheyes is not None
+    share, maps = width / frames.width, _maps(frames.fisheyes, width)
+    halves = []
+    for picture, places in zip(load_raw(frames, f, gray), maps, strict=True):
+        if share < 1:
+            size = picture.shape[1::-1]
+            picture = _shrunk(picture, share)
+            scale = np.array(picture.shape[1::-1]) / size
+            places = ((places + 0.5) * scale - 0.5).astype(np.float32)
+        halves.append(_sampled(picture, places))
+    front, back = halves
+    right, left = np.split(back, [width - _first(width) - width // 2], axis=1)
+    return np.concatenate([left, front, right], axis=1)
+
+
+@functools.lru_cache(maxsize=2)
+def clear_of_seam(height: int) -> np.ndarray:
+    """Where windows of a panorama of raw pairs are of one lens alone, (height, 2 height) bool."""
+    pixels = np.stack(np.meshgrid(np.arange(2 * height) + 0.5, np.arange(height) + 0.5), axis=-1)
+    ahead = bearings_from_erp(pixels, 2 * height, height)[..., 2]
+    clear = np.abs(ahead) > np.sin(SEAM)
+    clear.setflags(write=False)
+    return clear
+
+
+def _sampled(picture: np.ndarray, places: np.ndarray) -> np.ndarray:
+    nothing, how = np.zeros(0, np.float32), cv2.INTER_LANCZOS4
+    return cv2.remap(picture, places, nothing, how, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _first(width: int) -> int:
+    """The first column that the front lens faces."""
+    return (width + 1) // 4
+
+
+def _shrunk(picture: np.ndarray, share: float) -> np.ndarray:
+    height, width = (max(round(share * size), 1) for size in picture.shape[:2])
+    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+
+
+@functools.lru_cache(maxsize=2)
+def _maps(pair: Pair, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places in either picture of half a panorama (H, W / 2, 2) float32, OpenCV pixels; columns of
+    the back one from the right edge of the front one on."""
+    height, maps = width // 2, []
+    for lens, first in zip(pair, (_first(width), _first(width) + width // 2), strict=True):
+        columns = (first + np.arange(width // 2) + 0.5) % width
+        places = np.empty((height, width // 2, 2), np.float32)
+        for top in range(0, height, _BAND):
+            rows = np.arange(top, min(top + _BAND, height)) + 0.5
+            pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
+            found = project(lens, bearings_from_erp(pixels, width, height))
+            places[top : top + len(rows)] = found - 0.5
+        maps.append(places)
+    return maps[0], maps[1]
