@@ -5,6 +5,8 @@ of the rig, the back one behind. What a lens is thought to be may change after p
 then a direction that these show is one pixel of a fisheye, and that has another direction.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from gsba.types import Fisheye
@@ -76,16 +78,23 @@ def changed(lens: Fisheye, step: np.ndarray) -> Fisheye:
     turn = Rotation.from_rotvec(step[7:]) * Rotation.from_rotvec(lens.rotation)
     x, y = np.asarray(lens.principal) + lens.focal * step[1:3]
     k1, k2, k3, k4 = np.asarray(lens.radial) + step[3:7]
-    a, b, c = turn.as_rotvec()
-    return Fisheye(
-        lens.width,
-        lens.height,
-        float(lens.focal * np.exp(step[0])),
-        (float(x), float(y)),
-        (float(k1), float(k2), float(k3), float(k4)),
-        (float(a), float(b), float(c)),
-        lens.centre,
+    bent = replace(
+        lens,
+        focal=float(lens.focal * np.exp(step[0])),
+        principal=(float(x), float(y)),
+        radial=(float(k1), float(k2), float(k3), float(k4)),
     )
+    return _with_rotation(bent, turn.as_rotvec())
+
+
+def turned(pair: Pair, old_R_new: np.ndarray) -> Pair:
+    """The same lenses in a rig of other axes, turned (3, 3) against those so far."""
+    from scipy.spatial.transform import Rotation
+
+    front, back = (
+        Rotation.from_matrix(old_R_new.T @ rotation_of(lens)).as_rotvec() for lens in pair
+    )
+    return _with_rotation(pair[0], front), _with_rotation(pair[1], back)
 
 
 def difference(lens: Fisheye, before: Fisheye) -> np.ndarray:
@@ -112,6 +121,11 @@ def recalibrated(directions: np.ndarray, before: Pair, after: Pair) -> np.ndarra
     for part, old, new in zip((~behind, behind), before, after, strict=True):
         out[part] = unproject(new, project(old, directions[part]))
     return out
+
+
+def _with_rotation(lens: Fisheye, rotation: np.ndarray) -> Fisheye:
+    a, b, c = (float(v) for v in rotation)
+    return replace(lens, rotation=(a, b, c))
 
 
 def _bent(lens: Fisheye, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

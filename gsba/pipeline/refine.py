@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from gsba import video
 from gsba.bundle import self_calibration
-from gsba.camera.fisheye import Pair
+from gsba.camera.fisheye import Pair, turned
 from gsba.camera.lens import Lenses
 from gsba.config import RefineSettings
 from gsba.frames.dual_fisheye import SEAM
@@ -28,7 +27,16 @@ from gsba.pipeline.prior import ExtraFactors, Prior
 from gsba.pipeline.run import Journal, Run
 from gsba.placement.placement import check
 from gsba.store.store import RunStore
-from gsba.types import CoarsePoses, FrameSet, Matches, Solution, Trajectory, VerifiedPairs
+from gsba.trajectory.axes import quarter_turn
+from gsba.types import (
+    CoarsePoses,
+    FrameSet,
+    Matches,
+    PoseSource,
+    Solution,
+    Trajectory,
+    VerifiedPairs,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -120,17 +128,29 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
         if better is None:
             seen = frontend.extract(run)
             believed, world = solve(run, seen, prior, given)
-            off = self_calibration.apart(world.lenses, replace(world.lenses, fisheyes=None))
-            if off < _RECUT or n == _PASSES - 1:
+            better = None if n == _PASSES - 1 else _cut_better(prior.coarse, world)
+            if better is None:
                 return run, seen, believed, world
-            better = world.straightened(frames).fisheyes
-            assert better is not None
-            run.store.stage(name, known, partial(self_calibration.now, world.lenses), Pair, after)
-            logger.info("lenses are %.3f deg from what they were: all anew", np.rad2deg(off))
+            run.store.stage(name, known, lambda found=better: found, Pair, after)
         frames, again = replace(frames, fisheyes=better), Journal(dict(counts))
         settings, extra = run.settings, run.extra_factors
-        run = Run.begin(run.store, frames, prior.coarse, settings, extra, again)
+        run = Run.begin(run.store, frames, prior.coarse, settings, extra, again, True)
     raise AssertionError
+
+
+def _cut_better(coarse: CoarsePoses, world: Map) -> Pair | None:
+    """What raw pairs are better cut by, in the trajectory's axes; None = they are cut well."""
+    lenses = world.lenses
+    if lenses.cut_by is None:
+        return None
+    found, turn = lenses.fisheyes or lenses.cut_by, np.eye(3)
+    if (coarse.sources == PoseSource.SLAM).any():
+        turn = quarter_turn(coarse, world.solution.world_T_rigs)
+    off = self_calibration.apart(lenses, replace(lenses, fisheyes=None))
+    if off < _RECUT and np.array_equal(turn, np.eye(3)):
+        return None
+    logger.info("lenses are %.2f deg from what panoramas were cut by: all anew", np.rad2deg(off))
+    return turned(found, turn)
 
 
 def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tuple[Prior, Map]:
@@ -247,6 +267,10 @@ def _find_raw_camera(
         gates = run.settings.rounds.dense
     world = Map.of(better, seen.shown, found)
     looking, world = _settle_camera(run, looking, prior, matches, world, "settled")
+    if run.lenses_found:  # patches say more of them than features do
+        read = world.seeing()
+        free = replace(read.lenses, fisheyes=read.lenses.cut_by)
+        return looking, world.read(replace(read, lenses=free))
     known = backend.calibrate(run, looking, prior, "calibrated", matches, world.solution)
     world = replace(world, calibrated=known)
     for n in range(0 if known.reason else _CALIBRATIONS):

@@ -61,6 +61,7 @@ class Run:
     extra_factors: ExtraFactors | None  # the caller's
     custom: str | None  # of results that rest on those: never resumed
     num_threads: int
+    lenses_found: bool = False  # whether what raw pairs are cut by was found, so that it is free
 
     @classmethod
     def begin(
@@ -71,6 +72,7 @@ class Run:
         settings: RefineSettings,
         extra_factors: ExtraFactors | None = None,
         journal: Journal | None = None,
+        lenses_found: bool = False,
     ) -> "Run":
         """Start a run, or take it up, on these frames and poses.
 
@@ -84,7 +86,8 @@ class Run:
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
         start = coarse.world_T_rigs.tolist(), settings.read
         inputs = [fingerprint(paths), frames.timestamps.tolist(), frames.timed, *start]
-        inputs += map(asdict, frames.fisheyes or ())
+        if frames.fisheyes is not None:
+            inputs += [*map(asdict, frames.fisheyes), lenses_found]
         chain.stage("frames", inputs, lambda: frames, FrameSet)
         return cls(
             store=store,
@@ -98,6 +101,7 @@ class Run:
             extra_factors=extra_factors,
             custom=None if extra_factors is None else uuid.uuid4().hex,
             num_threads=settings.solver.num_threads or os.cpu_count() or 1,
+            lenses_found=lenses_found,
         )
 
     def stage(
