@@ -381,8 +381,9 @@ class ExportSettings(_Settings):
     face_size: int | None = Field(
         default=None, ge=16, le=_MAX_FACE
     )  # pixels; None = a quarter of the panorama's width
-    images: Literal["auto", "cube", "lenses"] = "auto"  # six faces as seen from one centre, or ten
-    # of one lens each where two are known; auto: those of raw fisheyes
+    images: Literal["auto", "cube", "lenses", "fisheye"] = "auto"  # six faces as seen from one
+    # centre, ten of one lens each where two are known, raw fisheyes as they are; auto: cube, of raw
+    # fisheyes lenses
 
 
 class SplatSettings(_Settings):

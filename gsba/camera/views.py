@@ -7,7 +7,7 @@ with all rows read in the middle of the exposure, as far as that is a turn; thei
 lenses', which a stabiliser may have turned below the panorama.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -23,6 +23,8 @@ from gsba.types import FACES, FrameSet, Reconstruction
 
 _FAR = 1e9  # map units: from there both lenses see alike
 _DENSE = 1.5  # times as many pixels as a view: beyond it, detail aliases
+_NEIGHBOURS = 12  # points that tell how far things are in a direction
+_SMOOTH = np.deg2rad(3.0)  # over which they are averaged, at least
 _NODES = 33  # across a face: what lenses bend turns over tens of degrees
 
 
@@ -119,7 +121,10 @@ def _side_extents(band_rad: float) -> tuple[float, float]:
 
 
 def seen_from_lenses(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
-    """The same with rigs whose axes are the lenses'."""
+    """The same with rigs whose axes are the lenses', all seen from where these are in the middle of
+    the readout."""
+    if lenses.twists is not None:
+        reconstruction = _in_the_middle(reconstruction, lenses)
     if lenses.axes is None:
         return reconstruction
     turns = lenses.axes[reconstruction.observation_frames]
@@ -134,12 +139,74 @@ def seen_from_lenses(reconstruction: Reconstruction, lenses: Lenses) -> Reconstr
     )
 
 
+def _in_the_middle(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
+    """The same with rays from the lenses' centres to where observed rays are at their points."""
+    bearings, starts = reconstruction.observation_bearings, reconstruction.observation_origins
+    assert starts is not None
+    frames = reconstruction.observation_frames
+    points = starts + observed_depths(reconstruction)[:, None] * bearings
+    origins = lenses.origins(bearings, frames)
+    rays = points - origins
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return replace(reconstruction, observation_bearings=rays, observation_origins=origins)
+
+
+def shown_in_pictures(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
+    """The same with bearings along the directions in which pictures show them."""
+    if lenses.twists is None:
+        return reconstruction
+    starts, frames = reconstruction.observation_origins, reconstruction.observation_frames
+    assert starts is not None
+    points = starts + observed_depths(reconstruction)[:, None] * reconstruction.observation_bearings
+    shown = lenses.seeing(points, frames)
+    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+    origins = lenses.origins(shown, frames)
+    return replace(reconstruction, observation_bearings=shown, observation_origins=origins)
+
+
+def scenes_of(reconstruction: Reconstruction) -> Callable[[int], np.ndarray]:
+    """Points (N, 3) that a frame sees, in its rig frame, by its index."""
+    order = np.argsort(reconstruction.observation_frames, kind="stable")
+    num = len(reconstruction.world_T_rigs)
+    ends = np.searchsorted(reconstruction.observation_frames[order], np.arange(num + 1))
+
+    def scene(f: int) -> np.ndarray:
+        seen = reconstruction.observation_points[order[ends[f] : ends[f + 1]]]
+        pose = reconstruction.world_T_rigs[f]
+        return (reconstruction.points_world[seen] - pose[:3, 3]) @ pose[:3, :3]
+
+    return scene
+
+
+def observed_depths(reconstruction: Reconstruction) -> np.ndarray:
+    """How far (O,) points are from where the rays start that observe them."""
+    frames = reconstruction.observation_frames
+    ends = reconstruction.points_world[reconstruction.observation_points]
+    starts = reconstruction.world_T_rigs[frames, :3, 3]
+    if reconstruction.observation_origins is not None:
+        turns = reconstruction.world_T_rigs[frames, :3, :3]
+        starts = starts + np.einsum("oij,oj->oi", turns, reconstruction.observation_origins)
+    return np.linalg.norm(ends - starts, axis=1)
+
+
 class ViewCutter:
     """Cuts the views of one frame out of panoramas of it."""
 
-    def __init__(self, views: tuple[View, ...], lenses: Lenses, frame: int) -> None:
-        """Where each view's pixels are pictured, frame `frame` of the lenses."""
-        self._views, self._offsets = views, [_offsets(view, lenses, frame) for view in views]
+    def __init__(
+        self,
+        views: tuple[View, ...],
+        lenses: Lenses,
+        frame: int,
+        scene: np.ndarray | None = None,
+    ) -> None:
+        """Where each view's pixels are pictured, frame `frame` of the lenses.
+
+        Args:
+            scene: (N, 3) points in the rig frame of this frame, which tell how far things are; None
+                = they are far. What frames move during the readout is taken out by that.
+        """
+        self._views = views
+        self._offsets = [_offsets(view, lenses, frame, scene) for view in views]
         self._turn = np.eye(3) if lenses.axes is None else lenses.axes[frame]
         self._cut_by, self._front = lenses.cut_by, lenses.centre[2]
 
@@ -200,14 +267,34 @@ class ViewCutter:
             yield view.rays(pixels) @ self._turn.T + moved
 
 
-def _offsets(view: View, lenses: Lenses, frame: int) -> np.ndarray:
+def _offsets(view: View, lenses: Lenses, frame: int, scene: np.ndarray | None) -> np.ndarray:
     """From rays to where panoramas show them, (N, N, 3) float32, corner to corner of a view."""
     places = np.linspace(0, [view.width, view.height], _NODES)
     rays = view.rays(np.stack(np.meshgrid(*places.T), axis=-1)).reshape(-1, 3)
     turned = rays if lenses.axes is None else rays @ lenses.axes[frame].T
-    shown = lenses.seeing(_FAR * turned, np.full(len(rays), frame))
+    frames = np.full(len(rays), frame)
+    ends = _FAR * turned
+    if scene is not None and len(scene):
+        ends = lenses.origins(turned, frames) + _depths(turned, scene)[:, None] * turned
+    shown = lenses.seeing(ends, frames)
     shown /= np.linalg.norm(shown, axis=1, keepdims=True)
     return (shown - turned).reshape(_NODES, _NODES, 3).astype(np.float32)
+
+
+def _depths(directions: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """How far (N,) things are in unit directions (N, 3), by points (M, 3) around: smooth."""
+    from scipy.spatial import KDTree
+
+    lengths = np.linalg.norm(points, axis=1)
+    near = min(_NEIGHBOURS, len(points))
+    apart, rows = KDTree(points / lengths[:, None]).query(directions, k=near)
+    apart, rows = apart.reshape(-1, near), rows.reshape(-1, near)
+    spread = np.maximum(apart[:, near // 2, None], _SMOOTH)
+    weights, order = np.exp(-((apart / spread) ** 2)), np.argsort(lengths[rows], axis=1)
+    heights = np.cumsum(np.take_along_axis(weights, order, axis=1), axis=1)
+    half = np.argmax(heights >= heights[:, -1:] / 2, axis=1)
+    middle = np.take_along_axis(order, half[:, None], axis=1)
+    return np.take_along_axis(lengths[rows], middle, axis=1)[:, 0]
 
 
 def views_for(frames: FrameSet, size: int, lenses: Lenses) -> tuple[View, ...]:

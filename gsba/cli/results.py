@@ -40,8 +40,8 @@ Images = Annotated[
     str,
     typer.Option(
         help="cube: six faces of one centre; lenses: ten of one lens each, where two were found; "
-        "auto: those of raw fisheyes.",
-        metavar="auto|cube|lenses",
+        "fisheye: raw ones as they are; auto: lenses of raw fisheyes, else cube.",
+        metavar="auto|cube|lenses|fisheye",
     ),
 ]
 
@@ -99,7 +99,8 @@ def export(
     folder = out or run / to
     said = _baseline(run, baseline) if scale == "lens" else None
     placement = place(reconstruction, frames, settings, said)
-    write(reconstruction, frames, folder, ExportFormat(to), face_size, placement, link, lenses)
+    given = reconstruction, frames, folder, ExportFormat(to), face_size, placement, link, lenses
+    write(*given, raw=images == "fisheye")
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
     typer.echo(f"{to}: {folder}")
@@ -117,8 +118,8 @@ def _lenses(
     from gsba.store.finished import load_lenses
 
     lenses = load_lenses(run, reconstruction)
-    if not lenses and images == "lenses":
-        raise GsbaError(f"{run}: no two lenses were found: export it without --images lenses")
+    if not lenses and images != "auto":
+        raise GsbaError(f"{run}: no two lenses were found: export it without --images {images}")
     return lenses
 
 

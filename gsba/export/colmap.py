@@ -1,6 +1,6 @@
 """COLMAP models (4.x): rigs and frames, with images.bin consistent for readers that know neither.
 
-Three layouts:
+Layouts:
 
 * `colmap`: PINHOLE faces in one rig, `images/front/NAME.jpg`, `masks/front/NAME.jpg.png`,
   `sparse/0`, and `rig_config.json` for COLMAP's own tools: six of one centre, or the ten of
@@ -8,6 +8,8 @@ Three layouts:
 * `colmap-flat`: the same cameras, `images/NAME_front.jpg`. For trainers that resolve images by
   their base name. `sparse/0/points3D.ply` is INRIA's start cloud, and `sparse/0/test.txt` lists all
   faces of every eighth frame: holding out single faces would leave their siblings in the training.
+* both with raw fisheyes as they are (`--images fisheye`): two OPENCV_FISHEYE cameras and
+  `images/front`, `images/back`; masks leave out what is beyond the circles; rows are as they were.
 * `colmap-erp`: one EQUIRECTANGULAR camera and the panoramas themselves.
 
 A frame's pose is stored as rig_from_world, where COLMAP's rig frame is that of the first camera.
@@ -15,20 +17,22 @@ Image f * C + c + 1 is face c of frame f, point j + 1 is point j.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.fisheye import project, rotation_of
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.sphere import erp_from_bearings
-from gsba.camera.views import View, seen_from_lenses, views_for
+from gsba.camera.views import View, scenes_of, seen_from_lenses, shown_in_pictures, views_for
 from gsba.export.images import face_size_for, suffix_of, write_panoramas, write_views
 from gsba.export.ply import write_splat_points
-from gsba.geometry import inverse, quaternion_from_rotation
+from gsba.export.raw import LENSES, raw_lenses, write_raw
+from gsba.geometry import inverse, pose, quaternion_from_rotation
 from gsba.log import GsbaError
-from gsba.types import FrameSet, Reconstruction
+from gsba.types import Fisheye, FrameSet, Reconstruction
 
 TEST_EVERY = 8  # frames, as the trainers' own hold-out
 
@@ -42,6 +46,7 @@ class Sensor:
     height: int  # pixels
     params: tuple[float, ...]  # as the model wants them, corner origin
     rig_T_sensor: np.ndarray  # (4, 4) float64
+    fisheye: Fisheye | None = None  # what it is, of OPENCV_FISHEYE
 
 
 def write_colmap(
@@ -57,9 +62,9 @@ def write_colmap(
     names = [[f"{view.name}/{_file(frames, f)}" for view in views] for f in range(len(frames))]
     seen, sensors = seen_from_lenses(reconstruction, lenses), list(map(_pinhole, views))
     write_model(partial / "sparse" / "0", seen, sensors, names)
-    text = json.dumps(_rig_config(sensors, views), indent=1) + "\n"
+    text = json.dumps(_rig_config(sensors, [view.name for view in views]), indent=1) + "\n"
     (partial / "rig_config.json").write_text(text)
-    _write_named_views(partial, frames, views, names, link, lenses)
+    _write_named_views(partial, frames, views, names, link, lenses, scenes_of(reconstruction))
 
 
 def write_colmap_flat(
@@ -84,7 +89,41 @@ def write_colmap_flat(
     )
     held_out = [name for of_frame in names[::TEST_EVERY] for name in of_frame]
     (model / "test.txt").write_text("\n".join(held_out) + "\n")
-    _write_named_views(partial, frames, views, names, link, lenses)
+    _write_named_views(partial, frames, views, names, link, lenses, scenes_of(reconstruction))
+
+
+def write_colmap_raw(
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    lenses: Lenses,
+    flat: bool,
+    link: bool = False,
+) -> None:
+    """Write the raw fisheyes themselves into `partial`, in the rig layout or the flat one."""
+    sensors = _raw_sensors(frames, lenses)
+    named = "{name}_{lens}{suffix}" if flat else "{lens}/{name}{suffix}"
+    names = [
+        [named.format(name=name, lens=lens, suffix=suffix_of(frames, f)) for lens in LENSES]
+        for f, name in enumerate(frames.names)
+    ]
+    model = partial / "sparse" / "0"
+    write_model(model, shown_in_pictures(reconstruction, lenses), sensors, names)
+    if flat:
+        held_out = [name for of_frame in names[::TEST_EVERY] for name in of_frame]
+        (model / "test.txt").write_text("\n".join(held_out) + "\n")
+        write_splat_points(
+            model / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
+        )
+    else:
+        text = json.dumps(_rig_config(sensors, LENSES), indent=1) + "\n"
+        (partial / "rig_config.json").write_text(text)
+    write_raw(
+        frames,
+        lambda f, lens: partial / "images" / names[f][lens],
+        lambda f, lens: partial / "masks" / f"{names[f][lens]}.png",
+        link,
+    )
 
 
 def write_colmap_erp(
@@ -202,6 +241,8 @@ def _project(
 
     Of those on the origin's side of the rig the one in which it is furthest from the border.
     """
+    if sensors[0].fisheye is not None:
+        return _project_raw(sensors, bearings, origins)
     if sensors[0].model == "EQUIRECTANGULAR":
         pixels = erp_from_bearings(bearings, sensors[0].width, sensors[0].height)
         return np.zeros(len(bearings), np.int64), pixels
@@ -218,16 +259,44 @@ def _project(
     return which, found[which, np.arange(len(bearings))]
 
 
+def _project_raw(
+    sensors: Sequence[Sensor], bearings: np.ndarray, origins: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `_project`, of the two lenses of raw pairs."""
+    ahead = bearings[:, 2] if origins is None else origins @ sensors[0].rig_T_sensor[:3, 3]
+    which = (ahead < 0).astype(np.int64)
+    pixels = np.empty((len(bearings), 2))
+    for c, sensor in enumerate(sensors):
+        assert sensor.fisheye is not None
+        pixels[which == c] = project(sensor.fisheye, bearings[which == c])
+    return which, pixels
+
+
+def _raw_sensors(frames: FrameSet, lenses: Lenses) -> list[Sensor]:
+    """The lenses of raw pairs, front and back, as cameras of a rig."""
+    return [
+        Sensor(
+            "OPENCV_FISHEYE",
+            lens.width,
+            lens.height,
+            (lens.focal, lens.focal, *lens.principal, *lens.radial),
+            pose(rotation_of(lens), sign * lenses.centre),
+            lens,
+        )
+        for lens, sign in zip(raw_lenses(frames), (1.0, -1.0), strict=True)
+    ]
+
+
 def _pinhole(view: View) -> Sensor:
     params = (view.focal, view.focal, *view.principal)
     return Sensor("PINHOLE", view.width, view.height, params, view.rig_T_view)
 
 
-def _rig_config(sensors: Sequence[Sensor], views: Sequence[View]) -> list[dict]:
+def _rig_config(sensors: Sequence[Sensor], names: Sequence[str]) -> list[dict]:
     """The rig as `colmap rig_configurator` reads it; rotations are cam_from_rig, wxyz."""
     configs = []
-    for sensor, view in zip(sensors, views, strict=True):
-        config: dict[str, object] = {"image_prefix": f"{view.name}/"}
+    for sensor, name in zip(sensors, names, strict=True):
+        config: dict[str, object] = {"image_prefix": f"{name}/"}
         if not configs:
             config["ref_sensor"] = True
         else:
@@ -250,6 +319,7 @@ def _write_named_views(
     names: list[list[str]],
     link: bool,
     lenses: Lenses,
+    scenes: Callable[[int], np.ndarray],
 ) -> None:
     place = {view.name: c for c, view in enumerate(views)}
     write_views(
@@ -259,4 +329,5 @@ def _write_named_views(
         lambda f, view: partial / "images" / names[f][place[view]],
         lambda f, view: partial / "masks" / f"{names[f][place[view]]}.png",
         link,
+        scenes,
     )

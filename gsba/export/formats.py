@@ -8,6 +8,7 @@ import numpy as np
 
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.export.folder import output_folder
+from gsba.log import GsbaError
 from gsba.placement.placement import Placement
 from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
 
@@ -34,6 +35,7 @@ def export(
     placement: Placement | None = None,
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
+    raw: bool = False,
 ) -> None:
     """Write a reconstruction in another program's format, all frames of it.
 
@@ -48,6 +50,8 @@ def export(
         link: hard links to the frames where these leave unchanged, not copies: who edits one edits
             the other.
         lenses: of the frames, in the unit of the reconstruction: faces are of one lens each then.
+
+        raw: raw fisheyes go out as they are, not as faces; only in COLMAP's formats.
 
     Raises:
         GsbaError: `out` is in use, the format does not fit the frames, or the disk refuses;
@@ -64,11 +68,31 @@ def export(
     reconstruction = placement.apply(reconstruction)
     with output_folder(out, to.value) as partial:
         seen_by = lenses.scaled(placement.similarity.scale)
-        _write(partial, reconstruction, frames, to, face_size, placement.up == "z", link, seen_by)
+        if raw:
+            _write_raw(partial, reconstruction, frames, to, link, seen_by)
+        else:
+            z_up = placement.up == "z"
+            _write(partial, reconstruction, frames, to, face_size, z_up, link, seen_by)
         placement.write(partial / "transform.json")
     logger.info(
         "%s: %d frames, %d points, in %s", to, len(frames), len(reconstruction.points_world), out
     )
+
+
+def _write_raw(
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    to: ExportFormat,
+    link: bool,
+    lenses: Lenses,
+) -> None:
+    from gsba.export import colmap
+
+    if to not in (ExportFormat.COLMAP, ExportFormat.COLMAP_FLAT):
+        raise GsbaError(f"--images fisheye goes with colmap or colmap-flat, not with {to.value}")
+    flat = to == ExportFormat.COLMAP_FLAT
+    colmap.write_colmap_raw(partial, reconstruction, frames, lenses, flat, link)
 
 
 def _write(

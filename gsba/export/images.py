@@ -48,7 +48,7 @@ def face_size_for(frames: FrameSet, face_size: int | None) -> int:
 
 def of_one_lens(images: str, frames: FrameSet) -> bool:
     """Whether faces are to be of one lens each, as `export.images` says it."""
-    return images == "lenses" or (images == "auto" and frames.fisheyes is not None)
+    return images in ("lenses", "fisheye") or (images == "auto" and frames.fisheyes is not None)
 
 
 def suffix_of(frames: FrameSet, f: int) -> str:
@@ -69,6 +69,7 @@ def write_views(
     image_path: Callable[[int, str], Path],
     mask_path: Callable[[int, str], Path],
     link: bool = False,
+    scenes: Callable[[int], np.ndarray] | None = None,
 ) -> None:
     """Write every view of every frame, and its mask where the frames have masks.
 
@@ -79,9 +80,10 @@ def write_views(
         image_path: file of the image, by frame index and view name.
         mask_path: file of the mask (PNG, 0 = ignore, 255 = use).
         link: hard links to images that leave unchanged.
+        scenes: points (N, 3) around a frame, rig frame, by its index: how far things are.
     """
     if lenses and frames.panoramic:
-        _write_lens_faces(frames, views, lenses, image_path, mask_path)
+        _write_lens_faces(frames, views, lenses, image_path, mask_path, scenes)
     else:
         _write_cube_faces(frames, views[0].width, image_path, mask_path, link)
 
@@ -106,13 +108,13 @@ def _write_cube_faces(
             for source, path in zip(frames.paths[f], paths, strict=True)
         ):
             for source, path in zip(frames.paths[f], paths, strict=True):
-                _pass_on(source, path, link)
+                pass_on(source, path, link)
         else:
             _write_all(paths, _resized(load_faces(frames, f), size))
         if has_masks(frames):
             _write_face_masks(frames, f, rig, [mask_path(f, face) for face in faces], faces)
 
-    _of_all_frames(write, len(frames))
+    of_all_frames(write, len(frames))
 
 
 def _write_lens_faces(
@@ -121,9 +123,10 @@ def _write_lens_faces(
     lenses: Lenses,
     image_path: Callable[[int, str], Path],
     mask_path: Callable[[int, str], Path],
+    scenes: Callable[[int], np.ndarray] | None,
 ) -> None:
     def write(f: int) -> None:
-        cutter = ViewCutter(views, lenses, f)
+        cutter = ViewCutter(views, lenses, f, None if scenes is None else scenes(f))
         raw = frames.fisheyes is not None
         cut = cutter.cut_raw(load_raw(frames, f)) if raw else cutter.cut(load_erp(frames, f))
         _write_all([image_path(f, view.name) for view in views], cut)
@@ -133,10 +136,11 @@ def _write_lens_faces(
             masks = [part.astype(np.uint8) * 255 for part in cutter.cut_mask(whole)]
             _write_all([mask_path(f, view.name) for view in views], masks)
 
-    _of_all_frames(write, len(frames))
+    of_all_frames(write, len(frames))
 
 
-def _of_all_frames(write: Callable[[int], None], num_frames: int) -> None:
+def of_all_frames(write: Callable[[int], None], num_frames: int) -> None:
+    """Write frames, a few at a time."""
     with ThreadPoolExecutor(min(os.cpu_count() or 1, _AT_ONCE)) as pool:
         running = [pool.submit(write, f) for f in range(num_frames)]
         try:
@@ -166,7 +170,7 @@ def write_panoramas(
         if frames.correction or frames.fisheyes:
             write_image(image_path(f), load_erp(frames, f))
         else:
-            _pass_on(frames.paths[f][0], image_path(f), link)
+            pass_on(frames.paths[f][0], image_path(f), link)
         if has_masks(frames):
             mask = load_mask(frames, f)
             if mask is None:
@@ -174,7 +178,7 @@ def write_panoramas(
             write_image(mask_path(f), mask.astype(np.uint8) * 255)
 
 
-def _pass_on(source: Path, path: Path, link: bool) -> None:
+def pass_on(source: Path, path: Path, link: bool) -> None:
     """Give `path` the content of `source`; without a second one on disk where that can be."""
     if not source.is_file():
         raise GsbaError(f"{source}: is gone; it was there when the run began")

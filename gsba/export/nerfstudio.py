@@ -9,13 +9,14 @@ trainers need the faces; the panoramas are for models that take equirectangular 
 """
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsba.camera.lens import ONE_CENTRE, Lenses
-from gsba.camera.views import View, seen_from_lenses, views_for
+from gsba.camera.views import View, scenes_of, seen_from_lenses, views_for
 from gsba.export.images import face_size_for, has_masks, suffix_of, write_panoramas, write_views
 from gsba.export.ply import write_splat_points
 from gsba.types import FrameSet, Reconstruction
@@ -44,7 +45,8 @@ def write_nerfstudio(
     write_splat_points(partial / _CLOUD, points, reconstruction.point_colors)
     views = views_for(frames, face_size_for(frames, face_size), lenses)
     seen = seen_from_lenses(reconstruction, lenses)
-    _write_face_dataset(partial, seen, frames, views, out_R_world, link, lenses)
+    scenes = scenes_of(reconstruction)
+    _write_face_dataset(partial, seen, frames, views, out_R_world, link, lenses, scenes)
     if frames.panoramic:
         _write_erp_dataset(partial, reconstruction, frames, out_R_world, link)
 
@@ -57,6 +59,7 @@ def _write_face_dataset(
     out_R_world: np.ndarray,
     link: bool,
     lenses: Lenses,
+    scenes: Callable[[int], np.ndarray],
 ) -> None:
     def image(f: int, face: str) -> str:
         return f"images/{frames.names[f]}_{face}{suffix_of(frames, f)}"
@@ -85,6 +88,7 @@ def _write_face_dataset(
         lambda f, face: partial / image(f, face),
         lambda f, face: partial / mask(f, face),
         link,
+        scenes,
     )
 
 

@@ -17,7 +17,7 @@ from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
 from gsba.placement.placement import Placement, metres_per_unit, place
 from gsba.report import findings
-from gsba.report.camera_findings import of_camera
+from gsba.report.camera_findings import of_camera, of_lenses
 from gsba.report.html import residual_sphere, write_html
 from gsba.report.report import build_report, plain, write_poses
 from gsba.trajectory.files import write_tum
@@ -119,6 +119,10 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
             run.settings.camera,
             frames.timed,
         )
+        if frames.fisheyes is not None:
+            found = world.lenses, world.calibrated, world.covariances
+            camera["lenses"], of_raw = of_lenses(*found)
+            more += of_raw
         if "splat" in run.settings.factors and world.lenses:
             more.append("splat left out: it takes a frame for one view point")
         notes += more
@@ -158,9 +162,11 @@ def _export(
     seen_by = lenses if of_one_lens(images, shown) else ONE_CENTRE
 
     def compute() -> Counts:
-        export(main, shown, folder, to, size, placement, lenses=seen_by)
+        raw = images == "fisheye"
+        export(main, shown, folder, to, size, placement, lenses=seen_by, raw=raw)
         return Counts(len(run.frames), len(shown), "frames")
 
     key = [size, placement.to_json(), *(["of one lens"] if seen_by else [])]
+    key += ["raw"] if images == "fisheye" else []
     run.store.stage(name, key, compute, Counts, run.chain.latest)
     run.store.claim(folder)

@@ -8,6 +8,8 @@ from gsba.bundle.camera_system import CameraCovariances
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of
 from gsba.bundle.readout import Readout
+from gsba.bundle.self_calibration import FREE, OF_FRONT, SelfCalibration
+from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
 from gsba.placement.placement import metres_per_unit
 
@@ -52,9 +54,7 @@ def of_camera(
         if baseline is not None:
             notes.append(f"two lenses were not found, and tell no scale: {centres.reason}")
         return said, notes
-    notes.append(
-        f"these panoramas are of two lenses {length:.5g} map units apart (sigma {sigma:.1g})"
-    )
+    notes.append(f"these frames are of two lenses {length:.5g} map units apart (sigma {sigma:.1g})")
     if baseline is not None:
         metres, of_metres = metres_per_unit((length, sigma), baseline)
         said |= {"metres_per_unit": metres, "metres_per_unit_sigma": of_metres}
@@ -73,6 +73,43 @@ def of_camera(
         said["readout"] = _of_readout(readout, timed)
         if timed:
             notes += _readout_notes(readout, settings)
+    return said, notes
+
+
+def of_lenses(
+    lenses: Lenses, voted: SelfCalibration | None, known: CameraCovariances | None
+) -> tuple[dict[str, Any], list[str]]:
+    """What the lenses of raw pairs are.
+
+    Args:
+        lenses: as the map has them.
+        voted: what features said of those that were given; None = they were found.
+        known: how well they are known.
+    """
+    if lenses.fisheyes is None:
+        reason = "" if voted is None else voted.reason
+        return {"taken": False, "reason": reason}, []
+    sigmas = np.full(FREE, np.nan)
+    if known is not None and known.lens_sigmas is not None:
+        sigmas = known.lens_sigmas
+    said, notes = dict[str, Any](taken=True, reason=""), []
+    of_lens = sigmas[:OF_FRONT], sigmas[OF_FRONT:]
+    for name, lens, own in zip(("front", "back"), lenses.fisheyes, of_lens, strict=True):
+        said[name] = {
+            "focal": lens.focal,
+            "focal_sigma": lens.focal * own[0],
+            "principal": lens.principal,
+            "principal_sigmas": lens.focal * own[1:3],
+            "radial": lens.radial,
+            "radial_sigmas": own[3:7],
+        }
+    said["back"]["turn_sigmas_deg"] = np.rad2deg(of_lens[1][7:])
+    front, back = (said[name] for name in ("front", "back"))
+    notes.append(
+        f"the lenses were calibrated as found: focal lengths {front['focal']:.2f} and "
+        f"{back['focal']:.2f} pixels (sigmas {front['focal_sigma']:.1g} and "
+        f"{back['focal_sigma']:.1g}); calibration.json is for other runs of this camera"
+    )
     return said, notes
 
 
