@@ -85,8 +85,7 @@ def refine(
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
         fresh: forget an earlier run in `out`.
-        extra_factors: makes factors of your own on the keys gsba.X(frame); they join every
-            bundle adjustment (and those are then never resumed).
+        extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
 
     Raises:
         GsbaError: an input or setting that cannot be used.

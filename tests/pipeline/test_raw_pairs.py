@@ -1,0 +1,158 @@
+"""A rendered walk taken by two fisheyes, refined and exported without a stitcher."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from tiny_run import SETTINGS
+from typer.testing import CliRunner
+
+from gsba.camera.calibration import calibration_json, read_calibration
+from gsba.camera.fisheye import Pair, changed, project, rotation_of, unproject
+from gsba.camera.sphere import erp_from_bearings
+from gsba.cli import app
+from gsba.config import RefineSettings
+from gsba.demo.degrade import degrade
+from gsba.demo.gallery import build_gallery
+from gsba.demo.render import render_erp
+from gsba.demo.walk import walk_poses
+from gsba.evaluate import TrajectoryErrors, evaluate
+from gsba.log import GsbaError
+from gsba.pipeline import refine
+from gsba.trajectory.files import read_trajectory, write_tum
+from gsba.types import Fisheye, Trajectory
+
+BASELINE, NUM_FRAMES, SIZE = 0.05, 16, 448
+BEND = (-0.025, 0.0018, 0.0, 0.0)
+LENS = Fisheye(SIZE, SIZE, 0.30457 * SIZE, (SIZE / 2, SIZE / 2), BEND, (0.0, 0.0, 0.0))
+LENSES: Pair = (LENS, replace(LENS, rotation=(0.0, np.pi, 0.0)))
+RAW_SETTINGS = SETTINGS.model_copy(update={"patches": RefineSettings().patches})
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of front/, back/ and what the walk is beside it."""
+    folder = tmp_path_factory.mktemp("raw")
+    truth, scene = walk_poses("rectangle", "forward", NUM_FRAMES, 0), build_gallery()
+    for name, lens, side in zip(("front", "back"), LENSES, (1, -1), strict=True):
+        (folder / "frames" / name).mkdir(parents=True)
+        maps = _maps(lens)
+        for f, pose in enumerate(truth.world_T_rigs):
+            at = pose.copy()
+            at[:3, 3] += side * 0.5 * BASELINE * pose[:3, 2]
+            erp = render_erp(scene, at, 1024, 512).clip(0, 255).astype(np.uint8)
+            picture = cv2.remap(erp, maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP)
+            picture[np.isnan(maps[0])] = 0
+            cv2.imwrite(str(folder / "frames" / name / f"{f:04d}.png"), picture[..., ::-1])
+    rows = [f"{f:04d},{time!r}" for f, time in enumerate(truth.timestamps.tolist())]
+    (folder / "frames/timestamps.csv").write_text("\n".join(rows))
+    write_tum(folder / "truth.tum", truth)
+    write_tum(folder / "slam.tum", degrade(truth, 0))
+    _write(folder / "true.json", LENSES)
+    off = np.array([-0.02, 0.008, -0.006, 0.02, 0, 0, 0, 0.008, -0.01, 0.006])
+    _write(folder / "off.json", (changed(LENSES[0], off), changed(LENSES[1], -off)))
+    return folder
+
+
+def _maps(lens: Fisheye) -> np.ndarray:
+    """Places (2, h, w) in a panorama of 1024 pixels; NaN beyond the circle."""
+    pixels = np.stack(np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5), axis=-1)
+    directions = unproject(lens, pixels)
+    maps = np.moveaxis(erp_from_bearings(directions, 1024, 512) - 0.5, -1, 0).astype(np.float32)
+    maps[:, directions @ rotation_of(lens)[:, 2] < np.cos(np.deg2rad(100))] = np.nan
+    return maps
+
+
+def _write(path: Path, pair: Pair) -> None:
+    centre = np.array([0, 0, BASELINE / 2])
+    path.write_text(json.dumps(calibration_json(pair, centre, "m", {})))
+
+
+def _refined(walk: Path, out: Path, calibration: str) -> tuple[dict, TrajectoryErrors]:
+    refine(
+        walk / "frames", walk / "slam.tum", out, RAW_SETTINGS, calibration=walk / calibration
+    )  # fmt: skip
+    report = json.loads((out / "report.json").read_text())
+    truth = read_trajectory(walk / "truth.tum")
+    return report, evaluate(read_trajectory(out / "trajectory.tum"), truth)
+
+
+def test_raw_pairs_of_known_lenses_become_faces_of_either(walk: Path, tmp_path: Path) -> None:
+    report, errors = _refined(walk, tmp_path / "run", "true.json")
+    camera = report["camera"]
+    assert camera["taken"] and not camera["lenses"]["taken"] and camera["lenses"]["reason"]
+    assert camera["metres_per_unit"] == pytest.approx(errors.scale, rel=0.03)  # 1 unit = 1 m here
+    assert errors.ate.rmse < 0.004
+    assert len(list((tmp_path / "run/colmap/images").iterdir())) == 10
+    kept = read_calibration(tmp_path / "run/calibration.json")
+    assert kept[0].focal == LENS.focal
+    np.testing.assert_allclose(kept[0].centre, [0, 0, BASELINE / 2], atol=0.001)
+    _check_fisheyes(tmp_path / "run")
+
+
+def _check_fisheyes(run: Path) -> None:
+    """Both pictures as they are, points where these show them; faces of one centre on request."""
+    call = ["-q", "export", str(run), "--to", "colmap", "--images"]
+    result = CliRunner().invoke(app, [*call, "fisheye", "--out", str(run / "raw")])
+    assert result.exit_code == 0, result.output
+    model = pycolmap.Reconstruction(run / "raw/sparse/0")
+    assert {camera.model.name for camera in model.cameras.values()} == {"OPENCV_FISHEYE"}
+    assert model.compute_mean_reprojection_error() < 0.5
+    masks = [cv2.imread(str(path), 0) for path in sorted((run / "raw/masks/front").iterdir())]
+    assert all(mask is not None and mask[SIZE // 2, SIZE // 2] == 255 for mask in masks)
+    assert all(mask is not None and mask[0, 0] == 0 for mask in masks)
+    result = CliRunner().invoke(app, [*call, "cube", "--out", str(run / "cube")])
+    assert result.exit_code == 0 and len(list((run / "cube/images").iterdir())) == 6
+    wrong = ["export", str(run), "--to", "nerfstudio", "--images", "fisheye"]
+    result = CliRunner().invoke(app, [*wrong, "--out", str(run / "no")])
+    assert result.exit_code == 1 and "colmap" in result.output and not (run / "no").exists()
+
+
+def test_lenses_that_are_off_are_found_and_all_is_done_anew(walk: Path, tmp_path: Path) -> None:
+    report, errors = _refined(walk, tmp_path / "run", "off.json")
+    assert report["camera"]["lenses"]["taken"]
+    assert errors.ate.rmse < 0.01
+    found = read_calibration(tmp_path / "run/calibration.json")
+    given = read_calibration(walk / "off.json")
+    assert _off_px(found) < 0.1 * _off_px(given)
+    before = (tmp_path / "run/trajectory.tum").read_bytes()
+    again, _ = _refined(walk, tmp_path / "run", "off.json")
+    assert (tmp_path / "run/trajectory.tum").read_bytes() == before
+    anew = {stage["name"] for stage in again["stages"] if not stage["resumed"]}
+    assert anew <= {"frames"}
+
+
+def _off_px(pair: Pair) -> float:
+    """How far directions are from their true pixels, up to a turn of the rig, rms."""
+    rng = np.random.default_rng(0)
+    there, here = [], []
+    for lens, true in zip(pair, LENSES, strict=True):
+        angles, around = rng.uniform(0.1, 1.5, 400), rng.uniform(0, 2 * np.pi, 400)
+        local = np.stack(
+            [np.sin(angles) * np.cos(around), np.sin(angles) * np.sin(around), np.cos(angles)], 1
+        )
+        here.append(local @ rotation_of(true).T)
+        there.append(unproject(lens, project(true, here[-1])))
+    a, b = np.concatenate(there), np.concatenate(here)
+    u, _, v = np.linalg.svd(a.T @ b)
+    return float(np.sqrt(np.mean(np.sum((a @ (u @ v) - b) ** 2, axis=1))) * LENS.focal)
+
+
+def test_a_calibration_is_not_for_panoramas(walk: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "stitched"
+    folder.mkdir()
+    for f in range(4):
+        cv2.imwrite(str(folder / f"{f}.png"), np.full((64, 128, 3), 90 + f, np.uint8))
+    trajectory = Trajectory(np.arange(4.0), np.tile(np.eye(4), (4, 1, 1)))
+    trajectory.world_T_rigs[:, 2, 3] = np.arange(4)
+    write_tum(tmp_path / "slam.tum", trajectory)
+    with pytest.raises(GsbaError, match=r"true\.json"):
+        refine(
+            folder, tmp_path / "slam.tum", tmp_path / "run", fps=1.0,
+            calibration=walk / "true.json",
+        )  # fmt: skip
+    assert not (tmp_path / "run").exists()
