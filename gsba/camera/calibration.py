@@ -1,10 +1,12 @@
 """What is known of a raw pair's lenses, in files.
 
-Takes JSON of our own form: `rig_T_lens` in metres, unless `unit` is "map". The rig keeps its axes,
-and is laid into the middle between the lenses.
+Takes JSON of our own form, whose rig keeps its axes: `rig_T_lens` in metres, unless `unit` is
+"map". Or what Kalibr and COLMAP write, see `gsba.camera.calibration_formats`. The rig's origin is
+laid into the middle between the lenses.
 """
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,37 +14,40 @@ from typing import Any
 
 import numpy as np
 
+from gsba.camera.calibration_formats import (
+    from_colmap_config,
+    from_colmap_model,
+    from_kalibr,
+    lens_of,
+)
 from gsba.camera.fisheye import Pair, rotation_of
 from gsba.geometry import pose
 from gsba.log import GsbaError
 from gsba.types import Fisheye
 
 _MODEL = "kannala-brandt: r = f (th + k1 th^3 + k2 th^5 + k3 th^7 + k4 th^9), corner origin"
+_WANTED = (
+    "it is to be lenses.front and lenses.back, each with width, height, f, cx, cy, k and "
+    "rig_T_lens, a Kalibr camchain of cam0 and cam1, or a COLMAP rig"
+)
 _ASIDE = np.deg2rad(20.0)  # at most, of a lens's axis from that of the rig
 
 
 def read_calibration(path: Path) -> Pair:
-    """The two lenses that a file describes.
+    """The two lenses that a file describes, or the folder of a COLMAP model.
 
     Raises:
         GsbaError: unreadable, or not of two lenses back to back.
     """
     try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
-    except ValueError as error:
-        raise GsbaError(f"{path}: is not JSON ({error})") from None
-    try:
-        metric = tree.get("unit", "m") == "m"
-        front, back = (_lens(tree["lenses"][name], metric) for name in ("front", "back"))
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+        pair = from_colmap_model(path) if path.is_dir() else _of_tree(_tree(path), path)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
         raise GsbaError(
-            f"{path}: not a calibration of two lenses ({type(error).__name__}: {error}); it holds "
-            "lenses.front and lenses.back, each with width, height, f, cx, cy, k and rig_T_lens"
+            f"{path}: not a calibration of two lenses ({kind}{_one_line(error)}); {_WANTED}"
         ) from None
     try:
-        return _centred((front, back))
+        return _centred(pair)
     except ValueError as error:
         raise GsbaError(f"{path}: {error}") from None
 
@@ -87,7 +92,7 @@ def _centred(pair: Pair) -> Pair:
     if min(ways[0], -ways[1]) < np.cos(_ASIDE):
         raise ValueError(
             "the front lens is to look along z of the rig and the back one the other way, within "
-            f"{np.rad2deg(_ASIDE):.0f} degrees"
+            f"{np.rad2deg(_ASIDE):.0f} degrees: check their poses"
         )
     middle = (np.asarray(pair[0].centre) + pair[1].centre) / 2
     front, back = (replace(lens, centre=_three(np.asarray(lens.centre) - middle)) for lens in pair)
@@ -123,32 +128,59 @@ def fitted(pair: Pair, size: tuple[int, int], path: Path) -> Pair:
     return front, back
 
 
-def _lens(tree: Mapping[str, Any], metric: bool) -> Fisheye:
-    from scipy.spatial.transform import Rotation
+def _tree(path: Path) -> Any:
+    """What a file holds, JSON or YAML.
 
+    Raises:
+        GsbaError: neither, or it cannot be read.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValueError:
+        raise GsbaError(f"{path}: is no text; give a calibration as JSON or YAML") from None
+    try:
+        if path.suffix.lower() in (".yaml", ".yml") or re.search(r"^cam\d+:", text, re.MULTILINE):
+            return _yaml(text)
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise GsbaError(
+            f"{path}: is neither JSON nor YAML ({_one_line(error)}); {_WANTED}"
+        ) from None
+
+
+def _yaml(text: str) -> Any:
+    import yaml
+
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from None
+
+
+def _of_tree(tree: Any, path: Path) -> Pair:
+    """The lenses, by whatever form a tree has."""
+    if isinstance(tree, list):
+        return from_colmap_config(tree, path)
+    if "cameras" in tree:
+        return from_colmap_config([tree], path)
+    if any(re.fullmatch(r"cam\d+", str(name)) for name in tree):
+        return from_kalibr(tree, path)
+    metric = tree.get("unit", "m") == "m"
+    front, back = (_lens(tree["lenses"][name], metric) for name in ("front", "back"))
+    return front, back
+
+
+def _lens(tree: Mapping[str, Any], metric: bool) -> Fisheye:
+    size = tree.get("width") or tree["size"], tree.get("height") or tree["size"]
     rig_T_lens = np.array(tree["rig_T_lens"], dtype=np.float64).reshape(4, 4)
-    turn = rig_T_lens[:3, :3]
-    if not np.isfinite(rig_T_lens).all() or np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3:
-        raise ValueError("rig_T_lens is no rigid motion")
-    if np.linalg.det(turn) < 0:
-        raise ValueError("rig_T_lens mirrors")
-    terms = [float(k) for k in tree["k"]]
-    k1, k2, k3, k4 = [*terms, 0.0, 0.0, 0.0, 0.0][:4]
-    width = int(tree.get("width") or tree["size"])
-    height = int(tree.get("height") or tree["size"])
-    lens = Fisheye(
-        width,
-        height,
-        float(tree["f"]),
-        (float(tree["cx"]), float(tree["cy"])),
-        (k1, k2, k3, k4),
-        _three(Rotation.from_matrix(turn).as_rotvec()),
-        _three(rig_T_lens[:3, 3] if metric else np.zeros(3)),
-    )
-    numbers = [lens.focal, *lens.principal, *terms]
-    if len(terms) > 4 or not np.isfinite(numbers).all() or min(lens.focal, width, height) <= 0:
-        raise ValueError("f, cx, cy, up to four k and the size are to be numbers, f above 0")
-    return lens
+    lens = lens_of(size, tree["f"], (tree["cx"], tree["cy"]), tree["k"], rig_T_lens)
+    return lens if metric else replace(lens, centre=(0.0, 0.0, 0.0))
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 def _three(vector: np.ndarray) -> tuple[float, float, float]:

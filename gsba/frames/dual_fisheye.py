@@ -7,7 +7,7 @@ import numpy as np
 
 from gsba.camera.fisheye import Pair, project
 from gsba.camera.sphere import bearings_from_erp
-from gsba.frames.files import decode
+from gsba.frames.raw_pairs import decode_pair
 from gsba.types import FrameSet
 
 _BAND = 256  # rows of which coordinates are held in double precision
@@ -22,10 +22,8 @@ def width_of(pair: Pair) -> int:
 def load_raw(frames: FrameSet, f: int, gray: bool = False) -> list[np.ndarray]:
     """Pictures (h, w[, 3]) uint8 of both lenses of frame f, as they are on disk."""
     assert frames.fisheyes is not None
-    return [
-        decode(path, (lens.width, lens.height), gray)
-        for path, lens in zip(frames.paths[f], frames.fisheyes, strict=True)
-    ]
+    lens = frames.fisheyes[0]
+    return decode_pair(frames.paths[f], (lens.width, lens.height), gray)
 
 
 def load_joined(frames: FrameSet, f: int, gray: bool, width: int) -> np.ndarray:

@@ -14,7 +14,7 @@ from gsba.camera.fisheye import Pair
 from gsba.frames.dual_fisheye import width_of
 from gsba.frames.files import image_size, is_image
 from gsba.frames.masks import find_masks
-from gsba.frames.raw_pairs import find_pairs, lenses_of
+from gsba.frames.raw_pairs import find_pairs, lenses_of, side_by_side
 from gsba.frames.times import frame_times
 from gsba.log import GsbaError, track
 from gsba.types import FACES, FrameSet
@@ -48,12 +48,12 @@ def scan(
     order_suffices: bool = False,
     calibration: Path | None = None,
 ) -> FrameSet:
-    """Frames of a folder, in time order, checked by their headers; no pixel is decoded.
+    """Frames of a folder, in time order, checked by their headers.
 
     The folder holds equirectangular images, or cube faces: subfolders `front`, `right`, ... with
     equal names, or files `NAME_front.jpg`, ...; up and down may be absent from all frames. Or it
-    holds raw fisheyes: subfolders `front` and `back` alone (or `lens0` and `lens1`), or files
-    `..._00_...` and `..._10_...`.
+    holds raw fisheyes: subfolders `front` and `back` alone (or `lens0` and `lens1`), files
+    `..._00_...` and `..._10_...`, or both side by side in 2:1 images.
 
     Args:
         folder: JPEG or PNG images; other files are ignored.
@@ -62,7 +62,8 @@ def scan(
         fps: frames per second of these files in name order.
         masks: one ERP mask for all frames, or a folder with one for each; white = use.
         order_suffices: where nothing gives times, name order stands in for them.
-        calibration: of the lenses of raw fisheyes, see `gsba.camera.calibration`.
+        calibration: of the lenses of raw fisheyes, see `gsba.camera.calibration`; 2:1 images are
+            such then.
 
     Raises:
         GsbaError: naming the first file or frame that cannot be used.
@@ -72,30 +73,18 @@ def scan(
     layout, faces, found = _find_frames(Path(folder))
     if len(found) < MIN_FRAMES:
         raise GsbaError(f"{folder}: {len(found)} frames; at least {MIN_FRAMES} are needed")
-    names = sorted(found, key=_natural)
-    _check_names(Path(folder), names)
-    if names != sorted(names):
-        _log.warning("frames are taken in numeric order (%s before %s)", *_first_swap(names))
-    table = timestamps
-    if table is None and fps is None and (Path(folder) / _TIMES_FILE).is_file():
-        table = Path(folder) / _TIMES_FILE
-    if fps is not None:
-        _warn_of_slots(Path(folder), max(path.name for path in found[names[-1]]))
-    times, timed = frame_times(names, table, fps, order_suffices)
-    order = np.argsort(times, kind="stable")
-    names, times = [names[i] for i in order], times[order]
-    same = np.flatnonzero(np.diff(times) <= 0)
-    if len(same):
-        a, b = names[same[0]], names[same[0] + 1]
-        raise GsbaError(f"frames '{a}' and '{b}' have the same time {times[same[0]]!r}")
+    names, times, timed = _in_time_order(Path(folder), found, timestamps, fps, order_suffices)
     paths = tuple(found[name] for name in names)
     width, height = _common_size(paths, layout)
+    images = [group[0] for group in paths]
+    if layout == "erp" and side_by_side(Path(folder), images, (width, height), calibration):
+        layout, paths = "fisheye", tuple((path, path) for path in images)
     fisheyes = _lenses(Path(folder), layout, paths, calibration)
     if fisheyes is not None:
         width, height = width_of(fisheyes), width_of(fisheyes) // 2
     erp_size = None if layout == "cube" else (width, height)
     return FrameSet(
-        names=tuple(names),
+        names=names,
         paths=_absolute(paths),
         timestamps=times,
         layout=layout,
@@ -108,6 +97,33 @@ def scan(
     )
 
 
+def _in_time_order(
+    folder: Path,
+    found: Mapping[str, tuple[Path, ...]],
+    timestamps: Path | None,
+    fps: float | None,
+    order_suffices: bool,
+) -> tuple[tuple[str, ...], np.ndarray, bool]:
+    """Names (F,) of the frames, their times (F,) ascending, and whether these are times."""
+    names = sorted(found, key=_natural)
+    _check_names(folder, names)
+    if names != sorted(names):
+        _log.warning("frames are taken in numeric order (%s before %s)", *_first_swap(names))
+    table = timestamps
+    if table is None and fps is None and (folder / _TIMES_FILE).is_file():
+        table = folder / _TIMES_FILE
+    if fps is not None:
+        _warn_of_slots(folder, max(path.name for path in found[names[-1]]))
+    times, timed = frame_times(names, table, fps, order_suffices)
+    order = np.argsort(times, kind="stable")
+    names, times = [names[i] for i in order], times[order]
+    same = np.flatnonzero(np.diff(times) <= 0)
+    if len(same):
+        a, b = names[same[0]], names[same[0] + 1]
+        raise GsbaError(f"frames '{a}' and '{b}' have the same time {times[same[0]]!r}")
+    return tuple(names), times, timed
+
+
 def _lenses(
     folder: Path, layout: str, paths: Sequence[tuple[Path, ...]], calibration: Path | None
 ) -> Pair | None:
@@ -116,8 +132,8 @@ def _lenses(
         return lenses_of(folder, paths, calibration)
     if calibration is not None:
         raise GsbaError(
-            f"{calibration}: a calibration is for raw fisheyes, but {folder} holds "
-            f"{'panoramas' if layout == 'erp' else 'cube faces'}"
+            f"{calibration}: a calibration is for raw fisheyes, but {folder} holds cube faces: "
+            "leave --calibration out"
         )
     return None
 
@@ -135,6 +151,8 @@ def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
     _check_names(Path(folder), names)
     paths = tuple(found[name] for name in names)
     width, height = _common_size(paths, layout)
+    if side_by_side(Path(folder), [path for (path,) in paths], (width, height)):
+        raise GsbaError(f"{folder}: holds raw fisheyes side by side; panoramas are wanted here")
     return FrameSet(
         names=tuple(names),
         paths=_absolute(paths),
@@ -281,6 +299,11 @@ def _common_size(paths: Sequence[tuple[Path, ...]], layout: str) -> tuple[int, i
                 raise GsbaError(f"{path}: is {w}x{h}; an equirectangular frame is 2:1")
             if layout == "cube" and (w != h or h == 0):
                 raise GsbaError(f"{path}: is {w}x{h}; a cube face is square")
+            if (w, h) != (width, height) and layout == "fisheye":
+                raise GsbaError(
+                    f"{path}: is {w}x{h}, but '{first.parent.name}/{first.name}' is "
+                    f"{width}x{height}: both lenses' pictures are of one size; extract them again"
+                )
             if (w, h) != (width, height):
                 raise GsbaError(f"{path}: is {w}x{h}, but '{first.name}' is {width}x{height}")
     return width, height

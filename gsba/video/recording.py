@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from gsba.frames.raw_pairs import two_circles
 from gsba.log import GsbaError
 from gsba.video.timeline import Timeline, Track, bgr, decode, luma, read_timeline, track_sizes
 
@@ -26,11 +27,6 @@ _NAMED = ("00", "10")  # between underscores in the names of a front and of a ba
 _NEARLY = 1.1  # longer side over the shorter, up to which a picture is nearly square
 _SHORT = 0.1  # part of the longer track's duration that the shorter may lack
 _LOOKED_AT = 5  # frames in which two circles side by side are looked for
-_SEVERAL = 2  # of them that must show such
-_DARK, _LIT = 32, 40  # grey levels: around image circles, and inside
-_OUTSIDE, _INSIDE = 0.58, 0.42  # radii in heights: beyond circles, those of 200 degrees too, which
-# the frame cuts off; well within
-_ROWS = 0.25  # part of the rows with corners in which circles show beside black ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,48 +273,10 @@ def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 
 def _shows_circles(track: Track, timeline: Timeline) -> tuple[bool, tuple[str, ...]]:
-    """Whether 2:1 frames are two image circles side by side, by their black corners; notes on it.
-
-    A panorama may be black above and below, but then it is black in whole rows; circles are lit in
-    rows whose corners are black. Frames that are dark all over say nothing.
-    """
+    """Whether 2:1 frames are two image circles side by side; notes on it."""
     num = len(timeline.ticks)
     middle = num // 2
     others = {(2 * i + 1) * num // (2 * _LOOKED_AT) for i in range(_LOOKED_AT)} - {middle}
-    seen = lit = 0
-    for part in ([middle], sorted(others)):  # the middle one settles it for most panoramas
-        for _, frame in decode(track, timeline, part):
-            corners_black, rows = _circles(luma(frame))
-            if not corners_black:
-                return False, ()
-            seen, lit = seen + 1, lit + (rows >= _ROWS)
-    if not seen:
-        return False, ()
-    if lit < min(_SEVERAL, seen):
-        return False, (f"{track.path}: black corners, but around no circles: taken for a panorama",)
-    note = (
-        f"{track.path}: raw, two fisheyes side by side, front left and back right: corners black "
-        f"around circles that are not, in {lit} of {seen} frames looked at"
-    )
-    return True, (note,)
-
-
-def _circles(grey: np.ndarray) -> tuple[bool, float]:
-    """What speaks for two image circles in a 2:1 picture (H, 2H) uint8.
-
-    Returns:
-        whether all around them is black, and in which part of the rows they are lit beside it.
-    """
-    height, width = grey.shape
-    v, u = np.ogrid[:height, :width]
-    radius = np.hypot(np.mod(u + 0.5, height) - height / 2, v + 0.5 - height / 2)
-    outside, inside = radius > _OUTSIDE * height, radius < _INSIDE * height
-    rows = np.flatnonzero(outside.any(axis=1) & inside.any(axis=1))
-    if not len(rows):
-        return False, 0.0
-    black = bool(np.percentile(grey[outside], 90) < _DARK)
-    lit = [
-        np.median(grey[row, inside[row]]) > _LIT and grey[row, outside[row]].mean() < _DARK
-        for row in rows
-    ]
-    return black, float(np.mean(lit))
+    parts = [middle], sorted(others)  # the middle one settles it for most panoramas
+    greys = (luma(frame) for part in parts for _, frame in decode(track, timeline, part))
+    return two_circles(greys, track.path)

@@ -1,0 +1,288 @@
+"""What other programs write of a raw pair's lenses: a Kalibr camchain, a COLMAP rig.
+
+These say how one camera is against the other. The rig's z is halfway between the front lens's axis
+and the reversed axis of the back one, its x the front picture's, made orthogonal to that.
+"""
+
+import logging
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsba.camera.fisheye import Pair
+from gsba.geometry import inverse, pose, rotation_from_quaternion
+from gsba.log import GsbaError
+from gsba.types import Fisheye
+
+_log = logging.getLogger(__name__)
+
+_SQUARE = 0.01  # relative, by which both focal lengths of a camera may differ
+_SEEN = np.deg2rad(95.0)  # from a lens's axis, as far as it is asked
+_WORST_FIT = 0.1  # pixels, of another camera model taken for ours
+_MODEL = "OPENCV_FISHEYE"
+
+
+def lens_of(
+    size: Sequence[Any],
+    focal: Any,
+    principal: Sequence[Any],
+    radial: Sequence[Any],
+    rig_T_lens: np.ndarray | None = None,
+) -> Fisheye:
+    """A lens of numbers that a file holds.
+
+    Args:
+        size: width and height, pixels.
+        focal: pixels per radian.
+        principal: pixels, corner origin.
+        radial: up to four, of the odd powers from the third on.
+        rig_T_lens: (4, 4), metres; None = it is the rig.
+
+    Raises:
+        ValueError: no numbers, or not those of a lens.
+    """
+    from scipy.spatial.transform import Rotation
+
+    width, height = (int(pixels) for pixels in size)
+    (x, y), terms, f = (float(v) for v in principal), [float(k) for k in radial], float(focal)
+    if len(terms) > 4 or not np.isfinite([f, x, y, *terms]).all() or min(f, width, height) <= 0:
+        raise ValueError("f, cx, cy, up to four k and the size are to be numbers, f above 0")
+    if not (0 < x < width and 0 < y < height):
+        raise ValueError(
+            f"the principal point ({x:g}, {y:g}) is outside of its picture, {width}x{height}"
+        )
+    k1, k2, k3, k4 = [*terms, 0.0, 0.0, 0.0, 0.0][:4]
+    squares = np.linspace(0, _SEEN, 200) ** 2
+    if (np.polyval([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0], squares) <= 0).any():
+        raise ValueError(
+            f"r(theta) of k {terms} does not grow up to {np.rad2deg(_SEEN):.0f} degrees"
+        )
+    turn, place = np.zeros(3), np.zeros(3)
+    if rig_T_lens is not None:
+        turn = Rotation.from_matrix(_rigid(rig_T_lens)[:3, :3]).as_rotvec()
+        place = rig_T_lens[:3, 3]
+    a, b, c = (float(v) for v in turn)
+    d, e, g = (float(v) for v in place)
+    return Fisheye(width, height, f, (x, y), (k1, k2, k3, k4), (a, b, c), (d, e, g))
+
+
+def from_kalibr(tree: Mapping[str, Any], path: Path) -> Pair:
+    """The lenses of a camchain: `cam0` is the front one, `cam1` the back one.
+
+    Raises:
+        GsbaError: of other cameras than these.
+        KeyError, TypeError, ValueError, IndexError: a field is missing, or is something else.
+    """
+    cameras = sorted(name for name in map(str, tree) if re.fullmatch(r"cam\d+", name))
+    if cameras != ["cam0", "cam1"]:
+        raise GsbaError(
+            f"{path}: holds {', '.join(cameras)}; of a raw pair there are cam0, which is taken for "
+            "the front lens, and cam1: calibrate these two"
+        )
+    front, back = (_kalibr_lens(tree[name], f"{path}: {name}") for name in cameras)
+    cam1_T_cam0 = np.array(tree["cam1"]["T_cn_cnm1"], dtype=np.float64).reshape(4, 4)
+    return _in_rig((front, back), inverse(_rigid(cam1_T_cam0)), path)
+
+
+def from_colmap_config(tree: Sequence[Any], path: Path) -> Pair:
+    """The lenses of one rig of a `rig_config.json`: its `ref_sensor` is the front one.
+
+    COLMAP knows pictures' sizes from the pictures; here `width` and `height` stand beside
+    `camera_params`. Lengths are metres, unless the rig's `unit` is "map".
+
+    Raises:
+        GsbaError: of other cameras than these.
+        KeyError, TypeError, ValueError, IndexError: a field is missing, or is something else.
+    """
+    cameras = [camera for rig in tree for camera in rig["cameras"]]
+    fronts = [camera for camera in cameras if camera.get("ref_sensor")]
+    backs = [camera for camera in cameras if not camera.get("ref_sensor")]
+    if len(tree) != 1 or len(fronts) != 1 or len(backs) != 1:
+        raise GsbaError(
+            f"{path}: holds {len(cameras)} cameras in {len(tree)} rigs, {len(fronts)} of them a "
+            "ref_sensor; of a raw pair there is one rig of two, and the front lens is its "
+            "ref_sensor"
+        )
+    lenses, poses = [], []
+    for name, camera in zip(("front", "back"), (fronts[0], backs[0]), strict=True):
+        if "width" not in camera or "height" not in camera:
+            raise GsbaError(
+                f"{path}: does not say how large the pictures of the {name} lens are: write width "
+                "and height, pixels, beside its camera_params"
+            )
+        size, model = (camera["width"], camera["height"]), camera["camera_model_name"]
+        lenses.append(_colmap_lens(model, size, camera["camera_params"], f"{path}: {name} lens"))
+        wxyz = np.array(camera.get("cam_from_rig_rotation", (1, 0, 0, 0)), dtype=np.float64)
+        at = np.array(camera.get("cam_from_rig_translation", (0, 0, 0)), dtype=np.float64)
+        if wxyz.shape != (4,) or at.shape != (3,) or not 0.9 < np.linalg.norm(wxyz) < 1.1:
+            raise ValueError("cam_from_rig of a quaternion wxyz and of three numbers is wanted")
+        if name == "back" and "cam_from_rig_rotation" not in camera:
+            raise KeyError("cam_from_rig_rotation")
+        poses.append(pose(rotation_from_quaternion(wxyz / np.linalg.norm(wxyz)), at))
+    front_T_back = _rigid(poses[0]) @ inverse(_rigid(poses[1]))
+    if tree[0].get("unit", "m") != "m":
+        front_T_back[:3, 3] = 0
+    return _in_rig((lenses[0], lenses[1]), front_T_back, path)
+
+
+def from_colmap_model(folder: Path) -> Pair:
+    """The lenses of a sparse model with one rig of two cameras, whose reference is the front one.
+
+    Its lengths are the model's own: how far the lenses are apart is not taken from it.
+
+    Raises:
+        GsbaError: no such model, or of other cameras than these.
+    """
+    import pycolmap
+
+    try:
+        model = pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
+        why = str(error).splitlines()[0].rpartition("] ")[2] if str(error) else "damaged"
+        raise GsbaError(
+            f"{folder}: is no COLMAP model that can be read ({why}); give the folder that holds "
+            "rigs, cameras, frames, images and points3D, .bin or .txt"
+        ) from None
+    rigs = list(model.rigs.values())
+    others = [dict(rig.non_ref_sensors) for rig in rigs]
+    if len(rigs) != 1 or len(others[0]) != 1:
+        raise GsbaError(
+            f"{folder}: holds {len(model.cameras)} cameras in {len(rigs)} rigs; of a raw pair "
+            "there is one rig of two, whose reference is the front lens (COLMAP's rig_configurator)"
+        )
+    ((sensor, back_from_front),) = others[0].items()
+    if back_from_front is None:
+        raise GsbaError(f"{folder}: does not say how the back lens is against the front one")
+    lenses = []
+    for name, index in (("front", rigs[0].ref_sensor_id.id), ("back", sensor.id)):
+        camera, where = model.cameras[index], f"{folder}: {name} lens"
+        size = camera.width, camera.height
+        lenses.append(_colmap_lens(camera.model.name, size, list(camera.params), where))
+    rotation = back_from_front.rotation.matrix().T
+    _log.info("%s: its lengths are its own: how far its lenses are apart is left out", folder)
+    return _in_rig((lenses[0], lenses[1]), pose(rotation, np.zeros(3)), folder)
+
+
+def _kalibr_lens(tree: Mapping[str, Any], where: str) -> Fisheye:
+    """A camera of a camchain, as the rig itself; pixel centres there are whole numbers."""
+    kind = str(tree["camera_model"]), str(tree["distortion_model"])
+    numbers = [float(v) for v in tree["intrinsics"]]
+    terms = [float(v) for v in tree["distortion_coeffs"]]
+    wanted = {("pinhole", "equidistant"): 4, ("omni", "radtan"): 5}.get(kind)
+    if wanted is None:
+        raise GsbaError(
+            f"{where} is {kind[0]} with {kind[1]}; pinhole with equidistant is wanted (Kalibr's "
+            "model pinhole-equi): calibrate with that"
+        )
+    if len(numbers) != wanted or len(terms) != 4:
+        raise ValueError(f"{wanted} intrinsics and 4 distortion_coeffs are wanted")
+    *xi, fu, fv, pu, pv = numbers
+    size, focal, principal = tree["resolution"], _focal(fu, fv, where), (pu + 0.5, pv + 0.5)
+    if kind[0] == "pinhole":
+        return lens_of(size, focal, principal, terms)
+    return _of_omni(size, (xi[0], focal), principal, terms, where)
+
+
+def _colmap_lens(model: str, size: Sequence[Any], params: Sequence[Any], where: str) -> Fisheye:
+    if model != _MODEL:
+        raise GsbaError(f"{where} is {model}; {_MODEL} is wanted: calibrate with that")
+    fx, fy, cx, cy, *terms = (float(v) for v in params)
+    if len(terms) != 4:
+        raise ValueError(f"{_MODEL} has fx, fy, cx, cy, k1, k2, k3, k4")
+    return lens_of(size, _focal(fx, fy, where), (cx, cy), terms)
+
+
+def _focal(across: float, down: float, where: str) -> float:
+    """One focal length for two that hardly differ."""
+    if not (across > 0 and down > 0):
+        raise ValueError("focal lengths are to be above 0")
+    if abs(np.log(across / down)) > _SQUARE:
+        raise GsbaError(
+            f"{where} has focal lengths {across:g} and {down:g}, more than {100 * _SQUARE:.0f} % "
+            "apart: pixels are taken for square; calibrate again"
+        )
+    return float(np.sqrt(across * down))
+
+
+def _of_omni(
+    size: Sequence[Any],
+    intrinsics: tuple[float, float],
+    principal: tuple[float, float],
+    distortion: Sequence[float],
+    where: str,
+) -> Fisheye:
+    """Our model next to Mei and Rives's (ICRA 2007) with radial and tangential distortion.
+
+    Args:
+        size: pixels.
+        intrinsics: xi and focal length.
+        principal: pixels, corner origin.
+        distortion: k1, k2, p1, p2.
+        where: for messages.
+    """
+    (xi, focal), (k1, k2, p1, p2) = intrinsics, distortion
+    angles, around = np.meshgrid(np.linspace(0, _SEEN, 96), np.arange(24) * np.pi / 12)
+    angles, around = angles.ravel(), around.ravel()
+    away = np.stack([np.cos(around), np.sin(around)], axis=1)
+    depths = np.cos(angles) + xi
+    if not depths.min() > 0:
+        raise GsbaError(f"{where}: its omni model ends before {np.rad2deg(_SEEN):.0f} degrees")
+    x, y = (plane := (np.sin(angles) / depths)[:, None] * away).T
+    squares = x * x + y * y
+    bent = plane * (1 + k1 * squares + k2 * squares**2)[:, None]
+    bent[:, 0] += 2 * p1 * x * y + p2 * (squares + 2 * x * x)
+    bent[:, 1] += p1 * (squares + 2 * y * y) + 2 * p2 * x * y
+    powers = angles[:, None] ** np.array([1, 3, 5, 7, 9])
+    radial = (away[:, :, None] * powers[:, None]).reshape(-1, 5)
+    columns = np.hstack([radial, np.tile(np.eye(2), (len(angles), 1))])
+    (f, *terms, dx, dy), *_ = np.linalg.lstsq(columns, (focal * bent).ravel())
+    off = (columns @ [f, *terms, dx, dy] - (focal * bent).ravel()).reshape(-1, 2)
+    worst = float(np.hypot(*off.T).max())
+    if not worst <= _WORST_FIT:
+        raise GsbaError(
+            f"{where} is omni with radtan, {worst:.2f} pixels from any lens that is read, within "
+            f"{np.rad2deg(_SEEN):.0f} degrees: calibrate with Kalibr's model pinhole-equi"
+        )
+    return lens_of(size, f, (principal[0] + dx, principal[1] + dy), np.array(terms) / f)
+
+
+def _rigid(a_T_b: np.ndarray) -> np.ndarray:
+    """A rigid motion (4, 4).
+
+    Raises:
+        ValueError: it is none.
+    """
+    turn = a_T_b[:3, :3]
+    if not np.isfinite(a_T_b).all() or np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3:
+        raise ValueError("the pose of a lens is no rigid motion")
+    if np.linalg.det(turn) < 0:
+        raise ValueError("the pose of a lens mirrors")
+    return a_T_b
+
+
+def _in_rig(pair: Pair, front_T_back: np.ndarray, path: Path) -> Pair:
+    """Both lenses in a rig whose axes lie between theirs; its origin is at the front one."""
+    from scipy.spatial.transform import Rotation
+
+    axis = np.array([0.0, 0, 1]) - front_T_back[:3, 2]
+    if axis[2] < 1:
+        raise GsbaError(
+            f"{path}: its two lenses look less than 90 degrees apart; those of a raw pair look "
+            "away from one another"
+        )
+    ahead = axis / np.linalg.norm(axis)
+    right = np.array([1.0, 0, 0]) - ahead[0] * ahead
+    right /= np.linalg.norm(right)
+    rig_R_front = np.stack([right, np.cross(ahead, right), ahead])
+    turns = rig_R_front, rig_R_front @ front_T_back[:3, :3]
+    places = np.zeros(3), rig_R_front @ front_T_back[:3, 3]
+    placed = []
+    for lens, turn, place in zip(pair, turns, places, strict=True):
+        a, b, c = (float(v) for v in Rotation.from_matrix(turn).as_rotvec())
+        x, y, z = (float(v) for v in place)
+        placed.append(replace(lens, rotation=(a, b, c), centre=(x, y, z)))
+    return placed[0], placed[1]
