@@ -68,6 +68,11 @@ def with_baseline(settings: RefineSettings, calibration: Path | None) -> RefineS
     millimetres = 1e3 * float(np.linalg.norm(front - back))
     if settings.camera.baseline() is not None or not millimetres:
         return settings
+    if not 2 <= millimetres <= 200:
+        raise GsbaError(
+            f"{calibration}: its lenses are {millimetres:.4g} mm apart, which no camera's are: "
+            'lengths are metres, unless the file says "unit": "map"'
+        )
     camera = settings.camera.model_copy(update={"baseline_mm": millimetres})
     return settings.model_copy(update={"camera": camera})
 

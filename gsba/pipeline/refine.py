@@ -40,6 +40,7 @@ from gsba.types import (
 
 logger = logging.getLogger(__name__)
 
+_Cut = tuple[Pair, bool]
 _PASSES = 3  # over raw pairs, from the pictures
 _RECUT = np.deg2rad(0.03)  # change of what their pixels show that is worth another
 _CALIBRATIONS = 4  # of raw lenses, and the map matched anew under them, at most
@@ -120,25 +121,27 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
     """
     known = [run.settings.model_dump(exclude={"export", "placement"}), run.custom]
     counts, frames = dict(run.journal.counts), run.frames
-    for n in range(_PASSES):
+    n = 0
+    while True:
         name, after, better = f"recalibrated{n}", run.chain.latest, None
         if frames.fisheyes is not None:
-            better = run.store.stored(name, known, Pair, after)
+            better = run.store.stored(name, known, _Cut, after)
         if better is None:
             seen = frontend.extract(run)
             believed, world = solve(run, seen, prior, given)
             better = None if n == _PASSES - 1 else _cut_better(prior.coarse, world)
             if better is None:
                 return run, seen, believed, world
-            run.store.stage(name, known, lambda found=better: found, Pair, after)
-        frames, again = replace(frames, fisheyes=better), Journal(dict(counts))
+            run.store.stage(name, known, lambda found=better: found, _Cut, after)
+        n, (fisheyes, found) = n + 1, better
+        frames, again = replace(frames, fisheyes=fisheyes), Journal(dict(counts))
         settings, extra = run.settings, run.extra_factors
-        run = Run.begin(run.store, frames, prior.coarse, settings, extra, again, True)
-    raise AssertionError
+        run = Run.begin(run.store, frames, prior.coarse, settings, extra, again, found)
 
 
-def _cut_better(coarse: CoarsePoses, world: Map) -> Pair | None:
-    """What raw pairs are better cut by, in the trajectory's axes; None = they are cut well."""
+def _cut_better(coarse: CoarsePoses, world: Map) -> _Cut | None:
+    """What raw pairs are better cut by, in the trajectory's axes, and whether that was found, not
+    given; None = they are cut well."""
     lenses = world.lenses
     if lenses.cut_by is None:
         return None
@@ -149,7 +152,7 @@ def _cut_better(coarse: CoarsePoses, world: Map) -> Pair | None:
     if off < _RECUT and np.array_equal(turn, np.eye(3)):
         return None
     logger.info("lenses are %.2f deg from what panoramas were cut by: all anew", np.rad2deg(off))
-    return turned(found, turn)
+    return turned(found, turn), lenses.fisheyes is not None
 
 
 def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tuple[Prior, Map]:
