@@ -34,8 +34,6 @@ class SelfCalibration:
     """What lenses are, as a map says."""
 
     lenses: Lenses  # with fisheyes of its own, if they were taken
-    step: np.ndarray  # (FREE,) float64, of the front one, then of the back one, taken or not
-    sigmas: np.ndarray  # (FREE,) float64, centres, poses and points adjusted with them
     part_gains: np.ndarray  # (PARTS,) float64, share of the robust cost of each part of the
     # sequence that what other parts give takes off, beside centres alone
     reason: str  # why none was taken; empty if one was
@@ -68,9 +66,8 @@ def estimate(
 
     systems, counts = models_of(landmarks, _MOST, keypoints, solved, problem, by_both)
     if not systems:
-        nothing = np.full(FREE, np.nan)
         why = "too few points to tell what lenses are"
-        return SelfCalibration(so_far, nothing, nothing, np.full(PARTS, np.nan), why, counts)
+        return SelfCalibration(so_far, np.full(PARTS, np.nan), why, counts)
     off = from_calibrated(so_far)
     gains = []
     for p, part in enumerate(systems):
@@ -78,9 +75,6 @@ def estimate(
         alone = np.concatenate([np.zeros(FREE), _centre_step(others)])
         gains.append((part.gain(_step(others, off)) - part.gain(alone)) / part.cost)
     found, gains = _step(systems, off), np.array(gains)
-    total = summed(systems)
-    precision = total.curvature * total.hessian + np.diag(_pull())
-    sigmas = np.sqrt(np.diagonal(np.linalg.inv(precision)))[:FREE]
     reason = ""
     if so_far.fisheyes is None and np.any(gains <= 0):
         reason = "it does not predict parts of the sequence that it was not found from"
@@ -93,7 +87,7 @@ def estimate(
     lenses = so_far if reason else moved(so_far, found[:FREE])
     if not reason:
         lenses = replace(lenses, centre=so_far.centre + found[FREE:])
-    return SelfCalibration(lenses, off + found[:FREE], sigmas, gains, reason, counts)
+    return SelfCalibration(lenses, gains, reason, counts)
 
 
 def by_lenses(bearings_rig: np.ndarray, shown: np.ndarray, lenses: Lenses) -> np.ndarray:

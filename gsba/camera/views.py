@@ -3,8 +3,8 @@
 A panorama of two lenses has no one place that all of it is seen from. Faces of one lens have:
 front and back whole, and what each lens has on its four sides, each with its lens's centre in the
 rig and nothing of where both pictures are blended. They are cut as the lens would have had them
-with all rows read in the middle of the exposure, as far as that is a turn; their rig's axes are the
-lenses', which a stabiliser may have turned below the panorama.
+with all rows read in the middle of the exposure, as far as points tell how far things are; their
+rig's axes are the lenses', which a stabiliser may have turned below the panorama.
 """
 
 from collections.abc import Callable, Iterator
@@ -141,12 +141,9 @@ def seen_from_lenses(reconstruction: Reconstruction, lenses: Lenses) -> Reconstr
 
 def _in_the_middle(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
     """The same with rays from the lenses' centres to where observed rays are at their points."""
-    bearings, starts = reconstruction.observation_bearings, reconstruction.observation_origins
-    assert starts is not None
-    frames = reconstruction.observation_frames
-    points = starts + observed_depths(reconstruction)[:, None] * bearings
+    bearings, frames = reconstruction.observation_bearings, reconstruction.observation_frames
     origins = lenses.origins(bearings, frames)
-    rays = points - origins
+    rays = _observed_points(reconstruction) - origins
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return replace(reconstruction, observation_bearings=rays, observation_origins=origins)
 
@@ -155,10 +152,8 @@ def shown_in_pictures(reconstruction: Reconstruction, lenses: Lenses) -> Reconst
     """The same with bearings along the directions in which pictures show them."""
     if lenses.twists is None:
         return reconstruction
-    starts, frames = reconstruction.observation_origins, reconstruction.observation_frames
-    assert starts is not None
-    points = starts + observed_depths(reconstruction)[:, None] * reconstruction.observation_bearings
-    shown = lenses.seeing(points, frames)
+    frames = reconstruction.observation_frames
+    shown = lenses.seeing(_observed_points(reconstruction), frames)
     shown /= np.linalg.norm(shown, axis=1, keepdims=True)
     origins = lenses.origins(shown, frames)
     return replace(reconstruction, observation_bearings=shown, observation_origins=origins)
@@ -178,15 +173,15 @@ def scenes_of(reconstruction: Reconstruction) -> Callable[[int], np.ndarray]:
     return scene
 
 
-def observed_depths(reconstruction: Reconstruction) -> np.ndarray:
-    """How far (O,) points are from where the rays start that observe them."""
-    frames = reconstruction.observation_frames
+def _observed_points(reconstruction: Reconstruction) -> np.ndarray:
+    """Where (O, 3), rig frames, rays of two lenses are once as far as the points they observe."""
+    starts = reconstruction.observation_origins
+    assert starts is not None
+    poses = reconstruction.world_T_rigs[reconstruction.observation_frames]
     ends = reconstruction.points_world[reconstruction.observation_points]
-    starts = reconstruction.world_T_rigs[frames, :3, 3]
-    if reconstruction.observation_origins is not None:
-        turns = reconstruction.world_T_rigs[frames, :3, :3]
-        starts = starts + np.einsum("oij,oj->oi", turns, reconstruction.observation_origins)
-    return np.linalg.norm(ends - starts, axis=1)
+    reaches = ends - poses[:, :3, 3] - np.einsum("oij,oj->oi", poses[:, :3, :3], starts)
+    depths = np.linalg.norm(reaches, axis=1)
+    return starts + depths[:, None] * reconstruction.observation_bearings
 
 
 class ViewCutter:

@@ -19,6 +19,7 @@ from gsba.bundle import (
     tracks,
     triangulation,
 )
+from gsba.bundle.adjustment import Problem
 from gsba.bundle.camera_system import CameraCovariances, CameraSystem
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of
@@ -43,6 +44,7 @@ from gsba.splat.refinement import SplatResult
 from gsba.store.store import digest
 from gsba.types import (
     Keypoints,
+    Landmarks,
     Matches,
     Reconstruction,
     Sighted,
@@ -116,9 +118,7 @@ def calibrate(
     """What the lenses of raw pairs are, from matches that no solution has chosen among."""
 
     def found(wide: Solution) -> SelfCalibration:
-        shown, problem = seen.shown.bearings_rig, run.problem(prior)
-        given = wide.landmarks, seen.keypoints, shown, wide, seen.lenses, problem
-        return self_calibration.estimate(*given)
+        return self_calibration.estimate(*_under_lenses(run, seen, prior, wide))
 
     return _of_matches(run, seen, prior, name, matches, solved, found, SelfCalibration)
 
@@ -141,9 +141,7 @@ def find_stitch_radius(
     """How far away panoramas take things to be, from the same under two lenses."""
 
     def found(wide: Solution) -> StitchRadius:
-        shown, problem = seen.shown.bearings_rig, run.problem(prior)
-        given = wide.landmarks, seen.keypoints, shown, wide, seen.lenses, problem
-        return lens_centres.stitched_for(*given)
+        return lens_centres.stitched_for(*_under_lenses(run, seen, prior, wide))
 
     return _of_matches(run, seen, prior, name, matches, solved, found, StitchRadius)
 
@@ -177,6 +175,14 @@ def settle_camera(
         return CameraSystem(wide, seen.keypoints, shown, camera, times, problem).step()
 
     return _of_matches(run, seen, prior, name, matches, solved, found, Readout)
+
+
+def _under_lenses(
+    run: Run, seen: Seen, prior: Prior, wide: Solution
+) -> tuple[Landmarks, Keypoints, np.ndarray, Solution, Lenses, Problem]:
+    """What is asked of a map for what its lenses do to pictures."""
+    shown, problem = seen.shown.bearings_rig, run.problem(prior)
+    return wide.landmarks, seen.keypoints, shown, wide, seen.lenses, problem
 
 
 def _of_matches(

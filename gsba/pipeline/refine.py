@@ -145,7 +145,7 @@ def _cut_better(coarse: CoarsePoses, world: Map) -> _Cut | None:
     lenses = world.lenses
     if lenses.cut_by is None:
         return None
-    found, turn = lenses.fisheyes or lenses.cut_by, np.eye(3)
+    found, turn = self_calibration.now(lenses), np.eye(3)
     if (coarse.sources == PoseSource.SLAM).any():
         turn = quarter_turn(coarse, world.solution.world_T_rigs)
     off = self_calibration.apart(lenses, replace(lenses, fisheyes=None))
