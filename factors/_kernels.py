@@ -211,56 +211,47 @@ def _pose_row(j0, j1, j2, dx, dy, dz, out):
 
 
 @_part
-def _reduce(num, seen, W, Y, normal, row_starts, columns, diagonal, off_diagonal, gradient):
-    """Take a landmark's Schur complement from the frames that see it; Y is scratch."""
-    inverse = invert_symmetric(normal, 0.0)
-    for i in range(num):
-        f = seen[i]
-        H, g = diagonal[f], gradient[f]
-        Wi, Yi = W[i], Y[i]
-        for r in range(6):
-            y0, y1, y2 = times_symmetric(inverse, Wi[0, r], Wi[1, r], Wi[2, r])
-            Yi[r, 0], Yi[r, 1], Yi[r, 2] = y0, y1, y2
-            g[r] -= y0 * normal[6] + y1 * normal[7] + y2 * normal[8]
-            for c in range(6):
-                H[r, c] -= y0 * Wi[0, c] + y1 * Wi[1, c] + y2 * Wi[2, c]
-        slot = row_starts[f]
-        for k in range(i + 1, num):
-            while columns[slot] != seen[k]:
-                slot += 1
-            B, Wk = off_diagonal[slot], W[k]
-            for r in range(6):
-                y0, y1, y2 = Yi[r, 0], Yi[r, 1], Yi[r, 2]
-                for c in range(6):
-                    B[r, c] -= y0 * Wk[0, c] + y1 * Wk[1, c] + y2 * Wk[2, c]
+def _take_product(Y, W, B):
+    """B -= Y W; a row's six entries stand apart, so that they share instructions."""
+    a0, a1, a2, a3, a4, a5 = W[0, 0], W[0, 1], W[0, 2], W[0, 3], W[0, 4], W[0, 5]
+    b0, b1, b2, b3, b4, b5 = W[1, 0], W[1, 1], W[1, 2], W[1, 3], W[1, 4], W[1, 5]
+    c0, c1, c2, c3, c4, c5 = W[2, 0], W[2, 1], W[2, 2], W[2, 3], W[2, 4], W[2, 5]
+    for r in range(6):
+        x, y, z = Y[r, 0], Y[r, 1], Y[r, 2]
+        t0 = B[r, 0] - (x * a0 + y * b0 + z * c0)
+        t1 = B[r, 1] - (x * a1 + y * b1 + z * c1)
+        t2 = B[r, 2] - (x * a2 + y * b2 + z * c2)
+        t3 = B[r, 3] - (x * a3 + y * b3 + z * c3)
+        t4 = B[r, 4] - (x * a4 + y * b4 + z * c4)
+        t5 = B[r, 5] - (x * a5 + y * b5 + z * c5)
+        B[r, 0], B[r, 1], B[r, 2], B[r, 3], B[r, 4], B[r, 5] = t0, t1, t2, t3, t4, t5
 
 
 @_kernel
-def eliminate_range(
-    first, last, obs, points, poses, row_starts, columns, diagonal, off_diagonal, gradient, costs,
+def linearize_range(
+    first, last, obs, visits, points, poses, W, inverses, shifts, diagonal, gradient, costs,
     point_costs,
 ):  # fmt: skip
-    """Add landmarks first..last, eliminated, to a reduced pose system.
+    """Add the poses' own part of landmarks first..last, and note what eliminates these.
 
     Args:
-        row_starts (F + 1,), columns (P,): covisible frame pairs i < k as sorted CSR rows.
-        diagonal (F, 6, 6), off_diagonal (P, 6, 6), gradient (F, 6), costs (T,): accumulated.
+        W (V, 3, 6): written, of each visit the Hessian between landmark and pose.
+        inverses (J, 6), shifts (J, 3): written, of each landmark the inverse of its Hessian and
+            that times its gradient.
+        diagonal (F, 6, 6), gradient (F, 6), costs (T,): accumulated.
         point_costs (J,): written for the range.
     """
-    seen = np.empty(obs.longest, np.int64)
-    W, Y = np.empty((obs.longest, 3, 6)), np.empty((obs.longest, 6, 3))
     a, b = np.empty(6), np.empty(6)
     normal = np.empty(9)
     for j in range(first, last):
         point = points[j]
         normal[:] = 0.0
-        num, previous, cost = 0, -1, 0.0
+        visit, previous, cost = visits.offsets[j] - 1, -1, 0.0
         for o in range(obs.offsets[j], obs.offsets[j + 1]):
             f = obs.frames[o]
             if f != previous:
-                seen[num], previous = f, f
-                W[num] = 0.0
-                num += 1
+                visit, previous = visit + 1, f
+                W[visit] = 0.0
             pose = poses[f]
             dx, dy, dz = rig_vector(pose, point)
             valid, r0, r1, a0, a1, a2, b0, b1, b2 = _seen_residual(obs, o, dx, dy, dz)
@@ -272,7 +263,7 @@ def eliminate_range(
             _pose_row(a0, a1, a2, dx, dy, dz, a)
             _pose_row(b0, b1, b2, dx, dy, dz, b)
             rows = _add_normal(normal, pose, a0, a1, a2, b0, b1, b2, r0, r1, w)
-            H, g, Wf = diagonal[f], gradient[f], W[num - 1]
+            H, g, Wf = diagonal[f], gradient[f], W[visit]
             for i in range(6):
                 ai, bi = w * a[i], w * b[i]
                 g[i] += ai * r0 + bi * r1
@@ -281,7 +272,41 @@ def eliminate_range(
                 for c in range(6):
                     H[i, c] += ai * a[c] + bi * b[c]
         point_costs[j] = cost
-        _reduce(num, seen, W, Y, normal, row_starts, columns, diagonal, off_diagonal, gradient)
+        inverse = invert_symmetric(normal, 0.0)
+        for c in range(6):
+            inverses[j, c] = inverse[c]
+        x, y, z = times_symmetric(inverse, normal[6], normal[7], normal[8])
+        shifts[j, 0], shifts[j, 1], shifts[j, 2] = x, y, z
+
+
+@_kernel
+def eliminate_rows(
+    first, last, visits, W, inverses, shifts, row_starts, columns, diagonal, off_diagonal, gradient
+):  # fmt: skip
+    """Take the landmarks' Schur complement from the rows of frames first..last.
+
+    Row by row, so that each sum has one order and its blocks stay near.
+
+    Args:
+        row_starts (F + 1,), columns (P,): covisible frame pairs i < k as sorted CSR rows.
+        diagonal (F, 6, 6), off_diagonal (P, 6, 6), gradient (F, 6): accumulated.
+    """
+    slots = np.empty(len(diagonal), np.int64)
+    Y = np.empty((6, 3))
+    for f in range(first, last):
+        H, g = diagonal[f], gradient[f]
+        for slot in range(row_starts[f], row_starts[f + 1]):
+            slots[columns[slot]] = slot
+        for e in range(visits.row_offsets[f], visits.row_offsets[f + 1]):
+            visit = visits.by_frame[e]
+            j = visits.owners[visit]
+            inverse, shift, Wf = inverses[j], shifts[j], W[visit]
+            for r in range(6):
+                g[r] -= Wf[0, r] * shift[0] + Wf[1, r] * shift[1] + Wf[2, r] * shift[2]
+                Y[r, 0], Y[r, 1], Y[r, 2] = times_symmetric(inverse, Wf[0, r], Wf[1, r], Wf[2, r])
+            _take_product(Y, Wf, H)
+            for k in range(visit + 1, visits.offsets[j + 1]):
+                _take_product(Y, W[k], off_diagonal[slots[visits.frames[k]]])
 
 
 @_part

@@ -29,6 +29,16 @@ class Observations(NamedTuple):
     loss_scale: float
 
 
+class Visits(NamedTuple):
+    """Frames that see each landmark, once each, and the landmarks that each frame sees."""
+
+    offsets: np.ndarray  # (J + 1,) int64: landmark j owns visits offsets[j]:offsets[j + 1]
+    frames: np.ndarray  # (V,) int32, ascending for each landmark
+    owners: np.ndarray  # (V,) int32, landmark
+    row_offsets: np.ndarray  # (F + 1,) int64: frame f owns entries of by_frame
+    by_frame: np.ndarray  # (V,) int32, visits by frame, then landmark
+
+
 class Term(Protocol):
     """Observations of one family, O of them, of the landmarks of a block."""
 
@@ -125,6 +135,19 @@ def sort_observations(
             obs.measurements[rows, 2] += num_cameras
             num_cameras += len(term.cameras())
     return obs, order, point_order
+
+
+def visits_of(offsets: np.ndarray, frames: np.ndarray, num_frames: int) -> Visits:
+    """Visits of observations (O,) sorted by landmark (J + 1 offsets), then frame."""
+    owners = np.repeat(np.arange(len(offsets) - 1, dtype=np.int32), np.diff(offsets))
+    new = np.ones(len(frames), dtype=bool)
+    new[1:] = (frames[1:] != frames[:-1]) | (owners[1:] != owners[:-1])
+    owners, frames = owners[new], frames[new].astype(np.int32)
+    before = np.concatenate([[0], np.cumsum(new)])
+    by_frame = np.argsort(frames, kind="stable").astype(np.int32)
+    row_offsets = np.zeros(num_frames + 1, dtype=np.int64)
+    np.cumsum(np.bincount(frames, minlength=num_frames), out=row_offsets[1:])
+    return Visits(before[offsets].astype(np.int64), frames, owners, row_offsets, by_frame)
 
 
 def covisible_pairs(

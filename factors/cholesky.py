@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.blas import dsyrk, dtrsm
+from scipy.linalg.blas import dsyrk, dtrsm, dtrsv
 from scipy.linalg.lapack import dpotrf, dtrtri
 
 from factors.compiled import kernel_and_part
@@ -80,6 +80,18 @@ class BlockCholesky:
                 over = self._fronts[parent]
                 front.above = _local(front.rows, over.first, over.width, over.rows)
 
+    @property
+    def num_operations(self) -> int:
+        """Floating-point operations of a factorization, about."""
+        sizes = [(DIM * (f.width + len(f.rows)), DIM * len(f.rows)) for f in self._fronts]
+        return sum((whole**3 - rest**3) // 3 for whole, rest in sizes)
+
+    @property
+    def num_entries(self) -> int:
+        """Of the factor."""
+        widths = [(DIM * f.width, DIM * len(f.rows)) for f in self._fronts]
+        return sum(width * (width + 1) // 2 + width * rest for width, rest in widths)
+
     def factorize(self, diagonal: np.ndarray, off_diagonal: np.ndarray) -> bool:
         """Factorize H; False (and unusable) where it is not positive definite.
 
@@ -108,11 +120,13 @@ class BlockCholesky:
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Solve H x = right, both (N, 6)."""
-        x = right[self.order].reshape(-1, 1)
+        x = right[self.order].ravel()
         for front in self._fronts:
-            x[front.own] = dtrsm(1.0, front.lower, x[front.own], lower=1)
+            x[front.own] = dtrsv(front.lower, x[front.own], lower=1)
             x[front.under] -= front.below @ x[front.own]
-        self._solve_upper(x)
+        for front in reversed(self._fronts):
+            rest = x[front.own] - front.below.T @ x[front.under]
+            x[front.own] = dtrsv(front.lower, rest, lower=1, trans=1)
         out = np.empty((self.num_blocks, DIM))
         out[self.order] = x.reshape(-1, DIM)
         return out
@@ -121,16 +135,12 @@ class BlockCholesky:
         """Vectors (D, N, 6) of covariance H^-1 from as many independent unit normals."""
         num = len(normals)
         x = np.ascontiguousarray(normals[:, self.order].reshape(num, DIM * self.num_blocks).T)
-        self._solve_upper(x)
+        for front in reversed(self._fronts):
+            rest = x[front.own] - front.below.T @ x[front.under]
+            x[front.own] = dtrsm(1.0, front.lower, rest, lower=1, trans_a=1)
         out = np.empty((num, self.num_blocks, DIM))
         out[:, self.order] = x.T.reshape(num, self.num_blocks, DIM)
         return out
-
-    def _solve_upper(self, x: np.ndarray) -> None:
-        """Back substitution of columns (6 N, D) in place: x <- L^-T x."""
-        for front in reversed(self._fronts):
-            right = x[front.own] - front.below.T @ x[front.under]
-            x[front.own] = dtrsm(1.0, front.lower, right, lower=1, trans_a=1)
 
     def inverse_blocks(self, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Blocks of the inverse of H (Takahashi's selected inversion, front by front).

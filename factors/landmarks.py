@@ -6,8 +6,16 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from factors._kernels import eliminate_range, polish_range, residuals_range
-from factors._observations import Term, check_term, covisible_pairs, sort_observations
+from factors._kernels import eliminate_rows, linearize_range, polish_range, residuals_range
+from factors._observations import (
+    Observations,
+    Term,
+    Visits,
+    check_term,
+    covisible_pairs,
+    sort_observations,
+    visits_of,
+)
 from factors._terms import pose_rows
 from factors.block import PoseSystem
 from factors.reduced_factor import reduced_factor
@@ -68,6 +76,7 @@ class LandmarkBlock:
             self.terms, len(self.pose_keys), len(points), self.loss
         )
         self._points = points[self._point_order]
+        self._visits = visits_of(self._obs.offsets, self._obs.frames, len(self.pose_keys))
         self._row_starts, self._columns = covisible_pairs(
             self._obs.offsets, self._obs.frames, len(self.pose_keys)
         )
@@ -89,31 +98,12 @@ class LandmarkBlock:
 
     def linearize(self, values: gtsam.Values) -> PoseSystem:
         """Reduced pose system at `values`: robust weights, landmarks eliminated."""
-        poses = pose_rows(values, self.pose_keys)
-        num_f, num_p = len(self.pose_keys), len(self._columns)
-        ranges = balanced_ranges(self._obs.offsets)
-
-        def work(i: int) -> tuple[np.ndarray, ...]:
-            sums = (
-                np.zeros((num_f, 6, 6)),
-                np.zeros((num_p, 6, 6)),
-                np.zeros((num_f, 6)),
-                np.zeros(len(self.families)),
-            )
-            eliminate_range(
-                *ranges[i], self._obs, self._points, poses, self._row_starts, self._columns,
-                *sums, self._point_costs,
-            )  # fmt: skip
-            return sums
-
-        parts = map_in_threads(work, len(ranges), self.num_threads)
-        total = next(parts)
-        for part in parts:
-            for target, more in zip(total, part, strict=True):
-                target += more
-        self._poses = poses
-        diagonal, off_diagonal, gradient, costs = total
-        return PoseSystem(diagonal, off_diagonal, gradient, self._named(costs))
+        self._poses = pose_rows(values, self.pose_keys)
+        system, costs, self._point_costs = eliminate_points(
+            self._obs, self._visits, self._points, self._poses, self._row_starts, self._columns,
+            len(self.families), self.num_threads,
+        )  # fmt: skip
+        return PoseSystem(*system, self._named(costs))
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Robust cost at `values`, `steps (F, 6)` from the linearization, landmarks moved along."""
@@ -193,6 +183,8 @@ class LandmarkBlock:
         num = len(keys)
         pairs = np.stack(np.triu_indices(num, 1), axis=1)
         row_starts = np.concatenate([[0], np.cumsum(np.arange(num - 1, -1, -1))]).astype(np.int64)
+        columns = pairs[:, 1].astype(np.int64)
+        visits = visits_of(local.offsets, local.frames, num)
 
         def evaluate(values: gtsam.Values, with_system: bool) -> tuple[float, PoseSystem | None]:
             poses = pose_rows(values, keys)
@@ -205,14 +197,10 @@ class LandmarkBlock:
             if not with_system:
                 return float(costs.sum()), None
             self._points[first:last] = points
-            diagonal, gradient = np.zeros((num, 6, 6)), np.zeros((num, 6))
-            off_diagonal = np.zeros((len(pairs), 6, 6))
-            eliminate_range(
-                0, last - first, local, points, poses, row_starts, pairs[:, 1].astype(np.int64),
-                diagonal, off_diagonal, gradient, np.zeros(len(self.families)),
-                np.empty(last - first),
-            )  # fmt: skip
-            return float(costs.sum()), PoseSystem(diagonal, off_diagonal, gradient, {})
+            system, _, _ = eliminate_points(
+                local, visits, points, poses, row_starts, columns, len(self.families), 1
+            )
+            return float(costs.sum()), PoseSystem(*system, {})
 
         return reduced_factor(keys, pairs, evaluate)
 
@@ -255,3 +243,61 @@ class LandmarkBlock:
 
     def _named(self, costs: np.ndarray) -> dict[str, float]:
         return {name: float(cost) for name, cost in zip(self.families, costs, strict=True)}
+
+
+def eliminate_points(
+    obs: Observations,
+    visits: Visits,
+    points: np.ndarray,
+    poses: np.ndarray,
+    row_starts: np.ndarray,
+    columns: np.ndarray,
+    num_families: int,
+    num_threads: int,
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
+    """Reduced pose system of observations: robust weights, landmarks eliminated.
+
+    Args:
+        obs, visits: by landmark.
+        points: (J, 3) world.
+        poses: (F, 12) as in `factors._kernels`.
+        row_starts, columns: (F + 1,), (P,) covisible frame pairs i < k as sorted CSR rows.
+
+    Returns:
+        Diagonal (F, 6, 6), off-diagonal (P, 6, 6) and gradient (F, 6); robust costs of families
+        (T,) and of landmarks (J,).
+    """
+    num_frames, num_points = len(poses), len(points)
+    W = np.empty((len(visits.frames), 3, 6))
+    inverses, shifts = np.empty((num_points, 6)), np.empty((num_points, 3))
+    point_costs = np.empty(num_points)
+    ranges = balanced_ranges(obs.offsets)
+
+    def work(i: int) -> tuple[np.ndarray, ...]:
+        sums = (
+            np.zeros((num_frames, 6, 6)),
+            np.zeros((num_frames, 6)),
+            np.zeros(num_families),
+        )
+        linearize_range(
+            *ranges[i], obs, visits, points, poses, W, inverses, shifts, *sums, point_costs
+        )
+        return sums
+
+    parts = map_in_threads(work, len(ranges), num_threads)
+    total = next(parts)
+    for part in parts:
+        for target, more in zip(total, part, strict=True):
+            target += more
+    diagonal, gradient, costs = total
+    off_diagonal = np.zeros((len(columns), 6, 6))
+    rows = balanced_ranges(visits.row_offsets)
+
+    def reduce(i: int) -> None:
+        eliminate_rows(
+            *rows[i], visits, W, inverses, shifts, row_starts, columns, diagonal, off_diagonal,
+            gradient,
+        )  # fmt: skip
+
+    run_in_threads(reduce, len(rows), num_threads)
+    return (diagonal, off_diagonal, gradient), costs, point_costs

@@ -9,9 +9,13 @@ from scipy.sparse import csr_matrix
 
 from factors.block import Block
 from factors.cholesky import DIM, BlockCholesky
+from factors.conjugate_gradients import conjugate_gradients
 
 GRAPH = "graph"  # family under which the cost of the native and user factors is reported
 _MIN_DIAGONAL = 1e-6  # least curvature that damping is proportional to, per sigma
+_STEP_TOLERANCE = 1e-2  # of a step by conjugate gradients: the next step is from there anyway
+_OPERATIONS_PER_BYTE = 4.0  # that a core does on dense blocks while it reads one from memory
+_LEAST_ITERATIONS = 10  # of conjugate gradients that must be cheaper than half a factorization
 
 
 class ReducedSystem:
@@ -65,6 +69,10 @@ class ReducedSystem:
         )
         self._set_columns(all_dims)
         self._cholesky = BlockCholesky(self._num, self._pairs)
+        self._factorized = False  # whether the Cholesky factor is of some system met before
+        bytes_read = 8 * (2 * self._cholesky.num_entries + DIM * DIM * len(self._pairs))
+        cheaper = self._cholesky.num_operations / (2 * _OPERATIONS_PER_BYTE * max(bytes_read, 1))
+        self._max_iterations = int(cheaper) if cheaper >= _LEAST_ITERATIONS else 0
 
     def linearize(self, values: gtsam.Values) -> dict[str, float]:
         """Assemble H and the gradient at `values`; returns the cost of each family."""
@@ -89,19 +97,39 @@ class ReducedSystem:
         return costs
 
     def solve(self, damping: float) -> np.ndarray | None:
-        """Step (N, 6) of the system damped by `damping` times its diagonal; None if singular."""
+        """Step (N, 6) of the system damped by `damping` times its diagonal; None if singular.
+
+        Where much fills in, the Cholesky factor of a system before it preconditions conjugate
+        gradients; it is renewed when they take longer than that would.
+        """
         curvature = np.einsum("nii->ni", self._diagonal)
         added = damping * np.maximum(curvature, _MIN_DIAGONAL)
         damped = self._diagonal.copy()
         np.einsum("nii->ni", damped)[:] += added
-        if not self._cholesky.factorize(damped, self._off_diagonal):
+        found = self._solve_by_iterations(damped) or self._solve_directly(damped)
+        if found is None:
+            return None
+        steps, residual = found
+        # c(0) - c(x) = -g^T x - x^T H x / 2, with (H + D) x = -g - residual
+        self._predicted = 0.5 * float((steps * (added * steps - self._gradient + residual)).sum())
+        return steps
+
+    def _solve_by_iterations(self, damped: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Step and what it leaves of the gradient; None where a factorization is cheaper."""
+        if not self._factorized or not self._max_iterations:
+            return None
+        return conjugate_gradients(
+            damped, self._off_diagonal, self._pairs, -self._gradient, self._cholesky.solve,
+            _STEP_TOLERANCE, self._max_iterations,
+        )  # fmt: skip
+
+    def _solve_directly(self, damped: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Step, leaving nothing; None if singular."""
+        self._factorized = self._cholesky.factorize(damped, self._off_diagonal)
+        if not self._factorized:
             return None
         steps = self._cholesky.solve(-self._gradient)
-        if not np.all(np.isfinite(steps)):
-            return None
-        # c(0) - c(x) = -g^T x - x^T H x / 2, with (H + D) x = -g
-        self._predicted = 0.5 * float((steps * (added * steps - self._gradient)).sum())
-        return steps
+        return (steps, np.zeros_like(steps)) if np.all(np.isfinite(steps)) else None
 
     def predicted_decrease(self) -> float:
         """Decrease of the cost that the undamped model expects of the last step."""
@@ -151,7 +179,8 @@ class ReducedSystem:
         idle = np.logical_not(np.any(self._diagonal, axis=(1, 2)))
         diagonal = np.where(idle[:, None, None], np.eye(DIM), self._diagonal)
         np.einsum("nii->ni", diagonal)[:] *= 1 + damping
-        if not self._cholesky.factorize(diagonal, self._off_diagonal):
+        self._factorized = self._cholesky.factorize(diagonal, self._off_diagonal)
+        if not self._factorized:
             return None
         inverse, between = self._cholesky.inverse_blocks(self._asked)
         drawn = self._cholesky.draw(rng.normal(size=(num_draws, self._num, DIM)))
