@@ -16,7 +16,7 @@ from factors import (
     ReprojectionTerm,
     RobustLoss,
 )
-from factors.cholesky import BlockCholesky
+from factors.reduced import ReducedSystem
 from gsba.bundle.optimizer import marginal_covariances, optimize
 from gsba.config import SolverSettings
 from gsba.log import GsbaError
@@ -377,30 +377,24 @@ def test_bad_terms_are_named(world):
         optimize(world.graph, [], gtsam.Values())
 
 
-def test_block_cholesky_solves_and_inverts():
-    rng = np.random.default_rng(7)
-    num = 30
-    pairs = np.array([(i, k) for i in range(num) for k in range(i + 1, num) if rng.random() < 0.15])
-    dense = np.zeros((num, 6, num, 6))
-    off = rng.normal(size=(len(pairs), 6, 6))
-    for (i, k), block in zip(pairs, off, strict=True):
-        dense[i, :, k, :], dense[k, :, i, :] = block, block.T
-    dense[np.arange(num), :, np.arange(num), :] += 60 * np.eye(6)  # diagonally dominant
-    matrix = dense.reshape(6 * num, 6 * num)
-    diagonal = np.tile(60 * np.eye(6), (num, 1, 1))
-    cholesky = BlockCholesky(num, pairs)
-    assert cholesky.factorize(diagonal, off)
-    right = rng.normal(size=(num, 6))
-    assert np.allclose(matrix @ cholesky.solve(right).ravel(), right.ravel(), atol=1e-12)
-    inverse = np.linalg.inv(matrix).reshape(num, 6, num, 6)
-    expected = inverse[np.arange(num), :, np.arange(num), :]
-    both = np.concatenate([pairs, pairs[:, ::-1]])
-    on_diagonal, between = cholesky.inverse_blocks(both)
-    assert np.allclose(on_diagonal, expected, atol=1e-14)
-    assert np.allclose(between, inverse[both[:, 0], :, both[:, 1], :], atol=1e-14)
-    roots = cholesky.draw(np.eye(6 * num).reshape(-1, num, 6)).reshape(6 * num, -1)
-    assert np.allclose(roots.T @ roots, inverse.reshape(6 * num, -1), atol=1e-14)
-    assert not cholesky.factorize(-diagonal, off)
+def test_steps_by_iterations_are_those_of_a_factorization(world):
+    def system() -> ReducedSystem:
+        out = ReducedSystem(world.graph, [world.block()], world.values)
+        out.linearize(world.values)
+        return out
+
+    direct, iterated = system(), system()
+    assert direct._max_iterations == 0  # eight frames are solved faster than that
+    iterated._max_iterations = 100
+    assert iterated.solve(1.0) is not None  # factorizes, which is far off as a preconditioner
+    before = iterated._cholesky._fronts[0].lower.copy()
+    exact, steps = direct.solve(1e-4), iterated.solve(1e-4)
+    np.testing.assert_array_equal(iterated._cholesky._fronts[0].lower, before)  # not renewed
+    assert 0 < np.abs(steps - exact).max() < 0.1 * np.abs(exact).max()
+    # an inexact step gains less, hardly so, and says it itself
+    assert 0.999 < iterated.predicted_decrease() / direct.predicted_decrease() < 1
+    iterated._max_iterations = 1  # that is not enough: a factorization of this very system
+    np.testing.assert_array_equal(iterated.solve(1e-4), exact)
 
 
 def test_history_is_logged(world, caplog):

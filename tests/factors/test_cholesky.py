@@ -1,0 +1,106 @@
+"""Sparse Cholesky and conjugate gradients on 6x6 blocks, beside dense algebra."""
+
+import numpy as np
+import pytest
+
+from factors.cholesky import BlockCholesky
+from factors.conjugate_gradients import conjugate_gradients
+from factors.supernodes import find_supernodes
+
+Pairs = list[tuple[int, int]]
+
+
+def _random(num: int) -> Pairs:
+    rng = np.random.default_rng(7)
+    return [(i, k) for i in range(num) for k in range(i + 1, num) if rng.random() < 0.15]
+
+
+PATTERNS: dict[str, tuple[int, Pairs]] = {
+    "random": (30, _random(30)),
+    "full": (12, [(i, k) for i in range(12) for k in range(i + 1, 12)]),
+    "a chain": (40, [(i, k) for i in range(40) for k in range(i + 1, min(i + 4, 40))]),
+    "a ring": (40, [(i, i + 1) for i in range(39)] + [(0, 39)]),
+    "a star": (15, [(0, k) for k in range(1, 15)]),
+    "two parts and a lone block": (9, [(0, 3), (3, 5), (1, 2), (2, 6), (1, 7)]),
+    "no pairs": (4, []),
+    "one block": (1, []),
+}
+
+
+class System:
+    """A diagonally dominant system of a pattern, in blocks and whole."""
+
+    def __init__(self, pattern: str) -> None:
+        self.num, pairs = PATTERNS[pattern]
+        self.pairs = np.array(pairs, np.int64).reshape(-1, 2)
+        rng = np.random.default_rng(1)
+        self.off_diagonal = rng.normal(size=(len(pairs), 6, 6))
+        dense = np.zeros((self.num, 6, self.num, 6))
+        for (i, k), block in zip(pairs, self.off_diagonal, strict=True):
+            dense[i, :, k, :], dense[k, :, i, :] = block, block.T
+        self.diagonal = np.tile(60 * np.eye(6), (self.num, 1, 1))
+        dense[np.arange(self.num), :, np.arange(self.num), :] = self.diagonal
+        self.matrix = dense.reshape(6 * self.num, 6 * self.num)
+        self.right = rng.normal(size=(self.num, 6))
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_cholesky_solves_inverts_and_draws(pattern: str) -> None:
+    system = System(pattern)
+    num, pairs = system.num, system.pairs
+    cholesky = BlockCholesky(num, pairs)
+    assert not cholesky.factorize(-system.diagonal, system.off_diagonal)
+    assert cholesky.factorize(system.diagonal, system.off_diagonal)
+    solution = cholesky.solve(system.right)
+    assert np.allclose(system.matrix @ solution.ravel(), system.right.ravel(), atol=1e-12)
+    inverse = np.linalg.inv(system.matrix).reshape(num, 6, num, 6)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    on_diagonal, between = cholesky.inverse_blocks(both)
+    expected = inverse[np.arange(num), :, np.arange(num), :]
+    assert np.allclose(on_diagonal, expected, atol=1e-14)
+    assert np.allclose(between, inverse[both[:, 0], :, both[:, 1], :], atol=1e-14)
+    roots = cholesky.draw(np.eye(6 * num).reshape(-1, num, 6)).reshape(6 * num, -1)
+    assert np.allclose(roots.T @ roots, inverse.reshape(6 * num, -1), atol=1e-14)
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_supernodes_hold_the_fill_of_plain_elimination(pattern: str) -> None:
+    num, pairs = PATTERNS[pattern]
+    runs = find_supernodes(num, np.array(pairs, np.int64).reshape(-1, 2))
+    assert sorted(runs.order) == list(range(num))
+    place = np.argsort(runs.order)
+    left = {(min(place[i], place[k]), max(place[i], place[k])) for i, k in pairs}
+    for column in range(num):
+        below = sorted(k for i, k in left if i == column)
+        left |= {(i, k) for a, i in enumerate(below) for k in below[a + 1 :]}
+    held = set()
+    for s, rows in enumerate(runs.rows):
+        columns = range(runs.starts[s], runs.starts[s + 1])
+        held |= {(i, k) for i in columns for k in (*columns, *rows) if i < k}
+        assert (runs.parents[s] == -1) == (len(rows) == 0)
+        if len(rows):
+            parent = runs.parents[s]
+            known = {*range(runs.starts[parent], runs.starts[parent + 1]), *runs.rows[parent]}
+            assert parent > s and set(rows) <= known
+    assert left <= held
+
+
+def test_conjugate_gradients_reach_the_solution_and_say_what_is_left() -> None:
+    system = System("random")
+    inverses = np.linalg.inv(system.diagonal)
+
+    def precondition(x: np.ndarray) -> np.ndarray:
+        return np.einsum("nij,nj->ni", inverses, x)
+
+    given = system.diagonal, system.off_diagonal, system.pairs, system.right, precondition
+    found = conjugate_gradients(*given, 1e-12, 100)
+    assert found is not None
+    x, residual = found
+    assert np.allclose(system.matrix @ x.ravel(), system.right.ravel(), atol=1e-10)
+    rough = conjugate_gradients(*given, 1e-2, 100)
+    assert rough is not None
+    left = system.right.ravel() - system.matrix @ rough[0].ravel()
+    assert np.allclose(rough[1].ravel(), left, atol=1e-12)
+    assert np.linalg.norm(residual) < np.linalg.norm(left) < 0.1 * np.linalg.norm(system.right)
+    assert conjugate_gradients(*given, 1e-12, 2) is None
+    assert conjugate_gradients(-given[0], *given[1:], 1e-2, 100) is None
