@@ -20,7 +20,12 @@ from pathlib import Path
 import numpy as np
 from common import peak_mb
 
-SIZES = {"S": (120, 23_700), "M": (500, 98_623), "L": (2_000, 375_000)}  # frames, landmarks
+SIZES = {  # frames, landmarks
+    "S": (120, 23_700),
+    "M": (500, 98_623),
+    "L": (2_000, 375_000),
+    "XL": (8_000, 1_500_000),
+}
 SIGMA = np.radians(0.05)  # per-axis bearing noise
 LOSS_SCALE = 2.0  # Cauchy, in sigmas
 OUTLIERS = 0.02

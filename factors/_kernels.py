@@ -235,9 +235,10 @@ def linearize_range(
     """Add the poses' own part of landmarks first..last, and note what eliminates these.
 
     Args:
+        visits: of a run of landmarks, these among them.
         W (V, 3, 6): written, of each visit the Hessian between landmark and pose.
-        inverses (J, 6), shifts (J, 3): written, of each landmark the inverse of its Hessian and
-            that times its gradient.
+        inverses (L, 6), shifts (L, 3): written, of each landmark of the run the inverse of its
+            Hessian and that times its gradient.
         diagonal (F, 6, 6), gradient (F, 6), costs (T,): accumulated.
         point_costs (J,): written for the range.
     """
@@ -246,7 +247,8 @@ def linearize_range(
     for j in range(first, last):
         point = points[j]
         normal[:] = 0.0
-        visit, previous, cost = visits.offsets[j] - 1, -1, 0.0
+        row = j - visits.first
+        visit, previous, cost = visits.offsets[row] - 1, -1, 0.0
         for o in range(obs.offsets[j], obs.offsets[j + 1]):
             f = obs.frames[o]
             if f != previous:
@@ -274,9 +276,9 @@ def linearize_range(
         point_costs[j] = cost
         inverse = invert_symmetric(normal, 0.0)
         for c in range(6):
-            inverses[j, c] = inverse[c]
+            inverses[row, c] = inverse[c]
         x, y, z = times_symmetric(inverse, normal[6], normal[7], normal[8])
-        shifts[j, 0], shifts[j, 1], shifts[j, 2] = x, y, z
+        shifts[row, 0], shifts[row, 1], shifts[row, 2] = x, y, z
 
 
 @_kernel
@@ -294,6 +296,8 @@ def eliminate_rows(
     slots = np.empty(len(diagonal), np.int64)
     Y = np.empty((6, 3))
     for f in range(first, last):
+        if visits.row_offsets[f] == visits.row_offsets[f + 1]:
+            continue
         H, g = diagonal[f], gradient[f]
         for slot in range(row_starts[f], row_starts[f + 1]):
             slots[columns[slot]] = slot

@@ -30,11 +30,12 @@ class Observations(NamedTuple):
 
 
 class Visits(NamedTuple):
-    """Frames that see each landmark, once each, and the landmarks that each frame sees."""
+    """Frames that see each of a run of landmarks, once each, and what each frame sees of them."""
 
-    offsets: np.ndarray  # (J + 1,) int64: landmark j owns visits offsets[j]:offsets[j + 1]
+    first: int  # landmark
+    offsets: np.ndarray  # (L + 1,) int64: landmark first + l owns visits offsets[l]:offsets[l + 1]
     frames: np.ndarray  # (V,) int32, ascending for each landmark
-    owners: np.ndarray  # (V,) int32, landmark
+    owners: np.ndarray  # (V,) int32, l
     row_offsets: np.ndarray  # (F + 1,) int64: frame f owns entries of by_frame
     by_frame: np.ndarray  # (V,) int32, visits by frame, then landmark
 
@@ -137,17 +138,31 @@ def sort_observations(
     return obs, order, point_order
 
 
-def visits_of(offsets: np.ndarray, frames: np.ndarray, num_frames: int) -> Visits:
-    """Visits of observations (O,) sorted by landmark (J + 1 offsets), then frame."""
+def visits_of(offsets: np.ndarray, frames: np.ndarray, num_frames: int, most: int) -> list[Visits]:
+    """Visits of observations sorted by landmark, then frame, cut into runs of landmarks.
+
+    Args:
+        offsets (J + 1,), frames (O,): observations by landmark.
+        num_frames: F.
+        most: visits of a run, but for what its last landmark has more.
+    """
     owners = np.repeat(np.arange(len(offsets) - 1, dtype=np.int32), np.diff(offsets))
     new = np.ones(len(frames), dtype=bool)
     new[1:] = (frames[1:] != frames[:-1]) | (owners[1:] != owners[:-1])
     owners, frames = owners[new], frames[new].astype(np.int32)
-    before = np.concatenate([[0], np.cumsum(new)])
-    by_frame = np.argsort(frames, kind="stable").astype(np.int32)
-    row_offsets = np.zeros(num_frames + 1, dtype=np.int64)
-    np.cumsum(np.bincount(frames, minlength=num_frames), out=row_offsets[1:])
-    return Visits(before[offsets].astype(np.int64), frames, owners, row_offsets, by_frame)
+    starts = np.concatenate([[0], np.cumsum(new)])[offsets]
+    cuts = np.searchsorted(starts, np.arange(most, starts[-1], most))
+    bounds = np.unique([0, *cuts, len(starts) - 1])
+    runs = []
+    for first, last in pairwise(bounds) if len(bounds) > 1 else [(0, 0)]:
+        span = slice(starts[first], starts[last])
+        row_offsets = np.zeros(num_frames + 1, dtype=np.int64)
+        np.cumsum(np.bincount(frames[span], minlength=num_frames), out=row_offsets[1:])
+        by_frame = np.argsort(frames[span], kind="stable").astype(np.int32)
+        inner = (starts[first : last + 1] - starts[first]).astype(np.int64)
+        own = owners[span] - np.int32(first)
+        runs.append(Visits(int(first), inner, frames[span], own, row_offsets, by_frame))
+    return runs
 
 
 def covisible_pairs(

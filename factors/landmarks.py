@@ -24,6 +24,8 @@ from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 
 _POLISH_TOLERANCE = 1e-12  # of a landmark's cost
 _HOST_POLISH_STEPS = 50  # at each evaluation: an error is a function of the poses alone
+_VISITS = 1 << 18  # of landmarks that are eliminated together: 38 MB
+_RANGE = 1 << 14  # least observations that a thread adds up on its own
 _PROPOSAL_TOLERANCE = 1e-6  # of a landmark's cost: further steps gain less than the poses do
 
 
@@ -76,7 +78,7 @@ class LandmarkBlock:
             self.terms, len(self.pose_keys), len(points), self.loss
         )
         self._points = points[self._point_order]
-        self._visits = visits_of(self._obs.offsets, self._obs.frames, len(self.pose_keys))
+        self._visits = visits_of(self._obs.offsets, self._obs.frames, len(self.pose_keys), _VISITS)
         self._row_starts, self._columns = covisible_pairs(
             self._obs.offsets, self._obs.frames, len(self.pose_keys)
         )
@@ -184,7 +186,7 @@ class LandmarkBlock:
         pairs = np.stack(np.triu_indices(num, 1), axis=1)
         row_starts = np.concatenate([[0], np.cumsum(np.arange(num - 1, -1, -1))]).astype(np.int64)
         columns = pairs[:, 1].astype(np.int64)
-        visits = visits_of(local.offsets, local.frames, num)
+        visits = visits_of(local.offsets, local.frames, num, _VISITS)
 
         def evaluate(values: gtsam.Values, with_system: bool) -> tuple[float, PoseSystem | None]:
             poses = pose_rows(values, keys)
@@ -247,7 +249,7 @@ class LandmarkBlock:
 
 def eliminate_points(
     obs: Observations,
-    visits: Visits,
+    visits: Sequence[Visits],
     points: np.ndarray,
     poses: np.ndarray,
     row_starts: np.ndarray,
@@ -267,37 +269,46 @@ def eliminate_points(
         Diagonal (F, 6, 6), off-diagonal (P, 6, 6) and gradient (F, 6); robust costs of families
         (T,) and of landmarks (J,).
     """
-    num_frames, num_points = len(poses), len(points)
-    W = np.empty((len(visits.frames), 3, 6))
-    inverses, shifts = np.empty((num_points, 6)), np.empty((num_points, 3))
-    point_costs = np.empty(num_points)
-    ranges = balanced_ranges(obs.offsets)
+    num = len(poses)
+    diagonal, gradient, costs = np.zeros((num, 6, 6)), np.zeros((num, 6)), np.zeros(num_families)
+    off_diagonal, point_costs = np.zeros((len(columns), 6, 6)), np.empty(len(points))
+    W = np.empty((max(len(run.frames) for run in visits), 3, 6))
+    pattern = row_starts, columns, diagonal, off_diagonal, gradient
+    for run in visits:
+        _eliminate_run(obs, run, points, poses, W, pattern, costs, point_costs, num_threads)
+    return (diagonal, off_diagonal, gradient), costs, point_costs
 
-    def work(i: int) -> tuple[np.ndarray, ...]:
-        sums = (
-            np.zeros((num_frames, 6, 6)),
-            np.zeros((num_frames, 6)),
-            np.zeros(num_families),
-        )
+
+def _eliminate_run(
+    obs: Observations,
+    run: Visits,
+    points: np.ndarray,
+    poses: np.ndarray,
+    W: np.ndarray,
+    pattern: tuple[np.ndarray, ...],
+    costs: np.ndarray,
+    point_costs: np.ndarray,
+    num_threads: int,
+) -> None:
+    """Add the landmarks of a run, eliminated; W is scratch for the visits of any run."""
+    _, _, diagonal, _, gradient = pattern
+    num = len(run.offsets) - 1
+    inverses, shifts = np.empty((num, 6)), np.empty((num, 3))
+    offsets = obs.offsets[run.first : run.first + num + 1]
+    ranges, rows = balanced_ranges(offsets - offsets[0], _RANGE), balanced_ranges(run.row_offsets)
+
+    def add(i: int) -> tuple[np.ndarray, ...]:
+        sums = np.zeros_like(diagonal), np.zeros_like(gradient), np.zeros_like(costs)
+        first, last = run.first + ranges[i][0], run.first + ranges[i][1]
         linearize_range(
-            *ranges[i], obs, visits, points, poses, W, inverses, shifts, *sums, point_costs
+            first, last, obs, run, points, poses, W, inverses, shifts, *sums, point_costs
         )
         return sums
 
-    parts = map_in_threads(work, len(ranges), num_threads)
-    total = next(parts)
-    for part in parts:
-        for target, more in zip(total, part, strict=True):
-            target += more
-    diagonal, gradient, costs = total
-    off_diagonal = np.zeros((len(columns), 6, 6))
-    rows = balanced_ranges(visits.row_offsets)
-
     def reduce(i: int) -> None:
-        eliminate_rows(
-            *rows[i], visits, W, inverses, shifts, row_starts, columns, diagonal, off_diagonal,
-            gradient,
-        )  # fmt: skip
+        eliminate_rows(*rows[i], run, W, inverses, shifts, *pattern)
 
+    for part in map_in_threads(add, len(ranges), num_threads):
+        for target, more in zip((diagonal, gradient, costs), part, strict=True):
+            target += more
     run_in_threads(reduce, len(rows), num_threads)
-    return (diagonal, off_diagonal, gradient), costs, point_costs

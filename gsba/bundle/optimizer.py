@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from factors import Block
 from factors.reduced import ReducedSystem
@@ -81,6 +82,7 @@ class _History:
         self.since = time.perf_counter()
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")  # sums keep their order, fronts are small
 def optimize(
     graph: gtsam.NonlinearFactorGraph,
     blocks: Sequence[Block],
@@ -158,6 +160,7 @@ def _checked_sum(costs: Mapping[str, float]) -> float:
     return sum(costs.values())
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def marginal_covariances(
     graph: gtsam.NonlinearFactorGraph,
     blocks: Sequence[Block],
