@@ -24,7 +24,6 @@ class Observations(NamedTuple):
     whiteners: np.ndarray  # (O, 3): [s00, s01, s11] of the upper triangular 2x2 sqrt information
     origins: np.ndarray  # (O, 3): where the ray starts, rig frame, map units
     cameras: np.ndarray  # (C, 12): [rig_R_face row-major (9), focal, principal u, v in pixels]
-    longest: int  # most observations of one landmark
     loss: int  # code of the robust loss
     loss_scale: float
 
@@ -120,7 +119,6 @@ def sort_observations(
         whiteners=np.empty((len(order), 3)),
         origins=np.zeros((len(order), 3)),
         cameras=np.concatenate([np.zeros((0, 12)), *(term.cameras() for term in terms)]),
-        longest=int(np.diff(offsets).max(initial=0)),
         loss=loss.code,
         loss_scale=float(loss.scale),
     )

@@ -11,7 +11,7 @@ from factors.supernodes import find_supernodes
 
 DIM = 6
 
-_kernel, _part = kernel_and_part()
+_kernel, _ = kernel_and_part()
 
 
 @dataclass(slots=True)

@@ -15,6 +15,7 @@ from factors import (
     ReprojectionFactor,
     ReprojectionTerm,
     RobustLoss,
+    landmarks,
 )
 from factors.reduced import ReducedSystem
 from gsba.bundle.optimizer import marginal_covariances, optimize
@@ -375,6 +376,17 @@ def test_bad_terms_are_named(world):
         LandmarkBlock(world.keys, np.zeros((1, 3)), [BearingTerm(one, one, np.eye(3)[:1], 0.0)])
     with pytest.raises(ValueError, match="no value"):
         optimize(world.graph, [], gtsam.Values())
+
+
+def test_landmarks_are_eliminated_in_runs_of_any_length(world, monkeypatch):
+    whole = world.block().linearize(world.values)
+    monkeypatch.setattr(landmarks, "_VISITS", 7)
+    block = world.block()
+    assert len(block._visits) > 20
+    parts = block.linearize(world.values)
+    for name in ("diagonal", "off_diagonal", "gradient"):
+        assert np.allclose(getattr(parts, name), getattr(whole, name), rtol=1e-10, atol=1e-6)
+    assert parts.costs == pytest.approx(whole.costs, rel=1e-12)
 
 
 def test_steps_by_iterations_are_those_of_a_factorization(world):
