@@ -107,7 +107,7 @@ def _check_fisheyes(run: Path) -> None:
     assert all(mask is not None and mask[0, 0] == 0 for mask in masks)
     result = CliRunner().invoke(app, [*call, "cube", "--out", str(run / "cube")])
     assert result.exit_code == 0 and len(list((run / "cube/images").iterdir())) == 6
-    wrong = ["export", str(run), "--to", "nerfstudio", "--images", "fisheye"]
+    wrong = ["export", str(run), "--to", "tum", "--images", "fisheye"]
     result = CliRunner().invoke(app, [*wrong, "--out", str(run / "no")])
     assert result.exit_code == 1 and "colmap" in result.output and not (run / "no").exists()
 
