@@ -24,7 +24,7 @@ from gsba.types import Reconstruction
 _COARSE = 128  # width of the grid that depths are taken on
 _NEAREST = 12.0  # distances of a lens from the middle: nearer, the seam lies beyond fisheyes' rims
 _FAR = 1e9  # map units
-_BAND = 256  # rows of which coordinates are held in double precision
+_BAND = 128  # rows of which coordinates are held in double precision
 
 _Look = Callable[[int, np.ndarray], np.ndarray]  # lens and directions (h, w, 3) to pixels (h, w, C)
 
