@@ -372,6 +372,13 @@ class SplatFactorSettings(_Settings):
     backend: Literal["auto", "gsplat", "cpu"] = "auto"
 
 
+# Which formats have a place for images that are no faces.
+FORMATS_OF: dict[str, tuple[str, ...]] = {
+    "fisheye": ("colmap", "colmap-flat", "nerfstudio"),
+    "panorama": ("colmap-erp", "nerfstudio", "tum"),
+}
+
+
 class ExportSettings(_Settings):
     """Datasets written at the end of a run."""
 
@@ -381,9 +388,18 @@ class ExportSettings(_Settings):
     face_size: int | None = Field(
         default=None, ge=16, le=_MAX_FACE
     )  # pixels; None = a quarter of the panorama's width
-    images: Literal["auto", "cube", "lenses", "fisheye"] = "auto"  # six faces as seen from one
-    # centre, ten of one lens each where two are known, raw fisheyes as they are; auto: cube, of raw
-    # fisheyes lenses
+    images: Literal["auto", "cube", "lenses", "fisheye", "panorama"] = "auto"  # six faces as seen
+    # from one centre, ten of one lens each where two are known, raw fisheyes as they are, panoramas
+    # at the map's depth; auto: cube, of raw fisheyes lenses
+
+    @model_validator(mode="after")
+    def _images_fit(self) -> "ExportSettings":
+        fitting = FORMATS_OF.get(self.images, self.formats)
+        for name in self.formats:
+            if name not in fitting:
+                choices = ", ".join(fitting)
+                raise ValueError(f"images = {self.images} goes with {choices}, not with {name}")
+        return self
 
 
 class SplatSettings(_Settings):

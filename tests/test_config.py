@@ -151,6 +151,13 @@ def test_configs_are_shipped() -> None:
     assert CONFIGS
 
 
+def test_images_that_a_format_has_no_place_for_are_refused_early() -> None:
+    with pytest.raises(GsbaError, match=r"panorama goes with .* tum, not with colmap$"):
+        load_config(None, ("export.images=panorama",))
+    fitting = 'export.formats=["colmap-erp","tum"]'
+    assert load_config(None, ("export.images=panorama", fitting)).export.images == "panorama"
+
+
 def test_sections_under_their_former_names_are_read(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

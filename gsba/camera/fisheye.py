@@ -107,17 +107,29 @@ def difference(lens: Fisheye, before: Fisheye) -> np.ndarray:
     return np.array([np.log(lens.focal / before.focal), *away, *radial, *turn.as_rotvec()])
 
 
-def pixels_of(pair: Pair, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lens (...,), 0 or 1, that faces directions (..., 3), and their pixels (..., 2) in it."""
-    lens = (directions[..., 2] < 0).astype(int)
+def pixels_of(
+    pair: Pair, directions: np.ndarray, behind: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lens (...,), 0 or 1, that faces directions (..., 3), and their pixels (..., 2) in it.
+
+    Args:
+        behind: (...,) bool, which ones are to be the back lens's; None = those that it faces.
+    """
+    lens = (directions[..., 2] < 0 if behind is None else behind).astype(int)
     both = np.stack([project(one, directions) for one in pair])
     return lens, np.where(lens[..., None] == 0, both[0], both[1])
 
 
-def recalibrated(directions: np.ndarray, before: Pair, after: Pair) -> np.ndarray:
-    """Where pixels are by other lenses than those that their directions (N, 3) are by."""
+def recalibrated(
+    directions: np.ndarray, before: Pair, after: Pair, behind: np.ndarray | None = None
+) -> np.ndarray:
+    """Where pixels are by other lenses than those that their directions (N, 3) are by.
+
+    Args:
+        behind: (N,) bool, which ones are the back lens's; None = those that it faces.
+    """
     out = np.empty_like(directions)
-    behind = directions[:, 2] < 0
+    behind = directions[:, 2] < 0 if behind is None else behind
     for part, old, new in zip((~behind, behind), before, after, strict=True):
         out[part] = unproject(new, project(old, directions[part]))
     return out

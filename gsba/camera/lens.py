@@ -53,12 +53,18 @@ class Lenses:
             return directions
         return np.einsum("nji,nj->ni", self.axes[frames], directions)
 
-    def origins(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
-        """Centres (N, 3) of the lenses that face directions (N, 3), both in the rig frame."""
-        signs = facing(self.own(directions, frames))[:, None]
+    def origins(
+        self, directions: np.ndarray, frames: np.ndarray, signs: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Centres (N, 3) of the lenses that face directions (N, 3), both in the rig frame.
+
+        Args:
+            signs: (N,) of the lenses to take instead, 1 = front, -1 = back.
+        """
+        signs = facing(self.own(directions, frames)) if signs is None else signs
         if self.axes is None:
-            return signs * self.centre
-        return signs * (self.axes[frames] @ self.centre)
+            return signs[:, None] * self.centre
+        return signs[:, None] * (self.axes[frames] @ self.centre)
 
     def by_centre(
         self, by_origin: np.ndarray, directions: np.ndarray, frames: np.ndarray
@@ -68,28 +74,43 @@ class Lenses:
         return signs * (by_origin if self.axes is None else by_origin @ self.axes[frames])
 
     def fractions(
-        self, directions: np.ndarray, frames: np.ndarray, sweeps: np.ndarray | None = None
+        self,
+        directions: np.ndarray,
+        frames: np.ndarray,
+        sweeps: np.ndarray | None = None,
+        signs: np.ndarray | None = None,
     ) -> np.ndarray:
         """When frames (N,) read unit directions (N, 3), part of the readout, (N,), 0 = its middle.
 
         Of raw pairs rows are known. Else a lens is taken to be equidistant: what it is not, twists
-        take up.
+        take up. The lens is the one that faces a direction, or that of `signs` as in `origins`.
         """
         sweeps = self.sweeps if sweeps is None else sweeps
         if sweeps is None:
             return np.zeros(len(directions))
         if self.cut_by is not None:
-            lens, pixels = pixels_of(self.cut_by, directions)
+            behind = None if signs is None else signs < 0
+            lens, pixels = pixels_of(self.cut_by, directions, behind)
             heights = np.array([one.height for one in self.cut_by])[lens]
             down = rows_run(self.cut_by)
             return np.sign(np.sum(down * sweeps, axis=1))[lens] * (pixels[:, 1] / heights - 0.5)
         own = self.own(directions, frames)
         across = own[:, :2]
         radii = np.linalg.norm(across, axis=1)
-        angles = np.arctan2(radii, np.abs(own[:, 2]))
-        lens = (own[:, 2] < 0).astype(int)
+        signs = facing(own) if signs is None else signs
+        angles = np.arctan2(radii, signs * own[:, 2])
+        lens = (signs < 0).astype(int)
         along = np.einsum("ni,ni->n", across, np.asarray(sweeps)[lens, :2])
         return angles / (2 * _HALF_FOV) * along / np.maximum(radii, 1e-12)
+
+    def swept(self, frame: int) -> np.ndarray:
+        """The rig of a frame when the front and the back lens of a raw pair read their top and
+        their bottom edge, (2, 2, 4, 4), in the rig in the middle of the readout."""
+        assert self.cut_by is not None and self.twists is not None and self.sweeps is not None
+        ways = np.sign(np.sum(rows_run(self.cut_by) * self.sweeps, axis=1))
+        moved = np.multiply.outer(np.outer(ways, [-0.5, 0.5]), self.twists[frame])
+        turns = _rotations(moved[..., :3].reshape(4, 3)).reshape(2, 2, 3, 3)
+        return pose(turns, moved[..., 3:])
 
     def rays(self, directions: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Directions and starts (N, 3) of what frames (N,) show in directions (N, 3), rig frame
@@ -119,17 +140,20 @@ class Lenses:
             turns, starts = later @ turns, np.einsum("nij,nj->ni", later, starts) + moves
         return pose(turns, starts)
 
-    def seeing(self, points_rig: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    def seeing(
+        self, points_rig: np.ndarray, frames: np.ndarray, signs: np.ndarray | None = None
+    ) -> np.ndarray:
         """Points (N, 3), rig frame in the middle of the readout, as the lens of frames (N,) that
-        faces each has them: vectors (N, 3) along the directions in which they are shown."""
-        vectors = self._shown(points_rig, frames)
+        faces each has them, or that of `signs` as in `origins`: vectors (N, 3) along the directions
+        in which they are shown."""
+        vectors = self._shown(points_rig, frames, signs)
         if self.twists is None:
             return vectors
         for _ in range(_SETTLED):
             units = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
-            turns, moves = self._moved(units, frames)
+            turns, moves = self._moved(units, frames, signs)
             local = np.einsum("nij,nj->ni", np.swapaxes(turns, 1, 2), points_rig - moves)
-            vectors = self._shown(local, frames)
+            vectors = self._shown(local, frames, signs)
         return vectors
 
     def calibrated(self, directions: np.ndarray) -> np.ndarray:
@@ -138,21 +162,26 @@ class Lenses:
             return directions
         return recalibrated(directions, self.cut_by, self.fisheyes)
 
-    def _moved(self, directions: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _moved(
+        self, directions: np.ndarray, frames: np.ndarray, signs: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """How frames (N,) turn (N, 3, 3) and move (N, 3) from their middle to the rows of unit
         directions (N, 3)."""
         assert self.twists is not None
-        moved = self.fractions(directions, frames)[:, None] * self.twists[frames]
+        moved = self.fractions(directions, frames, signs=signs)[:, None] * self.twists[frames]
         return _rotations(moved[:, :3]), moved[:, 3:]
 
-    def _shown(self, points: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    def _shown(
+        self, points: np.ndarray, frames: np.ndarray, signs: np.ndarray | None
+    ) -> np.ndarray:
         """Points (N, 3) along where a stitcher puts the directions that their lens sees them in."""
-        origins = self.origins(points, frames)
+        origins = self.origins(points, frames, signs)
         vectors = points - origins
         if self.cut_by is not None and self.fisheyes is not None:
             lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
             units = vectors / np.maximum(lengths, 1e-300)
-            return lengths * recalibrated(units, self.fisheyes, self.cut_by)
+            behind = None if signs is None else signs < 0
+            return lengths * recalibrated(units, self.fisheyes, self.cut_by, behind)
         if not self.nearness:
             return vectors
         lengths = np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -25,6 +25,9 @@ _FAR = 1e9  # map units: from there both lenses see alike
 _DENSE = 1.5  # times as many pixels as a view: beyond it, detail aliases
 _NEIGHBOURS = 12  # points that tell how far things are in a direction
 _SMOOTH = np.deg2rad(3.0)  # over which they are averaged, at least
+_ALIKE = 0.1  # part of a distance: what is further off a plane is of another one
+_UNTILTED = 0.05  # weight of a plane that faces the camera, part of the points'
+_ROBUST = 4  # rounds of weighting points by how far they lie off the plane
 _NODES = 33  # across a face: what lenses bend turns over tens of degrees
 
 
@@ -143,7 +146,7 @@ def _in_the_middle(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruc
     """The same with rays from the lenses' centres to where observed rays are at their points."""
     bearings, frames = reconstruction.observation_bearings, reconstruction.observation_frames
     origins = lenses.origins(bearings, frames)
-    rays = _observed_points(reconstruction) - origins
+    rays = observed_points(reconstruction) - origins
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return replace(reconstruction, observation_bearings=rays, observation_origins=origins)
 
@@ -153,7 +156,7 @@ def shown_in_pictures(reconstruction: Reconstruction, lenses: Lenses) -> Reconst
     if lenses.twists is None:
         return reconstruction
     frames = reconstruction.observation_frames
-    shown = lenses.seeing(_observed_points(reconstruction), frames)
+    shown = lenses.seeing(observed_points(reconstruction), frames)
     shown /= np.linalg.norm(shown, axis=1, keepdims=True)
     origins = lenses.origins(shown, frames)
     return replace(reconstruction, observation_bearings=shown, observation_origins=origins)
@@ -173,7 +176,7 @@ def scenes_of(reconstruction: Reconstruction) -> Callable[[int], np.ndarray]:
     return scene
 
 
-def _observed_points(reconstruction: Reconstruction) -> np.ndarray:
+def observed_points(reconstruction: Reconstruction) -> np.ndarray:
     """Where (O, 3), rig frames, rays of two lenses are once as far as the points they observe."""
     starts = reconstruction.observation_origins
     assert starts is not None
@@ -270,26 +273,47 @@ def _offsets(view: View, lenses: Lenses, frame: int, scene: np.ndarray | None) -
     frames = np.full(len(rays), frame)
     ends = _FAR * turned
     if scene is not None and len(scene):
-        ends = lenses.origins(turned, frames) + _depths(turned, scene)[:, None] * turned
+        ends = lenses.origins(turned, frames) + depths_along(turned, scene)[:, None] * turned
     shown = lenses.seeing(ends, frames)
     shown /= np.linalg.norm(shown, axis=1, keepdims=True)
     return (shown - turned).reshape(_NODES, _NODES, 3).astype(np.float32)
 
 
-def _depths(directions: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """How far (N,) things are in unit directions (N, 3), by points (M, 3) around: smooth."""
+def depths_along(directions: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """How far (N,) things are in unit directions (N, 3), by points (M, 3) around.
+
+    Each is on a plane through the points nearest in direction: there, inverse distances are linear
+    in directions. Points off it count little; where they cannot tell its tilt, it faces the camera.
+    """
     from scipy.spatial import KDTree
 
     lengths = np.linalg.norm(points, axis=1)
-    near = min(_NEIGHBOURS, len(points))
-    apart, rows = KDTree(points / lengths[:, None]).query(directions, k=near)
+    units, near = points / lengths[:, None], min(_NEIGHBOURS, len(points))
+    apart, rows = KDTree(units).query(directions, k=near)
     apart, rows = apart.reshape(-1, near), rows.reshape(-1, near)
     spread = np.maximum(apart[:, near // 2, None], _SMOOTH)
-    weights, order = np.exp(-((apart / spread) ** 2)), np.argsort(lengths[rows], axis=1)
+    weights, inverse = np.exp(-((apart / spread) ** 2)), 1 / lengths[rows]
+    middle = _weighted_median(inverse, weights)
+    flat, beside = middle[:, None] * directions, units[rows]
+    tilt, left = np.zeros_like(flat), inverse - np.einsum("nki,ni->nk", beside, flat)
+    facing_us = (_UNTILTED * spread**2 * weights.sum(axis=1, keepdims=True))[..., None] * np.eye(3)
+    for _ in range(_ROBUST):
+        off = (left - np.einsum("nki,ni->nk", beside, tilt)) / (_ALIKE * middle[:, None])
+        shares = weights / (1 + off**2)
+        normal = np.einsum("nk,nki,nkj->nij", shares, beside, beside) + facing_us
+        right = np.einsum("nk,nki,nk->ni", shares, beside, left)
+        tilt = np.linalg.solve(normal, right[..., None])[..., 0]
+    found = np.einsum("ni,ni->n", flat + tilt, directions)
+    return 1 / np.clip(found, inverse.min(axis=1), inverse.max(axis=1))
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(N,) of rows of values (N, K)."""
+    order = np.argsort(values, axis=1)
     heights = np.cumsum(np.take_along_axis(weights, order, axis=1), axis=1)
     half = np.argmax(heights >= heights[:, -1:] / 2, axis=1)
     middle = np.take_along_axis(order, half[:, None], axis=1)
-    return np.take_along_axis(lengths[rows], middle, axis=1)[:, 0]
+    return np.take_along_axis(values, middle, axis=1)[:, 0]
 
 
 def views_for(frames: FrameSet, size: int, lenses: Lenses) -> tuple[View, ...]:

@@ -40,8 +40,9 @@ Images = Annotated[
     str,
     typer.Option(
         help="cube: six faces of one centre; lenses: ten of one lens each, where two were found; "
-        "fisheye: raw ones as they are; auto: lenses of raw fisheyes, else cube.",
-        metavar="auto|cube|lenses|fisheye",
+        "fisheye: raw ones as they are; panorama: two lenses stitched at the map's depth, else the "
+        "frames; auto: lenses of raw fisheyes, else cube.",
+        metavar="auto|cube|lenses|fisheye|panorama",
     ),
 ]
 
@@ -89,7 +90,7 @@ def export(
     if to not in list(ExportFormat):
         raise GsbaError(f"--to {to} is not known: use one of {', '.join(ExportFormat)}")
     asked = {"up": up, "length": _length(scale), "between": between, "gps": gps, "align": align}
-    dataset = {"face_size": face_size, "images": images}
+    dataset = {"face_size": face_size, "images": images, "formats": [to]}
     settings = validated({"placement": asked, "export": dataset}).placement
     from gsba.placement.placement import place
     from gsba.store.finished import load_run
@@ -100,7 +101,7 @@ def export(
     said = _baseline(run, baseline) if scale == "lens" else None
     placement = place(reconstruction, frames, settings, said)
     given = reconstruction, frames, folder, ExportFormat(to), face_size, placement, link, lenses
-    write(*given, raw=images == "fisheye")
+    write(*given, images=images)
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
     typer.echo(f"{to}: {folder}")
@@ -118,7 +119,7 @@ def _lenses(
     from gsba.store.finished import load_lenses
 
     lenses = load_lenses(run, reconstruction)
-    if not lenses and images != "auto":
+    if not lenses and images not in ("auto", "panorama"):
         raise GsbaError(f"{run}: no two lenses were found: export it without --images {images}")
     return lenses
 

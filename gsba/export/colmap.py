@@ -10,7 +10,8 @@ Layouts:
   faces of every eighth frame: holding out single faces would leave their siblings in the training.
 * both with raw fisheyes as they are (`--images fisheye`): two OPENCV_FISHEYE cameras and
   `images/front`, `images/back`; masks leave out what is beyond the circles; rows are as they were.
-* `colmap-erp`: one EQUIRECTANGULAR camera and the panoramas themselves.
+* `colmap-erp`: one EQUIRECTANGULAR camera and the panoramas themselves; of two lenses, as one in
+  the middle would have them (`gsba.camera.one_centre`).
 
 A frame's pose is stored as rig_from_world, where COLMAP's rig frame is that of the first camera.
 Image f * C + c + 1 is face c of frame f, point j + 1 is point j.
@@ -25,6 +26,7 @@ import numpy as np
 
 from gsba.camera.fisheye import project, rotation_of
 from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.camera.one_centre import seen_from_the_middle
 from gsba.camera.sphere import erp_from_bearings
 from gsba.camera.views import View, scenes_of, seen_from_lenses, shown_in_pictures, views_for
 from gsba.export.images import face_size_for, suffix_of, write_panoramas, write_views
@@ -127,7 +129,11 @@ def write_colmap_raw(
 
 
 def write_colmap_erp(
-    partial: Path, reconstruction: Reconstruction, frames: FrameSet, link: bool = False
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    link: bool = False,
+    lenses: Lenses = ONE_CENTRE,
 ) -> None:
     """Write the equirectangular layout into `partial`."""
     if not frames.panoramic:
@@ -135,12 +141,15 @@ def write_colmap_erp(
     size = (frames.width, frames.height)
     sensor = Sensor("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), np.eye(4))
     names = [_file(frames, f) for f in range(len(frames))]
-    write_model(partial / "sparse" / "0", reconstruction, [sensor], [[name] for name in names])
+    seen = seen_from_the_middle(reconstruction) if lenses else reconstruction
+    write_model(partial / "sparse" / "0", seen, [sensor], [[name] for name in names])
     write_panoramas(
         frames,
         lambda f: partial / "images" / names[f],
         lambda f: partial / "masks" / f"{names[f]}.png",
         link,
+        lenses,
+        scenes_of(reconstruction),
     )
 
 

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.config import FORMATS_OF
 from gsba.export.folder import output_folder
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement
-from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
+from gsba.types import FrameSet, PoseStatus, Reconstruction
 
 logger = logging.getLogger(__name__)
 
@@ -23,7 +24,7 @@ class ExportFormat(StrEnum):
     COLMAP_ERP = "colmap-erp"  # one equirectangular camera
     NERFSTUDIO = "nerfstudio"  # transforms.json: pinhole faces, and panoramas
     PLY = "ply"  # points3D.ply, the start cloud of splat trainers
-    TUM = "tum"  # trajectory.tum
+    TUM = "tum"  # trajectory.tum, and panoramas on request
 
 
 def export(
@@ -35,7 +36,7 @@ def export(
     placement: Placement | None = None,
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
-    raw: bool = False,
+    images: str = "auto",
 ) -> None:
     """Write a reconstruction in another program's format, all frames of it.
 
@@ -49,14 +50,16 @@ def export(
         placement: where to put the world; None = where the run has it. `transform.json` states it.
         link: hard links to the frames where these leave unchanged, not copies: who edits one edits
             the other.
-        lenses: of the frames, in the unit of the reconstruction: faces are of one lens each then.
-
-        raw: raw fisheyes go out as they are, not as faces; only in COLMAP's formats.
+        lenses: of the frames, in the unit of the reconstruction: faces are of one lens each then,
+            and panoramas stitched at the map's depth.
+        images: as `export.images` says it: fisheye for raw ones as they are, panorama for panoramas
+            alone, else faces.
 
     Raises:
         GsbaError: `out` is in use, the format does not fit the frames, or the disk refuses;
             nothing is left behind then.
     """
+    _require_fitting(to, frames, images)
     unrefined = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
     if len(unrefined):
         names = ", ".join(frames.names[f] for f in unrefined[:5])
@@ -68,10 +71,12 @@ def export(
     reconstruction = placement.apply(reconstruction)
     with output_folder(out, to.value) as partial:
         seen_by = lenses.scaled(placement.similarity.scale)
-        if raw:
-            _write_raw(partial, reconstruction, frames, to, link, seen_by)
+        z_up = placement.up == "z"
+        if images == "fisheye":
+            _write_raw(partial, reconstruction, frames, to, z_up, link, seen_by)
+        elif images == "panorama":
+            _write_panoramas(partial, reconstruction, frames, to, z_up, link, seen_by)
         else:
-            z_up = placement.up == "z"
             _write(partial, reconstruction, frames, to, face_size, z_up, link, seen_by)
         placement.write(partial / "transform.json")
     logger.info(
@@ -84,15 +89,47 @@ def _write_raw(
     reconstruction: Reconstruction,
     frames: FrameSet,
     to: ExportFormat,
+    z_up: bool,
     link: bool,
     lenses: Lenses,
 ) -> None:
-    from gsba.export import colmap
+    from gsba.export import colmap, nerfstudio
 
-    if to not in (ExportFormat.COLMAP, ExportFormat.COLMAP_FLAT):
-        raise GsbaError(f"--images fisheye goes with colmap or colmap-flat, not with {to.value}")
+    if to == ExportFormat.NERFSTUDIO:
+        nerfstudio.write_nerfstudio_raw(partial, reconstruction, frames, lenses, z_up, link)
+        return
     flat = to == ExportFormat.COLMAP_FLAT
     colmap.write_colmap_raw(partial, reconstruction, frames, lenses, flat, link)
+
+
+def _write_panoramas(
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    to: ExportFormat,
+    z_up: bool,
+    link: bool,
+    lenses: Lenses,
+) -> None:
+    from gsba.export import colmap, nerfstudio, panoramas
+
+    match to:
+        case ExportFormat.COLMAP_ERP:
+            colmap.write_colmap_erp(partial, reconstruction, frames, link, lenses)
+        case ExportFormat.NERFSTUDIO:
+            nerfstudio.write_nerfstudio_erp(partial, reconstruction, frames, lenses, z_up, link)
+        case _:
+            panoramas.write_with_poses(partial, reconstruction, frames, lenses, link)
+
+
+def _require_fitting(to: ExportFormat, frames: FrameSet, images: str) -> None:
+    """Refuse images that a format has no place for, and panoramas of what are none."""
+    fitting = FORMATS_OF.get(images, (to.value,))
+    if to.value not in fitting:
+        choices = ", ".join(fitting)
+        raise GsbaError(f"--images {images} goes with {choices}, not with {to.value}")
+    if images == "panorama" and not frames.panoramic:
+        raise GsbaError("--images panorama needs panoramas, these frames are cube faces: use cube")
 
 
 def _write(
@@ -106,6 +143,7 @@ def _write(
     lenses: Lenses,
 ) -> None:
     from gsba.export import colmap, nerfstudio, ply
+    from gsba.export.panoramas import write_poses
 
     match to:
         case ExportFormat.COLMAP:
@@ -113,7 +151,7 @@ def _write(
         case ExportFormat.COLMAP_FLAT:
             colmap.write_colmap_flat(partial, reconstruction, frames, face_size, link, lenses)
         case ExportFormat.COLMAP_ERP:
-            colmap.write_colmap_erp(partial, reconstruction, frames, link)
+            colmap.write_colmap_erp(partial, reconstruction, frames, link, lenses)
         case ExportFormat.NERFSTUDIO:
             nerfstudio.write_nerfstudio(
                 partial, reconstruction, frames, face_size, z_up, link, lenses
@@ -123,7 +161,4 @@ def _write(
                 partial / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
             )
         case ExportFormat.TUM:
-            from gsba.trajectory.files import write_tum
-
-            trajectory = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
-            write_tum(partial / "trajectory.tum", trajectory)
+            write_poses(partial, reconstruction, frames)

@@ -17,7 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.camera.lens import Lenses
+from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.camera.one_centre import Stitcher
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import View, ViewCutter
 from gsba.disk import write_image
@@ -47,8 +48,10 @@ def face_size_for(frames: FrameSet, face_size: int | None) -> int:
 
 
 def of_one_lens(images: str, frames: FrameSet) -> bool:
-    """Whether faces are to be of one lens each, as `export.images` says it."""
-    return images in ("lenses", "fisheye") or (images == "auto" and frames.fisheyes is not None)
+    """Whether two lenses are told apart where they are known, as `export.images` says it."""
+    return images in ("lenses", "fisheye", "panorama") or (
+        images == "auto" and frames.fisheyes is not None
+    )
 
 
 def suffix_of(frames: FrameSet, f: int) -> str:
@@ -144,7 +147,7 @@ def of_all_frames(write: Callable[[int], None], num_frames: int) -> None:
     with ThreadPoolExecutor(min(os.cpu_count() or 1, _AT_ONCE)) as pool:
         running = [pool.submit(write, f) for f in range(num_frames)]
         try:
-            for future in track(running, "cutting faces"):
+            for future in track(running, "writing images"):
                 future.result()
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
@@ -155,17 +158,25 @@ def write_panoramas(
     image_path: Callable[[int], Path],
     mask_path: Callable[[int], Path],
     link: bool = False,
+    lenses: Lenses = ONE_CENTRE,
+    scenes: Callable[[int], np.ndarray] | None = None,
 ) -> None:
     """Copy every panorama, and write its mask where the frames have masks.
 
-    Panoramas that are corrected, and those of raw pairs, are written anew.
+    Panoramas that are corrected, and those of raw pairs, are written anew; those of two lenses are
+    stitched by `gsba.camera.one_centre`.
 
     Args:
         frames: panoramas.
         image_path: file of the image, by frame index.
         mask_path: file of the mask (PNG, 0 = ignore, 255 = use).
         link: hard links instead of copies.
+        lenses: of these frames.
+        scenes: points (N, 3) around a frame, rig frame, by its index: how far things are.
     """
+    if lenses:
+        _stitch_panoramas(frames, image_path, mask_path, lenses, scenes)
+        return
     for f in track(range(len(frames)), "copying panoramas"):
         if frames.correction or frames.fisheyes:
             write_image(image_path(f), load_erp(frames, f))
@@ -176,6 +187,28 @@ def write_panoramas(
             if mask is None:
                 mask = np.ones((frames.height, frames.width), bool)
             write_image(mask_path(f), mask.astype(np.uint8) * 255)
+
+
+def _stitch_panoramas(
+    frames: FrameSet,
+    image_path: Callable[[int], Path],
+    mask_path: Callable[[int], Path],
+    lenses: Lenses,
+    scenes: Callable[[int], np.ndarray] | None,
+) -> None:
+    def write(f: int) -> None:
+        stitcher = Stitcher(lenses, f, np.zeros((0, 3)) if scenes is None else scenes(f))
+        if frames.fisheyes is not None:
+            erp = stitcher.stitched_raw(load_raw(frames, f), frames.width)
+        else:
+            erp = stitcher.stitched(load_erp(frames, f))
+        write_image(image_path(f), erp)
+        if has_masks(frames):
+            mask = load_mask(frames, f)
+            whole = np.ones((frames.height, frames.width), bool) if mask is None else mask
+            write_image(mask_path(f), stitcher.stitched_mask(whole).astype(np.uint8) * 255)
+
+    of_all_frames(write, len(frames))
 
 
 def pass_on(source: Path, path: Path, link: bool) -> None:

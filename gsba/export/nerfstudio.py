@@ -1,11 +1,20 @@
-"""nerfstudio datasets: pinhole faces in transforms.json, panoramas in transforms_erp.json.
+"""nerfstudio datasets: pinhole faces in transforms.json, panoramas in transforms_erp.json; or, as
+`export.images` asks, panoramas alone or raw fisheyes alone in transforms.json.
 
 nerfstudio's cameras have OpenGL axes (y up, z backward) and its world has z up, so the world
 is turned by NERFSTUDIO_R_WORLD, which `applied_transform` states and the cloud shares. Base names
 are unique, because nerfstudio looks for down-scaled images by base name. Every eighth panorama is
 held out with all its faces: a face left in for training would give its siblings away. Splat
 trainers need the faces; the panoramas are for models that take equirectangular rays:
-`ns-train nerfacto --data OUT/transforms_erp.json`.
+`ns-train nerfacto --data OUT/transforms_erp.json`. nerfstudio takes what stands above the frames
+for all of them: lengths that differ stand with each frame alone.
+
+Raw fisheyes are OPENCV_FISHEYE with masks. Where the motion during the readout is known, each frame
+has, as instant-ngp reads them, `transform_matrix_start` and `transform_matrix_end` beside the pose
+of the middle, of the top and of the bottom edge of the picture, and `rolling_shutter` is
+[0, 0, 1, 0]: a pixel's pose is that share of the way from one to the other which its row is of the
+height. That is gsplat's ROLLING_TOP_TO_BOTTOM, with the inverses (in axes y down, z forward) as
+`viewmats` and `viewmats_rs`, and k1 to k4 as `radial_coeffs`.
 """
 
 import json
@@ -15,15 +24,19 @@ from typing import Any
 
 import numpy as np
 
+from gsba.camera.fisheye import rotation_of
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.views import View, scenes_of, seen_from_lenses, views_for
 from gsba.export.images import face_size_for, has_masks, suffix_of, write_panoramas, write_views
 from gsba.export.ply import write_splat_points
-from gsba.types import FrameSet, Reconstruction
+from gsba.export.raw import LENSES, raw_lenses, write_raw
+from gsba.geometry import pose
+from gsba.types import Fisheye, FrameSet, Reconstruction
 
 NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 _CV_R_GL = np.diag([1.0, -1, -1])  # OpenGL camera axes in our camera axes
 _CLOUD = "points3D.ply"
+_SEEN_DEG = 90.0  # from a fisheye's axis: gsplat draws nothing beyond, where the other lens sees
 _HOLD_OUT_EVERY = 8  # panoramas, as in the benchmarks of splat trainers
 
 
@@ -40,15 +53,78 @@ def write_nerfstudio(
 
     A world whose z points up already is not turned.
     """
-    out_R_world = np.eye(3) if z_up else NERFSTUDIO_R_WORLD
-    points = reconstruction.points_world @ out_R_world.T
-    write_splat_points(partial / _CLOUD, points, reconstruction.point_colors)
+    out_R_world = _write_cloud(partial, reconstruction, z_up)
     views = views_for(frames, face_size_for(frames, face_size), lenses)
     seen = seen_from_lenses(reconstruction, lenses)
     scenes = scenes_of(reconstruction)
     _write_face_dataset(partial, seen, frames, views, out_R_world, link, lenses, scenes)
     if frames.panoramic:
-        _write_erp_dataset(partial, reconstruction, frames, out_R_world, link)
+        given = partial, reconstruction, frames, lenses, out_R_world, link
+        _write_erp_dataset(*given, "_erp")
+
+
+def write_nerfstudio_erp(
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    lenses: Lenses,
+    z_up: bool = False,
+    link: bool = False,
+) -> None:
+    """Write panoramas, cloud and transforms.json into `partial`."""
+    out_R_world = _write_cloud(partial, reconstruction, z_up)
+    _write_erp_dataset(partial, reconstruction, frames, lenses, out_R_world, link, "")
+
+
+def write_nerfstudio_raw(
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    lenses: Lenses,
+    z_up: bool = False,
+    link: bool = False,
+) -> None:
+    """Write raw fisheyes as they are, cloud and transforms.json into `partial`."""
+    pair = raw_lenses(frames)
+    out_R_world = _write_cloud(partial, reconstruction, z_up)
+
+    def image(f: int, lens: int) -> str:
+        return f"images/{frames.names[f]}_{LENSES[lens]}{suffix_of(frames, f)}"
+
+    def mask(f: int, lens: int) -> str:
+        return f"masks/{frames.names[f]}_{LENSES[lens]}.png"
+
+    moving = lenses.twists is not None and lenses.sweeps is not None
+    entries = []
+    for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
+        rigs = lenses.swept(f) if moving else None
+        for number, (lens, sign) in enumerate(zip(pair, (1.0, -1.0), strict=True)):
+            rig_T_lens = pose(rotation_of(lens), sign * lenses.centre)
+            entry = _entry(image(f, number), out_R_world, world_T_rig @ rig_T_lens)
+            if rigs is not None:
+                for name, rig_T_rig in zip(("start", "end"), rigs[number], strict=True):
+                    matrix = _matrix(out_R_world, world_T_rig @ rig_T_rig @ rig_T_lens)
+                    entry[f"transform_matrix_{name}"] = matrix
+            entries.append({**entry, **_fisheye(lens), "mask_path": mask(f, number)})
+    camera: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE", "is_fisheye": True}
+    if moving:
+        camera["rolling_shutter"] = [0, 0, 1, 0]
+    _write_transforms(partial / "transforms.json", camera, entries, len(frames), out_R_world)
+    write_raw(
+        frames,
+        lambda f, lens: partial / image(f, lens),
+        lambda f, lens: partial / mask(f, lens),
+        link,
+        _SEEN_DEG,
+    )
+
+
+def _write_cloud(partial: Path, reconstruction: Reconstruction, z_up: bool) -> np.ndarray:
+    """Write the cloud as nerfstudio's world has it; returns out_R_world (3, 3)."""
+    out_R_world = np.eye(3) if z_up else NERFSTUDIO_R_WORLD
+    points = reconstruction.points_world @ out_R_world.T
+    write_splat_points(partial / _CLOUD, points, reconstruction.point_colors)
+    return out_R_world
 
 
 def _write_face_dataset(
@@ -68,8 +144,9 @@ def _write_face_dataset(
         return f"masks/{frames.names[f]}_{face}.png"
 
     # OPENCV without distortion is a pinhole, under the one name that all readers know.
-    camera = {"camera_model": "OPENCV", **_intrinsics(views[0])}
-    camera |= {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+    camera = {"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+    if not lenses:
+        camera |= _intrinsics(views[0])
     entries = []
     for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
         for view in views:
@@ -96,14 +173,17 @@ def _write_erp_dataset(
     partial: Path,
     reconstruction: Reconstruction,
     frames: FrameSet,
+    lenses: Lenses,
     out_R_world: np.ndarray,
     link: bool,
+    which: str,
 ) -> None:
     def image(f: int) -> str:
-        return f"images_erp/{frames.names[f]}{frames.paths[f][0].suffix}"
+        suffix = suffix_of(frames, f) if lenses else frames.paths[f][0].suffix
+        return f"images{which}/{frames.names[f]}{suffix}"
 
     def mask(f: int) -> str:
-        return f"masks_erp/{frames.names[f]}.png"
+        return f"masks{which}/{frames.names[f]}.png"
 
     width, height = frames.width, frames.height
     camera = {"camera_model": "EQUIRECTANGULAR", "fl_x": width / 2, "fl_y": float(height)}
@@ -114,8 +194,16 @@ def _write_erp_dataset(
         if has_masks(frames):
             entry["mask_path"] = mask(f)
         entries.append(entry)
-    _write_transforms(partial / "transforms_erp.json", camera, entries, len(entries), out_R_world)
-    write_panoramas(frames, lambda f: partial / image(f), lambda f: partial / mask(f), link)
+    path = partial / f"transforms{which}.json"
+    _write_transforms(path, camera, entries, len(entries), out_R_world)
+    write_panoramas(
+        frames,
+        lambda f: partial / image(f),
+        lambda f: partial / mask(f),
+        link,
+        lenses,
+        scenes_of(reconstruction),
+    )
 
 
 def _intrinsics(view: View) -> dict[str, Any]:
@@ -124,12 +212,24 @@ def _intrinsics(view: View) -> dict[str, Any]:
     return {**lengths, "w": view.width, "h": view.height}
 
 
+def _fisheye(lens: Fisheye) -> dict[str, Any]:
+    cx, cy = lens.principal
+    lengths = {"fl_x": lens.focal, "fl_y": lens.focal, "cx": cx, "cy": cy}
+    radial = dict(zip(("k1", "k2", "k3", "k4"), lens.radial, strict=True))
+    return {**lengths, "w": lens.width, "h": lens.height, **radial}
+
+
 def _entry(file_path: str, out_R_world: np.ndarray, world_T_camera: np.ndarray) -> dict[str, Any]:
-    """A frame of transforms.json; its matrix maps OpenGL camera axes to nerfstudio's world."""
+    """A frame of transforms.json."""
+    return {"file_path": file_path, "transform_matrix": _matrix(out_R_world, world_T_camera)}
+
+
+def _matrix(out_R_world: np.ndarray, world_T_camera: np.ndarray) -> list[list[float]]:
+    """From OpenGL camera axes to nerfstudio's world, (4, 4)."""
     matrix = np.eye(4)
     matrix[:3, :3] = out_R_world @ world_T_camera[:3, :3] @ _CV_R_GL
     matrix[:3, 3] = out_R_world @ world_T_camera[:3, 3]
-    return {"file_path": file_path, "transform_matrix": matrix.tolist()}
+    return matrix.tolist()
 
 
 def _write_transforms(

@@ -14,7 +14,7 @@ from gsba.log import GsbaError
 from gsba.types import Fisheye, FrameSet
 
 LENSES = ("front", "back")
-_SEEN = np.deg2rad(95.0)  # from a lens's axis: further out, circles end and calibrations with them
+SEEN_DEG = 95.0  # from a lens's axis: further out, circles end and calibrations with them
 
 
 def raw_lenses(frames: FrameSet) -> Pair:
@@ -33,6 +33,7 @@ def write_raw(
     image_path: Callable[[int, int], Path],
     mask_path: Callable[[int, int], Path],
     link: bool = False,
+    seen_deg: float = SEEN_DEG,
 ) -> None:
     """Copy both pictures of every frame, and write masks of where they show something.
 
@@ -41,8 +42,9 @@ def write_raw(
         image_path: file of the image, by frame index and lens.
         mask_path: file of the mask (PNG, 0 = ignore, 255 = use).
         link: hard links instead of copies.
+        seen_deg: from a lens's axis, beyond which masks leave its picture out.
     """
-    shown = [_shown(lens) for lens in raw_lenses(frames)]
+    shown = [_shown(lens, seen_deg) for lens in raw_lenses(frames)]
 
     def write(f: int) -> None:
         mask = load_mask(frames, f)
@@ -56,12 +58,12 @@ def write_raw(
     of_all_frames(write, len(frames))
 
 
-def _shown(lens: Fisheye) -> tuple[np.ndarray, np.ndarray]:
-    """Where a lens's picture shows something, (h, w) bool, and in which directions, (h, w, 3)."""
+def _shown(lens: Fisheye, seen_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where a lens's picture is to be used, (h, w) bool, and in which directions, (h, w, 3)."""
     pixels = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     directions = unproject(lens, np.stack(pixels, axis=-1))
     ahead = directions @ rotation_of(lens)[:, 2]
-    return ahead > np.cos(_SEEN), directions.astype(np.float32)
+    return ahead > np.cos(np.deg2rad(seen_deg)), directions.astype(np.float32)
 
 
 def _at(mask: np.ndarray, directions: np.ndarray) -> np.ndarray:

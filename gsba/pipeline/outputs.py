@@ -162,11 +162,10 @@ def _export(
     seen_by = lenses if of_one_lens(images, shown) else ONE_CENTRE
 
     def compute() -> Counts:
-        raw = images == "fisheye"
-        export(main, shown, folder, to, size, placement, lenses=seen_by, raw=raw)
+        export(main, shown, folder, to, size, placement, lenses=seen_by, images=images)
         return Counts(len(run.frames), len(shown), "frames")
 
     key = [size, placement.to_json(), *(["of one lens"] if seen_by else [])]
-    key += ["raw"] if images == "fisheye" else []
+    key += {"fisheye": ["raw"], "panorama": ["panorama"]}.get(images, [])
     run.store.stage(name, key, compute, Counts, run.chain.latest)
     run.store.claim(folder)

@@ -134,6 +134,7 @@ def test_nerfstudio_has_each_views_own_lengths_and_place(written) -> None:
     model = pycolmap.Reconstruction(folder / "colmap/sparse/0")
     images = {image.name: image for image in model.images.values()}
     assert len(meta["frames"]) == 10 * NUM_FRAMES
+    assert not {"fl_x", "fl_y", "cx", "cy", "w", "h"} & set(meta)  # taken for all frames else
     for entry in meta["frames"]:
         name, view = Path(entry["file_path"]).stem.split("_", 2)[1:]
         image = images[f"{view}/frame_{name}.png"]

@@ -21,8 +21,11 @@ from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.evaluate import TrajectoryErrors, evaluate
+from gsba.frames.files import decode
+from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError
 from gsba.pipeline import refine
+from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Fisheye, Trajectory
 
@@ -92,6 +95,7 @@ def test_raw_pairs_of_known_lenses_become_faces_of_either(walk: Path, tmp_path: 
     assert kept[0].focal == LENS.focal
     np.testing.assert_allclose(kept[0].centre, [0, 0, BASELINE / 2], atol=0.001)
     _check_fisheyes(tmp_path / "run")
+    _check_panoramas(walk, tmp_path / "run")
 
 
 def _check_fisheyes(run: Path) -> None:
@@ -107,9 +111,30 @@ def _check_fisheyes(run: Path) -> None:
     assert all(mask is not None and mask[0, 0] == 0 for mask in masks)
     result = CliRunner().invoke(app, [*call, "cube", "--out", str(run / "cube")])
     assert result.exit_code == 0 and len(list((run / "cube/images").iterdir())) == 6
-    wrong = ["export", str(run), "--to", "nerfstudio", "--images", "fisheye"]
+    wrong = ["export", str(run), "--to", "tum", "--images", "fisheye"]
     result = CliRunner().invoke(app, [*wrong, "--out", str(run / "no")])
     assert result.exit_code == 1 and "colmap" in result.output and not (run / "no").exists()
+
+
+def _check_panoramas(walk: Path, run: Path) -> None:
+    """Stitched at the map's depth they are what one camera sees, better than joined at infinity."""
+    call = ["-q", "export", str(run), "--to", "tum", "--images", "panorama"]
+    result = CliRunner().invoke(app, [*call, "--out", str(run / "panoramas")])
+    assert result.exit_code == 0, result.output
+    _, frames = load_run(run)
+    truth, scene = read_trajectory(walk / "truth.tum"), build_gallery()
+    size, off = (frames.width, frames.height), []
+    for f in (3, 11):
+        image = decode(run / f"panoramas/images/{frames.names[f]}.png", size)
+        exact = render_erp(scene, truth.world_T_rigs[f], *size)
+        off.append([_blurred_off(exact, found) for found in (image, load_erp(frames, f))])
+    stitched, joined = np.mean(off, axis=0)
+    assert stitched < 0.3 * joined, (stitched, joined)
+
+
+def _blurred_off(exact: np.ndarray, found: np.ndarray) -> float:
+    off = exact.astype(np.float32) - found
+    return float(np.abs(cv2.GaussianBlur(off, (0, 0), 1.5)).mean())
 
 
 def test_lenses_that_are_off_are_found_and_all_is_done_anew(walk: Path, tmp_path: Path) -> None:

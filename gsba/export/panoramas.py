@@ -1,0 +1,41 @@
+"""Poses in a file, and the panoramas that they are of in a folder: what programs without a format
+of their own take, and `gsba refine OUT/images OUT/trajectory.tum` reads back."""
+
+import csv
+from pathlib import Path
+
+from gsba.camera.lens import Lenses
+from gsba.camera.views import scenes_of
+from gsba.export.images import suffix_of, write_panoramas
+from gsba.trajectory.files import write_tum
+from gsba.types import FrameSet, Reconstruction, Trajectory
+
+
+def write_poses(partial: Path, reconstruction: Reconstruction, frames: FrameSet) -> None:
+    """Write `trajectory.tum` into `partial`."""
+    trajectory = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
+    write_tum(partial / "trajectory.tum", trajectory)
+
+
+def write_with_poses(
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    lenses: Lenses,
+    link: bool = False,
+) -> None:
+    """Write `trajectory.tum`, `images` with `timestamps.csv`, and `masks` into `partial`."""
+    write_poses(partial, reconstruction, frames)
+    images = partial / "images"
+    write_panoramas(
+        frames,
+        lambda f: images / f"{frames.names[f]}{suffix_of(frames, f)}",
+        lambda f: partial / "masks" / f"{frames.names[f]}.png",
+        link,
+        lenses,
+        scenes_of(reconstruction),
+    )
+    with (images / "timestamps.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["name", "timestamp"])
+        writer.writerows(zip(frames.names, map(float, frames.timestamps), strict=True))
