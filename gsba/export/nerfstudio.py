@@ -100,7 +100,7 @@ def _write_erp_dataset(
     link: bool,
 ) -> None:
     def image(f: int) -> str:
-        return f"images_erp/{frames.names[f]}{frames.paths[f][0].suffix}"
+        return f"images_erp/{frames.names[f]}{suffix_of(frames, f)}"
 
     def mask(f: int) -> str:
         return f"masks_erp/{frames.names[f]}.png"
