@@ -1,6 +1,6 @@
-# gsba on Debian: `docker build -t gsba .`, then `docker run --rm -v "$PWD:/work" gsba` runs the demo
-# and leaves it in ./gsba-demo. All that is done is in packaging/install.sh, which runs without
-# containers, too.
+# gsba on Debian: `docker build -t gsba .`, then
+# `docker run --rm --user "$(id -u)" -v "$PWD:/work" gsba` runs the demo and leaves it in ./gsba-demo.
+# All that is done is in packaging/install.sh, which runs without containers, too.
 FROM debian:bookworm-slim
 COPY . /source
 RUN sh /source/packaging/install.sh /source /opt/gsba && rm -rf /source
