@@ -25,6 +25,8 @@ tar -C "$source_folder" --exclude=.git -cf - . | tar -C "$work/source" -xf -
 chmod 1777 "$work/work"
 
 unset PYTHONPATH
-chroot "$work" env PIP_CERT=/etc/certificates.pem sh /source/packaging/install.sh /source /opt/gsba
+trusted=/etc/certificates.pem # whatever Debian's own packages make of /etc/ssl
+chroot "$work" env PIP_CERT=$trusted REQUESTS_CA_BUNDLE=$trusted SSL_CERT_FILE=$trusted \
+  sh /source/packaging/install.sh /source /opt/gsba
 chroot --userspec=65534:65534 "$work" env HOME=/nonexistent NUMBA_CACHE_DIR=/opt/gsba/kernels \
   sh -c 'cd /work && /opt/gsba/bin/gsba demo --frames 12 --width 512'

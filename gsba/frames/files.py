@@ -46,10 +46,10 @@ def image_header(path: Path) -> Header:
 
 
 def goes_out_as_it_is(source: Path, target: Path) -> bool:
-    """Whether a copy of an image under another name is what every trainer reads as we do.
+    """Whether every trainer can read a copy of an image under another name.
 
-    That is an upright JPEG or PNG of 8 bits and three colours. COLMAP and trainers ignore the
-    orientation tag, COLMAP reads no WebP, and nerfstudio takes 16-bit grey modulo 256.
+    That is an upright JPEG or PNG of 8 bits in colour. COLMAP and trainers ignore the orientation
+    tag, COLMAP reads no WebP, and nerfstudio takes 16-bit grey modulo 256.
     """
     same = source.suffix.lower() == target.suffix.lower()
     return same and source.is_file() and image_header(source).plain
