@@ -18,19 +18,20 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from matplotlib.figure import Figure
 
+from gsba.evaluate import charts
+from gsba.evaluate.trajectory import pose_errors
 from gsba.frames.pixels import load_erp
 from gsba.report.html.figures import viewing_axes
 from gsba.report.html.pictures import picture, worst_frames
-from gsba.similarity import residuals_of, similarity
 from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet, Reconstruction, Trajectory
 
-PAGE, LINE, INK, QUIET = "#f6f6f3", "#e3e3dd", "#1b1c1e", "#6b6e73"
-BEFORE, AFTER, TRUE = "#d9822b", "#1769aa", "#1b1c1e"
+PAGE, LINE, QUIET = "#f6f6f3", "#e3e3dd", "#6b6e73"
+BEFORE, AFTER = charts.BEFORE, charts.AFTER
 FONT = "system-ui,-apple-system,'Segoe UI',Roboto,Helvetica,Arial,sans-serif"
-MAP, CHART, HEIGHT, MARGIN = 470, 400, 420, 36  # pixels
 MAX_POINTS = 1600  # of the cloud, on the map
 VECTOR_GAIN = 120  # times longer than the residual is
 
@@ -49,7 +50,7 @@ def main() -> None:
     truth = read_trajectory(arguments.demo / "walk" / "groundtruth.tum")
     coarse = read_trajectory(run / "coarse.tum")
     arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / "trajectory.svg").write_text(trajectory(found, frames, coarse, truth))
+    trajectory(arguments.out / "trajectory.svg", found, frames, coarse, truth)
     write(arguments.out / "residuals.jpg", residuals(found, frames))
     write(arguments.out / "cloud.jpg", cloud(found))
     if arguments.splats is not None:
@@ -57,47 +58,38 @@ def main() -> None:
 
 
 def trajectory(
-    found: Reconstruction, frames: FrameSet, coarse: Trajectory, truth: Trajectory
-) -> str:
-    """SVG: the walk from above, before and after, and the error of every frame."""
+    path: Path, found: Reconstruction, frames: FrameSet, coarse: Trajectory, truth: Trajectory
+) -> None:
+    """Write the walk from above, before and after, and the error of every frame."""
     refined = Trajectory(frames.timestamps, found.world_T_rigs)
-    errors = [position_errors(poses, truth) for poses in (coarse, refined)]
+    errors = [pose_errors(poses, truth).positions for poses in (coarse, refined)]
     axes, _ = viewing_axes(found.world_T_rigs)
     centre = np.median(found.world_T_rigs[:, :3, 3], axis=0)
 
     def level(points: np.ndarray) -> np.ndarray:
-        return ((points - centre) @ axes.T)[:, :2] * [1, -1]
+        return ((points - centre) @ axes[:2].T).T
 
-    paths = [level(p.world_T_rigs[:, :3, 3]) for p in (coarse, refined)]
-    low, high = np.min([p.min(0) for p in paths], 0), np.max([p.max(0) for p in paths], 0)
-    scale = 0.72 * min(
-        (MAP - 2 * MARGIN) / (high - low)[0], (HEIGHT - 2 * MARGIN) / (high - low)[1]
-    )
-    middle = np.array([MAP / 2, HEIGHT / 2 + 8])
+    def fill(figure: Figure) -> None:
+        above, chart = figure.subplots(1, 2, width_ratios=(1.25, 1))
+        walks = [level(poses.world_T_rigs[:, :3, 3]) for poses in (coarse, refined)]
+        dots = level(found.points_world)
+        reach = 1.75 * np.abs(walks[1]).max(axis=1, keepdims=True)
+        near = np.flatnonzero((np.abs(dots) < reach).all(axis=0))
+        dots = dots[:, near[:: max(1, len(near) // MAX_POINTS)]]
+        above.plot(*dots, ".", color="#b9b7ae", markersize=1.5, rasterized=True)
+        above.set_title("From above")
+        above.set_aspect("equal", adjustable="datalim")
+        above.axis("off")
+        chart.set(title="Position error of every frame", yscale="log", xlabel="time, s")
+        for walk, off, color, label in zip(
+            walks, errors, (charts.BEFORE, charts.AFTER), ("before", "after"), strict=True
+        ):
+            above.plot(*walk, color=color)
+            chart.plot(frames.timestamps, off, ".-", color=color, label=label)
+        ratio = np.median(errors[0]) / np.median(errors[1])
+        chart.legend(title=f"median {ratio:.0f} times smaller", loc="center right")
 
-    def place(points: np.ndarray) -> np.ndarray:
-        return (points - (low + high) / 2) * scale + middle
-
-    points = place(level(found.points_world))
-    inside = np.all((points > [10, 54]) & (points < [MAP - 10, HEIGHT - 10]), axis=1)
-    rows = np.flatnonzero(inside)
-    rows = rows[:: max(1, len(rows) // MAX_POINTS)]
-    dots = "".join(f"M{x:.0f} {y:.0f}h.01" for x, y in points[rows])
-    body = [
-        f'<path d="{dots}" stroke="#b9b7ae" stroke-width="1.8" stroke-linecap="round"/>',
-        *(
-            f'<polyline points="{_joined(place(path))}" fill="none" stroke="{color}" '
-            f'stroke-width="2.6" stroke-linejoin="round" stroke-linecap="round"/>'
-            for path, color in zip(paths, (BEFORE, AFTER), strict=True)
-        ),
-        *(
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.4" fill="{AFTER}"/>'
-            for x, y in place(paths[1])
-        ),
-        _text(24, 34, "From above", INK, 15, 600),
-    ]
-    body += _error_chart(*errors)
-    return _page(MAP + CHART + 20, HEIGHT, body)
+    charts.write([path], (8.2, 3.9), fill)
 
 
 def _page(width: int, height: int, body: list[str]) -> str:
@@ -108,51 +100,6 @@ def _page(width: int, height: int, body: list[str]) -> str:
         f'<rect x=".5" y=".5" width="{width - 1}" height="{height - 1}" rx="14" fill="{PAGE}" '
         f'stroke="{LINE}"/>\n' + "\n".join(body) + "\n</svg>\n"
     )
-
-
-def position_errors(poses: Trajectory, truth: Trajectory) -> np.ndarray:
-    """Distance (F,) of every pose from the truth, in its units, after the best Sim(3)."""
-    assert np.allclose(poses.timestamps, truth.timestamps, atol=1e-6)
-    source, target = (p.world_T_rigs[:, :3, 3] for p in (poses, truth))
-    return residuals_of(similarity(source, target), source, target)
-
-
-def _error_chart(before: np.ndarray, after: np.ndarray) -> list[str]:
-    """Position error of every frame before and after, on a logarithmic axis."""
-    left, right, top, bottom = MAP + 66, MAP + CHART - 8, 70, HEIGHT - 52
-    lowest = np.floor(np.log10(max(min(before.min(), after.min()), 1e-9)))
-    highest = np.ceil(np.log10(max(before.max(), after.max())))
-
-    def y_of(values: np.ndarray | float) -> np.ndarray:
-        share = (np.log10(np.maximum(values, 10**lowest)) - lowest) / (highest - lowest)
-        return bottom - share * (bottom - top)
-
-    x = np.linspace(left, right, len(before))
-    body = [_text(MAP + 24, 34, "Position error of every frame", INK, 15, 600)]
-    for power in range(int(lowest), int(highest) + 1):
-        y = float(y_of(10.0**power))
-        body.append(f'<path d="M{left} {y:.1f}H{right}" stroke="{LINE}"/>')
-        label = f"{10.0**power:.9f}".rstrip("0").rstrip(".")
-        body.append(_text(left - 10, y + 4, label, QUIET, 12, anchor="end"))
-    for x0, y0, y1 in zip(x, y_of(before), y_of(after), strict=True):
-        body.append(
-            f'<path d="M{x0:.1f} {y0:.1f}V{y1:.1f}" stroke="{QUIET}" stroke-opacity=".22"/>'
-        )
-    for values, color in ((before, BEFORE), (after, AFTER)):
-        body += [
-            f'<circle cx="{x0:.1f}" cy="{y0:.1f}" r="3.8" fill="{color}"/>'
-            for x0, y0 in zip(x, y_of(values), strict=True)
-        ]
-    ratio = np.median(before) / np.median(after)
-    body.append(_text(left, HEIGHT - 22, f"median {ratio:.0f} times smaller", QUIET, 13))
-    for at, name, color in ((right - 132, "before", BEFORE), (right - 56, "after", AFTER)):
-        body.append(f'<circle cx="{at - 10}" cy="{HEIGHT - 26.5}" r="4" fill="{color}"/>')
-        body.append(_text(at, HEIGHT - 22, name, QUIET, 13))
-    return body
-
-
-def _joined(points: np.ndarray) -> str:
-    return " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
 
 
 def _text(

@@ -16,6 +16,7 @@ HEAVY = {
     "cv2",
     "gtsam",
     "kornia",
+    "matplotlib",
     "numba",
     "open3d",
     "pycolmap",

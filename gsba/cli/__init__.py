@@ -1,9 +1,19 @@
 """The command line. Commands parse, call and print; heavy imports stay in their bodies."""
 
-from gsba.cli import preparing, refining, results, splat, viewing
+from gsba.cli import checking, plotting, preparing, refining, results, splat, viewing
 from gsba.cli.app import app
 
-__all__ = ["app", "main", "preparing", "refining", "results", "splat", "viewing"]
+__all__ = [
+    "app",
+    "checking",
+    "main",
+    "plotting",
+    "preparing",
+    "refining",
+    "results",
+    "splat",
+    "viewing",
+]
 
 
 def main() -> None:

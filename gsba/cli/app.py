@@ -138,4 +138,5 @@ def _options(
     ] = False,
 ) -> None:
     _Call.debug = debug
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what cannot be read is said in our line
     show_log(logging.WARNING if quiet else logging.DEBUG if verbose else logging.INFO)

@@ -11,11 +11,13 @@ import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gsba.config import SplatSettings
 from gsba.disk import write_image, write_text
+from gsba.evaluate import charts
 from gsba.log import GsbaError
 from gsba.similarity import NoSimilarityError, pose_similarity
 from gsba.splat.backend import Backend
@@ -37,10 +39,12 @@ from gsba.store.store import digest, fingerprint
 from gsba.trajectory.association import matched_in_time
 from gsba.types import FrameSet, Reconstruction, Trajectory
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 logger = logging.getLogger(__name__)
 
 NO_LPIPS = "not computed: no weights"
-_COLORS = ((200, 60, 40), (30, 110, 200), (40, 150, 60), (150, 60, 160), (220, 140, 20))  # RGB
 _CURVE_POINTS = 10  # measurements during a training
 
 
@@ -83,8 +87,8 @@ def compare(
 ) -> dict[str, SourceResult]:
     """Train and measure a splat for each source of poses; resumes what is done.
 
-    Writes `out`/SOURCE/point_cloud.ply and checkpoint.npz, results.json, table.txt,
-    curves.png, and pictures/FRAME.jpg: the six faces as captured, then as each source has them.
+    Writes `out`/SOURCE/point_cloud.ply and checkpoint.npz, results.json, table.txt, curves.png and
+    .svg, and pictures/FRAME.jpg: the six faces as captured, then as each source has them.
 
     Args:
         reconstruction, frames: of a finished run; its tracks make the start clouds.
@@ -151,7 +155,7 @@ def _write(
     content = {"lpips": measured, "settings": settings.model_dump(), "sources": to_json(results)}
     write_text(out / "table.txt", lines + "\n")
     write_text(out / "results.json", json.dumps(content, indent=1))
-    _write_curves(out / "curves.png", results)
+    _write_curves(out, results)
 
 
 def train_and_measure(
@@ -268,11 +272,8 @@ def _write_pictures(
         write_image(folder / f"{frames.names[f]}.jpg", np.concatenate(rows))
 
 
-def _write_curves(path: Path, results: Mapping[str, SourceResult]) -> None:
-    """PSNR of held-out frames over steps, a line for each source."""
-    import cv2
-
-    left, top, wide, tall = 60, 20, 520, 300
+def _write_curves(out: Path, results: Mapping[str, SourceResult]) -> None:
+    """PSNR of held-out frames over steps, a line for each source, as curves.png and curves.svg."""
     lines = {
         name: np.array([(step, score.psnr) for step, score in sorted(result.curve.items())])
         for name, result in results.items()
@@ -280,25 +281,15 @@ def _write_curves(path: Path, results: Mapping[str, SourceResult]) -> None:
     }
     if not lines:
         return
-    every = np.concatenate(list(lines.values()))
-    low, high = np.floor(every[:, 1].min()), np.ceil(every[:, 1].max())
-    canvas = np.full((top + tall + 40, left + wide + 140, 3), 255, np.uint8)
 
-    def write(text: str, x: float, y: float, color: tuple[int, int, int] = (0, 0, 0)) -> None:
-        at = (int(x), int(y))
-        cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
+    def fill(figure: "Figure") -> None:
+        axes = figure.subplots()
+        for (name, line), color in zip(lines.items(), charts.colors(), strict=False):
+            axes.plot(line[:, 0], line[:, 1], color=color, marker=".", label=charts.plain(name))
+        axes.set(xlabel="training steps", ylabel="PSNR of held-out frames, dB", xlim=(0, None))
+        axes.legend()
 
-    for share in np.linspace(0, 1, 6):
-        y = int(top + (1 - share) * tall)
-        cv2.line(canvas, (left, y), (left + wide, y), (220, 220, 220), 1)
-        write(f"{low + share * (high - low):.1f}", 8, y + 4)
-        write(f"{share * every[:, 0].max():.0f}", left + share * wide - 12, top + tall + 16)
-    write("PSNR of held-out frames, dB, over steps", left, top + tall + 34)
-    for i, (name, line) in enumerate(lines.items()):
-        x = left + wide * line[:, 0] / every[:, 0].max()
-        y = top + tall * (high - line[:, 1]) / max(high - low, 1.0)
-        color = _COLORS[i % len(_COLORS)]
-        at = np.rint(np.column_stack([x, y])).astype(np.int32)
-        cv2.polylines(canvas, [at[:, None]], False, color, 2, cv2.LINE_AA)
-        write(name, left + wide + 8, y[-1] + 4, color)
-    write_image(path, canvas)
+    try:
+        charts.write([out / f"curves.{kind}" for kind in ("png", "svg")], (6.0, 3.6), fill)
+    except charts.NoMatplotlibError as error:
+        logger.info("no curves: %s", error)

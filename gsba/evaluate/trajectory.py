@@ -7,7 +7,7 @@ import numpy as np
 
 from gsba.geometry import nearest_rotation, quaternion_from_rotation, rotation_angle
 from gsba.log import GsbaError
-from gsba.similarity import residuals_of, similarity
+from gsba.similarity import Sim3, residuals_of, similarity
 from gsba.trajectory.association import matched_in_time
 from gsba.types import Trajectory
 
@@ -55,6 +55,38 @@ class TrajectoryErrors:
         return out
 
 
+@dataclass(frozen=True, slots=True)
+class PoseErrors:
+    """How far each pose of a trajectory is from the truth, after alignment to it."""
+
+    rows: np.ndarray  # (M,) of the estimate
+    true_rows: np.ndarray  # (M,) of the truth, ascending
+    fit: Sim3  # from the estimate's world into the truth's, by positions
+    positions: np.ndarray  # (M,) float64, truth units
+    rotations: np.ndarray  # (M,) float64, radians, after the best common rotation
+
+
+def pose_errors(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01) -> PoseErrors:
+    """Errors of single poses; alignment, arguments and failures are those of `evaluate`."""
+    rows_e, rows_t = matched_in_time(estimate, truth, tolerance_s)
+    if len(rows_t) < 3:
+        raise GsbaError(
+            f"only {len(rows_t)} of {len(truth.timestamps)} true poses have an estimate within "
+            f"{tolerance_s:g} s; alignment needs 3: check that both use one clock"
+        )
+    world_T_rigs, true_T_rigs = estimate.world_T_rigs[rows_e], truth.world_T_rigs[rows_t]
+    rotations, true_rotations = world_T_rigs[:, :3, :3], true_T_rigs[:, :3, :3]
+    positions, true_positions = world_T_rigs[:, :3, 3], true_T_rigs[:, :3, 3]
+    for owner, points in (("estimate", positions), ("truth", true_positions)):
+        if np.ptp(points, axis=0).max() <= 1e-12 * (1 + np.abs(points).max()):
+            raise GsbaError(f"the {owner} does not move: its positions leave the scale open")
+    fit = similarity(positions, true_positions)
+    common = nearest_rotation((true_rotations @ np.swapaxes(rotations, 1, 2)).sum(axis=0))
+    residual = np.swapaxes(true_rotations, 1, 2) @ common @ rotations
+    off = residuals_of(fit, positions, true_positions)
+    return PoseErrors(rows_e, rows_t, fit, off, rotation_angle(residual))
+
+
 def evaluate(
     estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01
 ) -> TrajectoryErrors:
@@ -72,32 +104,21 @@ def evaluate(
     Raises:
         GsbaError: fewer than three poses matched_in_time, or their positions coincide.
     """
-    rows_e, rows_t = matched_in_time(estimate, truth, tolerance_s)
-    if len(rows_t) < 3:
-        raise GsbaError(
-            f"only {len(rows_t)} of {len(truth.timestamps)} true poses have an estimate within "
-            f"{tolerance_s:g} s; alignment needs 3: check that both use one clock"
-        )
-    world_T_rigs, true_T_rigs = estimate.world_T_rigs[rows_e], truth.world_T_rigs[rows_t]
-    rotations, true_rotations = world_T_rigs[:, :3, :3], true_T_rigs[:, :3, :3]
-    positions, true_positions = world_T_rigs[:, :3, 3], true_T_rigs[:, :3, 3]
-    for owner, points in (("estimate", positions), ("truth", true_positions)):
-        if np.ptp(points, axis=0).max() <= 1e-12 * (1 + np.abs(points).max()):
-            raise GsbaError(f"the {owner} does not move: its positions leave the scale open")
-
-    fit = similarity(positions, true_positions)
-    common = nearest_rotation((true_rotations @ np.swapaxes(rotations, 1, 2)).sum(axis=0))
-    residual = np.swapaxes(true_rotations, 1, 2) @ common @ rotations
+    errors = pose_errors(estimate, truth, tolerance_s)
+    rows_t, scale = errors.true_rows, errors.fit.scale
+    world_T_rigs, true_T_rigs = estimate.world_T_rigs[errors.rows], truth.world_T_rigs[rows_t]
     steps = np.flatnonzero(np.diff(rows_t) == 1)
-    step_translation, step_rotation = _step_errors(world_T_rigs, true_T_rigs, steps, fit.scale)
+    step_translation, step_rotation = _step_errors(
+        world_T_rigs, true_T_rigs, steps, errors.fit.scale
+    )
     pair_errors = np.degrees(_pair_errors(world_T_rigs, true_T_rigs))
     num_truth = len(truth.timestamps)
     return TrajectoryErrors(
         num_truth=num_truth,
         num_matched=len(rows_t),
-        scale=fit.scale,
-        ate=ErrorStatistics.of(residuals_of(fit, positions, true_positions)),
-        rotation_deg=ErrorStatistics.of(np.degrees(rotation_angle(residual))),
+        scale=scale,
+        ate=ErrorStatistics.of(errors.positions),
+        rotation_deg=ErrorStatistics.of(np.degrees(errors.rotations)),
         rpe_translation=ErrorStatistics.of(step_translation),
         rpe_rotation_deg=ErrorStatistics.of(np.degrees(step_rotation)),
         auc=area_under_recall(pair_errors, num_truth * (num_truth - 1) // 2, AUC_THRESHOLDS_DEG),

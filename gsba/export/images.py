@@ -1,10 +1,11 @@
 """Images and masks of an export, a few frames in memory at a time.
 
 Faces are cut with bicubic sampling, low-passed first where they are much coarser than the
-panorama. They are written as PNG where the frame is PNG, else as JPEG of quality 95. Images that
-leave unchanged (panoramas; faces that came as faces of the same size) are copies, which share their
-place on disk with the original where the file system can (reflinks): an export may be moved and
-edited. On request they are hard links: then an edit of one is an edit of the other.
+panorama. They are written with 8 bits and three colours: as PNG where the frame is PNG or TIFF,
+else as JPEG of quality 95. Images that leave unchanged (panoramas; faces that came as faces of the
+same size; if every trainer reads them as we do) are copies, which share their place on disk with
+the original where the file system can (reflinks): an export may be moved and edited. On request
+they are hard links: then an edit of one is an edit of the other.
 """
 
 import fcntl
@@ -23,6 +24,7 @@ from gsba.camera.rig import CubeRig
 from gsba.camera.views import View, ViewCutter
 from gsba.disk import write_image
 from gsba.frames.dual_fisheye import load_raw
+from gsba.frames.files import goes_out_as_it_is
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.log import GsbaError, track
@@ -30,6 +32,7 @@ from gsba.types import FACES, FrameSet
 
 MIN_FACE_SIZE = 16  # pixels
 _FICLONE = 0x40049409  # of Linux: a file that shares another's blocks until one is written to
+_INSTEAD = {".webp": ".jpg", ".tif": ".png", ".tiff": ".png"}
 _AT_ONCE = 4  # frames at most: an 8K panorama and its faces take 250 MB
 
 
@@ -55,9 +58,9 @@ def of_one_lens(images: str, frames: FrameSet) -> bool:
 
 
 def suffix_of(frames: FrameSet, f: int) -> str:
-    """Suffix of the exported images of a frame: that of the input, JPEG for what is not PNG."""
+    """Suffix of the exported images of a frame: that of the input, or a kind that all can read."""
     suffix = frames.paths[f][0].suffix
-    return suffix if suffix.lower() in (".jpg", ".jpeg", ".png") else ".jpg"
+    return _INSTEAD.get(suffix.lower(), suffix)
 
 
 def has_masks(frames: FrameSet) -> bool:
@@ -106,10 +109,7 @@ def _write_cube_faces(
             from gsba.frames.cubemap import cut
 
             _write_all(paths, cut(load_erp(frames, f), rig))
-        elif size == frames.width and all(
-            source.suffix == path.suffix
-            for source, path in zip(frames.paths[f], paths, strict=True)
-        ):
+        elif size == frames.width and all(map(goes_out_as_it_is, frames.paths[f], paths)):
             for source, path in zip(frames.paths[f], paths, strict=True):
                 pass_on(source, path, link)
         else:
@@ -163,8 +163,8 @@ def write_panoramas(
 ) -> None:
     """Copy every panorama, and write its mask where the frames have masks.
 
-    Panoramas that are corrected, and those of raw pairs, are written anew; those of two lenses are
-    stitched by `gsba.camera.one_centre`.
+    Panoramas that are corrected, those of raw pairs, and images that trainers misread are written
+    anew; those of two lenses are stitched by `gsba.camera.one_centre`.
 
     Args:
         frames: panoramas.
@@ -178,10 +178,12 @@ def write_panoramas(
         _stitch_panoramas(frames, image_path, mask_path, lenses, scenes)
         return
     for f in track(range(len(frames)), "copying panoramas"):
-        if frames.correction or frames.fisheyes:
-            write_image(image_path(f), load_erp(frames, f))
+        source, path = frames.paths[f][0], image_path(f)
+        as_it_is = not (frames.correction or frames.fisheyes) and goes_out_as_it_is(source, path)
+        if as_it_is:
+            pass_on(source, path, link)
         else:
-            pass_on(frames.paths[f][0], image_path(f), link)
+            write_image(path, load_erp(frames, f))
         if has_masks(frames):
             mask = load_mask(frames, f)
             if mask is None:

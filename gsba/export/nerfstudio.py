@@ -179,8 +179,7 @@ def _write_erp_dataset(
     which: str,
 ) -> None:
     def image(f: int) -> str:
-        suffix = suffix_of(frames, f) if lenses else frames.paths[f][0].suffix
-        return f"images{which}/{frames.names[f]}{suffix}"
+        return f"images{which}/{frames.names[f]}{suffix_of(frames, f)}"
 
     def mask(f: int) -> str:
         return f"masks{which}/{frames.names[f]}.png"

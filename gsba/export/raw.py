@@ -9,6 +9,8 @@ from gsba.camera.fisheye import Pair, rotation_of, unproject
 from gsba.camera.sphere import erp_from_bearings
 from gsba.disk import write_image
 from gsba.export.images import of_all_frames, pass_on
+from gsba.frames.dual_fisheye import load_raw
+from gsba.frames.files import goes_out_as_it_is
 from gsba.frames.masks import load_mask
 from gsba.log import GsbaError
 from gsba.types import Fisheye, FrameSet
@@ -37,6 +39,8 @@ def write_raw(
 ) -> None:
     """Copy both pictures of every frame, and write masks of where they show something.
 
+    Pictures side by side in one image, and those that trainers misread, are written anew.
+
     Args:
         frames: raw pairs.
         image_path: file of the image, by frame index and lens.
@@ -47,11 +51,15 @@ def write_raw(
     shown = [_shown(lens, seen_deg) for lens in raw_lenses(frames)]
 
     def write(f: int) -> None:
-        mask = load_mask(frames, f)
-        for lens, (source, (seen, directions)) in enumerate(
-            zip(frames.paths[f], shown, strict=True)
-        ):
-            pass_on(source, image_path(f, lens), link)
+        mask, sources = load_mask(frames, f), frames.paths[f]
+        paths = [image_path(f, lens) for lens in range(len(sources))]
+        if sources[0] != sources[1] and all(map(goes_out_as_it_is, sources, paths)):
+            for source, path in zip(sources, paths, strict=True):
+                pass_on(source, path, link)
+        else:
+            for path, picture in zip(paths, load_raw(frames, f), strict=True):
+                write_image(path, picture)
+        for lens, (seen, directions) in enumerate(shown):
             used = seen if mask is None else seen & _at(mask, directions)
             write_image(mask_path(f, lens), used.astype(np.uint8) * 255)
 

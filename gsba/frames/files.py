@@ -7,107 +7,62 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.frames.headers import JPEG_END, Header, header_of
 from gsba.log import GsbaError
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-MAX_PIXELS = 1 << 28  # of one image: 768 MB of colours
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
 
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_PNG_END = b"IEND\xaeB`\x82"  # chunk type and its constant CRC
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_JPEG_BARE = {0x01, *range(0xD0, 0xD9)}  # markers without a segment: TEM, RST0-7, SOI
-_JPEG_FRAME = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0-15; not DHT, JPG, DAC
-_JPEG_SCAN = 0xDA  # SOS
 _MOST_PADDING, _FILLS = 1024, (b"\0", b"\xff")  # bytes before the end, and what they are
 
 
 def is_image(path: Path) -> bool:
-    """Whether the name is that of a visible JPEG or PNG file."""
+    """Whether the name is that of a visible JPEG, PNG, WebP or TIFF file."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of a JPEG or PNG as stored (EXIF orientation ignored), without decoding.
+    """Width and height of an image as shown (EXIF orientation respected), without decoding.
 
     Raises:
-        GsbaError: unreadable, neither JPEG nor PNG, its end is missing (truncated), or it has more
-            than MAX_PIXELS.
+        GsbaError: as of `image_header`.
+    """
+    return image_header(path).size
+
+
+def image_header(path: Path) -> Header:
+    """What a JPEG, PNG, WebP or TIFF says of itself.
+
+    Raises:
+        GsbaError: unreadable, no such image, its end is missing (truncated), a variant that is not
+            read, or more than MAX_PIXELS.
     """
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            return _size_in(data, path)
+            return header_of(data, path)
     except OSError as error:
         raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
     except ValueError:  # mmap refuses an empty file
         raise GsbaError(f"{path}: truncated or damaged image; copy or extract it again") from None
 
 
-def _size_in(data: mmap.mmap | bytes, path: Path) -> tuple[int, int]:
-    """Width and height in an image file's content."""
-    try:
-        if data[:8] == _PNG_SIGNATURE:
-            (width, height), complete = _png_header(data)
-        elif data[:2] == _JPEG_START:
-            (width, height), complete = _jpeg_header(data)
-        else:
-            raise GsbaError(f"{path}: not a JPEG or PNG image; remove or convert it")
-    except (IndexError, ValueError):  # ran past the end
-        raise GsbaError(f"{path}: truncated or damaged image; copy or extract it again") from None
-    if not complete:
-        raise GsbaError(f"{path}: truncated image (its end is missing); copy or extract it again")
-    if width * height > MAX_PIXELS:
-        raise GsbaError(
-            f"{path}: is {width}x{height}, {width * height / 1e6:.0f} megapixels; "
-            f"{MAX_PIXELS / 1e6:.0f} are read at most: make it smaller"
-        )
-    return width, height
+def goes_out_as_it_is(source: Path, target: Path) -> bool:
+    """Whether every trainer can read a copy of an image under another name.
 
-
-def _png_header(data: mmap.mmap | bytes) -> tuple[tuple[int, int], bool]:
-    """(width, height), and whether the end chunk is there. PNG 1.2, sections 3 and 4."""
-    if len(data) < 33 or data[12:16] != b"IHDR":
-        raise ValueError
-    size = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
-    return size, data.rfind(_PNG_END) > 0
-
-
-def _jpeg_header(data: mmap.mmap | bytes) -> tuple[tuple[int, int], bool]:
-    """(width, height), and whether the end marker follows the scan. ITU T.81, annex B.
-
-    The end marker cannot occur inside entropy-coded data, but does occur in EXIF thumbnails, so
-    it only counts after the first scan has begun; cameras may append data after it.
+    That is an upright JPEG or PNG of 8 bits in colour. COLMAP and trainers ignore the orientation
+    tag, COLMAP reads no WebP, and nerfstudio takes 16-bit grey modulo 256.
     """
-    position, size = 2, None
-    while True:
-        if data[position] != 0xFF:
-            raise ValueError
-        while data[position] == 0xFF:  # any number of fill bytes
-            position += 1
-        marker = data[position]
-        position += 1
-        if marker in _JPEG_BARE:
-            continue
-        length = int.from_bytes(data[position : position + 2], "big")
-        if marker in _JPEG_FRAME:
-            height, width = (
-                int.from_bytes(data[position + k : position + k + 2], "big") for k in (3, 5)
-            )
-            size = width, height
-        elif marker == _JPEG_SCAN:
-            if size is None:
-                raise ValueError
-            return size, data.rfind(_JPEG_END, position) > 0
-        position += max(length, 2)
+    same = source.suffix.lower() == target.suffix.lower()
+    return same and source.is_file() and image_header(source).plain
 
 
 def decode(
     path: Path, size: tuple[int, int], gray: bool = False, at_least: int | None = None
 ) -> np.ndarray:
-    """Pixels of an image, orientation tags ignored.
+    """Pixels of an image as shown: turned by the orientation tag, 16 bits scaled to 8.
 
     Args:
-        path: JPEG or PNG.
-        size: the width and height it must have.
+        path: JPEG, PNG, WebP or TIFF.
+        size: the width and height it must have, as shown.
         gray: one channel instead of RGB.
         at_least: width that is enough: a JPEG is decoded at a half, a quarter or an eighth of its
             size, which is fast, as long as it stays that wide.
@@ -124,29 +79,47 @@ def decode(
         raise GsbaError(
             f"{path}: cannot be read ({error.strerror}); it was there when the run began"
         ) from None
-    found = _size_in(encoded, path)
-    if found != size:
+    header = header_of(encoded, path)
+    if header.size != size:
         raise GsbaError(
-            f"{path}: is {found[0]}x{found[1]}, was {size[0]}x{size[1]} when the run began"
+            f"{path}: is {header.width}x{header.height}, was {size[0]}x{size[1]} when the run began"
         )
-    if encoded[:2] == _JPEG_START:
+    if header.kind == "JPEG":
         part = max(k for k in (1, 2, 4, 8) if k == 1 or size[0] >= k * (at_least or size[0]))
-        return _decoded_jpeg(encoded, path, size, part, gray)
-    return _decoded(encoded, path, gray)
+        stored = (size[1], size[0]) if header.swapped else size
+        pixels = _decoded_jpeg(encoded, path, stored, part, gray)
+    else:
+        pixels = _decoded(encoded, path, gray)
+    upright = header.kind == "TIFF"  # which OpenCV turns, asked or not
+    return pixels if upright else _turned(pixels, header.orientation)
+
+
+def _turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Stored pixels (h, w[, 3]) as they are to be shown. Exif 3.0, section 4.6.5, tag 0x0112."""
+    if orientation == 1:
+        return pixels
+    if orientation > 4:  # 1 to 4 of the transposed picture
+        pixels, orientation = pixels.swapaxes(0, 1), orientation - 4
+    down = -1 if orientation in (3, 4) else 1
+    across = -1 if orientation in (2, 3) else 1
+    return np.ascontiguousarray(pixels[::down, ::across])
 
 
 def _decoded(encoded: bytes, path: Path, gray: bool) -> np.ndarray:
-    """Pixels of a PNG, or of a JPEG of printing inks."""
+    """Pixels of what is no JPEG, or a JPEG of printing inks."""
     import cv2
 
     flag = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
     try:
         values = np.frombuffer(encoded, dtype=np.uint8)
-        pixels = cv2.imdecode(values, flag | cv2.IMREAD_IGNORE_ORIENTATION)
+        how = flag | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
+        pixels = cv2.imdecode(values, how)
     except cv2.error:
         pixels = None
     if pixels is None:
         raise GsbaError(f"{path}: cannot be decoded; copy or extract it again")
+    if pixels.dtype == np.uint16:
+        pixels = cv2.convertScaleAbs(pixels, alpha=1 / 257)  # 65535 is 255
     return pixels if gray else cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB, dst=pixels)
 
 
@@ -178,4 +151,4 @@ def _is_padding(complaint: str, encoded: bytes) -> bool:
     """Whether all that a decoder complains of is that some cameras fill up before the end."""
     found = re.search(r"(\d+) extraneous bytes before marker 0xd9", complaint)
     num = int(found[1]) if found else _MOST_PADDING + 1
-    return num <= _MOST_PADDING and any(fill * num + _JPEG_END in encoded for fill in _FILLS)
+    return num <= _MOST_PADDING and any(fill * num + JPEG_END in encoded for fill in _FILLS)

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsba.camera.fisheye import Pair
 from gsba.frames.dual_fisheye import width_of
-from gsba.frames.files import image_size, is_image
+from gsba.frames.files import image_header, image_size, is_image
 from gsba.frames.masks import find_masks
 from gsba.frames.raw_pairs import find_pairs, lenses_of, side_by_side
 from gsba.frames.times import frame_times
@@ -29,14 +29,12 @@ _FOREIGN = {  # images that are not read, by suffix
     ".bmp": "BMP",
     ".dng": "DNG",
     ".exr": "EXR",
+    ".gif": "GIF",
     ".heic": "HEIC",
     ".heif": "HEIF",
     ".insp": "INSP",
     ".jp2": "JPEG 2000",
     ".jxl": "JPEG XL",
-    ".tif": "TIFF",
-    ".tiff": "TIFF",
-    ".webp": "WebP",
 }
 
 
@@ -56,7 +54,7 @@ def scan(
     `..._00_...` and `..._10_...`, or both side by side in 2:1 images.
 
     Args:
-        folder: JPEG or PNG images; other files are ignored.
+        folder: JPEG, PNG, WebP or TIFF images; other files are ignored.
         timestamps: table of times (see `read_times`); else `timestamps.csv` in the folder, unless
             `fps` is given; else the file names, if they are times.
         fps: frames per second of these files in name order.
@@ -205,7 +203,7 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
     places = [folder, *(path for path in entries if path.name.lower() in FACES and path.is_dir())]
     foreign = _foreign(path for place in places for path in _entries(place))
     if foreign and (subfolders or images):
-        _log.warning("%s: left out %s: convert them to JPEG or PNG", folder, foreign)
+        _log.warning("%s: left out %s: convert them to JPEG, PNG, WebP or TIFF", folder, foreign)
     if subfolders:
         by_face = {
             face: _by_name(folder, filter(is_image, _entries(subfolders[face])))
@@ -214,13 +212,15 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
         }
         return "cube", *_cube_frames(folder, by_face)
     if not images and foreign:
-        raise GsbaError(f"{folder}: no JPEG or PNG images, but {foreign}: convert them first")
+        raise GsbaError(
+            f"{folder}: no JPEG, PNG, WebP or TIFF images, but {foreign}: convert them first"
+        )
     if not images:
         counts = Counter(Path(name).suffix.lower() or Path(name).name for name in others)
         held = ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items())[:5]) or "nothing"
         raise GsbaError(
-            f"{folder}: no JPEG or PNG images (it holds {held}); extract the video's frames there "
-            "first"
+            f"{folder}: no JPEG, PNG, WebP or TIFF images (it holds {held}); extract the video's "
+            "frames there first"
         )
     tagged = {path: m for path in images if (m := re.fullmatch(_TAGGED, path.stem))}
     tags = {match["face"].lower() for match in tagged.values()}
@@ -294,9 +294,13 @@ def _common_size(paths: Sequence[tuple[Path, ...]], layout: str) -> tuple[int, i
     width, height = image_size(first)
     for group in track(paths, "checking frames"):
         for path in group:
-            w, h = image_size(path)
+            header = image_header(path)
+            w, h = header.size
             if layout == "erp" and (w != 2 * h or h == 0):
-                raise GsbaError(f"{path}: is {w}x{h}; an equirectangular frame is 2:1")
+                turned = header.swapped and h == 2 * w
+                why = f" as its EXIF orientation {header.orientation} shows it" if turned else ""
+                what = ": remove that tag" if turned else ""
+                raise GsbaError(f"{path}: is {w}x{h}{why}; an equirectangular frame is 2:1{what}")
             if layout == "cube" and (w != h or h == 0):
                 raise GsbaError(f"{path}: is {w}x{h}; a cube face is square")
             if (w, h) != (width, height) and layout == "fisheye":

@@ -9,6 +9,7 @@ import logging
 import os
 import shutil
 import urllib.request
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -163,10 +164,9 @@ def _find(source: Source, given: str | None, setting: str, download: bool) -> Pa
         if not path.is_dir():
             raise GsbaError(f"{path}: no such weights file; {how}")
         folders.insert(0, path)
-    for folder in folders:
-        for name in source.files:
-            if (folder / name).is_file():
-                return folder / name
+    at_hand = _held(source, folders)
+    if at_hand is not None:
+        return at_hand
     if download:
         return _download(source)
     where = f"{given}: holds no weights of" if given else "no weights of"
@@ -174,6 +174,21 @@ def _find(source: Source, given: str | None, setting: str, download: bool) -> Pa
         f"{where} {source.network}; {how} and name it with --weights ({setting}), "
         "or let --download fetch it"
     )
+
+
+def cached_weights() -> dict[str, Path]:
+    """Files of weights that are in the caches, by key in SOURCES."""
+    found = {
+        key: _held(source, [*_torch_cache(), *_hub_cache(source.hub)])
+        for key, source in SOURCES.items()
+    }
+    return {key: path for key, path in found.items() if path is not None}
+
+
+def _held(source: Source, folders: Iterable[Path]) -> Path | None:
+    """A file of weights in one of several folders."""
+    paths = (folder / name for folder in folders for name in source.files)
+    return next((path for path in paths if path.is_file()), None)
 
 
 def _torch_cache() -> list[Path]:

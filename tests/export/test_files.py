@@ -1,14 +1,19 @@
 """What an export leaves on disk: point clouds, trajectories, and nothing half-written."""
 
 import errno
+import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from export_scene import COLORS, NUM_FRAMES, POINTS, cube_frames, panoramas, reconstruction
+from PIL import Image
 from plyfile import PlyData
 
 from gsba.export import ExportFormat, export, write_points
@@ -104,9 +109,61 @@ def test_panoramas_are_copied_where_they_cannot_be_linked(tmp_path, frames, monk
 def test_a_panorama_that_is_gone_is_named(tmp_path):
     frames = panoramas(tmp_path / "frames")
     frames.paths[4][0].unlink()
-    with pytest.raises(GsbaError, match=r"frame_0004.png: is gone"):
+    with pytest.raises(GsbaError, match=r"frame_0004.png: cannot be read"):
         export(reconstruction(), frames, tmp_path / "out", ExportFormat.COLMAP_ERP)
     assert _entries(tmp_path) == ["frames"]
+
+
+@pytest.mark.parametrize(
+    ("made", "suffix"),
+    [("grey.png", ".png"), ("deep.tif", ".png"), ("deep.png", ".png"), ("colour.webp", ".jpg")],
+)
+def test_what_trainers_misread_goes_out_in_eight_bits_and_colour(tmp_path, made, suffix):
+    frames = panoramas(tmp_path / "frames")
+    kind, wanted = Path(made), []
+    paths = []
+    for (path,) in frames.paths:
+        rgb = cv2.imread(str(path))[..., ::-1]
+        pixels = rgb if kind.stem == "colour" else rgb[..., 0]
+        wanted.append(pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2))
+        stored = pixels.astype(np.uint16) * 257 if kind.stem == "deep" else pixels
+        path.unlink()
+        paths.append((path.with_suffix(kind.suffix),))
+        options = {"quality": 100} if kind.suffix == ".webp" else {}
+        Image.fromarray(stored).save(paths[-1][0], **options)
+    frames = replace(frames, paths=tuple(paths))
+    export(reconstruction(), frames, tmp_path / "erp", ExportFormat.COLMAP_ERP, link=True)
+    model = pycolmap.Reconstruction(tmp_path / "erp" / "sparse" / "0")
+    for image in model.images.values():
+        f = frames.names.index(Path(image.name).stem)
+        assert Path(image.name).suffix == suffix
+        read = pycolmap.Bitmap.read(tmp_path / "erp" / "images" / image.name, True)
+        assert read is not None
+        off = np.abs(read.to_array().astype(int) - wanted[f])
+        assert off.mean() < 3 if suffix == ".jpg" else off.max() == 0
+    export(reconstruction(), frames, tmp_path / "ns", ExportFormat.NERFSTUDIO)
+    for name in ("transforms.json", "transforms_erp.json"):
+        for entry in json.loads((tmp_path / "ns" / name).read_text())["frames"]:
+            with Image.open(tmp_path / "ns" / entry["file_path"]) as image:
+                assert (
+                    image.mode == "RGB" and image.format == {".png": "PNG", ".jpg": "JPEG"}[suffix]
+                )
+
+
+def test_turned_faces_go_out_upright(tmp_path):
+    frames = cube_frames(tmp_path / "frames")
+    shown = {}
+    for path in [path for group in frames.paths for path in group]:
+        pixels = cv2.imread(str(path))[..., ::-1]
+        shown[path.parent.name, path.stem] = pixels
+        exif = Image.Exif()
+        exif[0x0112] = 8  # shown by a quarter turn to the left
+        Image.fromarray(np.ascontiguousarray(np.rot90(pixels, -1))).save(path, exif=exif)
+    export(reconstruction(), frames, tmp_path / "out", ExportFormat.COLMAP, link=True)
+    for path in (tmp_path / "out" / "images").rglob("*.png"):
+        with Image.open(path) as image:
+            assert image.getexif().get(0x0112, 1) == 1
+            assert np.array_equal(image, shown[path.parent.name, path.stem])
 
 
 def test_a_link_to_an_earlier_export_stays_a_link(tmp_path, frames):

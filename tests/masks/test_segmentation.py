@@ -117,7 +117,10 @@ def test_masks_meet_the_directions_of_their_faces(tmp_path: Path, frames: FrameS
         (f"{_ALL}\n(masks / 'f1_up.png').unlink()", r"wrote no mask f1_up.png \(1 of 18 missing\)"),
         ("pass", r"wrote no mask f0_front.png \(18 of 18 missing\)"),
         (f"{_ALL}\ncv2.imwrite(str(masks / 'f2_up.png'), np.zeros((9, 8), np.uint8))", "is 8x9"),
-        (f"{_ALL}\n(masks / 'f0_up.png').write_text('no')", "f0_up.png: not a JPEG or PNG image"),
+        (
+            f"{_ALL}\n(masks / 'f0_up.png').write_text('no')",
+            "f0_up.png: not a JPEG, PNG, WebP or TIFF image",
+        ),
     ],
 )
 def test_what_a_command_does_wrong(

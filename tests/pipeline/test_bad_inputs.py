@@ -77,11 +77,11 @@ def _other_clock(folder: Path) -> None:
 
 BAD: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "no frames folder": (lambda folder: (folder / "frames").rename(folder / "x"), ("no such",)),
-    "empty folder": (_empty, ("frames", "no JPEG or PNG")),
+    "empty folder": (_empty, ("frames", "no JPEG, PNG, WebP or TIFF")),
     "two frames": (_two_frames, ("2 frames", "3")),
     "not an image": (
         lambda folder: (folder / "frames/2.png").write_text("hello") and None,
-        ("2.png", "not a JPEG or PNG"),
+        ("2.png", "not a JPEG, PNG"),
     ),
     "truncated image": (_truncated, ("2.png", "truncated")),
     "not 2:1": (_resized(32, 32), ("2.png", "32x32")),

@@ -1,0 +1,54 @@
+"""What packages of the extras can do here; called in the process that has imported them."""
+
+import shutil
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+CODECS = ("h264", "hevc", "av1", "vp9", "prores", "mjpeg")
+
+
+def video() -> dict[str, Any]:
+    """Which of the usual codecs PyAV can decode."""
+    import av.codec
+
+    return {"codecs": {name: _decodes(av.codec.Codec, name) for name in CODECS}}
+
+
+def _decodes(codec: Any, name: str) -> bool:
+    try:
+        return bool(codec(name, "r"))
+    except ValueError:
+        return False
+
+
+def splat() -> dict[str, Any]:
+    """What torch and gsplat can do on CUDA; kernels are not built for it."""
+    import torch  # pyright: ignore[reportMissingImports]
+
+    usable = torch.cuda.is_available()
+    return {
+        "torch_cuda": torch.version.cuda,  # None = built for the CPU alone
+        "devices": [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
+        if usable
+        else [],
+        "driver": any(Path("/dev").glob("nvidia[0-9]*")),
+        "kernels": find_spec("gsplat.csrc") is not None,
+        "compiler": shutil.which("nvcc"),
+    }
+
+
+def learned() -> dict[str, Any]:
+    """Whose weights are in the caches."""
+    from gsba.learned.weights import cached_weights
+
+    return {"weights": sorted(cached_weights())}
+
+
+def scan() -> dict[str, Any]:
+    """Whether packed laser scans (LAZ) can be read."""
+    if find_spec("laspy") is None:
+        return {}
+    import laspy  # pyright: ignore[reportMissingImports]
+
+    return {"laz": bool(laspy.LazBackend.detect_available())}

@@ -1,0 +1,78 @@
+"""The machine that gsba runs on: processor, memory and disk, as far as it may use them."""
+
+import os
+import platform
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+_CGROUP = Path("/sys/fs/cgroup")
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """What there is, and how much of it may be used."""
+
+    system: str
+    python: str
+    processor: str
+    cores: int
+    usable_cores: float  # by affinity and by the container's quota
+    memory_bytes: int  # or the container's limit, where that is less
+    free_memory_bytes: int
+    free_disk_bytes: int  # where the command was called
+
+
+def look() -> Machine:
+    """This machine."""
+    total, free = _memory()
+    return Machine(
+        system=_system(),
+        python=platform.python_version(),
+        processor=_processor(),
+        cores=os.cpu_count() or 1,
+        usable_cores=min(len(os.sched_getaffinity(0)), _quota()),
+        memory_bytes=total,
+        free_memory_bytes=free,
+        free_disk_bytes=shutil.disk_usage(Path.cwd()).free,
+    )
+
+
+def _system() -> str:
+    try:
+        name = platform.freedesktop_os_release()["PRETTY_NAME"]
+    except (OSError, KeyError):
+        name = platform.system()
+    library, version = platform.libc_ver()
+    return ", ".join(filter(None, (name, platform.machine(), f"{library} {version}".strip())))
+
+
+def _processor() -> str:
+    for line in _text(Path("/proc/cpuinfo")).splitlines():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.processor() or "unknown processor"
+
+
+def _memory() -> tuple[int, int]:
+    """Bytes in all, and bytes that can be had now."""
+    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    fields = dict(line.split(":")[:2] for line in _text(Path("/proc/meminfo")).splitlines())
+    free = int(fields.get("MemAvailable", "0 kB").split()[0]) * 1024 or pages
+    limit, used = (_text(_CGROUP / name).strip() for name in ("memory.max", "memory.current"))
+    if limit.isdigit() and int(limit) < pages:
+        return int(limit), min(free, int(limit) - int(used or 0))
+    return pages, free
+
+
+def _quota() -> float:
+    """Cores that the container may use."""
+    quota, _, period = _text(_CGROUP / "cpu.max").strip().partition(" ")
+    return int(quota) / int(period) if quota.isdigit() and period.isdigit() else float("inf")
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError:
+        return ""

@@ -1,0 +1,168 @@
+"""Whether packages can be imported, tried in a Python of its own: a crash is a finding, too."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib import metadata, util
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any
+
+from gsba.doctor.requirements import Requirement
+from gsba.log import brief
+from gsba.version import __version__
+
+_TIMEOUT_S = 120.0
+_MOST_SHOWN = 160  # characters of what an import says
+_MOST_FILES = 300  # of a package that are looked through for libraries
+_LIBRARY = re.compile(r"([\w.+-]+\.so[\w.]*): cannot open shared object file")
+_DEBIAN = {"libglib-2.0.so.0": "libglib2.0-0", "libgthread-2.0.so.0": "libglib2.0-0"}
+_CHILD = "import sys; from gsba.doctor.child import answer; answer(sys.argv[1], sys.argv[2:])"
+
+
+@dataclass(frozen=True, slots=True)
+class Package:
+    """A package that gsba asks for, as it was found."""
+
+    name: str
+    version: str | None  # None = not installed
+    fault: str = ""  # why it cannot be used; "" = it can
+    libraries: tuple[str, ...] = ()  # shared ones of the system that it lacks
+
+    @property
+    def works(self) -> bool:
+        """Whether it is there and can be used."""
+        return self.version is not None and not self.fault
+
+
+def look_at(
+    wanted: Sequence[Requirement], facts: str
+) -> tuple[tuple[Package, ...], dict[str, Any]]:
+    """Import packages in a process of their own.
+
+    Args:
+        wanted: tried in this order.
+        facts: name of what the process is asked besides, see `gsba.doctor.facts`; "" = nothing.
+
+    Returns:
+        as found, and the answers; none where a package that they need is missing.
+    """
+    versions = {one.name: _version(one.name) for one in wanted}
+    unfit = {one.name: _unfit(one, versions[one.name]) for one in wanted}
+    tried = [one for one in wanted if not unfit[one.name]]
+    all_there = len(tried) == len(wanted)
+    reports, answers = _imported([one.module for one in tried], facts if all_there else "")
+    found = []
+    for one in wanted:
+        version, report = versions[one.name], reports.get(one.module, {})
+        fault, libraries = unfit[one.name], ()
+        if not fault and "error" in report:
+            libraries = _missing_libraries(one.module, report["error"])
+            fault = _fault(report, libraries)
+        found.append(Package(one.name, version, fault, libraries))
+    return tuple(found), answers
+
+
+def debian_package(library: str) -> str:
+    """Debian's package of a shared library, by how these are named: libX11.so.6 is in libx11-6."""
+    if library in _DEBIAN:
+        return _DEBIAN[library]
+    name, _, number = library.lower().partition(".so")
+    number = number.removeprefix(".")
+    return f"{name}-{number}" if number and name[-1].isdigit() else f"{name}{number}"
+
+
+def _version(name: str) -> str | None:
+    if name == "gsba":
+        return __version__  # which may run from its source
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _unfit(wanted: Requirement, version: str | None) -> str:
+    """Why a package need not be tried; "" = it is."""
+    if version is None:
+        return "is not installed"
+    return "" if wanted.allows(version) else f"{wanted.range} is needed"
+
+
+def _imported(
+    modules: Sequence[str], facts: str
+) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
+    """What became of each module, and answers; a module that ends the process is left out next."""
+    reports: dict[str, dict[str, Any]] = {}
+    answers: dict[str, Any] = {}
+    rest = list(modules)
+    while rest:
+        lines, ended = _child(facts, rest)
+        for line in lines:
+            answers.update(line.get("facts", {}))
+            if "module" in line:
+                reports[line["module"]] = line
+        begun = next((m for m in rest if reports.get(m, {}).get("state") == "begun"), None)
+        if begun is None:
+            untold = {"error": ended or "could not be tried"}
+            reports = dict.fromkeys(rest, untold) | reports
+            break
+        reports[begun] = {"error": ended}
+        rest, facts = rest[rest.index(begun) + 1 :], ""
+    return reports, answers
+
+
+def _child(facts: str, modules: Sequence[str]) -> tuple[list[dict[str, Any]], str]:
+    """Lines of a process that imports modules, and how it ended; "" = as it should."""
+    path = os.pathsep.join(filter(None, sys.path))
+    environment = {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
+    call = [sys.executable, "-c", _CHILD, facts, *modules]
+    try:
+        done = subprocess.run(
+            call, env=environment, capture_output=True, timeout=_TIMEOUT_S, check=False
+        )
+        output, code = done.stdout, done.returncode
+    except subprocess.TimeoutExpired as error:
+        output, code = error.stdout or b"", None
+    lines = [json.loads(line) for line in output.splitlines() if line.startswith(b"{")]
+    if code is None:
+        return lines, f"its import takes more than {_TIMEOUT_S:.0f} s"
+    if code >= 0:
+        return lines, "" if code == 0 else f"its import ends Python with code {code}"
+    name = signal.Signals(-code).name
+    why = ": it is built for another processor" if name == "SIGILL" else ""
+    return lines, f"its import crashes Python ({name}){why}"
+
+
+def _fault(report: dict[str, Any], libraries: Sequence[str]) -> str:
+    if libraries:
+        return f"lacks {', '.join(libraries)}"
+    if report.get("absent"):
+        return f"needs {report['absent']}, which is not installed"
+    return brief(" ".join(str(report["error"]).split()), _MOST_SHOWN)
+
+
+def _missing_libraries(module: str, error: str) -> tuple[str, ...]:
+    """Shared libraries that a package lacks: the one its import tells of, and what `ldd` sees."""
+    told = _LIBRARY.findall(error)
+    if not told:
+        return ()
+    lacking = dict.fromkeys(told)
+    bundled = {path.name for path in _shared_objects(module)}
+    for path in islice(_shared_objects(module), _MOST_FILES):
+        try:
+            listed = subprocess.run(["ldd", path], capture_output=True, text=True, timeout=10)
+        except (OSError, subprocess.TimeoutExpired):
+            break
+        lacking |= dict.fromkeys(re.findall(r"(\S+) => not found", listed.stdout))
+    return tuple(name for name in lacking if name in told or name not in bundled)
+
+
+def _shared_objects(module: str) -> Iterator[Path]:
+    spec = util.find_spec(module.partition(".")[0])
+    folders = spec.submodule_search_locations if spec else None
+    return chain.from_iterable(Path(folder).rglob("*.so*") for folder in folders or ())

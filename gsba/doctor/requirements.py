@@ -1,0 +1,74 @@
+"""What gsba asks of other packages: names, ranges of versions, and the extra they belong to."""
+
+import re
+import tomllib
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+import gsba
+
+NEEDED = ""  # the extra of what every run needs
+_MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "pyyaml": "yaml"}
+_NOT_EXAMINED = ("all", "test", "dev")  # sums of others, and what developers need
+
+
+@dataclass(frozen=True, slots=True)
+class Requirement:
+    """A package that gsba asks for."""
+
+    name: str  # of the distribution
+    module: str  # that is imported
+    range: str  # of versions, such as ">=5,<6"
+    extra: str  # "" = always needed
+
+    def allows(self, version: str) -> bool:
+        """Whether a version is in the range; of versions that are no numbers, all are."""
+        found = _numbers(version)
+        tests = {
+            ">=": lambda bound: found >= bound,
+            "<=": lambda bound: found <= bound,
+            "<": lambda bound: found < bound,
+            ">": lambda bound: found > bound,
+            "==": lambda bound: found == bound,
+            "!=": lambda bound: found != bound,
+        }
+        bounds = re.findall(r"(>=|<=|==|!=|<|>)\s*([0-9.]+)", self.range)
+        return not found or all(tests[how](_numbers(bound)) for how, bound in bounds)
+
+
+def requirements() -> tuple[Requirement, ...]:
+    """All of them, those that are always needed first.
+
+    Read from pyproject.toml where gsba runs from its source, else from what is installed.
+    """
+    project = Path(gsba.__file__).parents[1] / "pyproject.toml"
+    if project.is_file():
+        table = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
+        lines = [(line, NEEDED) for line in table["dependencies"]]
+        for extra, of_extra in table["optional-dependencies"].items():
+            lines += [(line, extra) for line in of_extra]
+    else:
+        lines = []
+        for line in metadata.requires("gsba") or ():
+            marker = re.search(r"extra\s*==\s*['\"]([^'\"]+)", line)
+            lines.append((line.partition(";")[0], marker[1] if marker else NEEDED))
+    kept = [(line, extra) for line, extra in lines if extra not in _NOT_EXAMINED]
+    return tuple(_requirement(line, extra) for line, extra in kept)
+
+
+def _requirement(line: str, extra: str) -> Requirement:
+    """Of a line such as `laspy[lazrs]>=2.5`."""
+    match = re.match(r"\s*([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*\(?([^;)]*)", line)
+    assert match is not None
+    name = match[1].lower()
+    return Requirement(name, _MODULES.get(name, name.replace("-", "_")), match[2].strip(), extra)
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    """(2, 13) of "2.13.0+cpu"."""
+    release = re.match(r"[0-9.]*", version)
+    numbers = [int(part) for part in (release[0] if release else "").split(".") if part]
+    while numbers and numbers[-1] == 0:
+        numbers.pop()
+    return tuple(numbers)

@@ -1,0 +1,82 @@
+"""How figures are drawn: by matplotlib (extra `plot`), in one style, with the same bytes each time.
+
+A user's own matplotlibrc has no say, and files hold no dates.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gsba.disk import atomic_write
+from gsba.log import GsbaError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+KINDS = {  # suffix -> what a file is not to hold
+    ".png": {"Software": None},
+    ".svg": {"Date": None, "Creator": None},
+    ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+}
+BEFORE, AFTER, TRUE = "#d9822b", "#1769aa", "#1b1c1e"  # as in report.html
+ALONE = "#2e7d4f"  # a trajectory that is no run's
+_COLORS = (AFTER, ALONE, "#b3383f", "#7d4fa3", "#8a6d1c", "#258a99")
+_STYLE = {
+    "axes.grid": True,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlesize": "medium",
+    "font.size": 9.0,
+    "grid.color": "#e3e3dd",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "lines.linewidth": 1.3,
+    "savefig.dpi": 200,
+    "svg.hashsalt": "gsba",
+}
+
+
+class NoMatplotlibError(GsbaError):
+    """Figures are wanted, and matplotlib is not installed."""
+
+
+def write(
+    paths: Sequence[Path], size_in: tuple[float, float], fill: Callable[["Figure"], None]
+) -> None:
+    """Draw one figure, and write it to files, atomically.
+
+    Args:
+        paths: with a suffix of KINDS each.
+        size_in: width and height, inches.
+        fill: draws into the figure.
+
+    Raises:
+        NoMatplotlibError: it is not installed.
+        GsbaError: the disk refuses.
+    """
+    try:
+        from matplotlib import style
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise NoMatplotlibError("figures need matplotlib: pip install 'gsba[plot]'") from None
+
+    def save(to: Path, metadata: dict[str, Any]) -> None:
+        figure.savefig(to, metadata=metadata)
+
+    with style.context(["default", _STYLE]):
+        figure = Figure(figsize=size_in, layout="constrained")
+        fill(figure)
+        for path in paths:
+            metadata = KINDS[path.suffix.lower()]
+            atomic_write(path, lambda to, metadata=metadata: save(to, metadata))
+
+
+def colors() -> Iterator[str]:
+    """A colour for each of several lines; after some of them they repeat."""
+    return cycle(_COLORS)
+
+
+def plain(name: str) -> str:
+    """A name that matplotlib shows as it is: not as a formula, nor left out of legends."""
+    return ("\u200b" if name.startswith("_") else "") + name.replace("$", r"\$")

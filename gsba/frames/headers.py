@@ -1,0 +1,270 @@
+"""What image files say of themselves before any pixel is decoded: JPEG, PNG, WebP and TIFF.
+
+Sizes are of what is shown: the orientation tag of EXIF turns or mirrors what is stored.
+"""
+
+import mmap
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsba.log import GsbaError
+
+MAX_PIXELS = 1 << 28  # of one image: 768 MB of colours
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_END = b"IEND\xaeB`\x82"  # chunk type and its constant CRC
+_PNG_COLOURS = (2, 6)  # RGB, RGB with alpha
+_PNG_TAIL = 1 << 16  # bytes before the end in which tags are looked for
+_JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_JPEG_BARE = {0x01, *range(0xD0, 0xD9)}  # markers without a segment: TEM, RST0-7, SOI
+_JPEG_FRAME = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0-15; not DHT, JPG, DAC
+_JPEG_SCAN, _JPEG_APP1 = 0xDA, 0xE1  # SOS; where EXIF is
+_EXIF = b"Exif\0\0"
+_WEBP_ANIMATED = 0x02  # of the flags of an extended file
+_TIFF_STARTS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"  # with +: BigTIFF
+_TIFF_TYPES = {1: 1, 3: 2, 4: 4, 16: 8}  # bytes of an unsigned number
+_WIDTH, _HEIGHT, _BITS, _COMPRESSION, _COLOURS = 256, 257, 258, 259, 262
+_ORIENTATION, _SAMPLES, _PLANES, _FORMAT = 274, 277, 284, 339
+_STRIPS, _STRIP_SIZES, _TILES, _TILE_SIZES = 273, 279, 324, 325
+_TIFF_TAGS = {
+    *(_WIDTH, _HEIGHT, _BITS, _COMPRESSION, _COLOURS, _ORIENTATION, _SAMPLES, _PLANES, _FORMAT),
+    *(_STRIPS, _STRIP_SIZES, _TILES, _TILE_SIZES),
+}
+_TIFF_COMPRESSIONS = {1, 5, 7, 8, 32773, 32946}  # none, LZW, JPEG, deflate, PackBits, old deflate
+
+Bytes = mmap.mmap | bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What an image file says of itself."""
+
+    kind: str  # "JPEG", "PNG", "WebP" or "TIFF"
+    width: int  # pixels as shown
+    height: int  # pixels as shown
+    orientation: int = 1  # EXIF's, 1 (as stored) to 8
+    plain: bool = False  # 8 bits of red, green and blue, as any program reads them
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height as shown."""
+        return self.width, self.height
+
+    @property
+    def swapped(self) -> bool:
+        """Whether rows are shown as columns."""
+        return self.orientation > 4
+
+
+class _Unread(Exception):
+    """Something that is whole, but not read here."""
+
+
+class _CutOff(Exception):
+    """The end is missing."""
+
+
+def header_of(data: Bytes, path: Path) -> Header:
+    """The header of an image file's content.
+
+    Args:
+        data: all of it.
+        path: for messages.
+
+    Raises:
+        GsbaError: no such image, its end is missing, a variant that is not read, or more than
+            MAX_PIXELS.
+    """
+    try:
+        header = _header(data)
+    except _CutOff:
+        raise GsbaError(
+            f"{path}: truncated image (its end is missing); copy or extract it again"
+        ) from None
+    except _Unread as what:
+        raise GsbaError(f"{path}: {what}") from None
+    except (IndexError, ValueError):  # ran past the end
+        raise GsbaError(f"{path}: truncated or damaged image; copy or extract it again") from None
+    if header.width * header.height > MAX_PIXELS:
+        raise GsbaError(
+            f"{path}: is {header.width}x{header.height}, "
+            f"{header.width * header.height / 1e6:.0f} megapixels; "
+            f"{MAX_PIXELS / 1e6:.0f} are read at most: make it smaller"
+        )
+    return header
+
+
+def _header(data: Bytes) -> Header:
+    if data[:8] == _PNG_SIGNATURE:
+        return _png(data)
+    if data[:2] == _JPEG_START:
+        return _jpeg(data)
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        return _webp(data)
+    if data[:4] in _TIFF_STARTS:
+        return _tiff(data)
+    raise _Unread("not a JPEG, PNG, WebP or TIFF image; remove or convert it")
+
+
+def _shown(kind: str, width: int, height: int, orientation: int, plain: bool) -> Header:
+    """A header of a stored width and height."""
+    if orientation > 4:
+        width, height = height, width
+    return Header(kind, width, height, orientation, plain and orientation == 1)
+
+
+def _png(data: Bytes) -> Header:
+    """PNG, third edition, sections 5 and 11."""
+    if len(data) < 33 or data[12:16] != b"IHDR":
+        raise ValueError
+    if data.rfind(_PNG_END) <= 0:
+        raise _CutOff
+    width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
+    plain = data[24] == 8 and data[25] in _PNG_COLOURS
+    return _shown("PNG", width, height, _orientation(_png_exif(data)), plain)
+
+
+def _png_exif(data: Bytes) -> bytes:
+    """The eXIf chunk: before the pixels, or behind them near the end."""
+    position = 8
+    while (kind := data[position + 4 : position + 8]) not in (b"IDAT", b"IEND", b""):
+        length = int.from_bytes(data[position : position + 4], "big")
+        if kind == b"eXIf":
+            return data[position + 8 : position + 8 + length]
+        position += 12 + length
+    at = data.rfind(b"eXIf", max(len(data) - _PNG_TAIL, position))
+    length = int.from_bytes(data[at - 4 : at], "big") if at > 0 else 0
+    found = data[at : at + 4 + length]
+    checksum = int.from_bytes(data[at + 4 + length : at + 8 + length], "big")
+    return found[4:] if length and zlib.crc32(found) == checksum else b""
+
+
+def _jpeg(data: Bytes) -> Header:
+    """ITU T.81, annex B.
+
+    The end marker cannot occur inside entropy-coded data, but does occur in EXIF thumbnails, so
+    it only counts after the first scan has begun; cameras may append data after it.
+    """
+    position, size, exif, components = 2, None, b"", 0
+    while True:
+        if data[position] != 0xFF:
+            raise ValueError
+        while data[position] == 0xFF:  # any number of fill bytes
+            position += 1
+        marker = data[position]
+        position += 1
+        if marker in _JPEG_BARE:
+            continue
+        length = int.from_bytes(data[position : position + 2], "big")
+        if marker in _JPEG_FRAME:
+            if data[position + 2] != 8:
+                raise _Unread(f"a JPEG of {data[position + 2]} bits; save it with 8, or as PNG")
+            height, width = (
+                int.from_bytes(data[position + k : position + k + 2], "big") for k in (3, 5)
+            )
+            size, components = (width, height), data[position + 7]
+        elif marker == _JPEG_APP1 and not exif and data[position + 2 : position + 8] == _EXIF:
+            exif = data[position + 8 : position + length]
+        elif marker == _JPEG_SCAN:
+            if size is None:
+                raise ValueError
+            if data.rfind(JPEG_END, position) <= 0:
+                raise _CutOff
+            return _shown("JPEG", *size, _orientation(exif), components == 3)
+        position += max(length, 2)
+
+
+def _webp(data: Bytes) -> Header:
+    """RFC 9649, section 2."""
+    end = 8 + int.from_bytes(data[4:8], "little")
+    if len(data) < end:
+        raise _CutOff
+    kind, body = data[12:16], data[20:30]
+    if len(body) < 10:
+        raise ValueError
+    if kind == b"VP8X":
+        if body[0] & _WEBP_ANIMATED:
+            raise _Unread("an animated WebP; extract its pictures to files of their own")
+        width, height = (int.from_bytes(body[at : at + 3], "little") + 1 for at in (4, 7))
+    elif kind == b"VP8L":
+        bits = int.from_bytes(body[1:5], "little")
+        width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    elif kind == b"VP8 ":
+        width, height = (int.from_bytes(body[at : at + 2], "little") & 0x3FFF for at in (6, 8))
+    else:
+        raise ValueError
+    exif, position = b"", 12
+    while not exif and position + 8 < end:
+        length = int.from_bytes(data[position + 4 : position + 8], "little")
+        if data[position : position + 4] == b"EXIF":
+            exif = data[position + 8 : position + 8 + length].removeprefix(_EXIF)
+        position += 8 + length + length % 2
+    return _shown("WebP", width, height, _orientation(exif), False)
+
+
+def _tiff(data: Bytes) -> Header:
+    """TIFF 6.0, sections 2, 3 and 8, of its first picture."""
+    tags = _directory(data)
+    bits, planes = tags.get(_BITS, (1,)), tags.get(_PLANES, (1,))[0]
+    colours, samples = tags.get(_COLOURS, (1,))[0], tags.get(_SAMPLES, (1,))[0]
+    deep = max(bits) > 8
+    what = ""
+    if any(form != 1 for form in tags.get(_FORMAT, (1,))):
+        what = "numbers that are signed or floating-point"
+    elif deep and (set(bits) != {16} or colours not in (1, 2) or (planes != 1 and samples > 1)):
+        what = f"{max(bits)} bits in an order of its own"
+    elif tags.get(_COMPRESSION, (1,))[0] not in _TIFF_COMPRESSIONS:
+        what = f"compression {tags[_COMPRESSION][0]}"
+    if what:
+        raise _Unread(f"a TIFF of {what}; save it as PNG, or as TIFF of 8 or 16 bits with LZW")
+    for starts, sizes in ((_STRIPS, _STRIP_SIZES), (_TILES, _TILE_SIZES)):
+        for start, size in zip(tags.get(starts, ()), tags.get(sizes, ()), strict=False):
+            if start + size > len(data):
+                raise _CutOff
+    if _STRIPS not in tags and _TILES not in tags:
+        raise ValueError
+    width, height = (tags.get(tag, (0,))[0] for tag in (_WIDTH, _HEIGHT))
+    return _shown("TIFF", width, height, _turn(tags), False)
+
+
+def _directory(data: Bytes) -> dict[int, tuple[int, ...]]:
+    """The tags of a TIFF's first directory that are asked for here; of EXIF data too."""
+    starts = {b"II": "little", b"MM": "big"}
+    order = starts.get(data[:2])
+    if order not in ("little", "big"):
+        raise ValueError
+
+    def number(at: int, size: int) -> int:
+        if at + size > len(data):
+            raise ValueError
+        return int.from_bytes(data[at : at + size], order)
+
+    big = number(2, 2) == 43
+    wide, of_count, entry = (8, 8, 20) if big else (4, 2, 12)
+    first = number(8 if big else 4, wide)
+    tags: dict[int, tuple[int, ...]] = {}
+    for k in range(number(first, of_count)):
+        at = first + of_count + k * entry
+        tag, size, count = number(at, 2), _TIFF_TYPES.get(number(at + 2, 2)), number(at + 4, wide)
+        if tag not in _TIFF_TAGS or size is None or not count:
+            continue
+        at += 4 + wide
+        place = at if size * count <= wide else number(at, wide)
+        if place + size * count > len(data):
+            raise _CutOff
+        tags[tag] = tuple(number(place + i * size, size) for i in range(count))
+    return tags
+
+
+def _orientation(exif: bytes) -> int:
+    """What EXIF data say of how a picture is held; 1 where they say nothing that can be read."""
+    try:
+        return _turn(_directory(exif))
+    except (ValueError, _CutOff):
+        return 1
+
+
+def _turn(tags: dict[int, tuple[int, ...]]) -> int:
+    turn = tags.get(_ORIENTATION, (1,))[0]
+    return turn if 1 <= turn <= 8 else 1

@@ -1,0 +1,10 @@
+"""Figures of several runs side by side: trajectories, errors against the truth, residuals.
+
+Takes folders of finished runs, or trajectory files, and the truth if there is one.
+Gives PNG, SVG or PDF, the same bytes for the same runs.
+"""
+
+from gsba.plot.figures import draw
+from gsba.plot.runs import Shown, load
+
+__all__ = ["Shown", "draw", "load"]

@@ -1,0 +1,164 @@
+"""The figures: what each shows, and where it is written."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gsba.evaluate import charts
+from gsba.log import GsbaError
+from gsba.plot.runs import Shown
+from gsba.report.html.figures import viewing_axes
+from gsba.similarity import Sim3
+from gsba.types import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+_WIDTH, _ROW = 7.2, 2.7  # inches: the text width of a paper, a row of panels
+_MOST_BESIDE = 3  # trajectories in a row
+_MOST_POINTS = 2000  # of a curve of shares
+
+Fill = Callable[["SubFigure | Figure"], None]
+
+
+def draw(shown: Sequence[Shown], out: Path, truth: Trajectory | None = None) -> list[Path]:
+    """Write the figures of several runs.
+
+    Trajectories from above, each run in a panel; with the truth, errors of every pose over time
+    and their distribution; of runs, angular residuals of frames over time and of all observations.
+
+    Args:
+        shown: of `gsba.plot.load`, with the same truth.
+        out: a folder for trajectories, errors and residuals, each as PNG and SVG; or a file (PNG,
+            SVG or PDF) for all of them in one figure.
+        truth: true poses.
+
+    Returns:
+        the files.
+
+    Raises:
+        GsbaError: matplotlib is not installed, a file of another kind, or the disk refuses.
+    """
+    rows = -(-len(shown) // _MOST_BESIDE)
+    figures: dict[str, tuple[int, Fill]] = {
+        "trajectories": (rows, lambda figure: _trajectories(figure, shown, truth))
+    }
+    if truth is not None:
+        figures["errors"] = (2, lambda figure: _errors(figure, shown))
+    if any(one.residuals_deg is not None for one in shown):
+        figures["residuals"] = (1, lambda figure: _residuals(figure, shown))
+    if not out.suffix or out.is_dir():
+        files = []
+        for name, (num_rows, fill) in figures.items():
+            paths = [out / f"{name}.{kind}" for kind in ("png", "svg")]
+            charts.write(paths, (_WIDTH, num_rows * _ROW), fill)
+            files += paths
+        return files
+    if out.suffix.lower() not in charts.KINDS:
+        raise GsbaError(f"--out {out}: figures are .png, .svg or .pdf files; or name a folder")
+    heights = [num_rows for num_rows, _ in figures.values()]
+
+    def fill_all(figure: "Figure") -> None:
+        parts = figure.subfigures(len(figures), 1, height_ratios=heights, squeeze=False)[:, 0]
+        for part, (_, fill) in zip(parts, figures.values(), strict=True):
+            fill(part)
+
+    charts.write([out], (_WIDTH, sum(heights) * _ROW), fill_all)
+    return [out]
+
+
+def _trajectories(
+    figure: "SubFigure | Figure", shown: Sequence[Shown], truth: Trajectory | None
+) -> None:
+    """Walks from above, before and after; dots are the truth."""
+    beside = min(len(shown), _MOST_BESIDE)
+    rows = -(-len(shown) // beside)
+    panels = figure.subplots(rows, beside, squeeze=False).ravel()
+    common = shown[0].refined if truth is None else truth
+    unit = "units of the truth" if truth is not None else f"units of {charts.plain(shown[0].name)}"
+    lines: dict[str, Any] = {}
+    for one, axes in zip(shown, panels, strict=False):
+        world, own = (one.refined, Sim3()) if one.placed is None else (common, one.placed)
+        looked = _Above(world)
+        if one.coarse is not None:
+            before = one.coarse_errors.fit if one.coarse_errors is not None else own
+            lines["before"] = looked.line(axes, one.coarse, before, charts.BEFORE, "-")
+            lines["after"] = looked.line(axes, one.refined, own, charts.AFTER, "-")
+        else:
+            lines["trajectory"] = looked.line(axes, one.refined, own, charts.ALONE, "-")
+        if truth is not None:
+            lines["truth"] = looked.line(axes, truth, Sim3(), charts.TRUE, ":")
+        axes.set_title(charts.plain(one.name))
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_xlabel("own units" if one.placed is None else unit)
+    for axes in panels[len(shown) :]:
+        axes.remove()
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4)
+
+
+class _Above:
+    """The view from above on a walk: its two level axes, as report.html has them."""
+
+    def __init__(self, world: Trajectory) -> None:
+        finite = np.isfinite(world.world_T_rigs).all(axis=(1, 2))
+        poses = world.world_T_rigs[finite]
+        self._axes, _ = viewing_axes(poses)
+        self._centre = np.median(poses[:, :3, 3], axis=0)
+
+    def line(self, axes: "Axes", walk: Trajectory, placed: Sim3, color: str, style: str) -> object:
+        """Draw a walk, carried into this world; gaps where poses are missing."""
+        positions = placed.points(walk.world_T_rigs[:, :3, 3])
+        across, up = ((positions - self._centre) @ self._axes[:2].T).T
+        return axes.plot(across, up, color=color, linestyle=style)[0]
+
+
+def _errors(figure: "SubFigure | Figure", shown: Sequence[Shown]) -> None:
+    """Errors of every pose: of positions above, of rotations below; over time, and their shares."""
+    panels = figure.subplots(2, 2)
+    lines: dict[str, Any] = {}
+    start = min(float(one.refined.timestamps[0]) for one in shown)
+    for one, color in zip(shown, charts.colors(), strict=False):
+        name = charts.plain(one.name)
+        kinds = [(one.coarse_errors, one.coarse, ":", f"{name}, before")]
+        for errors, walk, style, label in [*kinds, (one.errors, one.refined, "-", name)]:
+            if errors is None or walk is None:
+                continue
+            times = walk.timestamps[errors.rows] - start
+            for row, off in enumerate((errors.positions, np.degrees(errors.rotations))):
+                how = {"color": color, "linestyle": style}
+                lines[label] = panels[row, 0].plot(times, off, **how)[0]
+                panels[row, 1].plot(*_shares(off), **how)
+    for row, what in enumerate(("position error, units of the truth", "rotation error, degrees")):
+        panels[row, 0].set(ylabel=what, yscale="log")
+        panels[row, 1].set(ylabel="share of frames", xscale="log", ylim=(0, 1), xlabel=what)
+    panels[1, 0].set_xlabel("time, s")
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4)
+
+
+def _residuals(figure: "SubFigure | Figure", shown: Sequence[Shown]) -> None:
+    """Angular residuals: the median of every frame over time, and shares of all observations."""
+    left, right = figure.subplots(1, 2)
+    lines: dict[str, Any] = {}
+    common = all(one.placed is not None for one in shown)
+    starts = [float(one.refined.timestamps[0]) for one in shown]
+    for k, (one, color) in enumerate(zip(shown, charts.colors(), strict=False)):
+        if one.residuals_deg is None or one.frame_residuals_deg is None:
+            continue
+        times = one.refined.timestamps - (min(starts) if common else starts[k])
+        name = charts.plain(one.name)
+        lines[name] = left.plot(times, one.frame_residuals_deg, color=color)[0]
+        right.plot(*_shares(one.residuals_deg), color=color)
+    left.set(xlabel="time, s", ylabel="median residual, degrees", ylim=(0, None))
+    right.set(xlabel="residual, degrees", ylabel="share of observations", ylim=(0, 1))
+    right.set_xscale("log")
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4)
+
+
+def _shares(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values (P,) ascending and which share of all is no larger, at most so many points."""
+    ordered = np.sort(values)
+    rows = np.unique(np.linspace(0, len(ordered) - 1, min(len(ordered), _MOST_POINTS)).astype(int))
+    return ordered[rows], (rows + 1) / max(len(ordered), 1)

@@ -1,0 +1,54 @@
+"""Raw fisheyes of an export: each lens's picture in a file of its own, as trainers read it."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from export_scene import panoramas
+from PIL import Image
+from two_fisheyes import made_pair, picture, write
+
+from gsba.export.raw import write_raw
+from gsba.types import FrameSet
+
+PAIR = made_pair(120)
+
+
+def _frames(folder: Path, layout: str) -> tuple[FrameSet, list[np.ndarray]]:
+    """One frame of two lenses, and their pictures."""
+    shown = [picture(lens) for lens in PAIR]
+    base = panoramas(folder / "panoramas").taken(np.arange(1))
+    if layout == "beside":
+        paths = (write(folder / "0.png", np.concatenate(shown, axis=1)),) * 2
+    else:
+        paths = (folder / f"0_00.{layout}", folder / f"0_10.{layout}")
+        for path, pixels in zip(paths, shown, strict=True):
+            Image.fromarray(pixels).save(path, **({"lossless": True} if layout == "webp" else {}))
+    made = FrameSet(
+        base.names, (paths,), base.timestamps, "fisheye", (), 240, 120, (None,), fisheyes=PAIR
+    )
+    return made, shown
+
+
+@pytest.mark.parametrize("layout", ["png", "beside", "tif", "webp"])
+def test_each_lens_has_a_picture_of_its_own(tmp_path: Path, layout: str) -> None:
+    frames, shown = _frames(tmp_path, layout)
+    suffix = "jpg" if layout == "webp" else "png"
+    write_raw(
+        frames,
+        lambda f, lens: tmp_path / f"out{lens}.{suffix}",
+        lambda f, lens: tmp_path / f"mask{lens}.png",
+        link=True,
+    )
+    for lens, wanted in enumerate(shown):
+        read = pycolmap.Bitmap.read(tmp_path / f"out{lens}.{suffix}", True)
+        assert read is not None
+        found = read.to_array()
+        assert found.shape == wanted.shape
+        off = np.abs(found.astype(int) - wanted)
+        assert off.mean() < 3 if layout == "webp" else off.max() == 0
+        with Image.open(tmp_path / f"mask{lens}.png") as mask:
+            assert mask.size == (120, 120)
+    linked = layout == "png"
+    assert (tmp_path / f"out0.{suffix}").samefile(frames.paths[0][0]) == linked
