@@ -55,6 +55,14 @@ Camera = Annotated[
 Calibration = Annotated[
     Path | None, typer.Option(help="Of the lenses of raw fisheyes.", metavar="FILE")
 ]
+Imu = Annotated[
+    Path | None,
+    typer.Option(
+        help="Gyro and accelerometer that rode along: t, gyro x y z [rad/s], accelerometer x y z "
+        "[m/s^2]; or a maker's recording.",
+        metavar="FILE",
+    ),
+]
 Segment = Annotated[
     str | None,
     typer.Option(help="Your own masks of faces: called with IMAGES MASKS.", metavar="COMMAND"),
@@ -88,6 +96,7 @@ def refine(
     ] = None,
     camera: Camera = None,
     calibration: Calibration = None,
+    imu: Imu = None,
     fps: Annotated[
         float | None,
         typer.Option(help="Frames per second, from time 0; of a video: frames kept per second."),
@@ -119,6 +128,7 @@ def refine(
         timestamps=timestamps,
         fps=fps,
         calibration=calibration,
+        imu=imu,
         fresh=fresh,
     )
     typer.echo(_summary(out))

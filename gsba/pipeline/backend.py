@@ -29,6 +29,7 @@ from gsba.bundle.reconstruction import assemble, world_scale
 from gsba.bundle.self_calibration import SelfCalibration
 from gsba.bundle.stitching import Stitching
 from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.imu.alignment import Alignment, align, turning_of
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.merged_map import Registered, follow
@@ -290,6 +291,23 @@ def measure_strength(run: Run, seen: Seen, prior: Prior, solved: Solution) -> Pr
 
     strength = run.stage("strength", [run.solving_key(), closer], compute, MapStrength)
     return replace(prior, strength=strength)
+
+
+def align_imu(run: Run, prior: Prior, solved: Solution, name: str) -> Prior:
+    """What a gyro says of the frames' turning, by better poses than before."""
+    readings, former, times = run.imu, prior.gyro, run.frames.timestamps
+    if readings is None or former is None or former.reason:
+        return prior
+    rotations = solved.world_T_rigs[:, :3, :3]
+    steps = np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]
+
+    def compute() -> Alignment:
+        return align(times, steps, ~prior.trust.unseen_steps, readings, former)
+
+    found = run.stage(name, readings.digest, compute, Alignment)
+    if found.reason:
+        return prior
+    return replace(prior, gyro=found, turning=turning_of(readings, found, times))
 
 
 def align_patches(run: Run, prior: Prior, world: Map, number: int) -> Map:

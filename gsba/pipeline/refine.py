@@ -15,6 +15,7 @@ from gsba.camera.lens import Lenses
 from gsba.config import RefineSettings
 from gsba.frames.dual_fisheye import SEAM
 from gsba.frames.scan import scan
+from gsba.imu.files import read_imu
 from gsba.loop_closure import connectivity
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
@@ -63,6 +64,7 @@ def refine(
     timestamps: Path | None = None,
     fps: float | None = None,
     calibration: Path | None = None,
+    imu: Path | None = None,
     fresh: bool = False,
     extra_factors: ExtraFactors | None = None,
 ) -> RunResult:
@@ -85,6 +87,7 @@ def refine(
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
+        imu: readings of a gyro that rode along, and of an accelerometer; see `gsba.imu.files`.
         fresh: forget an earlier run in `out`.
         extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
 
@@ -107,7 +110,8 @@ def refine(
         frame_set, journal = merging.before(store, frame_set, chosen), Journal()
         if chosen.distractors:
             frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
-        run = Run.begin(store, frame_set, coarse, settings, extra_factors, journal)
+        readings = imu and read_imu(imu)
+        run = Run.begin(store, frame_set, coarse, settings, extra_factors, journal, imu=readings)
         run, seen, prior, world = _solve_raw(run, Prior.of(coarse, extra_factors), given)
         result = backend.reconstruct(run, seen, prior, world)
         return outputs.write(run, prior, world, result, backend.keep_lenses(run, world, result))
@@ -120,6 +124,7 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
         The run that it was in the end, its keypoints, and what `solve` gives.
     """
     known = [run.settings.model_dump(exclude={"export", "placement"}), run.custom]
+    known += [] if run.imu is None else [run.imu.digest]
     counts, frames = dict(run.journal.counts), run.frames
     n = 0
     while True:
@@ -136,7 +141,7 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
         n, (fisheyes, found) = n + 1, better
         frames, again = replace(frames, fisheyes=fisheyes), Journal(dict(counts))
         settings, extra = run.settings, run.extra_factors
-        run = Run.begin(run.store, frames, prior.coarse, settings, extra, again, found)
+        run = Run.begin(run.store, frames, prior.coarse, settings, extra, again, found, run.imu)
 
 
 def _cut_better(coarse: CoarsePoses, world: Map) -> _Cut | None:
@@ -177,6 +182,7 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     # Neighbours in time, and what they say of the trajectory and its clock.
     prior, near = frontend.match_neighbours(run, seen, prior, given)
     prior, near = frontend.judge_trajectory(run, seen, prior, near)
+    prior = frontend.align_imu(run, seen, prior, near)
     if prior.turning_only:
         return prior, Map.of(prior.start(), seen.shown)
     # A chain of relative poses, then all that neighbours have in common.
@@ -190,8 +196,10 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     prior, solved, loops = frontend.close_loops(run, seen, prior, solved)
     matches = [along, known, loops]
     solved = backend.adjust(run, seen, prior, "closed", matches, solved, rounds.loops)
+    prior = backend.align_imu(run, prior, solved, "imu_closed")
     seen, world = _find_camera(run, seen, prior, matches, solved)
     solved = world.solution
+    prior = backend.align_imu(run, prior, solved, "imu_camera")
     prior = backend.measure_strength(run, seen, prior, solved)
     seen, solved, along = _look_closer(run, seen, prior, solved, along)
     # The map matched anew from itself.
@@ -203,6 +211,8 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     # Below a pixel: patches, pixels, splats.
     world = replace(world, solution=solved, observed=seen.shown)
     for n in range(1, patch_rounds + 1):
+        if n > 1:
+            prior = backend.align_imu(run, prior, world.solution, f"imu_aligned{n}")
         world = backend.align_patches(run, prior, world, n)
     if "photometric" in families:
         world = backend.refine_photometric(run, prior, world)

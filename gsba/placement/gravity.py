@@ -8,6 +8,7 @@ import numpy as np
 
 from gsba.camera.rig import CubeRig
 from gsba.frames import cubemap
+from gsba.geometry import median_direction
 from gsba.types import FACES, FrameSet, PoseStatus, Reconstruction
 
 logger = logging.getLogger(__name__)
@@ -52,7 +53,7 @@ def estimate(reconstruction: Reconstruction, frames: FrameSet) -> Gravity | None
     if not len(good):
         return None
     ups = -reconstruction.world_T_rigs[good, :3, 1]
-    by_rigs = _median_direction(ups)
+    by_rigs = median_direction(ups)
     spread = float(np.degrees(np.median(np.arccos(np.clip(ups @ by_rigs, -1, 1)))))
     if spread > 30:
         logger.warning("the rigs agree on no up axis (%.0f degrees apart)", spread)
@@ -72,17 +73,6 @@ def estimate(reconstruction: Reconstruction, frames: FrameSet) -> Gravity | None
         spread,
     )
     return gravity
-
-
-def _median_direction(directions: np.ndarray) -> np.ndarray:
-    """Unit vector (3,) of least summed chord to unit vectors (N, 3) (Weiszfeld)."""
-    median = directions.mean(axis=0)
-    for _ in range(50):
-        distance = np.linalg.norm(directions - median, axis=1)
-        weights = 1 / np.maximum(distance, 1e-6)
-        median = weights @ directions / weights.sum()
-    length = np.linalg.norm(median)
-    return median / length if length > 1e-9 else np.array([0.0, -1.0, 0.0])
 
 
 def _edge_normals(
