@@ -421,6 +421,8 @@ class Reconstruction:
     lens_baseline: tuple[float, float] | None = None  # between two lenses, map units, and its
     # standard deviation; None = there is one
     fisheyes: tuple[Fisheye, Fisheye] | None = None  # of raw pairs, as found: see FrameSet
+    vertical: np.ndarray | None = None  # (3,) float64, unit, up or down by an accelerometer; None =
+    # there was none
 
     def largest_map(self) -> np.ndarray:
         """Frames (F',) int64 of the largest map: those that are exported."""

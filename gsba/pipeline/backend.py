@@ -30,6 +30,7 @@ from gsba.bundle.self_calibration import SelfCalibration
 from gsba.bundle.stitching import Stitching
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.imu.alignment import Alignment, align, turning_of
+from gsba.imu.gravity import up_axis
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.merged_map import Registered, follow
@@ -47,6 +48,7 @@ from gsba.types import (
     Keypoints,
     Landmarks,
     Matches,
+    PoseStatus,
     Reconstruction,
     Sighted,
     Solution,
@@ -538,13 +540,24 @@ def reconstruct(run: Run, seen: Seen, prior: Prior, world: Map) -> Reconstructio
             prior.parts,
             joint,
         )
-        result = replace(result, fisheyes=frames.fisheyes)
+        result = replace(result, fisheyes=frames.fisheyes, vertical=_vertical(run, prior, result))
         if not world.lenses or world.centres is None:
             return result
         baseline = baseline_of(world.centres, world_scale(solved, result))
         return replace(result, lens_baseline=baseline)
 
     return run.stage("reconstruction", run.solving_key(), compute, Reconstruction)
+
+
+def _vertical(run: Run, prior: Prior, result: Reconstruction) -> np.ndarray | None:
+    """The vertical in the world of a result, by an accelerometer that rode along."""
+    if run.imu is None or prior.gyro is None or prior.gyro.reason:
+        return None
+    good = result.pose_statuses == PoseStatus.REFINED
+    if result.components is not None:  # each map has a world of its own
+        good &= result.components == 0
+    rotations = result.world_T_rigs[good, :3, :3]
+    return up_axis(run.imu, prior.gyro, run.frames.timestamps[good], rotations)
 
 
 def keep_lenses(run: Run, world: Map, result: Reconstruction) -> Lenses:

@@ -15,7 +15,6 @@ from gsba.camera.lens import Lenses
 from gsba.config import RefineSettings
 from gsba.frames.dual_fisheye import SEAM
 from gsba.frames.scan import scan
-from gsba.imu.files import read_imu
 from gsba.loop_closure import connectivity
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
@@ -88,6 +87,7 @@ def refine(
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
         imu: readings of a gyro that rode along, and of an accelerometer; see `gsba.imu.files`.
+            None = those that a raw video holds, if any.
         fresh: forget an earlier run in `out`.
         extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
 
@@ -100,17 +100,18 @@ def refine(
     chosen = merging.choose(masks, segment)
     origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
+    readings = inputs.read_gyro(imu, frames)
     if video.is_video(frames):
         inputs.extract_frames(out, origin, settings, fps, fresh)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, calibration)
     check(settings.placement, frame_set, settings.camera.baseline())
+    inputs.check_gyro(imu, frame_set)
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh) as store:
         frame_set, journal = merging.before(store, frame_set, chosen), Journal()
         if chosen.distractors:
             frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
-        readings = imu and read_imu(imu)
         run = Run.begin(store, frame_set, coarse, settings, extra_factors, journal, imu=readings)
         run, seen, prior, world = _solve_raw(run, Prior.of(coarse, extra_factors), given)
         result = backend.reconstruct(run, seen, prior, world)
