@@ -40,6 +40,9 @@ Download = Annotated[
     bool, typer.Option("--download", help="Fetch missing weights from their authors.")
 ]
 
+Keyframes = Annotated[
+    Path | None, typer.Option(help="Keyframe trajectory of the same run.", metavar="FILE")
+]
 Masks = Annotated[
     list[Path] | None,
     typer.Option(
@@ -80,9 +83,7 @@ def refine(
         list[Path] | None,
         typer.Argument(help="TUM, KITTI or stella_vslam map.msg; several are pieces of one run."),
     ] = None,
-    keyframes: Annotated[
-        Path | None, typer.Option(help="Keyframe trajectory of the same run.", metavar="FILE")
-    ] = None,
+    keyframes: Keyframes = None,
     no_trajectory: Annotated[
         bool, typer.Option("--no-trajectory", help="Start from the images alone.")
     ] = False,
