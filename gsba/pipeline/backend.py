@@ -295,8 +295,15 @@ def measure_strength(run: Run, seen: Seen, prior: Prior, solved: Solution) -> Pr
     return replace(prior, strength=strength)
 
 
-def align_imu(run: Run, prior: Prior, solved: Solution, name: str) -> Prior:
-    """What a gyro says of the frames' turning, by better poses than before."""
+def align_imu(
+    run: Run, prior: Prior, solved: Solution, name: str, *, with_noise: bool = True
+) -> Prior:
+    """What a gyro says of the frames' turning, by better poses than before.
+
+    Args:
+        with_noise: measure its noise, too. Poses have followed it by as much as it was believed:
+            the noise that they leave is measured once where they have become much better.
+    """
     readings, former, times = run.imu, prior.gyro, run.frames.timestamps
     if readings is None or former is None or former.reason:
         return prior
@@ -309,6 +316,8 @@ def align_imu(run: Run, prior: Prior, solved: Solution, name: str) -> Prior:
     found = run.stage(name, readings.digest, compute, Alignment)
     if found.reason:
         return prior
+    if not with_noise:
+        found = replace(found, noise=former.noise)
     return replace(prior, gyro=found, turning=turning_of(readings, found, times))
 
 
@@ -332,6 +341,7 @@ def _adjust_under_lenses(
     if not world.lenses:
         return _adjust_aligned(run, prior, world, sighted, name)
     for n in range(_CALIBRATIONS):
+        prior = align_imu(run, prior, world.solution, f"imu_{name}_{n}", with_noise=False)
         seen = _see_anew(run, prior, world, sighted, name, n)
         better = _adjust_aligned(run, prior, seen, sighted, f"{name}_{n}" if n else name)
         if better is None:

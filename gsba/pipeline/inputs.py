@@ -100,12 +100,6 @@ def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
         return None
 
 
-def check_gyro(imu: Path | None, frames: FrameSet) -> None:
-    """Raise GsbaError where readings that were asked for cannot belong to frames."""
-    if imu is not None and not frames.timed:
-        raise GsbaError(f"{imu}: nothing says when frames were taken: pass --timestamps or --fps")
-
-
 def extract_frames(
     out: Path,
     origin: Mapping[str, Path],

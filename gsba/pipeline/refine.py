@@ -86,8 +86,7 @@ def refine(
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
-        imu: readings of a gyro that rode along, and of an accelerometer; see `gsba.imu.files`.
-            None = those that a raw video holds, if any.
+        imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
         fresh: forget an earlier run in `out`.
         extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
 
@@ -106,16 +105,20 @@ def refine(
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, calibration)
     check(settings.placement, frame_set, settings.camera.baseline())
-    inputs.check_gyro(imu, frame_set)
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh) as store:
         frame_set, journal = merging.before(store, frame_set, chosen), Journal()
         if chosen.distractors:
             frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
         run = Run.begin(store, frame_set, coarse, settings, extra_factors, journal, imu=readings)
-        run, seen, prior, world = _solve_raw(run, Prior.of(coarse, extra_factors), given)
-        result = backend.reconstruct(run, seen, prior, world)
-        return outputs.write(run, prior, world, result, backend.keep_lenses(run, world, result))
+        return _refine(run, Prior.of(coarse, extra_factors), given)
+
+
+def _refine(run: Run, prior: Prior, given: Sequence[Trajectory]) -> RunResult:
+    """A run from its frames to what it leaves behind."""
+    run, seen, prior, world = _solve_raw(run, prior, given)
+    result = backend.reconstruct(run, seen, prior, world)
+    return outputs.write(run, prior, world, result, backend.keep_lenses(run, world, result))
 
 
 def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run, Seen, Prior, Map]:
@@ -219,6 +222,7 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
         world = backend.refine_photometric(run, prior, world)
     if "splat" in families and not world.lenses:  # it is rendered as seen from one point
         world = backend.refine_on_splat(run, prior, world)
+    prior = backend.align_imu(run, prior, world.solution, "imu_final", with_noise=False)
     return prior, backend.measure_camera(run, prior, world)
 
 
