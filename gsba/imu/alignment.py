@@ -22,7 +22,8 @@ _MOST_TRIED = 60_000  # offsets
 _MOST_AT_ONCE = 200_000  # turns of all offsets tried together
 _OVER = 0.4  # part of the video that may lie outside the readings
 _TRIED = 6  # offsets of the grid that are refined
-_ROUNDS = 5  # of clock, then bias and axes
+_ROUNDS = 3  # of clock, then bias and axes
+_SETTLED = 1e-5  # s of change after which no more are needed
 _REWEIGHTED = 10  # passes over bias and axes
 _WIDTH = 2.0  # of their loss, standard deviations
 _MIN_TURNS = 4  # steps that turn
@@ -75,10 +76,11 @@ def align(
     else:
         shift = former.clock.times(np.array([turns.middle]))[0] - turns.middle
         starts = [(np.array([shift, former.clock.rate]), former.bias)]
-    found = [_Guess.of(turns, readings, *start).settled() for start in starts]
+    found = [_Guess.of(turns, readings, *start).refined() for start in starts]
     sigma = min(noise(one.fit.residuals(one.parameters)) for one in found)
     best = min(found, key=lambda one: one.fit.cost(one.parameters, sigma))
-    return _judged(best, [one for one in found if one is not best], timestamps, counts)
+    others = [one for one in found if one is not best]
+    return _judged(best.settled(), others, timestamps, counts)
 
 
 def turning_of(readings: Readings, found: Alignment, timestamps: np.ndarray) -> Turning:
@@ -136,12 +138,20 @@ class _Guess:
         fit = ClockFit(turns, _trajectory(near, bias + more, axes))
         return cls(turns, readings, parameters, bias + more, axes, sigma, fit)
 
+    def refined(self) -> "_Guess":
+        """The same with a better clock, of the rate that it has."""
+        parameters = self.fit.refine(self.parameters, with_rate=False)
+        return _Guess.of(self.turns, self.readings, parameters, self.bias)
+
     def settled(self) -> "_Guess":
         """The same with the clock that fits best."""
         one = self
         for _ in range(_ROUNDS):
             parameters = simplest(one.fit, one.fit.refine(one.parameters))[0]
+            moved = abs(float(parameters[0] - one.parameters[0]))
             one = _Guess.of(self.turns, self.readings, parameters, one.bias)
+            if moved < _SETTLED:
+                break
         return one
 
 

@@ -69,8 +69,7 @@ def refine(
 ) -> RunResult:
     """Refine the pose of every frame, and write poses, cloud, report and datasets to `out`.
 
-    A second call with the same `out` takes up finished stages; a changed setting re-runs what
-    depends on it.
+    A second call with the same `out` re-runs only what depends on settings that changed.
 
     Args:
         frames: folder of 2:1 panoramas, raw fisheyes or cube faces, or a video, for `out`/frames.
