@@ -202,7 +202,7 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     prior = backend.align_imu(run, prior, solved, "imu_closed")
     seen, world = _find_camera(run, seen, prior, matches, solved)
     solved = world.solution
-    prior = backend.align_imu(run, prior, solved, "imu_camera")
+    prior = backend.align_imu(run, prior, solved, "imu_camera", with_noise=bool(world.lenses))
     prior = backend.measure_strength(run, seen, prior, solved)
     seen, solved, along = _look_closer(run, seen, prior, solved, along)
     # The map matched anew from itself.

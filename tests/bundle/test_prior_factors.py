@@ -9,7 +9,8 @@ from synthetic import loop_walk
 from gsba.bundle import prior_factors
 from gsba.bundle.prior_factors import X
 from gsba.config import PriorSettings
-from gsba.geometry import inverse, rotation_angle
+from gsba.geometry import inverse, pose, rotation_angle
+from gsba.types import Turning
 
 SETTINGS = PriorSettings()
 
@@ -152,8 +153,8 @@ def test_turns_of_a_gyro_hold_rotations_and_nothing_else() -> None:
     graph = prior_factors.turns(turning, 5.0, 2.0)
     values = gtsam.Values()
     for f, rotation in enumerate(rotations):
-        values.insert(prior_factors.X(f), gtsam.Pose3(pose(rotation.as_matrix(), rng.normal(size=3))))
+        values.insert(X(f), gtsam.Pose3(pose(rotation.as_matrix(), rng.normal(size=3))))
     assert graph.size() == 2 and graph.error(values) < 1e-8
-    turned = values.atPose3(prior_factors.X(3)) * gtsam.Pose3(gtsam.Rot3.Rx(2e-3), np.zeros(3))
-    values.update(prior_factors.X(3), turned)
-    assert graph.error(values) == pytest.approx(2.0 * np.log1p(1 / 4), rel=1e-3)  # Cauchy, one sigma
+    turned = values.atPose3(X(3)) * gtsam.Pose3(gtsam.Rot3.Rx(2e-3), np.zeros(3))
+    values.update(X(3), turned)  # by one standard deviation
+    assert graph.error(values) == pytest.approx(2.0 * np.log1p(1 / 4), rel=1e-3)
