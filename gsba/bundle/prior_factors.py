@@ -72,9 +72,10 @@ def turns(turning: Turning, extent: float, loss_sigmas: float) -> gtsam.Nonlinea
         loss_sigmas: scale of the Cauchy loss, standard deviations.
     """
     graph = gtsam.NonlinearFactorGraph()
+    anywhere = _ANYWHERE * max(extent, 1e-9)
     loss = gtsam.noiseModel.mEstimator.Cauchy.Create(loss_sigmas)
     for f in np.flatnonzero(np.isfinite(turning.step_sigmas)).tolist():
-        sigmas = np.array([turning.step_sigmas[f]] * 3 + [_ANYWHERE * extent] * 3)
+        sigmas = np.array([turning.step_sigmas[f]] * 3 + [anywhere] * 3)
         model = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
         step = gtsam.Pose3(gtsam.Rot3.Expmap(turning.steps[f]), np.zeros(3))
         graph.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), step, model))

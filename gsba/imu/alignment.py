@@ -13,7 +13,7 @@ import numpy as np
 
 from gsba.geometry import nearest_rotation, pose
 from gsba.imu.readings import Readings
-from gsba.trajectory.clock import MIN_STEPS, Clock, explained, simplest, turning
+from gsba.trajectory.clock import MIN_STEPS, Clock, simplest
 from gsba.trajectory.clock_search import ClockFit, Turns, merged, noise
 from gsba.types import Counts, Trajectory, Turning
 
@@ -26,6 +26,7 @@ _ROUNDS = 3  # of clock, then bias and axes
 _SETTLED = 1e-5  # s of change after which no more are needed
 _REWEIGHTED = 10  # passes over bias and axes
 _WIDTH = 2.0  # of their loss, standard deviations
+_TURNING, _AGREEING = 4.0, 3.0  # standard deviations: what counts as a turn, and as the same
 _MIN_TURNS = 4  # steps that turn
 _EXPLAINED = 0.6  # part of them that a gyro explains at least
 _RIVAL = 0.75  # of what the best offset explains that no other may reach
@@ -86,20 +87,16 @@ def align(
 def turning_of(readings: Readings, found: Alignment, timestamps: np.ndarray) -> Turning:
     """What the gyro says of frames at timestamps (F,): between them, and during each."""
     times = found.clock.times(timestamps)
+    readings = readings.between(times[0] - _READOUT, times[-1] + _READOUT)
     spans = np.column_stack([times[:-1], times[1:]])
     turned = _turned(readings, found.bias, spans) @ found.rig_R_imu.T
     rates = (readings.mean_rates(times, _READOUT) - found.bias) @ found.rig_R_imu.T
-    bent = np.nanstd(np.diff(readings.rates, axis=0) / np.diff(readings.timestamps)[:, None])
-    noisy = readings.noise()
-    every = float(np.median(np.diff(readings.timestamps)))
-    bent = max(float(bent) ** 2 - 2 * (noisy / every) ** 2, 0.0) ** 0.5  # without that noise
-    noisy /= np.sqrt(max(_READOUT / every, 1.0))
-    return Turning(
-        turned,
-        np.where(readings.covers(spans), found.noise, np.inf),
-        rates,
-        float(np.hypot(noisy, found.offset_sigma * bent)),
-    )
+    noisy, every = readings.noise(), float(np.median(np.diff(readings.timestamps)))
+    bent = float(np.std(np.diff(readings.rates, axis=0) / np.diff(readings.timestamps)[:, None]))
+    bent = max(bent**2 - 2 * (noisy / every) ** 2, 0.0) ** 0.5  # rad/s^2, without that noise
+    sigma = np.hypot(noisy / np.sqrt(max(_READOUT / every, 1.0)), found.offset_sigma * bent)
+    known = readings.covers(spans)
+    return Turning(turned, np.where(known, found.noise, np.inf), rates, float(sigma))
 
 
 def orientations(readings: Readings, found: Alignment, times: np.ndarray) -> np.ndarray:
@@ -153,6 +150,11 @@ class _Guess:
             if moved < _SETTLED:
                 break
         return one
+
+    def explained(self, turning: np.ndarray, sigma: float) -> float:
+        """Part of the turns `turning (n,)` that are the gyro's, too, but for noise."""
+        off = np.linalg.norm(self.fit.residuals(self.parameters), axis=1)
+        return float(np.mean(off[turning] < _AGREEING * sigma)) if turning.any() else 0.0
 
 
 def _bias_and_axes(turns: Turns, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -223,9 +225,11 @@ def _judged(
     best: _Guess, others: list[_Guess], timestamps: np.ndarray, counts: Counts
 ) -> Alignment:
     """Whether the best is believed."""
-    fit, parameters, interval = best.fit, best.parameters, float(np.median(np.diff(timestamps)))
-    share = explained(fit, parameters, parameters)
-    begin = fit.turns.middle - timestamps[0]
+    fit, parameters, turns = best.fit, best.parameters, best.turns
+    sigma = noise(fit.residuals(parameters))
+    turning = np.linalg.norm(turns.rotvecs, axis=1) > _TURNING * sigma
+    share = best.explained(turning, sigma)
+    begin = turns.middle - timestamps[0]
     offset = parameters[0] - (parameters[1] - 1) * begin
     found = Alignment(
         Clock(float(timestamps[0]), float(offset), float(parameters[1])),
@@ -237,11 +241,11 @@ def _judged(
         share,
         counts,
     )
-    rivals = [o for o in others if abs(o.parameters[0] - parameters[0]) > interval]
-    rival = max((explained(o.fit, o.parameters, parameters) for o in rivals), default=0.0)
-    if np.quantile(np.linalg.norm(fit.turns.rotvecs, axis=1), 0.9) < _TURN:
+    rivals = [o for o in others if abs(o.parameters[0] - parameters[0]) > turns.step]
+    rival = max((one.explained(turning, sigma) for one in rivals), default=0.0)
+    if np.quantile(np.linalg.norm(turns.rotvecs, axis=1), 0.9) < _TURN:
         return replace(found, reason="the camera turns too little to tell the gyro's clock")
-    if share < _EXPLAINED or turning(fit, parameters).sum() < _MIN_TURNS:
+    if share < _EXPLAINED or turning.sum() < _MIN_TURNS:
         return replace(found, reason="at no offset does the gyro turn as the images do")
     if rival > _RIVAL * share:
         return replace(found, reason="the gyro turns as the images do at several offsets")

@@ -17,6 +17,7 @@ from gsba.log import GsbaError, brief
 
 _TABLES = (".csv", ".txt", ".tsv", ".dat")
 _EXTRA = "gsba[imu]"
+_PANIC = "PanicException"  # of libraries in Rust: no Exception, and nowhere to import it from
 _FASTEST = 40.0  # rad/s: gyros end at 35, which are 2000 deg/s
 _SLOWEST = 25.0  # readings per second: less say nothing of the 10 to 30 ms of a readout
 _LEAST = 10  # readings
@@ -52,15 +53,17 @@ def read_telemetry(path: Path) -> Readings:
         GsbaError: the library is not there, or finds no readings.
     """
     try:
-        import telemetry_parser  # type: ignore[import-not-found]
+        from telemetry_parser import Parser  # type: ignore[import-not-found]
     except ImportError:
         raise GsbaError(
             f"{path}: its gyro is read by telemetry-parser: pip install '{_EXTRA}', or give a "
             "table (t, gyro x y z, accelerometer x y z)"
         ) from None
     try:
-        rows = telemetry_parser.Parser(str(path)).normalized_imu()
-    except (OSError, ValueError) as error:
+        rows = Parser(str(path)).normalized_imu()
+    except BaseException as error:
+        if not isinstance(error, OSError | ValueError) and type(error).__name__ != _PANIC:
+            raise
         raise GsbaError(f"{path}: telemetry-parser finds no gyro in it ({error})") from None
     rows = [row for row in rows if row.get("gyro") is not None]
     times = np.array([1e-3 * row["timestamp_ms"] for row in rows], np.float64)
@@ -102,11 +105,12 @@ def _read_table(path: Path) -> Readings:
 
 
 def _header(path: Path) -> tuple[int, list[str]] | None:
-    """A header behind a #, where the first line is one."""
+    """A header behind a #, where the first line is one: it begins with the column of times."""
     with path.open(encoding="utf-8-sig") as file:
         first = file.readline().strip()
     cells = _cells(first.lstrip("# "))
-    return (1, cells) if first.startswith("#") and len(cells) >= 4 else None
+    timed = re.fullmatch(_NAMES["t"][0], _name_and_unit(cells[0] if cells else "")[0])
+    return (1, cells) if first.startswith("#") and timed else None
 
 
 def _cells(text: str) -> list[str]:

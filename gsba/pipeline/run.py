@@ -86,9 +86,7 @@ class Run:
         if settings.camera.model == "two_lens" and not frames.panoramic:
             raise GsbaError("camera.model = two_lens is for panoramas: cube faces hide the seam")
         if imu is not None and not frames.timed:
-            raise GsbaError(
-                "--imu: nothing says when frames are from: pass --timestamps or --fps"
-            )
+            raise GsbaError("--imu: nothing says when frames are from: pass --timestamps or --fps")
         chain = Chain(store)
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
         start = coarse.world_T_rigs.tolist(), settings.read

@@ -88,7 +88,7 @@ def estimate(
     interval = float(np.median(np.diff(timestamps)))
     best, covariance = simplest(fit, fit.refine(start))
     others: list[np.ndarray] = []
-    if fit.apart(best, start) > interval or explained(fit, best, best) < _SURE:
+    if fit.apart(best, start) > interval or _explained(fit, best, best) < _SURE:
         tried = [best, *(fit.refine(p) for p in fit.candidates(start, reach_s))]
         sigma = min(noise(fit.residuals(p)) for p in tried)
         best, covariance = simplest(fit, min(tried, key=lambda p: fit.cost(p, sigma)))
@@ -96,17 +96,17 @@ def estimate(
     return _judged(fit, given, best, covariance, others, interval)
 
 
-def turning(fit: ClockFit, best: np.ndarray) -> np.ndarray:
+def _turning(fit: ClockFit, best: np.ndarray) -> np.ndarray:
     """Steps (N,) with more turn than noise."""
     sigma = noise(fit.residuals(best))
     return np.linalg.norm(fit.turns.rotvecs, axis=1) > _TURNING * sigma
 
 
-def explained(fit: ClockFit, parameters: np.ndarray, best: np.ndarray) -> float:
+def _explained(fit: ClockFit, parameters: np.ndarray, best: np.ndarray) -> float:
     """Part of the steps that turn in which a clock makes the trajectory turn as much."""
-    chosen, sigma = turning(fit, best), noise(fit.residuals(best))
+    turning, sigma = _turning(fit, best), noise(fit.residuals(best))
     off = np.linalg.norm(fit.residuals(parameters), axis=1)
-    return float(np.mean(off[chosen] < _AGREEING * sigma)) if chosen.any() else 0.0
+    return float(np.mean(off[turning] < _AGREEING * sigma)) if turning.any() else 0.0
 
 
 def simplest(fit: ClockFit, best: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -140,16 +140,16 @@ def _judged(
     found = Clock(given.start, float(best[0] - (best[1] - 1) * begin), float(best[1]))
     offset_sigma = float(np.sqrt(at_start @ covariance @ at_start))
     rate_sigma, certain = float(np.sqrt(covariance[1, 1])), fit.time_sigma(covariance)
-    before, after = (explained(fit, p, best) for p in (start, best))
+    before, after = (_explained(fit, p, best) for p in (start, best))
     same = fit.apart(best, start) < _SIGNIFICANT * certain or after < before + _BETTER
     verdict, note = "unclear", ""
-    if turning(fit, best).sum() < _MIN_TURNS or certain > max(_KNOWN * interval, _KNOWN_S):
+    if _turning(fit, best).sum() < _MIN_TURNS or certain > max(_KNOWN * interval, _KNOWN_S):
         note = f"the camera turns too little to tell the clock (to {certain:.2g} s): not checked"
     elif after < _EXPLAINED:
         note = "at no offset does the trajectory turn as the images do: the clock was not checked"
     elif same:
         verdict = "agrees"
-    elif max((explained(fit, p, best) for p in others), default=0.0) > _RIVAL * after:
+    elif max((_explained(fit, p, best) for p in others), default=0.0) > _RIVAL * after:
         note = f"several clocks fit, such as an offset of {found.offset:.3f} s: none was changed"
     else:
         verdict, note = "corrected", _correction(found, offset_sigma, rate_sigma, degrees)

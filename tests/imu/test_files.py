@@ -61,6 +61,12 @@ def test_euroc_tables_and_foreign_columns_in_any_order(tmp_path: Path) -> None:
     assert found.forces is None
 
 
+def test_a_remark_is_no_header(tmp_path: Path) -> None:
+    path = _table(tmp_path / "imu.csv")
+    path.write_text("# made by a logger, at 100 Hz, on a Monday\n" + path.read_text())
+    np.testing.assert_array_equal(read_imu(path).rates, VALUES[:, :3])
+
+
 def test_four_columns_are_a_gyro_alone(tmp_path: Path) -> None:
     found = read_imu(_write(tmp_path / "imu.txt", "", np.column_stack([TIMES, VALUES[:, :3]])))
     np.testing.assert_array_equal(found.rates, VALUES[:, :3])
@@ -125,6 +131,14 @@ def test_what_telemetry_parser_cannot_read_is_named(tmp_path: Path) -> None:
     path = tmp_path / "walk.insv"
     path.write_bytes(bytes(2000))
     with pytest.raises(GsbaError, match=r"walk\.insv: telemetry-parser finds no gyro"):
+        read_imu(path)
+
+
+def test_a_panic_of_the_library_is_one_line_too(tmp_path: Path) -> None:
+    pytest.importorskip("telemetry_parser", reason="needs gsba[imu]")
+    path = tmp_path / "walk.gcsv"
+    path.write_text("GYROFLOW IMU LOG\ntscale,often\nt,gx,gy,gz\n0,1,2,3\n")
+    with pytest.raises(GsbaError, match=r"walk\.gcsv: telemetry-parser finds no gyro"):
         read_imu(path)
 
 
