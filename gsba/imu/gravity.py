@@ -6,7 +6,7 @@ from gsba.geometry import median_direction
 from gsba.imu.alignment import Alignment, orientations
 from gsba.imu.readings import Readings
 
-_MEAN_S = 2.0  # s that a force is averaged over: strides cancel out
+_MEAN_S = 1.05  # s that a force is averaged over: two steps, in which sways cancel out
 _LEAST = 3  # such means
 _WEIGHT = 9.80665  # m/s^2
 _OFF = 0.2  # part of it, by which a mean that counts may be longer or shorter
@@ -18,7 +18,7 @@ def up_axis(
     """Unit vector (3,) along the vertical in the world; None where forces do not tell.
 
     Forces are turned into the world by the pose of the frame before and the gyro since then, and
-    averaged over a few strides each. What speeds up or brakes for longer is an outlier: the
+    averaged over two steps each. What speeds up or brakes for longer is an outlier: the
     geometric median of the means counts.
 
     Args:
