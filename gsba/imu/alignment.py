@@ -3,7 +3,8 @@
 Between two instants the gyro has to turn by as much as the images, in axes of its own. Over a grid
 of offsets each gives its best axes and bias in closed form (Kabsch 1976, on rotation vectors; what
 grows with time alone is the bias), and says how much of the turns it explains. The best few are
-refined as the clocks of trajectories are.
+refined as the clocks of trajectories are. Gyros are off by a percent of what they show: that of
+each of its axes is found as well, from turns good enough to tell.
 """
 
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.geometry import nearest_rotation, pose
-from gsba.imu.readings import Readings
+from gsba.imu.readings import Readings, Sensor
 from gsba.trajectory.clock import MIN_STEPS, Clock, simplest
 from gsba.trajectory.clock_search import ClockFit, Turns, merged, noise
 from gsba.types import Counts, Trajectory, Turning
@@ -30,6 +31,7 @@ _TURNING, _AGREEING = 4.0, 3.0  # standard deviations: what counts as a turn, an
 _MIN_TURNS = 4  # steps that turn
 _EXPLAINED = 0.6  # part of them that a gyro explains at least
 _RIVAL = 0.75  # of what the best offset explains that no other may reach
+_SCALE = 0.01  # standard deviation of what a gyro shows of a rate, part of it
 _AXES = np.deg2rad(5.0)  # standard deviation of the axes, at most
 _TURN = np.deg2rad(1.0)  # of a step: a tenth of them has to turn by as much
 _LEAST_NOISE = np.deg2rad(0.003)  # of a turn: steady gyros on the move know no better
@@ -43,7 +45,7 @@ class Alignment:
 
     clock: Clock  # the sensor's
     offset_sigma: float  # s, standard deviation
-    bias: np.ndarray  # (3,) float64, rad/s, what the gyro shows at rest
+    sensor: Sensor  # bias and scales
     rig_R_imu: np.ndarray  # (3, 3) float64, the sensor's axes in the rig's
     axes_sigma: float  # rad, standard deviation of the axis known worst
     noise: float  # rad per axis, of a turn between frames, what images are off included
@@ -73,10 +75,10 @@ def align(
     if len(turns) < MIN_STEPS:
         return _nothing(timestamps, f"{len(turns)} turns of images to compare with", counts)
     if former is None:
-        starts = [(p, np.zeros(3)) for p in _candidates(turns, readings)]
+        starts = [(p, np.zeros(3)) for p in _candidates(turns, readings)]  # no bias
     else:
         shift = former.clock.times(np.array([turns.middle]))[0] - turns.middle
-        starts = [(np.array([shift, former.clock.rate]), former.bias)]
+        starts = [(np.array([shift, former.clock.rate]), former.sensor.bias)]
     found = [_Guess.of(turns, readings, *start).refined() for start in starts]
     sigma = min(noise(one.fit.residuals(one.parameters)) for one in found)
     best = min(found, key=lambda one: one.fit.cost(one.parameters, sigma))
@@ -89,8 +91,8 @@ def turning_of(readings: Readings, found: Alignment, timestamps: np.ndarray) -> 
     times = found.clock.times(timestamps)
     readings = readings.between(times[0] - _READOUT, times[-1] + _READOUT)
     spans = np.column_stack([times[:-1], times[1:]])
-    turned = _turned(readings, found.bias, spans) @ found.rig_R_imu.T
-    rates = (readings.mean_rates(times, _READOUT) - found.bias) @ found.rig_R_imu.T
+    turned = _turned(readings, found.sensor, spans) @ found.rig_R_imu.T
+    rates = found.sensor.true(readings.mean_rates(times, _READOUT)) @ found.rig_R_imu.T
     noisy, every = readings.noise(), float(np.median(np.diff(readings.timestamps)))
     bent = float(np.std(np.diff(readings.rates, axis=0) / np.diff(readings.timestamps)[:, None]))
     bent = max(bent**2 - 2 * (noisy / every) ** 2, 0.0) ** 0.5  # rad/s^2, without that noise
@@ -104,7 +106,7 @@ def orientations(readings: Readings, found: Alignment, times: np.ndarray) -> np.
     from scipy.spatial.transform import Rotation, Slerp
 
     near = readings.between(times.min(), times.max())
-    turned = Slerp(near.timestamps, Rotation.from_matrix(near.turned(found.bias)))
+    turned = Slerp(near.timestamps, Rotation.from_matrix(near.turned(found.sensor)))
     inside = np.clip(times, *near.timestamps[[0, -1]])
     return found.rig_R_imu @ turned(inside).as_matrix() @ found.rig_R_imu.T
 
@@ -116,7 +118,7 @@ class _Guess:
     turns: Turns
     readings: Readings  # those around the turns, if the clock is about right
     parameters: np.ndarray  # (2,) see `ClockFit`
-    bias: np.ndarray  # (3,)
+    sensor: Sensor
     rig_R_imu: np.ndarray  # (3, 3)
     axes_sigma: float
     fit: ClockFit  # of the turns with the gyro, in the rig's axes
@@ -125,20 +127,22 @@ class _Guess:
     def of(
         cls, turns: Turns, readings: Readings, parameters: np.ndarray, bias: np.ndarray
     ) -> "_Guess":
-        """The best bias and axes for a clock, around a bias."""
+        """The best bias, scales and axes for a clock, around a bias."""
         begin, end = turns.middle + parameters[0] + 1.1 * turns.ends
         near = readings.between(begin - 2 * turns.step, end + 2 * turns.step)
         near = near if len(near.timestamps) > 2 else readings
         free = replace(turns, rotvecs=np.zeros_like(turns.rotvecs))
-        turned = ClockFit(free, _trajectory(near, bias)).residuals(parameters)
-        more, axes, sigma = _bias_and_axes(turns, turned)
-        fit = ClockFit(turns, _trajectory(near, bias + more, axes))
-        return cls(turns, readings, parameters, bias + more, axes, sigma, fit)
+        plain = Sensor(bias, np.ones(3))
+        turned = ClockFit(free, _trajectory(near, plain)).residuals(parameters)
+        left, axes, sigma = _sensor_and_axes(turns, turned)
+        sensor = replace(left, bias=bias + left.bias)
+        fit = ClockFit(turns, _trajectory(near, sensor, axes))
+        return cls(turns, readings, parameters, sensor, axes, sigma, fit)
 
     def refined(self) -> "_Guess":
         """The same with a better clock, of the rate that it has."""
         parameters = self.fit.refine(self.parameters, with_rate=False)
-        return _Guess.of(self.turns, self.readings, parameters, self.bias)
+        return _Guess.of(self.turns, self.readings, parameters, self.sensor.bias)
 
     def settled(self) -> "_Guess":
         """The same with the clock that fits best."""
@@ -146,7 +150,7 @@ class _Guess:
         for _ in range(_ROUNDS):
             parameters = simplest(one.fit, one.fit.refine(one.parameters))[0]
             moved = abs(float(parameters[0] - one.parameters[0]))
-            one = _Guess.of(self.turns, self.readings, parameters, one.bias)
+            one = _Guess.of(self.turns, self.readings, parameters, one.sensor.bias)
             if moved < _SETTLED:
                 break
         return one
@@ -157,29 +161,31 @@ class _Guess:
         return float(np.mean(off[turning] < _AGREEING * sigma)) if turning.any() else 0.0
 
 
-def _bias_and_axes(turns: Turns, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Bias (3,), axes (3, 3) and their standard deviation, that carry turns (n, 3) of the sensor to
-    those of the images, under a Cauchy loss."""
+def _sensor_and_axes(turns: Turns, turned: np.ndarray) -> tuple[Sensor, np.ndarray, float]:
+    """Bias and scales, axes (3, 3) and their standard deviation, that carry turns (n, 3) of the
+    sensor to those of the images, under a Cauchy loss."""
     spans, seen = np.diff(turns.times, axis=1), turns.rotvecs
-    weights = np.ones((len(spans), 1))
+    weights, scales, sigma = np.ones((len(spans), 1)), np.ones(3), float(np.std(seen))
     for _ in range(_REWEIGHTED):
         total = np.sum(weights * spans**2)
         by_time = [np.sum(weights * spans * some, axis=0) / total for some in (seen, turned)]
         left = seen - spans * by_time[0], turned - spans * by_time[1]
-        axes = nearest_rotation((weights * left[0]).T @ left[1])
-        bias = by_time[1] - axes.T @ by_time[0]
-        off = seen - (turned - spans * bias) @ axes.T
+        axes = nearest_rotation((weights * left[0]).T @ (left[1] * scales))
+        said = np.sum(weights * left[1] * (left[0] @ axes), axis=0) + (sigma / _SCALE) ** 2
+        scales = said / (np.sum(weights * left[1] ** 2, axis=0) + (sigma / _SCALE) ** 2)
+        bias = by_time[1] - axes.T @ by_time[0] / scales
+        off = seen - scales * (turned - spans * bias) @ axes.T
         sigma = noise(off)
         weights = 1 / (1 + np.sum(off**2, axis=1, keepdims=True) / (_WIDTH * sigma) ** 2)
     scatter = (weights * left[1]).T @ left[1]
     information = np.linalg.eigvalsh(np.trace(scatter) * np.eye(3) - scatter)[0]
-    return bias, axes, float(sigma / np.sqrt(max(information, 1e-300)))
+    return Sensor(bias, scales), axes, float(sigma / np.sqrt(max(information, 1e-300)))
 
 
 def _candidates(turns: Turns, readings: Readings) -> Iterator[np.ndarray]:
     """Parameters (2,) of the offsets on a grid that explain most, best first."""
     free = replace(turns, rotvecs=np.zeros_like(turns.rotvecs))
-    fit = ClockFit(free, _trajectory(readings, np.zeros(3)))
+    fit = ClockFit(free, _trajectory(readings, Sensor.ideal()))
     over = _OVER * float(np.ptp(turns.times))
     ends = fit.span - turns.middle - turns.ends
     low, high = min(ends) - over, max(ends) + over
@@ -207,18 +213,18 @@ def _candidates(turns: Turns, readings: Readings) -> Iterator[np.ndarray]:
             return
 
 
-def _trajectory(readings: Readings, bias: np.ndarray, axes: np.ndarray | None = None) -> Trajectory:
+def _trajectory(readings: Readings, sensor: Sensor, axes: np.ndarray | None = None) -> Trajectory:
     """Orientations that rates add up to, none moving; in the sensor's axes or the rig's."""
-    turned = readings.turned(bias)
+    turned = readings.turned(sensor)
     every = max(int(_EVERY / float(np.median(np.diff(readings.timestamps)))), 1)
     turned = turned[::every] if axes is None else axes @ turned[::every] @ axes.T
     return Trajectory(readings.timestamps[::every], pose(turned, np.zeros((len(turned), 3))))
 
 
-def _turned(readings: Readings, bias: np.ndarray, spans: np.ndarray) -> np.ndarray:
+def _turned(readings: Readings, sensor: Sensor, spans: np.ndarray) -> np.ndarray:
     """Rotation vectors (n, 3) over spans of time (n, 2), on the sensor's clock and in its axes."""
     free = Turns(spans, np.zeros((len(spans), 3)))
-    return ClockFit(free, _trajectory(readings, bias)).residuals(np.array([0.0, 1.0]))
+    return ClockFit(free, _trajectory(readings, sensor)).residuals(np.array([0.0, 1.0]))
 
 
 def _judged(
@@ -234,7 +240,7 @@ def _judged(
     found = Alignment(
         Clock(float(timestamps[0]), float(offset), float(parameters[1])),
         float(np.sqrt(fit.covariance(parameters, with_rate=False)[0, 0])),
-        best.bias,
+        best.sensor,
         best.rig_R_imu,
         best.axes_sigma,
         noise(fit.residuals(parameters), _LEAST_NOISE),
@@ -256,4 +262,4 @@ def _judged(
 
 def _nothing(timestamps: np.ndarray, reason: str, counts: Counts) -> Alignment:
     clock, nan = Clock(float(timestamps[0]), 0.0, 1.0), float("nan")
-    return Alignment(clock, nan, np.zeros(3), np.eye(3), nan, nan, 0.0, counts, reason)
+    return Alignment(clock, nan, Sensor.ideal(), np.eye(3), nan, nan, 0.0, counts, reason)

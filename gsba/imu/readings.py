@@ -9,6 +9,23 @@ _MOST_GAP = 0.1  # s between two readings: the camera may have turned otherwise 
 
 
 @dataclass(frozen=True, slots=True)
+class Sensor:
+    """What a gyro makes of a rate."""
+
+    bias: np.ndarray  # (3,) float64, rad/s, what it shows at rest
+    scales: np.ndarray  # (3,) float64, rad/s for each that it shows beside, about one
+
+    @classmethod
+    def ideal(cls) -> "Sensor":
+        """One that shows what is."""
+        return cls(np.zeros(3), np.ones(3))
+
+    def true(self, shown: np.ndarray) -> np.ndarray:
+        """Rates (n, 3) of rates that it shows."""
+        return self.scales * (shown - self.bias)
+
+
+@dataclass(frozen=True, slots=True)
 class Readings:
     """Readings of a gyro and an accelerometer with common axes, right-handed, fixed to the camera.
 
@@ -42,15 +59,11 @@ class Readings:
         inside = (first >= 0) & (times[:, 1] <= self.timestamps[-1])
         return inside & (gaps[last + 1] == gaps[np.maximum(first, 0)])
 
-    def turned(self, bias: np.ndarray) -> np.ndarray:
-        """Rotations (N, 3, 3) from the sensor's axes at each reading to those at the first.
-
-        Args:
-            bias: (3,) what the gyro shows at rest, rad/s.
-        """
+    def turned(self, sensor: Sensor) -> np.ndarray:
+        """Rotations (N, 3, 3) from the sensor's axes at each reading to those at the first."""
         from scipy.spatial.transform import Rotation
 
-        rates = self.rates - bias
+        rates = sensor.true(self.rates)
         onward = 0.5 * (rates[:-1] + rates[1:]) * np.diff(self.timestamps)[:, None]
         num, block = len(onward), max(int(np.sqrt(len(onward))), 1)
         padded = np.concatenate([onward, np.zeros((-num % block, 3))]).reshape(-1, block, 3)

@@ -31,7 +31,8 @@ def of_gyro(
         "offset_s": found.clock.offset,
         "offset_sigma_s": found.offset_sigma,
         "rate": found.clock.rate,
-        "bias_deg_per_s": np.rad2deg(found.bias),
+        "bias_deg_per_s": np.rad2deg(found.sensor.bias),
+        "scales": found.sensor.scales,
         "rig_R_imu": found.rig_R_imu,
         "axes_sigma_deg": np.rad2deg(found.axes_sigma),
         "noise_of_a_step_deg": np.rad2deg(found.noise),
@@ -44,11 +45,12 @@ def of_gyro(
     steps = _steps_used(turning, world_T_rigs)
     during = None if readout is None or readout.lenses.twists is None else bool(readout.by_gyro)
     said |= {"steps_used": steps, "during_readout": during}
+    bias = ", ".join(f"{value:.3g}" for value in np.rad2deg(found.sensor.bias))
     notes = [
         f"the gyro has a say on {100 * steps:.0f} % of the steps between frames, each known to "
         f"{np.rad2deg(found.noise):.2g} degrees; its clock is {found.clock.offset:.4f} s ahead "
-        f"(sigma {found.offset_sigma:.1g}), its bias {_triple(np.rad2deg(found.bias))} degrees per "
-        f"second, its axes are known to {np.rad2deg(found.axes_sigma):.2g} degrees"
+        f"(sigma {found.offset_sigma:.1g}), its bias {bias} degrees per second, "
+        f"its axes are known to {np.rad2deg(found.axes_sigma):.2g} degrees"
     ]
     if during is not None:
         how = "as the gyro says" if during else "otherwise than the gyro says, and by images alone"
@@ -65,7 +67,3 @@ def _steps_used(turning: Turning, world_T_rigs: np.ndarray) -> float:
     off = (found.inv() * Rotation.from_rotvec(turning.steps)).as_rotvec()
     near = np.linalg.norm(off, axis=1) < _LOST * np.sqrt(3) * turning.step_sigmas
     return float(np.mean(near & np.isfinite(turning.step_sigmas)))
-
-
-def _triple(values: np.ndarray) -> str:
-    return ", ".join(f"{value:.3g}" for value in values)

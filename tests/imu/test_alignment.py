@@ -31,7 +31,7 @@ def test_clock_bias_and_axes_are_found_from_turns(seed: int) -> None:
     # within the deviation that is claimed.
     assert abs(found.clock.offset - OFFSET_S) < min(0.003, 2 * found.offset_sigma)
     assert found.clock.rate == 1
-    np.testing.assert_allclose(found.bias, BIAS, atol=np.deg2rad(0.1))
+    np.testing.assert_allclose(found.sensor.bias, BIAS, atol=np.deg2rad(0.1))
     assert _off_deg(found) < 3 * np.rad2deg(found.axes_sigma) < 2
     assert found.noise == pytest.approx(SIGMA, rel=0.3)
     assert found.explained > 0.8  # noise of 49 turns leaves some beyond three deviations
@@ -44,6 +44,20 @@ def test_better_turns_tell_more_from_where_worse_ones_ended() -> None:
     assert abs(better.clock.offset - OFFSET_S) < 1e-4
     assert _off_deg(better) < 0.02 < _off_deg(first)
     assert better.noise < 0.1 * first.noise
+
+
+def test_a_gyro_that_shows_too_much_is_found_out() -> None:
+    """By as much as they do: its axes by -1, +1.5 and +2 percent."""
+    on, scales = ride(), np.array([0.99, 1.015, 1.02])
+    readings = on.readings()
+    shown = BIAS + scales * (readings.rates - BIAS)
+    readings = replace(readings, rates=shown)
+    first = _aligned(on, readings)
+    found = align(on.timestamps, on.steps(), np.ones(49, bool), readings, first)
+    np.testing.assert_allclose(found.sensor.scales * scales, 1, atol=2e-3)
+    said = turning_of(readings, found, on.timestamps)
+    true = Rotation.from_matrix(on.steps()).as_rotvec()
+    np.testing.assert_allclose(said.steps, true, atol=1e-3)
 
 
 def test_a_clock_that_runs_fast_is_followed() -> None:

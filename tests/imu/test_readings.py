@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from riding_gyro import BIAS, IMU_R_RIG, OFFSET_S, ride
 
-from gsba.imu.readings import Readings
+from gsba.imu.readings import Readings, Sensor
 
 
 @pytest.mark.parametrize("hz", [100.0, 1000.0])
@@ -12,14 +12,14 @@ def test_rates_add_up_to_how_the_camera_turned(hz: float) -> None:
     on = ride()
     readings = on.readings(0.0, hz)
     true = on.rotations(readings.timestamps - OFFSET_S)
-    rigs = IMU_R_RIG.T @ readings.turned(BIAS) @ IMU_R_RIG
+    rigs = IMU_R_RIG.T @ readings.turned(Sensor(BIAS, np.ones(3))) @ IMU_R_RIG
     np.testing.assert_allclose(rigs, true[0].T @ true, atol=0.1 / hz**2 * 100)
 
 
 def test_turned_is_exact_for_a_steady_turn_of_any_length() -> None:
     for num in (2, 3, 17, 100):
         readings = Readings(0.01 * np.arange(num), np.tile([0.0, 0, np.pi], (num, 1)))
-        turned = readings.turned(np.zeros(3))
+        turned = readings.turned(Sensor.ideal())
         angles = np.pi * readings.timestamps
         assert len(turned) == num
         np.testing.assert_allclose(turned[:, 0, 0], np.cos(angles), atol=1e-12)
