@@ -11,6 +11,9 @@ from tiny_run import SETTINGS, Case, computed_stages
 from typer.testing import CliRunner
 
 from gsba.cli import app
+from gsba.imu.readings import Readings
+from gsba.log import GsbaError
+from gsba.pipeline.inputs import read_gyro
 from gsba.types import Trajectory
 
 IMU_R_RIG = Rotation.from_rotvec([0.4, 2.0, -0.8]).as_matrix()
@@ -97,3 +100,27 @@ def test_readings_that_cannot_be_used_are_refused_before_anything_is_written(
         .endswith("no column is gyro_z: name them t, gyro_x, gyro_y, gyro_z, acc_x, acc_y, acc_z")
     )
     assert not out.exists()
+
+
+def test_a_raw_video_gives_its_own_readings_or_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of two files the first lens's holds them."""
+    asked, found = [], Readings(np.arange(10) / 100, np.zeros((10, 3)))
+
+    def read(path: Path) -> Readings:
+        asked.append(path.name)
+        if "_00_" not in path.name:
+            raise GsbaError(f"{path}: no gyro in it")
+        return found
+
+    monkeypatch.setattr("gsba.pipeline.inputs.read_telemetry", read)
+    for name in ("walk_00_1.insv", "walk_10_1.insv", "other.insv", "stitched.mp4"):
+        (tmp_path / name).write_bytes(b"")
+    caplog.set_level("INFO")
+    assert read_gyro(None, tmp_path / "walk_10_1.insv") is found
+    assert read_gyro(None, tmp_path / "other.insv") is None
+    assert "no gyro: " in caplog.text and "no gyro in it" in caplog.text
+    assert read_gyro(None, tmp_path / "stitched.mp4") is None
+    assert read_gyro(None, tmp_path) is None
+    assert asked == ["walk_00_1.insv", "other.insv"]
