@@ -83,6 +83,17 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     return u @ np.diag([1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))]) @ vt
 
 
+def median_direction(directions: np.ndarray) -> np.ndarray:
+    """Unit vector (3,) of least summed chord to unit vectors (N, 3) (Weiszfeld)."""
+    median = directions.mean(axis=0)
+    for _ in range(50):
+        distance = np.linalg.norm(directions - median, axis=1)
+        weights = 1 / np.maximum(distance, 1e-6)
+        median = weights @ directions / weights.sum()
+    length = np.linalg.norm(median)
+    return median / length if length > 1e-9 else np.array([0.0, -1.0, 0.0])
+
+
 def furthest(positions: np.ndarray) -> tuple[int, float]:
     """Row of the position (N, 3) that is furthest from the first, and its distance."""
     distances = np.linalg.norm(positions - positions[0], axis=1)

@@ -132,6 +132,16 @@ class StepNoise:
 
 
 @dataclass(frozen=True, slots=True)
+class Turning:
+    """How frames turn, as a gyro says: in the rig's axes."""
+
+    steps: np.ndarray  # (F - 1, 3) float64, rotation vectors of f_R_next, radians
+    step_sigmas: np.ndarray  # (F - 1,) float64, radians per axis; infinite = not known
+    rates: np.ndarray  # (F, 3) float64, rad/s, during each frame; NaN = not known
+    rate_sigma: float  # rad/s per axis
+
+
+@dataclass(frozen=True, slots=True)
 class Features:
     """Keypoints of one frame, face after face, the strongest of a face first."""
 
@@ -411,6 +421,8 @@ class Reconstruction:
     lens_baseline: tuple[float, float] | None = None  # between two lenses, map units, and its
     # standard deviation; None = there is one
     fisheyes: tuple[Fisheye, Fisheye] | None = None  # of raw pairs, as found: see FrameSet
+    vertical: np.ndarray | None = None  # (3,) float64, unit, up or down by an accelerometer; None =
+    # there was none
 
     def largest_map(self) -> np.ndarray:
         """Frames (F',) int64 of the largest map: those that are exported."""

@@ -20,7 +20,7 @@ from gsba.bundle import prior_factors, triangulation
 from gsba.bundle.optimizer import marginal_covariances, optimize
 from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.config import RefineSettings, SolverSettings
-from gsba.types import JointErrors, Keypoints, Landmarks, Round, Sighted, Solution, Tracks
+from gsba.types import JointErrors, Keypoints, Landmarks, Round, Sighted, Solution, Tracks, Turning
 
 logger = logging.getLogger(__name__)
 
@@ -38,6 +38,7 @@ class Problem:
     rig: CubeRig  # the faces, for the reprojection family
     settings: RefineSettings  # families, loss, solver, rounds
     num_threads: int  # of the solver
+    turning: Turning | None = None  # of the frames, by a gyro; its say on poses is in the priors
 
 
 def adjust_sighted(

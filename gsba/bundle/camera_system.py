@@ -21,7 +21,7 @@ from gsba.bundle.lens_centres import by_nearness
 from gsba.bundle.optimizer import marginal_covariances
 from gsba.bundle.readout import Readout
 from gsba.bundle.shared_parameters import by_origin, weighted, without_points
-from gsba.types import JointErrors, Keypoints, Solution
+from gsba.types import JointErrors, Keypoints, Solution, Turning
 
 A = gtsam.symbol_shorthand.A  # turn (2,) rad of a frame's lenses, about x and y of their frame
 B = gtsam.symbol_shorthand.B  # turn (3,) rad of the back lens of raw pairs in the rig
@@ -35,6 +35,9 @@ W = gtsam.symbol_shorthand.W  # own motion (6,) of a frame, beside that of its v
 _OF_LENSES = (F(0), 3), (K(0), 4), (F(1), 3), (K(1), 4), (B(0), 3)  # as `self_calibration` has them
 _DAMPING = 1e-6
 _SPREADS = 4  # passes over how widely frames' own motion is spread
+_CONTRADICTED = 4.0  # squares of standard deviations that a gyro's rotations may be off, and
+_EXPLAINED = 0.5  # part of what images show that it may leave over, where they are further off
+_LEAST_TURN = 1e-6  # rad, standard deviation
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +65,17 @@ class CameraSystem:
     problem: Problem  # priors, loss
 
     def step(self) -> Readout:
-        """The camera that bearings ask for, poses and points adjusted with it."""
+        """The camera that bearings ask for, poses and points adjusted with it.
+
+        Frames turn while they are read as a gyro says, unless images have it otherwise.
+        """
+        turning = readout.turning_of(self.seeing.lenses, self.problem)
+        if turning is None or self.seeing.lenses.twists is None:
+            return self._step()
+        seeing = replace(self.seeing, by_gyro=self._agrees(turning))
+        return replace(self, seeing=seeing)._step()
+
+    def _step(self) -> Readout:
         camera, num = _linearized(self), len(self.solved.world_T_rigs)
         lenses, found = self.seeing.lenses, self.seeing
         variances = None
@@ -89,7 +102,7 @@ class CameraSystem:
             said = self.problem.settings.camera.nearness(float(np.linalg.norm(lenses.centre)))
             lenses = replace(lenses, nearness=said)
         if lenses.twists is not None:
-            motion = readout.velocities(self.solved.world_T_rigs, self.timestamps)
+            motion = _velocities(self)
             longer, own = float(of(D, 1, 1)[0, 0]), of(W, num, 6)
             lenses = replace(lenses, twists=lenses.twists + longer * motion + own)
             duration, sigmas = self.seeing.readout_s + longer, camera.own[0].sigmas
@@ -100,6 +113,19 @@ class CameraSystem:
             each = [steps[system.first_block[key], :dim] for key, dim in _OF_LENSES]
             lenses = self_calibration.moved(lenses, np.concatenate(each))
         return replace(found, lenses=lenses)
+
+    def _agrees(self, turning: Turning) -> bool:
+        """Whether frames turn while they are read as a gyro says, by images alone."""
+        camera = _linearized(replace(self, seeing=replace(self.seeing, by_gyro=False)))
+        system, own = camera.system(self.problem.priors), camera.own[0]
+        steps, variances = system.solve(_DAMPING), _own_variances(camera, system)
+        told = np.isfinite(turning.rates).all(axis=1)
+        if steps is None or variances is None or not told.any():
+            return False
+        seen = (own.off + steps[_rows(own, system)])[told, :3]
+        off = seen - self.seeing.readout_s * turning.rates[told]
+        near = np.median(off**2 / variances[told, :3]) < _CONTRADICTED
+        return bool(near or np.sum(off**2) < _EXPLAINED * np.sum(seen**2))
 
     def covariances(self, components: np.ndarray | None = None) -> CameraCovariances:
         """Marginal covariances with the first pose and the extent of each map held fixed.
@@ -133,6 +159,14 @@ class _Own:
     symbol: Callable[[int], int]
     off: np.ndarray  # (F, D) what they are from where they are drawn to
     sigmas: np.ndarray  # (D,) how strongly
+    told: np.ndarray | None = None  # (F,) bool, those whose first three a gyro tells; None = none
+    told_sigma: float = np.inf  # how strongly these
+
+    def sigmas_of(self, frame: int) -> np.ndarray:
+        """How strongly those of a frame are drawn (D,)."""
+        if self.told is None or not self.told[frame]:
+            return self.sigmas
+        return np.concatenate([np.full(3, self.told_sigma), self.sigmas[3:]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,8 +195,8 @@ class _Camera:
                 model = gtsam.noiseModel.Diagonal.Sigmas(spread[key])
                 graph.add(gtsam.PriorFactorVector(key, -off, model))
         for own in self.own:
-            model = gtsam.noiseModel.Diagonal.Sigmas(own.sigmas)
             for f, off in enumerate(own.off):
+                model = gtsam.noiseModel.Diagonal.Sigmas(own.sigmas_of(f))
                 graph.add(gtsam.PriorFactorVector(own.symbol(f), -off, model))
         return graph
 
@@ -195,13 +229,32 @@ def _spread_anew(
     """
     own = camera.own[0]
     squares = (own.off + steps[_rows(own, system)]) ** 2 + variances
-    spread = replace(own, sigmas=np.sqrt(np.mean(squares, axis=0)))
+    sigmas = np.sqrt(np.mean(squares, axis=0))
+    if own.told is not None:  # what a gyro tells is no measure of the others
+        sigmas[:3] = own.sigmas[:3]
+    spread = replace(own, sigmas=sigmas)
     return replace(camera, own=(spread, *camera.own[1:]))
 
 
 def _rows(own: _Own, system: ReducedSystem) -> list[int]:
     """Block of each frame's variable."""
     return [system.first_block[own.symbol(f)] for f in range(len(own.off))]
+
+
+def _velocities(given: CameraSystem) -> np.ndarray:
+    """How frames move, as far as poses and a gyro that is believed tell (F, 6)."""
+    turning = given.problem.turning if given.seeing.by_gyro else None
+    return readout.velocities(given.solved.world_T_rigs, given.timestamps, turning)
+
+
+def _held(given: CameraSystem, own: _Own) -> _Own:
+    """Frames' own motion, its rotation held to what a gyro that is believed tells."""
+    turning = given.problem.turning
+    if turning is None or not given.seeing.by_gyro:
+        return own
+    told = np.isfinite(turning.rates).all(axis=1)
+    sigma = max(given.seeing.readout_s * turning.rate_sigma, _LEAST_TURN)
+    return replace(own, told=told, told_sigma=sigma)
 
 
 def _linearized(given: CameraSystem) -> _Camera:
@@ -228,11 +281,11 @@ def _linearized(given: CameraSystem) -> _Camera:
         off = self_calibration.from_calibrated(lenses)
         shared += _of_lenses(self_calibration.by_lenses(bearings, directions, lenses))
     if lenses.twists is not None:
-        velocities = readout.velocities(solved.world_T_rigs, given.timestamps)
+        velocities = _velocities(given)
         times = lenses.fractions(directions, frames)[:, None, None]
         shared.append((D(0), times * (seen.by_pose @ velocities[frames, :, None])))
         beside = lenses.twists - seeing.readout_s * velocities
-        own.append(_Own(W, beside, readout.own_sigmas(seeing, velocities)))
+        own.append(_held(given, _Own(W, beside, readout.own_sigmas(seeing, velocities))))
         by_frame.append(times * seen.by_pose)
     if lenses.axes is not None:
         own.append(_Own(A, np.zeros((num, 2)), np.full(2, lens_axes.TURNS[-1])))

@@ -5,9 +5,10 @@ import numpy as np
 
 from gsba.config import PriorSettings
 from gsba.geometry import furthest, inverse
-from gsba.types import StepNoise
+from gsba.types import StepNoise, Turning
 
 X = gtsam.symbol_shorthand.X
+_ANYWHERE = 1e4  # extents of a map: as good as no say
 
 
 def build(
@@ -59,6 +60,25 @@ def build(
     gauge = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-6] * 3 + [1e-6 * extent] * 3))
     fixed = gtsam.Pose3(coarse_world_T_rigs[0] if first is None else first)
     graph.add(gtsam.PriorFactorPose3(X(0), fixed, gauge))
+    return graph
+
+
+def turns(turning: Turning, extent: float, loss_sigmas: float) -> gtsam.NonlinearFactorGraph:
+    """Relative rotations of neighbours as a gyro has them, of no say on where they are.
+
+    Args:
+        turning: steps and how well they are known.
+        extent: of the map, in its unit.
+        loss_sigmas: scale of the Cauchy loss, standard deviations.
+    """
+    graph = gtsam.NonlinearFactorGraph()
+    anywhere = _ANYWHERE * max(extent, 1e-9)
+    loss = gtsam.noiseModel.mEstimator.Cauchy.Create(loss_sigmas)
+    for f in np.flatnonzero(np.isfinite(turning.step_sigmas)).tolist():
+        sigmas = np.array([turning.step_sigmas[f]] * 3 + [anywhere] * 3)
+        model = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+        step = gtsam.Pose3(gtsam.Rot3.Expmap(turning.steps[f]), np.zeros(3))
+        graph.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), step, model))
     return graph
 
 

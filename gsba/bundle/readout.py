@@ -15,7 +15,7 @@ from gsba.bundle.adjustment import Problem
 from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of
 from gsba.camera.lens import Lenses, rows_run
 from gsba.config import CameraSettings
-from gsba.types import Counts, Keypoints, Landmarks, Solution
+from gsba.types import Counts, Keypoints, Landmarks, Solution, Turning
 
 logger = logging.getLogger(__name__)
 
@@ -39,6 +39,7 @@ class Readout:
     gains: np.ndarray = field(default_factory=lambda: np.full(PARTS, np.nan))  # (PARTS,) float64,
     # share of the robust cost of each part that the duration which other parts give takes off
     reason: str = ""  # why none was taken; empty if one was
+    by_gyro: bool | None = None  # whether rotations are held to a gyro's; None = there is none
     counts: Counts = field(default_factory=lambda: Counts(0, 0, "observations"))
 
 
@@ -62,12 +63,16 @@ def estimate(
         timestamps: (F,) seconds, whose differences give velocities.
         problem: loss, settings.
     """
-    motion = velocities(solved.world_T_rigs, timestamps)
+    motion = velocities(solved.world_T_rigs, timestamps, turning_of(lenses, problem))
+    offsets = _offsets(landmarks, keypoints, solved) if motion[:, :3].any() else None
     ways, frames = _ways(problem.settings.camera, lenses), keypoints.frames()
     times = np.stack([lenses.fractions(shown, frames, way) for way in ways], axis=1)
 
     def by_duration(rows: np.ndarray, by_origin: np.ndarray) -> np.ndarray:
-        moved = np.einsum("oij,oj->oi", by_origin, motion[frames[rows], 3:])
+        moving = motion[frames[rows], 3:]
+        if offsets is not None:  # a turning ray's point moves as if it were carried along
+            moving = moving + np.cross(motion[frames[rows], :3], offsets[rows])
+        moved = np.einsum("oij,oj->oi", by_origin, moving)
         return moved[:, :, None] * times[rows, None, :]
 
     systems, counts = models_of(landmarks, _MOST, keypoints, solved, problem, by_duration)
@@ -97,17 +102,35 @@ def own_sigmas(found: Readout, motion: np.ndarray) -> np.ndarray:
     return np.repeat([turn, move], 3)
 
 
-def velocities(world_T_rigs: np.ndarray, timestamps: np.ndarray) -> np.ndarray:
-    """Mean velocity (F, 6) around each frame, [0 rad/s, translation per s], rig frame.
+def _offsets(landmarks: Landmarks, keypoints: Keypoints, solved: Solution) -> np.ndarray:
+    """Points (N, 3) in the rig frames of the keypoints that see them; 0 = none."""
+    tracks, offsets = landmarks.tracks, np.zeros((len(keypoints.faces), 3))
+    poses = solved.world_T_rigs[tracks.frames]
+    from_rigs = landmarks.points_world[tracks.points] - poses[:, :3, 3]
+    offsets[keypoints.rows(tracks)] = np.einsum("oji,oj->oi", poses[:, :3, :3], from_rigs)
+    return offsets
 
-    Between frames a walk turns to and fro: rotations say nothing of those during a readout.
+
+def turning_of(lenses: Lenses, problem: Problem) -> Turning | None:
+    """What a gyro says of the frames' turning; None where a stabiliser took it out of them."""
+    return None if lenses.axes is not None else problem.turning
+
+
+def velocities(
+    world_T_rigs: np.ndarray, timestamps: np.ndarray, turning: Turning | None = None
+) -> np.ndarray:
+    """Mean velocity (F, 6) around each frame, [rotation rad/s, translation per s], rig frame.
+
+    Between frames a walk turns to and fro: rotations say nothing of those during a readout, which
+    are 0 where no gyro knows them.
     """
     before = np.maximum(np.arange(len(timestamps)) - 1, 0)
     after = np.minimum(np.arange(len(timestamps)) + 1, len(timestamps) - 1)
     span = (timestamps[after] - timestamps[before])[:, None]
     moved = world_T_rigs[after, :3, 3] - world_T_rigs[before, :3, 3]
     local = np.einsum("fji,fj->fi", world_T_rigs[:, :3, :3], moved)
-    return np.hstack([np.zeros_like(local), local / span])
+    rates = np.zeros_like(local) if turning is None else np.nan_to_num(turning.rates)
+    return np.hstack([rates, local / span])
 
 
 def _durations(systems: list[SharedModel]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

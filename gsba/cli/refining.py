@@ -40,6 +40,9 @@ Download = Annotated[
     bool, typer.Option("--download", help="Fetch missing weights from their authors.")
 ]
 
+Keyframes = Annotated[
+    Path | None, typer.Option(help="Keyframe trajectory of the same run.", metavar="FILE")
+]
 Masks = Annotated[
     list[Path] | None,
     typer.Option(
@@ -54,6 +57,14 @@ Camera = Annotated[
 ]
 Calibration = Annotated[
     Path | None, typer.Option(help="Of the lenses of raw fisheyes.", metavar="FILE")
+]
+Imu = Annotated[
+    Path | None,
+    typer.Option(
+        help="Gyro and accelerometer that rode along: t, gyro x y z [rad/s], accelerometer x y z "
+        "[m/s^2]; or a maker's recording.",
+        metavar="FILE",
+    ),
 ]
 Segment = Annotated[
     str | None,
@@ -72,9 +83,7 @@ def refine(
         list[Path] | None,
         typer.Argument(help="TUM, KITTI or stella_vslam map.msg; several are pieces of one run."),
     ] = None,
-    keyframes: Annotated[
-        Path | None, typer.Option(help="Keyframe trajectory of the same run.", metavar="FILE")
-    ] = None,
+    keyframes: Keyframes = None,
     no_trajectory: Annotated[
         bool, typer.Option("--no-trajectory", help="Start from the images alone.")
     ] = False,
@@ -88,6 +97,7 @@ def refine(
     ] = None,
     camera: Camera = None,
     calibration: Calibration = None,
+    imu: Imu = None,
     fps: Annotated[
         float | None,
         typer.Option(help="Frames per second, from time 0; of a video: frames kept per second."),
@@ -119,6 +129,7 @@ def refine(
         timestamps=timestamps,
         fps=fps,
         calibration=calibration,
+        imu=imu,
         fresh=fresh,
     )
     typer.echo(_summary(out))

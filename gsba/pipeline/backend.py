@@ -29,6 +29,8 @@ from gsba.bundle.reconstruction import assemble, world_scale
 from gsba.bundle.self_calibration import SelfCalibration
 from gsba.bundle.stitching import Stitching
 from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.imu.alignment import Alignment, align, turning_of
+from gsba.imu.gravity import up_axis
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.merged_map import Registered, follow
@@ -46,6 +48,7 @@ from gsba.types import (
     Keypoints,
     Landmarks,
     Matches,
+    PoseStatus,
     Reconstruction,
     Sighted,
     Solution,
@@ -292,6 +295,32 @@ def measure_strength(run: Run, seen: Seen, prior: Prior, solved: Solution) -> Pr
     return replace(prior, strength=strength)
 
 
+def align_imu(
+    run: Run, prior: Prior, solved: Solution, name: str, *, with_noise: bool = True
+) -> Prior:
+    """What a gyro says of the frames' turning, by better poses than before.
+
+    Args:
+        with_noise: measure its noise, too. Poses have followed it by as much as it was believed:
+            the noise that they leave is measured once where they have become much better.
+    """
+    readings, former, times = run.imu, prior.gyro, run.frames.timestamps
+    if readings is None or former is None or former.reason:
+        return prior
+    rotations = solved.world_T_rigs[:, :3, :3]
+    steps = np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]
+
+    def compute() -> Alignment:
+        return align(times, steps, ~prior.trust.unseen_steps, readings, former)
+
+    found = run.stage(name, readings.digest, compute, Alignment)
+    if found.reason:
+        return prior
+    if not with_noise:
+        found = replace(found, noise=former.noise)
+    return replace(prior, gyro=found, turning=turning_of(readings, found, times))
+
+
 def align_patches(run: Run, prior: Prior, world: Map, number: int) -> Map:
     """Patches around the map's points aligned to its frames, solved, straightened.
 
@@ -312,6 +341,7 @@ def _adjust_under_lenses(
     if not world.lenses:
         return _adjust_aligned(run, prior, world, sighted, name)
     for n in range(_CALIBRATIONS):
+        prior = align_imu(run, prior, world.solution, f"imu_{name}_{n}", with_noise=False)
         seen = _see_anew(run, prior, world, sighted, name, n)
         better = _adjust_aligned(run, prior, seen, sighted, f"{name}_{n}" if n else name)
         if better is None:
@@ -520,13 +550,24 @@ def reconstruct(run: Run, seen: Seen, prior: Prior, world: Map) -> Reconstructio
             prior.parts,
             joint,
         )
-        result = replace(result, fisheyes=frames.fisheyes)
+        result = replace(result, fisheyes=frames.fisheyes, vertical=_vertical(run, prior, result))
         if not world.lenses or world.centres is None:
             return result
         baseline = baseline_of(world.centres, world_scale(solved, result))
         return replace(result, lens_baseline=baseline)
 
     return run.stage("reconstruction", run.solving_key(), compute, Reconstruction)
+
+
+def _vertical(run: Run, prior: Prior, result: Reconstruction) -> np.ndarray | None:
+    """The vertical in the world of a result, by an accelerometer that rode along."""
+    if run.imu is None or prior.gyro is None or prior.gyro.reason:
+        return None
+    good = result.pose_statuses == PoseStatus.REFINED
+    if result.components is not None:  # each map has a world of its own
+        good &= result.components == 0
+    rotations = result.world_T_rigs[good, :3, :3]
+    return up_axis(run.imu, prior.gyro, run.frames.timestamps[good], rotations)
 
 
 def keep_lenses(run: Run, world: Map, result: Reconstruction) -> Lenses:

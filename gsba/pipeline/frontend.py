@@ -11,6 +11,7 @@ from gsba.camera.lens import Lenses
 from gsba.config import RefineSettings
 from gsba.features import detection, extraction
 from gsba.frames import panorama
+from gsba.imu.alignment import Alignment, align, turning_of
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, loops
 from gsba.loop_closure.loops import Closed
@@ -22,6 +23,7 @@ from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
 from gsba.store.store import PerFrame
 from gsba.trajectory.clock import ClockEstimate
+from gsba.trajectory.steps import image_steps
 from gsba.types import Features, Keypoints, Matches, Solution, Trajectory, VerifiedPairs
 
 _DARK = 32  # of 255
@@ -157,6 +159,22 @@ def judge_trajectory(
     if prior.absent:
         coarse = replace(coarse, world_T_rigs=trust.world_T_rigs)
     return replace(prior, coarse=coarse), near
+
+
+def align_imu(run: Run, seen: Seen, prior: Prior, near: VerifiedPairs) -> Prior:
+    """What a gyro says of the frames' turning, found from how neighbours turn."""
+    readings, times = run.imu, run.frames.timestamps
+    if readings is None:
+        return prior
+    steps = image_steps(near, seen.keypoints, run.settings.verify)
+
+    def compute() -> Alignment:
+        return align(times, steps.f_T_nexts[:, :3, :3], steps.verified, readings)
+
+    found = run.stage("imu", readings.digest, compute, Alignment)
+    if found.reason:
+        return replace(prior, gyro=found)
+    return replace(prior, gyro=found, turning=turning_of(readings, found, times))
 
 
 def _hindrance(run: Run) -> str:

@@ -10,6 +10,8 @@ from gsba import video
 from gsba.camera.calibration import read_calibration
 from gsba.config import RefineSettings
 from gsba.frames.times import check_fps
+from gsba.imu.files import read_imu, read_telemetry
+from gsba.imu.readings import Readings
 from gsba.log import GsbaError
 from gsba.placement.placement import EXIF
 from gsba.store.store import RunStore
@@ -22,6 +24,7 @@ from gsba.types import CoarsePoses, FrameSet, Trajectory
 
 logger = logging.getLogger(__name__)
 
+_WITH_GYRO = (".insv", ".osv", ".360")  # raw videos that may hold readings
 _NO_MOTION = 1e-9  # extent in map units that is rounding alone
 
 
@@ -75,6 +78,26 @@ def with_baseline(settings: RefineSettings, calibration: Path | None) -> RefineS
         )
     camera = settings.camera.model_copy(update={"baseline_mm": millimetres})
     return settings.model_copy(update={"camera": camera})
+
+
+def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
+    """Readings that a run is given, or that its raw video holds.
+
+    A video without them, or without the library that reads them, is taken as it is, in a line.
+
+    Raises:
+        GsbaError: a file of readings that cannot be used.
+    """
+    if imu is not None:
+        return read_imu(imu)
+    if not frames.is_file() or frames.suffix.lower() not in _WITH_GYRO:
+        return None
+    front = frames.with_name(frames.name.replace("_10_", "_00_"))  # of two files, the one with it
+    try:
+        return read_telemetry(front if front.is_file() else frames)
+    except GsbaError as error:
+        logger.info("no gyro: %s", error)
+        return None
 
 
 def extract_frames(

@@ -19,6 +19,7 @@ from gsba.placement.placement import Placement, metres_per_unit, place
 from gsba.report import findings
 from gsba.report.camera_findings import of_camera, of_lenses
 from gsba.report.html import residual_sphere, write_html
+from gsba.report.imu_findings import of_gyro
 from gsba.report.report import build_report, plain, write_poses
 from gsba.trajectory.files import write_tum
 from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
@@ -126,6 +127,10 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
         if "splat" in run.settings.factors and world.lenses:
             more.append("splat left out: it takes a frame for one view point")
         notes += more
+    gyro = None
+    if prior.gyro is not None:
+        gyro, more = of_gyro(prior.gyro, prior.turning, world.readout, world.solution.world_T_rigs)
+        notes += more
     most = run.settings.closer.max_scale_sigma
     notes += findings.of_frames(frames, coarse, result, undone, world.frame_weights, most)
     report = build_report(
@@ -142,6 +147,7 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
         moves=world.moves,
         stitching=world.stitching and findings.of_field(world.stitching),
         camera=camera,
+        gyro=gyro,
     )
     report["residual_sphere"] = plain(residual_sphere(result), digits=4)
     return report

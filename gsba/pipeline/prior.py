@@ -9,11 +9,12 @@ import numpy as np
 from gsba.bundle import prior_factors
 from gsba.bundle.map_strength import MapStrength
 from gsba.config import PriorSettings
+from gsba.imu.alignment import Alignment
 from gsba.loop_closure.merged_map import Registered, side_by_side
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import Joint
 from gsba.trajectory.judgement import Trust
-from gsba.types import CoarsePoses, PoseSource, Solution
+from gsba.types import CoarsePoses, PoseSource, Solution, Turning
 
 ExtraFactors = Callable[[CoarsePoses], Iterable[gtsam.NonlinearFactor]]
 
@@ -30,6 +31,8 @@ class Prior:
     parts: np.ndarray | None = None  # (F,) int64, parts that nothing ties together; None = one
     merged: Registered | None = None  # parts of the map, joined; None = it never was in parts
     strength: MapStrength | None = None  # of the map, by images alone; None = not measured
+    gyro: Alignment | None = None  # of the sensor that rides along; None = there is none
+    turning: Turning | None = None  # what it says of the frames; None = it is not believed
 
     @classmethod
     def of(cls, coarse: CoarsePoses, extra_factors: ExtraFactors | None = None) -> "Prior":
@@ -70,6 +73,9 @@ class Prior:
             false, noise = false | strength.held_steps, strength.noise
         first = trust.world_T_rigs[0]
         graph = prior_factors.build(believed, settings, false, trust.false_frames, first, noise)
+        if self.turning is not None:
+            extent = float(np.linalg.norm(np.ptp(believed[:, :3, 3], axis=0)))
+            graph.push_back(prior_factors.turns(self.turning, extent, settings.loss_sigmas))
         for factor in self.extra:
             graph.add(factor)
         return graph

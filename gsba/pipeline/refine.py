@@ -63,13 +63,13 @@ def refine(
     timestamps: Path | None = None,
     fps: float | None = None,
     calibration: Path | None = None,
+    imu: Path | None = None,
     fresh: bool = False,
     extra_factors: ExtraFactors | None = None,
 ) -> RunResult:
     """Refine the pose of every frame, and write poses, cloud, report and datasets to `out`.
 
-    A second call with the same `out` takes up finished stages; a changed setting re-runs what
-    depends on it.
+    A second call with the same `out` re-runs only what depends on settings that changed.
 
     Args:
         frames: folder of 2:1 panoramas, raw fisheyes or cube faces, or a video, for `out`/frames.
@@ -85,6 +85,7 @@ def refine(
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
+        imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
         fresh: forget an earlier run in `out`.
         extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
 
@@ -97,6 +98,7 @@ def refine(
     chosen = merging.choose(masks, segment)
     origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
+    readings = inputs.read_gyro(imu, frames)
     if video.is_video(frames):
         inputs.extract_frames(out, origin, settings, fps, fresh)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
@@ -107,10 +109,15 @@ def refine(
         frame_set, journal = merging.before(store, frame_set, chosen), Journal()
         if chosen.distractors:
             frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
-        run = Run.begin(store, frame_set, coarse, settings, extra_factors, journal)
-        run, seen, prior, world = _solve_raw(run, Prior.of(coarse, extra_factors), given)
-        result = backend.reconstruct(run, seen, prior, world)
-        return outputs.write(run, prior, world, result, backend.keep_lenses(run, world, result))
+        run = Run.begin(store, frame_set, coarse, settings, extra_factors, journal, imu=readings)
+        return _refine(run, Prior.of(coarse, extra_factors), given)
+
+
+def _refine(run: Run, prior: Prior, given: Sequence[Trajectory]) -> RunResult:
+    """A run from its frames to what it leaves behind."""
+    run, seen, prior, world = _solve_raw(run, prior, given)
+    result = backend.reconstruct(run, seen, prior, world)
+    return outputs.write(run, prior, world, result, backend.keep_lenses(run, world, result))
 
 
 def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run, Seen, Prior, Map]:
@@ -120,6 +127,7 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
         The run that it was in the end, its keypoints, and what `solve` gives.
     """
     known = [run.settings.model_dump(exclude={"export", "placement"}), run.custom]
+    known += [] if run.imu is None else [run.imu.digest]
     counts, frames = dict(run.journal.counts), run.frames
     n = 0
     while True:
@@ -136,7 +144,7 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
         n, (fisheyes, found) = n + 1, better
         frames, again = replace(frames, fisheyes=fisheyes), Journal(dict(counts))
         settings, extra = run.settings, run.extra_factors
-        run = Run.begin(run.store, frames, prior.coarse, settings, extra, again, found)
+        run = Run.begin(run.store, frames, prior.coarse, settings, extra, again, found, run.imu)
 
 
 def _cut_better(coarse: CoarsePoses, world: Map) -> _Cut | None:
@@ -177,6 +185,7 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     # Neighbours in time, and what they say of the trajectory and its clock.
     prior, near = frontend.match_neighbours(run, seen, prior, given)
     prior, near = frontend.judge_trajectory(run, seen, prior, near)
+    prior = frontend.align_imu(run, seen, prior, near)
     if prior.turning_only:
         return prior, Map.of(prior.start(), seen.shown)
     # A chain of relative poses, then all that neighbours have in common.
@@ -190,8 +199,10 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     prior, solved, loops = frontend.close_loops(run, seen, prior, solved)
     matches = [along, known, loops]
     solved = backend.adjust(run, seen, prior, "closed", matches, solved, rounds.loops)
+    prior = backend.align_imu(run, prior, solved, "imu_closed")
     seen, world = _find_camera(run, seen, prior, matches, solved)
     solved = world.solution
+    prior = backend.align_imu(run, prior, solved, "imu_camera", with_noise=bool(world.lenses))
     prior = backend.measure_strength(run, seen, prior, solved)
     seen, solved, along = _look_closer(run, seen, prior, solved, along)
     # The map matched anew from itself.
@@ -203,11 +214,14 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     # Below a pixel: patches, pixels, splats.
     world = replace(world, solution=solved, observed=seen.shown)
     for n in range(1, patch_rounds + 1):
+        if n > 1:
+            prior = backend.align_imu(run, prior, world.solution, f"imu_aligned{n}")
         world = backend.align_patches(run, prior, world, n)
     if "photometric" in families:
         world = backend.refine_photometric(run, prior, world)
     if "splat" in families and not world.lenses:  # it is rendered as seen from one point
         world = backend.refine_on_splat(run, prior, world)
+    prior = backend.align_imu(run, prior, world.solution, "imu_final", with_noise=False)
     return prior, backend.measure_camera(run, prior, world)
 
 

@@ -13,6 +13,7 @@ from gsba.camera.rig import CubeRig
 from gsba.config import PriorSettings, RefineSettings
 from gsba.frames import cubemap
 from gsba.frames.panorama import Greys
+from gsba.imu.readings import Readings
 from gsba.log import GsbaError
 from gsba.photometric import direct
 from gsba.pipeline.prior import ExtraFactors, Prior
@@ -62,6 +63,7 @@ class Run:
     custom: str | None  # of results that rest on those: never resumed
     num_threads: int
     lenses_found: bool = False  # whether what raw pairs are cut by was found, so that it is free
+    imu: Readings | None = None  # of a gyro that rode along; None = there are none
 
     @classmethod
     def begin(
@@ -73,6 +75,7 @@ class Run:
         extra_factors: ExtraFactors | None = None,
         journal: Journal | None = None,
         lenses_found: bool = False,
+        imu: Readings | None = None,
     ) -> "Run":
         """Start a run, or take it up, on these frames and poses.
 
@@ -82,6 +85,8 @@ class Run:
         direct.check(frames, settings)
         if settings.camera.model == "two_lens" and not frames.panoramic:
             raise GsbaError("camera.model = two_lens is for panoramas: cube faces hide the seam")
+        if imu is not None and not frames.timed:
+            raise GsbaError("--imu: nothing says when frames are from: pass --timestamps or --fps")
         chain = Chain(store)
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
         start = coarse.world_T_rigs.tolist(), settings.read
@@ -102,6 +107,7 @@ class Run:
             custom=None if extra_factors is None else uuid.uuid4().hex,
             num_threads=settings.solver.num_threads or os.cpu_count() or 1,
             lenses_found=lenses_found,
+            imu=imu,
         )
 
     def stage(
@@ -132,7 +138,7 @@ class Run:
         """
         graph = prior.graph(noise or self.settings.priors)
         settings = self.settings if self.frames.timed else self.settings.untimed()
-        return Problem(graph, self.rig, settings, self.num_threads)
+        return Problem(graph, self.rig, settings, self.num_threads, prior.turning)
 
     def matching_key(self) -> list[object]:
         """Settings that matches rest on."""

@@ -1,4 +1,4 @@
-"""Which way is up: the rigs' common up axis, made exact by vertical edges in the pictures."""
+"""Which way is up: by an accelerometer, or what rigs have in common, made exact by edges."""
 
 import logging
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ import numpy as np
 
 from gsba.camera.rig import CubeRig
 from gsba.frames import cubemap
+from gsba.geometry import median_direction
 from gsba.types import FACES, FrameSet, PoseStatus, Reconstruction
 
 logger = logging.getLogger(__name__)
@@ -19,6 +20,8 @@ _GATES_DEG = (8.0, 4.0, 2.0, 1.0, 0.6)  # around vertical, from the rigs' up axi
 _MIN_EDGES = 40  # within the last gate, or the edges say nothing
 _MIN_SPREAD = 0.1  # of the edges' directions around the vertical: 0 = all in one plane, 1 = even
 _MAX_TURN_DEG = 10.0  # from the rigs' up axis; what is further off is no gravity
+_MAX_SPREAD_DEG = 30.0  # of the rigs' up axes; beyond, they have none in common
+_MAX_OFF_DEG = 2.0  # from an accelerometer's
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,21 +31,23 @@ class Gravity:
     up: np.ndarray  # (3,) float64, unit
     by_rigs: np.ndarray  # (3,) float64, unit, the rigs' common up axis
     spread_deg: float  # median angle of a rig's up axis to the common one
-    num_edges: int  # vertical edges it rests on; 0 = on the rigs alone
+    num_edges: int  # vertical edges it rests on; 0 = on the rigs or the accelerometer alone
+    by_forces: np.ndarray | None = None  # (3,) float64, unit, by an accelerometer; None = none
 
     @property
     def turn_deg(self) -> float:
-        """How far the edges moved it from the rigs' up axis."""
-        return float(np.degrees(np.arccos(np.clip(self.up @ self.by_rigs, -1, 1))))
+        """How far it is from the rigs' up axis."""
+        return _degrees(self.up, self.by_rigs)
 
 
 def estimate(reconstruction: Reconstruction, frames: FrameSet) -> Gravity | None:
     """Direction of up, or None where neither rigs nor edges tell.
 
-    The geometric median of the rigs' up axes is right to the degrees that people sway. Vertical
-    edges (doors, walls, posts) then decide: the plane through the camera and such an edge holds the
-    vertical, so that its normal is level. The normals' least principal axis is taken over edges
-    from all around, in gates that tighten (after Kosecka and Zhang, Video Compass, ECCV 2002).
+    An accelerometer is right to its bias, some tenths of a degree; without one, the geometric
+    median of the rigs' up axes to the degrees that people sway. Vertical edges (doors, walls,
+    posts) then decide: the plane through the camera and such an edge holds the vertical, so that
+    its normal is level. The normals' least principal axis is taken over edges from all around, in
+    gates that tighten (after Kosecka and Zhang, Video Compass, ECCV 2002).
 
     Args:
         reconstruction: refined poses; unrefined ones have no say.
@@ -52,19 +57,24 @@ def estimate(reconstruction: Reconstruction, frames: FrameSet) -> Gravity | None
     if not len(good):
         return None
     ups = -reconstruction.world_T_rigs[good, :3, 1]
-    by_rigs = _median_direction(ups)
+    by_rigs, forces = median_direction(ups), reconstruction.vertical
     spread = float(np.degrees(np.median(np.arccos(np.clip(ups @ by_rigs, -1, 1)))))
-    if spread > 30:
+    if forces is not None and forces @ by_rigs < 0 and spread <= _MAX_SPREAD_DEG:
+        forces = -forces  # makers differ in its sign
+    if spread > _MAX_SPREAD_DEG and forces is None:
         logger.warning("the rigs agree on no up axis (%.0f degrees apart)", spread)
         return None
     chosen = good[np.unique(np.linspace(0, len(good) - 1, _MAX_FRAMES).astype(int))]
     found = [_edge_normals(frames, int(f), reconstruction.world_T_rigs[f]) for f in chosen]
     normals, weights = (np.concatenate(part) for part in zip(*found, strict=True))
-    up, num_edges = _level_axis(normals, weights, by_rigs)
-    gravity = Gravity(up, by_rigs, spread, num_edges)
-    if gravity.turn_deg > _MAX_TURN_DEG:
-        logger.warning("vertical edges are %.1f degrees off the rigs: ignored", gravity.turn_deg)
-        gravity = Gravity(by_rigs, by_rigs, spread, 0)
+    start, most, what = by_rigs, _MAX_TURN_DEG, "rigs"
+    if forces is not None:
+        start, most, what = forces, _MAX_OFF_DEG, "accelerometer"
+    up, num_edges = _level_axis(normals, weights, start)
+    gravity = Gravity(up, by_rigs, spread, num_edges, forces)
+    if (off := _degrees(up, start)) > most:
+        logger.warning("vertical edges are %.1f degrees off the %s: ignored", off, what)
+        gravity = Gravity(start, by_rigs, spread, 0, forces)
     logger.info(
         "up: %d vertical edges, %.2f degrees from the rigs' common axis (these %.2f degrees apart)",
         gravity.num_edges,
@@ -74,15 +84,9 @@ def estimate(reconstruction: Reconstruction, frames: FrameSet) -> Gravity | None
     return gravity
 
 
-def _median_direction(directions: np.ndarray) -> np.ndarray:
-    """Unit vector (3,) of least summed chord to unit vectors (N, 3) (Weiszfeld)."""
-    median = directions.mean(axis=0)
-    for _ in range(50):
-        distance = np.linalg.norm(directions - median, axis=1)
-        weights = 1 / np.maximum(distance, 1e-6)
-        median = weights @ directions / weights.sum()
-    length = np.linalg.norm(median)
-    return median / length if length > 1e-9 else np.array([0.0, -1.0, 0.0])
+def _degrees(one: np.ndarray, other: np.ndarray) -> float:
+    """Angle between two unit vectors."""
+    return float(np.degrees(np.arccos(np.clip(one @ other, -1, 1))))
 
 
 def _edge_normals(

@@ -102,6 +102,7 @@ def build_report(
     moves: Sequence[object] = (),
     stitching: Mapping[str, Any] | None = None,
     camera: Mapping[str, Any] | None = None,
+    gyro: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Content of report.json: plain values only.
 
@@ -116,6 +117,7 @@ def build_report(
         moves: of the poses against a splat, see `gsba.splat.refinement.Move`.
         stitching: the field of directions, see `gsba.report.findings.of_field`.
         camera: where its lenses are, see `gsba.report.findings.of_camera`.
+        gyro: that rode along, see `gsba.report.imu_findings.of_gyro`.
     """
     quality = frame_quality(reconstruction)
     stage_rows = [
@@ -130,6 +132,7 @@ def build_report(
         "trajectory": trajectory,
         "stitching": stitching,
         **({} if camera is None else {"camera": camera}),
+        **({} if gyro is None else {"gyro": gyro}),
         "stages": stage_rows,
         "solver": solver,
         "splat": moves,

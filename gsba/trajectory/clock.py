@@ -86,12 +86,12 @@ def estimate(
     fit = ClockFit(turns, trajectory)
     start = np.array([offset, 1.0])
     interval = float(np.median(np.diff(timestamps)))
-    best, covariance = _simplest(fit, fit.refine(start))
+    best, covariance = simplest(fit, fit.refine(start))
     others: list[np.ndarray] = []
     if fit.apart(best, start) > interval or _explained(fit, best, best) < _SURE:
         tried = [best, *(fit.refine(p) for p in fit.candidates(start, reach_s))]
         sigma = min(noise(fit.residuals(p)) for p in tried)
-        best, covariance = _simplest(fit, min(tried, key=lambda p: fit.cost(p, sigma)))
+        best, covariance = simplest(fit, min(tried, key=lambda p: fit.cost(p, sigma)))
         others = [p for p in tried if fit.apart(p, best) > interval]
     return _judged(fit, given, best, covariance, others, interval)
 
@@ -109,7 +109,7 @@ def _explained(fit: ClockFit, parameters: np.ndarray, best: np.ndarray) -> float
     return float(np.mean(off[turning] < _AGREEING * sigma)) if turning.any() else 0.0
 
 
-def _simplest(fit: ClockFit, best: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def simplest(fit: ClockFit, best: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The clock without an error of rate, unless there evidently is one; and its covariance."""
     best = fit.settle(best)
     covariance = fit.covariance(best)

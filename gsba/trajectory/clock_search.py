@@ -307,10 +307,10 @@ def _bounded(residuals: np.ndarray, sigma: float) -> float:
     return float(np.mean(squares / (squares + (_WIDTH * sigma) ** 2)))
 
 
-def noise(residuals: np.ndarray) -> float:
-    """Noise per axis of rotations (N, 3), however large most of them are."""
+def noise(residuals: np.ndarray, least: float = _MIN_SIGMA) -> float:
+    """Noise per axis of rotations (N, 3), however large most of them are, but not below `least`."""
     lengths = np.linalg.norm(residuals, axis=1)
-    return max(float(np.quantile(lengths, _QUIET)) / _QUIET_LENGTH, _MIN_SIGMA)
+    return max(float(np.quantile(lengths, _QUIET)) / _QUIET_LENGTH, least)
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from gsba.bundle.readout import Readout
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
 from gsba.similarity import pose_similarity
-from gsba.types import Solution
+from gsba.types import Solution, Turning
 
 CENTRE, BAND, READOUT_S = np.array([0.004, -0.003, 0.05]), np.deg2rad(4), 0.03
 SWEEPS = np.array([[-1.0, 0, 0], [0, 1.0, 0]])
@@ -30,9 +30,11 @@ def _settled(
     seed: int = 0,
     rounds: int = 5,
     said: CameraSettings | None = None,
+    turning: Turning | None = None,
 ):
     world, shown = seen_through(camera, seed)
-    solved, problem = Solution.without_points(world.world_T_rigs), problem_of(world, said)
+    solved = Solution.without_points(world.world_T_rigs)
+    problem = replace(problem_of(world, said), turning=turning)
     for _ in range(rounds):
         solved, keypoints, tracks = solved_under(world, shown, known.lenses, solved)
         there = replace(solved, landmarks=placed(solved, keypoints, tracks))
@@ -62,6 +64,37 @@ def test_a_stitch_radius_that_is_said_goes_with_the_lenses() -> None:
     np.testing.assert_allclose(scale * found.lenses.centre, CENTRE, atol=0.001)
     measured = CameraSystem(*given).covariances()
     assert np.isnan(measured.nearness_sigma) and np.isfinite(measured.readout_sigma)
+
+
+def _turning(twists: np.ndarray, known: np.ndarray) -> Turning:
+    """A gyro's rates of frames that turn by twists, where they are known (F,)."""
+    rates = np.where(known[:, None], twists[:, :3] / READOUT_S, np.nan)
+    return Turning(np.zeros((23, 3)), np.full(23, np.inf), rates, np.deg2rad(0.1))
+
+
+def test_frames_turn_while_they_are_read_as_a_gyro_says() -> None:
+    """Nobody else knows that as well; frames that the gyro does not know are found as before."""
+    known = np.arange(24) % 6 > 0
+    still = replace(LENSES, twists=LENSES.twists * np.repeat([0.0, 1.0], 3))
+    start, off = Readout(still, 0.8 * READOUT_S), {}
+    for gyro in (None, _turning(LENSES.twists, known)):
+        _, found, _ = _settled(LENSES, start, rounds=4, turning=gyro)
+        assert found.by_gyro is (None if gyro is None else True)
+        assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
+        off[gyro is None] = np.abs(found.lenses.twists - LENSES.twists)[:, :3]
+    assert np.median(off[False][known]) < 0.2 * np.median(off[True][known])
+    assert np.median(off[False][~known]) < 1.2 * np.median(off[True][~known])
+
+
+def test_a_gyro_that_images_contradict_is_not_followed() -> None:
+    """As if it were of another time: by as much, but otherwise."""
+    still = replace(LENSES, twists=LENSES.twists * np.repeat([0.0, 1.0], 3))
+    twists = []
+    for gyro in (None, _turning(LENSES.twists[::-1], np.ones(24, bool))):
+        _, found, _ = _settled(LENSES, Readout(still, READOUT_S), rounds=2, turning=gyro)
+        assert not found.by_gyro
+        twists.append(found.lenses.twists)
+    np.testing.assert_array_equal(*twists)
 
 
 def test_covariances_are_those_of_errors_and_wider_than_of_a_known_camera() -> None:

@@ -9,7 +9,8 @@ from synthetic import loop_walk
 from gsba.bundle import prior_factors
 from gsba.bundle.prior_factors import X
 from gsba.config import PriorSettings
-from gsba.geometry import inverse, rotation_angle
+from gsba.geometry import inverse, pose, rotation_angle
+from gsba.types import Turning
 
 SETTINGS = PriorSettings()
 
@@ -138,3 +139,22 @@ def test_fixed_scale_holds_the_extent() -> None:
     assert held.error(_values(coarse)) == pytest.approx(0, abs=1e-9)
     assert held.error(_values(bigger)) == pytest.approx(0.5 * 1e4**2, rel=1e-6)
     assert prior_factors.fixed_scale(np.stack([np.eye(4)] * 3)).size() == 0
+
+
+def test_turns_of_a_gyro_hold_rotations_and_nothing_else() -> None:
+    """Steps it knows cost what they are off, whatever lies between the frames."""
+    rng = np.random.default_rng(0)
+    steps = rng.normal(0, 0.3, (3, 3))
+    rotations = [Rotation.from_rotvec(rng.normal(size=3))]
+    for step in steps:
+        rotations.append(rotations[-1] * Rotation.from_rotvec(step))
+    sigmas = np.array([1e-3, np.inf, 2e-3])
+    turning = Turning(steps, sigmas, np.full((4, 3), np.nan), 0.0)
+    graph = prior_factors.turns(turning, 5.0, 2.0)
+    values = gtsam.Values()
+    for f, rotation in enumerate(rotations):
+        values.insert(X(f), gtsam.Pose3(pose(rotation.as_matrix(), rng.normal(size=3))))
+    assert graph.size() == 2 and graph.error(values) < 1e-8
+    turned = values.atPose3(X(3)) * gtsam.Pose3(gtsam.Rot3.Rx(2e-3), np.zeros(3))
+    values.update(X(3), turned)  # by one standard deviation
+    assert graph.error(values) == pytest.approx(2.0 * np.log1p(1 / 4), rel=1e-3)

@@ -1,0 +1,197 @@
+"""Readings of inertial units from disk: a table, or whatever `telemetry_parser` can read.
+
+A table has a column of times, three of rates and, if need be, three of forces, separated by commas,
+semicolons or blanks. Without a header these are, in this order, seconds, rad/s and m/s^2. A header
+names columns (`t`, `gyro_x`, `acc_x`, ...), in any order among others, and may give units in
+brackets (`gyro_x [deg/s]`).
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from gsba.frames.times import read_lines
+from gsba.imu.readings import Readings
+from gsba.log import GsbaError, brief
+
+_TABLES = (".csv", ".txt", ".tsv", ".dat")
+_EXTRA = "gsba[imu]"
+_PANIC = "PanicException"  # of libraries in Rust: no Exception, and nowhere to import it from
+_FASTEST = 40.0  # rad/s: gyros end at 35, which are 2000 deg/s
+_SLOWEST = 25.0  # readings per second: less say nothing of the 10 to 30 ms of a readout
+_LEAST = 10  # readings
+_STANDARD_GRAVITY = 9.80665
+_DEGREE = np.pi / 180
+_TIMES = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_RATES = {"": 1.0, "rad/s": 1.0, "deg/s": _DEGREE, "dps": _DEGREE}
+_FORCES = {"": 1.0, "m/s2": 1.0, "g": _STANDARD_GRAVITY}
+_NAMES = {
+    "t": (r"t|time|timestamp", _TIMES),
+    "gyro": (r"(?:w|g|gyr|gyro|gyroscope|omega|w_rs_s|angular_velocity)[_. ]?([xyz])", _RATES),
+    "acc": (r"(?:a|acc|accel|accelerometer|a_rs_s|linear_acceleration)[_. ]?([xyz])", _FORCES),
+}
+_UNSAID = ["t", *(f"gyro_{axis}" for axis in "xyz"), *(f"acc_{axis}" for axis in "xyz")]
+
+
+def read_imu(path: Path) -> Readings:
+    """Readings of a table, or of a recording that `telemetry_parser` reads.
+
+    Raises:
+        GsbaError: what cannot be read or used, with the line; or `telemetry_parser` is not there.
+    """
+    path = Path(path)
+    if path.suffix.lower() in _TABLES or not path.is_file():
+        return _read_table(path)
+    return read_telemetry(path)
+
+
+def read_telemetry(path: Path) -> Readings:
+    """Readings that a maker's recording holds, by `telemetry_parser`: deg/s and m/s^2.
+
+    Raises:
+        GsbaError: the library is not there, or finds no readings.
+    """
+    try:
+        from telemetry_parser import Parser  # type: ignore[import-not-found]
+    except ImportError:
+        raise GsbaError(
+            f"{path}: its gyro is read by telemetry-parser: pip install '{_EXTRA}', or give a "
+            "table (t, gyro x y z, accelerometer x y z)"
+        ) from None
+    try:
+        rows = Parser(str(path)).normalized_imu()
+    except BaseException as error:
+        if not isinstance(error, OSError | ValueError) and type(error).__name__ != _PANIC:
+            raise
+        raise GsbaError(f"{path}: telemetry-parser finds no gyro in it ({error})") from None
+    rows = [row for row in rows if row.get("gyro") is not None]
+    times = np.array([1e-3 * row["timestamp_ms"] for row in rows], np.float64)
+    rates = np.array([row["gyro"] for row in rows], np.float64).reshape(-1, 3) * _DEGREE
+    forces = None
+    if rows and all(row.get("accl") is not None for row in rows):
+        forces = np.array([row["accl"] for row in rows], np.float64).reshape(-1, 3)
+    return _checked(path, times, rates, forces, [f"reading {n + 1}" for n in range(len(rows))])
+
+
+def _read_table(path: Path) -> Readings:
+    """Readings of a table."""
+    lines = [(line, _cells(text)) for line, text in read_lines(path)]
+    header = _header(path)
+    if lines and header is None and not _is_number(lines[0][1][0]):
+        header = lines[0]
+    if lines and header is not None and header[1] == lines[0][1]:
+        lines = lines[1:]
+    if not lines:
+        raise GsbaError(f"{path}: holds no readings")
+    if header is None and len(lines[0][1]) not in (4, 7):
+        raise GsbaError(
+            f"{path}:{lines[0][0]}: {len(lines[0][1])} columns; want t, gyro x y z [rad/s] and "
+            "accelerometer x y z [m/s^2], or a header that names them"
+        )
+    names = _UNSAID[: len(lines[0][1])] if header is None else header[1]
+    columns = _columns(f"{path}:{header[0]}" if header else str(path), names)
+    values = np.empty((len(lines), len(columns)))
+    for n, (line, cells) in enumerate(lines):
+        if len(cells) != len(names):
+            raise GsbaError(f"{path}:{line}: {len(cells)} values where {len(names)} are named")
+        for k, (column, scale) in enumerate(columns):
+            if not _is_number(cells[column]):
+                raise GsbaError(f"{path}:{line}: '{brief(cells[column])}' is not a finite number")
+            values[n, k] = float(cells[column]) * scale
+    forces = values[:, 4:] if values.shape[1] == 7 else None
+    where = [f"{line}" for line, _ in lines]
+    return _checked(path, values[:, 0], values[:, 1:4], forces, where)
+
+
+def _header(path: Path) -> tuple[int, list[str]] | None:
+    """A header behind a #, where the first line is one: it begins with the column of times."""
+    with path.open(encoding="utf-8-sig") as file:
+        first = file.readline().strip()
+    cells = _cells(first.lstrip("# "))
+    timed = re.fullmatch(_NAMES["t"][0], _name_and_unit(cells[0] if cells else "")[0])
+    return (1, cells) if first.startswith("#") and timed else None
+
+
+def _cells(text: str) -> list[str]:
+    for mark in ",;\t":
+        if mark in text:
+            return [cell.strip() for cell in text.split(mark)]
+    return text.split()
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return bool(np.isfinite(float(text)))
+    except ValueError:
+        return False
+
+
+def _columns(where: str, names: list[str]) -> list[tuple[int, float]]:
+    """Column of t, of each axis of the gyro and of the accelerometer, and what its unit is worth.
+
+    Raises:
+        GsbaError: one that is missing, named twice, or of a unit that is not known.
+    """
+    found: dict[str, tuple[int, float]] = {}
+    for column, name in enumerate(names):
+        plain, unit = _name_and_unit(name)
+        for kind, (pattern, units) in _NAMES.items():
+            match = re.fullmatch(pattern, plain)
+            if match is None:
+                continue
+            key = "_".join([kind, *match.groups()])
+            if unit not in units:
+                known = ", ".join(filter(None, units))
+                raise GsbaError(f"{where}: '{brief(name)}': want one of {known}")
+            if key in found:
+                raise GsbaError(f"{where}: two columns are {key}: leave one out")
+            found[key] = column, units[unit]
+    wanted = _UNSAID if any(key.startswith("acc") for key in found) else _UNSAID[:4]
+    for key in wanted:
+        if key not in found:
+            raise GsbaError(f"{where}: no column is {key}: name them {', '.join(_UNSAID)}")
+    return [found[key] for key in wanted]
+
+
+def _name_and_unit(name: str) -> tuple[str, str]:
+    """A column's name in small letters, and its unit as the tables here spell it."""
+    match = re.fullmatch(r"([^\[(]*?)\s*(?:[\[(](.*)[\])])?", name.lower().strip())
+    plain, unit = (match[1], match[2] or "") if match else (name, "?")
+    for old, new in (("²", "2"), ("^2", "2"), ("s^-1", "/s"), ("s^-2", "/s2"), ("°", "deg")):
+        unit = unit.replace(old, new)
+    return plain, unit.replace(" ", "").replace("s-2", "/s2").replace("//", "/")
+
+
+def _checked(
+    path: Path,
+    times: np.ndarray,
+    rates: np.ndarray,
+    forces: np.ndarray | None,
+    where: list[str],
+) -> Readings:
+    """Readings that can be used; `where` names each."""
+    if len(times) < _LEAST:
+        raise GsbaError(f"{path}: {len(times)} readings of a gyro; at least {_LEAST} are needed")
+    bad = np.flatnonzero(~np.isfinite(np.column_stack([times, rates])).all(axis=1))
+    if len(bad):
+        raise GsbaError(f"{path}:{where[bad[0]]}: holds a number that is not finite")
+    late = np.flatnonzero(np.diff(times) <= 0)
+    if len(late):
+        raise GsbaError(
+            f"{path}:{where[late[0] + 1]}: time {times[late[0] + 1]:.9g} does not come after "
+            f"{times[late[0]]:.9g}; sort the file"
+        )
+    fast = np.flatnonzero(np.abs(rates).max(axis=1) > _FASTEST)
+    if len(fast):
+        raise GsbaError(
+            f"{path}:{where[fast[0]]}: {np.abs(rates[fast[0]]).max():.4g} rad/s, which no gyro "
+            "measures: if these are deg/s, say so in a header (gyro_x [deg/s], ...)"
+        )
+    every = float(np.median(np.diff(times)))
+    if every > 1 / _SLOWEST:
+        raise GsbaError(
+            f"{path}: a reading every {every:.3g} s; {_SLOWEST:g} per second are needed: is t in "
+            "another unit (t [ms])?"
+        )
+    return Readings(times, rates, forces)

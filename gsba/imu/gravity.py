@@ -1,0 +1,51 @@
+"""Which way is up, from an accelerometer: at rest, and on average on the move, it shows that."""
+
+import numpy as np
+
+from gsba.geometry import median_direction
+from gsba.imu.alignment import Alignment, orientations
+from gsba.imu.readings import Readings
+
+_MEAN_S = 1.05  # s that a force is averaged over: two steps, in which sways cancel out
+_LEAST = 3  # such means
+_WEIGHT = 9.80665  # m/s^2
+_OFF = 0.2  # part of it, by which a mean that counts may be longer or shorter
+
+
+def up_axis(
+    readings: Readings, found: Alignment, timestamps: np.ndarray, world_R_rigs: np.ndarray
+) -> np.ndarray | None:
+    """Unit vector (3,) along the vertical in the world; None where forces do not tell.
+
+    Forces are turned into the world by the pose of the frame before and the gyro since then, and
+    averaged over two steps each. What speeds up or brakes for longer is an outlier: the
+    geometric median of the means counts.
+
+    Args:
+        readings: of both sensors.
+        found: how they belong to the frames.
+        timestamps: (F,) of frames, seconds, on their own clock.
+        world_R_rigs: (F, 3, 3) refined.
+    """
+    if readings.forces is None:
+        return None
+    times = found.clock.times(timestamps)
+    inside = (readings.timestamps >= times[0]) & (readings.timestamps <= times[-1])
+    if not inside.any():
+        return None
+    at, forces = readings.timestamps[inside], readings.forces[inside] @ found.rig_R_imu.T
+    before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 1)
+    turned = orientations(readings, found, np.concatenate([times, at]))
+    of_frames, of_forces = turned[: len(times)], turned[len(times) :]
+    worlds = world_R_rigs @ np.swapaxes(of_frames, 1, 2)
+    up = np.einsum("nij,njk,nk->ni", worlds[before], of_forces, forces)
+    part = ((at - at[0]) / _MEAN_S).astype(int)
+    counts = np.bincount(part)
+    full = counts > 0.5 * np.median(counts[counts > 0])
+    means = np.column_stack([np.bincount(part, column) for column in up.T])
+    means = means[full] / counts[full, None]
+    lengths = np.linalg.norm(means, axis=1)
+    right = np.abs(lengths - _WEIGHT) < _OFF * _WEIGHT
+    if right.sum() < _LEAST:
+        return None
+    return median_direction(means[right] / lengths[right, None])

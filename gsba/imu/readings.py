@@ -1,0 +1,93 @@
+"""What an inertial unit measured, and the rotations that its rates add up to."""
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+_MOST_GAP = 0.1  # s between two readings: the camera may have turned otherwise meanwhile
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """What a gyro makes of a rate."""
+
+    bias: np.ndarray  # (3,) float64, rad/s, what it shows at rest
+    scales: np.ndarray  # (3,) float64, rad/s for each that it shows beside, about one
+
+    @classmethod
+    def ideal(cls) -> "Sensor":
+        """One that shows what is."""
+        return cls(np.zeros(3), np.ones(3))
+
+    def true(self, shown: np.ndarray) -> np.ndarray:
+        """Rates (n, 3) of rates that it shows."""
+        return self.scales * (shown - self.bias)
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """Readings of a gyro and an accelerometer with common axes, right-handed, fixed to the camera.
+
+    How these lie in the camera, and what the gyro shows at rest, is not known.
+    """
+
+    timestamps: np.ndarray  # (N,) float64, seconds on a clock of their own, strictly increasing
+    rates: np.ndarray  # (N, 3) float64, rad/s
+    forces: np.ndarray | None = None  # (N, 3) float64, m/s^2, 9.8 upwards at rest; None = none
+
+    @property
+    def digest(self) -> str:
+        """Equal for equal readings."""
+        forces = () if self.forces is None else (self.forces,)
+        parts = [np.ascontiguousarray(part) for part in (self.timestamps, self.rates, *forces)]
+        return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
+
+    def between(self, begin: float, end: float) -> "Readings":
+        """Those of a span of time, and one more at either end."""
+        first = max(int(np.searchsorted(self.timestamps, begin)) - 1, 0)
+        last = int(np.searchsorted(self.timestamps, end, side="right")) + 1
+        forces = None if self.forces is None else self.forces[first:last]
+        return Readings(self.timestamps[first:last], self.rates[first:last], forces)
+
+    def covers(self, times: np.ndarray) -> np.ndarray:
+        """Whether spans of time (n, 2) lie within the readings (n,), without a gap."""
+        late = np.diff(self.timestamps, append=np.inf) > _MOST_GAP
+        gaps = np.concatenate([[0], np.cumsum(late)])
+        first = np.searchsorted(self.timestamps, times[:, 0], side="right") - 1
+        last = np.searchsorted(self.timestamps, times[:, 1]) - 1
+        inside = (first >= 0) & (times[:, 1] <= self.timestamps[-1])
+        return inside & (gaps[last + 1] == gaps[np.maximum(first, 0)])
+
+    def turned(self, sensor: Sensor) -> np.ndarray:
+        """Rotations (N, 3, 3) from the sensor's axes at each reading to those at the first."""
+        from scipy.spatial.transform import Rotation
+
+        rates = sensor.true(self.rates)
+        onward = 0.5 * (rates[:-1] + rates[1:]) * np.diff(self.timestamps)[:, None]
+        num, block = len(onward), max(int(np.sqrt(len(onward))), 1)
+        padded = np.concatenate([onward, np.zeros((-num % block, 3))]).reshape(-1, block, 3)
+        within = [Rotation.from_rotvec(padded[:, 0])]
+        for n in range(1, block):
+            within.append(within[-1] * Rotation.from_rotvec(padded[:, n]))
+        starts = [Rotation.identity()]
+        for end in within[-1]:
+            starts.append(starts[-1] * end)
+        before = np.array([start.as_matrix() for start in starts[:-1]])
+        after = np.stack([one.as_matrix() for one in within], axis=1)
+        turned = (before[:, None] @ after).reshape(-1, 3, 3)[:num]
+        return np.concatenate([np.eye(3)[None], turned])
+
+    def mean_rates(self, times: np.ndarray, span: float) -> np.ndarray:
+        """Mean rates (n, 3) over a span of seconds around times (n,); NaN where none are known."""
+        angles = np.zeros_like(self.rates)
+        steps = 0.5 * (self.rates[:-1] + self.rates[1:]) * np.diff(self.timestamps)[:, None]
+        np.cumsum(steps, axis=0, out=angles[1:])
+        ends = times[:, None] + 0.5 * span * np.array([-1.0, 1.0])
+        at = np.stack([np.interp(ends, self.timestamps, column) for column in angles.T], axis=2)
+        return np.where(self.covers(ends)[:, None], (at[:, 1] - at[:, 0]) / span, np.nan)
+
+    def noise(self) -> float:
+        """Noise of a rate, rad/s per axis, from how neighbours differ from a line."""
+        bent = self.rates[2:] - 2 * self.rates[1:-1] + self.rates[:-2]
+        return float(1.4826 * np.median(np.abs(bent)) / np.sqrt(6)) if len(bent) else 0.0
