@@ -33,7 +33,7 @@ class Backend(Protocol):
         sh_degree: int | None,
         near: float,
     ) -> list[Rendering]:
-        """An image for each camera, all of one size; see `gsba.splat.rasterise.render`."""
+        """An image for each camera; see `gsba.splat.rasterise.render`."""
         ...
 
     def descend(
@@ -90,7 +90,7 @@ class CpuBackend:
             found = self.gradients(gaussians, lesson, near, ssim_weight)
             adam.step(gaussians, found.gaussians, moments, lesson.rates, lesson.number)
             if pull is not None:
-                pull.add(found.centres, found.seen, lesson.camera.size)
+                pull.add(found.centres, found.seen, lesson.camera.focal)
 
     def gradients(
         self, gaussians: Gaussians, lesson: Lesson, near: float, ssim_weight: float
