@@ -103,7 +103,7 @@ def test_poses_come_back_by_what_each_lens_sees(taken, room: Gaussians) -> None:
     for optics in (Optics(lenses), ONE_EYE):
         found = align(room, frames, moved, NEAR, BACKEND, (48,), optics=optics)
         off.append(np.linalg.norm(found[:, :3, 3] - POSES[:, :3, 3], axis=1).max())
-    assert off[0] < 2e-3 and off[1] > 3 * off[0]
+    assert off[0] < 4e-3 and off[1] > 10 * off[0]
 
 
 def test_what_is_blended_has_no_weight(taken) -> None:
