@@ -3,9 +3,9 @@
     python -m benchmarks.splat_lenses --out WORK [--seeds 0 1 2] [--markdown FILE]
 
 For each seed the demo's gallery is walked with the two-lens camera and refined with and without its
-model. Three splats are trained on the CPU: `lenses`, on faces of one lens each, as `gsba train` does
-it; `stitched`, from the same poses on six faces at one centre of the panoramas; `central`, on such
-faces with what was refined as seen from one centre. Each frame is shown equally often.
+model. Three splats are trained on the CPU: `lenses`, on faces of one lens each, as `gsba train`
+does it; `stitched`, from the same poses on six faces at one centre of the panoramas; `central`, on
+such faces with what was refined as seen from one centre. Each frame is shown equally often.
 
 Whole frames are held out. They are scored twice, each splat rendered at its own poses:
 
@@ -17,7 +17,7 @@ Whole frames are held out. They are scored twice, each splat rendered at its own
   of one centre, without noise; after the gain of each channel that fits best, because a frame's
   exposure is its own.
 
-Runs and splats are kept in WORK and taken up again. Exit 1 where `lenses` is behind on its pixels.
+Runs and splats are kept in WORK and taken up again. Exit 1 where `lenses` is behind on the first.
 """
 
 import argparse
@@ -56,7 +56,8 @@ _ALMOST = 1e-9  # of the distance between lenses: views of both, all from the mi
 
 def refined(walk: Path, out: Path, model: str) -> Path:
     """The finished run of a walk."""
-    settings = RefineSettings(camera=CameraSettings(model=model), export=ExportSettings(formats=()))
+    camera = CameraSettings.model_validate({"model": model})
+    settings = RefineSettings(camera=camera, export=ExportSettings(formats=()))
     refine(walk / "images", walk / "slam.tum", out, settings)
     return out
 

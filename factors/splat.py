@@ -3,7 +3,7 @@
 A rendering at the last accepted pose, colour and expected depth, is a cloud of points with grey
 values. At another pose each point falls elsewhere in the captured frame; the residual is what the
 frame shows there less what the rendering has, after one gain and one offset per frame. So the
-rasteriser is never differentiated, and the six faces of a frame together give one 6x6 block. After
+rasteriser is never differentiated, and all faces of a frame together give one 6x6 block. After
 Newcombe et al., DTAM, ICCV 2011 (tracking against a rendered model), on the sphere.
 """
 
@@ -82,8 +82,8 @@ class SplatBlock:
             loss: robust loss on each whitened residual; None is Cauchy at one sigma.
             correlation: pixels that err together and count as one; 25 made the errors of aligned
                 poses about as large as their covariance says, at faces of 48 to 192 pixels.
-            centres: (C, 3) float64, of the cameras; None = all are in the rig's.
-            turns: (F, 3, 3) float64, of all cameras in each frame's rig; None = none.
+            centres: (C, 3) float64, of the cameras in the rig; None = all are in its own.
+            turns: (F, 3, 3) float64, of all cameras together in each frame's rig; None = none.
 
         Raises:
             ValueError: as many images and masks as keys are needed.
@@ -255,19 +255,9 @@ def _cubic(t, values, slopes):
 
 @_kernel
 def _sample_faces(
-    points,
-    pose,
-    rig_R_faces,
-    rig_t_faces,
-    focals,
-    principals,
-    image,
-    weights,
-    with_jacobian,
-    grey,
-    jacobian,
-    trust,
-):
+    points, pose, rig_R_faces, rig_t_faces, focals, principals, image, weights, with_jacobian,
+    grey, jacobian, trust,
+):  # fmt: skip
     """See SplatBlock._sample; a point belongs to the face along which it is furthest out."""
     num_faces, height, width = image.shape
     across, d_across, down, d_down = np.empty(4), np.empty(4), np.empty(4), np.empty(4)

@@ -96,8 +96,7 @@ def compare(
         backend: the renderer.
         out: folder to write.
         lpips: distance of images for the last measurement; None = leave it out.
-        optics: of the frames, in the run's unit: all trains on, and is measured on, faces of one
-            lens each where they are of two.
+        optics: of the frames, in the run's unit; with two lenses, faces are of one of them each.
 
     Raises:
         GsbaError: too few frames have a pose in every source, or a training fails.
