@@ -8,7 +8,7 @@ and walls along them are worth some 0.2 dB that no pose has earned.
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -34,7 +34,7 @@ from gsba.splat.scene import (
     start_cloud,
 )
 from gsba.splat.scores import Distance, Score, mean_score, measure
-from gsba.splat.train import Views, train
+from gsba.splat.train import Images, Views, train
 from gsba.store.store import digest, fingerprint
 from gsba.trajectory.association import matched_in_time
 from gsba.types import FrameSet, Reconstruction, Trajectory
@@ -274,7 +274,7 @@ def _write_pictures(
         write_image(folder / f"{frames.names[f]}.jpg", np.concatenate(rows))
 
 
-def _side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:
+def _side_by_side(images: Images) -> np.ndarray:
     """Images (h, w, 3) in a row, black below the lower ones."""
     tallest = max(map(len, images))
     padded = [np.pad(image, ((0, tallest - len(image)), (0, 0), (0, 0))) for image in images]

@@ -15,7 +15,7 @@ from gsba.frames.masks import load_mask
 from gsba.log import GsbaError, track
 from gsba.splat.camera import view_camera
 from gsba.splat.gaussians import Gaussians, from_cloud
-from gsba.splat.train import Views, extent_of
+from gsba.splat.train import Images, Views, extent_of
 from gsba.types import FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
 
 _GATE = np.deg2rad(3.0)  # of an observation under poses that may have drifted
@@ -27,8 +27,8 @@ class Faces:
     """Pictures of some frames, the same views of each."""
 
     views: tuple[View, ...]  # (K,)
-    images: Sequence[np.ndarray]  # (W K) of (h, w, 3) uint8 RGB, frame after frame
-    use: Sequence[np.ndarray]  # (W K) of (h, w) bool, pixels that count
+    images: Images  # (W K,) of (h, w, 3) uint8 RGB, frame after frame
+    use: Images  # (W K,) of (h, w) bool, pixels that count
     turns: np.ndarray | None = None  # (W, 3, 3) rig_R_lenses of each frame; None = the rig's axes
 
     def poses(self, world_T_rigs: np.ndarray) -> np.ndarray:
@@ -123,9 +123,7 @@ def cut_lens_faces(
     return _averaged(images, shapes), None if masks is None else _surely(masks, shapes)
 
 
-def _averaged(
-    images: Sequence[np.ndarray] | np.ndarray, shapes: Sequence[tuple[int, int]]
-) -> list[np.ndarray]:
+def _averaged(images: Images, shapes: Sequence[tuple[int, int]]) -> list[np.ndarray]:
     """Images resized to widths and heights, of means over areas where they shrink."""
     import cv2
 
@@ -134,9 +132,7 @@ def _averaged(
     return [cv2.resize(image, shape, interpolation=way) for image, shape in pairs]
 
 
-def _surely(
-    masks: Sequence[np.ndarray] | np.ndarray, shapes: Sequence[tuple[int, int]]
-) -> list[np.ndarray]:
+def _surely(masks: Images, shapes: Sequence[tuple[int, int]]) -> list[np.ndarray]:
     """Masks resized to widths and heights, True where they are all over the pixel."""
     shares = _averaged([mask.astype(np.float32) for mask in masks], shapes)
     return [share > 0.999 for share in shares]

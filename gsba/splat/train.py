@@ -30,14 +30,16 @@ _PUBLISHED = 30_000  # steps that the published times are for
 _COPIES = 8  # of all parameters at once: gradients, two moments, and what density control makes
 _CHECK_EVERY = 20  # steps between looks for values that are not finite, at ends of stretches
 
+Images = Sequence[np.ndarray] | np.ndarray  # of sizes of their own, or of one
+
 
 @dataclass(frozen=True, slots=True)
 class Views:
     """Posed images to train on."""
 
     cameras: Sequence[FaceCamera]  # (V,)
-    images: Sequence[np.ndarray]  # (V,) of (H, W, 3) uint8, RGB
-    use: Sequence[np.ndarray] | None  # (V,) of (H, W) bool, pixels that count; None = all
+    images: Images  # (V,) of (H, W, 3) uint8, RGB
+    use: Images | None  # (V,) of (H, W) bool, pixels that count; None = all
     panoramas: np.ndarray  # (V,) int, which panorama each is a part of
 
     @property

@@ -53,7 +53,7 @@ def room() -> Gaussians:
     return concatenate([_walls(2.0, 0.12, 0.1), replace(dots, sh=sh)])
 
 
-@pytest.fixture(scope="module", params=LENSES.values(), ids=LENSES)
+@pytest.fixture(scope="module", params=LENSES.values(), ids=list(LENSES))
 def taken(request: pytest.FixtureRequest, room: Gaussians, tmp_path_factory):
     """Panoramas of the room, each direction from the lens that faces it; and these lenses."""
     lenses, folder = request.param, tmp_path_factory.mktemp("frames")
@@ -110,6 +110,7 @@ def test_what_is_blended_has_no_weight(taken) -> None:
     frames, lenses = taken
     captured = capture(frames, np.array([0]), 32, Optics(lenses))
     (weights,) = captured.weights
+    assert weights is not None
     for view, weight in zip(captured.views, weights, strict=True):
         pixels = np.stack(np.meshgrid(*2 * (np.arange(view.width) + 0.5,)), axis=-1)
         rays = view.rays(pixels).reshape(-1, 3)
