@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from gsba.camera.calibration import calibration_json, read_calibration
 from gsba.camera.fisheye import Pair, changed, project, rotation_of, unproject
 from gsba.camera.sphere import erp_from_bearings
+from gsba.camera.views import lens_views
 from gsba.cli import app
 from gsba.config import RefineSettings
 from gsba.demo.degrade import degrade
@@ -23,6 +24,7 @@ from gsba.demo.walk import walk_poses
 from gsba.evaluate import TrajectoryErrors, evaluate
 from gsba.log import GsbaError
 from gsba.pipeline import refine
+from gsba.store.finished import load_lenses, load_run
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Fisheye, Trajectory
 
@@ -92,6 +94,7 @@ def test_raw_pairs_of_known_lenses_become_faces_of_either(walk: Path, tmp_path: 
     assert kept[0].focal == LENS.focal
     np.testing.assert_allclose(kept[0].centre, [0, 0, BASELINE / 2], atol=0.001)
     _check_fisheyes(tmp_path / "run")
+    _check_families(walk, tmp_path / "run")
 
 
 def _check_fisheyes(run: Path) -> None:
@@ -110,6 +113,32 @@ def _check_fisheyes(run: Path) -> None:
     wrong = ["export", str(run), "--to", "nerfstudio", "--images", "fisheye"]
     result = CliRunner().invoke(app, [*wrong, "--out", str(run / "no")])
     assert result.exit_code == 1 and "colmap" in result.output and not (run / "no").exists()
+
+
+def _check_families(walk: Path, run: Path) -> None:
+    """Pixels of the lenses have their say, each from its own; a splat is trained on them."""
+    more = {
+        "factors": ("bearing", "photometric", "splat"),
+        "photometric": {"spacing_deg": 15.0, "depth_levels": 0},
+        "splat": {"sizes": (24,), "first_steps": 30, "steps": 10, "moves": 1, "backend": "cpu"},
+    }
+    settings = RefineSettings.model_validate(RAW_SETTINGS.model_dump() | more)
+    refine(walk / "frames", walk / "slam.tum", run, settings, calibration=walk / "true.json")
+    report, truth = (
+        json.loads((run / "report.json").read_text()),
+        read_trajectory(walk / "truth.tum"),
+    )
+    computed = [stage["name"] for stage in report["stages"] if not stage["resumed"]]
+    assert computed[:2] == ["photometric", "splat"] and len(report["splat"]) == 1
+    assert evaluate(read_trajectory(run / "trajectory.tum"), truth).ate.rmse < 0.004
+    train = ["-q", "train", str(run), "--iterations", "20", "--face-size", "32", "--backend", "cpu"]
+    result = CliRunner().invoke(app, train)
+    assert result.exit_code == 0, result.output
+    (picture, *_) = sorted((run / "splat/pictures").iterdir())
+    views = lens_views(load_lenses(run, load_run(run)[0]), 32)
+    shown = cv2.imread(str(picture))
+    assert shown is not None and shown.shape[1] == sum(view.width for view in views)
+    assert shown[:20].mean() > 40  # captured: nothing of the black around the circles
 
 
 def test_lenses_that_are_off_are_found_and_all_is_done_anew(walk: Path, tmp_path: Path) -> None:
