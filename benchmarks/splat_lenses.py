@@ -5,7 +5,8 @@
 For each seed the demo's gallery is walked with the two-lens camera and refined with and without its
 model. Three splats are trained on the CPU: `lenses`, on faces of one lens each, as `gsba train`
 does it; `stitched`, from the same poses on six faces at one centre of the panoramas; `central`, on
-such faces with what was refined as seen from one centre. Each frame is shown equally often.
+such faces with what was refined as seen from one centre. Each frame is shown equally often, which
+takes ten steps where six faces take six; `lenses-even` is `lenses` with as many steps as these.
 
 Whole frames are held out. They are scored twice, each splat rendered at its own poses:
 
@@ -50,7 +51,7 @@ from gsba.store.store import digest
 from gsba.trajectory.files import read_trajectory
 
 WIDTH, FINE = 1024, 2048  # pixels across the walk's panoramas, and across exact ones
-ROWS = ("lenses", "stitched", "central")
+ROWS = ("lenses", "lenses-even", "stitched", "central")
 _ALMOST = 1e-9  # of the distance between lenses: views of both, all from the middle
 
 
@@ -98,7 +99,7 @@ def run_seed(
     for row in rows:
         if row == "central":
             reconstruction, frames = load_run(runs["central"])
-        taken, seen = (optics, optics) if row == "lenses" else (ONE_EYE, between)
+        taken, seen = (optics, optics) if row.startswith("lenses") else (ONE_EYE, between)
         chosen = settings
         if row == "lenses":  # ten views a frame
             chosen = settings.model_copy(update={"iterations": settings.iterations * 10 // 6})

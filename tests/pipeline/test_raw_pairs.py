@@ -119,7 +119,7 @@ def _check_families(walk: Path, run: Path) -> None:
     """Pixels of the lenses have their say, each from its own; a splat is trained on them."""
     more = {
         "factors": ("bearing", "photometric", "splat"),
-        "photometric": {"spacing_deg": 15.0, "depth_levels": 0},
+        "photometric": {"spacing_deg": 20.0, "depth_levels": 0},
         "splat": {"sizes": (24,), "first_steps": 30, "steps": 10, "moves": 1, "backend": "cpu"},
     }
     settings = RefineSettings.model_validate(RAW_SETTINGS.model_dump() | more)
