@@ -45,7 +45,8 @@ class Backend(Protocol):
         near: float,
         ssim_weight: float,
     ) -> None:
-        """A step of Adam for each lesson, down `gsba.splat.metrics.training_loss`.
+        """A step of Adam for each lesson, down `gsba.splat.metrics.training_loss` times the view's
+        share of a face: pixels of all views count alike.
 
         Args:
             gaussians, moments: changed in place.
@@ -95,11 +96,11 @@ class CpuBackend:
     def gradients(
         self, gaussians: Gaussians, lesson: Lesson, near: float, ssim_weight: float
     ) -> Gradients:
-        """Of the training loss of one lesson."""
+        """Of the training loss of one lesson, times the share of its view."""
         image, tape = render(gaussians, lesson.camera, lesson.sh_degree, near, self.num_threads)
         truth = lesson.truth.astype(np.float32) / 255
         slope = training_loss(image.color, truth, lesson.use, ssim_weight)[1]
-        return differentiate(tape, slope, num_threads=self.num_threads)
+        return differentiate(tape, lesson.camera.share * slope, num_threads=self.num_threads)
 
 
 def choose_backend(name: str, num_threads: int | None = None) -> Backend:

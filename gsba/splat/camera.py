@@ -20,6 +20,11 @@ class FaceCamera:
     focal: float  # pixels
     principal: tuple[float, float]  # pixels, corner origin
 
+    @property
+    def share(self) -> float:
+        """Its pixels, part of those of a face of 90 degrees that is as dense."""
+        return self.width * self.height / (2 * self.focal) ** 2
+
     def packed(self) -> np.ndarray:
         """`[face_R_world row-major (9), centre (3), focal, principal (2), width, height]`, (17,)
         float64."""

@@ -101,7 +101,8 @@ class GsplatBackend:
                 degree = gaussians.usable_degree(lesson.sh_degree)
                 image, _, notes = self._run(values, [lesson.camera], degree, near, "RGB")
                 notes["means2d"].retain_grad()
-                image[0].backward(self._slope(image[0].detach(), lesson, ssim_weight))
+                slope = self._slope(image[0].detach(), lesson, ssim_weight)
+                image[0].backward(lesson.camera.share * slope)
                 with torch.no_grad():
                     self._move(values, first, second, lesson.rates, lesson.number)
                     slopes = notes["means2d"].grad[0]
