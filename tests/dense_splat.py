@@ -25,8 +25,9 @@ def render(gaussians: Gaussians, camera: FaceCamera, degree: int) -> np.ndarray:
         x, y, z = local[g]
         if z <= 1e-2:
             continue
-        low, high = -np.array(camera.principal), size - camera.principal
-        slopes = np.clip([x / z, y / z], 1.3 * low / camera.focal, 1.3 * high / camera.focal)
+        middle, limit = 0.5 * size - camera.principal, 1.3 * 0.5 * size
+        bounds = (middle - limit) / camera.focal, (middle + limit) / camera.focal
+        slopes = np.clip([x / z, y / z], *bounds)
         affine = camera.focal / z * np.array([[1, 0, -slopes[0]], [0, 1, -slopes[1]]])
         axes = rotation(quaternions[g]) * np.exp(log_scales[g])
         root = affine @ camera.world_R_face.T @ axes

@@ -10,7 +10,7 @@ import numpy as np
 from factors.compiled import kernel_and_part
 
 DILATION = 0.3  # pixels^2 added to both variances: a splat is never thinner than a pixel
-GUARD = 1.3  # slopes x / z beyond this multiple of the image's are clamped in the affine map
+GUARD = 1.3  # slopes x / z beyond an image this much wider are clamped in the affine map
 _ALPHA = 255.0  # 1 / the least alpha that is blended, see _tiles.MIN_ALPHA
 
 _C0 = 0.28209479177387814
@@ -112,8 +112,9 @@ def _flatten(camera, mean, log_scale, rotation, scales, at, slope, flat):
         scales[r] = np.exp(log_scale[r])
     focal, z = camera[12], at[2]
     for r in range(2):
-        low, high = camera[13 + r] / focal, (camera[15 + r] - camera[13 + r]) / focal
-        at[3 + r] = min(max(at[r] / z, -GUARD * low), GUARD * high)
+        half = 0.5 * camera[15 + r] / focal
+        middle, limit = half - camera[13 + r] / focal, GUARD * half
+        at[3 + r] = min(max(at[r] / z, middle - limit), middle + limit)
     for k in range(3):
         slope[0, k] = focal / z * (camera[k] - at[3] * camera[6 + k])
         slope[1, k] = focal / z * (camera[3 + k] - at[4] * camera[6 + k])
