@@ -149,7 +149,7 @@ def splat_psnr(
     split = split_frames(refined_frames(reconstruction), settings.held_out_every)
     poses, backend = reconstruction.world_T_rigs, choose_backend("cpu", 2)
     seen, unseen = (
-        make_views(*load_faces(source, part, FACE_SIZE), poses[part])
+        make_views(load_faces(source, part, FACE_SIZE), poses[part])
         for source, part in ((frames, split.training), (clean, split.held_out))
     )
     files = fingerprint([*(p[0] for p in frames.paths), *frames.mask_paths])

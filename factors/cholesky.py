@@ -1,10 +1,9 @@
 """Sparse Cholesky of symmetric systems of 6x6 blocks: pose graphs after elimination."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg.blas import dsyrk, dtrsm, dtrsv
-from scipy.linalg.lapack import dpotrf, dtrtri
+from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
 from factors.compiled import kernel_and_part
 from factors.supernodes import find_supernodes
@@ -12,6 +11,13 @@ from factors.supernodes import find_supernodes
 DIM = 6
 
 _kernel, _ = kernel_and_part()
+
+syrk, trsm, trsv = get_blas_funcs(("syrk", "trsm", "trsv"), dtype=np.float64)
+potrf, trtri = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
+
+
+def _nothing() -> np.ndarray:
+    return np.empty((0, 0))
 
 
 @dataclass(slots=True)
@@ -28,8 +34,10 @@ class _Front:
     places: np.ndarray  # (E, 2) local row and column of each
     flips: np.ndarray  # (E,) bool, where the pair's block is to be transposed
     above: np.ndarray  # (R,) local places of the rows in the parent's front
-    lower: np.ndarray | None = None  # (6 W, 6 W) factor of the columns' own block
-    below: np.ndarray | None = None  # (6 R, 6 W) factor under it
+    lower: np.ndarray = field(
+        default_factory=_nothing
+    )  # (6 W, 6 W) factor of the columns' own block
+    below: np.ndarray = field(default_factory=_nothing)  # (6 R, 6 W) factor under it
 
     @property
     def own(self) -> slice:
@@ -108,12 +116,12 @@ class BlockCholesky:
             _fill(lower, below, blocks, off_diagonal, front.slots, front.places, front.flips)
             for update, above in updates.pop(s, []):
                 _extend(lower, below, rest, update, above)
-            lower, failed = dpotrf(lower, lower=1, clean=1, overwrite_a=1)
+            lower, failed = potrf(lower, lower=1, clean=1, overwrite_a=1)
             if failed or not np.isfinite(lower[-1, -1]):
                 return False
             if num:
-                below = dtrsm(1.0, lower, below, side=1, lower=1, trans_a=1, overwrite_b=1)
-                rest = dsyrk(-1.0, below, beta=1.0, c=rest, lower=1, overwrite_c=1)
+                below = trsm(1.0, lower, below, side=1, lower=1, trans_a=1, overwrite_b=1)
+                rest = syrk(-1.0, below, beta=1.0, c=rest, lower=1, overwrite_c=1)
                 updates.setdefault(int(self._parents[s]), []).append((rest, front.above))
             front.lower, front.below = lower, below
         return True
@@ -122,11 +130,11 @@ class BlockCholesky:
         """Solve H x = right, both (N, 6)."""
         x = right[self.order].ravel()
         for front in self._fronts:
-            x[front.own] = dtrsv(front.lower, x[front.own], lower=1)
+            x[front.own] = trsv(front.lower, x[front.own], lower=1)
             x[front.under] -= front.below @ x[front.own]
         for front in reversed(self._fronts):
             rest = x[front.own] - front.below.T @ x[front.under]
-            x[front.own] = dtrsv(front.lower, rest, lower=1, trans=1)
+            x[front.own] = trsv(front.lower, rest, lower=1, trans=1)
         out = np.empty((self.num_blocks, DIM))
         out[self.order] = x.reshape(-1, DIM)
         return out
@@ -137,7 +145,7 @@ class BlockCholesky:
         x = np.ascontiguousarray(normals[:, self.order].reshape(num, DIM * self.num_blocks).T)
         for front in reversed(self._fronts):
             rest = x[front.own] - front.below.T @ x[front.under]
-            x[front.own] = dtrsm(1.0, front.lower, rest, lower=1, trans_a=1)
+            x[front.own] = trsm(1.0, front.lower, rest, lower=1, trans_a=1)
         out = np.empty((num, self.num_blocks, DIM))
         out[:, self.order] = x.T.reshape(num, self.num_blocks, DIM)
         return out
@@ -163,7 +171,7 @@ class BlockCholesky:
         whole: dict[int, np.ndarray] = {}  # of fronts whose children are still to come
         for s in range(len(self._fronts) - 1, -1, -1):
             front, parent = self._fronts[s], int(self._parents[s])
-            Z = self._inverse_of_front(front, whole.get(parent))
+            Z = self._inverse_of_front(front, whole.get(parent, _nothing()))
             if parent >= 0:
                 waiting[parent] -= 1
                 if not waiting[parent]:
@@ -180,11 +188,11 @@ class BlockCholesky:
         between[flip] = np.swapaxes(between[flip], 1, 2)
         return inverse, between
 
-    def _inverse_of_front(self, front: _Front, parent: np.ndarray | None) -> np.ndarray:
+    def _inverse_of_front(self, front: _Front, parent: np.ndarray) -> np.ndarray:
         """H^-1 at the columns and rows of a front, from that at the parent's."""
         width, num = DIM * front.width, DIM * len(front.rows)
         Z = np.empty((width + num, width + num))
-        root, _ = dtrtri(front.lower, lower=1)
+        root, _ = trtri(front.lower, lower=1)
         Z[:width, :width] = root.T @ root
         if num:
             at = (DIM * front.above[:, None] + np.arange(DIM)).ravel()

@@ -3,7 +3,7 @@
 A rendering at the last accepted pose, colour and expected depth, is a cloud of points with grey
 values. At another pose each point falls elsewhere in the captured frame; the residual is what the
 frame shows there less what the rendering has, after one gain and one offset per frame. So the
-rasteriser is never differentiated, and the six faces of a frame together give one 6x6 block. After
+rasteriser is never differentiated, and all faces of a frame together give one 6x6 block. After
 Newcombe et al., DTAM, ICCV 2011 (tracking against a rendered model), on the sphere.
 """
 
@@ -66,6 +66,8 @@ class SplatBlock:
         render: Render,
         loss: RobustLoss | None = None,
         correlation: float = 25.0,
+        centres: np.ndarray | None = None,
+        turns: np.ndarray | None = None,
     ) -> None:
         """Prepare the captured frames for sampling.
 
@@ -80,6 +82,8 @@ class SplatBlock:
             loss: robust loss on each whitened residual; None is Cauchy at one sigma.
             correlation: pixels that err together and count as one; 25 made the errors of aligned
                 poses about as large as their covariance says, at faces of 48 to 192 pixels.
+            centres: (C, 3) float64, of the cameras in the rig; None = all are in its own.
+            turns: (F, 3, 3) float64, of all cameras together in each frame's rig; None = none.
 
         Raises:
             ValueError: as many images and masks as keys are needed.
@@ -90,7 +94,8 @@ class SplatBlock:
         self.pairs = np.zeros((0, 2), np.int64)
         self.loss = loss or RobustLoss("cauchy", 1.0)
         self.correlation = correlation
-        self._cameras, self._render = cameras, render
+        self._cameras, self._render, self._turns = cameras, render, turns
+        self._centres = np.zeros((len(cameras.focals), 3)) if centres is None else centres
         self._images = [_spline(image) for image in images]
         whole = np.ones(self._images[0].shape if len(images) else (0, 0, 0), np.float32)
         self._trust = [whole if w is None else np.ascontiguousarray(w, np.float32) for w in weights]
@@ -180,12 +185,16 @@ class SplatBlock:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Captured grey (N,), its Jacobian by the pose (N, 6), and weights (N,), 0 = not seen."""
         num, cameras = len(view.points_world), self._cameras
+        rotations, centres = cameras.rig_R_faces, self._centres
+        if self._turns is not None:
+            rotations, centres = self._turns[f] @ rotations, centres @ self._turns[f].T
         grey, trust = np.zeros(num), np.zeros(num)
         jacobian = np.zeros((num if with_jacobian else 0, 6))
         _sample_faces(
             view.points_world,
             pose,
-            np.ascontiguousarray(cameras.rig_R_faces),
+            np.ascontiguousarray(rotations),
+            np.ascontiguousarray(centres),
             np.asarray(cameras.focals, np.float64),
             np.asarray(cameras.principals, np.float64),
             self._images[f],
@@ -246,18 +255,9 @@ def _cubic(t, values, slopes):
 
 @_kernel
 def _sample_faces(
-    points,
-    pose,
-    rig_R_faces,
-    focals,
-    principals,
-    image,
-    weights,
-    with_jacobian,
-    grey,
-    jacobian,
-    trust,
-):
+    points, pose, rig_R_faces, rig_t_faces, focals, principals, image, weights, with_jacobian,
+    grey, jacobian, trust,
+):  # fmt: skip
     """See SplatBlock._sample; a point belongs to the face along which it is furthest out."""
     num_faces, height, width = image.shape
     across, d_across, down, d_down = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
@@ -268,15 +268,16 @@ def _sample_faces(
         dz = pose[2] * x + pose[5] * y + pose[8] * z
         face, depth = 0, -1.0
         for c in range(num_faces):
-            R = rig_R_faces[c]
-            forward = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
+            R, t = rig_R_faces[c], rig_t_faces[c]
+            forward = R[0, 2] * (dx - t[0]) + R[1, 2] * (dy - t[1]) + R[2, 2] * (dz - t[2])
             if forward > depth:
                 face, depth = c, forward
         if not depth > 1e-9:
             continue
-        R, focal = rig_R_faces[face], focals[face]
-        right = (R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) / depth
-        lower = (R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / depth
+        R, t, focal = rig_R_faces[face], rig_t_faces[face], focals[face]
+        x, y, z = dx - t[0], dy - t[1], dz - t[2]
+        right = (R[0, 0] * x + R[1, 0] * y + R[2, 0] * z) / depth
+        lower = (R[0, 1] * x + R[1, 1] * y + R[2, 1] * z) / depth
         u = focal * right + principals[face, 0] - 0.5
         v = focal * lower + principals[face, 1] - 0.5
         column, row = int(np.floor(u)), int(np.floor(v))

@@ -421,7 +421,7 @@ class SplatSettings(_Settings):
     rate_colors: float = Field(default=2.5e-3, gt=0)  # a twentieth of it for what varies by view
     rate_fade: float = Field(default=1.0, gt=0, le=1)  # of all but the means' rate, at the end
     densify: bool = True
-    densify_pull: float = Field(default=2e-4, gt=0)  # gradient of a centre, image half-widths
+    densify_pull: float = Field(default=2e-4, gt=0)  # gradient of a centre, focal lengths
     densify_scale: float = Field(default=0.01, gt=0)  # smaller: cloned, larger: split; of extent
     min_opacity: float = Field(default=5e-3, gt=0, lt=1)
     max_scale: float = Field(default=0.1, gt=0)  # of extent

@@ -18,20 +18,22 @@ def render(gaussians: Gaussians, camera: FaceCamera, degree: int) -> np.ndarray:
     values = np.einsum("nk,nkc->nc", harmonics(directions)[:, :num], sh[:, :num])
     colors = np.maximum(values + 0.5, 0)
     opacities = 1 / (1 + np.exp(-logits))
-    v, u = np.mgrid[: camera.size, : camera.size] + 0.5
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    size = np.array([camera.width, camera.height])
     image, through = np.zeros((*u.shape, 5)), np.ones(u.shape)
     for g in np.argsort(local[:, 2]):
         x, y, z = local[g]
         if z <= 1e-2:
             continue
-        limit = 1.3 * 0.5 * camera.size / camera.focal
-        slopes = np.clip([x / z, y / z], -limit, limit)
+        middle, limit = 0.5 * size - camera.principal, 1.3 * 0.5 * size
+        bounds = (middle - limit) / camera.focal, (middle + limit) / camera.focal
+        slopes = np.clip([x / z, y / z], *bounds)
         affine = camera.focal / z * np.array([[1, 0, -slopes[0]], [0, 1, -slopes[1]]])
         axes = rotation(quaternions[g]) * np.exp(log_scales[g])
         root = affine @ camera.world_R_face.T @ axes
         inverse = np.linalg.inv(root @ root.T + 0.3 * np.eye(2))
-        du = u - (camera.focal * x / z + camera.size / 2)
-        dv = v - (camera.focal * y / z + camera.size / 2)
+        du = u - (camera.focal * x / z + camera.principal[0])
+        dv = v - (camera.focal * y / z + camera.principal[1])
         power = inverse[0, 0] * du**2 + 2 * inverse[0, 1] * du * dv + inverse[1, 1] * dv**2
         alpha = np.minimum(opacities[g] * np.exp(-0.5 * power), 0.99)
         alpha = np.where((alpha >= 1 / 255) & (through >= 1e-4), alpha, 0)

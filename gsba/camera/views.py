@@ -15,7 +15,7 @@ import numpy as np
 
 from gsba.camera.fisheye import project
 from gsba.camera.lens import Lenses
-from gsba.camera.rig import RIG_R_FACE
+from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings
 from gsba.camera.straighten import PAD
 from gsba.geometry import pose
@@ -54,6 +54,12 @@ class View:
         rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
         return rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ self.rig_R_view.T
 
+    def finer(self, times: int) -> "View":
+        """The same with `times` as many pixels either way."""
+        u, v = self.principal
+        size = {"width": times * self.width, "height": times * self.height}
+        return replace(self, **size, focal=times * self.focal, principal=(times * u, times * v))
+
 
 def cube_views(faces: tuple[str, ...], size: int) -> tuple[View, ...]:
     """Faces of `size` pixels and 90 degrees, of one centre."""
@@ -61,6 +67,15 @@ def cube_views(faces: tuple[str, ...], size: int) -> tuple[View, ...]:
     return tuple(
         View(face, size, size, half, (half, half), RIG_R_FACE[FACES.index(face)], np.zeros(3))
         for face in faces
+    )
+
+
+def rig_views(rig: CubeRig) -> tuple[View, ...]:
+    """The faces of a cube rig, in FACES order."""
+    principal = (rig.principal, rig.principal)
+    return tuple(
+        View(face, rig.size, rig.size, float(rig.focal), principal, rig_R_face, np.zeros(3))
+        for face, rig_R_face in zip(FACES, RIG_R_FACE, strict=True)
     )
 
 
@@ -131,15 +146,20 @@ def seen_from_lenses(reconstruction: Reconstruction, lenses: Lenses) -> Reconstr
     if lenses.axes is None:
         return reconstruction
     turns = lenses.axes[reconstruction.observation_frames]
-    turned = reconstruction.world_T_rigs.copy()
-    turned[:, :3, :3] = turned[:, :3, :3] @ lenses.axes
     origins = reconstruction.observation_origins
     return replace(
         reconstruction,
-        world_T_rigs=turned,
+        world_T_rigs=turned_rigs(reconstruction.world_T_rigs, lenses.axes),
         observation_bearings=np.einsum("oji,oj->oi", turns, reconstruction.observation_bearings),
         observation_origins=None if origins is None else np.einsum("oji,oj->oi", turns, origins),
     )
+
+
+def turned_rigs(world_T_rigs: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """Poses (W, 4, 4) of the same rigs with axes turned (W, 3, 3) in them."""
+    turned = world_T_rigs.copy()
+    turned[:, :3, :3] = turned[:, :3, :3] @ turns
+    return turned
 
 
 def _in_the_middle(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
@@ -164,14 +184,22 @@ def shown_in_pictures(reconstruction: Reconstruction, lenses: Lenses) -> Reconst
 
 def scenes_of(reconstruction: Reconstruction) -> Callable[[int], np.ndarray]:
     """Points (N, 3) that a frame sees, in its rig frame, by its index."""
-    order = np.argsort(reconstruction.observation_frames, kind="stable")
-    num = len(reconstruction.world_T_rigs)
-    ends = np.searchsorted(reconstruction.observation_frames[order], np.arange(num + 1))
+    poses, points = reconstruction.world_T_rigs, reconstruction.points_world
+    return scenes_around(
+        poses, points, reconstruction.observation_points, reconstruction.observation_frames
+    )
+
+
+def scenes_around(
+    world_T_rigs: np.ndarray, points_world: np.ndarray, points: np.ndarray, frames: np.ndarray
+) -> Callable[[int], np.ndarray]:
+    """As `scenes_of`, of poses (F, 4, 4), points (J, 3), and which (O,) of either is observed."""
+    order = np.argsort(frames, kind="stable")
+    ends = np.searchsorted(frames[order], np.arange(len(world_T_rigs) + 1))
 
     def scene(f: int) -> np.ndarray:
-        seen = reconstruction.observation_points[order[ends[f] : ends[f + 1]]]
-        pose = reconstruction.world_T_rigs[f]
-        return (reconstruction.points_world[seen] - pose[:3, 3]) @ pose[:3, :3]
+        seen, pose = points[order[ends[f] : ends[f + 1]]], world_T_rigs[f]
+        return (points_world[seen] - pose[:3, 3]) @ pose[:3, :3]
 
     return scene
 
@@ -239,9 +267,9 @@ class ViewCutter:
         return parts
 
     def cut_mask(self, mask: np.ndarray) -> list[np.ndarray]:
-        """Masks (height, width) bool of one (H, 2 H) bool."""
-        found = self._sampled(mask.astype(np.uint8), cv2.INTER_NEAREST)
-        return [part > 0 for part in found]
+        """Masks (height, width) of one (H, 2 H), bool or float32 weights."""
+        whole = mask.astype(np.uint8) if mask.dtype == bool else mask
+        return [part.astype(mask.dtype) for part in self._sampled(whole, cv2.INTER_NEAREST)]
 
     def _sampled(self, image: np.ndarray, how: int) -> list[np.ndarray]:
         height, width = image.shape[:2]

@@ -52,17 +52,17 @@ def render(
     face_size: FaceSize = None,
     backend: BackendName = "auto",
 ) -> None:
-    """Render a splat at the refined pose of a frame: six faces and a panorama."""
+    """Render a splat at the refined pose of a frame: its faces, as `train` has them, and a panorama
+    of one centre."""
     import numpy as np
 
-    from gsba.camera.rig import CubeRig
+    from gsba.camera.optics import Optics
     from gsba.disk import write_image
     from gsba.splat import read_ply, scene
     from gsba.splat.backend import choose_backend
-    from gsba.splat.pictures import render_faces, render_panorama
-    from gsba.store.finished import load_run
+    from gsba.splat.pictures import render_panorama, render_views
+    from gsba.store.finished import load_lenses, load_run
     from gsba.store.folder import claim
-    from gsba.types import FACES
 
     settings = splat_settings(None, face_size, backend)
     reconstruction, frames = load_run(run)
@@ -70,11 +70,13 @@ def render(
         raise GsbaError(f"no frame {frame!r} in {run}: its first is {frames.names[0]!r}")
     gaussians, renderer = read_ply(splat), choose_backend(settings.backend)
     near = scene.near_of(reconstruction.world_T_rigs, settings)
-    pose = reconstruction.world_T_rigs[frames.names.index(frame)]
-    folder, rig = out or run / "renderings", CubeRig(settings.face_size, np.pi / 2)
-    faces = render_faces(gaussians, pose, rig, near, renderer)
+    optics = Optics.of(load_lenses(run, reconstruction), reconstruction)
+    f, folder = frames.names.index(frame), out or run / "renderings"
+    pose, views = reconstruction.world_T_rigs[f], optics.views(settings.face_size)
+    (rig,) = optics.own(pose[None], np.array([f]))
+    faces = render_views(gaussians, rig, views, near, renderer)
     panorama = render_panorama(gaussians, pose, 4 * settings.face_size, near, renderer)
-    for name, image in [*zip(FACES, faces, strict=True), ("erp", panorama)]:
+    for name, image in [*zip([v.name for v in views], faces, strict=True), ("erp", panorama)]:
         write_image(folder / f"{frame}_{name}.png", image)
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
@@ -106,10 +108,11 @@ def _compare(
     run: Path, others, settings: "SplatSettings", out: Path, lpips_weights: Sequence[Path]
 ):
     """Results of the run's own poses and of others."""
+    from gsba.camera.optics import Optics
     from gsba.evaluate.splats import compare, poses_for
     from gsba.splat.backend import choose_backend
     from gsba.splat.lpips import Lpips
-    from gsba.store.finished import load_run
+    from gsba.store.finished import load_lenses, load_run
     from gsba.store.folder import claim
 
     lpips = Lpips(lpips_weights) if lpips_weights else None
@@ -117,7 +120,8 @@ def _compare(
     sources = {"refined": reconstruction.world_T_rigs}
     sources |= {name: poses_for(frames, trajectory) for name, trajectory in others.items()}
     renderer = choose_backend(settings.backend)
-    results = compare(reconstruction, frames, sources, settings, renderer, out, lpips)
+    optics = Optics.of(load_lenses(run, reconstruction), reconstruction)
+    results = compare(reconstruction, frames, sources, settings, renderer, out, lpips, optics)
     claim(run.resolve(), out.resolve())
     return results
 

@@ -9,12 +9,13 @@ and walls along them are worth some 0.2 dB that no pose has earned.
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gsba.camera.optics import ONE_EYE, Optics
 from gsba.config import SplatSettings
 from gsba.disk import write_image, write_text
 from gsba.evaluate import charts
@@ -22,9 +23,10 @@ from gsba.log import GsbaError
 from gsba.similarity import NoSimilarityError, pose_similarity
 from gsba.splat.backend import Backend
 from gsba.splat.gaussians import Gaussians
-from gsba.splat.pictures import render_faces
+from gsba.splat.pictures import render_views
 from gsba.splat.ply import write_ply
 from gsba.splat.scene import (
+    Faces,
     Split,
     load_faces,
     make_views,
@@ -34,7 +36,7 @@ from gsba.splat.scene import (
     start_cloud,
 )
 from gsba.splat.scores import Distance, Score, mean_score, measure
-from gsba.splat.train import Views, train
+from gsba.splat.train import Images, Views, train
 from gsba.store.store import digest, fingerprint
 from gsba.trajectory.association import matched_in_time
 from gsba.types import FrameSet, Reconstruction, Trajectory
@@ -84,11 +86,12 @@ def compare(
     backend: Backend,
     out: Path,
     lpips: Distance | None = None,
+    optics: Optics = ONE_EYE,
 ) -> dict[str, SourceResult]:
     """Train and measure a splat for each source of poses; resumes what is done.
 
     Writes `out`/SOURCE/point_cloud.ply and checkpoint.npz, results.json, table.txt, curves.png and
-    .svg, and pictures/FRAME.jpg: the six faces as captured, then as each source has them.
+    .svg, and pictures/FRAME.jpg: the faces as captured, then as each source has them.
 
     Args:
         reconstruction, frames: of a finished run; its tracks make the start clouds.
@@ -97,6 +100,7 @@ def compare(
         backend: the renderer.
         out: folder to write.
         lpips: distance of images for the last measurement; None = leave it out.
+        optics: of the frames, in the run's unit; with two lenses, faces are of one of them each.
 
     Raises:
         GsbaError: too few frames have a pose in every source, or a training fails.
@@ -108,16 +112,16 @@ def compare(
     own = reconstruction.world_T_rigs[usable]
     sources = {name: _beside(poses, usable, own) for name, poses in sources.items()}
     faces = [
-        load_faces(frames, part, settings.face_size) for part in (split.training, split.held_out)
+        load_faces(frames, part, settings.face_size, optics)
+        for part in (split.training, split.held_out)
     ]
     results, splats = {}, {}
     for name, poses in sources.items():
         logger.info("splat on %s poses, %d frames", name, len(split.training))
-        training = make_views(*faces[0], poses[split.training])
-        held_out = make_views(*faces[1], poses[split.held_out])
-        key = digest(
-            fingerprint([p[0] for p in frames.paths]), poses.tolist(), settings, backend.name
-        )
+        training = make_views(faces[0], poses[split.training])
+        held_out = make_views(faces[1], poses[split.held_out])
+        files = fingerprint([p[0] for p in frames.paths])
+        key = digest(files, poses.tolist(), settings, backend.name, *_key_of(optics))
         splats[name], results[name] = train_and_measure(
             reconstruction,
             frames,
@@ -132,10 +136,16 @@ def compare(
             lpips,
         )
     _write(out, results, settings, lpips is not None)
-    _write_pictures(
-        out / "pictures", frames, split, faces[1][0], sources, splats, settings, backend
-    )
+    _write_pictures(out / "pictures", frames, split, faces[1], sources, splats, settings, backend)
     return results
+
+
+def _key_of(optics: Optics) -> list[object]:
+    """What faces depend on beside their frames."""
+    if not optics:
+        return []
+    values = (getattr(optics.lenses, entry.name) for entry in fields(optics.lenses))
+    return [v.tolist() if isinstance(v, np.ndarray) else v for v in values]
 
 
 def _beside(poses: np.ndarray, usable: np.ndarray, own: np.ndarray) -> np.ndarray:
@@ -250,26 +260,29 @@ def _write_pictures(
     folder: Path,
     frames: FrameSet,
     split: Split,
-    captured: np.ndarray,
+    captured: Faces,
     sources: Mapping[str, np.ndarray],
     splats: Mapping[str, Gaussians],
     settings: SplatSettings,
     backend: Backend,
 ) -> None:
     """One row of faces for what was captured, then one for each source."""
-    from gsba.camera.rig import CubeRig
-
-    rig = CubeRig(settings.face_size, np.pi / 2)
+    each = len(captured.views)
     for i, f in enumerate(split.held_out):
-        rows = [np.concatenate(list(captured[6 * i : 6 * i + 6]), axis=1)]
+        rows = [_side_by_side(captured.images[each * i : each * (i + 1)])]
         for name, poses in sources.items():
             near = near_of(poses[split.training], settings)
-            rows.append(
-                np.concatenate(
-                    list(render_faces(splats[name], poses[f], rig, near, backend)), axis=1
-                )
-            )
+            rig = captured.poses(poses[split.held_out])[i]
+            views = render_views(splats[name], rig, captured.views, near, backend)
+            rows.append(_side_by_side(views))
         write_image(folder / f"{frames.names[f]}.jpg", np.concatenate(rows))
+
+
+def _side_by_side(images: Images) -> np.ndarray:
+    """Images (h, w, 3) in a row, black below the lower ones."""
+    tallest = max(map(len, images))
+    padded = [np.pad(image, ((0, tallest - len(image)), (0, 0), (0, 0))) for image in images]
+    return np.concatenate(padded, axis=1)
 
 
 def _write_curves(out: Path, results: Mapping[str, SourceResult]) -> None:

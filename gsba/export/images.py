@@ -23,6 +23,7 @@ from gsba.camera.one_centre import Stitcher
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import View, ViewCutter
 from gsba.disk import write_image
+from gsba.frames import lens_faces
 from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.files import goes_out_as_it_is
 from gsba.frames.masks import load_mask
@@ -130,8 +131,7 @@ def _write_lens_faces(
 ) -> None:
     def write(f: int) -> None:
         cutter = ViewCutter(views, lenses, f, None if scenes is None else scenes(f))
-        raw = frames.fisheyes is not None
-        cut = cutter.cut_raw(load_raw(frames, f)) if raw else cutter.cut(load_erp(frames, f))
+        cut = lens_faces.cut(frames, f, cutter)
         _write_all([image_path(f, view.name) for view in views], cut)
         if has_masks(frames):
             mask = load_mask(frames, f)

@@ -241,16 +241,18 @@ def joint(
     frame_weights: np.ndarray,
     settings: RefineSettings,
     num_threads: int,
+    lenses: Lenses = ONE_CENTRE,
 ) -> list[PhotometricBlock]:
     """The patches of a solved map, to join the solve of a further family; none if not asked for.
 
     Args:
         frame_weights: (F,) of each frame's pixels, see `PhotometricResult`.
+        lenses: what the panoramas are stitched from.
     """
     if "photometric" not in settings.factors:
         return []
     level = settings.photometric.levels[-1]
-    pixels, trust, _ = _patches(frames, solved, level, settings, num_threads, ONE_CENTRE)
+    pixels, trust, _ = _patches(frames, solved, level, settings, num_threads, lenses)
     if pixels is None:
         return []
     start = make_block(pixels, trust, settings, num_threads)

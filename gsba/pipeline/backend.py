@@ -29,6 +29,8 @@ from gsba.bundle.reconstruction import assemble, world_scale
 from gsba.bundle.self_calibration import SelfCalibration
 from gsba.bundle.stitching import Stitching
 from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.camera.optics import Optics
+from gsba.camera.views import scenes_around
 from gsba.imu.alignment import Alignment, align, turning_of
 from gsba.imu.gravity import up_axis
 from gsba.log import GsbaError
@@ -480,7 +482,8 @@ def refine_photometric(run: Run, prior: Prior, world: Map) -> Map:
 
     def compute() -> PhotometricResult:
         frames, keypoints = world.straightened(run.frames), world.keypoints(run.rig)
-        return direct.refine(frames, keypoints, world.solution, run.problem(prior), world.lenses)
+        lenses = world.lenses.cut_anew()
+        return direct.refine(frames, keypoints, world.solution, run.problem(prior), lenses)
 
     found = run.stage("photometric", key, compute, PhotometricResult)
     return replace(world, solution=found.adjustment, frame_weights=found.frame_weights)
@@ -494,9 +497,14 @@ def refine_on_splat(run: Run, prior: Prior, world: Map) -> Map:
 
     def compute() -> SplatResult:
         frames, start = world.straightened(run.frames), digest(key, solved.world_T_rigs.tolist())
-        patches = direct.joint(frames, solved, world.frame_weights, settings, run.num_threads)
-        keypoints, problem = world.keypoints(run.rig), run.problem(prior)
-        return refinement.refine(frames, keypoints, solved, problem, patches, turns, start)
+        lenses = world.lenses.cut_anew() if world.lenses else ONE_CENTRE
+        weights = world.frame_weights
+        patches = direct.joint(frames, solved, weights, settings, run.num_threads, lenses)
+        places, seen = solved.landmarks.points_world, solved.landmarks.tracks
+        around = scenes_around(solved.world_T_rigs, places, seen.points, seen.frames)
+        optics = Optics(lenses, around)
+        given = frames, world.keypoints(run.rig), solved, run.problem(prior)
+        return refinement.refine(*given, patches, turns, start, optics)
 
     found = run.stage("splat", key, compute, SplatResult)
     turns.unlink(missing_ok=True)

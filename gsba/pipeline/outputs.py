@@ -124,8 +124,6 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
             found = world.lenses, world.calibrated, world.covariances
             camera["lenses"], of_raw = of_lenses(*found)
             more += of_raw
-        if "splat" in run.settings.factors and world.lenses:
-            more.append("splat left out: it takes a frame for one view point")
         notes += more
     gyro = None
     if prior.gyro is not None:

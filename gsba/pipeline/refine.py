@@ -219,7 +219,7 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
         world = backend.align_patches(run, prior, world, n)
     if "photometric" in families:
         world = backend.refine_photometric(run, prior, world)
-    if "splat" in families and not world.lenses:  # it is rendered as seen from one point
+    if "splat" in families:
         world = backend.refine_on_splat(run, prior, world)
     prior = backend.align_imu(run, prior, world.solution, "imu_final", with_noise=False)
     return prior, backend.measure_camera(run, prior, world)

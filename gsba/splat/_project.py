@@ -10,7 +10,7 @@ import numpy as np
 from factors.compiled import kernel_and_part
 
 DILATION = 0.3  # pixels^2 added to both variances: a splat is never thinner than a pixel
-GUARD = 1.3  # slopes x / z beyond this multiple of the image's are clamped in the affine map
+GUARD = 1.3  # slopes x / z beyond an image this much wider are clamped in the affine map
 _ALPHA = 255.0  # 1 / the least alpha that is blended, see _tiles.MIN_ALPHA
 
 _C0 = 0.28209479177387814
@@ -91,12 +91,12 @@ def _rotation(q, out):
 
 
 @_part
-def _flatten(camera, mean, log_scale, rotation, half, scales, at, slope, flat):
+def _flatten(camera, mean, log_scale, rotation, scales, at, slope, flat):
     """A Gaussian in the image.
 
     Args:
-        camera: (14,) `[face_R_world row-major (9), centre (3), focal, principal]`.
-        half: half the image's width over the focal length.
+        camera: (17,) `[face_R_world row-major (9), centre (3), focal, principal (2), width,
+            height]`.
         rotation: (3, 3) of the Gaussian.
         scales: (3,) filled: standard deviations.
         at: (5,) filled: mean in the camera, then x / z and y / z as the affine map takes them.
@@ -111,9 +111,10 @@ def _flatten(camera, mean, log_scale, rotation, half, scales, at, slope, flat):
             at[r] += camera[3 * r + k] * (mean[k] - camera[9 + k])
         scales[r] = np.exp(log_scale[r])
     focal, z = camera[12], at[2]
-    limit = GUARD * half
-    at[3] = min(max(at[0] / z, -limit), limit)
-    at[4] = min(max(at[1] / z, -limit), limit)
+    for r in range(2):
+        half = 0.5 * camera[15 + r] / focal
+        middle, limit = half - camera[13 + r] / focal, GUARD * half
+        at[3 + r] = min(max(at[r] / z, middle - limit), middle + limit)
     for k in range(3):
         slope[0, k] = focal / z * (camera[k] - at[3] * camera[6 + k])
         slope[1, k] = focal / z * (camera[3 + k] - at[4] * camera[6 + k])
@@ -145,7 +146,6 @@ def _color(offset, sh, num, basis, slopes, splat):
 @_kernel
 def project(
     camera,
-    size,
     near,
     means,
     log_scales,
@@ -158,11 +158,10 @@ def project(
     begin,
     end,
 ):
-    """Splats of the Gaussians begin..end - 1 in a square image.
+    """Splats of the Gaussians begin..end - 1 in an image.
 
     Args:
-        camera: (14,) float64, see `_flatten`.
-        size: pixels.
+        camera: (17,) float64, see `_flatten`.
         near: Gaussians nearer in z are not seen.
         degree: of the spherical harmonics in use; sh is (N, K, 3).
         splats: (N, 10) float32, filled, see `_tiles`.
@@ -172,7 +171,7 @@ def project(
     num = (degree + 1) ** 2
     basis, slopes, rotation = np.empty(16), np.zeros((16, 3)), np.empty((3, 3))
     scales, at, slope, flat = np.empty(3), np.empty(5), np.empty((2, 3)), np.empty((2, 3))
-    offset, half = np.empty(3), 0.5 * size / camera[12]
+    offset, width, height = np.empty(3), camera[15], camera[16]
     for g in range(begin, end):
         reach2[g] = 0
         opacity = 1 / (1 + np.exp(-float(logits[g])))
@@ -182,15 +181,13 @@ def project(
         if z <= near or opacity * _ALPHA <= 1:
             continue
         _rotation(quaternions[g], rotation)
-        uu, uv, vv = _flatten(
-            camera, means[g], log_scales[g], rotation, half, scales, at, slope, flat
-        )
+        uu, uv, vv = _flatten(camera, means[g], log_scales[g], rotation, scales, at, slope, flat)
         det = uu * vv - uv * uv
         reach = 2 * np.log(opacity * _ALPHA)
         u = camera[12] * at[0] / z + camera[13]
-        v = camera[12] * at[1] / z + camera[13]
+        v = camera[12] * at[1] / z + camera[14]
         wide, tall = np.sqrt(reach * uu), np.sqrt(reach * vv)
-        outside = u + wide < 0 or u - wide > size or v + tall < 0 or v - tall > size
+        outside = u + wide < 0 or u - wide > width or v + tall < 0 or v - tall > height
         if outside or not det > 0:
             continue
         splats[g, 0], splats[g, 1] = u, v
@@ -284,7 +281,7 @@ def _through_color(d_splat, splat, sh, offset, num, basis, slopes, d_sh, d_offse
 
 @_kernel
 def backproject(
-    camera, size, means, log_scales, quaternions, sh, degree, splats, reach2, d_splats,
+    camera, means, log_scales, quaternions, sh, degree, splats, reach2, d_splats,
     d_means, d_log_scales, d_quaternions, d_logits, d_sh, begin, end,
 ):  # fmt: skip
     """Gradients of the parameters begin..end - 1 from those of their splats, d_splats (N, 10).
@@ -296,12 +293,11 @@ def backproject(
     rotation, d_rotation = np.empty((3, 3)), np.empty((3, 3))
     scales, at, slope, flat = np.empty(3), np.empty(5), np.empty((2, 3)), np.empty((2, 3))
     d_at, offset, d_offset = np.empty(3), np.empty(3), np.empty(3)
-    half = 0.5 * size / camera[12]
     for g in range(begin, end):
         if reach2[g] == 0:
             continue
         _rotation(quaternions[g], rotation)
-        _flatten(camera, means[g], log_scales[g], rotation, half, scales, at, slope, flat)
+        _flatten(camera, means[g], log_scales[g], rotation, scales, at, slope, flat)
         d, z = d_splats[g], at[2]
         d_at[0], d_at[1] = d[0] * camera[12] / z, d[1] * camera[12] / z
         d_at[2] = d[9] - (d_at[0] * at[0] + d_at[1] * at[1]) / z

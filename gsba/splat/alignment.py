@@ -1,7 +1,7 @@
 """Frames against a splat: the block that aligns rig poses to what the splat renders."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -10,7 +10,9 @@ from factors import BearingTerm, FaceCameras, LandmarkBlock, RobustLoss
 from factors.splat import RenderedView, SplatBlock
 from gsba.bundle import prior_factors
 from gsba.bundle.optimizer import optimize
-from gsba.camera.rig import RIG_R_FACE, CubeRig
+from gsba.camera.optics import ONE_EYE, Optics
+from gsba.camera.rig import CubeRig
+from gsba.camera.views import View, rig_views, turned_rigs
 from gsba.config import SolverSettings
 from gsba.frames import cubemap
 from gsba.frames.masks import load_weights
@@ -18,8 +20,8 @@ from gsba.log import track
 from gsba.splat.backend import Backend
 from gsba.splat.camera import rig_cameras
 from gsba.splat.gaussians import Gaussians
-from gsba.splat.scene import cut_faces, place_points
-from gsba.types import FACES, FrameSet, Reconstruction
+from gsba.splat.scene import cut_faces, cut_lens_faces, place_points
+from gsba.types import FrameSet, Reconstruction
 
 MIN_ALPHA = 0.95  # of a rendered pixel that is believed
 MAX_STEP = 0.1  # of the depth, between neighbouring pixels: more is an edge
@@ -35,10 +37,11 @@ class Captured:
     """Grey faces of frames, to be aligned to renderings of one size."""
 
     which: np.ndarray  # (W,) int, frame indices
-    size: int  # pixels of a rendered face
-    rig: CubeRig  # the captured faces
-    images: tuple[np.ndarray, ...]  # (W,) of (6, S, S) float32, 0..1
-    weights: tuple[np.ndarray | None, ...]  # (W,) of (6, S, S) float32, 0..1; None = all one
+    rendered: tuple[View, ...]  # what they are compared with
+    views: tuple[View, ...]  # (K,) the captured faces
+    images: tuple[np.ndarray, ...]  # (W,) of (K, S, S) float32, 0..1
+    weights: tuple[np.ndarray | None, ...]  # (W,) of (K, S, S) float32, 0..1; None = all one
+    turns: np.ndarray | None = None  # (W, 3, 3) of the views' rig in each frame's; None = none
 
 
 def align(
@@ -49,6 +52,7 @@ def align(
     backend: Backend,
     sizes: Sequence[int] = (24, 48, 96, 192),
     reconstruction: Reconstruction | None = None,
+    optics: Optics = ONE_EYE,
 ) -> np.ndarray:
     """Align the poses of all frames to a splat that stays as it is, from coarse to fine.
 
@@ -63,6 +67,7 @@ def align(
         backend: the renderer.
         sizes: pixels of a face at each level.
         reconstruction: whose observations join as bearing factors; None = the splat alone.
+        optics: of the frames.
 
     Returns:
         (F, 4, 4) float64.
@@ -71,7 +76,8 @@ def align(
     settings = SolverSettings(max_iterations=MAX_STEPS, relative_tolerance=1e-5)
     poses = world_T_rigs
     for level, size in enumerate(sizes):
-        blocks: list = [splat_block(gaussians, capture(frames, which, size), near, backend)]
+        captured = capture(frames, which, size, optics)
+        blocks: list = [splat_block(gaussians, captured, near, backend)]
         if reconstruction is not None:
             gate = float(np.deg2rad(GATES_DEG[min(level, len(GATES_DEG) - 1)]))
             blocks.append(bearing_block(reconstruction, poses, gate))
@@ -104,8 +110,10 @@ def bearing_block(
     return LandmarkBlock(keys, landmarks.points_world, [term], RobustLoss("cauchy", 1.0))
 
 
-def capture(frames: FrameSet, which: np.ndarray, size: int) -> Captured:
+def capture(frames: FrameSet, which: np.ndarray, size: int, optics: Optics = ONE_EYE) -> Captured:
     """Grey faces of some frames, as dense as rendered ones of `size` pixels."""
+    if optics:
+        return _capture_of_lenses(frames, which, size, optics)
     rig = _captured_rig(frames, size)
     images, weights = [], []
     for f in track(which, "cutting faces", total=len(which)):
@@ -114,7 +122,32 @@ def capture(frames: FrameSet, which: np.ndarray, size: int) -> Captured:
         found = load_weights(frames, int(f))
         trust = 1.0 if found is None else cubemap.cut_mask(found, rig)
         weights.append(None if mask is None else (mask * trust).astype(np.float32))
-    return Captured(which, size, rig, tuple(images), tuple(weights))
+    rendered = optics.views(size)
+    return Captured(which, rendered, rig_views(rig), tuple(images), tuple(weights))
+
+
+def _capture_of_lenses(frames: FrameSet, which: np.ndarray, size: int, optics: Optics) -> Captured:
+    """As `capture`, faces of one lens each, squares around those that are rendered.
+
+    What is blended or of the other lens has no weight.
+    """
+    wide, rendered, lenses = _wide_rig(size), optics.views(size), optics.lenses
+    square = {"width": wide.size, "height": wide.size, "principal": (wide.principal,) * 2}
+    views = tuple(replace(view, **square) for view in rendered)
+    pixels = np.stack(np.meshgrid(*2 * (np.arange(wide.size) + 0.5,)), axis=-1)
+    heights = [np.sign(v.centre @ lenses.centre) * v.rays(pixels)[..., 2] for v in views]
+    clear = np.stack(heights) > np.sin(lenses.band_rad)
+    images, weights = [], []
+    for f in track(which, "cutting faces", total=len(which)):
+        faces, masks = cut_lens_faces(frames, int(f), views, optics)
+        images.append((np.stack(faces) @ _LUMA / 255).astype(np.float32))
+        found = load_weights(frames, int(f))
+        trust = clear if masks is None else clear & np.stack(masks)
+        if found is not None:
+            trust = trust * np.stack(optics.cutter(views, int(f)).cut_mask(found))
+        weights.append(trust.astype(np.float32))
+    turns = None if lenses.axes is None else lenses.axes[which]
+    return Captured(which, rendered, views, tuple(images), tuple(weights), turns)
 
 
 def splat_block(
@@ -133,34 +166,46 @@ def splat_block(
         backend: the renderer.
         loss: see `factors.splat.SplatBlock`.
     """
-    rendered, rig, num = CubeRig(captured.size, np.pi / 2), captured.rig, len(FACES)
-    cameras = FaceCameras(RIG_R_FACE, np.full(num, rig.focal), np.full((num, 2), rig.principal))
+    views, turns = captured.views, captured.turns
+    rotations, centres = (
+        np.stack([v.rig_R_view for v in views]),
+        np.stack([v.centre for v in views]),
+    )
+    focals, principals = np.array([v.focal for v in views]), np.array([v.principal for v in views])
 
-    def render(_row: int, world_T_rig: np.ndarray) -> RenderedView:
-        return render_view(gaussians, world_T_rig, rendered, near, backend)
+    def render(row: int, world_T_rig: np.ndarray) -> RenderedView:
+        if turns is not None:
+            (world_T_rig,) = turned_rigs(world_T_rig[None], turns[[row]])
+        return render_view(gaussians, world_T_rig, captured.rendered, near, backend)
 
     keys = [prior_factors.X(int(f)) for f in captured.which]
-    return SplatBlock(keys, captured.images, captured.weights, cameras, render, loss)
+    cameras = FaceCameras(rotations, focals, principals)
+    return SplatBlock(
+        keys, captured.images, captured.weights, cameras, render, loss, centres=centres, turns=turns
+    )
 
 
 def render_view(
-    gaussians: Gaussians, world_T_rig: np.ndarray, rig: CubeRig, near: float, backend: Backend
+    gaussians: Gaussians,
+    world_T_rig: np.ndarray,
+    views: Sequence[View],
+    near: float,
+    backend: Backend,
 ) -> RenderedView:
-    """Pixels of all faces that the splat is sure of, as points with grey values.
+    """Pixels of all views that the splat is sure of, as points with grey values.
 
     Args:
         world_T_rig: (4, 4), where to render from.
-        rig: faces to render.
+        views: of that rig.
     """
-    centres = np.arange(rig.size) + 0.5
-    grid = np.stack(np.meshgrid(centres, centres), axis=-1)
     points, greys = [], []
-    cameras = rig_cameras(world_T_rig, rig)
+    cameras = rig_cameras(world_T_rig, views)
     images = backend.render(gaussians, cameras, None, near)
     for camera, image in zip(cameras, images, strict=True):
+        grid = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         sure = (image.alpha > MIN_ALPHA) & ~_edges(image.depth)
         depth = image.depth[sure].astype(np.float64)
-        offsets = (grid[sure] - rig.principal) / rig.focal
+        offsets = (np.stack(grid, axis=-1)[sure] - camera.principal) / camera.focal
         local = np.column_stack([offsets, np.ones(len(offsets))]) * depth[:, None]
         points.append(local @ camera.world_R_face.T + camera.face_in_world)
         # What lies behind a pixel that is not quite opaque is unknown: leave its share out.
@@ -182,5 +227,9 @@ def _captured_rig(frames: FrameSet, size: int) -> CubeRig:
     """Faces as dense as rendered ones and a little wider; those of cube frames are as they are."""
     if not frames.panoramic:
         return cubemap.native_rig(frames)
+    return _wide_rig(size)
+
+
+def _wide_rig(size: int) -> CubeRig:
     hfov = np.deg2rad(_MARGIN_HFOV_DEG)
     return CubeRig(round(size * np.tan(hfov / 2)), hfov)

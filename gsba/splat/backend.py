@@ -33,7 +33,7 @@ class Backend(Protocol):
         sh_degree: int | None,
         near: float,
     ) -> list[Rendering]:
-        """An image for each camera, all of one size; see `gsba.splat.rasterise.render`."""
+        """An image for each camera; see `gsba.splat.rasterise.render`."""
         ...
 
     def descend(
@@ -45,7 +45,8 @@ class Backend(Protocol):
         near: float,
         ssim_weight: float,
     ) -> None:
-        """A step of Adam for each lesson, down `gsba.splat.metrics.training_loss`.
+        """A step of Adam for each lesson, down `gsba.splat.metrics.training_loss` times the view's
+        share of a face: pixels of all views count alike.
 
         Args:
             gaussians, moments: changed in place.
@@ -90,16 +91,16 @@ class CpuBackend:
             found = self.gradients(gaussians, lesson, near, ssim_weight)
             adam.step(gaussians, found.gaussians, moments, lesson.rates, lesson.number)
             if pull is not None:
-                pull.add(found.centres, found.seen, lesson.camera.size)
+                pull.add(found.centres, found.seen, lesson.camera.focal)
 
     def gradients(
         self, gaussians: Gaussians, lesson: Lesson, near: float, ssim_weight: float
     ) -> Gradients:
-        """Of the training loss of one lesson."""
+        """Of the training loss of one lesson, times the share of its view."""
         image, tape = render(gaussians, lesson.camera, lesson.sh_degree, near, self.num_threads)
         truth = lesson.truth.astype(np.float32) / 255
         slope = training_loss(image.color, truth, lesson.use, ssim_weight)[1]
-        return differentiate(tape, slope, num_threads=self.num_threads)
+        return differentiate(tape, lesson.camera.share * slope, num_threads=self.num_threads)
 
 
 def choose_backend(name: str, num_threads: int | None = None) -> Backend:

@@ -1,30 +1,48 @@
-"""The pinhole cameras that splats are rendered with: the faces of a rig."""
+"""The pinhole cameras that splats are rendered with: views of rigs."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.camera.rig import RIG_R_FACE, CubeRig
+from gsba.camera.rig import CubeRig
+from gsba.camera.views import View, rig_views
 
 
 @dataclass(frozen=True, slots=True)
 class FaceCamera:
-    """One square pinhole image, principal point in its middle."""
+    """One pinhole image."""
 
     world_R_face: np.ndarray  # (3, 3) float64, face axes right, down, forward
     face_in_world: np.ndarray  # (3,) float64, map units
-    size: int  # pixels
+    width: int  # pixels
+    height: int  # pixels
     focal: float  # pixels
+    principal: tuple[float, float]  # pixels, corner origin
+
+    @property
+    def share(self) -> float:
+        """Its pixels, part of those of a face of 90 degrees that is as dense."""
+        return self.width * self.height / (2 * self.focal) ** 2
 
     def packed(self) -> np.ndarray:
-        """`[face_R_world row-major (9), centre (3), focal, principal]`, (14,) float64."""
-        tail = [self.focal, 0.5 * self.size]
+        """`[face_R_world row-major (9), centre (3), focal, principal (2), width, height]`, (17,)
+        float64."""
+        tail = [self.focal, *self.principal, self.width, self.height]
         return np.concatenate([self.world_R_face.T.ravel(), self.face_in_world, tail])
 
 
-def rig_cameras(world_T_rig: np.ndarray, rig: CubeRig) -> list[FaceCamera]:
-    """Cameras of all faces of a rig, in FACES order; see `face_camera`."""
-    return [face_camera(world_T_rig, face, rig) for face in range(len(RIG_R_FACE))]
+def rig_cameras(world_T_rig: np.ndarray, views: Iterable[View]) -> list[FaceCamera]:
+    """Cameras of some views of a rig (4, 4)."""
+    return [view_camera(world_T_rig, view) for view in views]
+
+
+def view_camera(world_T_rig: np.ndarray, view: View) -> FaceCamera:
+    """Camera of one view of a rig (4, 4)."""
+    rotation = world_T_rig[:3, :3]
+    centre = world_T_rig[:3, 3] + rotation @ view.centre
+    size = view.width, view.height
+    return FaceCamera(rotation @ view.rig_R_view, centre, *size, view.focal, view.principal)
 
 
 def face_camera(world_T_rig: np.ndarray, face: int, rig: CubeRig) -> FaceCamera:
@@ -35,5 +53,4 @@ def face_camera(world_T_rig: np.ndarray, face: int, rig: CubeRig) -> FaceCamera:
         face: index into FACES.
         rig: size and field of view.
     """
-    world_R_face = world_T_rig[:3, :3] @ RIG_R_FACE[face]
-    return FaceCamera(world_R_face, world_T_rig[:3, 3].copy(), rig.size, float(rig.focal))
+    return view_camera(world_T_rig, rig_views(rig)[face])

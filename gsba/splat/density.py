@@ -16,7 +16,7 @@ RESET_OPACITY = 0.01
 class Pull:
     """How strongly images have pulled at projected centres since the last densification."""
 
-    sums: np.ndarray  # (N,) float32, gradient lengths, image half-widths
+    sums: np.ndarray  # (N,) float32, gradient lengths, focal lengths
     counts: np.ndarray  # (N,) float32, views that saw the Gaussian
 
     @classmethod
@@ -24,15 +24,15 @@ class Pull:
         """Of Gaussians that no view has seen yet."""
         return cls(np.zeros(num, np.float32), np.zeros(num, np.float32))
 
-    def add(self, centres: np.ndarray, seen: np.ndarray, size: int) -> None:
+    def add(self, centres: np.ndarray, seen: np.ndarray, focal: float) -> None:
         """Count one view, in place.
 
         Args:
             centres: (N, 2) gradients per pixel.
             seen: (N,) bool.
-            size: pixels of the image.
+            focal: of the view, pixels: half the width of a face.
         """
-        self.sums[:] += 0.5 * size * np.hypot(centres[:, 0], centres[:, 1])
+        self.sums[:] += focal * np.hypot(centres[:, 0], centres[:, 1])
         self.counts[:] += seen
 
 
@@ -40,7 +40,7 @@ class Pull:
 class DensityLimits:
     """Thresholds of the density control."""
 
-    pull: float  # mean gradient from which on a Gaussian is densified, image half-widths
+    pull: float  # mean gradient from which on a Gaussian is densified, focal lengths
     clone_scale: float  # smaller ones are cloned, larger ones split, map units
     max_scale: float | None  # larger ones are pruned, map units; None = none
     min_opacity: float  # fainter ones are pruned

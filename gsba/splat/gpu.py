@@ -65,15 +65,19 @@ class GsplatBackend:
         sh_degree: int | None,
         near: float,
     ) -> list[Rendering]:
-        """See `gsba.splat.backend.Backend`; all cameras are one batch."""
-        degree = gaussians.usable_degree(sh_degree)
+        """See `gsba.splat.backend.Backend`; all cameras of one size are one batch."""
+        degree, renderings = gaussians.usable_degree(sh_degree), {}
         with self._within_memory(gaussians), self._torch.no_grad():
-            found = self._run(self._upload(gaussians), cameras, degree, near, "RGB+ED")
-        images, alphas = (part.cpu().numpy() for part in found[:2])
-        return [
-            Rendering(image[..., :3].copy(), image[..., 3].copy(), alpha[..., 0].copy())
-            for image, alpha in zip(images, alphas, strict=True)
-        ]
+            parameters = self._upload(gaussians)
+            for size in dict.fromkeys((camera.width, camera.height) for camera in cameras):
+                rows = [c for c, one in enumerate(cameras) if (one.width, one.height) == size]
+                batch = [cameras[c] for c in rows]
+                found = self._run(parameters, batch, degree, near, "RGB+ED")
+                images, alphas = (part.cpu().numpy() for part in found[:2])
+                for c, image, alpha in zip(rows, images, alphas, strict=True):
+                    parts = image[..., :3], image[..., 3], alpha[..., 0]
+                    renderings[c] = Rendering(*(part.copy() for part in parts))
+        return [renderings[c] for c in range(len(cameras))]
 
     def descend(
         self,
@@ -97,11 +101,12 @@ class GsplatBackend:
                 degree = gaussians.usable_degree(lesson.sh_degree)
                 image, _, notes = self._run(values, [lesson.camera], degree, near, "RGB")
                 notes["means2d"].retain_grad()
-                image[0].backward(self._slope(image[0].detach(), lesson, ssim_weight))
+                slope = self._slope(image[0].detach(), lesson, ssim_weight)
+                image[0].backward(lesson.camera.share * slope)
                 with torch.no_grad():
                     self._move(values, first, second, lesson.rates, lesson.number)
                     slopes = notes["means2d"].grad[0]
-                    sums += 0.5 * lesson.camera.size * torch.hypot(slopes[:, 0], slopes[:, 1])
+                    sums += lesson.camera.focal * torch.hypot(slopes[:, 0], slopes[:, 1])
                     counts += (notes["radii"][0] > 0).reshape(len(gaussians), -1).all(dim=1)
         parts = (gaussians, moments.first, moments.second)
         for part, tensors in zip(parts, (values, first, second), strict=True):
@@ -132,17 +137,15 @@ class GsplatBackend:
         near: float,
         mode: Literal["RGB", "RGB+ED"],
     ) -> tuple[Any, Any, dict[str, Any]]:
-        """Images (C, H, W, 3 or 4), alphas (C, H, W, 1), and gsplat's notes."""
+        """Images (C, H, W, 3 or 4) of one size, alphas (C, H, W, 1), and gsplat's notes."""
         means, log_scales, quaternions, logits, sh = parameters
-        size, middle = cameras[0].size, 0.5 * cameras[0].size
-        faces_T_world = np.tile(np.eye(4), (len(cameras), 1, 1))
-        intrinsics = np.tile(
-            np.array([[0, 0, middle], [0, 0, middle], [0, 0, 1]]), (len(cameras), 1, 1)
-        )
+        num = len(cameras)
+        faces_T_world, intrinsics = np.tile(np.eye(4), (num, 1, 1)), np.zeros((num, 3, 3))
         for c, camera in enumerate(cameras):
             faces_T_world[c, :3, :3] = camera.world_R_face.T
             faces_T_world[c, :3, 3] = -camera.world_R_face.T @ camera.face_in_world
-            intrinsics[c, 0, 0] = intrinsics[c, 1, 1] = camera.focal
+            intrinsics[c] = np.diag([camera.focal, camera.focal, 1])
+            intrinsics[c, :2, 2] = camera.principal
         torch = self._torch
         viewmats, Ks = (
             torch.tensor(array, dtype=torch.float32, device=self._device)
@@ -156,8 +159,8 @@ class GsplatBackend:
             colors=sh,
             viewmats=viewmats,
             Ks=Ks,
-            width=size,
-            height=size,
+            width=cameras[0].width,
+            height=cameras[0].height,
             near_plane=near,
             eps2d=DILATION,
             sh_degree=sh_degree,

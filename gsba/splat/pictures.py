@@ -1,9 +1,12 @@
-"""Pictures of a splat: the faces of a rig, and panoramas."""
+"""Pictures of a splat: views of a rig, and panoramas."""
+
+from collections.abc import Iterable
 
 import numpy as np
 
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.views import View, rig_views
 from gsba.splat.backend import Backend
 from gsba.splat.camera import rig_cameras
 from gsba.splat.gaussians import Gaussians
@@ -12,23 +15,30 @@ from gsba.types import FACES
 _PANORAMA_HFOV_DEG = 94.0  # of the faces a panorama is sampled from
 
 
-def render_faces(
-    gaussians: Gaussians, world_T_rig: np.ndarray, rig: CubeRig, near: float, backend: Backend
-) -> np.ndarray:
-    """The six faces (6, size, size, 3) uint8 RGB of a rig, in FACES order."""
-    renderings = backend.render(gaussians, rig_cameras(world_T_rig, rig), None, near)
-    return np.stack([to_uint8(rendering.color) for rendering in renderings])
+def render_views(
+    gaussians: Gaussians,
+    world_T_rig: np.ndarray,
+    views: Iterable[View],
+    near: float,
+    backend: Backend,
+) -> list[np.ndarray]:
+    """Each view of a rig, (height, width, 3) uint8 RGB."""
+    renderings = backend.render(gaussians, rig_cameras(world_T_rig, views), None, near)
+    return [to_uint8(rendering.color) for rendering in renderings]
 
 
 def render_panorama(
     gaussians: Gaussians, world_T_rig: np.ndarray, width: int, near: float, backend: Backend
 ) -> np.ndarray:
-    """An equirectangular image (width / 2, width, 3) uint8 RGB, sampled from wider faces."""
+    """An equirectangular image (width / 2, width, 3) uint8 RGB as seen from the rig's centre.
+
+    It is sampled from wider faces.
+    """
     import cv2
 
     hfov = np.deg2rad(_PANORAMA_HFOV_DEG)
     rig = CubeRig(round(width / np.pi * np.tan(hfov / 2)), hfov)  # as dense as the equator
-    faces = render_faces(gaussians, world_T_rig, rig, near, backend)
+    faces = render_views(gaussians, world_T_rig, rig_views(rig), near, backend)
     height = width // 2
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     bearings = bearings_from_erp(np.stack([u, v], axis=-1), width, height)

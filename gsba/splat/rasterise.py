@@ -75,31 +75,32 @@ def render(
         The image, and what `differentiate` needs.
     """
     degree = gaussians.usable_degree(sh_degree)
-    num, across = len(gaussians), -(-camera.size // _tiles.TILE)
+    num = len(gaussians)
+    across, down = (-(-pixels // _tiles.TILE) for pixels in (camera.width, camera.height))
     splats, reach2 = np.empty((num, 10), np.float32), np.empty(num, np.float32)
-    given = (camera.packed(), camera.size, near, *gaussians.arrays(), degree)
+    given = (camera.packed(), near, *gaussians.arrays(), degree)
     run = functools.partial(_in_parallel, num_threads or os.cpu_count() or 1)
     run(num, 2048, _project.project, *given, splats, reach2)
     offsets = np.zeros(num + 1, np.int64)
     counts = offsets[1:]
-    run(num, 8192, _tiles.count_tiles, splats, reach2, across, across, counts)
+    run(num, 8192, _tiles.count_tiles, splats, reach2, down, across, counts)
     np.cumsum(counts, out=counts)
     seen = np.flatnonzero(reach2)
     order = seen[np.argsort(splats[seen, 9], kind="stable")]
-    starts = np.empty(across * across + 1, np.int64)
+    starts = np.empty(down * across + 1, np.int64)
     owners, entries = np.empty(offsets[-1], np.int32), np.empty(offsets[-1], np.int64)
-    _tiles.fill_tiles(splats, reach2, order, offsets, across, across, starts, owners, entries)
-    image = np.empty((_tiles.CHANNELS, across * _tiles.TILE, across * _tiles.TILE), np.float32)
-    used = np.empty(across * across, np.int64)
+    _tiles.fill_tiles(splats, reach2, order, offsets, down, across, starts, owners, entries)
+    image = np.empty((_tiles.CHANNELS, down * _tiles.TILE, across * _tiles.TILE), np.float32)
+    used = np.empty(down * across, np.int64)
     given = (splats, reach2, starts, owners, across, image, used)
-    run(across * across, 8, _tiles.blend_tiles, *given)
+    run(down * across, 8, _tiles.blend_tiles, *given)
     tape = Tape(
         gaussians, camera, degree, splats, reach2, offsets, starts, owners, entries, used, image
     )
-    size = camera.size
-    alpha = image[4, :size, :size]
-    depth = np.divide(image[3, :size, :size], alpha, out=np.zeros_like(alpha), where=alpha > 0)
-    color = np.ascontiguousarray(np.moveaxis(image[:3, :size, :size], 0, -1))
+    shown = image[:, : camera.height, : camera.width]
+    alpha = shown[4]
+    depth = np.divide(shown[3], alpha, out=np.zeros_like(alpha), where=alpha > 0)
+    color = np.ascontiguousarray(np.moveaxis(shown[:3], 0, -1))
     return Rendering(color, depth, alpha.copy()), tape
 
 
@@ -119,28 +120,29 @@ def differentiate(
         d_alpha: (H, W); None = zero.
         num_threads: None = all cores.
     """
-    size, image = tape.camera.size, tape.image
-    slopes = np.zeros_like(image)
-    slopes[:3, :size, :size] = np.moveaxis(d_color, -1, 0)
+    image, slopes = tape.image, np.zeros_like(tape.image)
+    inside = np.s_[:, : tape.camera.height, : tape.camera.width]
+    shown, sloped = image[inside], slopes[inside]
+    sloped[:3] = np.moveaxis(d_color, -1, 0)
     if d_depth is not None:
-        alpha = image[4, :size, :size]
+        alpha = shown[4]
         share = np.divide(d_depth, alpha, out=np.zeros_like(alpha), where=alpha > 0)
-        slopes[3, :size, :size] = share
-        depth = np.divide(image[3, :size, :size], alpha, out=np.zeros_like(alpha), where=alpha > 0)
-        slopes[4, :size, :size] -= share * depth
+        sloped[3] = share
+        depth = np.divide(shown[3], alpha, out=np.zeros_like(alpha), where=alpha > 0)
+        sloped[4] -= share * depth
     if d_alpha is not None:
-        slopes[4, :size, :size] += d_alpha
+        sloped[4] += d_alpha
     run = functools.partial(_in_parallel, num_threads or os.cpu_count() or 1)
-    across, num = image.shape[1] // _tiles.TILE, len(tape.reach2)
+    across, num = image.shape[2] // _tiles.TILE, len(tape.reach2)
     shares = np.zeros((len(tape.entries), 10), np.float32)
     rows = (tape.splats, tape.reach2, tape.starts, tape.owners, tape.entries)
     given = (*rows, across, image, slopes, tape.used, shares)
-    run(across * across, 8, _tiles.differentiate_tiles, *given)
+    run(len(tape.used), 8, _tiles.differentiate_tiles, *given)
     d_splats = np.empty((num, 10), np.float32)
     run(num, 4096, _tiles.sum_entries, tape.offsets, shares, d_splats)
     out = zeros_like(tape.gaussians)
     means, log_scales, quaternions, _, sh = tape.gaussians.arrays()
-    given = (tape.camera.packed(), size, means, log_scales, quaternions, sh, tape.sh_degree)
+    given = (tape.camera.packed(), means, log_scales, quaternions, sh, tape.sh_degree)
     given = (*given, tape.splats, tape.reach2, d_splats, *out.arrays())
     run(num, 2048, _project.backproject, *given)
     return Gradients(out, d_splats[:, :2].copy(), tape.reach2 > 0)

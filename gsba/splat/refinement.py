@@ -27,14 +27,15 @@ from factors import Block, LandmarkBlock
 from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import Problem
 from gsba.bundle.optimizer import OptimizeResult, optimize
+from gsba.camera.optics import ONE_EYE, Optics
 from gsba.config import SplatSettings
 from gsba.splat.alignment import Captured, capture, splat_block
 from gsba.splat.backend import choose_backend
 from gsba.splat.evidence import score, standard_error, together
 from gsba.splat.gaussians import Gaussians, from_cloud
-from gsba.splat.scene import Split, load_faces, make_views, near_of, split_frames
+from gsba.splat.scene import Faces, Split, load_faces, make_views, near_of, split_frames
 from gsba.splat.scores import face_psnrs
-from gsba.splat.train import State, Views, advance, begin
+from gsba.splat.train import State, advance, begin
 from gsba.store.records import RecordError, load_record, read_info, save_record
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Round, Solution
 
@@ -91,6 +92,7 @@ def refine(
     further: Sequence[Block] = (),
     checkpoint: Path | None = None,
     key: str = "",
+    optics: Optics = ONE_EYE,
 ) -> SplatResult:
     """Refine a solved map against splats of its own frames, from coarse faces to fine.
 
@@ -102,6 +104,7 @@ def refine(
         further: blocks that join each move, on the same keys.
         checkpoint: file that keeps the turns made, and that they go on from; None = none.
         key: what the turns depend on; a checkpoint of another key is not taken up.
+        optics: of the frames.
 
     Raises:
         GsbaError: all frames are masked, or a splat that is no longer finite.
@@ -122,7 +125,7 @@ def refine(
         first = begin(cloud, turns.training(0))
         progress = _Progress(0, -1, start.world_T_rigs, first, (), ())
     while progress.level < len(chosen.sizes):
-        turns.look(frames, progress.level)
+        turns.look(frames, progress.level, optics)
         while progress.turns < chosen.moves:
             progress = turns.turn(progress)
             if checkpoint is not None:
@@ -170,8 +173,8 @@ class _Turns:
         self.keypoints, self.solved, self.problem = keypoints, solved, problem
         self.settings, self.further, self.split = problem.settings, further, split
         self.backend = choose_backend(self.settings.splat.backend, problem.num_threads)
-        self.faces: tuple[np.ndarray, np.ndarray]
-        self.held_out: tuple[np.ndarray, np.ndarray]
+        self.faces: Faces
+        self.held_out: Faces
         self.captured: Captured
 
     def training(self, level: int) -> SplatSettings:
@@ -187,12 +190,12 @@ class _Turns:
             seed=self.settings.seed,
         )
 
-    def look(self, frames: FrameSet, level: int) -> None:
+    def look(self, frames: FrameSet, level: int, optics: Optics) -> None:
         """Cut the faces of a level."""
         size = self.settings.splat.sizes[level]
-        self.faces = load_faces(frames, self.split.training, size)
-        self.held_out = load_faces(frames, self.split.held_out, size)
-        self.captured = capture(frames, self.split.training, size)
+        self.faces = load_faces(frames, self.split.training, size, optics)
+        self.held_out = load_faces(frames, self.split.held_out, size, optics)
+        self.captured = capture(frames, self.split.training, size, optics)
 
     def turn(self, before: _Progress) -> _Progress:
         """The first training of a level, or a move of the poses and the training after it."""
@@ -284,20 +287,14 @@ class _Turns:
     def _trained(
         self, state: State, world_T_rigs: np.ndarray, settings: SplatSettings, steps: int
     ) -> State:
-        views = self._views(self.faces, world_T_rigs, self.split.training)
+        views = make_views(self.faces, world_T_rigs[self.split.training])
         return advance(state, views, settings, self.backend, steps)
 
     def _looks(self, state: State, world_T_rigs: np.ndarray, settings: SplatSettings) -> np.ndarray:
         """PSNR (V,) of each held-out face in dB, exposure aside."""
-        views = self._views(self.held_out, world_T_rigs, self.split.held_out)
+        views = make_views(self.held_out, world_T_rigs[self.split.held_out])
         near = near_of(world_T_rigs[self.split.training], settings)
         return face_psnrs(state.gaussians, views, settings, near, self.backend)
-
-    @staticmethod
-    def _views(
-        faces: tuple[np.ndarray, np.ndarray], world_T_rigs: np.ndarray, which: np.ndarray
-    ) -> Views:
-        return make_views(*faces, world_T_rigs[which])
 
     def _placed(self, world_T_rigs: np.ndarray) -> Landmarks:
         """The map's points under other poses."""

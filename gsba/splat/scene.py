@@ -1,21 +1,39 @@
 """From a run to splats: posed faces, start clouds, training, and metrics of held-out frames."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsba.bundle import triangulation
+from gsba.camera.optics import ONE_EYE, Optics
 from gsba.camera.rig import CubeRig
+from gsba.camera.views import View, turned_rigs
 from gsba.config import SplatSettings, TriangulateSettings
-from gsba.frames import cubemap
+from gsba.frames import cubemap, lens_faces
+from gsba.frames.masks import load_mask
 from gsba.log import GsbaError, track
-from gsba.splat.camera import face_camera
+from gsba.splat.camera import view_camera
 from gsba.splat.gaussians import Gaussians, from_cloud
-from gsba.splat.train import Views, extent_of
+from gsba.splat.train import Images, Views, extent_of
 from gsba.types import FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
 
 _GATE = np.deg2rad(3.0)  # of an observation under poses that may have drifted
 _MAX_TIMES = 8  # samples of a panorama along a pixel of a face, at most
+
+
+@dataclass(frozen=True, slots=True)
+class Faces:
+    """Pictures of some frames, the same views of each."""
+
+    views: tuple[View, ...]  # (K,)
+    images: Images  # (W K,) of (h, w, 3) uint8 RGB, frame after frame
+    use: Images  # (W K,) of (h, w) bool, pixels that count
+    turns: np.ndarray | None = None  # (W, 3, 3) rig_R_lenses of each frame; None = the rig's axes
+
+    def poses(self, world_T_rigs: np.ndarray) -> np.ndarray:
+        """Of the rigs that the views are in, (W, 4, 4), from those of the frames."""
+        return world_T_rigs if self.turns is None else turned_rigs(world_T_rigs, self.turns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,20 +66,24 @@ def refined_frames(reconstruction: Reconstruction) -> np.ndarray:
     return reconstruction.pose_statuses == PoseStatus.REFINED
 
 
-def load_faces(frames: FrameSet, which: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Faces of some frames, 90 degrees wide.
+def load_faces(frames: FrameSet, which: np.ndarray, size: int, optics: Optics = ONE_EYE) -> Faces:
+    """Faces of some frames (W,): six of 90 degrees, or those of one lens each.
 
-    Returns:
-        Images (6 W, size, size, 3) uint8 RGB, frame after frame, and where they count, bool.
+    Args:
+        size: pixels of a whole face.
+        optics: of the frames.
     """
-    rig = CubeRig(size, np.pi / 2)
-    images = np.empty((len(which), 6, size, size, 3), np.uint8)
-    use = np.ones((len(which), 6, size, size), bool)
-    for i, f in enumerate(track(which, "cutting faces", total=len(which))):
-        images[i], mask = cut_faces(frames, int(f), rig)
-        if mask is not None:
-            use[i] = mask
-    return images.reshape(-1, size, size, 3), use.reshape(-1, size, size)
+    rig, images, use = CubeRig(size, np.pi / 2), [], []
+    views = optics.views(size)
+    for f in track(which, "cutting faces", total=len(which)):
+        if optics:
+            parts, masks = cut_lens_faces(frames, int(f), views, optics)
+        else:
+            parts, masks = cut_faces(frames, int(f), rig)
+        images += list(parts)
+        use += list(masks) if masks is not None else [np.ones(p.shape[:2], bool) for p in parts]
+    turns = None if optics.lenses.axes is None else optics.lenses.axes[which]
+    return Faces(views, images, use, turns)
 
 
 def cut_faces(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.ndarray | None]:
@@ -73,8 +95,6 @@ def cut_faces(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, n
     Returns:
         (6, size, size, 3) uint8 RGB, and where they may be used, bool or None.
     """
-    import cv2
-
     if not frames.panoramic:
         whole = cubemap.native_rig(frames)
     else:
@@ -83,28 +103,55 @@ def cut_faces(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, n
     images, mask = cubemap.load(frames, frame, whole)
     if whole.size == rig.size:
         return images, mask
-    shape = (rig.size, rig.size)
-    way = cv2.INTER_AREA if rig.size < whole.size else cv2.INTER_CUBIC
-    images = np.stack([cv2.resize(image, shape, interpolation=way) for image in images])
-    if mask is None:
-        return images, None
-    shares = [cv2.resize(m.astype(np.float32), shape, interpolation=way) for m in mask]
-    return images, np.stack(shares) > 0.999
+    shapes = [(rig.size, rig.size)] * len(images)
+    surely = None if mask is None else np.stack(_surely(mask, shapes))
+    return np.stack(_averaged(images, shapes)), surely
 
 
-def make_views(images: np.ndarray, use: np.ndarray, world_T_rigs: np.ndarray) -> Views:
+def cut_lens_faces(
+    frames: FrameSet, frame: int, views: Sequence[View], optics: Optics
+) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
+    """As `cut_faces`, of one lens each: images as large as the views, and masks or None."""
+    times = int(np.clip(-(-frames.width / (2 * np.pi) // views[0].focal), 1, _MAX_TIMES))
+    finer = tuple(view.finer(times) for view in views)
+    cutter = optics.cutter(finer, frame)
+    images, whole = lens_faces.cut(frames, frame, cutter), load_mask(frames, frame)
+    masks = None if whole is None else cutter.cut_mask(whole)
+    if times == 1:
+        return images, masks
+    shapes = [(view.width, view.height) for view in views]
+    return _averaged(images, shapes), None if masks is None else _surely(masks, shapes)
+
+
+def _averaged(images: Images, shapes: Sequence[tuple[int, int]]) -> list[np.ndarray]:
+    """Images resized to widths and heights, of means over areas where they shrink."""
+    import cv2
+
+    way = cv2.INTER_AREA if shapes[0][1] < len(images[0]) else cv2.INTER_CUBIC
+    pairs = zip(images, shapes, strict=True)
+    return [cv2.resize(image, shape, interpolation=way) for image, shape in pairs]
+
+
+def _surely(masks: Images, shapes: Sequence[tuple[int, int]]) -> list[np.ndarray]:
+    """Masks resized to widths and heights, True where they are all over the pixel."""
+    shares = _averaged([mask.astype(np.float32) for mask in masks], shapes)
+    return [share > 0.999 for share in shares]
+
+
+def make_views(faces: Faces, world_T_rigs: np.ndarray) -> Views:
     """Pose faces, dropping those with nothing to see.
 
     Args:
-        images, use: of `load_faces`.
+        faces: of `load_faces`.
         world_T_rigs: (W, 4, 4) of their frames.
     """
-    rig = CubeRig(images.shape[1], np.pi / 2)
-    seen = np.flatnonzero(use.any(axis=(1, 2)))
-    cameras = [face_camera(world_T_rigs[v // 6], int(v % 6), rig) for v in seen]
-    if len(seen) < len(images):
-        images, use = images[seen], use[seen]
-    return Views(cameras, images, None if use.all() else use, seen // 6)
+    each, poses = len(faces.views), faces.poses(world_T_rigs)
+    seen = [v for v, use in enumerate(faces.use) if use.any()]
+    cameras = [view_camera(poses[v // each], faces.views[v % each]) for v in seen]
+    images, use = [faces.images[v] for v in seen], [faces.use[v] for v in seen]
+    return Views(
+        cameras, images, None if all(u.all() for u in use) else use, np.array(seen, int) // each
+    )
 
 
 def place_points(

@@ -30,15 +30,24 @@ _PUBLISHED = 30_000  # steps that the published times are for
 _COPIES = 8  # of all parameters at once: gradients, two moments, and what density control makes
 _CHECK_EVERY = 20  # steps between looks for values that are not finite, at ends of stretches
 
+Images = Sequence[np.ndarray] | np.ndarray  # of sizes of their own, or of one
+
 
 @dataclass(frozen=True, slots=True)
 class Views:
     """Posed images to train on."""
 
-    cameras: Sequence[FaceCamera]  # (V,) all of one size
-    images: np.ndarray  # (V, H, W, 3) uint8, RGB
-    use: np.ndarray | None  # (V, H, W) bool, pixels that count; None = all
-    panoramas: np.ndarray  # (V,) int, which panorama each is a face of
+    cameras: Sequence[FaceCamera]  # (V,)
+    images: Images  # (V,) of (H, W, 3) uint8, RGB
+    use: Images | None  # (V,) of (H, W) bool, pixels that count; None = all
+    panoramas: np.ndarray  # (V,) int, which panorama each is a part of
+
+    @property
+    def num_pixels(self) -> int:
+        """How many count."""
+        if self.use is not None:
+            return sum(int(np.count_nonzero(use)) for use in self.use)
+        return sum(camera.width * camera.height for camera in self.cameras)
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +210,7 @@ def most_gaussians(views: Views, settings: SplatSettings, backend: Backend) -> t
     if settings.max_gaussians is not None:
         return settings.max_gaussians, "allowed"
     num = num_parameters(settings.sh_degree)
-    pixels = int(np.prod(views.images.shape[:3]) if views.use is None else views.use.sum())
+    pixels = views.num_pixels
     determined = max(3 * pixels // num, 1)
     held = max(backend.memory_bytes // 2 // (_COPIES * np.dtype(np.float32).itemsize * num), 1)
     if determined <= held:
@@ -217,7 +226,7 @@ class Trainer:
     """
 
     def __init__(self, views: Views, settings: SplatSettings, backend: Backend) -> None:
-        if len(views.images) == 0 or (views.use is not None and not views.use.any()):
+        if views.num_pixels == 0:
             raise GsbaError("no pixel to train a splat on: all frames are masked or held out")
         self.most, self.limit = most_gaussians(views, settings, backend)
         self.views, self.settings, self.backend = views, settings, backend

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsba.camera.rig import RIG_R_FACE
+from gsba.camera.views import View as Face
 from gsba.geometry import quaternion_from_rotation
 from gsba.log import GsbaError
 from gsba.report.report import frame_quality
-from gsba.types import FACES, PoseStatus
-from gsba.view.scene import Scene, faces_of
+from gsba.types import PoseStatus
+from gsba.view.scene import Scene, faces_of, views_of
 
 if TYPE_CHECKING:
     import viser  # pyright: ignore[reportMissingImports]
@@ -57,7 +57,7 @@ class View:
                 return
             self.frame, self._masked = f, masked
             try:
-                faces, problem = faces_of(self.scene.frames, f, masked), ""
+                faces, problem = faces_of(self.scene.frames, f, masked, self.scene.optics), ""
             except GsbaError as error:
                 faces, problem = {}, str(error)
             with self.server.atomic():
@@ -181,7 +181,7 @@ class View:
         self.controls[label] = box
 
     def _place_frame(self, f: int, faces: dict[str, np.ndarray]) -> None:
-        """Six pictures around the rig, and the points that have observations in it."""
+        """Pictures around the rig, and the points that have observations in it."""
         add, found = self.server.scene, self.scene.reconstruction
         world_T_rig = found.world_T_rigs[f]
         position = self.scale * world_T_rig[:3, 3]
@@ -189,28 +189,8 @@ class View:
         if "/frame" not in self.nodes:
             self.nodes["/frame"] = add.add_frame("/frame", show_axes=False)
         self.nodes["/frame"].wxyz, self.nodes["/frame"].position = wxyz, position
-        for name in FACES:
-            if name not in faces:
-                if name in self._faces:
-                    self._faces.pop(name).remove()
-                continue
-            if name in self._faces:
-                self._faces[name].image = faces[name]
-                continue
-            self._faces[name] = add.add_camera_frustum(
-                f"/frame/{name}",
-                np.pi / 2,
-                1.0,
-                scale=0.5 * self.size,
-                thickness=0.006 * self.size,
-                color=_AFTER,
-                image=faces[name],
-                format="jpeg",
-                jpeg_quality=_JPEG_QUALITY,
-                wxyz=quaternion_from_rotation(RIG_R_FACE[FACES.index(name)]),
-                cast_shadow=False,
-                receive_shadow=False,
-            )
+        for view in views_of(self.scene.frames, self.scene.optics):
+            self._place_face(f, view, faces.get(view.name))
         rows = found.observation_points[found.observation_frames == f]
         self.nodes["/seen"] = add.add_point_cloud(
             "/seen",
@@ -221,6 +201,37 @@ class View:
             point_shading="flat",
             precision="float32",
             visible=bool(self.controls["Points it sees"].value),
+        )
+
+    def _place_face(self, f: int, view: Face, image: np.ndarray | None) -> None:
+        """A picture where its view of a frame is; none where there is none."""
+        name, axes = view.name, self.scene.optics.lenses.axes
+        if image is None:
+            if name in self._faces:
+                self._faces.pop(name).remove()
+            return
+        turn = np.eye(3) if axes is None else axes[f]
+        wxyz = quaternion_from_rotation(turn @ view.rig_R_view)
+        position = self.scale * turn @ view.centre
+        if name in self._faces:
+            shown = self._faces[name]
+            shown.image, shown.wxyz, shown.position = image, wxyz, position
+            return
+        wide, tall = view.width / (2 * view.focal), view.height / (2 * view.focal)
+        self._faces[name] = self.server.scene.add_camera_frustum(
+            f"/frame/{name}",
+            2 * np.arctan(tall),
+            wide / tall,
+            scale=0.5 * self.size * np.cbrt(wide * tall),  # all pictures as far from their lens
+            thickness=0.006 * self.size,
+            color=_AFTER,
+            image=image,
+            format="jpeg",
+            jpeg_quality=_JPEG_QUALITY,
+            wxyz=wxyz,
+            position=position,
+            cast_shadow=False,
+            receive_shadow=False,
         )
 
     def _about(self, f: int, problem: str) -> str:

@@ -7,14 +7,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsba.frames import cubemap
+from gsba.camera.optics import ONE_EYE, Optics
+from gsba.camera.views import View
+from gsba.frames import cubemap, lens_faces
+from gsba.frames.masks import load_mask
 from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement, read_placement
 from gsba.report.html.figures import viewing_axes
 from gsba.splat.gaussians import SH_CONSTANT, Gaussians
 from gsba.splat.ply import read_ply
-from gsba.store.finished import load_run
+from gsba.store.finished import load_lenses, load_run
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FACES, FrameSet, Reconstruction
 
@@ -49,6 +52,7 @@ class Scene:
     unit: str  # of the world: "map units", "m", ...
     grounds: str  # what places the world, for people
     step: float  # median distance of neighbouring frames, > 0: how large to draw things
+    optics: Optics = ONE_EYE  # of the frames, unit of the world
 
 
 def load_scene(run: Path) -> Scene:
@@ -68,6 +72,7 @@ def load_scene(run: Path) -> Scene:
         _placed_splat(path.parent.name, read_ply(path), placement)
         for path in sorted(run.glob("splat/*/point_cloud.ply"))
     )
+    lenses = load_lenses(run, reconstruction).scaled(placement.similarity.scale)
     steps = np.linalg.norm(np.diff(placed.world_T_rigs[:, :3, 3], axis=0), axis=1)
     moving = steps[steps > 1e-9 * (1 + steps.max(initial=0))]
     return Scene(
@@ -80,30 +85,56 @@ def load_scene(run: Path) -> Scene:
         unit=placement.unit,
         grounds=grounds,
         step=float(np.median(moving)) if len(moving) else 1.0,
+        optics=Optics.of(lenses, placed),
     )
 
 
 _UPS = {"-y": np.array([0.0, -1.0, 0.0]), "z": np.array([0.0, 0.0, 1.0])}
 
 
-def faces_of(frames: FrameSet, f: int, masked: bool) -> dict[str, np.ndarray]:
-    """The cube faces of a frame, face name -> (size, size, 3) uint8 RGB.
+def faces_of(
+    frames: FrameSet, f: int, masked: bool, optics: Optics = ONE_EYE
+) -> dict[str, np.ndarray]:
+    """The faces of a frame, by the names of the views that `views_of` has, uint8 RGB.
 
     Args:
         frames: panoramas or cube faces; faces that were never taken are left out.
         f: the frame.
         masked: tint what its mask leaves out.
+        optics: of the frames.
 
     Raises:
         GsbaError: pictures that have vanished or changed since the run.
     """
+    if optics:
+        return _lens_faces(frames, f, masked, optics)
     rig = cubemap.native_rig(frames, _MAX_FACE)
     images, use = cubemap.load(frames, f, rig)
     if masked and use is not None and frames.mask_paths[f] is not None:
-        tinted = (1 - _TINT) * images[~use] + _TINT * _MASKED
-        images[~use] = np.round(tinted).astype(np.uint8)
+        images = _tinted(images, use)
     names = frames.faces or FACES
     return {name: _shrunk(images[FACES.index(name)]) for name in names}
+
+
+def views_of(frames: FrameSet, optics: Optics) -> tuple[View, ...]:
+    """What the shown pictures of a frame are."""
+    return optics.views(min(frames.native_face_size, _MAX_FACE))
+
+
+def _lens_faces(frames: FrameSet, f: int, masked: bool, optics: Optics) -> dict[str, np.ndarray]:
+    views = views_of(frames, optics)
+    cutter = optics.cutter(views, f)
+    images, mask = lens_faces.cut(frames, f, cutter), load_mask(frames, f) if masked else None
+    if mask is not None:
+        pairs = zip(images, cutter.cut_mask(mask), strict=True)
+        images = [_tinted(image, use) for image, use in pairs]
+    return {view.name: image for view, image in zip(views, images, strict=True)}
+
+
+def _tinted(image: np.ndarray, use: np.ndarray) -> np.ndarray:
+    """Pictures (..., 3) with what is not used (...) bool in another colour."""
+    tinted = np.round((1 - _TINT) * image + _TINT * _MASKED).astype(np.uint8)
+    return np.where(use[..., None], image, tinted)
 
 
 def _shrunk(image: np.ndarray) -> np.ndarray:

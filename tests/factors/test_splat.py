@@ -9,10 +9,15 @@ from factors.splat import RenderedView, SplatBlock
 from gsba.bundle.optimizer import optimize
 from gsba.bundle.prior_factors import X
 from gsba.camera.rig import RIG_R_FACE, CubeRig
+from gsba.geometry import pose
 
 RIG = CubeRig(48, np.deg2rad(100))
 CAMERAS = FaceCameras(RIG_R_FACE, np.full(6, RIG.focal), np.full((6, 2), RIG.principal))
 GRID = np.stack(np.meshgrid(np.arange(48) + 0.5, np.arange(48) + 0.5), axis=-1)
+CENTRES = np.random.default_rng(2).normal(0, 0.1, (6, 3))
+TURNS = np.stack(
+    [gtsam.Rot3.Expmap(v).matrix() for v in np.random.default_rng(3).normal(0, 0.3, (3, 3))]
+)
 BEARINGS = np.stack([RIG.bearings(GRID, face) for face in range(6)])  # (6, 48, 48, 3)
 
 
@@ -37,15 +42,27 @@ def truth(num: int) -> list[gtsam.Pose3]:
     return [gtsam.Pose3.Expmap(rng.normal(0, 0.4, 6)) for _ in range(num)]
 
 
-def block_at(poses: list[gtsam.Pose3], loss: str = "cauchy", spoil: float = 0.0) -> SplatBlock:
-    """Frames captured at these poses with an exposure of their own, partly covered."""
+def block_at(
+    poses: list[gtsam.Pose3], loss: str = "cauchy", spoil: float = 0.0, apart: bool = False
+) -> SplatBlock:
+    """Frames captured at these poses with an exposure of their own, partly covered.
+
+    Cameras that are apart have centres of their own, and are turned in each frame's rig.
+    """
+    centres, turns = (CENTRES, TURNS[: len(poses)]) if apart else (None, None)
     images = []
     for f, world_T_rig in enumerate(poses):
-        image = (1.1 - 0.1 * f) * look(world_T_rig.matrix(), BEARINGS)[1] - 0.03
+        image = np.empty((6, 48, 48))
+        for c in range(6):
+            world_T_camera = world_T_rig.matrix()
+            if apart:
+                world_T_camera = world_T_camera @ pose(TURNS[f], TURNS[f] @ CENTRES[c])
+            image[c] = (1.1 - 0.1 * f) * look(world_T_camera, BEARINGS[c])[1] - 0.03
         image[0, : int(spoil * 48)] = 1.0  # somebody in the picture
         images.append(image.astype(np.float32))
-    keys = [X(f) for f in range(len(poses))]
-    return SplatBlock(keys, images, [None] * len(poses), CAMERAS, render, RobustLoss(loss, 1.0))
+    keys, loss_of = [X(f) for f in range(len(poses))], RobustLoss(loss, 1.0)
+    given = keys, images, [None] * len(poses), CAMERAS, render, loss_of
+    return SplatBlock(*given, centres=centres, turns=turns)
 
 
 def values_of(poses: list[gtsam.Pose3]) -> gtsam.Values:
@@ -65,10 +82,13 @@ def errors(values: gtsam.Values, poses: list[gtsam.Pose3]) -> np.ndarray:
     return np.abs(np.array(list(found)))
 
 
-@pytest.mark.parametrize("loss", ["none", "huber", "cauchy", "geman_mcclure"])
-def test_gradient_is_that_of_the_cost(loss: str) -> None:
+LOSSES = [("none", False), ("huber", False), ("cauchy", True), ("geman_mcclure", False)]
+
+
+@pytest.mark.parametrize(("loss", "apart"), LOSSES)
+def test_gradient_is_that_of_the_cost(loss: str, apart: bool) -> None:
     poses = truth(2)
-    block, start = block_at(poses, loss), moved(poses, 0.02)
+    block, start = block_at(poses, loss, apart=apart), moved(poses, 0.02)
     block.refresh(values_of(start))
     at = moved(start, 0.01)
     gradient = block.linearize(values_of(at)).gradient
@@ -83,9 +103,10 @@ def test_gradient_is_that_of_the_cost(loss: str) -> None:
             assert gradient[f, i] == pytest.approx(expected, abs=1e-3 * np.abs(gradient).max())
 
 
-def test_jacobians_of_the_residuals() -> None:
+@pytest.mark.parametrize("apart", [False, True])
+def test_jacobians_of_the_residuals(apart: bool) -> None:
     poses = truth(1)
-    block = block_at(poses)
+    block = block_at(poses, apart=apart)
     block.refresh(values_of(moved(poses, 0.03)))
     row = np.r_[poses[0].matrix()[:3, :3].ravel(), poses[0].matrix()[:3, 3]]
     _, analytic, _ = block._residuals(0, row, True)
@@ -100,10 +121,12 @@ def test_jacobians_of_the_residuals() -> None:
     assert same_face.mean() > 0.995  # a point that changes its face has no derivative
 
 
-def test_poses_are_found_again_under_another_exposure() -> None:
+@pytest.mark.parametrize("apart", [False, True])
+def test_poses_are_found_again_under_another_exposure(apart: bool) -> None:
     poses = truth(3)
     start = values_of(moved(poses, 0.03))  # 1.7 degrees, 0.03 of a room 4 wide
-    result = optimize(gtsam.NonlinearFactorGraph(), [block_at(poses)], start)
+    block = block_at(poses, apart=apart)
+    result = optimize(gtsam.NonlinearFactorGraph(), [block], start)
     assert errors(start, poses).max() > 0.03
     assert errors(result.values, poses).max() < 5e-4
 

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from gsba.camera.calibration import calibration_json, read_calibration
 from gsba.camera.fisheye import Pair, changed, project, rotation_of, unproject
 from gsba.camera.sphere import erp_from_bearings
+from gsba.camera.views import lens_views
 from gsba.cli import app
 from gsba.config import RefineSettings
 from gsba.demo.degrade import degrade
@@ -25,7 +26,7 @@ from gsba.frames.files import decode
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError
 from gsba.pipeline import refine
-from gsba.store.finished import load_run
+from gsba.store.finished import load_lenses, load_run
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Fisheye, Trajectory
 
@@ -96,6 +97,7 @@ def test_raw_pairs_of_known_lenses_become_faces_of_either(walk: Path, tmp_path: 
     np.testing.assert_allclose(kept[0].centre, [0, 0, BASELINE / 2], atol=0.001)
     _check_fisheyes(tmp_path / "run")
     _check_panoramas(walk, tmp_path / "run")
+    _check_families(walk, tmp_path / "run")
 
 
 def _check_fisheyes(run: Path) -> None:
@@ -135,6 +137,32 @@ def _check_panoramas(walk: Path, run: Path) -> None:
 def _blurred_off(exact: np.ndarray, found: np.ndarray) -> float:
     off = exact.astype(np.float32) - found
     return float(np.abs(cv2.GaussianBlur(off, (0, 0), 1.5)).mean())
+
+
+def _check_families(walk: Path, run: Path) -> None:
+    """Pixels of the lenses have their say, each from its own; a splat is trained on them."""
+    more = {
+        "factors": ("bearing", "photometric", "splat"),
+        "photometric": {"spacing_deg": 20.0, "depth_levels": 0},
+        "splat": {"sizes": (24,), "first_steps": 30, "steps": 10, "moves": 1, "backend": "cpu"},
+    }
+    settings = RefineSettings.model_validate(RAW_SETTINGS.model_dump() | more)
+    refine(walk / "frames", walk / "slam.tum", run, settings, calibration=walk / "true.json")
+    report, truth = (
+        json.loads((run / "report.json").read_text()),
+        read_trajectory(walk / "truth.tum"),
+    )
+    computed = [stage["name"] for stage in report["stages"] if not stage["resumed"]]
+    assert computed[:2] == ["photometric", "splat"] and len(report["splat"]) == 1
+    assert evaluate(read_trajectory(run / "trajectory.tum"), truth).ate.rmse < 0.004
+    train = ["-q", "train", str(run), "--iterations", "20", "--face-size", "32", "--backend", "cpu"]
+    result = CliRunner().invoke(app, train)
+    assert result.exit_code == 0, result.output
+    (picture, *_) = sorted((run / "splat/pictures").iterdir())
+    views = lens_views(load_lenses(run, load_run(run)[0]), 32)
+    shown = cv2.imread(str(picture))
+    assert shown is not None and shown.shape[1] == sum(view.width for view in views)
+    assert shown[:20].mean() > 40  # captured: nothing of the black around the circles
 
 
 def test_lenses_that_are_off_are_found_and_all_is_done_anew(walk: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from tiny_run import SETTINGS
 from typer.testing import CliRunner
 
 from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.views import lens_views
 from gsba.cli import app
 from gsba.config import PlacementSettings, RefineSettings
 from gsba.demo import make_walk
@@ -23,6 +24,7 @@ from gsba.placement.placement import place
 from gsba.store.finished import load_lenses, load_run
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet
+from gsba.view import faces_of, load_scene
 
 BASELINE, NUM_FRAMES, WIDTH = 0.05, 16, 768
 WALK_SETTINGS = SETTINGS.model_copy(update={"patches": RefineSettings().patches})
@@ -65,8 +67,8 @@ def walk(tmp_path_factory: pytest.TempPathFactory):
     return _walk(tmp_path_factory.mktemp("lenses") / "walk", _fixed, "forward")
 
 
-def _refine(walk, out: Path, **camera) -> tuple[dict, TrajectoryErrors]:
-    settings = WALK_SETTINGS.model_dump() | {"camera": camera}
+def _refine(walk, out: Path, more=None, **camera) -> tuple[dict, TrajectoryErrors]:
+    settings = WALK_SETTINGS.model_dump() | {"camera": camera} | (more or {})
     refine(walk.frames_dir, walk.slam_path, out, RefineSettings.model_validate(settings))
     report = json.loads((out / "report.json").read_text())
     errors = evaluate(read_trajectory(out / "trajectory.tum"), read_trajectory(walk.truth_path))
@@ -84,6 +86,12 @@ def test_a_camera_of_two_lenses_is_found_and_gives_the_scale(walk, tmp_path: Pat
     assert placed.similarity.scale == pytest.approx(camera["metres_per_unit"])
     assert placed.unit == "m"
     _export_both(tmp_path / "two", errors.scale)
+    _train_and_look(tmp_path / "two")
+    small = {"sizes": (24,), "first_steps": 30, "steps": 10, "moves": 1, "backend": "cpu"}
+    again = {"factors": ("bearing", "splat"), "splat": {**small, "held_out_every": 4}}
+    report, _ = _refine(walk, tmp_path / "two", again, baseline_mm=50.0)
+    assert len(report["splat"]) == 1 and report["camera"]["taken"]
+    assert next(stage["name"] for stage in report["stages"] if not stage["resumed"]) == "splat"
     _, central = _refine(walk, tmp_path / "one", model="central")
     one = ["export", str(tmp_path / "one"), "--to", "colmap", "--images", "lenses"]
     refused = CliRunner().invoke(app, one)
@@ -109,6 +117,23 @@ def _export_both(run: Path, scale: float) -> None:
         np.testing.assert_allclose(lengths, BASELINE if number == 10 else 0, rtol=0.02, atol=1e-9)
     wrong = CliRunner().invoke(app, ["export", str(run), "--to", "colmap", "--images", "ball"])
     assert wrong.exit_code == 1 and "export.images" in wrong.output
+
+
+def _train_and_look(run: Path) -> None:
+    """Splats and the viewer have the faces of one lens each, in its place."""
+    reconstruction, frames = load_run(run)
+    size = ["--face-size", "32", "--backend", "cpu"]
+    splat, name = run / "splat/refined/point_cloud.ply", frames.names[3]
+    calls = (["train", str(run), "--iterations", "30"], ["render", str(splat), str(run), "--frame"])
+    for call in (calls[0], [*calls[1], name]):
+        result = CliRunner().invoke(app, ["-q", *call, *size])
+        assert result.exit_code == 0, result.output
+    views = [view.name for view in lens_views(load_lenses(run, reconstruction), 32)]
+    rendered = {path.name for path in (run / "renderings").iterdir()}
+    assert rendered == {f"{name}_{view}.png" for view in [*views, "erp"]} and len(rendered) == 11
+    scene = load_scene(run)
+    faces = faces_of(scene.frames, 3, False, scene.optics)
+    assert [*faces] == views and len({image.shape for image in faces.values()}) == 3
 
 
 def test_lenses_that_turn_below_a_stabilised_panorama_are_found(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import pytest
 from tiny_run import Case
 
 from gsba.camera.rig import RIG_R_FACE, CubeRig
+from gsba.camera.views import rig_views
 from gsba.config import SplatSettings
 from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import pose
@@ -27,7 +28,7 @@ def splat(case: Case) -> Gaussians:
     )
     poses = case.result.reconstruction.world_T_rigs
     every = np.arange(len(poses))
-    views = make_views(*load_faces(case.result.frames, every, 48), poses)
+    views = make_views(load_faces(case.result.frames, every, 48), poses)
     start = start_cloud(case.result.reconstruction, poses, every, 0)
     return train(start, views, settings, BACKEND)
 
@@ -67,7 +68,7 @@ def test_a_view_is_points_on_what_was_rendered() -> None:
     points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)])
     wall = from_cloud(points, np.full((x.size, 3), 200, np.uint8), 0, opacity=0.99)
     world_T_rig = pose(np.eye(3), np.array([0.1, 0.0, 0.2]))
-    view = render_view(wall, world_T_rig, CubeRig(32, np.pi / 2), 0.01, BACKEND)
+    view = render_view(wall, world_T_rig, rig_views(CubeRig(32, np.pi / 2)), 0.01, BACKEND)
     assert len(view.grey) > 500
     ahead = (view.points_world - world_T_rig[:3, 3]) @ RIG_R_FACE[0]
     middle = np.abs(ahead[:, 0] / ahead[:, 2]) < 0.9

@@ -95,12 +95,14 @@ def _gaussians(num: int, seed: int) -> Gaussians:
 
 
 def _cameras(num: int) -> list[FaceCamera]:
-    """Around the blobs, looking at them, none with a Gaussian near its own plane."""
+    """Around the blobs, looking at them, none with a Gaussian near its own plane; of two shapes."""
     draw = np.random.default_rng(5)
     cameras = []
-    for quaternion in draw.normal(0, 1, (num, 4)):
+    for c, quaternion in enumerate(draw.normal(0, 1, (num, 4))):
         turn = rotation_from_quaternion(quaternion / np.linalg.norm(quaternion))
-        cameras.append(FaceCamera(turn, turn @ np.array([0.1, 0.2, -3.0]), SIZE, 0.5 * SIZE))
+        place, height = turn @ np.array([0.1, 0.2, -3.0]), SIZE - 10 * (c % 2)
+        middle = (0.5 * SIZE, 0.5 * height)
+        cameras.append(FaceCamera(turn, place, SIZE, height, 0.5 * SIZE, middle))
     return cameras
 
 
@@ -121,9 +123,10 @@ def test_renderings_are_those_of_the_cpu(backend: Backend, degree: int | None) -
 def _views(splat: Gaussians, masked: bool) -> Views:
     cameras = _cameras(6)
     found = CpuBackend(1).render(splat, cameras, None, NEAR)
-    images = np.stack([np.clip(255 * image.color, 0, 255).astype(np.uint8) for image in found])
-    use = np.ones(images.shape[:3], bool)
-    use[:, 20:, :10] = not masked
+    images = [np.clip(255 * image.color, 0, 255).astype(np.uint8) for image in found]
+    use = [np.ones(image.shape[:2], bool) for image in images]
+    for one in use:
+        one[20:, :10] = not masked
     return Views(cameras, images, use if masked else None, np.zeros(6, int))
 
 

@@ -15,13 +15,21 @@ from gsba.splat.rasterise import differentiate, render
 SIZE = 40  # not a multiple of the tile: the last tiles reach beyond the image
 
 
-def scene(seed: int, num: int, pixels: float = 3.0) -> tuple[Gaussians, FaceCamera]:
-    """Gaussians in front of, around and behind a tilted face; some large, some faint."""
+def scene(
+    seed: int, num: int, pixels: float = 3.0, wide: bool = False
+) -> tuple[Gaussians, FaceCamera]:
+    """Gaussians in front of, around and behind a tilted face; some large, some faint.
+
+    A wide face is one of another shape, with the principal point beside its middle.
+    """
     rng = np.random.default_rng(seed)
     world_T_rig = np.eye(4)
     world_T_rig[:3, :3] = dense_splat.rotation(rng.normal(size=4))
     world_T_rig[:3, 3] = rng.normal(size=3)
     camera = face_camera(world_T_rig, 1, CubeRig(SIZE, np.deg2rad(90)))
+    if wide:
+        size = {"width": SIZE + 9, "height": SIZE - 17}
+        camera = dataclasses.replace(camera, **size, principal=(20.0, 13.5))
     z = rng.uniform(1, 6, num) * np.where(rng.random(num) < 0.1, -1, 1)
     local = np.column_stack([rng.uniform(-1.4, 1.4, (num, 2)) * np.abs(z)[:, None], z])
     widths = np.log(pixels / camera.focal * np.abs(z))[:, None] + rng.normal(0, 0.6, (num, 3))
@@ -49,7 +57,7 @@ def test_exponential() -> None:
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("degree", range(4))
 def test_image_is_that_of_the_dense_reference(seed: int, degree: int) -> None:
-    gaussians, camera = scene(seed, 150)
+    gaussians, camera = scene(seed, 150, wide=seed > 1)
     ours = stacked(gaussians, camera, sh_degree=degree, num_threads=2)
     reference = dense_splat.render(gaussians, camera, degree)
     scale = np.array([1, 1, 1, 6, 1])  # depths reach 6
@@ -99,9 +107,9 @@ def numerical(loss, gaussians: Gaussians, name: str, picks: np.ndarray) -> np.nd
 @pytest.mark.parametrize("name", [entry.name for entry in dataclasses.fields(Gaussians)])
 @pytest.mark.parametrize("seed", [10, 11])
 def test_gradients_are_those_of_the_dense_reference(seed: int, name: str) -> None:
-    gaussians, camera = scene(seed, 30, pixels=4)
+    gaussians, camera = scene(seed, 30, pixels=4, wide=seed > 10)
     rng = np.random.default_rng(seed)
-    weights = rng.normal(size=(SIZE, SIZE, 5))
+    weights = rng.normal(size=(camera.height, camera.width, 5))
 
     def loss(moved: Gaussians) -> float:
         return float(np.sum(weights * dense_splat.render(moved, camera, 3)))

@@ -10,6 +10,7 @@ from tiny_run import Case
 from typer.testing import CliRunner
 
 from gsba.camera.rig import CubeRig
+from gsba.camera.views import rig_views
 from gsba.cli import app
 from gsba.config import SplatSettings
 from gsba.evaluate.splats import compare, poses_for
@@ -17,12 +18,13 @@ from gsba.geometry import pose
 from gsba.log import GsbaError
 from gsba.splat import from_cloud, read_ply, scene
 from gsba.splat.backend import CpuBackend
-from gsba.splat.pictures import render_faces, render_panorama
+from gsba.splat.pictures import render_panorama, render_views
 from gsba.splat.scores import measure
 from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
+SIX = rig_views(CubeRig(16, np.pi / 2))
 TINY = ["--iterations", "30", "--face-size", "32", "--backend", "cpu"]
 
 
@@ -131,18 +133,18 @@ def test_a_panorama_shows_what_the_faces_show(run: Path) -> None:
     splat = read_ply(run / "splat/refined/point_cloud.ply")
     where, backend = reconstruction.world_T_rigs[0], CpuBackend(1)
     panorama = render_panorama(splat, where, 256, 0.01, backend)
-    faces = render_faces(splat, where, CubeRig(65, np.pi / 2), 0.01, backend)
-    assert np.abs(panorama[64, 128].astype(int) - faces[0, 32, 32]).max() < 12  # straight ahead
-    assert np.abs(panorama[64, 192].astype(int) - faces[1, 32, 32]).max() < 12  # right
+    faces = render_views(splat, where, rig_views(CubeRig(65, np.pi / 2)), 0.01, backend)
+    assert np.abs(panorama[64, 128].astype(int) - faces[0][32, 32]).max() < 12  # straight ahead
+    assert np.abs(panorama[64, 192].astype(int) - faces[1][32, 32]).max() < 12  # right
 
 
 def test_a_masked_face_is_left_out(case: Case) -> None:
     images = np.zeros((6, 16, 16, 3), np.uint8)
     use = np.ones((6, 16, 16), bool)
     use[5] = False
-    views = scene.make_views(images, use, np.eye(4)[None])
+    views = scene.make_views(scene.Faces(SIX, images, use), np.eye(4)[None])
     assert len(views.cameras) == 5 and views.use is None
-    nothing = scene.make_views(images, np.zeros_like(use), np.eye(4)[None])
+    nothing = scene.make_views(scene.Faces(SIX, images, np.zeros_like(use)), np.eye(4)[None])
     gaussians = from_cloud(np.ones((2, 3)), np.zeros((2, 3), np.uint8))
     with pytest.raises(GsbaError, match="held-out frames are masked"):
         measure(gaussians, nothing, SplatSettings(), 0.01, CpuBackend(1))
@@ -151,7 +153,8 @@ def test_a_masked_face_is_left_out(case: Case) -> None:
 def test_panoramas_at_one_place_are_scored_apart() -> None:
     images = np.zeros((12, 16, 16, 3), np.uint8)
     images[6:] = 128
-    views = scene.make_views(images, np.ones((12, 16, 16), bool), np.eye(4)[None].repeat(2, 0))
+    faces = scene.Faces(SIX, images, np.ones((12, 16, 16), bool))
+    views = scene.make_views(faces, np.eye(4)[None].repeat(2, 0))
     gaussians = from_cloud(np.full((2, 3), 99.0), np.zeros((2, 3), np.uint8))
     scores = measure(gaussians, views, SplatSettings(), 0.01, CpuBackend(1))
     assert list(scores) == [0, 1] and scores[0].psnr > scores[1].psnr

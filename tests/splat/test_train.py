@@ -16,6 +16,7 @@ from gsba.splat.backend import CpuBackend, choose_backend
 from gsba.splat.camera import face_camera
 from gsba.splat.density import DensityLimits, Pull, densify, reset_opacity
 from gsba.splat.gaussians import Gaussians, from_cloud
+from gsba.splat.lesson import Lesson
 from gsba.splat.metrics import psnr
 from gsba.splat.rasterise import render
 from gsba.splat.train import Views, advance, begin, extent_of, most_gaussians, times_for, train
@@ -49,7 +50,7 @@ def start(truth: Gaussians) -> Gaussians:
 
 def quality(splat: Gaussians, views: Views) -> float:
     found = [render(splat, camera)[0].color for camera in views.cameras]
-    return psnr(np.clip(found, 0, 1), views.images / 255)
+    return psnr(np.clip(found, 0, 1), np.asarray(views.images) / 255)
 
 
 def same(one: Gaussians, other: Gaussians) -> bool:
@@ -67,6 +68,24 @@ def test_images_are_learned_the_same_way_every_time() -> None:
     assert same(splat, train(first, views, SETTINGS, CpuBackend(2)))
     other = SETTINGS.model_copy(update={"seed": 4})
     assert not same(splat, train(first, views, other, CpuBackend(1)))
+
+
+def test_halves_of_a_view_teach_what_the_whole_does() -> None:
+    truth, views = scene()
+    splat, whole = start(truth), views.cameras[2]
+    flat = np.array([-2.5, -2, -1.5], np.float32)
+    small = dataclasses.replace(splat, log_scales=splat.log_scales + flat)
+    half, found = SIZE // 2, []
+    for first, last in ((0, SIZE), (0, half), (half, SIZE)):
+        middle = (half - first, half)
+        camera = dataclasses.replace(whole, width=last - first, principal=middle)
+        truth_there = views.images[2][:, first:last]
+        lesson = Lesson(camera, truth_there, None, 1, adam.Rates(*[1.0] * 6), 1)
+        found.append(CpuBackend(1).gradients(small, lesson, 0.01, ssim_weight=0.0))
+    for entry in dataclasses.fields(Gaussians):
+        one, left, right = (getattr(part.gaussians, entry.name) for part in found)
+        assert np.allclose(left + right, one, atol=1e-3 * np.abs(one).max()) and np.any(left)
+    assert np.allclose(found[1].centres + found[2].centres, found[0].centres, atol=1e-6)
 
 
 class Hasty(CpuBackend):
@@ -170,7 +189,7 @@ def test_a_cap_follows_from_pixels_and_memory(caplog: pytest.LogCaptureFixture) 
     splat = train(start(truth), views, eager, backend)
     assert 500 < len(splat) <= 18_432 // 23
     assert "801 Gaussians are the most that 6144 pixels determine" in caplog.text
-    half = np.zeros(views.images.shape[:3], bool)
+    half = np.zeros((6, SIZE, SIZE), bool)
     half[:, :16] = True
     masked = dataclasses.replace(views, use=half)
     assert most_gaussians(masked, eager, backend)[0] == 18_432 // 2 // 23
@@ -184,7 +203,7 @@ def test_a_cap_follows_from_pixels_and_memory(caplog: pytest.LogCaptureFixture) 
 
 def test_nothing_to_train_on_is_refused() -> None:
     truth, views = scene()
-    masked = dataclasses.replace(views, use=np.zeros(views.images.shape[:3], bool))
+    masked = dataclasses.replace(views, use=np.zeros((6, SIZE, SIZE), bool))
     with pytest.raises(GsbaError, match="all frames are masked"):
         train(start(truth), masked, SETTINGS, CpuBackend(1))
     with pytest.raises(GsbaError, match="no Gaussian"):

@@ -1,0 +1,20 @@
+"""Faces of one lens each, cut from whatever a frame is made of."""
+
+import numpy as np
+
+from gsba.camera.views import ViewCutter
+from gsba.frames.dual_fisheye import load_raw
+from gsba.frames.pixels import load_erp
+from gsba.types import FrameSet
+
+
+def cut(frames: FrameSet, f: int, cutter: ViewCutter) -> list[np.ndarray]:
+    """Images (height, width, 3) uint8 RGB of each view of frame f.
+
+    Args:
+        frames: panoramas, or raw pairs, which are cut in one step.
+        cutter: of that frame.
+    """
+    if frames.fisheyes is not None:
+        return cutter.cut_raw(load_raw(frames, f))
+    return cutter.cut(load_erp(frames, f))
