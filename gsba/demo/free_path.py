@@ -47,13 +47,14 @@ def free_path(
         grid = np.stack(np.meshgrid(x, np.array([y]), z, indexing="ij"), axis=-1).reshape(-1, 3)
         free = clearance(grid)
         open_ = _walkable(free, seen(grid, _DOWN), seen(grid, -_DOWN), edge)
-        cells, _ = label(open_.reshape(len(x), len(z)))
+        cells = _rooms(open_.reshape(len(x), len(z)))
         counts = np.bincount(cells.ravel())
         counts[0] = 0
         largest = int(np.argmax(counts))
         if counts[largest] > best:
-            best, room, at = int(counts[largest]), cells == largest, free.reshape(cells.shape)
-            where = grid.reshape(*cells.shape, 3)
+            best, room = int(counts[largest]), cells == largest
+            at = free.reshape(room.shape)
+            where = grid.reshape(*room.shape, 3)
     if room is None or best < _MIN_CELLS:
         return None, 0.0
     way = _round(room, at)
@@ -73,6 +74,13 @@ def _walkable(free: np.ndarray, below: np.ndarray, above: np.ndarray, edge: floa
     if not walkable.any():
         return walkable
     return walkable & (np.abs(below - np.median(below[walkable])) < 2 * edge)
+
+
+def _rooms(walkable: np.ndarray) -> np.ndarray:
+    """Numbers (X, Z) of connected parts, 0 = none."""
+    found = label(walkable)
+    assert isinstance(found, tuple)
+    return found[0]
 
 
 def _round(room: np.ndarray, clearance: np.ndarray) -> np.ndarray:

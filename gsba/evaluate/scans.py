@@ -9,7 +9,7 @@ from gsba.bundle.triangulation import points_under
 from gsba.scans.distances import Distances, distances_to
 from gsba.scans.files import normals_of
 from gsba.scans.fit import approach, settle
-from gsba.scans.register import Registration, register
+from gsba.scans.registration import Registration, register
 from gsba.scans.search import Guess
 from gsba.scans.types import Cloud, Scan, cloud_of
 from gsba.similarity import Sim3, pose_similarity
@@ -67,7 +67,7 @@ def scan_errors(
         reconstruction: refined.
         scan: of the same place.
         coarse_T_rigs: (F, 4, 4) poses of the frames before, of any world and scale.
-        guess: see `gsba.scans.register`.
+        guess: see `gsba.scans.registration`.
 
     Raises:
         GsbaError: the cloud has no place in the scan, or several.

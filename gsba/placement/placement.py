@@ -19,7 +19,7 @@ from gsba.log import GsbaError, brief
 from gsba.placement.exif import read_exif_gps
 from gsba.placement.gps import GpsFixes, local_from_geodetic, read_gps
 from gsba.scans.files import check_scan, normals_of, read_pairs, read_scan, upwards
-from gsba.scans.register import in_file, register
+from gsba.scans.registration import in_file, register
 from gsba.scans.search import Guess
 from gsba.scans.types import cloud_of
 from gsba.similarity import (

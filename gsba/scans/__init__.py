@@ -6,7 +6,7 @@ Gives the similarity between both, what speaks for it, and distances.
 
 from gsba.scans.distances import Distances, distances_to
 from gsba.scans.files import check_scan, normals_of, read_mesh, read_pairs, read_scan, upwards
-from gsba.scans.register import Registration, in_file, register
+from gsba.scans.registration import Registration, in_file, register
 from gsba.scans.search import Guess
 from gsba.scans.types import Cloud, Scan, cloud_of
 

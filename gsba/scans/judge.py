@@ -16,13 +16,13 @@ from gsba.similarity import Sim3
 
 SIGMAS = 3.0  # from its surface that an explained point may be
 _CELLS_ALONG = 400  # of the scan's grid along its extent, at most
-_BEYOND = 0.5  # of a ray's length that is looked at behind its point
+_BEYOND = 1.0  # of a cloud's size: how far behind a point surfaces contradict it
 _LEAST_SINE = 0.15  # of a ray to a surface that it crosses
 _REACH = 0.02  # of a cloud's size: how far surfaces count as near
 _ALIKE = 0.7  # cosine between a point's normal and its surface's
 _INLIERS = 0.8  # share of near points that are on their surface
 _LEAST_ALIKE = 100  # near points whose brightness can be compared
-_CELLS = 3  # of a cloud's size: points within share their luck
+_CELLS = 4  # of a cloud's size: points within share their luck
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,8 @@ class Verdict:
     explained: np.ndarray  # (N,) bool
     contradicted: np.ndarray  # (N,) bool
     near: np.ndarray  # (N,) bool: beside a surface of the same normal
-    logs: np.ndarray  # (N,) float64, log likelihood of a near point's distance, times the reach
+    logs: np.ndarray  # (N,) float64, log likelihood of its distance, times the reach; of points
+    # that are not near as of such far ones
     cells: np.ndarray  # (N,) int64, of points nearby, in the cloud's own world
 
     @property
@@ -47,19 +48,22 @@ class Verdict:
         return float(self.explained.sum() / max(said, 1))
 
     def lead(self, other: "Verdict") -> float:
-        """By how many standard errors this explains better what both find a surface near.
+        """By how many standard errors this explains the cloud better than another placement.
 
-        What is missing in the scan at one place and not at the other thus tells nothing. The test
-        is Vuong's of models that are not nested (Econometrica 57, 1989), over cells, as neighbours
-        share their luck, and by Wilcoxon's signed ranks (Biometrics 1, 1945), so that no single
-        piece of furniture decides.
+        Vuong's test of models that are not nested (Econometrica 57, 1989), with cells as the
+        independent draws: no single piece of furniture makes more than one. Points compared are
+        those that both are judged by, as what is missing in the scan at one place and not at the
+        other tells nothing; or those of them with a surface near in both, whichever tells more.
         """
-        both = self.near & other.near
+        near = self.near & other.near
+        judged = near | (
+            (self.explained | self.contradicted) & (other.explained | other.contradicted)
+        )
+        return max((self._lead(other, both) for both in (near, judged)), key=abs)
+
+    def _lead(self, other: "Verdict", both: np.ndarray) -> float:
         gains = np.bincount(self.cells[both], (self.logs - other.logs)[both])
-        gains = gains[np.bincount(self.cells[both]) > 0]
-        ranks = np.argsort(np.argsort(np.abs(gains), kind="stable"), kind="stable") + 1.0
-        error = float(np.sqrt(np.sum(ranks**2)))
-        return float(np.sum(np.sign(gains) * ranks)) / max(error, 1e-9)
+        return float(gains.sum()) / max(float(np.linalg.norm(gains)), 1e-9)
 
 
 class Grid:
@@ -67,9 +71,9 @@ class Grid:
 
     def __init__(self, scan: Scan) -> None:
         extent = float(np.ptp(scan.points, axis=0).max())
-        self.edge = max(extent / _CELLS_ALONG, 3 * scan.spacing)
-        self.low = scan.points.min(axis=0) - self.edge
-        self.shape = np.ceil((np.ptp(scan.points, axis=0)) / self.edge).astype(int) + 3
+        self.edge = max(extent / _CELLS_ALONG, 5 * scan.spacing)
+        self.low = scan.points.min(axis=0) - 1.5 * self.edge  # around it nothing
+        self.shape = np.ceil((np.ptp(scan.points, axis=0)) / self.edge).astype(int) + 4
         self.rows = np.full(self.shape, -1, np.int32)
         at = self._cells(scan.points)
         self.rows[at[:, 0], at[:, 1], at[:, 2]] = np.arange(len(at))
@@ -97,7 +101,9 @@ class Grid:
             along = np.einsum("ni,ni->n", normals, ways[met])
             before = np.einsum("ni,ni->n", normals, self.scan.points[rows] - eyes[met])
             steep = np.abs(along) > _LEAST_SINE * lengths[met]
-            first[met[steep]] = before[steep] / along[steep]
+            met, crossing = met[steep], before[steep] / along[steep]
+            here = np.abs(crossing - part[met]) * lengths[met] <= 2 * self.edge
+            first[met[here]] = crossing[here]
         return first
 
 
@@ -115,17 +121,20 @@ def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: Grid, sigma: float) -> Ve
     explained = off <= SIGMAS * sigmas
     eyes = fit.points(cloud.eyes)
     ways = carried - eyes
-    margins = (SIGMAS * sigmas + 2 * grid.edge) / np.maximum(np.linalg.norm(ways, axis=1), 1e-12)
-    first = grid.first_crossings(eyes, carried + _BEYOND * ways)
+    lengths = np.maximum(np.linalg.norm(ways, axis=1), 1e-12)[:, None]
+    first = grid.first_crossings(eyes, carried + _BEYOND * cloud.size * fit.scale * ways / lengths)
+    first *= 1 + _BEYOND * cloud.size * fit.scale / lengths[:, 0]  # of the way to the point
+    margins = (SIGMAS * sigmas + 2 * grid.edge) / lengths[:, 0]
     crossed = (first < 1 - margins) | ((first > 1 + margins) & np.isfinite(first))
-    reach = _REACH * cloud.size * fit.scale
+    reach = max(_REACH * cloud.size * fit.scale, 3 * scan.spacing)
     near = (gaps <= reach) & (np.abs(turned) > _ALIKE)
     likely = _INLIERS * np.exp(-0.5 * (off / sigmas) ** 2) / (np.sqrt(2 * np.pi) * sigmas)
     return Verdict(
         explained,
         ~explained & (crossed | (gaps <= reach)),
         near,
-        np.log(likely * reach + (1 - _INLIERS) / 2) + _alike(cloud, scan, nearest, near),
+        np.log(np.where(near, likely * reach, 0) + (1 - _INLIERS) / 2)
+        + _alike(cloud, scan, nearest, near),
         cells_of(cloud.points, cloud.size / _CELLS),
     )
 

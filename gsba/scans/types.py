@@ -35,7 +35,7 @@ class Scan:
         return float(np.median(self.tree.query(some, 2)[0][:, 1]))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Cloud:
     """A run's points that rays determine well."""
 
@@ -46,7 +46,7 @@ class Cloud:
     normals: np.ndarray  # (N, 3) float64, unit, of either sign
     brightness: np.ndarray  # (N,) float64, of any scale
 
-    @property
+    @cached_property
     def size(self) -> float:
         """See `size_of`."""
         return size_of(self.points)

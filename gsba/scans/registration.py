@@ -23,10 +23,10 @@ _JUDGED = 6  # of them, the likeliest, with all of the cloud
 _WIDTH = 0.08  # of the cloud's size: of the loss at first
 _STRAY = 1.2  # of a scale, from candidate to fit: more is a collapse
 _SAME = 0.05  # of the cloud's size: fits nearer than this are one
-_RIVALS = 0.5  # of the largest share: placements that explain less are none
+_RIVALS = 0.8  # of the best one's share: placements that explain less are none
 _LEAST_SHARE = 0.25  # of the cloud, explained
-_LEAST_AGREEMENT = 0.6  # explained, of what the scan says something about
-_LEAST_LEAD = 3.0  # standard errors over any rival
+_LEAST_AGREEMENT = 0.65  # explained, of what the scan says something about
+_LEAST_LEAD = 3.5  # standard errors over any rival
 
 
 class NoPlacementError(GsbaError):
@@ -39,7 +39,7 @@ class Registration:
 
     fit: Fit
     verdict: Verdict
-    rivals: int  # other placements that explain at least half as much
+    rivals: int  # other placements that explain about as much
     lead: float  # standard errors over the best of them; infinite = there is none
 
     def __str__(self) -> str:
