@@ -200,7 +200,7 @@ def _offset(points: np.ndarray) -> np.ndarray:
 def _thinned(cloud: Any) -> Any:
     """At most so many points, one for each cell that has some."""
     extent = float(np.ptp(np.asarray(cloud.points), axis=0).max())
-    cell = extent / 2000
+    cell = extent / 1000
     while len(cloud.points) > _MOST_POINTS:
-        cloud, cell = cloud.voxel_down_sample(cell), cell * 1.25
+        cloud, cell = cloud.voxel_down_sample(cell), cell * 1.3
     return cloud
