@@ -44,6 +44,16 @@ Images = Annotated[
         metavar="auto|cube|lenses|fisheye",
     ),
 ]
+AlignScan = Annotated[
+    str | None,
+    typer.Option(help="PLY, PCD, LAS, LAZ, OBJ or GLB: its world and unit.", metavar="SCAN"),
+]
+Pairs = Annotated[
+    str | None,
+    typer.Option(
+        help="With --align-scan: lines of a frame or x,y,z, and X,Y,Z of the scan.", metavar="FILE"
+    ),
+]
 
 
 @command
@@ -76,14 +86,8 @@ def export(
     align: Annotated[
         str | None, typer.Option(help="True poses: their world and unit.", metavar="TRUTH.tum")
     ] = None,
-    align_scan: Annotated[
-        str | None,
-        typer.Option(help="PLY, PCD, LAS, LAZ, OBJ or GLB: its world and unit.", metavar="SCAN"),
-    ] = None,
-    pairs: Annotated[
-        str | None,
-        typer.Option(help="With --align-scan: lines of a frame or x,y,z, and X,Y,Z of the scan."),
-    ] = None,
+    align_scan: AlignScan = None,
+    pairs: Pairs = None,
     link: Annotated[
         bool, typer.Option("--link", help="Hard links to unchanged frames, not copies.")
     ] = False,

@@ -85,7 +85,7 @@ def score(fit: Sim3, cloud: Cloud, scan: Scan, points: int = 400) -> float:
     reach = _NEAR * cloud.size * fit.scale
     gaps, nearest = scan.tree.query(fit.points(cloud.points[rows]), distance_upper_bound=reach)
     found = gaps < reach
-    normals = scan.normals[nearest[found]]
+    normals = scan.normals[np.asarray(nearest)[found]]
     turned = cloud.normals[rows][found] @ fit.rotation.T
     alike = np.abs(np.einsum("ni,ni->n", normals, turned)) > 0.8
     return float(np.sum((1 - gaps[found] / reach) * alike)) / len(rows)
