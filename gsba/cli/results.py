@@ -153,21 +153,24 @@ def _length(text: str | None) -> float | str | None:
         return text
 
 
+ScanFile = Annotated[
+    Path | None, typer.Option(help="A scan of the place: how far the run's points are off it.")
+]
+Depth = Annotated[
+    Path | None,
+    typer.Option(help="True depth maps: also say how far pixels are moved.", metavar="DIR"),
+]
+
+
 @command
 def evaluate(
     estimate: Annotated[Path, typer.Argument(help="A run, or a trajectory file.", metavar="RUN")],
     truth: Annotated[Path | None, typer.Option(help="True trajectory (TUM).")] = None,
-    depth: Annotated[
-        Path | None,
-        typer.Option(help="True depth maps: also say how far pixels are moved.", metavar="DIR"),
-    ] = None,
+    depth: Depth = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the numbers here too.", metavar="FILE")
     ] = None,
-    scan: Annotated[
-        Path | None,
-        typer.Option(help="A scan of the place: how far the run's points are off it."),
-    ] = None,
+    scan: ScanFile = None,
     splat: Annotated[
         bool, typer.Option("--splat", help="Train splats on poses, and measure held-out frames.")
     ] = False,
