@@ -438,6 +438,8 @@ class PlacementSettings(_Settings):
     between: tuple[str, str] | None = None  # frames by name, or points "x,y,z" of the run's world
     gps: _Text | None = None  # file of positions, or "exif": metres, east-north-up
     align: _Text | None = None  # TUM file of true poses: its world and unit
+    scan: _Text | None = None  # PLY, PCD, LAS, LAZ, OBJ or GLB of the place: its world and unit
+    pairs: _Text | None = None  # file of three or more pairs, run and scan, to find it by
 
 
 class RefineSettings(_Settings):

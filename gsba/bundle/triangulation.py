@@ -6,7 +6,7 @@ from factors.compiled import kernel_and_part
 from factors.threads import balanced_ranges, run_in_threads
 from gsba.config import TriangulateSettings
 from gsba.geometry import moved_to
-from gsba.types import Counts, Keypoints, Landmarks, Tracks
+from gsba.types import Counts, Keypoints, Landmarks, Reconstruction, Tracks
 
 _kernel, _part = kernel_and_part()
 _MAX_HYPOTHESES = 12  # pairs of observations tried per track
@@ -229,3 +229,18 @@ def _gauss_newton_step(rays, centres, sigmas, lo, hi, point, gate):
     point[0] -= x
     point[1] -= y
     point[2] -= z
+
+
+def points_under(reconstruction: Reconstruction, world_T_rigs: np.ndarray) -> np.ndarray:
+    """Points (J, 3) nearest to the rays of a reconstruction under other poses (F, 4, 4)."""
+    frames, points = reconstruction.observation_frames, reconstruction.observation_points
+    lenses = moved_to(world_T_rigs[frames], reconstruction.observation_origins)
+    rotations, centres = lenses[:, :3, :3], lenses[:, :3, 3]
+    rays = np.einsum("oij,oj->oi", rotations, reconstruction.observation_bearings)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # off the ray
+    shape = len(reconstruction.points_world)
+    normal, target = np.zeros((shape, 3, 3)), np.zeros((shape, 3))
+    np.add.at(normal, points, across)
+    np.add.at(target, points, np.einsum("oij,oj->oi", across, centres))
+    normal += 1e-9 * np.eye(3)  # parallel rays leave the depth open
+    return np.linalg.solve(normal, target[..., None])[..., 0]

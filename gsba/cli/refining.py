@@ -146,7 +146,9 @@ def _summary(out: Path) -> str:
 
 @command
 def demo(
-    path: Annotated[str, typer.Option(help="rectangle, oval or open.")] = "rectangle",
+    path: Annotated[
+        str, typer.Option(help="rectangle, oval or open; with --mesh: a TUM file of poses.")
+    ] = "rectangle",
     heading: Annotated[str, typer.Option(help="locked or forward.")] = "locked",
     out: Annotated[Path, typer.Option(help="Folder for the walk and its run.")] = Path("gsba-demo"),
     frames: Annotated[int, typer.Option(help="Frames of the walk.")] = 40,
@@ -155,15 +157,25 @@ def demo(
     camera: Annotated[
         str, typer.Option(help="ideal, or two-lens: as those on sale, rows read one after another.")
     ] = "ideal",
+    mesh: Annotated[
+        Path | None,
+        typer.Option(help="Walk through this instead: OBJ, GLB or PLY with colours."),
+    ] = None,
 ) -> None:
     """Render a walk with exact truth, spoil its trajectory as SLAM would, refine and compare."""
     from gsba.config import CameraSettings, RefineSettings
-    from gsba.demo import make_walk
+    from gsba.demo import make_mesh_walk, make_walk
     from gsba.evaluate.trajectory import evaluate as compare
     from gsba.evaluate.trajectory import format_table
     from gsba.trajectory.files import read_trajectory
 
-    walk = make_walk(out / "walk", path, heading, frames, width, seed, camera=camera)  # type: ignore[arg-type]
+    if mesh is not None:
+        if (heading, camera) != ("locked", "ideal"):
+            raise GsbaError("--mesh is walked by an ideal camera: leave out --heading and --camera")
+        given = None if path == "rectangle" else Path(path)
+        walk = make_mesh_walk(out / "walk", mesh, given, frames, width, seed)
+    else:
+        walk = make_walk(out / "walk", path, heading, frames, width, seed, camera=camera)  # type: ignore[arg-type]
     run, central = out / "run", out / "run-central"
     from gsba import pipeline
 

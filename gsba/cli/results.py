@@ -45,6 +45,16 @@ Images = Annotated[
         metavar="auto|cube|lenses|fisheye|panorama",
     ),
 ]
+AlignScan = Annotated[
+    str | None,
+    typer.Option(help="PLY, PCD, LAS, LAZ, OBJ or GLB: its world and unit.", metavar="SCAN"),
+]
+Pairs = Annotated[
+    str | None,
+    typer.Option(
+        help="With --align-scan: lines of a frame or x,y,z, and X,Y,Z of the scan.", metavar="FILE"
+    ),
+]
 
 
 @command
@@ -77,6 +87,8 @@ def export(
     align: Annotated[
         str | None, typer.Option(help="True poses: their world and unit.", metavar="TRUTH.tum")
     ] = None,
+    align_scan: AlignScan = None,
+    pairs: Pairs = None,
     link: Annotated[
         bool, typer.Option("--link", help="Hard links to unchanged frames, not copies.")
     ] = False,
@@ -90,6 +102,7 @@ def export(
     if to not in list(ExportFormat):
         raise GsbaError(f"--to {to} is not known: use one of {', '.join(ExportFormat)}")
     asked = {"up": up, "length": _length(scale), "between": between, "gps": gps, "align": align}
+    asked |= {"scan": align_scan, "pairs": pairs}
     dataset = {"face_size": face_size, "images": images, "formats": [to]}
     settings = validated({"placement": asked, "export": dataset}).placement
     from gsba.placement.placement import place
@@ -141,17 +154,24 @@ def _length(text: str | None) -> float | str | None:
         return text
 
 
+ScanFile = Annotated[
+    Path | None, typer.Option(help="A scan of the place: how far the run's points are off it.")
+]
+Depth = Annotated[
+    Path | None,
+    typer.Option(help="True depth maps: also say how far pixels are moved.", metavar="DIR"),
+]
+
+
 @command
 def evaluate(
     estimate: Annotated[Path, typer.Argument(help="A run, or a trajectory file.", metavar="RUN")],
     truth: Annotated[Path | None, typer.Option(help="True trajectory (TUM).")] = None,
-    depth: Annotated[
-        Path | None,
-        typer.Option(help="True depth maps: also say how far pixels are moved.", metavar="DIR"),
-    ] = None,
+    depth: Depth = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the numbers here too.", metavar="FILE")
     ] = None,
+    scan: ScanFile = None,
     splat: Annotated[
         bool, typer.Option("--splat", help="Train splats on poses, and measure held-out frames.")
     ] = False,
@@ -169,9 +189,11 @@ def evaluate(
     if splat:
         settings = splat_settings(iterations, face_size, backend, max_gaussians)
         evaluate_splat(estimate, against or [], settings, lpips or [])
+    if scan is not None:
+        _against_scan(estimate, scan, json_file if truth is None else None)
     if truth is None:
-        if not splat:
-            raise GsbaError("nothing to compare with: give --truth FILE, or --splat")
+        if not splat and scan is None:
+            raise GsbaError("nothing to compare with: give --truth FILE, --scan FILE, or --splat")
         return
     from gsba.disk import write_text
     from gsba.evaluate.pixels import depth_maps, induced_errors
@@ -201,6 +223,31 @@ def evaluate(
         )
     if judged:
         typer.echo(judged)
+
+
+def _against_scan(run: Path, path: Path, json_file: Path | None) -> None:
+    """Measure a run on a scan: a table, RUN/scan.json, and its cloud in colours of distance."""
+    from gsba.disk import write_json
+    from gsba.evaluate.scans import format_scan, scan_errors
+    from gsba.export.ply import write_splat_points
+    from gsba.scans import in_file, read_scan
+    from gsba.store.finished import load_run
+    from gsba.trajectory.files import read_trajectory
+
+    reconstruction, frames = load_run(run)
+    before = run / "coarse.tum"
+    coarse = read_trajectory(before).world_T_rigs if before.exists() else None
+    if coarse is not None and len(coarse) != len(frames):
+        raise GsbaError(f"{before}: is of other frames: refine again")
+    surfaces = read_scan(path)
+    with in_file(path):
+        errors = scan_errors(reconstruction, surfaces, coarse)
+    content = {"scan": str(path), "offset": surfaces.offset.tolist(), **errors.to_json()}
+    for file in filter(None, (run / "scan.json", json_file)):
+        write_json(file, content)
+    write_splat_points(run / "scan.ply", errors.cloud, errors.colors())
+    typer.echo(format_scan(errors))
+    typer.echo(f"{run / 'scan.json'} holds the histograms, {run / 'scan.ply'} the coloured cloud.")
 
 
 def _consistency(run: Path, truth: "Trajectory") -> "tuple[Consistency | None, str]":

@@ -74,7 +74,11 @@ def make_walk(
     """
     from gsba.demo.gallery import build_gallery
 
-    _check(out, path, heading, camera, num_frames, width, seed)
+    choices = ((path, WalkPath, "path"), (heading, Heading, "heading"), (camera, Camera, "camera"))
+    for value, allowed, what in choices:
+        if value not in get_args(allowed):
+            raise GsbaError(f"{what} {value!r} is none of {', '.join(get_args(allowed))}")
+    check_walk(out, num_frames, width, seed)
     lenses = TwoLenses() if camera == "two-lens" else None
     partial = out.with_name(f".{out.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -82,7 +86,7 @@ def make_walk(
     truth = walk_poses(path, heading, num_frames, seed)
     scene = build_gallery()
     logger.info("gallery of %d faces, %d frames of %d px", len(scene.corners), num_frames, width)
-    _write_frames(partial, scene, truth, width, seed, lenses)
+    write_frames(partial, truth, _pictures(scene, truth, width, seed, lenses), seed)
     if lenses is not None:
         lenses.write(partial / "calibration.json")
     if depth:
@@ -102,13 +106,24 @@ def walk_poses(path: WalkPath, heading: Heading, num_frames: int, seed: int) -> 
     """
     rng = np.random.default_rng(seed)
     at, tangent = _sample(path, num_frames)
-    wobble = [_wobble(rng, num_frames) for _ in range(6)]
     yaw = np.arctan2(tangent[:, 0], tangent[:, 1]) if heading == "forward" else 0.0
+    positions = np.stack([at[:, 0], np.full(num_frames, -EYE_HEIGHT), at[:, 1]], axis=1)
+    return held_by_hand(positions, yaw, rng)
+
+
+def held_by_hand(
+    positions: np.ndarray, yaw: np.ndarray | float, rng: np.random.Generator, unit: float = 1.0
+) -> Trajectory:
+    """Poses around positions (N, 3) of a walk, headings in radians, swaying as a hand does.
+
+    Args:
+        unit: of the positions, in those of the gallery.
+    """
+    wobble = [_wobble(rng, len(positions)) for _ in range(6)]
     pitch, turn, roll = (np.radians(w) * x for w, x in zip(WOBBLE_DEG, wobble, strict=False))
     rotations = _rotations(1, yaw + turn) @ _rotations(0, pitch) @ _rotations(2, roll)
-    positions = np.stack([at[:, 0], np.full(num_frames, -EYE_HEIGHT), at[:, 1]], axis=1)
-    positions += WOBBLE_UNITS * np.stack(wobble[3:], axis=1)
-    return Trajectory(np.arange(num_frames) / FRAMES_PER_SECOND, pose(rotations, positions))
+    swaying = positions + unit * WOBBLE_UNITS * np.stack(wobble[3:], axis=1)
+    return Trajectory(np.arange(len(positions)) / FRAMES_PER_SECOND, pose(rotations, swaying))
 
 
 def _sample(path: WalkPath, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
@@ -176,16 +191,14 @@ def _rotations(axis: int, angles: np.ndarray | float) -> np.ndarray:
     return Rotation.from_rotvec(np.atleast_1d(angles)[:, None] * np.eye(3)[axis]).as_matrix()
 
 
-def _write_frames(
-    out: Path, scene, truth: Trajectory, width: int, seed: int, lenses: TwoLenses | None
-) -> None:
-    """JPEGs with exposure and noise, and their times."""
+def write_frames(out: Path, truth: Trajectory, pictures: Iterator[np.ndarray], seed: int) -> None:
+    """Panoramas (H, W, 3), 0..255, as JPEGs with exposure and noise, and their times."""
     import cv2
 
     rng = np.random.default_rng([seed, 1])
     exposures = 1 + EXPOSURE_SWING * np.tanh(_wobble(rng, len(truth.timestamps)))
     names = [f"{f:06d}.jpg" for f in range(len(exposures))]
-    frames = zip(names, _pictures(scene, truth, width, seed, lenses), exposures, strict=True)
+    frames = zip(names, pictures, exposures, strict=True)
     for name, picture, exposure in track(frames, "rendering the walk", total=len(names)):
         image = exposure * picture
         image += NOISE * rng.standard_normal(image.shape, dtype=np.float32)
@@ -227,17 +240,8 @@ def _write_depth(folder: Path, scene, truth: Trajectory, width: int) -> None:
         np.savez_compressed(folder / f"{f:06d}.npz", range=depth)
 
 
-def _check(
-    out: Path, path: str, heading: str, camera: str, num_frames: int, width: int, seed: int
-) -> None:
-    choices = (
-        (path, WalkPath, "path"),
-        (heading, Heading, "heading"),
-        (camera, Camera, "camera"),
-    )
-    for value, allowed, what in choices:
-        if value not in get_args(allowed):
-            raise GsbaError(f"{what} {value!r} is none of {', '.join(get_args(allowed))}")
+def check_walk(out: Path, num_frames: int, width: int, seed: int) -> None:
+    """Raise GsbaError for numbers out of range, and a folder that holds something else."""
     if seed < 0:
         raise GsbaError(f"seed {seed}: must be 0 or more")
     if num_frames < 3:

@@ -18,6 +18,10 @@ from gsba.geometry import pose
 from gsba.log import GsbaError, brief
 from gsba.placement.exif import read_exif_gps
 from gsba.placement.gps import GpsFixes, local_from_geodetic, read_gps
+from gsba.scans.files import check_scan, normals_of, read_pairs, read_scan, upwards
+from gsba.scans.registration import in_file, register
+from gsba.scans.search import Guess
+from gsba.scans.types import cloud_of
 from gsba.similarity import (
     Sim3,
     extents,
@@ -37,6 +41,7 @@ logger = logging.getLogger(__name__)
 
 EXIF = "exif"  # in place of a file of positions: those in the pictures
 _UP_WORLD = np.array([0.0, -1.0, 0.0])  # of an upright world: y down, as cameras have it
+UPS = {"z": np.array([0.0, 0, 1]), "y": np.array([0.0, 1, 0])}  # axes of scans that point up
 _TOLERANCE_S = 0.02  # of true poses around a frame
 _SCALES = (1e-12, 1e12)  # that a run may be placed at; others are slips
 _FURTHEST = 1e12  # from the origin, in the placed unit
@@ -52,7 +57,7 @@ class Placement:
 
     similarity: Sim3 = field(default_factory=Sim3)
     unit: str = "map units"  # of the placed world
-    up: str | None = None  # axis of the placed world that points up: "-y", "z"; None = unknown
+    up: str | None = None  # axis of the placed world that points up: "-y", "y", "z"; None = unknown
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,), unit of the placed
     origin: tuple[float, float, float] | None = None  # latitude, longitude, altitude of placed 0
     grounds: dict[str, Any] = field(default_factory=dict)  # what it rests on, and how well
@@ -151,7 +156,8 @@ def place(
         settings: `up` alone turns as little as it takes to make -y the way up. With `length`
             the unit becomes the metre. `gps` gives metres east, north and up; together with `up` it
             decides heading, scale and place only; "exif" takes the positions in the pictures.
-            `align` gives the world of the true poses.
+            `align` gives the world of the true poses, `scan` that of a scan of the place; with
+            it, `up`, `gps` or `pairs` only tell where to look.
         baseline: metres between the lenses and their standard deviation, for a length of "lens".
 
     Raises:
@@ -165,7 +171,7 @@ def place(
     if not (_SCALES[0] <= scale <= _SCALES[1] and far <= _FURTHEST):
         raise GsbaError(
             f"the run would be placed at a scale of {scale:g}, up to {far:g} from the "
-            "origin: check what --scale, --between, --gps or --align say"
+            "origin: check what --scale, --between, --gps, --align or --align-scan say"
         )
     return placement
 
@@ -179,6 +185,8 @@ def _placement(
     """What the settings ask for, however odd."""
     if settings.align is not None:
         return _aligned(reconstruction, frames, Path(settings.align))
+    if settings.scan is not None:
+        return _in_scan(reconstruction, frames, settings)
     placement = Placement()
     if settings.up == "auto":
         placement = _upright(reconstruction, frames)
@@ -216,6 +224,10 @@ def check(
     ways = [settings.length is not None, settings.gps is not None, settings.align is not None]
     if sum(ways) > 1:
         raise GsbaError("--scale, --gps and --align each decide the scale: pass one")
+    if settings.scan is not None and (settings.length is not None or settings.align is not None):
+        raise GsbaError("--align-scan decides the scale: leave out --scale and --align")
+    if settings.pairs is not None and settings.scan is None:
+        raise GsbaError("--pairs are of a run and a scan: give --align-scan SCAN as well")
     if settings.align is not None and settings.up != "none":
         raise GsbaError("--align decides which way is up: leave out --up auto")
     if settings.gps == EXIF:
@@ -225,6 +237,10 @@ def check(
         read_gps(Path(settings.gps))
     if settings.align is not None:
         read_trajectory(Path(settings.align))
+    if settings.scan is not None:
+        check_scan(Path(settings.scan))
+    if settings.pairs is not None:
+        read_pairs(Path(settings.pairs))
 
 
 def _upright(reconstruction: Reconstruction, frames: FrameSet) -> Placement:
@@ -407,6 +423,50 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
     grounds = {"file": str(path), "poses": len(rows), "outliers": int(np.sum(~used)), "rmse": sigma}
     unit = "units of the true poses"
     return Placement(fit, unit=unit, offset=offset, grounds={"align": grounds})
+
+
+def _in_scan(
+    reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings
+) -> Placement:
+    """The world of a scan, what is known of the run's beforehand telling where to look."""
+    assert settings.scan is not None
+    path = Path(settings.scan)
+    guess, grounds, up = Guess(), {}, None
+    axis = UPS[upwards(path)]
+    if settings.pairs is not None:
+        guess = _by_pairs(reconstruction, frames, Path(settings.pairs))
+        grounds = {"pairs": settings.pairs}
+    elif settings.gps is not None:
+        upright = _upright(reconstruction, frames) if settings.up == "auto" else Placement()
+        earth = _on_earth(reconstruction, frames, Path(settings.gps), upright)
+        turn = _least_turn(np.array([0.0, 0, 1]), axis)
+        guess = Guess(scale=earth.similarity.scale, rotation=turn @ earth.similarity.rotation)
+        grounds = earth.grounds
+    elif settings.up == "auto":
+        upright = _upright(reconstruction, frames)
+        guess = Guess(axis=(upright.similarity.rotation.T @ _UP_WORLD, axis))
+        grounds = upright.grounds
+    if settings.up == "auto":
+        up = upwards(path)
+    scan = read_scan(path)
+    with in_file(path):
+        if settings.pairs is not None:
+            guess = guess.without(scan.offset)
+        found = register(cloud_of(reconstruction, normals_of), scan, guess)
+    logger.info("--align-scan %s: %s", path, found)
+    grounds |= {"scan": {"file": str(path), **found.to_json()}}
+    unit = "units of the scan"
+    return Placement(found.fit.similarity, unit, up, scan.offset, grounds=grounds)
+
+
+def _by_pairs(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Guess:
+    """A similarity by picked pairs, in the world of the scan's file."""
+    ends, target = read_pairs(path)
+    source = np.array([_point(end, reconstruction, frames) for end in ends])
+    if extents(source)[1] <= _LEVEL_SPREAD:
+        raise GsbaError(f"{path}: its points lie on a line: pick one beside it")
+    with naming(path):
+        return Guess(similarity=similarity(source, target))
 
 
 def _require_times(path: Path, frames: FrameSet) -> None:

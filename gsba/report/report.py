@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
+from gsba.bundle.triangulation import points_under
 from gsba.disk import atomic_write
 from gsba.geometry import angular_errors, moved_to, quaternion_from_rotation
 from gsba.store.store import StageRecord
@@ -60,19 +61,9 @@ def median_residual_deg(reconstruction: Reconstruction, world_T_rigs: np.ndarray
 
     Each point is placed anew, nearest to the rays of its observations. NaN without observations.
     """
-    frames, points = reconstruction.observation_frames, reconstruction.observation_points
-    if len(frames) == 0:
+    if len(reconstruction.observation_frames) == 0:
         return math.nan
-    lenses = moved_to(world_T_rigs[frames], reconstruction.observation_origins)
-    rotations, centres = lenses[:, :3, :3], lenses[:, :3, 3]
-    rays = np.einsum("oij,oj->oi", rotations, reconstruction.observation_bearings)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # off the ray
-    shape = len(reconstruction.points_world)
-    normal, target = np.zeros((shape, 3, 3)), np.zeros((shape, 3))
-    np.add.at(normal, points, across)
-    np.add.at(target, points, np.einsum("oij,oj->oi", across, centres))
-    normal += 1e-9 * np.eye(3)  # parallel rays leave the depth open
-    placed = np.linalg.solve(normal, target[..., None])[..., 0]
+    placed = points_under(reconstruction, world_T_rigs)
     moved = dataclasses.replace(reconstruction, world_T_rigs=world_T_rigs, points_world=placed)
     return float(np.degrees(np.median(angular_residuals(moved))))
 

@@ -89,7 +89,7 @@ def load_scene(run: Path) -> Scene:
     )
 
 
-_UPS = {"-y": np.array([0.0, -1.0, 0.0]), "z": np.array([0.0, 0.0, 1.0])}
+_UPS = {"-y": np.array([0.0, -1, 0]), "y": np.array([0.0, 1, 0]), "z": np.array([0.0, 0, 1])}
 
 
 def faces_of(

@@ -1,0 +1,118 @@
+"""A round to walk in a space that nobody has described: free of surfaces, above a floor."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d, label
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+
+_CELLS = 90  # of a level's longer side
+_LEVELS = 24  # heights that are tried
+_EYE = (0.25, 0.75)  # of the height from floor to ceiling, where eyes may be
+_MIN_CELLS = 60  # of a level that can be walked
+_STOPS = 6  # that a round passes
+_ROUND = 3.0  # cells, standard deviation of the smoothing that rounds corners
+_DOWN = np.array([0.0, 1.0, 0.0])
+
+
+def free_path(
+    low: np.ndarray,
+    high: np.ndarray,
+    clearance: Callable[[np.ndarray], np.ndarray],
+    seen: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    num: int,
+) -> tuple[np.ndarray | None, float]:
+    """Positions evenly along a closed way at one height, away from surfaces.
+
+    Of all heights, the one with the largest connected room is taken: free, with a floor below that
+    most of the room shares. The way visits stops far from each other, by the shortest ways through
+    what is most open.
+
+    Args:
+        low, high: (3,) corners of the space; x right, y down, z forward.
+        clearance: distances (N,) of points (N, 3) to the next surface.
+        seen: distances (N,) from points (N, 3) along a direction (3,) to a surface; inf = none.
+        num: positions.
+
+    Returns:
+        (num, 3) positions, None where there is no room; and the median clearance.
+    """
+    edge = float(np.max((high - low)[[0, 2]])) / _CELLS
+    x = np.arange(low[0] + edge / 2, high[0], edge)
+    z = np.arange(low[2] + edge / 2, high[2], edge)
+    best, room = 0, None
+    where = at = np.zeros((0, 0, 3))
+    for y in np.linspace(low[1], high[1], _LEVELS + 2)[1:-1]:
+        grid = np.stack(np.meshgrid(x, np.array([y]), z, indexing="ij"), axis=-1).reshape(-1, 3)
+        free = clearance(grid)
+        open_ = _walkable(free, seen(grid, _DOWN), seen(grid, -_DOWN), edge)
+        cells = _rooms(open_.reshape(len(x), len(z)))
+        counts = np.bincount(cells.ravel())
+        counts[0] = 0
+        largest = int(np.argmax(counts))
+        if counts[largest] > best:
+            best, room = int(counts[largest]), cells == largest
+            at = free.reshape(room.shape)
+            where = grid.reshape(*room.shape, 3)
+    if room is None or best < _MIN_CELLS:
+        return None, 0.0
+    way = _round(room, at)
+    points = where[way[:, 0], way[:, 1]]
+    points = gaussian_filter1d(points, _ROUND, axis=0, mode="wrap")
+    points = np.concatenate([points, points[:1]])
+    length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
+    stops = np.linspace(0, length[-1], num, endpoint=False)
+    even = np.stack([np.interp(stops, length, points[:, k]) for k in range(3)], axis=1)
+    return even, float(np.median(clearance(even)))
+
+
+def _walkable(free: np.ndarray, below: np.ndarray, above: np.ndarray, edge: float) -> np.ndarray:
+    """Where (N,) eyes may be: clear of surfaces, above the floor that most of the place has."""
+    part = np.where(np.isfinite(above), below / np.maximum(below + above, 1e-12), 0.5)
+    walkable = (free > 2.5 * edge) & np.isfinite(below) & (part > _EYE[0]) & (part < _EYE[1])
+    if not walkable.any():
+        return walkable
+    return walkable & (np.abs(below - np.median(below[walkable])) < 2 * edge)
+
+
+def _rooms(walkable: np.ndarray) -> np.ndarray:
+    """Numbers (X, Z) of connected parts, 0 = none."""
+    found = label(walkable)
+    assert isinstance(found, tuple)
+    return found[0]
+
+
+def _round(room: np.ndarray, clearance: np.ndarray) -> np.ndarray:
+    """Cells (N, 2) of a closed way through a room (X, Z) bool, by stops far from each other."""
+    cells = np.argwhere(room)
+    number = np.full(room.shape, -1)
+    number[room] = np.arange(len(cells))
+    rows, columns, costs = [], [], []
+    for step in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        to = cells + step
+        inside = (to >= 0).all(axis=1) & (to < room.shape).all(axis=1)
+        there = np.full(len(cells), -1)
+        there[inside] = number[to[inside, 0], to[inside, 1]]
+        linked = np.flatnonzero(there >= 0)
+        rows.append(linked)
+        columns.append(there[linked])
+        costs.append(np.hypot(*step) / clearance[cells[linked, 0], cells[linked, 1]])
+    shape = (len(cells), len(cells))
+    graph = coo_matrix(
+        (np.concatenate(costs), (np.concatenate(rows), np.concatenate(columns))), shape=shape
+    ).tocsr()
+    start = int(np.argmax(clearance[room]))
+    stops = [int(np.argmax(dijkstra(graph, directed=False, indices=start)))]
+    for _ in range(_STOPS - 1):
+        apart = dijkstra(graph, directed=False, indices=stops, min_only=True)
+        stops.append(int(np.argmax(apart)))
+    middle = cells.mean(axis=0)
+    stops.sort(key=lambda n: float(np.arctan2(*(cells[n] - middle))))
+    way: list[int] = []
+    for here, there in zip(stops, [*stops[1:], stops[0]], strict=True):
+        before = dijkstra(graph, directed=False, indices=there, return_predecessors=True)[1]
+        while here != there:
+            way.append(here)
+            here = int(before[here])
+    return cells[np.array(way)]

@@ -1,0 +1,29 @@
+"""Scans of the place by other means: read, and registered with a run's cloud.
+
+Takes a finished result, and a cloud or mesh from a file.
+Gives the similarity between both, what speaks for it, and distances.
+"""
+
+from gsba.scans.distances import Distances, distances_to
+from gsba.scans.files import check_scan, normals_of, read_mesh, read_pairs, read_scan, upwards
+from gsba.scans.registration import Registration, in_file, register
+from gsba.scans.search import Guess
+from gsba.scans.types import Cloud, Scan, cloud_of
+
+__all__ = [
+    "Cloud",
+    "Distances",
+    "Guess",
+    "Registration",
+    "Scan",
+    "check_scan",
+    "cloud_of",
+    "distances_to",
+    "in_file",
+    "normals_of",
+    "read_mesh",
+    "read_pairs",
+    "read_scan",
+    "register",
+    "upwards",
+]

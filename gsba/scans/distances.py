@@ -1,0 +1,58 @@
+"""How far a run's cloud lies off a scan."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gsba.scans.types import Scan
+
+_BINS = 30  # of a histogram
+_ENOUGH = 0.98  # of the cloud, that the histogram spans
+
+
+@dataclass(frozen=True, slots=True)
+class Distances:
+    """Of a cloud's points to the surfaces of a scan."""
+
+    values: np.ndarray  # (N,) float64, unit of the scan
+    explained: float  # share of points on a surface, see `gsba.scans.judge`
+
+    @property
+    def median(self) -> float:
+        """Half of the points are nearer."""
+        return float(np.median(self.values))
+
+    @property
+    def percentile90(self) -> float:
+        """Nine in ten are nearer."""
+        return float(np.quantile(self.values, 0.9))
+
+    def histogram(self, furthest: float) -> tuple[np.ndarray, np.ndarray]:
+        """Counts (B + 1,), the last one of what is further off, and the edges (B + 1,) of bins."""
+        edges = np.linspace(0, furthest, _BINS + 1)
+        counts = np.histogram(self.values, edges)[0]
+        return np.append(counts, np.sum(self.values > furthest)), edges
+
+    def to_json(self, furthest: float) -> dict[str, Any]:
+        """Plain values; the histogram spans distances up to `furthest`."""
+        counts, edges = self.histogram(furthest)
+        return {
+            "points": len(self.values),
+            "median": self.median,
+            "percentile90": self.percentile90,
+            "explained": self.explained,
+            "histogram": {"edges": edges.tolist(), "counts": counts.tolist()},
+        }
+
+
+def distances_to(scan: Scan, points: np.ndarray) -> np.ndarray:
+    """Distances (N,) of points (N, 3) to a scan's surfaces.
+
+    To the plane of the nearest point where that is as near as points of the scan are to each other,
+    so that its spacing adds nothing; else to the point itself.
+    """
+    gaps, nearest = scan.tree.query(points)
+    off = np.einsum("ni,ni->n", scan.normals[nearest], points - scan.points[nearest])
+    along = np.sqrt(np.maximum(gaps**2 - off**2, 0))
+    return np.where(along <= 2 * scan.spacing, np.abs(off), gaps)

@@ -1,0 +1,206 @@
+"""Scans from their files: clouds and meshes by open3d, LAS and LAZ by laspy; normals and features.
+
+The one module that imports open3d.
+"""
+
+import logging
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from gsba.frames.times import read_lines
+from gsba.log import GsbaError, brief
+from gsba.scans.types import Scan
+
+logger = logging.getLogger(__name__)
+
+CLOUDS, MESHES, LASER = (".pcd",), (".obj", ".glb", ".gltf"), (".las", ".laz")
+SUFFIXES = (".ply", *CLOUDS, *LASER, *MESHES)
+_MOST_POINTS = 400_000  # of a thinned scan
+_SAMPLES = 1_000_000  # on a mesh, before it is thinned
+_FAR = 1e4  # coordinates beyond lose digits as float32: an offset is kept apart
+_NEIGHBOURS = 24  # that a normal rests on
+_MIN_POINTS = 1000
+_MIN_PAIRS = 3
+
+
+def open3d() -> ModuleType:
+    """The library, if it is there and its system libraries are.
+
+    Raises:
+        GsbaError: with what to install.
+    """
+    try:
+        import open3d  # pyright: ignore[reportMissingImports]
+    except ModuleNotFoundError as error:
+        raise GsbaError(
+            f"scans need open3d ({error.name} is missing): pip install 'gsba[scan]'"
+        ) from None
+    except (ImportError, OSError) as error:
+        raise GsbaError(
+            f"open3d cannot be loaded ({error}): apt-get install libx11-6 libgl1 libegl1 "
+            "libgomp1 libusb-1.0-0, or what your system calls them"
+        ) from None
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
+    return open3d
+
+
+def upwards(path: Path) -> str:
+    """Which axis of a scan's world points up: y of OBJ and glTF, z of all others."""
+    return "y" if path.suffix.lower() in MESHES else "z"
+
+
+def read_pairs(path: Path) -> tuple[list[str], np.ndarray]:
+    """Picked pairs: what names a point of the run, and points (N, 3) of the scan's file.
+
+    Lines of two columns: a frame, or x,y,z in the run's world; X,Y,Z of the scan.
+
+    Raises:
+        GsbaError: with the line that cannot be used, or there are fewer than three.
+    """
+    ends, points = [], []
+    for number, line in read_lines(path):
+        try:
+            end, text = line.rsplit(maxsplit=1)
+            point = [float(part) for part in text.split(",")]
+        except ValueError:
+            point = []
+        if len(point) != 3 or not np.isfinite(point).all():
+            raise GsbaError(
+                f"{path}:{number}: {brief(line)}: want a frame or x,y,z, and then X,Y,Z of the scan"
+            )
+        ends.append(end)
+        points.append(point)
+    if len(ends) < _MIN_PAIRS:
+        raise GsbaError(f"{path}: holds {len(ends)} pairs; {_MIN_PAIRS} are needed")
+    return ends, np.array(points)
+
+
+def check_scan(path: Path) -> None:
+    """Raise GsbaError where a scan cannot be one: by its name, or what reads it is missing."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise GsbaError(f"{path}: is no scan: give one of {', '.join(SUFFIXES)}")
+    try:
+        with path.open("rb"):
+            pass
+    except OSError as error:
+        raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
+    open3d()
+    if path.suffix.lower() in LASER:
+        _laspy()
+
+
+def read_scan(path: Path) -> Scan:
+    """A scan's surfaces, thinned to some 400,000 points with normals.
+
+    Meshes are sampled evenly over their surfaces. Of clouds, each point left is the mean of a cell,
+    its normal that of the plane through its neighbours.
+
+    Raises:
+        GsbaError: no such file, none that is understood, or too little in it.
+    """
+    check_scan(path)
+    o3d, suffix = open3d(), path.suffix.lower()
+    mesh = None
+    if suffix in MESHES or suffix == ".ply":
+        mesh = read_mesh(path, empty=suffix == ".ply")
+    if mesh is not None:
+        vertices = np.asarray(mesh.vertices)
+        offset = _offset(vertices)
+        mesh.vertices = o3d.utility.Vector3dVector(vertices - offset)
+        o3d.utility.random.seed(0)
+        cloud = mesh.sample_points_uniformly(_SAMPLES, use_triangle_normal=True)
+    else:
+        points, colors = (_of_laser if suffix in LASER else _of_cloud)(path)
+        good = np.isfinite(points).all(axis=1)
+        points, colors = points[good], None if colors is None else colors[good]
+        offset = _offset(points)
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points - offset))
+        if colors is not None:
+            cloud.colors = o3d.utility.Vector3dVector(colors)
+    if len(cloud.points) < _MIN_POINTS:
+        raise GsbaError(f"{path}: holds {len(cloud.points)} points; a scan has {_MIN_POINTS}")
+    cloud = _thinned(cloud)
+    if mesh is None:
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NEIGHBOURS))
+    points, normals = np.array(cloud.points), np.array(cloud.normals)
+    lengths = np.linalg.norm(normals, axis=1)
+    good = np.isfinite(lengths) & (lengths > 0.1)
+    light = np.array(cloud.colors).mean(axis=1)[good] if cloud.has_colors() else None
+    if light is not None and np.ptp(light) == 0:
+        light = None
+    scan = Scan(points[good], normals[good] / lengths[good, None], offset, light)
+    logger.info("%s: %d points, %.3g apart", path, len(points), scan.spacing)
+    return scan
+
+
+def read_mesh(path: Path, empty: bool = False) -> Any:
+    """Triangles of a mesh file with what colours them, as open3d's TriangleMesh.
+
+    Args:
+        empty: give None for a file that has none: it is a cloud.
+
+    Raises:
+        GsbaError: it cannot be read, or holds no triangles.
+    """
+    mesh = open3d().io.read_triangle_mesh(str(path), enable_post_processing=True)
+    if len(mesh.triangles):
+        return mesh
+    if empty:
+        return None
+    raise GsbaError(f"{path}: holds no triangles that open3d can read")
+
+
+def normals_of(points: np.ndarray) -> np.ndarray:
+    """Unit normals (N, 3) of the planes through the neighbours of points (N, 3)."""
+    o3d = open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
+    return np.array(cloud.normals)
+
+
+def _of_cloud(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Points and colours (M, 3) of a PLY or PCD file."""
+    cloud = open3d().io.read_point_cloud(str(path))
+    return np.array(cloud.points), np.array(cloud.colors) if cloud.has_colors() else None
+
+
+def _laspy() -> ModuleType:
+    try:
+        import laspy  # pyright: ignore[reportMissingImports]
+    except ModuleNotFoundError:
+        raise GsbaError("LAS and LAZ need laspy: pip install 'gsba[scan]'") from None
+    return laspy
+
+
+def _of_laser(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Points and colours (M, 3), or intensities in place of these, of a LAS or LAZ file."""
+    laspy = _laspy()
+    try:
+        file = laspy.read(path)
+        names = set(file.point_format.dimension_names)
+        points = np.array(file.xyz, np.float64)
+        seen = ("red", "green", "blue") if {"red", "green", "blue"} <= names else ("intensity",) * 3
+        colors = np.stack([np.asarray(file[name], np.float64) for name in seen], axis=1)
+    except Exception as error:  # of the parser, each in its own words
+        raise GsbaError(f"{path}: cannot be read ({error})") from None
+    return points, colors / max(colors.max(initial=0), 1.0)
+
+
+def _offset(points: np.ndarray) -> np.ndarray:
+    """What is kept apart of large coordinates (3,)."""
+    if not len(points):
+        return np.zeros(3)
+    middle = np.median(points, axis=0)
+    return np.round(middle, -2) if np.abs(middle).max() > _FAR else np.zeros(3)
+
+
+def _thinned(cloud: Any) -> Any:
+    """At most so many points, one for each cell that has some."""
+    extent = float(np.ptp(np.asarray(cloud.points), axis=0).max())
+    cell = extent / 1000
+    while len(cloud.points) > _MOST_POINTS:
+        cloud, cell = cloud.voxel_down_sample(cell), cell * 1.3
+    return cloud

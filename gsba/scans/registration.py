@@ -1,0 +1,151 @@
+"""A cloud onto a scan: all that may be its place is tried, and what the scan says decides."""
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsba.log import GsbaError
+from gsba.scans.fit import Fit, approach, settle
+from gsba.scans.judge import Grid, Verdict, verdict
+from gsba.scans.search import Guess, candidates, distance
+from gsba.scans.types import Cloud, Scan
+from gsba.similarity import Sim3
+
+logger = logging.getLogger(__name__)
+
+_TRIED = 16  # candidates that are laid on the scan
+_JUDGED = 6  # of them, the likeliest, with all of the cloud
+_WIDTH = 0.08  # of the cloud's size: of the loss at first
+_STRAY = 1.2  # of a scale, from candidate to fit: more is a collapse
+_SAME = 0.05  # of the cloud's size: fits nearer than this are one
+_RIVALS = 0.8  # of the best one's share: placements that explain less are none
+_LEAST_SHARE = 0.25  # of the cloud, explained
+_LEAST_AGREEMENT = 0.65  # explained, of what the scan says something about
+_LEAST_LEAD = 3.5  # standard errors over any rival
+
+
+class NoPlacementError(GsbaError):
+    """A cloud has no place in a scan, or several."""
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """Where a cloud is in a scan, and what speaks for it."""
+
+    fit: Fit
+    verdict: Verdict
+    rivals: int  # other placements that explain about as much
+    lead: float  # standard errors over the best of them; infinite = there is none
+
+    def __str__(self) -> str:
+        found, sigmas = self.fit.similarity, self.fit.sigmas
+        lead = f", {self.lead:.1f} sigmas before the next" if self.rivals else ""
+        return (
+            f"{100 * self.verdict.share:.0f} % of the cloud explained{lead}; scale "
+            f"{found.scale:.6g} to {100 * sigmas[6]:.2g} %, place to {max(sigmas[3:6]):.2g} units"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for transform.json and reports."""
+        sigmas = self.fit.sigmas
+        return {
+            "explained": round(self.verdict.share, 4),
+            "contradicted": round(float(self.verdict.contradicted.mean()), 4),
+            "residual_sigma": self.fit.sigma,
+            "scale_sigma": float(sigmas[6] * self.fit.similarity.scale),
+            "rotation_sigmas_deg": np.degrees(sigmas[:3]).tolist(),
+            "translation_sigmas": sigmas[3:6].tolist(),
+            "about": self.fit.middle.tolist(),
+            "rivals": self.rivals,
+            "lead_sigmas": round(self.lead, 2) if self.rivals else None,
+        }
+
+
+@contextmanager
+def in_file(path: Path) -> Iterator[None]:
+    """Say which file a cloud has no place in."""
+    try:
+        yield
+    except NoPlacementError as error:
+        raise GsbaError(f"{path}: {error}") from None
+
+
+def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registration:
+    """The similarity that carries a cloud onto a scan, if there is one and one only.
+
+    Args:
+        guess: what is known beforehand; nothing else is tried.
+
+    Raises:
+        NoPlacementError: no placement explains enough, or several do about as well.
+    """
+    near = _laid(candidates(cloud, scan, guess or Guess(), _TRIED), cloud, scan)
+    grid = Grid(scan)
+    shares = [verdict(fit, cloud, scan, grid, sigma).share for fit, sigma in near]
+    order = np.argsort([-share for share in shares], kind="stable")[:_JUDGED]
+    fits = [settle(near[n][0], cloud, scan, near[n][1]) for n in order]
+    if not fits:
+        raise NoPlacementError("nothing in it resembles the run: " + _ADVICE)
+    sigma = fits[0].sigma  # one for all, so that their likelihoods compare
+    verdicts = [verdict(fit.similarity, cloud, scan, grid, sigma) for fit in fits]
+    best = _best(verdicts)
+    least = _RIVALS * verdicts[best].share
+    leads = [verdicts[best].lead(v) for v in _others(verdicts, best) if v.share >= least]
+    found = Registration(fits[best], verdicts[best], len(leads), min(leads, default=np.inf))
+    for fit, said in zip(fits, verdicts, strict=True):
+        logger.debug(
+            "scale %.5g: %.3f explained, %.3f contradicted, %.1f sigmas behind",
+            fit.similarity.scale,
+            said.share,
+            said.contradicted.mean(),
+            verdicts[best].lead(said),
+        )
+    _check(found)
+    return found
+
+
+_ADVICE = "check that it is of the same place, or tell where: --pairs, --gps or --up auto"
+
+
+def _check(found: Registration) -> None:
+    said = found.verdict
+    if said.share < _LEAST_SHARE or said.agreement < _LEAST_AGREEMENT:
+        raise NoPlacementError(
+            f"no placement explains the run: the best has {100 * said.share:.0f} % of its points "
+            f"on the scan's surfaces, and {100 * said.contradicted.mean():.0f} % contradict it: "
+            + _ADVICE
+        )
+    if found.lead < _LEAST_LEAD:
+        raise NoPlacementError(
+            f"several placements explain the run about equally (the best leads by "
+            f"{found.lead:.1f} standard errors, {_LEAST_LEAD:g} are needed): " + _ADVICE
+        )
+
+
+def _laid(starts: Sequence[Sim3], cloud: Cloud, scan: Scan) -> list[tuple[Sim3, float]]:
+    """Distinct similarities that candidates lead to, and what distances scatter by at each."""
+    near: list[tuple[Sim3, float]] = []
+    for start in starts:
+        fit, sigma = approach(start, cloud, scan, _WIDTH * cloud.size * start.scale)
+        same = (distance(fit, other, cloud) < _SAME for other, _ in near)
+        if 1 / _STRAY < fit.scale / start.scale < _STRAY and not any(same):
+            near.append((fit, sigma))
+    return near
+
+
+def _best(verdicts: Sequence[Verdict]) -> int:
+    """The one that no other with a like share leads; they come by falling share."""
+    best, least = 0, _RIVALS * verdicts[0].share
+    for n, said in enumerate(verdicts):
+        if said.share >= least and said.lead(verdicts[best]) > 0:
+            best = n
+    return best
+
+
+def _others(verdicts: Sequence[Verdict], best: int) -> Iterator[Verdict]:
+    return (said for n, said in enumerate(verdicts) if n != best)

@@ -1,0 +1,202 @@
+"""Where a cloud may be in a scan, roughly: by directions that surfaces share, and by features.
+
+Rooms are told by their planes: both have the same axes, along which the profiles of surfaces
+correlate at one scale and shift. All ways to lay axes on axes are tried, so that rooms which look
+the same turned show it. What has no such planes is told by features.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import permutations, product
+
+import numpy as np
+
+from gsba.scans.types import Cloud, Scan, size_of
+from gsba.similarity import Sim3
+
+_SCALES = (0.125, 2.5)  # of the ratio of both sizes: a cloud is rarely larger than its scan
+_STEP = 1.012  # from scale to scale
+_BINS = 512  # of a profile, over the scan's extent
+_AXIS_DEG = 12.0  # of normals from an axis that they are of
+_PEAKS = 4  # of a correlation, that are tried
+_KEPT = 150  # candidates by profiles, for each way to lay axes on axes
+_NEAR = 0.03  # of the cloud's size: how close a point must come to count for a candidate
+_POINTS = (80, 400)  # of the cloud that judge candidates, and then the better ones
+_TELLING = 300  # better ones
+_APART = 0.15  # of the cloud's size: nearer candidates are one
+
+
+@dataclass(frozen=True, slots=True)
+class Guess:
+    """What is known of a similarity beforehand; None = nothing."""
+
+    similarity: Sim3 | None = None  # near the answer in all
+    scale: float | None = None  # within a tenth
+    axis: tuple[np.ndarray, np.ndarray] | None = None  # unit vectors (3,), cloud and scan: one
+    # is carried to the other, to some degrees
+    rotation: np.ndarray | None = None  # (3, 3), to some degrees
+
+    def without(self, offset: np.ndarray) -> "Guess":
+        """For a scan whose offset (3,) is kept apart."""
+        if self.similarity is None:
+            return self
+        near = self.similarity
+        return replace(self, similarity=replace(near, translation=near.translation - offset))
+
+    def allows(self, candidate: Sim3, turn_deg: float = 15.0) -> bool:
+        """Whether a similarity is none that is known to be wrong."""
+        least = np.cos(np.radians(turn_deg))
+        if self.scale is not None and not 1 / 1.1 < candidate.scale / self.scale < 1.1:
+            return False
+        if self.axis is not None and self.axis[1] @ candidate.rotation @ self.axis[0] < least:
+            return False
+        if self.rotation is None:
+            return True
+        return (np.trace(self.rotation.T @ candidate.rotation) - 1) / 2 >= least
+
+
+def candidates(cloud: Cloud, scan: Scan, guess: Guess, most: int) -> list[Sim3]:
+    """The likeliest similarities of a cloud and a scan, the best first, none twice."""
+    if guess.similarity is not None:
+        return [guess.similarity]
+    found = list(_by_axes(cloud, scan, guess))
+    for points in _POINTS:
+        scores = np.array([score(fit, cloud, scan, points) for fit in found])
+        found = [found[n] for n in np.argsort(-scores, kind="stable")[:_TELLING]]
+    distinct: list[Sim3] = []
+    for fit in found:
+        if all(distance(fit, other, cloud) > _APART for other in distinct):
+            distinct.append(fit)
+        if len(distinct) == most:
+            break
+    return distinct
+
+
+def distance(first: Sim3, second: Sim3, cloud: Cloud) -> float:
+    """How far two similarities carry the cloud's points apart at most, of the first's sizes."""
+    some = _some(cloud.points, 50)
+    apart = np.linalg.norm(first.points(some) - second.points(some), axis=1)
+    return float(np.quantile(apart, 0.9)) / (min(first.scale, second.scale) * cloud.size)
+
+
+def score(fit: Sim3, cloud: Cloud, scan: Scan, points: int = 400) -> float:
+    """Share of some of the cloud's points that have a surface of their normal nearby."""
+    rows = _rows(len(cloud.points), points)
+    reach = _NEAR * cloud.size * fit.scale
+    gaps, nearest = scan.tree.query(fit.points(cloud.points[rows]), distance_upper_bound=reach)
+    found = gaps < reach
+    normals = scan.normals[np.asarray(nearest)[found]]
+    turned = cloud.normals[rows][found] @ fit.rotation.T
+    alike = np.abs(np.einsum("ni,ni->n", normals, turned)) > 0.8
+    return float(np.sum((1 - gaps[found] / reach) * alike)) / len(rows)
+
+
+def _rows(num: int, most: int) -> np.ndarray:
+    """Some of so many, evenly (at random, by one seed)."""
+    return np.sort(np.random.default_rng(0).permutation(num)[:most])
+
+
+def _some(points: np.ndarray, most: int) -> np.ndarray:
+    return points[_rows(len(points), most)]
+
+
+def main_axes(normals: np.ndarray) -> np.ndarray:
+    """Rows (3, 3) of a right-handed frame: the direction most normals share, and the next."""
+    some = _some(normals, 4000)
+    tried = _half_sphere(1500)
+    votes = _votes(some, tried)
+    first = _centred(some, tried[np.argmax(votes)])
+    level = np.abs(tried @ first) < np.sin(np.radians(8))
+    second = _centred(some, tried[np.argmax(np.where(level, votes, -1))])
+    second = second - first * (first @ second)
+    second /= np.linalg.norm(second)
+    return np.stack([first, second, np.cross(first, second)])
+
+
+def _votes(normals: np.ndarray, tried: np.ndarray) -> np.ndarray:
+    cosines = np.abs(tried @ normals.T)
+    return np.sum(np.exp((cosines**2 - 1) / np.radians(5) ** 2 / 2), axis=1)
+
+
+def _centred(normals: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """An axis moved to the middle of the normals around it."""
+    for _ in range(10):
+        near = normals[np.abs(normals @ axis) > np.cos(np.radians(8))]
+        if not len(near):
+            break
+        axis = np.linalg.eigh(near.T @ near)[1][:, 2]
+    return axis
+
+
+def _half_sphere(num: int) -> np.ndarray:
+    """Directions (num, 3) evenly over half the sphere (Fibonacci's lattice)."""
+    z = (np.arange(num) + 0.5) / num
+    turn = np.pi * (1 + np.sqrt(5)) * np.arange(num)
+    flat = np.sqrt(1 - z * z)
+    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+
+
+def _turns() -> Iterator[np.ndarray]:
+    """The 24 rotations (3, 3) that carry axes to axes."""
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        turn = np.zeros((3, 3))
+        turn[range(3), order] = signs
+        if np.linalg.det(turn) > 0:
+            yield turn
+
+
+def _by_axes(cloud: Cloud, scan: Scan, guess: Guess) -> Iterator[Sim3]:
+    """Candidates whose profiles along common axes correlate best, so many for each turn of them."""
+    of_cloud, of_scan = main_axes(cloud.normals), main_axes(scan.normals)
+    here, there = cloud.points @ of_cloud.T, scan.points @ of_scan.T
+    middle, low = np.median(here, axis=0), there.min(axis=0)
+    width = float(np.ptp(there, axis=0).max()) * 1.02 / _BINS
+    if guess.scale is None:
+        low_scale, high_scale = np.array(_SCALES) * size_of(scan.points) / cloud.size
+    else:
+        low_scale, high_scale = guess.scale / 1.1, guess.scale * 1.1
+    scales = np.exp(np.arange(np.log(low_scale), np.log(high_scale), np.log(_STEP)))
+    profiles = [_profile(there[:, j] - low[j], scan.normals @ of_scan[j], width) for j in range(3)]
+    spectra = np.fft.rfft(profiles, 2 * _BINS)
+    values = np.zeros((3, 2, 3, len(scales), _PEAKS))  # by axis, its sign, and axis of the scan
+    shifts = np.zeros_like(values)
+    for i, flip, n in product(range(3), range(2), range(len(scales))):
+        along = (1 - 2 * flip) * scales[n] * (here[:, i] - middle[i])
+        start = along.min()
+        own = _profile(along - start, cloud.normals @ of_cloud[i], width)
+        correlated = np.fft.irfft(np.conj(np.fft.rfft(own, 2 * _BINS)) * spectra, axis=1)
+        values[i, flip, :, n], bins = _peaks(correlated)
+        shifts[i, flip, :, n] = bins * width - start + low[:, None]
+    for turn in _turns():
+        rotation = of_scan.T @ turn @ of_cloud
+        axes = np.argmax(np.abs(turn), axis=1)
+        flips = (turn[range(3), axes] < 0).astype(int)
+        x, y, z = (values[axes[j], flips[j], j] for j in range(3))
+        sums = x[:, :, None, None] + y[:, None, :, None] + z[:, None, None, :]
+        for at in np.argsort(-sums, axis=None, kind="stable")[:_KEPT]:
+            n, *peaks = (int(k) for k in np.unravel_index(at, sums.shape))
+            shift = [shifts[axes[j], flips[j], j, n, peaks[j]] for j in range(3)]
+            moved = of_scan.T @ np.array(shift) - scales[n] * rotation @ (of_cloud.T @ middle)
+            fit = Sim3(float(scales[n]), rotation, moved)
+            if not guess.allows(fit):
+                break
+            yield fit
+
+
+def _peaks(correlated: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The highest maxima (A, _PEAKS) of cyclic correlations (A, 2 _BINS), and their shifts."""
+    higher = np.maximum(np.roll(correlated, 1, axis=1), np.roll(correlated, -1, axis=1))
+    tops = np.where(correlated >= higher, correlated, -1.0)
+    at = np.argsort(-tops, axis=1, kind="stable")[:, :_PEAKS]
+    return np.take_along_axis(tops, at, axis=1), np.where(at < _BINS, at, at - 2 * _BINS)
+
+
+def _profile(along: np.ndarray, cosines: np.ndarray, width: float) -> np.ndarray:
+    """Where along an axis surfaces square to it are (_BINS,), of unit length and mean zero."""
+    facing = np.abs(cosines) > np.cos(np.radians(_AXIS_DEG))
+    bins = (along[facing] / width).astype(np.int64)
+    counts = np.bincount(bins[(bins >= 0) & (bins < _BINS)], minlength=_BINS).astype(np.float64)
+    smooth = np.convolve(counts, [0.25, 0.5, 1, 0.5, 0.25], "same")
+    profile = np.sqrt(smooth)
+    profile -= profile.mean()
+    return profile / max(float(np.linalg.norm(profile)), 1e-12)

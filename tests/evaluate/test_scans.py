@@ -1,0 +1,59 @@
+"""A run measured on a scan: near where its points are, far where they were before."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scan_world import HALL, INTO_SCAN, SIZE, cloud, scan
+
+from gsba.evaluate import scans
+from gsba.evaluate.scans import format_scan, scan_errors
+from gsba.geometry import pose
+from gsba.types import PoseStatus, Reconstruction
+
+
+def _run() -> Reconstruction:
+    """Points of a hall, each seen from three of twelve frames that have one heading."""
+    seen = cloud(SIZE, HALL, 0, num=1500)
+    rng = np.random.default_rng(1)
+    positions = rng.uniform([1, 1.5, 1], [5, 2.4, 1.6], (12, 3))
+    frames = np.sort(rng.permuted(np.tile(np.arange(12), (1500, 1)), axis=1)[:, :3], axis=1).ravel()
+    owners = np.repeat(np.arange(1500), 3)
+    rays = seen.points[owners] - positions[frames]
+    return Reconstruction(
+        pose(np.tile(np.eye(3), (12, 1, 1)), positions),
+        np.full((12, 6, 6), np.nan),
+        np.full(12, PoseStatus.REFINED, np.uint8),
+        seen.points,
+        np.full((1500, 3), 99, np.uint8),
+        np.zeros(1500),
+        owners.astype(np.int32),
+        frames.astype(np.int32),
+        rays / np.linalg.norm(rays, axis=1, keepdims=True),
+        np.full(len(owners), 5e-4),
+    )
+
+
+def test_distances_after_and_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    run, surfaces = _run(), scan(SIZE, HALL, 0, missing=0.0)
+    exact = cloud(SIZE, HALL, 0, num=1500)
+    rows = {tuple(p): n for p, n in zip(exact.points, exact.normals, strict=True)}
+    monkeypatch.setattr(
+        scans, "normals_of", lambda points: np.array([rows[tuple(p)] for p in points])
+    )
+    coarse = run.world_T_rigs.copy()
+    coarse[:, :3, 3] += np.random.default_rng(2).normal(0, 0.05, (12, 3))
+    errors = scan_errors(run, surfaces, coarse)
+    np.testing.assert_allclose(errors.registration.fit.similarity.scale, INTO_SCAN.scale, rtol=1e-3)
+    assert errors.before is not None
+    assert errors.after.median < 0.01 * INTO_SCAN.scale < errors.before.median
+    content = errors.to_json()
+    for part in (content["after"], content["before"]):
+        assert sum(part["histogram"]["counts"]) == part["points"]
+    assert content["registration"]["lead_sigmas"] is None or content["registration"]["rivals"]
+    colors = errors.colors()
+    near, far = np.argmin(errors.after.values), np.argmax(errors.after.values)
+    assert colors[near, 2] > colors[near, 0] and colors[far, 0] > colors[far, 2]
+    assert "before" in format_scan(errors)
+    alone = scan_errors(dataclasses.replace(run), surfaces)
+    assert alone.before is None and alone.to_json()["before"] is None

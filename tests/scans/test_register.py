@@ -1,0 +1,136 @@
+"""A cloud laid on a scan: where it is known to be, and refused where the scan cannot tell."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scan_world import HALL, INTO_SCAN, SIZE, cloud, rectangles, sampled, scan
+from scipy.spatial.transform import Rotation
+
+from gsba.scans.fit import _weighted, moved_by, settle
+from gsba.scans.judge import Grid, verdict
+from gsba.scans.registration import NoPlacementError, register
+from gsba.scans.search import Guess, main_axes
+from gsba.scans.types import Scan
+from gsba.similarity import Sim3, similarity
+
+MOVED = (
+    tuple(
+        (tuple(np.add(low, step)), tuple(np.add(high, step)))
+        for (low, high), step in zip(HALL[:2], ((0.4, 0.6, 0), (-0.8, -0.4, 0)), strict=True)
+    )
+    + HALL[2:]
+)
+OTHER = (((0.7, 2.2, 0.0), (2.1, 2.9, 1.1)), ((3.4, 0.0, 0.0), (3.9, 2.4, 2.2)))
+
+
+def _errors(found: Sim3, true: Sim3) -> tuple[float, float]:
+    """Relative scale, and the largest shift of the room's corners, units of the room."""
+    corners = np.array(np.meshgrid(*[(0, s) for s in SIZE])).reshape(3, -1).T
+    off = np.linalg.norm(found.points(corners) - true.points(corners), axis=1)
+    return abs(found.scale / true.scale - 1), float(off.max()) / true.scale
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_place_is_found_though_a_third_is_missing_and_furniture_moved(seed: int) -> None:
+    """Limits: a thousandth of scale, 5 mm of place; the noise of the scan is 5 mm."""
+    rng = np.random.default_rng([seed, 2])
+    turn = Rotation.random(random_state=seed).as_matrix()
+    into = Sim3(float(np.exp(rng.uniform(-1.5, 1.5))), turn, rng.normal(0, 30, 3))
+    found = register(cloud(SIZE, HALL, seed), scan(SIZE, MOVED, seed, into))
+    scale, place = _errors(found.fit.similarity, into)
+    assert scale < 1e-3 and place < 5e-3
+    assert 0.4 < found.verdict.share < 0.8  # what is missing explains nothing
+    assert found.fit.sigmas[6] < 1e-3 and scale < 6 * found.fit.sigmas[6]
+
+
+def test_chance_has_no_say() -> None:
+    first, second = (register(cloud(SIZE, HALL, 0), scan(SIZE, MOVED, 0)) for _ in range(2))
+    np.testing.assert_array_equal(first.fit.similarity.new_T_old, second.fit.similarity.new_T_old)
+    assert first.lead == second.lead
+
+
+def test_a_room_that_looks_the_same_turned_is_refused_unless_told() -> None:
+    """An empty box: half a turn around each axis changes nothing."""
+    run, surfaces = cloud(SIZE, (), 1), scan(SIZE, (), 1, missing=0.0)
+    with pytest.raises(NoPlacementError, match="several placements explain the run about equally"):
+        register(run, surfaces)
+    sources = np.array([[0.0, 0, 0], [6, 0, 0], [0, 4, 2.6]])
+    picked = INTO_SCAN.points(sources) + np.array([[0.2, -0.1, 0], [0, 0.2, 0.1], [-0.1, 0, 0.2]])
+    found = register(run, surfaces, Guess(similarity=similarity(sources, picked)))
+    assert _errors(found.fit.similarity, INTO_SCAN)[1] < 5e-3
+
+
+def test_colours_tell_what_shapes_do_not() -> None:
+    run, surfaces = cloud(SIZE, (), 2), scan(SIZE, (), 2, missing=0.0)
+    shade = lambda points: np.sin(3 * points[:, 0]) + points[:, 1] * points[:, 2]  # noqa: E731
+    run = replace(run, brightness=shade(run.points))
+    surfaces = replace(surfaces, brightness=shade(INTO_SCAN.points_back(surfaces.points)))
+    found = register(run, surfaces)
+    assert _errors(found.fit.similarity, INTO_SCAN)[1] < 5e-3 and found.rivals > 0
+
+
+@pytest.mark.parametrize("size", [(6.0, 4.0, 2.6), (9.0, 3.0, 3.5)])
+def test_a_wrong_building_is_refused(size: tuple[float, float, float]) -> None:
+    with pytest.raises(NoPlacementError):
+        register(cloud(SIZE, HALL, 3), scan(size, OTHER, 3, missing=0.1))
+
+
+def test_what_is_known_beforehand_rules_the_rest_out() -> None:
+    assert Guess(scale=2.0).allows(Sim3(2.1)) and not Guess(scale=2.0).allows(Sim3(2.5))
+    up = np.array([0.0, 0, 1])
+    turned = Sim3(1.0, Rotation.from_rotvec([0, 0, 2.0]).as_matrix())
+    tipped = Sim3(1.0, Rotation.from_rotvec([2.0, 0, 0]).as_matrix())
+    assert Guess(axis=(up, up)).allows(turned) and not Guess(axis=(up, up)).allows(tipped)
+    assert not Guess(rotation=np.eye(3)).allows(turned)
+
+
+def test_residuals_follow_their_jacobian() -> None:
+    run, surfaces = cloud(SIZE, HALL, 4, num=300), scan(SIZE, HALL, 4, missing=0.0)
+    jacobians, _, weights, carried, middle = _weighted(INTO_SCAN, run, surfaces, 0.02)
+    rows, near = surfaces.tree.query(carried)[1], weights > 0
+    h = 1e-6
+    for k in range(7):
+        sides = []
+        for sign in (-h, h):
+            points = moved_by(INTO_SCAN, sign * np.eye(7)[k], middle).points(run.points)
+            offsets = points - surfaces.points[rows]
+            sides.append(np.einsum("ni,ni->n", surfaces.normals[rows], offsets))
+        numerical = (sides[1] - sides[0]) / (2 * h)
+        np.testing.assert_allclose(jacobians[near, k], numerical[near], atol=1e-7)
+
+
+def test_standard_deviations_are_those_of_errors() -> None:
+    """Over scans of one room: whitened errors of unit size, within what 16 draws tell."""
+    squares = []
+    for seed in range(16):
+        run, surfaces = cloud(SIZE, HALL, seed, num=800), scan(SIZE, HALL, seed, num=8000)
+        fit = settle(INTO_SCAN, run, surfaces, 0.02)
+        scale = np.log(fit.similarity.scale / INTO_SCAN.scale)
+        shift = fit.similarity.points_back(fit.middle[None]) - INTO_SCAN.points_back(
+            fit.middle[None]
+        )
+        shift = INTO_SCAN.scale * INTO_SCAN.rotation @ shift[0]
+        squares.append(np.r_[shift, scale] ** 2 / fit.sigmas[3:] ** 2)
+    assert 0.5 < np.mean(squares) < 2.0
+
+
+def test_rays_through_a_wall_contradict() -> None:
+    """A wall of the scan before what the cloud saw, and none where nothing was scanned."""
+    run = cloud(SIZE, (), 5, num=600, sigma=1e-3)
+    run = replace(run, eyes=np.tile(np.array(SIZE) / 2, (600, 1)))
+    wall = np.array([[[4.5, 0, 0], [0, 4, 0], [0, 0, 2.6], [1, 0, 0]]])
+    points, normals = sampled(np.random.default_rng(0), wall, 4000)
+    said = verdict(Sim3(), run, surfaces := Scan(points, normals), Grid(surfaces), 1e-3)
+    inner = (np.abs(run.points - [6, 2, 1.3]) < [0.01, 1, 0.6]).all(axis=1)
+    assert inner.sum() > 5 and said.contradicted[inner].all() and not said.explained[inner].any()
+    assert not said.contradicted[run.points[:, 0] < 2.0].any()
+
+
+def test_axes_of_a_room_are_its_walls() -> None:
+    turn = Rotation.from_rotvec([0.3, 1.1, -0.6]).as_matrix()
+    normals = sampled(np.random.default_rng(1), rectangles(SIZE, HALL), 3000)[1]
+    noisy = normals + 0.05 * np.random.default_rng(2).standard_normal(normals.shape)
+    noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
+    found = np.abs(main_axes(noisy @ turn.T) @ turn)
+    assert np.sort(found.max(axis=1))[0] > np.cos(np.radians(1)) and np.linalg.det(found) != 0
