@@ -10,10 +10,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import diags_array as diags
-from scipy.sparse.linalg import splu
+from scipy.sparse import bsr_array, csr_array
 
 from factors.bearing import bearing_residuals, tangent_basis
+from factors.cholesky import BlockCholesky
 from factors.elimination import LinearSystem, eliminate
 from factors.robust import RobustLoss
 from gsba.bundle.adjustment import Problem, landmark_block, values_of
@@ -191,16 +191,30 @@ def _without_poses(system: LinearSystem, num_frames: int, curvature: float) -> S
     """Eliminate poses as well."""
     num = 6 * num_frames
     of_poses, across = system.hessian[:num, :num], system.hessian[:num, num:].toarray()
-    diagonal = of_poses.diagonal()
-    damping = diags(np.where(diagonal > 0, _POSE_DAMPING * diagonal, 1.0))
     right = np.column_stack([across, system.gradient[:num]])
-    coupled = right.T @ splu((of_poses + damping).tocsc()).solve(right)
+    coupled = right.T @ _solve_poses(of_poses, right)
     return SharedModel(
         system.cost - 0.5 * float(coupled[-1, -1]),
         system.gradient[num:] - coupled[:-1, -1],
         system.hessian[num:, num:].toarray() - coupled[:-1, :-1],
         curvature,
     )
+
+
+def _solve_poses(of_poses: csr_array, right: np.ndarray) -> np.ndarray:
+    """Poses (6 F, K) that a damped Hessian takes to as many right sides."""
+    blocks = bsr_array(of_poses, blocksize=(6, 6))
+    rows = np.repeat(np.arange(len(blocks.indptr) - 1), np.diff(blocks.indptr))
+    own, upper = rows == blocks.indices, rows < blocks.indices
+    diagonal = np.zeros((len(blocks.indptr) - 1, 6, 6))
+    diagonal[rows[own]] = blocks.data[own]
+    entries = np.einsum("nii->ni", diagonal)
+    entries += np.where(entries > 0, _POSE_DAMPING * entries, 1.0)
+    cholesky = BlockCholesky(len(diagonal), np.column_stack([rows[upper], blocks.indices[upper]]))
+    if not cholesky.factorize(diagonal, blocks.data[upper]):
+        raise ArithmeticError("a damped Hessian of poses is not positive definite")
+    columns = [cholesky.solve(column.reshape(-1, 6)).ravel() for column in right.T]
+    return np.column_stack(columns)
 
 
 def without_points(

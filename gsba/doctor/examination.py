@@ -20,6 +20,7 @@ _WHAT = {
     "splat": "splats on a GPU",
     "view": "a run in the browser",
     "plot": "figures",
+    "imu": "gyros of raw videos",
     "scan": "laser scans and meshes",
 }
 _OWN = Requirement("gsba", "gsba.pipeline.refine", "", NEEDED)
