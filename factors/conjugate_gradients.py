@@ -4,9 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from factors.cholesky import DIM
 from factors.compiled import kernel_and_part
-
-DIM = 6
 
 _kernel, _ = kernel_and_part()
 

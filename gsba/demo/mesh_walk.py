@@ -4,7 +4,6 @@ The truth is in the mesh's world: y up for OBJ and glTF, z up for PLY.
 """
 
 import logging
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,12 @@ import cv2
 import numpy as np
 
 from gsba.camera.sphere import bearings_from_erp
-from gsba.demo.degrade import degrade
 from gsba.demo.free_path import free_path
-from gsba.demo.walk import DemoWalk, check_walk, held_by_hand, write_frames
+from gsba.demo.walk import DemoWalk, check_walk, held_by_hand, walk_folder, write_frames
 from gsba.geometry import pose
 from gsba.log import GsbaError
 from gsba.scans.files import MESHES, open3d, read_mesh, upwards
-from gsba.trajectory.files import read_trajectory, write_tum
+from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory
 
 logger = logging.getLogger(__name__)
@@ -138,16 +136,9 @@ def make_mesh_walk(
     scene = MeshScene(mesh)
     if truth is None:
         truth = _found(scene, mesh, num_frames, seed)
-    partial = out.with_name(f".{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    (partial / "images").mkdir(parents=True)
     logger.info("%s: %d triangles, %d frames", mesh, len(scene.triangles), len(truth.timestamps))
-    write_frames(partial, truth, _pictures(scene, truth, width), seed)
-    write_tum(partial / "groundtruth.tum", truth)
-    write_tum(partial / "slam.tum", degrade(truth, seed))
-    if out.exists():
-        shutil.rmtree(out)
-    partial.rename(out)
+    with walk_folder(out, truth, seed) as partial:
+        write_frames(partial, truth, _pictures(scene, truth, width), seed)
     return DemoWalk(out / "images", out / "groundtruth.tum", out / "slam.tum", None)
 
 

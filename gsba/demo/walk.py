@@ -4,6 +4,7 @@ import csv
 import logging
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -80,23 +81,30 @@ def make_walk(
             raise GsbaError(f"{what} {value!r} is none of {', '.join(get_args(allowed))}")
     check_walk(out, num_frames, width, seed)
     lenses = TwoLenses() if camera == "two-lens" else None
-    partial = out.with_name(f".{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    (partial / "images").mkdir(parents=True)
     truth = walk_poses(path, heading, num_frames, seed)
     scene = build_gallery()
     logger.info("gallery of %d faces, %d frames of %d px", len(scene.corners), num_frames, width)
-    write_frames(partial, truth, _pictures(scene, truth, width, seed, lenses), seed)
-    if lenses is not None:
-        lenses.write(partial / "calibration.json")
-    if depth:
-        _write_depth(partial / "depth", scene, truth, width // 4)
+    with walk_folder(out, truth, seed) as partial:
+        write_frames(partial, truth, _pictures(scene, truth, width, seed, lenses), seed)
+        if lenses is not None:
+            lenses.write(partial / "calibration.json")
+        if depth:
+            _write_depth(partial / "depth", scene, truth, width // 4)
+    return DemoWalk(out / "images", out / "groundtruth.tum", out / "slam.tum", lenses)
+
+
+@contextmanager
+def walk_folder(out: Path, truth: Trajectory, seed: int) -> Iterator[Path]:
+    """Folder to write a walk's images into; with its trajectories it takes the place of `out`."""
+    partial = out.with_name(f".{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    (partial / "images").mkdir(parents=True)
+    yield partial
     write_tum(partial / "groundtruth.tum", truth)
     write_tum(partial / "slam.tum", degrade(truth, seed))
     if out.exists():
         shutil.rmtree(out)
     partial.rename(out)
-    return DemoWalk(out / "images", out / "groundtruth.tum", out / "slam.tum", lenses)
 
 
 def walk_poses(path: WalkPath, heading: Heading, num_frames: int, seed: int) -> Trajectory:
