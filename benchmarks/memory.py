@@ -21,6 +21,7 @@ from gsba.frames import panorama
 from gsba.frames.scan import scan
 from gsba.geometry import pose
 from gsba.photometric import alignment
+from gsba.store.shards import Threads
 from gsba.types import Counts, Keypoints, Landmarks, Tracks
 
 POINTS, DISTANCE = 60, 1e4  # of each frame, and how far they are: no parallax, so no shift is wrong
@@ -81,7 +82,7 @@ def run(folder: Path, num_threads: int) -> dict[str, float]:
     greys = panorama.Greys(frames, settings.max_width)
     before = peak_mb()
     sighted = alignment.align(
-        landmarks, poses, keypoints, 1.0, greys, rig, "align", None, settings, num_threads
+        landmarks, poses, keypoints, 1.0, greys, rig, "align", None, settings, Threads(num_threads)
     )
     kept, received = sighted.counts.kept, sighted.counts.received
     return {"frames": len(frames), "before_mb": before, "peak_mb": peak_mb(),

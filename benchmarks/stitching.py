@@ -58,7 +58,7 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
     greys = panorama.Greys(frames, settings.patches.max_width)
     priors = prior_factors.build(start.world_T_rigs, settings.priors)
     used, held = split(start.landmarks, settings.seed)
-    none, threads = SphereField.none(), 2
+    none, threads, workers = SphereField.none(), 2, Threads(2)
     problem = adjustment.Problem(priors, rig, settings, threads)
 
     bearing = adjustment.adjust(
@@ -70,7 +70,7 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
         for number in (1, 2):
             sighted = alignment.align(
                 solved.landmarks, solved.world_T_rigs, observed, solved.noise, greys, rig,
-                f"{name} {number}", aligned, settings.patches, threads, field,
+                f"{name} {number}", aligned, settings.patches, workers, field,
             )  # fmt: skip
             there = replace(sighted, keypoints=stitching.corrected(sighted.keypoints, field, rig))
             solved, found = adjustment.adjust_sighted(
@@ -89,7 +89,7 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
     placed = place(last, held.tracks, keypoints, settings)
     sighted = alignment.align(
         placed, last.solved.world_T_rigs, keypoints, start.noise, greys, rig, "held out", None,
-        settings.patches, threads, last.field,
+        settings.patches, workers, last.field,
     )  # fmt: skip
     return variants, sighted
 

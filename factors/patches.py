@@ -1,5 +1,7 @@
 """Patches of panoramas, aligned to other panoramas: sub-pixel sightings with their covariance."""
 
+import copy
+
 import numpy as np
 
 from factors._patch_kernels import align_templates, cut_templates
@@ -64,6 +66,18 @@ class PatchSet:
             np.zeros((num, 8, 8), np.float32),
             np.full(num, FLAT, np.uint8),
         )
+
+    def taken(self, rows: np.ndarray) -> "PatchSet":
+        """Some of the templates (T',), by their rows."""
+        found, whole = copy.copy(self), self.templates
+        found.templates = whole._replace(
+            grey=whole.grey[rows],
+            by_x=whole.by_x[rows],
+            by_y=whole.by_y[rows],
+            inverses=whole.inverses[rows],
+            states=whole.states[rows],
+        )
+        return found
 
     def cut(
         self,

@@ -1,6 +1,7 @@
 """Settings: one frozen model per stage, defaults that run a sensible job with no file."""
 
 import logging
+import os
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -316,6 +317,10 @@ class SolverSettings(_Settings):
     loss_sigmas: float = Field(default=1.0, gt=0)  # scale of the loss, standard deviations
     lambda_initial: float = Field(default=1e-4, gt=0)  # damping, part of the diagonal
     num_threads: int | None = Field(default=None, ge=1)  # None = all cores
+
+    def threads(self) -> int:
+        """How many to use."""
+        return self.num_threads or os.cpu_count() or 1
 
 
 class PhotometricSettings(_Settings):

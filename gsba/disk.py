@@ -2,7 +2,7 @@
 
 import errno
 import json
-import os
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -39,7 +39,8 @@ def atomic_write(path: Path, write: Callable[[Path], object]) -> None:
     Raises:
         GsbaError: full disk, no permission and the like.
     """
-    temporary = path.with_name(f"{_TEMPORARY}{os.getpid()}-{path.name}")
+    # Processes of several machines may write the same file at a time.
+    temporary = path.with_name(f"{_TEMPORARY}{uuid.uuid4().hex[:8]}-{path.name}")
     with disk_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:

@@ -92,14 +92,19 @@ class FrameSet:
         """Pixels across a 90-degree face that is as dense as the frames."""
         return self.width // 4 if self.panoramic else self.width
 
-    def taken(self, rows: np.ndarray) -> "FrameSet":
-        """Some of the frames (F',), ascending."""
+    def taken(self, rows: np.ndarray, absolute: bool = False) -> "FrameSet":
+        """Some of the frames (F',), ascending; with absolute paths for other processes."""
+        paths = tuple(self.paths[f] for f in rows)
+        mask_paths = tuple(self.mask_paths[f] for f in rows)
+        if absolute:
+            paths = tuple(tuple(path.absolute() for path in group) for group in paths)
+            mask_paths = tuple(path and path.absolute() for path in mask_paths)
         return replace(
             self,
             names=tuple(self.names[f] for f in rows),
-            paths=tuple(self.paths[f] for f in rows),
+            paths=paths,
             timestamps=self.timestamps[rows],
-            mask_paths=tuple(self.mask_paths[f] for f in rows),
+            mask_paths=mask_paths,
         )
 
 

@@ -66,6 +66,14 @@ Imu = Annotated[
         metavar="FILE",
     ),
 ]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        help="Dask scheduler whose workers do what can be shared out: tcp://HOST:PORT, its "
+        "FILE.json, local:N, slurm:N, ...",
+        metavar="ADDRESS",
+    ),
+]
 Segment = Annotated[
     str | None,
     typer.Option(help="Your own masks of faces: called with IMAGES MASKS.", metavar="COMMAND"),
@@ -105,6 +113,7 @@ def refine(
     weights: Weights = None,
     accept_noncommercial: Consent = False,
     download: Download = False,
+    cluster: Cluster = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="Replace an earlier run.")] = False,
 ) -> None:
     """Refine the pose of every frame; the same call again resumes."""
@@ -131,6 +140,7 @@ def refine(
         calibration=calibration,
         imu=imu,
         fresh=fresh,
+        cluster=cluster,
     )
     typer.echo(_summary(out))
 

@@ -1,7 +1,7 @@
 """Features of every frame of a run, stored frame by frame."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +11,48 @@ from gsba.config import RefineSettings
 from gsba.features import detection
 from gsba.features.detection import Extractor
 from gsba.frames import cubemap
+from gsba.store.shards import StoredRecords
 from gsba.store.store import PerFrame, RunStore, fingerprint
 from gsba.types import Features, FrameSet
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFeatures:
+    """Features of frames by index, read from where they are stored."""
+
+    found: Sequence[PerFrame[Features]]  # (F,) which of several extractions holds each frame
+    names: tuple[str, ...]  # (F,)
+
+    def __call__(self, frame: int) -> Features:
+        return self.found[frame][self.names[frame]]
+
+    def taken(self, frames: Iterable[int]) -> Callable[[int], Features]:
+        """Those of some frames, as workers elsewhere can read them."""
+        paths: dict[int, Path] = {}
+        keys: dict[int, str] = {}
+        for frame in frames:
+            stored = self.found[frame].records({frame: self.names[frame]})
+            paths |= stored.paths
+            keys |= stored.keys
+        return StoredRecords(paths, keys, Features)
+
+
+@dataclass(frozen=True, slots=True)
+class _Extraction:
+    """Finds the features of a frame; image and mask are read, cut and released."""
+
+    frames: FrameSet
+    index: Mapping[str, int]
+    rig: CubeRig
+    make_extractor: Callable[[], Extractor]
+
+    def __call__(self, name: str) -> Features:
+        images, masks = cubemap.load(self.frames, self.index[name], self.rig)
+        return detection.extract(images, masks, self.rig, self.make_extractor())
+
+    def taken(self, names: Sequence[str]) -> "_Extraction":
+        frames = self.frames.taken(np.array([self.index[name] for name in names]), absolute=True)
+        return replace(self, frames=frames, index={name: f for f, name in enumerate(names)})
 
 
 def extract(
@@ -20,7 +60,6 @@ def extract(
     frames: FrameSet,
     rig: CubeRig,
     settings: RefineSettings,
-    num_threads: int,
     make_extractor: Callable[[], Extractor],
     files: Sequence[Path],
     name: str = "features",
@@ -30,7 +69,6 @@ def extract(
 
     Args:
         store, frames, rig, settings: of the run.
-        num_threads: frames treated at a time.
         make_extractor: makes what finds keypoints, for each frame.
         files: that it depends on: weights of a learned one.
         name: of the stage.
@@ -44,14 +82,11 @@ def extract(
     }
     chosen = settings.features
 
-    def compute(frame: str) -> Features:
-        images, masks = cubemap.load(frames, index[frame], rig)
-        return detection.extract(images, masks, rig, make_extractor())
-
+    compute = _Extraction(frames, index, rig, make_extractor)
     inputs = {
         frame: fingerprint([*frames.paths[f], frames.mask_paths[f]]) for frame, f in index.items()
     }
     relevant = chosen.model_dump(exclude={"weights", "accept_noncommercial", "download"})
     cut = [] if frames.fisheyes is None else [list(map(asdict, frames.fisheyes))]
     key = [settings.cubemap, relevant, fingerprint(files), *cut]
-    return store.per_frame(name, key, inputs, compute, Features, num_threads=num_threads)
+    return store.per_frame(name, key, inputs, compute, Features)

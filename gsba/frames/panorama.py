@@ -61,9 +61,16 @@ class Greys:
 
     def __init__(self, frames: FrameSet, max_width: int, limit_mb: float = 128.0) -> None:
         self.num_frames, self.width = len(frames), width_for(frames, max_width)
-        self._frames = frames
+        self._frames, self._limit_mb = frames, limit_mb
         self._room = int(limit_mb * 2**20 / self.width**2)  # images of width^2 / 2, and masks
         self._kept: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
+
+    def __reduce__(self) -> tuple[object, ...]:  # pictures are read again
+        return Greys, (self._frames, self.width, self._limit_mb)
+
+    def taken(self, chosen: np.ndarray) -> "Greys":
+        """Those of some frames (F',), ascending, as workers elsewhere can read them."""
+        return Greys(self._frames.taken(chosen, absolute=True), self.width, self._limit_mb)
 
     def __getitem__(self, frame: int) -> tuple[np.ndarray, np.ndarray | None]:
         """As `load_grey`, from any thread."""

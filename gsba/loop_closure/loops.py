@@ -45,7 +45,8 @@ def close(context: MatchContext, solved: Solution, unseen: np.ndarray) -> Closed
         unseen: (F - 1,) bool, steps that no images confirm: they may be off by their length.
     """
     settings, keypoints = context.settings, context.keypoints
-    looks = looks_of(context.strongest, len(solved.world_T_rigs), settings.seed)
+    num = len(solved.world_T_rigs)
+    looks = looks_of(context.strongest, num, settings.seed, context.workers)
     chosen = candidates(looks, solved, unseen, settings)
     strongest = replace(context, frames=context.strongest)
     verified = recovery.match_anywhere(strongest, chosen, MIN_SHARE)

@@ -78,7 +78,7 @@ class _Joining:
         self.context, self.solved, self.parts = context, solved, parts
         self.held, self.ties = held, ties
         self.times, self.depth = timestamps, solved.median_depth()
-        self.looks = looks_of(context.strongest, num, context.settings.seed)
+        self.looks = looks_of(context.strongest, num, context.settings.seed, context.workers)
         self.poses = solved.world_T_rigs.copy()
         self.known = solved.points_by_keypoint(context.keypoints)  # rig frames, own units
         self.moves = [Sim3()] * num  # of each frame, so far

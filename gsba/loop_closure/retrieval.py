@@ -4,26 +4,80 @@ Looks are compared as vectors of locally aggregated descriptors (VLAD: Jegou et 
 normalised word by word as in Arandjelovic and Zisserman, CVPR 2013) over whole panoramas.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
 import numpy as np
 from scipy.sparse import csr_matrix
 
 from gsba.matching.guided_search import SearchableFrames
+from gsba.store.shards import Workers, blocks_of_frames
 
 _WORDS = 64  # of the vocabulary
 _SAMPLES = 20_000  # descriptors it is made from
 _ROUNDING = 1e-5  # of descriptors, float32 and of length one: a shorter sum has no direction
 
 
-def looks_of(frames: SearchableFrames, num_frames: int, seed: int) -> np.ndarray:
+def looks_of(frames: SearchableFrames, num_frames: int, seed: int, workers: Workers) -> np.ndarray:
     """What each panorama looks like, whatever its heading: (F, D) float32 of length one."""
-    rng = np.random.default_rng(seed)
     share = max(_SAMPLES // max(num_frames, 1), 8)
-    sample = np.concatenate(
-        [rng.permutation(frames[f].descriptors)[:share] for f in range(num_frames)]
-    )
-    words = _words(sample, rng)
-    looks = [_aggregate(frames[f].descriptors, words) for f in range(num_frames)]
-    return np.array(looks, np.float32)
+    samples = _SampleJob(frames, np.arange(num_frames), share, seed)
+    sample = np.concatenate(list(workers.map_shards(samples)))
+    words = _words(sample, np.random.default_rng(seed))
+    looks = workers.map_shards(_LookJob(frames, np.arange(num_frames), words))
+    return np.array(list(looks), np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class _SampleJob:
+    """The job of drawing descriptors of each frame."""
+
+    frames: SearchableFrames
+    chosen: np.ndarray  # (F,) frames
+    share: int  # descriptors of each
+    seed: int
+    title: str = "sampling"
+    returns: Any = np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.chosen)
+
+    def __call__(self, item: int) -> np.ndarray:
+        frame = int(self.chosen[item])
+        rng = np.random.default_rng([self.seed, frame])
+        return rng.permutation(self.frames[frame].descriptors)[: self.share]
+
+    def blocks(self) -> Sequence[tuple[int, int]]:
+        return blocks_of_frames(self.chosen)
+
+    def part(self, start: int, stop: int) -> "_SampleJob":
+        chosen = self.chosen[start:stop]
+        return replace(self, chosen=chosen, frames=self.frames.taken(chosen.tolist()))
+
+
+@dataclass(frozen=True, slots=True)
+class _LookJob:
+    """The job of aggregating the descriptors of each frame."""
+
+    frames: SearchableFrames
+    chosen: np.ndarray  # (F,) frames
+    words: np.ndarray  # (W, D)
+    title: str = "looks"
+    returns: Any = np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.chosen)
+
+    def __call__(self, item: int) -> np.ndarray:
+        return _aggregate(self.frames[int(self.chosen[item])].descriptors, self.words)
+
+    def blocks(self) -> Sequence[tuple[int, int]]:
+        return blocks_of_frames(self.chosen)
+
+    def part(self, start: int, stop: int) -> "_LookJob":
+        chosen = self.chosen[start:stop]
+        return replace(self, chosen=chosen, frames=self.frames.taken(chosen.tolist()))
 
 
 def _words(sample: np.ndarray, rng: np.random.Generator, rounds: int = 12) -> np.ndarray:

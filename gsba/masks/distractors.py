@@ -8,7 +8,7 @@ neighbours could have seen it.
 """
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -22,7 +22,9 @@ from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp
 from gsba.geometry import inverse
 from gsba.masks import _distractor_kernels
-from gsba.types import FrameSet, Landmarks
+from gsba.store.shards import StoredRecords
+from gsba.store.store import PerFrame
+from gsba.types import FrameSet, Landmarks, Tracks
 
 _WIDTH = 512  # pixels across the panoramas that are compared
 _NEIGHBOURS = 6
@@ -69,6 +71,31 @@ def distractor_mask(found: Distractors) -> np.ndarray:
     return distractor_weights(found) == 0
 
 
+@dataclass(frozen=True, slots=True)
+class KnownMasks:
+    """What an earlier look found: (h, 2h) bool, True = distractor, by frame."""
+
+    found: PerFrame[Distractors]
+    names: tuple[str, ...]  # (F,)
+
+    def __call__(self, frame: int) -> np.ndarray:
+        return distractor_mask(self.found[self.names[frame]])
+
+    def taken(self, chosen: Sequence[int]) -> "_StoredMasks":
+        """Those of some frames, renumbered, as workers elsewhere can read them."""
+        return _StoredMasks(self.found.records({n: self.names[f] for n, f in enumerate(chosen)}))
+
+
+@dataclass(frozen=True, slots=True)
+class _StoredMasks:
+    """The same from files alone."""
+
+    records: StoredRecords[Distractors]
+
+    def __call__(self, frame: int) -> np.ndarray:
+        return distractor_mask(self.records(frame))
+
+
 class StaticScene:
     """A solved map, ready to be asked frame by frame, from any thread.
 
@@ -81,6 +108,7 @@ class StaticScene:
         known: distractors (h, w) bool of a frame found before: they explain and accuse nobody, and
             stay what they are where too few neighbours are left to tell.
         limit_mb: of memory.
+        neighbours: of frames that will be asked for, where others are left out.
     """
 
     def __init__(
@@ -90,8 +118,10 @@ class StaticScene:
         landmarks: Landmarks,
         known: Callable[[int], np.ndarray] | None = None,
         limit_mb: float = 256.0,
+        neighbours: Mapping[int, np.ndarray] | None = None,
     ) -> None:
         self._frames, self._poses, self._landmarks = frames, world_T_rigs, landmarks
+        self._limit_mb, self._known_neighbours = limit_mb, neighbours or {}
         whole = frames.panoramic
         self.width = min(_WIDTH, frames.width) if whole else panorama.width_for(frames, _WIDTH)
         self._known, self._rays = known, _rays(self.width)
@@ -102,6 +132,38 @@ class StaticScene:
         order = np.argsort(tracks.frames, kind="stable")
         starts = np.searchsorted(tracks.frames[order], np.arange(len(frames) + 1))
         self._seen = [np.unique(tracks.points[order[a:b]]) for a, b in pairwise(starts)]
+
+    def __reduce__(self) -> tuple[object, ...]:  # pictures are read again
+        own = self._frames, self._poses, self._landmarks, self._known
+        return StaticScene, (*own, self._limit_mb, self._known_neighbours)
+
+    def taken(self, chosen: Sequence[int]) -> tuple["StaticScene", dict[int, int]]:
+        """The scene that some frames need, as workers elsewhere can look at it.
+
+        Returns:
+            It, and the number there of each of its frames.
+        """
+        near = {frame: self._neighbours(frame) for frame in chosen}
+        rows = np.unique(np.concatenate([np.array(chosen, np.int64), *near.values()]))
+        number = {int(row): n for n, row in enumerate(rows)}
+        tracks = self._landmarks.tracks
+        shown = np.isin(tracks.frames, rows)
+        points, renumbered = np.unique(tracks.points[shown], return_inverse=True)
+        own_frames = np.searchsorted(rows, tracks.frames[shown]).astype(np.int32)
+        own = Tracks(renumbered.astype(np.int32), own_frames, tracks.keypoints[shown], len(points))
+        places = self._landmarks.points_world[points]
+        known = self._known
+        if isinstance(known, KnownMasks):
+            known = known.taken(rows.tolist())
+        scene = StaticScene(
+            self._frames.taken(rows, absolute=True),
+            self._poses[rows],
+            Landmarks(places, own, self._landmarks.counts),
+            known,
+            self._limit_mb,
+            {number[f]: np.searchsorted(rows, others) for f, others in near.items()},
+        )
+        return scene, number
 
     def find(self, frame: int) -> Distractors:
         """Distractors in one frame."""
@@ -130,6 +192,8 @@ class StaticScene:
 
     def _neighbours(self, frame: int) -> np.ndarray:
         """The frames that share most points, most first."""
+        if frame in self._known_neighbours:
+            return self._known_neighbours[frame]
         inside = np.zeros(len(self._landmarks.points_world), bool)
         inside[self._seen[frame]] = True
         shared = np.array([np.count_nonzero(inside[seen]) for seen in self._seen])
@@ -301,3 +365,19 @@ def _unwrapped(image: np.ndarray) -> np.ndarray:
 
 def _averaged(image: np.ndarray) -> np.ndarray:
     return _unwrapped(cv2.blur(_wrapped(image), (_PATCH, _PATCH), borderType=cv2.BORDER_REPLICATE))
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Finds the distractors of a frame by its name."""
+
+    scene: StaticScene
+    numbers: Mapping[str, int]  # of the scene's frames
+
+    def __call__(self, name: str) -> Distractors:
+        return self.scene.find(self.numbers[name])
+
+    def taken(self, names: Sequence[str]) -> "Look":
+        """What some frames need of it; see `gsba.store.store.Taken`."""
+        scene, number = self.scene.taken([self.numbers[name] for name in names])
+        return Look(scene, {name: number[self.numbers[name]] for name in names})

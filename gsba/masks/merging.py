@@ -17,7 +17,13 @@ from gsba.frames.masks import levels_of, load_mask, load_weights
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
 from gsba.masks.carrier import Carrier, carrier_mask, find_carrier, write_carrier
-from gsba.masks.distractors import Distractors, StaticScene, distractor_mask, distractor_weights
+from gsba.masks.distractors import (
+    Distractors,
+    KnownMasks,
+    Look,
+    StaticScene,
+    distractor_weights,
+)
 from gsba.masks.segmentation import Segment, load_segmented, segmented
 from gsba.store.store import PerFrame, RunStore, fingerprint
 from gsba.types import Counts, FrameSet, Solution
@@ -84,7 +90,7 @@ def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
 
 
 def after(
-    store: RunStore, frames: FrameSet, solved: Solution, stage: str, num_threads: int
+    store: RunStore, frames: FrameSet, solved: Solution, stage: str
 ) -> tuple[FrameSet, Counts]:
     """Frames without what no static scene explains.
 
@@ -94,27 +100,15 @@ def after(
     Args:
         solved: a first solution.
         stage: its name.
-        num_threads: frames looked at at a time.
     """
     items = dict.fromkeys(frames.names)
-    index = {name: f for f, name in enumerate(frames.names)}
 
-    def look(name: str, known: PerFrame[Distractors] | None) -> PerFrame[Distractors]:
-        def of(f: int) -> np.ndarray:
-            assert known is not None
-            return distractor_mask(known[frames.names[f]])
-
-        removed = None if known is None else of
-        scene = StaticScene(frames, solved.world_T_rigs, solved.landmarks, removed)
-        return store.per_frame(
-            name,
-            None,
-            items,
-            lambda frame: scene.find(index[frame]),
-            Distractors,
-            [stage] if known is None else ["distractors1"],
-            num_threads,
-        )
+    def look(name: str, before: PerFrame[Distractors] | None) -> PerFrame[Distractors]:
+        known = None if before is None else KnownMasks(before, frames.names)
+        scene = StaticScene(frames, solved.world_T_rigs, solved.landmarks, known)
+        compute = Look(scene, {frame: f for f, frame in enumerate(frames.names)})
+        behind = [stage] if known is None else ["distractors1"]
+        return store.per_frame(name, None, items, compute, Distractors, behind)
 
     found = look("distractors", look("distractors1", None))
     results = [found[name] for name in frames.names]

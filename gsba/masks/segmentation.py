@@ -73,7 +73,7 @@ def segmented(store: RunStore, frames: FrameSet, segment: Segment) -> PerFrame[S
 
     key = [uuid.uuid4().hex if callable(segment) else segment, size]
     items = {name: fingerprint(frames.paths[f]) for name, f in index.items()}
-    found = store.per_frame("segmented", key, items, compute, Segmented)
+    found = store.per_frame("segmented", key, items, compute, Segmented, alone=True)
     shutil.rmtree(folder, ignore_errors=True)
     return found
 

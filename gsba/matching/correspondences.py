@@ -119,16 +119,16 @@ def verified(
     context: MatchContext,
 ) -> VerifiedPairs:
     """Matches whose geometry holds: see `verification.verify`."""
-    settings, threads = context.settings, context.num_threads
+    settings, workers = context.settings, context.workers
     return verification.verify(
-        found, context.keypoints, f0_T_f1s, sigmas, settings.verify, settings.seed, threads
+        found, context.keypoints, f0_T_f1s, sigmas, settings.verify, settings.seed, workers
     )
 
 
 def _estimates(found: Matches, context: MatchContext) -> list[verification.Estimate | None]:
     """The geometry of each pair, whatever the trajectory says."""
-    settings, threads = context.settings, context.num_threads
-    return verification.estimate(found, context.keypoints, settings.verify, settings.seed, threads)
+    settings, workers = context.settings, context.workers
+    return verification.estimate(found, context.keypoints, settings.verify, settings.seed, workers)
 
 
 def _shares(found: Matches, kept: VerifiedPairs) -> np.ndarray:

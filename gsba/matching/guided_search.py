@@ -5,21 +5,21 @@ A point seen along `a` in frame 0 must lie, in frame 1, on the great circle thro
 never compared: this is the speed, and the defence against repeated structure.
 """
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from threading import Lock
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import RIG_R_FACE, owner_faces
 from gsba.config import MatchingSettings, RefineSettings
+from gsba.features.extraction import FrameFeatures
 from gsba.geometry import inverse
-from gsba.log import track
 from gsba.matching._search_kernels import HEAD, Cells, Limits, Rows, passes, search
+from gsba.store.shards import Workers, blocks_of_frames
 from gsba.types import Features, Keypoints, Matches
 
 _CELLS = 8  # cells along a face's side
@@ -243,6 +243,7 @@ class SearchableFrames:
         load: reads the features of a frame.
         strongest: keypoints of a face to match, None for all.
         capacity: frames kept in memory.
+        axes: that descriptors are searched in, see `searchable`; None = those of frame 0.
     """
 
     def __init__(
@@ -250,13 +251,26 @@ class SearchableFrames:
         load: Callable[[int], Features],
         strongest: int | None = None,
         capacity: int = 96,
+        axes: np.ndarray | None = None,
     ) -> None:
-        first = load(0)
-        axes = principal_axes(first.descriptors) if len(first) else None
+        if axes is None:
+            first = load(0)
+            axes = principal_axes(first.descriptors) if len(first) else None
         self._get = lru_cache(capacity)(lambda frame: searchable(load(frame), axes, strongest))
         self._features = lru_cache(max(capacity // 8, 2))(load)
+        self._load, self._axes, self._capacity = load, axes, capacity
         self._lock = Lock()
         self.strongest = strongest
+
+    def __reduce__(self) -> tuple[type, tuple[object, ...]]:
+        return SearchableFrames, (self._load, self.strongest, self._capacity, self._axes)
+
+    def taken(self, frames: Iterable[int]) -> "SearchableFrames":
+        """Some of them, as workers elsewhere can read them."""
+        load = self._load
+        if isinstance(load, FrameFeatures):
+            load = load.taken(frames)
+        return SearchableFrames(load, self.strongest, self._capacity, self._axes)
 
     def __getitem__(self, frame: int) -> Searchable:
         with self._lock:
@@ -289,7 +303,7 @@ class MatchContext:
     strongest: SearchableFrames  # the same with the strongest keypoints only
     keypoints: Keypoints  # of all frames
     settings: RefineSettings  # of pairs, matching and verification
-    num_threads: int  # pairs matched at a time
+    workers: Workers  # who match pairs
     matcher: Matcher = guided  # compares two frames
     lenses: Lenses = field(default_factory=Lenses)  # that keypoints are seen through
 
@@ -310,7 +324,7 @@ class MatchContext:
                 for gate, (_, f1) in zip(gates, pairs, strict=True)
             ]
         frames = self.strongest if strongest else self.frames
-        how = self.settings.matching, self.num_threads
+        how = self.settings.matching, self.workers
         matcher = guided if guided_only else self.matcher
         return match(pairs, world_T_rigs, gates, frames, *how, points_rig, matcher)
 
@@ -321,7 +335,7 @@ def match(
     gates: Sequence[Gate],
     frames: SearchableFrames,
     settings: MatchingSettings,
-    num_threads: int,
+    workers: Workers,
     points_rig: Sequence[np.ndarray] | None = None,
     matcher: Matcher = guided,
 ) -> Matches:
@@ -333,21 +347,58 @@ def match(
         gates: (P) how far to trust the prediction.
         frames: features.
         settings: similarity and distinctiveness.
-        num_threads: pairs matched at a time.
+        workers: who do it.
         points_rig: (F) arrays (K_f, 3), see `match_pair`; frame 0 of a pair must be known.
         matcher: compares two frames.
     """
     f0_T_f1s = inverse(world_T_rigs[pairs[:, 0]]) @ world_T_rigs[pairs[:, 1]]
-
-    def match_pair(p: int) -> np.ndarray:
-        f0, f1 = (int(f) for f in pairs[p])
-        points = None if points_rig is None else points_rig[f0]
-        return matcher(frames, (f0, f1), f0_T_f1s[p], gates[p], settings, points)
-
     order = np.lexsort((pairs[:, 1], pairs[:, 0]))  # pairs that share frames follow one another
+    points = None
+    if points_rig is not None:
+        points = {int(f0): points_rig[f0] for f0 in np.unique(pairs[:, 0])}
+    chosen = [gates[p] for p in order]
+    job = _PairJob(pairs[order], f0_T_f1s[order], chosen, frames, settings, points, matcher)
     rows = [_NO_MATCHES] * len(pairs)
-    with ThreadPoolExecutor(num_threads) as pool:
-        found = track(pool.map(match_pair, order), "matching", len(pairs))
-        for p, matched in zip(order, found, strict=True):
-            rows[p] = matched
+    for p, matched in zip(order, workers.map_shards(job), strict=True):
+        rows[p] = matched
     return Matches.of_rows(np.asarray(pairs, np.int32).reshape(-1, 2), rows)
+
+
+@dataclass(frozen=True, slots=True)
+class _PairJob:
+    """The job of matching pairs, frame by frame."""
+
+    pairs: np.ndarray  # (P, 2)
+    f0_T_f1s: np.ndarray  # (P, 4, 4)
+    gates: Sequence[Gate]  # (P)
+    frames: SearchableFrames
+    settings: MatchingSettings
+    points: Mapping[int, np.ndarray] | None  # of first frames, (K, 3)
+    matcher: Matcher
+    title: str = "matching"
+    returns: Any = np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __call__(self, p: int) -> np.ndarray:
+        f0, f1 = (int(f) for f in self.pairs[p])
+        points = None if self.points is None else self.points[f0]
+        gate, f0_T_f1 = self.gates[p], self.f0_T_f1s[p]
+        return self.matcher(self.frames, (f0, f1), f0_T_f1, gate, self.settings, points)
+
+    def blocks(self) -> Sequence[tuple[int, int]]:
+        return blocks_of_frames(self.pairs[:, 0])
+
+    def part(self, start: int, stop: int) -> "_PairJob":
+        pairs, points = self.pairs[start:stop], self.points
+        if points is not None:
+            points = {int(f0): points[int(f0)] for f0 in np.unique(pairs[:, 0])}
+        return replace(
+            self,
+            pairs=pairs,
+            f0_T_f1s=self.f0_T_f1s[start:stop],
+            gates=list(self.gates[start:stop]),
+            frames=self.frames.taken(np.unique(pairs).tolist()),
+            points=points,
+        )

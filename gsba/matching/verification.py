@@ -1,13 +1,17 @@
 """Two-view verification on bearings, and agreement with the trajectory."""
 
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from gsba.config import VerifySettings
 from gsba.geometry import inverse, parallax, pose, rotation_angle
+from gsba.store.shards import Workers, even_blocks
 from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
+
+_BLOCK = 256  # pairs that a worker elsewhere gets at a time
 
 Estimate = tuple[np.ndarray, np.ndarray]  # f0_T_f1 (4, 4), inlier mask (m,); see `relative_pose`
 
@@ -19,7 +23,7 @@ def verify(
     position_sigmas: np.ndarray | None,
     settings: VerifySettings,
     seed: int,
-    num_threads: int = 1,
+    workers: Workers,
 ) -> VerifiedPairs:
     """Estimate a relative pose per pair by LO-RANSAC and keep pairs that agree with the prior.
 
@@ -32,9 +36,9 @@ def verify(
             how much its direction is worth.
         settings: thresholds.
         seed: of the sampling.
-        num_threads: pairs verified at a time.
+        workers: who do it.
     """
-    estimates = estimate(matches, keypoints, settings, seed, num_threads)
+    estimates = estimate(matches, keypoints, settings, seed, workers)
     return agree_with_prior(
         matches, estimates, keypoints, prior_f0_T_f1s, position_sigmas, settings
     )
@@ -85,16 +89,39 @@ def agree_with_prior(
 
 
 def estimate(
-    matches: Matches, keypoints: Keypoints, settings: VerifySettings, seed: int, num_threads: int
+    matches: Matches, keypoints: Keypoints, settings: VerifySettings, seed: int, workers: Workers
 ) -> list[Estimate | None]:
     """`relative_pose` of every pair, whatever the prior says."""
 
-    def one(p: int) -> Estimate | None:
-        rays0, rays1 = keypoints.matched(matches.pairs[p], matches.of(p))
-        return relative_pose(rays0, rays1, settings, seed)
+    def rays(p: int) -> tuple[np.ndarray, np.ndarray]:
+        return keypoints.matched(matches.pairs[p], matches.of(p))
 
-    with ThreadPoolExecutor(num_threads) as pool:
-        return list(pool.map(one, range(len(matches.pairs))))
+    return list(workers.map_shards(_PoseJob(len(matches.pairs), rays, settings, seed)))
+
+
+@dataclass(frozen=True, slots=True)
+class _PoseJob:
+    """The job of estimating relative poses."""
+
+    num: int
+    rays: Callable[[int], tuple[np.ndarray, np.ndarray]]  # of a pair, (m, 3) in either frame
+    settings: VerifySettings
+    seed: int
+    title: str = "verifying"
+    returns: Any = Estimate | None
+
+    def __len__(self) -> int:
+        return self.num
+
+    def __call__(self, p: int) -> Estimate | None:
+        return relative_pose(*self.rays(p), self.settings, self.seed)
+
+    def blocks(self) -> Sequence[tuple[int, int]]:
+        return even_blocks(self.num, _BLOCK)
+
+    def part(self, start: int, stop: int) -> "_PoseJob":
+        rays = [self.rays(p) for p in range(start, stop)]
+        return replace(self, num=len(rays), rays=rays.__getitem__)
 
 
 def relative_pose(

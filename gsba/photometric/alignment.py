@@ -1,33 +1,24 @@
 """Sub-pixel observations: the patch around each point, aligned to every frame that shows it."""
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 
 from factors import tangent_basis
 from factors.patches import ALIGNED, REASONS, PatchSet, Sightings, expect, found_at
 from factors.sphere_field import SphereField
-from factors.sphere_image import SphereImage
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import PatchSettings
 from gsba.frames import panorama
-from gsba.log import track
+from gsba.photometric import frame_jobs
 from gsba.photometric.references import references, visible_frames
+from gsba.store.shards import Workers
 from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
 
-_WINDOW = 0.6  # standard deviation of the patch's window, part of half a patch
-_SEARCH = 3.0  # shifts followed while aligning, in largest accepted ones
-_STEPS = 12
-_TOLERANCE = 0.02  # of the last step, pixels
 _LEAST_SIGMA = 0.03  # pixels: what sampling and a plane for the surface cost the best of patches
 
 _STRAIGHT = SphereField.none()
-
-_Mask: TypeAlias = np.ndarray | None  # (H, 2H) bool, True = use
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +41,7 @@ def align(
     name: str,
     aligned: np.ndarray | None,
     settings: PatchSettings,
-    num_threads: int,
+    workers: Workers,
     field: SphereField = _STRAIGHT,
     lenses: Lenses = ONE_CENTRE,
 ) -> Sighted:
@@ -69,7 +60,7 @@ def align(
         name: beside the progress bar.
         aligned: (N,) bool, which of the keypoints patches have confirmed; None = none.
         settings: limits and sizes.
-        num_threads: frames worked on at a time.
+        workers: who work on frames.
         field: of the camera; keypoints are as observed, the map as corrected.
         lenses: that see the points; nothing is looked for where two pictures are blended.
 
@@ -82,18 +73,9 @@ def align(
     origins, spreads, seeing, sightings = _expected(
         landmarks, world_T_rigs, rows, extended, greys.width, settings, field, lenses
     )
-    reach = _SEARCH * settings.max_shift_px
-    sigmas = settings.affine_sigma, settings.grey_sigma
-    patches = PatchSet(len(hosts), settings.patch_size, _WINDOW, *sigmas)
-
-    def cut(image: SphereImage, mask: _Mask, chosen: np.ndarray) -> None:
-        patches.cut(image, mask, chosen, origins, spreads, settings.min_contrast)
-
-    def align_in(image: SphereImage, mask: _Mask, chosen: np.ndarray) -> None:
-        patches.align(image, mask, chosen, sightings, reach, _STEPS, _TOLERANCE)
-
-    _stream(cut, greys, hosts, f"{name}: templates", num_threads)
-    _stream(align_in, greys, seeing, name, num_threads)
+    title = f"{name}: templates"
+    patches = frame_jobs.cut(title, greys, hosts, origins, spreads, settings, workers)
+    frame_jobs.align(name, greys, seeing, patches, sightings, settings, workers)
     kept, found, dropped = _accepted(patches, sightings, seeing, 2 * np.pi / greys.width, settings)
     at_hosts = _at_hosts(patches, sightings, kept, hosts, origins, spreads)
     former = _former(landmarks, keypoints, noise, [found, at_hosts], greys.num_frames)
@@ -166,30 +148,6 @@ def _carried(
     spreads = np.einsum("oba,obc->oac", rotations, planes_world)
     distances = np.maximum(np.linalg.norm(origins, axis=1), 1e-300)
     return origins / distances[:, None], spreads / distances[:, None, None]
-
-
-def _stream(
-    work: Callable[[SphereImage, _Mask, np.ndarray], None],
-    greys: panorama.Greys,
-    frame_of: np.ndarray,
-    title: str,
-    num_threads: int,
-) -> None:
-    """Do `work(image, mask, rows of a frame)` for every frame that has rows, `frame_of (R,)`."""
-    order = np.argsort(frame_of, kind="stable")
-    bounds = np.searchsorted(frame_of[order], np.arange(greys.num_frames + 1))
-
-    def one(frame: int) -> None:
-        grey, mask = greys[frame]
-        work(SphereImage.of(grey, smooth=True), mask, order[bounds[frame] : bounds[frame + 1]])
-
-    with ThreadPoolExecutor(num_threads) as pool:
-        running = [pool.submit(one, int(frame)) for frame in np.flatnonzero(np.diff(bounds))]
-        try:
-            for future in track(running, title):
-                future.result()
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _accepted(

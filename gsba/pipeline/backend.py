@@ -369,7 +369,7 @@ def _align(run: Run, world: Map, name: str) -> Sighted:
             name,
             world.aligned,
             settings,
-            run.num_threads,
+            run.store.workers,
             world.field,
             world.lenses,
         )

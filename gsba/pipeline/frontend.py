@@ -10,6 +10,7 @@ from gsba import learned
 from gsba.camera.lens import Lenses
 from gsba.config import RefineSettings
 from gsba.features import detection, extraction
+from gsba.features.extraction import FrameFeatures
 from gsba.frames import panorama
 from gsba.imu.alignment import Alignment, align, turning_of
 from gsba.log import GsbaError
@@ -70,17 +71,14 @@ def _extract(
 ) -> PerFrame[Features]:
     make = learned.make_extractor(settings.features, run.weights)
     files = [path for stage, path in run.weights.items() if stage == "features"]
-    return extraction.extract(
-        run.store, run.frames, run.rig, settings, run.num_threads, make, files, name, chosen
-    )
+    return extraction.extract(run.store, run.frames, run.rig, settings, make, files, name, chosen)
 
 
 def _see(run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str) -> Seen:
     """Features of each frame (F,), ready to be matched; `stage`: the last one they are of."""
     frames, settings = run.frames, run.settings
 
-    def load(frame: int) -> Features:
-        return found[frame][frames.names[frame]]
+    load = FrameFeatures(found, frames.names)
 
     def gather() -> Keypoints:
         return detection.gather(map(load, range(len(frames))))
@@ -91,7 +89,7 @@ def _see(run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str) -
         SearchableFrames(load, settings.pairs.strongest_per_face),
         keypoints,
         settings,
-        run.num_threads,
+        run.store.workers,
         learned.make_matcher(settings, run.weights, run.rig.size),
     )
     return Seen(tuple(found), keypoints, context)

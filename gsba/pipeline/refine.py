@@ -4,6 +4,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -19,7 +20,7 @@ from gsba.loop_closure import connectivity
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
 from gsba.photometric import direct
-from gsba.pipeline import backend, frontend, inputs, outputs
+from gsba.pipeline import backend, frontend, inputs, outputs, workers
 from gsba.pipeline.frontend import Seen
 from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
@@ -37,6 +38,9 @@ from gsba.types import (
     Trajectory,
     VerifiedPairs,
 )
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 logger = logging.getLogger(__name__)
 
@@ -66,6 +70,8 @@ def refine(
     imu: Path | None = None,
     fresh: bool = False,
     extra_factors: ExtraFactors | None = None,
+    cluster: str | None = None,
+    client: "Client | None" = None,
 ) -> RunResult:
     """Refine the pose of every frame, and write poses, cloud, report and datasets to `out`.
 
@@ -88,6 +94,9 @@ def refine(
         imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
         fresh: forget an earlier run in `out`.
         extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
+        cluster: address of a Dask scheduler whose workers do what can be shared out, see
+            `gsba.pipeline.workers.connect`; None = threads here.
+        client: of such a scheduler, in place of its address.
 
     Raises:
         GsbaError: an input or setting that cannot be used.
@@ -105,7 +114,8 @@ def refine(
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, calibration)
     check(settings.placement, frame_set, settings.camera.baseline())
     coarse = inputs.coarse_poses(frame_set, given, settings)
-    with RunStore(out, origin, fresh) as store:
+    hire = workers.hire(cluster, client, frames, settings.solver.threads())
+    with RunStore(out, origin, fresh, hire) as store:
         frame_set, journal = merging.before(store, frame_set, chosen), Journal()
         if chosen.distractors:
             frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
@@ -350,7 +360,7 @@ def _without_distractors(
         prior, world = solve(run, frontend.extract(run), Prior.of(coarse), given)
     if prior.turning_only:
         return frames
-    first, threads = f"first-{run.chain.latest[0]}", run.num_threads
-    frames, counts = merging.after(store, frames, world.solution, first, threads)
+    first = f"first-{run.chain.latest[0]}"
+    frames, counts = merging.after(store, frames, world.solution, first)
     journal.note("distractors", counts)
     return frames

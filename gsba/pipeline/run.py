@@ -1,6 +1,5 @@
 """A run: what no stage changes, how a stage is kept, and the journal that the report reads."""
 
-import os
 import uuid
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -105,7 +104,7 @@ class Run:
             weights=learned.find_weights(settings),
             extra_factors=extra_factors,
             custom=None if extra_factors is None else uuid.uuid4().hex,
-            num_threads=settings.solver.num_threads or os.cpu_count() or 1,
+            num_threads=settings.solver.threads(),
             lenses_found=lenses_found,
             imu=imu,
         )

@@ -15,22 +15,25 @@ import os
 import resource
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Generic, TypeVar
+from types import NoneType
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from pydantic import BaseModel
 
 from gsba.disk import write_text
-from gsba.log import GsbaError, track
+from gsba.log import GsbaError
 from gsba.store.folder import MARKER, STAGES, claim, is_run_folder, open_run_folder
 from gsba.store.records import FORMAT, RecordError, load_record, read_info, save_record, typed
+from gsba.store.shards import Spent, StoredRecords, Threads, Workers, even_blocks
 from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
+_SHARDS = "shards"  # folder of pieces of the stage that is being computed
 T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +44,9 @@ class StageRecord:
     key: str  # hash of all the result depends on
     resumed: bool  # taken from an earlier call
     seconds: float  # wall clock
-    cpu_seconds: float  # all threads of the process
+    cpu_seconds: float  # all threads of the process, and of workers elsewhere
     peak_mb: float  # high-water mark of the process's resident memory when the stage ended
+    workers: int = 0  # elsewhere, that took part
 
 
 class RunStore:
@@ -52,20 +56,34 @@ class RunStore:
         root: folder of the run, made if missing.
         origin: what the run is about, e.g. `{"frames": path, "trajectory": path}`.
         fresh: forget an earlier run in `root`: delete what gsba wrote there, and only that.
+        hire: makes the workers that stages are shared out among, from the folder of shards; None =
+            one thread.
     Raises:
         GsbaError: the folder belongs to another run, to something else, or to a live process.
     """
 
-    def __init__(self, root: Path, origin: Mapping[str, Path], fresh: bool = False) -> None:
+    def __init__(
+        self,
+        root: Path,
+        origin: Mapping[str, Path],
+        fresh: bool = False,
+        hire: Callable[[Path], Workers] | None = None,
+    ) -> None:
         self.root = root
         self.records: dict[str, StageRecord] = {}  # stages of this call, in order
         self._prefix = ""
         self._lock = open_run_folder(root, origin, fresh)
+        try:
+            self.workers = Threads(1) if hire is None else hire(root / STAGES / _SHARDS)
+        except BaseException:
+            os.close(self._lock)
+            raise
 
     def __enter__(self) -> "RunStore":
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.workers.close()
         os.close(self._lock)
 
     @contextmanager
@@ -103,11 +121,12 @@ class RunStore:
             value, record = stored
             self._note(replace(record, resumed=True))
             return value
-        wall, cpu = time.perf_counter(), time.process_time()
+        clocks = _Clocks.now(self.workers)
         with _named_in_memory_errors(name):
             value = compute()
-        record = _measured(name, key, wall, cpu)
+        record = clocks.measured(name, key, self.workers)
         save_record(path, value, dataclasses.asdict(record))
+        self._forget_shards()
         self._note(record)
         return value
 
@@ -119,16 +138,17 @@ class RunStore:
         compute: Callable[[str], T],
         returns: type[T],
         after: Sequence[str] = (),
-        num_threads: int = 1,
+        alone: bool = False,
     ) -> "PerFrame[T]":
         """Results of a stage that treats every frame alone, one file each, resumed frame by frame.
 
         Args:
             items: frame name -> what this frame's result depends on besides `settings`, e.g.
                 `fingerprint(paths)`; only frames whose entry changed are computed again.
-            compute: makes the result of the named frame.
+            compute: makes the result of the named frame; see `Taken` for what workers elsewhere
+                need of it.
             name, settings, returns, after: as for `stage`.
-            num_threads: frames computed at a time.
+            alone: one frame at a time, here.
         """
         base = self._key(name, settings, after)
         name = self._prefix + name
@@ -138,19 +158,17 @@ class RunStore:
         frames.discard_others()
         missing = [item for item in frames if not frames.is_stored(item)]
         spent = _read_cost(folder / "cost.json", base) if len(missing) < len(keys) else None
-        wall, cpu = time.perf_counter(), time.process_time()
+        workers = Threads(1) if alone else self.workers
+        clocks = _Clocks.now(workers)
         try:
-            with _named_in_memory_errors(name), ThreadPoolExecutor(num_threads) as pool:
-                running = [pool.submit(frames.__getitem__, item) for item in missing]
-                try:
-                    for future in track(running, name):
-                        future.result()
-                finally:
-                    pool.shutdown(wait=True, cancel_futures=True)
+            with _named_in_memory_errors(name):
+                for _ in workers.map_shards(_Missing(name, frames, tuple(missing))):
+                    pass
         finally:
-            record = _measured(name, base, wall, cpu, spent)
+            record = clocks.measured(name, base, workers, spent)
             text = json.dumps(dataclasses.asdict(record))
             write_text(folder / "cost.json", text)
+        self._forget_shards()
         self._note(replace(record, key=digest(base, keys), resumed=not missing))
         return frames
 
@@ -165,6 +183,11 @@ class RunStore:
     def forget(self, name: str) -> None:
         """Drop the stored result of a stage, so that it is computed again."""
         _stage_path(self.root, name).unlink(missing_ok=True)
+
+    def _forget_shards(self) -> None:
+        """Delete the pieces of a stage that is stored now."""
+        for path in (self.root / STAGES / _SHARDS).glob("*"):
+            path.unlink(missing_ok=True)
 
     def claim(self, path: Path) -> None:
         """Note a final output (a file, or a folder with all its files) as written by gsba."""
@@ -206,6 +229,19 @@ class Chain:
         return result
 
 
+@runtime_checkable
+class Taken(Protocol[T_co]):
+    """A per-frame computation that knows what some frames need of it."""
+
+    def __call__(self, name: str) -> T_co:
+        """The named frame's result."""
+        ...
+
+    def taken(self, names: Sequence[str]) -> "Taken[T_co]":
+        """What computes these alone; it can be pickled."""
+        ...
+
+
 class PerFrame(Generic[T]):
     """Results of a per-frame stage: frame name -> record, read from disk whenever asked for.
 
@@ -244,6 +280,18 @@ class PerFrame(Generic[T]):
         except RecordError:
             return False
 
+    def taken(self, names: Sequence[str]) -> "PerFrame[T]":
+        """Those of some frames, as workers elsewhere can compute them."""
+        compute = self._compute.taken(names) if isinstance(self._compute, Taken) else self._compute
+        keys = {name: self._keys[name] for name in names}
+        return PerFrame(self._folder.absolute(), keys, compute, self._returns)
+
+    def records(self, names: Mapping[int, str]) -> StoredRecords[T]:
+        """What is stored of some frames, by numbers that are given to them."""
+        paths = {number: self._path(name).absolute() for number, name in names.items()}
+        keys = {number: self._keys[name] for number, name in names.items()}
+        return StoredRecords(paths, keys, self._returns)
+
     def discard_others(self) -> None:
         """Delete results of frames that are no longer asked for."""
         for path in set(self._folder.glob("*.npz")) - {self._path(name) for name in self}:
@@ -251,6 +299,29 @@ class PerFrame(Generic[T]):
 
     def _path(self, name: str) -> Path:
         return self._folder / f"{name}.npz"
+
+
+@dataclass(frozen=True, slots=True)
+class _Missing:
+    """The job of computing frames that are not stored yet, and of storing them."""
+
+    title: str
+    frames: PerFrame[Any]
+    names: tuple[str, ...]
+    returns: Any = NoneType
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __call__(self, item: int) -> None:
+        self.frames[self.names[item]]
+
+    def blocks(self) -> Sequence[tuple[int, int]]:
+        return even_blocks(len(self.names))
+
+    def part(self, start: int, stop: int) -> "_Missing":
+        names = self.names[start:stop]
+        return replace(self, frames=self.frames.taken(names), names=names)
 
 
 def load_stage(root: Path, name: str, returns: type[T]) -> T:
@@ -319,18 +390,33 @@ def _load_if_current(path: Path, key: str, returns: type[T]) -> tuple[T, StageRe
         return None
 
 
-def _measured(
-    name: str, key: str, wall: float, cpu: float, spent: StageRecord | None = None
-) -> StageRecord:
-    """Cost since the given clocks, on top of what an interrupted call has `spent`."""
-    seconds = time.perf_counter() - wall
-    cpu_seconds = time.process_time() - cpu
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0  # Linux counts in kB
-    if spent is not None:
-        seconds += spent.seconds
-        cpu_seconds += spent.cpu_seconds
-        peak_mb = max(peak_mb, spent.peak_mb)
-    return StageRecord(name, key, False, seconds, cpu_seconds, peak_mb)
+@dataclass(frozen=True, slots=True)
+class _Clocks:
+    """When a stage began, for all that work on it."""
+
+    wall: float
+    cpu: float
+    elsewhere: Spent
+
+    @classmethod
+    def now(cls, workers: Workers) -> "_Clocks":
+        return cls(time.perf_counter(), time.process_time(), workers.spent())
+
+    def measured(
+        self, name: str, key: str, workers: Workers, spent: StageRecord | None = None
+    ) -> StageRecord:
+        """Cost since then, on top of what an interrupted call has `spent`."""
+        elsewhere, before = workers.spent(), self.elsewhere
+        seconds = time.perf_counter() - self.wall
+        cpu_seconds = time.process_time() - self.cpu
+        cpu_seconds += elsewhere.cpu_seconds - before.cpu_seconds
+        took_part = [w for w, n in elsewhere.shards.items() if n > before.shards.get(w, 0)]
+        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0  # Linux: in kB
+        if spent is not None:
+            seconds += spent.seconds
+            cpu_seconds += spent.cpu_seconds
+            peak_mb = max(peak_mb, spent.peak_mb)
+        return StageRecord(name, key, False, seconds, cpu_seconds, peak_mb, len(took_part))
 
 
 def _read_cost(path: Path, key: str) -> StageRecord | None:

@@ -28,6 +28,7 @@ from gsba.learned.magicleap import SuperGlue
 from gsba.log import GsbaError
 from gsba.matching import guided_search
 from gsba.matching.guided_search import Gate, SearchableFrames, guided
+from gsba.store.shards import Threads
 from gsba.types import FACES, Features
 
 RIG = CubeRig(96, np.deg2rad(96))
@@ -102,7 +103,7 @@ def test_contract(
         poses: np.ndarray, strongest: int | None = None, num: int = 1
     ) -> guided_search.Matches:
         pairs, frames = np.array([[0, 1]] * num), _frames(found, strongest)
-        how = settings.matching, num
+        how = settings.matching, Threads(num)
         return guided_search.match(pairs, poses, [GATE] * num, frames, *how, matcher=compare)
 
     matched = match(poses, num=2)

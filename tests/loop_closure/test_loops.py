@@ -15,6 +15,7 @@ from gsba.loop_closure.pose_graph import Loop
 from gsba.loop_closure.retrieval import _aggregate, looks_of
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.similarity import relative_map
+from gsba.store.shards import Threads
 from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
 
 NUM_FRAMES, NUM_POINTS = 40, 1500
@@ -85,11 +86,11 @@ def test_looks_do_not_depend_on_heading() -> None:
 
 
 def _context(frames: SearchableFrames, keypoints: Keypoints) -> MatchContext:
-    return MatchContext(frames, frames, keypoints, SETTINGS, 1)
+    return MatchContext(frames, frames, keypoints, SETTINGS, Threads(1))
 
 
 def test_the_same_place_looks_most_alike() -> None:
-    looks = looks_of(_scene()[0], NUM_FRAMES, 0)
+    looks = looks_of(_scene()[0], NUM_FRAMES, 0, Threads(1))
     far = [f for f in range(NUM_FRAMES) if 4 < f < NUM_FRAMES - 4]
     alike = looks @ looks.T
     assert alike[0, NUM_FRAMES - 1] > max(alike[0, f] for f in far)

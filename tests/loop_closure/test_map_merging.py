@@ -14,6 +14,7 @@ from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.merged_map import Registered, follow
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.similarity import Sim3
+from gsba.store.shards import Threads
 from gsba.trajectory.joining import GUESS, PLACES, Joint
 from gsba.trajectory.judgement import Trust
 from gsba.types import CoarsePoses, Counts, Landmarks, PoseSource, Solution, Tracks
@@ -51,7 +52,7 @@ def _scene(strange: bool = False) -> tuple[MatchContext, Solution, np.ndarray]:
     own = Tracks(renumbered.astype(np.int32), table[:, 1], table[:, 2], len(kept))
     landmarks = Landmarks(points[kept // 2], own, Counts(len(kept), len(kept), "tracks"))
     among = SearchableFrames(frames.__getitem__)
-    context = MatchContext(among, among, detection.gather(frames), SETTINGS, 1)
+    context = MatchContext(among, among, detection.gather(frames), SETTINGS, Threads(1))
     return context, Solution(TRUTH, landmarks, 1.0, ()), kept % 2 == 1
 
 

@@ -10,6 +10,7 @@ from gsba.features import detection
 from gsba.geometry import pose
 from gsba.matching import correspondences
 from gsba.matching.guided_search import MatchContext, SearchableFrames
+from gsba.store.shards import Threads
 from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks, VerifiedPairs
 
 NUM = 300
@@ -42,7 +43,7 @@ def _loops_to_last(shift: float, loop_deg: float = 2.0) -> tuple[VerifiedPairs, 
     """All loops, and the rows of those that end in the last frame."""
     settings = RefineSettings(pairs=PairSettings(window=2, loop_deg=loop_deg))
     frames, keypoints, solved = _scene(shift)
-    context = MatchContext(frames, frames, keypoints, settings, 1)
+    context = MatchContext(frames, frames, keypoints, settings, Threads(1))
     found = correspondences.match_loops(context, solved)
     return found, np.flatnonzero(found.matches.pairs[:, 1] == LAST)
 
@@ -84,7 +85,7 @@ def test_all_keypoints_decide_where_the_strongest_disagree(
         frames.append(features_of(bearings[by_face], descriptors[by_face]))
     settings = RefineSettings(pairs=PairSettings(window=2, least_agreement=least_agreement))
     all_, strongest = (SearchableFrames(frames.__getitem__, n) for n in (None, 40))
-    context = MatchContext(all_, strongest, detection.gather(frames), settings, 1)
+    context = MatchContext(all_, strongest, detection.gather(frames), settings, Threads(1))
     world_T_rigs = pose(np.tile(np.eye(3), (2, 1, 1)), np.stack([np.zeros(3), true]))
     nothing = Landmarks(
         np.zeros((0, 3)),

@@ -11,6 +11,7 @@ from gsba.config import MatchingSettings
 from gsba.geometry import pose
 from gsba.matching import guided_search
 from gsba.matching.guided_search import Gate, SearchableFrames, match_pair, searchable, within_gate
+from gsba.store.shards import Threads
 from gsba.types import Features
 
 NUM = 400
@@ -302,7 +303,12 @@ def test_pairs_are_matched_in_order_whatever_the_threads(scene: Scene) -> None:
     pairs = np.array([[0, 1], [1, 2], [0, 2]])
     single, threaded = (
         guided_search.match(
-            pairs, world_T_rigs, [BAND] * 3, SearchableFrames(_reader(frames)), SETTINGS, threads
+            pairs,
+            world_T_rigs,
+            [BAND] * 3,
+            SearchableFrames(_reader(frames)),
+            SETTINGS,
+            Threads(threads),
         )
         for threads in (1, 3)
     )
@@ -315,7 +321,7 @@ def test_pairs_are_matched_in_order_whatever_the_threads(scene: Scene) -> None:
 def test_no_pairs_are_no_error(scene: Scene) -> None:
     none = np.zeros((0, 2), np.int32)
     frames = SearchableFrames(_reader([scene.first()]))
-    found = guided_search.match(none, np.eye(4)[None], [], frames, SETTINGS, 2)
+    found = guided_search.match(none, np.eye(4)[None], [], frames, SETTINGS, Threads(2))
     assert found.keypoints.shape == (0, 2) and found.pairs.shape == (0, 2)
 
 

@@ -12,6 +12,7 @@ from gsba.geometry import inverse, pose, rotation_angle
 from gsba.matching import correspondences, recovery
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
+from gsba.store.shards import Threads
 from gsba.types import CoarsePoses, Keypoints, PoseSource, Solution
 
 NUM, NUM_FRAMES = 250, 8
@@ -38,7 +39,7 @@ def _scene(cut: int | None = None) -> tuple[SearchableFrames, Keypoints]:
 
 def _context(cut: int | None = None) -> MatchContext:
     frames, keypoints = _scene(cut)
-    return MatchContext(frames, frames, keypoints, SETTINGS, 1)
+    return MatchContext(frames, frames, keypoints, SETTINGS, Threads(1))
 
 
 def _run(slam: np.ndarray, cut: int | None = None, times: np.ndarray = TIMES) -> Recovered:

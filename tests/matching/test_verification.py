@@ -8,6 +8,7 @@ from synthetic import bearings_of, unit, with_noise
 from gsba.config import VerifySettings
 from gsba.geometry import pose, rotation_angle
 from gsba.matching import verification
+from gsba.store.shards import Threads
 from gsba.types import Keypoints, Matches, VerifiedPairs
 
 NUM = 200
@@ -80,7 +81,8 @@ def _run(
         np.concatenate([np.zeros((0, 2), np.int32), *rows]),
     )
     spread = np.zeros(len(views)) if sigmas is None else np.array(sigmas)
-    return verification.verify(matches, keypoints, np.array(priors), spread, SETTINGS, 0)
+    how = SETTINGS, 0, Threads(1)
+    return verification.verify(matches, keypoints, np.array(priors), spread, *how)
 
 
 def _turned(f0_T_f1: np.ndarray, degrees: float) -> np.ndarray:

@@ -15,6 +15,7 @@ from gsba.config import PatchSettings, RefineSettings
 from gsba.frames.panorama import Greys
 from gsba.geometry import inverse, pose
 from gsba.photometric import alignment
+from gsba.store.shards import Threads
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Sighted, Solution, Tracks
 
 NUM, WIDTH = 6, 512
@@ -116,7 +117,7 @@ def _run(
         "align",
         aligned,
         settings,
-        2,
+        Threads(2),
     )
 
 
@@ -179,7 +180,7 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
     before = adjustment.adjust(landmarks.tracks, keypoints, start, problem, gates)
     sighted = alignment.align(
         before.landmarks, before.world_T_rigs, keypoints, before.noise, Greys(frames, 4096), RIG,
-        "align", None, SETTINGS, 2,
+        "align", None, SETTINGS, Threads(2),
     )  # fmt: skip
     after, known = adjustment.adjust_sighted(sighted, before, problem, gates)
     assert np.median(rotation_errors(after)) < 0.5 * np.median(rotation_errors(before))
@@ -224,8 +225,9 @@ def test_points_at_a_centre_and_behind_walls_do_no_harm(walk) -> None:
     points[100] = world_T_rigs[landmarks.tracks.frames[300], :3, 3]
     moved = replace(landmarks, points_world=points)
     sighted = alignment.align(
-        moved, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None, SETTINGS, 2
-    )
+        moved, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None, SETTINGS,
+        Threads(2),
+    )  # fmt: skip
     assert np.isfinite(sighted.keypoints.bearings_rig).all()
     assert np.isfinite(sighted.keypoints.sqrt_infos).all()
 
@@ -258,8 +260,9 @@ def test_no_points_are_no_observations(walk) -> None:
     none = Solution.without_points(world_T_rigs).landmarks
     _, keypoints = _start(world_T_rigs)
     sighted = alignment.align(
-        none, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None, SETTINGS, 2
-    )
+        none, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None, SETTINGS,
+        Threads(2),
+    )  # fmt: skip
     assert len(sighted.tracks) == 0 and sighted.counts.received == 0
 
 

@@ -1,0 +1,194 @@
+"""Patches cut from frames, and aligned to frames: jobs of which each frame is an item."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from factors.patches import PatchSet, Sightings
+from factors.sphere_image import SphereImage
+from gsba.config import PatchSettings
+from gsba.frames.panorama import Greys
+from gsba.store.shards import Workers, blocks_of_frames
+
+_WINDOW = 0.6  # standard deviation of the patch's window, part of half a patch
+_SEARCH = 3.0  # shifts followed while aligning, in largest accepted ones
+_STEPS = 12
+_TOLERANCE = 0.02  # of the last step, pixels
+
+
+def cut(
+    name: str,
+    greys: Greys,
+    hosts: np.ndarray,
+    origins: np.ndarray,
+    spreads: np.ndarray,
+    settings: PatchSettings,
+    workers: Workers,
+) -> PatchSet:
+    """Templates cut from the frames they are from.
+
+    Args:
+        name: beside the progress bar.
+        greys: the frames' images.
+        hosts: (J,) frame of each template.
+        origins (J, 3), spreads (J, 3, 2): plane patches, rig frame of the host.
+        settings: sizes and limits.
+        workers: who do it.
+    """
+    patches = _room(len(hosts), settings)
+    rows = _by_frame(hosts, greys.num_frames)
+    job = _CutJob(name, greys, rows.frames, rows, origins, spreads, settings)
+    whole = patches.templates
+    for chosen, found in zip(rows.each(), workers.map_shards(job), strict=True):
+        arrays = whole.grey, whole.by_x, whole.by_y, whole.inverses, whole.states
+        for array, part in zip(arrays, found, strict=True):
+            array[chosen] = part
+    return patches
+
+
+def align(
+    name: str,
+    greys: Greys,
+    seeing: np.ndarray,
+    patches: PatchSet,
+    sightings: Sightings,
+    settings: PatchSettings,
+    workers: Workers,
+) -> None:
+    """Align templates to the frames that should show them.
+
+    Args:
+        seeing: (O,) frame of each sighting.
+        patches: the templates.
+        sightings: where they should be; what became of them is filled in.
+        name, greys, settings, workers: as for `cut`.
+    """
+    rows = _by_frame(seeing, greys.num_frames)
+    job = _AlignJob(name, greys, rows.frames, rows, patches, sightings, settings)
+    for chosen, found in zip(rows.each(), workers.map_shards(job), strict=True):
+        arrays = sightings.warps, sightings.scores, sightings.variances, sightings.states
+        for array, part in zip(arrays, found, strict=True):
+            array[chosen] = part
+
+
+def _room(num: int, settings: PatchSettings) -> PatchSet:
+    """Room for templates."""
+    return PatchSet(num, settings.patch_size, _WINDOW, settings.affine_sigma, settings.grey_sigma)
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """Rows of a table that belong to each of some frames."""
+
+    frames: np.ndarray  # (N,) ascending, those with rows
+    order: np.ndarray  # (R,) rows, frame by frame
+    bounds: np.ndarray  # (N + 1,)
+
+    def each(self) -> Sequence[np.ndarray]:
+        return [self.order[a:b] for a, b in pairwise(self.bounds.tolist())]
+
+    def of(self, item: int) -> np.ndarray:
+        return self.order[self.bounds[item] : self.bounds[item + 1]]
+
+    def taken(self, start: int, stop: int) -> tuple[np.ndarray, "_Rows"]:
+        """Rows of some items, and these numbered by their place among them."""
+        bounds = self.bounds[start : stop + 1]
+        chosen = self.order[bounds[0] : bounds[-1]]
+        frames = np.arange(stop - start)
+        return chosen, _Rows(frames, np.arange(len(chosen)), bounds - bounds[0])
+
+
+def _by_frame(frame_of: np.ndarray, num_frames: int) -> _Rows:
+    order = np.argsort(frame_of, kind="stable")
+    bounds = np.searchsorted(frame_of[order], np.arange(num_frames + 1))
+    frames = np.flatnonzero(np.diff(bounds))
+    return _Rows(frames, order, np.append(bounds[frames], len(order)))
+
+
+@dataclass(frozen=True, slots=True)
+class _CutJob:
+    """The job of cutting templates."""
+
+    title: str
+    greys: Greys
+    frames: np.ndarray  # (N,) that have any
+    rows: _Rows
+    origins: np.ndarray  # (J, 3)
+    spreads: np.ndarray  # (J, 3, 2)
+    settings: PatchSettings
+    returns: Any = tuple[np.ndarray, ...]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __call__(self, item: int) -> tuple[np.ndarray, ...]:
+        rows = self.rows.of(item)
+        image, mask = _image(self.greys, int(self.rows.frames[item]))
+        found = _room(len(rows), self.settings)
+        every, least = np.arange(len(rows)), self.settings.min_contrast
+        found.cut(image, mask, every, self.origins[rows], self.spreads[rows], least)
+        own = found.templates
+        return own.grey, own.by_x, own.by_y, own.inverses, own.states
+
+    def blocks(self) -> Sequence[tuple[int, int]]:
+        return blocks_of_frames(self.frames)
+
+    def part(self, start: int, stop: int) -> "_CutJob":
+        chosen, rows = self.rows.taken(start, stop)
+        return replace(
+            self,
+            greys=self.greys.taken(self.frames[start:stop]),
+            frames=self.frames[start:stop],
+            rows=rows,
+            origins=self.origins[chosen],
+            spreads=self.spreads[chosen],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _AlignJob:
+    """The job of aligning templates."""
+
+    title: str
+    greys: Greys
+    frames: np.ndarray  # (N,) that should show any
+    rows: _Rows
+    patches: PatchSet
+    sightings: Sightings
+    settings: PatchSettings
+    returns: Any = tuple[np.ndarray, ...]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __call__(self, item: int) -> tuple[np.ndarray, ...]:
+        rows = self.rows.of(item)
+        image, mask = _image(self.greys, int(self.rows.frames[item]))
+        own = Sightings(*(column[rows] for column in self.sightings))
+        reach, every = _SEARCH * self.settings.max_shift_px, np.arange(len(rows))
+        self.patches.align(image, mask, every, own, reach, _STEPS, _TOLERANCE)
+        return own.warps, own.scores, own.variances, own.states
+
+    def blocks(self) -> Sequence[tuple[int, int]]:
+        return blocks_of_frames(self.frames)
+
+    def part(self, start: int, stop: int) -> "_AlignJob":
+        chosen, rows = self.rows.taken(start, stop)
+        own = Sightings(*(column[chosen] for column in self.sightings))
+        used, templates = np.unique(own.templates, return_inverse=True)
+        return replace(
+            self,
+            greys=self.greys.taken(self.frames[start:stop]),
+            frames=self.frames[start:stop],
+            rows=rows,
+            patches=self.patches.taken(used),
+            sightings=own._replace(templates=templates),
+        )
+
+
+def _image(greys: Greys, frame: int) -> tuple[SphereImage, np.ndarray | None]:
+    grey, mask = greys[frame]
+    return SphereImage.of(grey, smooth=True), mask
