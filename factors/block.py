@@ -43,7 +43,8 @@ class Block(Protocol):
         ...
 
     def linearize(self, values: gtsam.Values) -> PoseSystem:
-        """Model of the cost at accepted values, inner variables eliminated."""
+        """Model of the cost at accepted values, inner variables eliminated; the caller may
+        change its arrays."""
         ...
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:

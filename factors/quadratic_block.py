@@ -1,6 +1,7 @@
 """A block whose cost is a quadratic function, linearized elsewhere."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -38,7 +39,8 @@ class QuadraticBlock:
 
     def linearize(self, values: gtsam.Values) -> PoseSystem:
         """The function itself, whatever the values."""
-        return self._system
+        system = self._system
+        return replace(system, off_diagonal=system.off_diagonal.copy())
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Cost at `steps (V, 6)`."""

@@ -9,7 +9,10 @@ from scipy.sparse import csr_matrix
 
 from factors.block import Block
 from factors.cholesky import DIM, BlockCholesky
+from factors.compiled import kernel_and_part
 from factors.conjugate_gradients import conjugate_gradients
+
+_kernel, _ = kernel_and_part()
 
 GRAPH = "graph"  # family under which the cost of the native and user factors is reported
 _MIN_DIAGONAL = 1e-6  # least curvature that damping is proportional to, per sigma
@@ -77,19 +80,17 @@ class ReducedSystem:
     def linearize(self, values: gtsam.Values) -> dict[str, float]:
         """Assemble H and the gradient at `values`; returns the cost of each family."""
         self._diagonal = np.zeros((self._num, DIM, DIM))
-        self._off_diagonal = np.zeros((len(self._pairs), DIM, DIM))
         self._gradient = np.zeros((self._num, DIM))
+        self._off_diagonal = np.zeros((0, DIM, DIM))  # frees that of before
         costs: dict[str, float] = {}
-        for block, rows, (slots, flip) in zip(
-            self._blocks, self._block_rows, self._block_slots, strict=True
-        ):
+        parts = []
+        for block, rows in zip(self._blocks, self._block_rows, strict=True):
             system = block.linearize(values)
             self._diagonal[rows] += system.diagonal
             self._gradient[rows] += system.gradient
-            self._off_diagonal[slots] += np.where(
-                flip[:, None, None], np.swapaxes(system.off_diagonal, 1, 2), system.off_diagonal
-            )
+            parts.append(system.off_diagonal)
             _add_costs(costs, system.costs)
+        self._off_diagonal = self._gathered(parts)
         if self._graph_keys:
             self._add_graph(values)
             _add_costs(costs, {GRAPH: self._graph.error(values)})
@@ -143,6 +144,17 @@ class ReducedSystem:
             start = DIM * self.first_block[key]
             delta.insert(key, flat[start : start + dim])
         return values.retract(delta)
+
+    def _gathered(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        """Off-diagonal blocks (P, 6, 6) of all; those of one block of factors that has them all,
+        gigabytes of many laps, are not copied."""
+        slots, flip = self._block_slots[0] if len(parts) == 1 else ((), np.zeros(0))
+        if len(slots) == len(self._pairs) and not flip.any():
+            return parts[0]
+        out = np.zeros((len(self._pairs), DIM, DIM))
+        for part, (slots, flip) in zip(parts, self._block_slots, strict=True):
+            _add_blocks(out, slots, flip, part)
+        return out
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Total cost at tentative values, `steps (N, 6)` from the linearization point."""
@@ -258,6 +270,16 @@ class ReducedSystem:
         np.add.at(self._diagonal, (block_i[same], offset_i[same], offset_j[same]), x[same])
         slots = np.searchsorted(self._codes, block_i[upper] * self._num + block_j[upper])
         np.add.at(self._off_diagonal, (slots, offset_i[upper], offset_j[upper]), x[upper])
+
+
+@_kernel
+def _add_blocks(target, slots, flip, blocks):
+    """Add blocks (Q, 6, 6), those to be flipped transposed, to the slots (Q,) of others."""
+    for q in range(len(slots)):
+        to, block = target[slots[q]], blocks[q]
+        for r in range(DIM):
+            for c in range(DIM):
+                to[r, c] += block[c, r] if flip[q] else block[r, c]
 
 
 def _add_costs(total: dict[str, float], costs) -> None:

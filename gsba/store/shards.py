@@ -185,9 +185,7 @@ def run_shard(path: str) -> Manifest:
     """
     shard, worker = Path(path), f"{socket.gethostname()}:{os.getpid()}"
     if not shard.exists():
-        raise GsbaError(
-            f"worker {worker} does not see {path}: put the run on a disk that it shares"
-        )
+        raise GsbaError(f"worker {worker} does not see {path}: put the run on a shared disk")
     wall, cpu = time.perf_counter(), time.thread_time()
     with shard.open("rb") as content:
         version = content.readline().decode().strip()
