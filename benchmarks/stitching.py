@@ -28,6 +28,7 @@ from gsba.config import RefineSettings
 from gsba.frames import cubemap, panorama
 from gsba.geometry import angular_errors
 from gsba.photometric import alignment
+from gsba.store.shards import Threads
 from gsba.store.store import load_stage
 from gsba.types import FrameSet, Keypoints, Landmarks, Sighted, Solution, Tracks
 

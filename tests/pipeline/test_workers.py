@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from shard_jobs import Squares
-from tiny_run import SETTINGS, Case
+from tiny_run import Case
 
 from gsba.log import GsbaError
 from gsba.pipeline import workers
