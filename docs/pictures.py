@@ -8,7 +8,8 @@ r"""Draw the pictures of README and docs from what `gsba demo` leaves.
 
 Writes docs/images: trajectory.svg, residuals.jpg, cloud.jpg and, from what either
 benchmarks/splat_quality.py or gsba evaluate --splat left, splats.svg. The colours are those of
-report.html.
+report.html. The picture of the README is made on its own, by the commands that docs/splats.md has;
+`--beside FOLDER` writes raw-and-refined.jpg alone.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from matplotlib.figure import Figure
+from PIL import Image, ImageDraw, ImageFont
 
 from gsba.evaluate import charts
 from gsba.evaluate.trajectory import pose_errors
@@ -27,7 +29,7 @@ from gsba.report.html.figures import viewing_axes
 from gsba.report.html.pictures import picture, worst_frames
 from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory
-from gsba.types import FrameSet, Reconstruction, Trajectory
+from gsba.types import FACES, FrameSet, Reconstruction, Trajectory
 
 PAGE, LINE, QUIET = "#f6f6f3", "#e3e3dd", "#6b6e73"
 BEFORE, AFTER = charts.BEFORE, charts.AFTER
@@ -40,11 +42,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("demo", type=Path, help="folder that gsba demo wrote")
+    parser.add_argument("demo", type=Path, nargs="?", help="folder that gsba demo wrote")
     parser.add_argument("--run", type=Path, help="run to draw; DEMO/run by default")
     parser.add_argument("--splats", type=Path, help="folder with pictures/ and results.json")
+    parser.add_argument("--beside", type=Path, help="as --splats; for raw-and-refined.jpg alone")
+    parser.add_argument("--frame", help="held-out frame of raw-and-refined.jpg")
+    parser.add_argument("--face", default="front", choices=FACES, help="and its face")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "images")
     arguments = parser.parse_args()
+    if arguments.beside is not None:
+        shown = beside(arguments.beside, arguments.frame, arguments.face)
+        (arguments.out / "raw-and-refined.jpg").write_bytes(jpeg(shown, 250_000))
+        return
+    if arguments.demo is None:
+        parser.error("give the folder that gsba demo wrote, or --beside")
     run = arguments.run or arguments.demo / "run"
     found, frames = load_run(run)
     truth = read_trajectory(arguments.demo / "walk" / "groundtruth.tum")
@@ -197,6 +208,28 @@ def splats(folder: Path) -> str:
         )
         body.append(_text(x + 2, 33, label, color, 15, 600))
     return _page(width, height, body)
+
+
+def beside(folder: Path, frame: str | None, face: str) -> np.ndarray:
+    """A face of a held-out frame as splats on coarse and on refined poses show it, RGB."""
+    names = list(json.loads((folder / "results.json").read_text())["sources"])
+    pictures = sorted((folder / "pictures").glob("*.jpg"))
+    path = folder / "pictures" / f"{frame}.jpg" if frame else pictures[len(pictures) // 2]
+    sheet = cv2.imread(str(path))[..., ::-1]  # as for `splats`
+    size, wide, gap = sheet.shape[1] // len(FACES), 600, 12
+    column, coarse = FACES.index(face), next(n for n in range(len(names)) if names[n] != "refined")
+    canvas = Image.new("RGB", (2 * wide + gap, wide), PAGE)
+    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(26)
+    for place, (row, label, color) in enumerate(
+        ((coarse, "raw SLAM poses", BEFORE), (names.index("refined"), "refined poses", AFTER))
+    ):
+        rows, columns = (slice(n * size, (n + 1) * size) for n in (1 + row, column))
+        image = cv2.resize(sheet[rows, columns], (wide, wide), interpolation=cv2.INTER_CUBIC)
+        x = place * (wide + gap)
+        canvas.paste(Image.fromarray(image), (x, 0))
+        draw.rectangle((x, 0, x + 36 + draw.textlength(label, font), 48), fill=PAGE)
+        draw.text((x + 16, 8), label, fill=color, font=font)
+    return np.asarray(canvas)
 
 
 def _rgb(color: str) -> tuple[int, int, int]:

@@ -1,13 +1,17 @@
-"""The documentation is true: its code runs, its commands exist, its links lead somewhere."""
+"""The documentation is true: code runs, commands and messages exist, links lead somewhere."""
 
+import ast
 import os
 import re
 import shlex
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import typer.main
+import yaml
 from tiny_run import NUM_FRAMES, Case
 
 from gsba.cli import app
@@ -16,12 +20,21 @@ from gsba.config_file import load_config
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
-IDS = [str(page.relative_to(ROOT)) for page in PAGES]
-MAX_PICTURE = 150_000  # bytes
+
+
+def _name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+IDS = [_name(page) for page in PAGES]
+MAX_PICTURE = 400_000  # bytes
+MAX_README = 120  # lines
+LEAST_SAID = 12  # characters of a message that its code must have, beside what it fills in
 
 
 def _blocks(page: Path, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+    found = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+    return [text for name, text in found if name == language]
 
 
 def test_writing_a_factor_runs(case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,11 +51,70 @@ def test_writing_a_factor_runs(case: Case, tmp_path: Path, monkeypatch: pytest.M
     assert (tmp_path / "level-run" / "trajectory.tum").exists()
 
 
-@pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_library_and_readme_run(
+    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    os.symlink(case.frames, tmp_path / "frames")
+    os.symlink(case.slam, tmp_path / "frame_trajectory.txt")
+    os.symlink(ROOT / "configs", tmp_path / "configs")
+    monkeypatch.chdir(tmp_path)
+    for page in (ROOT / "README.md", DOCS / "library.md"):
+        names: dict = {"__name__": page.stem}
+        exec(compile("\n".join(_blocks(page, "python")), str(page), "exec"), names)
+    assert names["settings"].solver.num_threads == 2
+    assert len(names["frames"].names) == len(names["level"](names["result"].coarse)) == NUM_FRAMES
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= MAX_README
+
+
+def _prose(page: Path) -> str:
+    """A page without its fenced blocks."""
+    return re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+
+
+def _anchors(page: Path) -> set[str]:
+    """Of the headings, as long as GitHub and the site name them alike."""
+    found = set()
+    for heading in re.findall(r"^#+ (.+)$", _prose(page), re.MULTILINE):
+        text = re.sub(r"[^\w\s-]", "", re.sub(r"\]\([^)]*\)", "", heading)).strip().lower()
+        github, site = text.replace(" ", "-"), re.sub(r"[-\s]+", "-", text)
+        if github == site:
+            found.add(site)
+    return found
+
+
+@pytest.mark.parametrize("page", [*PAGES, *(ROOT / "benchmarks").rglob("*.md")], ids=_name)
 def test_links_lead_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\(([^)]+)\)", page.read_text()):
-        if not target.startswith(("http://", "https://", "#")):
-            assert (page.parent / target.partition("#")[0]).exists(), target
+    for target in re.findall(r"\]\(([^)]+)\)", _prose(page)):
+        if not target.startswith(("http://", "https://")):
+            path, _, anchor = target.partition("#")
+            linked = (page.parent / path) if path else page
+            assert linked.exists(), target
+            if page.parent == DOCS:  # what lies elsewhere is not on the site, but for these tables
+                inside = linked.resolve().relative_to(ROOT)
+                assert inside.parts[0] in ("docs", "benchmarks"), target
+                assert inside.parts[0] == "docs" or inside.suffix == ".md", target
+            if anchor:
+                assert anchor in _anchors(linked), target
+
+
+def test_every_page_has_its_place() -> None:
+    """In the site's navigation and in the list that GitHub shows; what is named there exists."""
+    entries = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
+    shown = [e for entry in entries for e in (_children(entry))]
+    pages = [page.name for page in DOCS.glob("*.md")]
+    assert sorted(shown) == sorted(pages)
+    listed = re.findall(r"^- \[.+?\]\((.+?)\)", (DOCS / "README.md").read_text(), re.MULTILINE)
+    assert listed == shown[1:]
+    for name in shown[1:]:
+        assert f"](docs/{name})" in (ROOT / "README.md").read_text(), name
+
+
+def _children(entry: str | dict) -> list[str]:
+    """Pages of an entry of the navigation."""
+    return [entry] if isinstance(entry, str) else [page for row in entry.values() for page in row]
 
 
 def test_pictures_are_small_and_shown() -> None:
@@ -87,3 +159,54 @@ def test_settings_exist(page: Path) -> None:
 def test_config_files_exist(page: Path) -> None:
     for name in re.findall(r"configs/([a-z]+\.toml)", page.read_text()):
         assert (ROOT / "configs" / name).exists(), name
+
+
+def _constants(node: ast.AST) -> Iterator[list[str]]:
+    """Texts in code, but docstrings: fixed parts, what is filled in lies between them."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.JoinedStr):
+            parts = [""]
+            for value in child.values:
+                if isinstance(value, ast.Constant):
+                    parts[-1] += str(value.value)
+                else:
+                    parts.append("")
+            yield parts
+            for value in child.values:
+                yield from _constants(value)
+        elif isinstance(child, ast.Constant) and isinstance(child.value, str):
+            yield re.split(r"%[-.\d]*[a-z]", child.value)
+        elif not (isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant)):
+            yield from _constants(child)
+
+
+@cache
+def _patterns() -> tuple[re.Pattern[str], ...]:
+    """Whole texts of the code, open where something is filled in."""
+    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "gsba").rglob("*.py"))
+    texts = {tuple(parts) for tree in trees for parts in _constants(tree)}
+    return tuple(
+        re.compile("(.*?)".join(map(re.escape, parts)))
+        for parts in sorted(texts)
+        if len("".join(parts)) >= LEAST_SAID
+    )
+
+
+def _is_said(text: str) -> bool:
+    """Whether a text of the code reads like this, filled in with names, numbers and others."""
+    if len(re.findall(r"(?<![\w.])[a-z]{3,}(?![\w./=])", text)) < 3:
+        return True
+    found = (pattern.fullmatch(text) for pattern in _patterns())
+    return any(match and all(map(_is_said, match.groups())) for match in found)
+
+
+QUOTED = re.findall(r"^> `(.+)`$", (DOCS / "faq.md").read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("message", QUOTED)
+def test_quoted_messages_are_those_of_the_code(message: str) -> None:
+    assert len(message.split()) > 3 and _is_said(message)
+
+
+def test_a_message_that_nobody_prints_is_found_out() -> None:
+    assert not _is_said("frames and trajectory are not friends in time: make them meet")

@@ -254,7 +254,7 @@ def _entries(folder: Path) -> list[Path]:
     try:
         return sorted(folder.iterdir())
     except FileNotFoundError:
-        raise GsbaError(f"{folder}: no such folder") from None
+        raise GsbaError(f"{folder}: no such file or folder") from None
     except NotADirectoryError:
         raise GsbaError(f"{folder}: is a file; give the folder of extracted frames") from None
     except OSError as error:

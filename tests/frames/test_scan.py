@@ -161,7 +161,7 @@ def test_images_beside_face_folders(tmp_path: Path) -> None:
 
 
 def test_refused_folders(tmp_path: Path, folder: Path) -> None:
-    with pytest.raises(GsbaError, match=r"no such folder"):
+    with pytest.raises(GsbaError, match=r"no such file or folder"):
         scan(tmp_path / "none", fps=1)
     with pytest.raises(GsbaError, match=r"is a file"):
         scan(folder / "0000.jpg", fps=1)

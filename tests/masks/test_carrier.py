@@ -144,7 +144,7 @@ def test_command_writes_what_can_be_looked_at(tmp_path: Path) -> None:
     both = cv2.imread(str(merged.mask_paths[3]), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(both > 0, (found > 0) & (own > 0))
     bad = CliRunner().invoke(app, ["mask", str(tmp_path / "nowhere"), "--out", str(tmp_path / "n")])
-    assert bad.exit_code == 1 and "no such folder" in bad.stderr
+    assert bad.exit_code == 1 and "no such file or folder" in bad.stderr
 
 
 def test_refine_leaves_the_carrier_out(case: Case, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ const page = fs.readFileSync(process.argv[2], "utf8");
 const data = page.match(/id="data">(.*?)<\/script>/s)[1];
 const script = page.match(/<script>\n(.*?)<\/script>/s)[1];
 const tiles = [], errors = [];
-const context = () => new Proxy({}, {
+const context = () => new Proxy({ measureText: text => ({ width: 6 * text.length }) }, {
   get: (t, k) => k in t ? t[k] : (...a) => {
     for (const v of a) if (typeof v === "number" && !Number.isFinite(v)) errors.push(`${String(k)}(${a})`);
   },

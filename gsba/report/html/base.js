@@ -82,6 +82,12 @@ function hover(canvas, locate) {
   canvas.addEventListener("pointerleave", event => { tip(event, ""); mark(-1); });
 }
 
+/* Text that stays legible on whatever is below it. */
+function label(g, text, x, y) {
+  g.strokeStyle = css("--card"); g.lineWidth = 4; g.lineJoin = "round"; g.strokeText(text, x, y);
+  g.fillStyle = css("--quiet"); g.fillText(text, x, y);
+}
+
 /* Round steps for an axis from low to high. */
 function ticks(low, high, count) {
   const raw = (high - low) / Math.max(count, 1) || 1;

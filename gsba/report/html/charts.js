@@ -41,9 +41,9 @@ function worldMap(canvas, across, up) {
       for (const path of [before, after]) { g.beginPath(); g.arc(X(path[marked]), Y(path[marked]), 6, 0, 7); g.stroke(); }
     }
     const unit = ticks(0, 120 / view.scale, 1).pop() || 1, length = unit * view.scale;
-    g.strokeStyle = g.fillStyle = css("--quiet"); g.lineWidth = 1.5; g.textAlign = "right";
+    g.strokeStyle = css("--quiet"); g.lineWidth = 1.5; g.textAlign = "right";
     g.beginPath(); g.moveTo(width - 12 - length, height - 12); g.lineTo(width - 12, height - 12); g.stroke();
-    g.fillText(`${num(unit)} map unit${unit === 1 ? "" : "s"}`, width - 12, height - 18);
+    label(g, `${num(unit)} map unit${unit === 1 ? "" : "s"}`, width - 12, height - 18);
   });
   let held = null;
   canvas.addEventListener("pointerdown", e => { held = [e.offsetX, e.offsetY]; canvas.setPointerCapture(e.pointerId); });
@@ -91,7 +91,7 @@ function series(parent, title, unit, values, colour) {
     const high = (sorted[sorted.length - 1] || 1) * 1.06;
     const X = f => left + (N > 1 ? f / (N - 1) : .5) * (width - left - right), Y = v => height - bottom - v / high * (height - top - bottom);
     g.textAlign = "right"; g.textBaseline = "middle"; g.lineWidth = 1;
-    for (const v of ticks(0, high, 2)) {
+    for (const v of ticks(0, high, 3)) {
       g.strokeStyle = css("--grid"); g.beginPath(); g.moveTo(left, Y(v)); g.lineTo(width - right, Y(v)); g.stroke();
       g.fillStyle = css("--quiet"); g.fillText(num(v), left - 8, Y(v));
     }
@@ -153,8 +153,8 @@ function sphere(canvas, scale, data) {
       const x = (j + .5) * w, y = (i + .5) * h, k = 1.8 * w / stretch;
       g.beginPath(); g.moveTo(x, y); g.lineTo(x + k * east[i][j], y + k * south[i][j]); g.stroke();
     }
-    g.fillStyle = css("--quiet"); g.textAlign = "center"; g.textBaseline = "bottom";
-    ["left", "front", "right"].forEach((text, i) => g.fillText(text, width * (i + 1) / 4, height - 4));
+    g.textAlign = "center"; g.textBaseline = "bottom";
+    ["left", "front", "right"].forEach((text, i) => label(g, text, width * (i + 1) / 4, height - 4));
   });
   scale.append("0", make("i"), `${num(high)}° (${num(high * pxPerDeg)} px)`);
   hover(canvas, (x, y) => {

@@ -82,11 +82,15 @@ function cost() {
       g.fillStyle = css("--quiet"); g.fillText(num(10 ** p), left - 8, Y(10 ** p));
     }
     g.textAlign = "left";
+    let free = left; // where the last name of a stage ends
     rounds.forEach((r, i) => {
       const end = i + 1 < rounds.length ? rounds[i + 1].start : steps.length;
       if (!r.round.accepted) { g.fillStyle = css("--bad"); g.globalAlpha = .12; g.fillRect(edge(r.start), top, edge(end) - edge(r.start), height - top - bottom); g.globalAlpha = 1; }
       g.strokeStyle = css("--line"); g.globalAlpha = r.number === 1 ? 1 : .5; g.beginPath(); g.moveTo(edge(r.start), r.number === 1 ? 8 : top); g.lineTo(edge(r.start), height - bottom); g.stroke(); g.globalAlpha = 1;
-      if (r.number === 1) { g.fillStyle = css("--quiet"); g.fillText(r.stage, edge(r.start) + 5, 13); }
+      if (r.number === 1 && edge(r.start) >= free) {
+        g.fillStyle = css("--quiet"); g.fillText(r.stage, edge(r.start) + 5, 13);
+        free = edge(r.start) + 10 + g.measureText(r.stage).width;
+      }
     });
     families.forEach((name, n) => {
       g.strokeStyle = g.fillStyle = css(COLOURS[n % 6]); g.lineWidth = 1.6;
