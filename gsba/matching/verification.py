@@ -8,10 +8,8 @@ import numpy as np
 
 from gsba.config import VerifySettings
 from gsba.geometry import inverse, parallax, pose, rotation_angle
-from gsba.store.shards import Workers, even_blocks
+from gsba.store.shards import ITEMS, Workers, even_blocks
 from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
-
-_BLOCK = 256  # pairs that a worker elsewhere gets at a time
 
 Estimate = tuple[np.ndarray, np.ndarray]  # f0_T_f1 (4, 4), inlier mask (m,); see `relative_pose`
 
@@ -117,7 +115,7 @@ class _PoseJob:
         return relative_pose(*self.rays(p), self.settings, self.seed)
 
     def blocks(self) -> Sequence[tuple[int, int]]:
-        return even_blocks(self.num, _BLOCK)
+        return even_blocks(self.num, ITEMS)
 
     def part(self, start: int, stop: int) -> "_PoseJob":
         rays = [self.rays(p) for p in range(start, stop)]

@@ -351,11 +351,13 @@ def _prepare(client: "Client") -> None:
         name = "gsba"
 
         def setup(self, worker: Any) -> None:
+            import cv2
             from threadpoolctl import threadpool_limits
 
             memory = worker.memory_manager
             memory.memory_target_fraction = memory.memory_spill_fraction = False
             memory.memory_pause_fraction = False
             threadpool_limits(limits=1, user_api="blas")
+            cv2.setNumThreads(1)
 
     client.register_plugin(Settings())

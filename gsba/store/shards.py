@@ -30,6 +30,7 @@ R = TypeVar("R")
 R_co = TypeVar("R_co", covariant=True)
 
 BLOCK = 32  # consecutive frames that a worker elsewhere gets at a time
+ITEMS = 256  # pairs of frames at most
 
 
 class Job(Protocol[R_co]):
@@ -112,10 +113,10 @@ class Threads:
 
 
 def blocks_of_frames(frames: np.ndarray) -> list[tuple[int, int]]:
-    """Runs of items whose frames (N,), ascending, are of the same `BLOCK` frames."""
+    """Runs of at most `ITEMS` items whose frames (N,), ascending, are of the same `BLOCK`."""
     cuts = np.flatnonzero(np.diff(frames // BLOCK)) + 1
-    bounds = [0, *cuts.tolist(), len(frames)]
-    return [(a, b) for a, b in pairwise(bounds) if b > a]
+    bounds = pairwise([0, *cuts.tolist(), len(frames)])
+    return [(start, min(start + ITEMS, b)) for a, b in bounds for start in range(a, b, ITEMS)]
 
 
 def even_blocks(num: int, size: int = BLOCK) -> list[tuple[int, int]]:

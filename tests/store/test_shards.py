@@ -55,6 +55,7 @@ def test_blocks_cover_all_items_in_order() -> None:
     frames = np.array([0, 0, 5, 31, 32, 40, 200, 200])
     assert blocks_of_frames(frames) == [(0, 4), (4, 6), (6, 8)]
     assert blocks_of_frames(np.zeros(0, int)) == []
+    assert blocks_of_frames(np.zeros(600, int)) == [(0, 256), (256, 512), (512, 600)]
     assert even_blocks(70) == [(0, 32), (32, 64), (64, 70)]
     assert even_blocks(0) == []
 
