@@ -79,6 +79,7 @@ def _estimate(
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = settings.max_error_deg * _WIDTH / 360
     options.ransac.min_num_trials, options.ransac.max_num_trials = 100, 10_000
+    options.ransac.min_inlier_ratio = settings.min_inliers / len(bearings)
     options.ransac.random_seed = seed
     pixels = erp_from_bearings(bearings, *size)
     found = pycolmap.estimate_absolute_pose(pixels, points_world, camera, options)

@@ -133,6 +133,7 @@ def relative_pose(
     options = pycolmap.RANSACOptions()
     options.max_error = np.deg2rad(settings.max_error_deg)
     options.min_num_trials, options.max_num_trials = 100, 3000
+    options.min_inlier_ratio = settings.min_inliers / len(bearings0)  # with fewer it is refused
     options.random_seed = seed
     found = pycolmap.estimate_relative_pose(bearings0, bearings1, options)
     if found is None or found["num_inliers"] < settings.min_inliers:
