@@ -23,6 +23,7 @@ from gsba.camera.one_centre import Stitcher
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import View, ViewCutter
 from gsba.export.pictures import Pictures, Shown
+from gsba.frames.buffers import give_back_freed_memory
 from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.files import goes_out_as_it_is
 from gsba.frames.pixels import load_faces
@@ -167,6 +168,7 @@ def write_pictures(frames: FrameSet, writers: Sequence[FrameWriter]) -> None:
             writer(shown)
 
     if writers:
+        give_back_freed_memory()
         of_all_frames(write, len(frames))
 
 

@@ -4,7 +4,6 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -14,8 +13,6 @@ from gsba.frames.buffers import Buffers
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_padded
 from gsba.types import FrameSet
-
-T = TypeVar("T")
 
 
 class Pictures:
@@ -28,19 +25,19 @@ class Pictures:
         self.frames = frames
         self.buffers = Buffers()
         self._uses = Counter(frames.mask_paths)
-        self._common: dict[Hashable, object] = {}
-        self._lock = threading.RLock()
+        self._masks: dict[Hashable, list[bytes]] = {}
+        self._lock = threading.Lock()
 
     def same_mask(self, f: int) -> bool:
         """Whether another frame has the mask of frame f."""
         return self._uses[self.frames.mask_paths[f]] > 1
 
-    def common(self, key: Hashable, make: Callable[[], T]) -> T:
-        """What the first frame that asks by this key has made."""
-        with self._lock:
-            if key not in self._common:
-                self._common[key] = make()
-            return self._common[key]  # type: ignore[return-value]  # of the same key, so made alike
+    def masks(self, key: Hashable, make: Callable[[], list[bytes]]) -> list[bytes]:
+        """Files as the first frame that asks by this key has them made."""
+        with self._lock:  # so that no other thread makes them too
+            if key not in self._masks:
+                self._masks[key] = make()
+            return self._masks[key]
 
 
 class Shown:
@@ -67,14 +64,9 @@ class Shown:
     @property
     def mask(self) -> np.ndarray:
         """Where the panorama may be used, (h, 2 h) bool."""
-        frames, f = self._frames, self.f
-
-        def load() -> np.ndarray:
-            found = load_mask(frames, f)
-            return np.ones((frames.height, frames.width), bool) if found is None else found
-
-        same = self._pictures.same_mask(f)
-        return self._pictures.common(frames.mask_paths[f], load) if same else load()
+        found = load_mask(self._frames, self.f)
+        size = self._frames.height, self._frames.width
+        return np.ones(size, bool) if found is None else found
 
     def room(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         """Memory for pictures of one kind, until the thread's next frame."""
@@ -105,7 +97,7 @@ class Shown:
 
         key = "mask", key, self._frames.mask_paths[self.f]
         if self._pictures.same_mask(self.f):
-            _write(paths, self._pictures.common(key, encode))
+            _write(paths, self._pictures.masks(key, encode))
         else:
             self.write(key, paths, lambda: (part.astype(np.uint8) * 255 for part in make()))
 

@@ -1,5 +1,6 @@
 """Memory that threads use again for every frame."""
 
+import ctypes
 import math
 import threading
 
@@ -20,3 +21,11 @@ class Buffers(threading.local):
             self._kept.pop(name, None)
             self._kept[name] = np.empty(size, np.uint8)
         return self._kept[name][:size].reshape(shape)
+
+
+def give_back_freed_memory() -> None:
+    """Let glibc return what earlier stages have freed and it holds on to, see
+    `gsba.features.detection.keep_freed_memory`."""
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "malloc_trim"):
+        libc.malloc_trim(0)

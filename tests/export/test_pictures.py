@@ -32,8 +32,9 @@ def _frames(folder: Path, kind: str) -> FrameSet:
     if kind == "corrected":
         return replace(frames, correction=BENT)
     if kind == "masks of their own":
-        own = [folder / "own.png", *frames.mask_paths[1:4], None, *frames.mask_paths[5:]]
-        cv2.imwrite(str(own[0]), np.tile(np.uint8([0, 255]), (HEIGHT, WIDTH // 2)))
+        own = [*frames.mask_paths]
+        own[3:5] = folder / "own.png", None
+        cv2.imwrite(str(own[3]), np.tile(np.array([0, 255], np.uint8), (HEIGHT, WIDTH // 2)))
         return replace(frames, mask_paths=tuple(own))
     return frames
 
@@ -62,17 +63,26 @@ def _threads(monkeypatch: pytest.MonkeyPatch, num: int) -> None:
     monkeypatch.setattr(images.os, "cpu_count", lambda: num)
 
 
-@pytest.mark.parametrize("lenses", [ONE_CENTRE, TWO], ids=["one centre", "two"])
-@pytest.mark.parametrize("kind", ["plain", "masked", "masks of their own", "corrected"])
+@pytest.mark.parametrize(
+    ("kind", "lenses"),
+    [
+        ("plain", ONE_CENTRE),
+        ("masked", ONE_CENTRE),
+        ("masks of their own", ONE_CENTRE),
+        ("corrected", ONE_CENTRE),
+        ("masks of their own", TWO),
+    ],
+)
 def test_files_are_the_same_together_and_alone(tmp_path, monkeypatch, kind, lenses):
-    frames, outs = _frames(tmp_path, kind), {to: tmp_path / "all" / to for to in FORMATS}
+    rows, outs = np.arange(3, 7), {to: tmp_path / "all" / to for to in FORMATS}
+    frames, scene = _frames(tmp_path, kind).taken(rows), reconstruction().taken(rows)
     _threads(monkeypatch, 4)
-    export_all(reconstruction(), frames, outs, face_size=64, lenses=lenses)
+    export_all(scene, frames, outs, face_size=64, lenses=lenses)
     _threads(monkeypatch, 1)
     for to in FORMATS:
-        export(reconstruction(), frames, tmp_path / "one" / to, to, 64, lenses=lenses)
+        export(scene, frames, tmp_path / "one" / to, to, 64, lenses=lenses)
     together, alone = _written(tmp_path / "all"), _written(tmp_path / "one")
-    assert together == alone and len(together) > 100
+    assert together == alone and len(together) > 80
 
 
 @pytest.mark.parametrize("size", [96, 40])  # cut as it is, and low-passed first
