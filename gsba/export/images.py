@@ -14,6 +14,7 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -140,14 +141,18 @@ def _lens_face_writer(
 ) -> FrameWriter:
     def write(shown: Shown) -> None:
         f = shown.f
-        cutter = ViewCutter(views, lenses, f, None if scenes is None else scenes(f))
+
+        @cache
+        def cutter() -> ViewCutter:
+            return ViewCutter(views, lenses, f, None if scenes is None else scenes(f))
 
         def cut() -> Iterator[np.ndarray]:
-            raw = frames.fisheyes is not None
-            return cutter.cut_raw(load_raw(frames, f)) if raw else cutter.cut_padded(shown.padded)
+            if frames.fisheyes is not None:
+                return cutter().cut_raw(load_raw(frames, f))
+            return cutter().cut_padded(shown.padded)
 
         def cut_mask() -> Iterator[np.ndarray]:
-            return (part.astype(np.uint8) * 255 for part in cutter.cut_mask(shown.mask))
+            return (part.astype(np.uint8) * 255 for part in cutter().cut_mask(shown.mask))
 
         size = views[0].width
         shown.write(("of lenses", size), [image_path(f, view.name) for view in views], cut)
@@ -230,15 +235,18 @@ def _stitched_writer(
 ) -> FrameWriter:
     def write(shown: Shown) -> None:
         f = shown.f
-        stitcher = Stitcher(lenses, f, np.zeros((0, 3)) if scenes is None else scenes(f))
+
+        @cache
+        def stitcher() -> Stitcher:
+            return Stitcher(lenses, f, np.zeros((0, 3)) if scenes is None else scenes(f))
 
         def stitched() -> list[np.ndarray]:
             if frames.fisheyes is not None:
-                return [stitcher.stitched_raw(load_raw(frames, f), frames.width)]
-            return [stitcher.stitched(shown.erp)]
+                return [stitcher().stitched_raw(load_raw(frames, f), frames.width)]
+            return [stitcher().stitched(shown.erp)]
 
         def mask() -> list[np.ndarray]:
-            return [stitcher.stitched_mask(shown.mask).astype(np.uint8) * 255]
+            return [stitcher().stitched_mask(shown.mask).astype(np.uint8) * 255]
 
         shown.write("stitched", [image_path(f)], stitched)
         if has_masks(frames):
