@@ -71,15 +71,23 @@ def write_image(path: Path, image: "np.ndarray", jpeg_quality: int = 95) -> None
     Raises:
         GsbaError: a picture that cannot be encoded so, or the disk refuses.
     """
+    write_bytes(path, encoded_image(image, path, jpeg_quality))
+
+
+def encoded_image(image: "np.ndarray", path: Path, jpeg_quality: int = 95) -> bytes:
+    """The content of the file at `path` that shows (H, W, 3) RGB or (H, W) uint8.
+
+    Raises:
+        GsbaError: a picture that cannot be encoded as the suffix says.
+    """
     import cv2
-    import numpy as np
 
     options = [] if path.suffix.lower() == ".png" else [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
-    pixels = np.ascontiguousarray(image[..., ::-1] if image.ndim == 3 else image)
+    pixels = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
     done, encoded = cv2.imencode(path.suffix, pixels, options)
     if not done:
         raise GsbaError(f"{path}: cannot be encoded")
-    write_bytes(path, encoded.tobytes())
+    return encoded.tobytes()
 
 
 def remove_temporaries(folder: Path) -> None:

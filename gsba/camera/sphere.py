@@ -2,6 +2,8 @@
 
 import numpy as np
 
+_AT_ONCE = 64  # rows that are moved through the cache
+
 
 def bearings_from_erp(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
     """Unit bearings of equirectangular pixels.
@@ -33,13 +35,37 @@ def dense_enough(width: int, focal: float) -> int:
     return 2 * round(density / 2) if width > 1.5 * density else width
 
 
+def low_passed(erp: np.ndarray, focal: float) -> np.ndarray:
+    """A panorama averaged down as `dense_enough` says; itself where it is."""
+    import cv2
+
+    width = dense_enough(erp.shape[1], focal)
+    if width == erp.shape[1]:
+        return erp
+    return cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
+
+
 def around_seam(image: np.ndarray, columns: int) -> np.ndarray:
     """A panorama (h, 2h[, C]) with columns from beyond the seam on either side."""
     return np.concatenate([image[:, -columns:], image, image[:, :columns]], axis=1)
 
 
-def around_sphere(image: np.ndarray, pad: int) -> np.ndarray:
-    """A panorama (h, 2h[, C]) padded by what lies beyond seam and poles on the sphere."""
-    from factors.patch_windows import over_poles
+def around_sphere(image: np.ndarray, pad: int, out: np.ndarray | None = None) -> np.ndarray:
+    """A panorama (h, 2h[, C]) padded by what lies beyond seam and poles on the sphere.
 
-    return around_seam(over_poles(image, pad), pad)
+    Args:
+        out: (h + 2 pad, 2h + 2 pad[, C]) to fill. The panorama may already be in its middle, or
+            occupy the end of its memory: no row is written over one that is still to be moved.
+    """
+    height, width = image.shape[:2]
+    if out is None:
+        shape = (height + 2 * pad, width + 2 * pad, *image.shape[2:])
+        out = np.empty(shape, image.dtype)
+    for top in range(0, height, _AT_ONCE):
+        rows = image[top : top + _AT_ONCE]
+        out[pad + top : pad + top + len(rows), pad:-pad] = rows
+    inner = out[:, pad:-pad]
+    inner[:pad] = np.roll(inner[pad : 2 * pad][::-1], width // 2, axis=1)
+    inner[-pad:] = np.roll(inner[-2 * pad : -pad][::-1], width // 2, axis=1)
+    out[:, :pad], out[:, -pad:] = inner[:, -pad:], inner[:, :pad]
+    return out

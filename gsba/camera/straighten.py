@@ -1,10 +1,9 @@
 """Panoramas resampled so that what stitching bends is straight."""
 
-import functools
-
 import numpy as np
 
 from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings
+from gsba.camera.tables import table
 
 PAD = 4  # pixels of wrap-around: the support of bicubic sampling, and more
 _COARSE = 256  # width of the grid that a field is evaluated on; it turns over 18 degrees or more
@@ -23,17 +22,28 @@ def straightened(erp: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
     """
     import cv2
 
-    height, width = erp.shape[:2]
-    maps = _maps(correction, width, height)
     if erp.dtype == bool:
+        height, width = erp.shape
+        maps = _maps(correction, width, height)
         nearest = cv2.remap(
             around_sphere(erp.astype(np.uint8), PAD), maps[0], maps[1], cv2.INTER_NEAREST
         )
         return nearest > 0
-    return cv2.remap(around_sphere(erp, PAD), maps[0], maps[1], cv2.INTER_LANCZOS4)
+    return straightened_inside(around_sphere(erp, PAD), correction)
 
 
-@functools.lru_cache(maxsize=1)
+def straightened_inside(
+    padded: np.ndarray, correction: tuple[float, ...], out: np.ndarray | None = None
+) -> np.ndarray:
+    """As `straightened`, uint8, of a panorama with PAD pixels around it; into `out`, if given."""
+    import cv2
+
+    height, width = (size - 2 * PAD for size in padded.shape[:2])
+    maps = _maps(correction, width, height)
+    return cv2.remap(padded, maps[0], maps[1], cv2.INTER_LANCZOS4, dst=out)
+
+
+@table(maxsize=1)
 def _maps(correction: tuple[float, ...], width: int, height: int) -> np.ndarray:
     """Places (2, H, W) float32 in the padded panorama, OpenCV pixels."""
     import cv2

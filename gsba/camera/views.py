@@ -9,6 +9,7 @@ rig's axes are the lenses', which a stabiliser may have turned below the panoram
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -16,10 +17,10 @@ import numpy as np
 from gsba.camera.fisheye import project
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import RIG_R_FACE, CubeRig
-from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings
+from gsba.camera.sphere import around_sphere, erp_from_bearings, low_passed
 from gsba.camera.straighten import PAD
 from gsba.geometry import pose
-from gsba.types import FACES, FrameSet, Reconstruction
+from gsba.types import FACES, Fisheye, FrameSet, Reconstruction
 
 _FAR = 1e9  # map units: from there both lenses see alike
 _DENSE = 1.5  # times as many pixels as a view: beyond it, detail aliases
@@ -28,6 +29,7 @@ _SMOOTH = np.deg2rad(3.0)  # over which they are averaged, at least
 _ALIKE = 0.1  # part of a distance: what is further off a plane is of another one
 _UNTILTED = 0.05  # weight of a plane that faces the camera, part of the points'
 _ROBUST = 4  # rounds of weighting points by how far they lie off the plane
+_BAND = 128  # rows of which coordinates are held in double precision
 _NODES = 33  # across a face: what lenses bend turns over tens of degrees
 
 
@@ -238,59 +240,71 @@ class ViewCutter:
 
     def cut(self, erp: np.ndarray) -> list[np.ndarray]:
         """Images (height, width[, C]) uint8, bicubic, of a panorama (H, 2 H[, C]) uint8."""
-        width = dense_enough(erp.shape[1], self._views[0].focal)
-        if width < erp.shape[1]:
-            erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
-        return self._sampled(erp, cv2.INTER_CUBIC)
+        padded = around_sphere(low_passed(erp, self._views[0].focal), PAD)
+        return list(self._sampled(padded, cv2.INTER_CUBIC))
 
-    def cut_raw(self, pictures: list[np.ndarray]) -> list[np.ndarray]:
-        """As `cut`, straight from the pictures (h, w[, C]) uint8 of both lenses of a raw pair."""
+    def cut_padded(self, padded: np.ndarray) -> Iterator[np.ndarray]:
+        """As `cut`, one image after the other, of a panorama with PAD pixels around it."""
+        inner = padded[PAD:-PAD, PAD:-PAD]
+        small = low_passed(inner, self._views[0].focal)
+        if small is not inner:
+            padded = around_sphere(small, PAD)
+        return self._sampled(padded, cv2.INTER_CUBIC)
+
+    def cut_raw(self, pictures: list[np.ndarray]) -> Iterator[np.ndarray]:
+        """As `cut_padded`, straight from the pictures (h, w[, C]) uint8 of both lenses of a raw
+        pair."""
         assert self._cut_by is not None
-        parts = []
-        for view, shown in zip(self._views, self._shown(), strict=True):
+        for view, offsets in zip(self._views, self._offsets, strict=True):
             number = int(view.centre[2] * self._front < 0)
             lens, picture = self._cut_by[number], pictures[number]
-            places = project(lens, shown)
-            share = min(_DENSE * view.focal / lens.focal, 1.0)
+            share, scale = min(_DENSE * view.focal / lens.focal, 1.0), np.ones(2)
             if share * _DENSE < 1:
                 picture = cv2.resize(
                     picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA
                 )
-                places = places * (np.array(picture.shape[1::-1]) / (lens.width, lens.height))
-            maps = (places - 0.5).astype(np.float32)
-            parts.append(
-                cv2.remap(
-                    picture, maps[..., 0], maps[..., 1], cv2.INTER_CUBIC,
-                    borderMode=cv2.BORDER_REPLICATE,
-                )
-            )  # fmt: skip
-        return parts
+                scale = np.array(picture.shape[1::-1]) / (lens.width, lens.height)
+            u, v = self._maps(view, offsets, partial(_in_picture, lens, scale))
+            yield cv2.remap(picture, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
     def cut_mask(self, mask: np.ndarray) -> list[np.ndarray]:
         """Masks (height, width) of one (H, 2 H), bool or float32 weights."""
-        whole = mask.astype(np.uint8) if mask.dtype == bool else mask
+        whole = around_sphere(mask.astype(np.uint8) if mask.dtype == bool else mask, PAD)
         return [part.astype(mask.dtype) for part in self._sampled(whole, cv2.INTER_NEAREST)]
 
-    def _sampled(self, image: np.ndarray, how: int) -> list[np.ndarray]:
-        height, width = image.shape[:2]
-        padded, parts = around_sphere(image, PAD), []
-        for shown in self._shown():
-            maps = (erp_from_bearings(shown, width, height) - 0.5 + PAD).astype(np.float32)
-            parts.append(cv2.remap(padded, maps[..., 0], maps[..., 1], how))
-        return parts
+    def _sampled(self, padded: np.ndarray, how: int) -> Iterator[np.ndarray]:
+        height, width = (size - 2 * PAD for size in padded.shape[:2])
 
-    def _shown(self) -> Iterator[np.ndarray]:
-        """Where panoramas show the pixels of each view, directions (height, width, 3)."""
+        def places(shown: np.ndarray) -> np.ndarray:
+            return erp_from_bearings(shown, width, height) - 0.5 + PAD
+
         for view, offsets in zip(self._views, self._offsets, strict=True):
-            centres = np.arange(view.width) + 0.5, np.arange(view.height) + 0.5
-            pixels = np.stack(np.meshgrid(*centres), axis=-1)
-            places = pixels * ((_NODES - 1) / np.array([view.width, view.height]))
-            places = places.astype(np.float32)
+            u, v = self._maps(view, offsets, places)
+            yield cv2.remap(padded, u, v, how)
+
+    def _maps(
+        self, view: View, offsets: np.ndarray, places: Callable[[np.ndarray], np.ndarray]
+    ) -> np.ndarray:
+        """Places (2, height, width) float32 of a view's pixels: those (h, w, 2) of the directions
+        (h, w, 3) in which pictures show them."""
+        maps = np.empty((2, view.height, view.width), np.float32)
+        for top in range(0, view.height, _BAND):
+            rows = np.arange(top, min(top + _BAND, view.height)) + 0.5
+            pixels = np.stack(np.meshgrid(np.arange(view.width) + 0.5, rows), axis=-1)
+            nodes = pixels * ((_NODES - 1) / np.array([view.width, view.height]))
+            nodes = nodes.astype(np.float32)
             moved = cv2.remap(
-                offsets, places[..., 0], places[..., 1], cv2.INTER_CUBIC,
+                offsets, nodes[..., 0], nodes[..., 1], cv2.INTER_CUBIC,
                 borderMode=cv2.BORDER_REPLICATE,
             )  # fmt: skip
-            yield view.rays(pixels) @ self._turn.T + moved
+            found = places(view.rays(pixels) @ self._turn.T + moved)
+            maps[:, top : top + len(rows)] = np.moveaxis(found, -1, 0)
+        return maps
+
+
+def _in_picture(lens: Fisheye, scale: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    """OpenCV pixels (..., 2) of directions (..., 3), in a lens's picture scaled by (2,)."""
+    return project(lens, shown) * scale - 0.5
 
 
 def _offsets(view: View, lenses: Lenses, frame: int, scene: np.ndarray | None) -> np.ndarray:

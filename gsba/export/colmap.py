@@ -29,9 +29,9 @@ from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.one_centre import seen_from_the_middle
 from gsba.camera.sphere import erp_from_bearings
 from gsba.camera.views import View, scenes_of, seen_from_lenses, shown_in_pictures, views_for
-from gsba.export.images import face_size_for, suffix_of, write_panoramas, write_views
+from gsba.export.images import FrameWriter, face_size_for, panorama_writer, suffix_of, view_writer
 from gsba.export.ply import write_splat_points
-from gsba.export.raw import LENSES, raw_lenses, write_raw
+from gsba.export.raw import LENSES, raw_lenses, raw_writer
 from gsba.geometry import inverse, pose, quaternion_from_rotation
 from gsba.log import GsbaError
 from gsba.types import Fisheye, FrameSet, Reconstruction
@@ -58,15 +58,15 @@ def write_colmap(
     face_size: int | None,
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
-) -> None:
-    """Write the rig layout into `partial`."""
+) -> FrameWriter:
+    """Write the rig layout into `partial`, all but the pictures."""
     views = views_for(frames, face_size_for(frames, face_size), lenses)
     names = [[f"{view.name}/{_file(frames, f)}" for view in views] for f in range(len(frames))]
     seen, sensors = seen_from_lenses(reconstruction, lenses), list(map(_pinhole, views))
     write_model(partial / "sparse" / "0", seen, sensors, names)
     text = json.dumps(_rig_config(sensors, [view.name for view in views]), indent=1) + "\n"
     (partial / "rig_config.json").write_text(text)
-    _write_named_views(partial, frames, views, names, link, lenses, scenes_of(reconstruction))
+    return _named_views(partial, frames, views, names, link, lenses, scenes_of(reconstruction))
 
 
 def write_colmap_flat(
@@ -76,8 +76,8 @@ def write_colmap_flat(
     face_size: int | None,
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
-) -> None:
-    """Write the layout with unique base names into `partial`."""
+) -> FrameWriter:
+    """Write the layout with unique base names into `partial`, all but the pictures."""
     views = views_for(frames, face_size_for(frames, face_size), lenses)
     names = [
         [f"{name}_{view.name}{suffix_of(frames, f)}" for view in views]
@@ -91,7 +91,7 @@ def write_colmap_flat(
     )
     held_out = [name for of_frame in names[::TEST_EVERY] for name in of_frame]
     (model / "test.txt").write_text("\n".join(held_out) + "\n")
-    _write_named_views(partial, frames, views, names, link, lenses, scenes_of(reconstruction))
+    return _named_views(partial, frames, views, names, link, lenses, scenes_of(reconstruction))
 
 
 def write_colmap_raw(
@@ -101,8 +101,9 @@ def write_colmap_raw(
     lenses: Lenses,
     flat: bool,
     link: bool = False,
-) -> None:
-    """Write the raw fisheyes themselves into `partial`, in the rig layout or the flat one."""
+) -> FrameWriter:
+    """Write the rig layout of the raw fisheyes themselves into `partial`, or the flat one, all but
+    the pictures."""
     sensors = _raw_sensors(frames, lenses)
     named = "{name}_{lens}{suffix}" if flat else "{lens}/{name}{suffix}"
     names = [
@@ -120,7 +121,7 @@ def write_colmap_raw(
     else:
         text = json.dumps(_rig_config(sensors, LENSES), indent=1) + "\n"
         (partial / "rig_config.json").write_text(text)
-    write_raw(
+    return raw_writer(
         frames,
         lambda f, lens: partial / "images" / names[f][lens],
         lambda f, lens: partial / "masks" / f"{names[f][lens]}.png",
@@ -134,8 +135,8 @@ def write_colmap_erp(
     frames: FrameSet,
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
-) -> None:
-    """Write the equirectangular layout into `partial`."""
+) -> FrameWriter:
+    """Write the equirectangular layout into `partial`, all but the pictures."""
     if not frames.panoramic:
         raise GsbaError("colmap-erp needs panoramas, these frames are cube faces: use colmap")
     size = (frames.width, frames.height)
@@ -143,7 +144,7 @@ def write_colmap_erp(
     names = [_file(frames, f) for f in range(len(frames))]
     seen = seen_from_the_middle(reconstruction) if lenses else reconstruction
     write_model(partial / "sparse" / "0", seen, [sensor], [[name] for name in names])
-    write_panoramas(
+    return panorama_writer(
         frames,
         lambda f: partial / "images" / names[f],
         lambda f: partial / "masks" / f"{names[f]}.png",
@@ -321,7 +322,7 @@ def _file(frames: FrameSet, f: int) -> str:
     return f"{frames.names[f]}{suffix_of(frames, f)}"
 
 
-def _write_named_views(
+def _named_views(
     partial: Path,
     frames: FrameSet,
     views: tuple[View, ...],
@@ -329,9 +330,9 @@ def _write_named_views(
     link: bool,
     lenses: Lenses,
     scenes: Callable[[int], np.ndarray],
-) -> None:
+) -> FrameWriter:
     place = {view.name: c for c, view in enumerate(views)}
-    write_views(
+    return view_writer(
         frames,
         views,
         lenses,

@@ -1,6 +1,8 @@
 """One door to every export format."""
 
 import logging
+from collections.abc import Mapping
+from contextlib import ExitStack
 from enum import StrEnum
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import numpy as np
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import FORMATS_OF
 from gsba.export.folder import output_folder
+from gsba.export.images import FrameWriter, write_pictures
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement
 from gsba.types import FrameSet, PoseStatus, Reconstruction
@@ -59,7 +62,32 @@ def export(
         GsbaError: `out` is in use, the format does not fit the frames, or the disk refuses;
             nothing is left behind then.
     """
-    _require_fitting(to, frames, images)
+    export_all(
+        reconstruction, frames, {to: out}, face_size, placement, link, lenses=lenses, images=images
+    )
+
+
+def export_all(
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    outs: Mapping[ExportFormat, Path],
+    face_size: int | None = None,
+    placement: Placement | None = None,
+    link: bool = False,
+    lenses: Lenses = ONE_CENTRE,
+    images: str = "auto",
+) -> None:
+    """As `export`, in several formats at once: every picture is read, cut and encoded once.
+
+    Args:
+        outs: folder of each format.
+        reconstruction, frames, face_size, placement, link, lenses, images: as of `export`.
+
+    Raises:
+        GsbaError: as of `export`; none of the folders is written then.
+    """
+    for to in outs:
+        _require_fitting(to, frames, images)
     unrefined = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
     if len(unrefined):
         names = ", ".join(frames.names[f] for f in unrefined[:5])
@@ -69,19 +97,23 @@ def export(
         logger.warning("no points: the poses alone go out, and trainers need a start cloud")
     placement = placement or Placement()
     reconstruction = placement.apply(reconstruction)
-    with output_folder(out, to.value) as partial:
-        seen_by = lenses.scaled(placement.similarity.scale)
-        z_up = placement.up == "z"
-        if images == "fisheye":
-            _write_raw(partial, reconstruction, frames, to, z_up, link, seen_by)
-        elif images == "panorama":
-            _write_panoramas(partial, reconstruction, frames, to, z_up, link, seen_by)
-        else:
-            _write(partial, reconstruction, frames, to, face_size, z_up, link, seen_by)
-        placement.write(partial / "transform.json")
-    logger.info(
-        "%s: %d frames, %d points, in %s", to, len(frames), len(reconstruction.points_world), out
-    )
+    seen_by, z_up = lenses.scaled(placement.similarity.scale), placement.up == "z"
+    writers: list[FrameWriter] = []
+    with ExitStack() as folders:
+        for to, out in outs.items():
+            partial = folders.enter_context(output_folder(out, to.value))
+            given = partial, reconstruction, frames, to
+            if images == "fisheye":
+                writers += _write_raw(*given, z_up, link, seen_by)
+            elif images == "panorama":
+                writers += _write_panoramas(*given, z_up, link, seen_by)
+            else:
+                writers += _write(*given, face_size, z_up, link, seen_by)
+            placement.write(partial / "transform.json")
+        write_pictures(frames, writers)
+    for to, out in outs.items():
+        num_points = len(reconstruction.points_world)
+        logger.info("%s: %d frames, %d points, in %s", to, len(frames), num_points, out)
 
 
 def _write_raw(
@@ -92,14 +124,13 @@ def _write_raw(
     z_up: bool,
     link: bool,
     lenses: Lenses,
-) -> None:
+) -> list[FrameWriter]:
     from gsba.export import colmap, nerfstudio
 
     if to == ExportFormat.NERFSTUDIO:
-        nerfstudio.write_nerfstudio_raw(partial, reconstruction, frames, lenses, z_up, link)
-        return
+        return nerfstudio.write_nerfstudio_raw(partial, reconstruction, frames, lenses, z_up, link)
     flat = to == ExportFormat.COLMAP_FLAT
-    colmap.write_colmap_raw(partial, reconstruction, frames, lenses, flat, link)
+    return [colmap.write_colmap_raw(partial, reconstruction, frames, lenses, flat, link)]
 
 
 def _write_panoramas(
@@ -110,16 +141,17 @@ def _write_panoramas(
     z_up: bool,
     link: bool,
     lenses: Lenses,
-) -> None:
+) -> list[FrameWriter]:
     from gsba.export import colmap, nerfstudio, panoramas
 
+    given = partial, reconstruction, frames
     match to:
         case ExportFormat.COLMAP_ERP:
-            colmap.write_colmap_erp(partial, reconstruction, frames, link, lenses)
+            return [colmap.write_colmap_erp(*given, link, lenses)]
         case ExportFormat.NERFSTUDIO:
-            nerfstudio.write_nerfstudio_erp(partial, reconstruction, frames, lenses, z_up, link)
+            return nerfstudio.write_nerfstudio_erp(*given, lenses, z_up, link)
         case _:
-            panoramas.write_with_poses(partial, reconstruction, frames, lenses, link)
+            return [panoramas.write_with_poses(*given, lenses, link)]
 
 
 def _require_fitting(to: ExportFormat, frames: FrameSet, images: str) -> None:
@@ -141,24 +173,24 @@ def _write(
     z_up: bool,
     link: bool,
     lenses: Lenses,
-) -> None:
+) -> list[FrameWriter]:
     from gsba.export import colmap, nerfstudio, ply
     from gsba.export.panoramas import write_poses
 
+    given = partial, reconstruction, frames
     match to:
         case ExportFormat.COLMAP:
-            colmap.write_colmap(partial, reconstruction, frames, face_size, link, lenses)
+            return [colmap.write_colmap(*given, face_size, link, lenses)]
         case ExportFormat.COLMAP_FLAT:
-            colmap.write_colmap_flat(partial, reconstruction, frames, face_size, link, lenses)
+            return [colmap.write_colmap_flat(*given, face_size, link, lenses)]
         case ExportFormat.COLMAP_ERP:
-            colmap.write_colmap_erp(partial, reconstruction, frames, link, lenses)
+            return [colmap.write_colmap_erp(*given, link, lenses)]
         case ExportFormat.NERFSTUDIO:
-            nerfstudio.write_nerfstudio(
-                partial, reconstruction, frames, face_size, z_up, link, lenses
-            )
+            return nerfstudio.write_nerfstudio(*given, face_size, z_up, link, lenses)
         case ExportFormat.PLY:
             ply.write_splat_points(
                 partial / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
             )
         case ExportFormat.TUM:
             write_poses(partial, reconstruction, frames)
+    return []

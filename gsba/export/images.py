@@ -11,9 +11,10 @@ they are hard links: then an edit of one is an edit of the other.
 import fcntl
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -22,19 +23,20 @@ from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.one_centre import Stitcher
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import View, ViewCutter
-from gsba.disk import write_image
-from gsba.frames import lens_faces
+from gsba.export.pictures import Pictures, Shown
+from gsba.frames.buffers import give_back_freed_memory
 from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.files import goes_out_as_it_is
-from gsba.frames.masks import load_mask
-from gsba.frames.pixels import load_erp, load_faces
+from gsba.frames.pixels import load_faces
 from gsba.log import GsbaError, track
 from gsba.types import FACES, FrameSet
 
 MIN_FACE_SIZE = 16  # pixels
 _FICLONE = 0x40049409  # of Linux: a file that shares another's blocks until one is written to
 _INSTEAD = {".webp": ".jpg", ".tif": ".png", ".tiff": ".png"}
-_AT_ONCE = 4  # frames at most: an 8K panorama and its faces take 250 MB
+_AT_ONCE = 4  # frames at most: an 8K panorama, a face and what is encoded take 130 MB
+
+FrameWriter = Callable[[Shown], None]  # writes what a dataset shows of a frame
 
 
 def face_size_for(frames: FrameSet, face_size: int | None) -> int:
@@ -69,7 +71,7 @@ def has_masks(frames: FrameSet) -> bool:
     return any(path is not None for path in frames.mask_paths)
 
 
-def write_views(
+def view_writer(
     frames: FrameSet,
     views: tuple[View, ...],
     lenses: Lenses,
@@ -77,8 +79,8 @@ def write_views(
     mask_path: Callable[[int, str], Path],
     link: bool = False,
     scenes: Callable[[int], np.ndarray] | None = None,
-) -> None:
-    """Write every view of every frame, and its mask where the frames have masks.
+) -> FrameWriter:
+    """Writes every view of a frame, and its mask where the frames have masks.
 
     Args:
         frames: panoramas, or faces of which the missing ones stay missing.
@@ -90,56 +92,89 @@ def write_views(
         scenes: points (N, 3) around a frame, rig frame, by its index: how far things are.
     """
     if lenses and frames.panoramic:
-        _write_lens_faces(frames, views, lenses, image_path, mask_path, scenes)
-    else:
-        _write_cube_faces(frames, views[0].width, image_path, mask_path, link)
+        return _lens_face_writer(frames, views, lenses, image_path, mask_path, scenes)
+    return _cube_face_writer(frames, views[0].width, image_path, mask_path, link)
 
 
-def _write_cube_faces(
+def _cube_face_writer(
     frames: FrameSet,
     size: int,
     image_path: Callable[[int, str], Path],
     mask_path: Callable[[int, str], Path],
     link: bool,
-) -> None:
-    rig, faces = CubeRig(size, np.pi / 2), frames.faces or FACES
+) -> FrameWriter:
+    from gsba.frames import cubemap
 
-    def write(f: int) -> None:
+    rig, faces = CubeRig(size, np.pi / 2), frames.faces or FACES
+    chosen = [FACES.index(face) for face in faces]
+
+    def write(shown: Shown) -> None:
+        f = shown.f
         paths = [image_path(f, face) for face in faces]
         if frames.panoramic:
-            from gsba.frames.cubemap import cut
-
-            _write_all(paths, cut(load_erp(frames, f), rig))
+            room = shown.room("face", (size, size, 3))
+            shown.write(size, paths, lambda: cubemap.cut_padded(shown.padded, rig, room))
         elif size == frames.width and all(map(goes_out_as_it_is, frames.paths[f], paths)):
             for source, path in zip(frames.paths[f], paths, strict=True):
                 pass_on(source, path, link)
         else:
-            _write_all(paths, _resized(load_faces(frames, f), size))
+            shown.write(size, paths, lambda: _resized(load_faces(frames, f), size))
         if has_masks(frames):
-            _write_face_masks(frames, f, rig, [mask_path(f, face) for face in faces], faces)
+            masks = [mask_path(f, face) for face in faces]
+            shown.write_masks(size, masks, lambda: cut_mask(f, shown)[chosen])
 
-    of_all_frames(write, len(frames))
+    def cut_mask(f: int, shown: Shown) -> np.ndarray:
+        if frames.mask_paths[f] is None:
+            return np.ones((len(FACES), size, size), bool)
+        return cubemap.cut_mask(shown.mask, rig)
+
+    return write
 
 
-def _write_lens_faces(
+def _lens_face_writer(
     frames: FrameSet,
     views: tuple[View, ...],
     lenses: Lenses,
     image_path: Callable[[int, str], Path],
     mask_path: Callable[[int, str], Path],
     scenes: Callable[[int], np.ndarray] | None,
-) -> None:
-    def write(f: int) -> None:
-        cutter = ViewCutter(views, lenses, f, None if scenes is None else scenes(f))
-        cut = lens_faces.cut(frames, f, cutter)
-        _write_all([image_path(f, view.name) for view in views], cut)
-        if has_masks(frames):
-            mask = load_mask(frames, f)
-            whole = np.ones((frames.height, frames.width), bool) if mask is None else mask
-            masks = [part.astype(np.uint8) * 255 for part in cutter.cut_mask(whole)]
-            _write_all([mask_path(f, view.name) for view in views], masks)
+) -> FrameWriter:
+    def write(shown: Shown) -> None:
+        f = shown.f
 
-    of_all_frames(write, len(frames))
+        @cache
+        def cutter() -> ViewCutter:
+            return ViewCutter(views, lenses, f, None if scenes is None else scenes(f))
+
+        def cut() -> Iterator[np.ndarray]:
+            if frames.fisheyes is not None:
+                return cutter().cut_raw(load_raw(frames, f))
+            return cutter().cut_padded(shown.padded)
+
+        def cut_mask() -> Iterator[np.ndarray]:
+            return (part.astype(np.uint8) * 255 for part in cutter().cut_mask(shown.mask))
+
+        size = views[0].width
+        shown.write(("of lenses", size), [image_path(f, view.name) for view in views], cut)
+        if has_masks(frames):
+            paths = [mask_path(f, view.name) for view in views]
+            shown.write(("masks of lenses", size), paths, cut_mask)
+
+    return write
+
+
+def write_pictures(frames: FrameSet, writers: Sequence[FrameWriter]) -> None:
+    """Write what all datasets of an export show, frame by frame."""
+    pictures = Pictures(frames)
+
+    def write(f: int) -> None:
+        shown = Shown(pictures, f)
+        for writer in writers:
+            writer(shown)
+
+    if writers:
+        give_back_freed_memory()
+        of_all_frames(write, len(frames))
 
 
 def of_all_frames(write: Callable[[int], None], num_frames: int) -> None:
@@ -153,15 +188,15 @@ def of_all_frames(write: Callable[[int], None], num_frames: int) -> None:
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def write_panoramas(
+def panorama_writer(
     frames: FrameSet,
     image_path: Callable[[int], Path],
     mask_path: Callable[[int], Path],
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
     scenes: Callable[[int], np.ndarray] | None = None,
-) -> None:
-    """Copy every panorama, and write its mask where the frames have masks.
+) -> FrameWriter:
+    """Copies the panorama of a frame, and writes its mask where the frames have masks.
 
     Panoramas that are corrected, those of raw pairs, and images that trainers misread are written
     anew; those of two lenses are stitched by `gsba.camera.one_centre`.
@@ -175,42 +210,49 @@ def write_panoramas(
         scenes: points (N, 3) around a frame, rig frame, by its index: how far things are.
     """
     if lenses:
-        _stitch_panoramas(frames, image_path, mask_path, lenses, scenes)
-        return
-    for f in track(range(len(frames)), "copying panoramas"):
+        return _stitched_writer(frames, image_path, mask_path, lenses, scenes)
+
+    def write(shown: Shown) -> None:
+        f = shown.f
         source, path = frames.paths[f][0], image_path(f)
         as_it_is = not (frames.correction or frames.fisheyes) and goes_out_as_it_is(source, path)
         if as_it_is:
             pass_on(source, path, link)
         else:
-            write_image(path, load_erp(frames, f))
+            shown.write("panorama", [path], lambda: [shown.erp])
         if has_masks(frames):
-            mask = load_mask(frames, f)
-            if mask is None:
-                mask = np.ones((frames.height, frames.width), bool)
-            write_image(mask_path(f), mask.astype(np.uint8) * 255)
+            shown.write_masks("panorama", [mask_path(f)], lambda: [shown.mask])
+
+    return write
 
 
-def _stitch_panoramas(
+def _stitched_writer(
     frames: FrameSet,
     image_path: Callable[[int], Path],
     mask_path: Callable[[int], Path],
     lenses: Lenses,
     scenes: Callable[[int], np.ndarray] | None,
-) -> None:
-    def write(f: int) -> None:
-        stitcher = Stitcher(lenses, f, np.zeros((0, 3)) if scenes is None else scenes(f))
-        if frames.fisheyes is not None:
-            erp = stitcher.stitched_raw(load_raw(frames, f), frames.width)
-        else:
-            erp = stitcher.stitched(load_erp(frames, f))
-        write_image(image_path(f), erp)
-        if has_masks(frames):
-            mask = load_mask(frames, f)
-            whole = np.ones((frames.height, frames.width), bool) if mask is None else mask
-            write_image(mask_path(f), stitcher.stitched_mask(whole).astype(np.uint8) * 255)
+) -> FrameWriter:
+    def write(shown: Shown) -> None:
+        f = shown.f
 
-    of_all_frames(write, len(frames))
+        @cache
+        def stitcher() -> Stitcher:
+            return Stitcher(lenses, f, np.zeros((0, 3)) if scenes is None else scenes(f))
+
+        def stitched() -> list[np.ndarray]:
+            if frames.fisheyes is not None:
+                return [stitcher().stitched_raw(load_raw(frames, f), frames.width)]
+            return [stitcher().stitched(shown.erp)]
+
+        def mask() -> list[np.ndarray]:
+            return [stitcher().stitched_mask(shown.mask).astype(np.uint8) * 255]
+
+        shown.write("stitched", [image_path(f)], stitched)
+        if has_masks(frames):
+            shown.write("stitched mask", [mask_path(f)], mask)
+
+    return write
 
 
 def pass_on(source: Path, path: Path, link: bool) -> None:
@@ -226,21 +268,6 @@ def pass_on(source: Path, path: Path, link: bool) -> None:
         fcntl.ioctl(clone, _FICLONE, original.fileno())
         return
     shutil.copyfile(source, path)
-
-
-def _write_all(paths: Sequence[Path], images: Sequence[np.ndarray] | np.ndarray) -> None:
-    for path, image in zip(paths, images, strict=True):
-        write_image(path, image)
-
-
-def _write_face_masks(
-    frames: FrameSet, f: int, rig: CubeRig, paths: Sequence[Path], faces: Sequence[str]
-) -> None:
-    from gsba.frames.cubemap import cut_mask
-
-    mask = load_mask(frames, f)
-    use = np.ones((len(FACES), rig.size, rig.size), bool) if mask is None else cut_mask(mask, rig)
-    _write_all(paths, use[[FACES.index(face) for face in faces]].astype(np.uint8) * 255)
 
 
 def _resized(faces: np.ndarray, size: int) -> np.ndarray:

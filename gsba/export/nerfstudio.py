@@ -27,9 +27,16 @@ import numpy as np
 from gsba.camera.fisheye import rotation_of
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.views import View, scenes_of, seen_from_lenses, views_for
-from gsba.export.images import face_size_for, has_masks, suffix_of, write_panoramas, write_views
+from gsba.export.images import (
+    FrameWriter,
+    face_size_for,
+    has_masks,
+    panorama_writer,
+    suffix_of,
+    view_writer,
+)
 from gsba.export.ply import write_splat_points
-from gsba.export.raw import LENSES, raw_lenses, write_raw
+from gsba.export.raw import LENSES, raw_lenses, raw_writer
 from gsba.geometry import pose
 from gsba.types import Fisheye, FrameSet, Reconstruction
 
@@ -48,8 +55,9 @@ def write_nerfstudio(
     z_up: bool = False,
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
-) -> None:
-    """Write faces, cloud and transforms.json into `partial`; for panoramas the ERP variant too.
+) -> list[FrameWriter]:
+    """Write cloud and transforms.json of faces into `partial`; for panoramas the ERP variant too;
+    all but the pictures.
 
     A world whose z points up already is not turned.
     """
@@ -57,10 +65,12 @@ def write_nerfstudio(
     views = views_for(frames, face_size_for(frames, face_size), lenses)
     seen = seen_from_lenses(reconstruction, lenses)
     scenes = scenes_of(reconstruction)
-    _write_face_dataset(partial, seen, frames, views, out_R_world, link, lenses, scenes)
+    given = partial, seen, frames, views, out_R_world, link, lenses, scenes
+    writers = [_write_face_dataset(*given)]
     if frames.panoramic:
         given = partial, reconstruction, frames, lenses, out_R_world, link
-        _write_erp_dataset(*given, "_erp")
+        writers.append(_write_erp_dataset(*given, "_erp"))
+    return writers
 
 
 def write_nerfstudio_erp(
@@ -70,10 +80,10 @@ def write_nerfstudio_erp(
     lenses: Lenses,
     z_up: bool = False,
     link: bool = False,
-) -> None:
-    """Write panoramas, cloud and transforms.json into `partial`."""
+) -> list[FrameWriter]:
+    """Write cloud and transforms.json of panoramas into `partial`, all but the pictures."""
     out_R_world = _write_cloud(partial, reconstruction, z_up)
-    _write_erp_dataset(partial, reconstruction, frames, lenses, out_R_world, link, "")
+    return [_write_erp_dataset(partial, reconstruction, frames, lenses, out_R_world, link, "")]
 
 
 def write_nerfstudio_raw(
@@ -83,8 +93,8 @@ def write_nerfstudio_raw(
     lenses: Lenses,
     z_up: bool = False,
     link: bool = False,
-) -> None:
-    """Write raw fisheyes as they are, cloud and transforms.json into `partial`."""
+) -> list[FrameWriter]:
+    """Write cloud and transforms.json of raw fisheyes into `partial`, all but the pictures."""
     pair = raw_lenses(frames)
     out_R_world = _write_cloud(partial, reconstruction, z_up)
 
@@ -110,13 +120,14 @@ def write_nerfstudio_raw(
     if moving:
         camera["rolling_shutter"] = [0, 0, 1, 0]
     _write_transforms(partial / "transforms.json", camera, entries, len(frames), out_R_world)
-    write_raw(
+    writer = raw_writer(
         frames,
         lambda f, lens: partial / image(f, lens),
         lambda f, lens: partial / mask(f, lens),
         link,
         _SEEN_DEG,
     )
+    return [writer]
 
 
 def _write_cloud(partial: Path, reconstruction: Reconstruction, z_up: bool) -> np.ndarray:
@@ -136,7 +147,7 @@ def _write_face_dataset(
     link: bool,
     lenses: Lenses,
     scenes: Callable[[int], np.ndarray],
-) -> None:
+) -> FrameWriter:
     def image(f: int, face: str) -> str:
         return f"images/{frames.names[f]}_{face}{suffix_of(frames, f)}"
 
@@ -158,7 +169,7 @@ def _write_face_dataset(
                 entry["mask_path"] = mask(f, view.name)
             entries.append(entry)
     _write_transforms(partial / "transforms.json", camera, entries, len(frames), out_R_world)
-    write_views(
+    return view_writer(
         frames,
         views,
         lenses,
@@ -177,7 +188,7 @@ def _write_erp_dataset(
     out_R_world: np.ndarray,
     link: bool,
     which: str,
-) -> None:
+) -> FrameWriter:
     def image(f: int) -> str:
         return f"images{which}/{frames.names[f]}{suffix_of(frames, f)}"
 
@@ -195,7 +206,7 @@ def _write_erp_dataset(
         entries.append(entry)
     path = partial / f"transforms{which}.json"
     _write_transforms(path, camera, entries, len(entries), out_R_world)
-    write_panoramas(
+    return panorama_writer(
         frames,
         lambda f: partial / image(f),
         lambda f: partial / mask(f),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gsba.camera.lens import Lenses
 from gsba.camera.views import scenes_of
-from gsba.export.images import suffix_of, write_panoramas
+from gsba.export.images import FrameWriter, panorama_writer, suffix_of
 from gsba.trajectory.files import write_tum
 from gsba.types import FrameSet, Reconstruction, Trajectory
 
@@ -23,11 +23,17 @@ def write_with_poses(
     frames: FrameSet,
     lenses: Lenses,
     link: bool = False,
-) -> None:
-    """Write `trajectory.tum`, `images` with `timestamps.csv`, and `masks` into `partial`."""
+) -> FrameWriter:
+    """Write `trajectory.tum`, and `timestamps.csv` in `images`, into `partial`; what goes beside it
+    and into `masks` is to be written frame by frame."""
     write_poses(partial, reconstruction, frames)
     images = partial / "images"
-    write_panoramas(
+    images.mkdir()
+    with (images / "timestamps.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["name", "timestamp"])
+        writer.writerows(zip(frames.names, map(float, frames.timestamps), strict=True))
+    return panorama_writer(
         frames,
         lambda f: images / f"{frames.names[f]}{suffix_of(frames, f)}",
         lambda f: partial / "masks" / f"{frames.names[f]}.png",
@@ -35,7 +41,3 @@ def write_with_poses(
         lenses,
         scenes_of(reconstruction),
     )
-    with (images / "timestamps.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["name", "timestamp"])
-        writer.writerows(zip(frames.names, map(float, frames.timestamps), strict=True))

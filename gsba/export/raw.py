@@ -7,15 +7,15 @@ import numpy as np
 
 from gsba.camera.fisheye import Pair, rotation_of, unproject
 from gsba.camera.sphere import erp_from_bearings
-from gsba.disk import write_image
-from gsba.export.images import of_all_frames, pass_on
+from gsba.export.images import FrameWriter, pass_on
+from gsba.export.pictures import Shown
 from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.files import goes_out_as_it_is
-from gsba.frames.masks import load_mask
 from gsba.log import GsbaError
 from gsba.types import Fisheye, FrameSet
 
 LENSES = ("front", "back")
+_BAND = 256  # rows of which coordinates are held in double precision
 SEEN_DEG = 95.0  # from a lens's axis: further out, circles end and calibrations with them
 
 
@@ -30,14 +30,14 @@ def raw_lenses(frames: FrameSet) -> Pair:
     return frames.fisheyes
 
 
-def write_raw(
+def raw_writer(
     frames: FrameSet,
     image_path: Callable[[int, int], Path],
     mask_path: Callable[[int, int], Path],
     link: bool = False,
     seen_deg: float = SEEN_DEG,
-) -> None:
-    """Copy both pictures of every frame, and write masks of where they show something.
+) -> FrameWriter:
+    """Copies both pictures of a frame, and writes masks of where they show something.
 
     Pictures side by side in one image, and those that trainers misread, are written anew.
 
@@ -48,35 +48,44 @@ def write_raw(
         link: hard links instead of copies.
         seen_deg: from a lens's axis, beyond which masks leave its picture out.
     """
-    shown = [_shown(lens, seen_deg) for lens in raw_lenses(frames)]
+    size = frames.width, frames.height
+    circles = [_circle(lens, seen_deg, *size) for lens in raw_lenses(frames)]
 
-    def write(f: int) -> None:
-        mask, sources = load_mask(frames, f), frames.paths[f]
+    def write(shown: Shown) -> None:
+        f = shown.f
+        sources = frames.paths[f]
         paths = [image_path(f, lens) for lens in range(len(sources))]
         if sources[0] != sources[1] and all(map(goes_out_as_it_is, sources, paths)):
             for source, path in zip(sources, paths, strict=True):
                 pass_on(source, path, link)
         else:
-            for path, picture in zip(paths, load_raw(frames, f), strict=True):
-                write_image(path, picture)
-        for lens, (seen, directions) in enumerate(shown):
-            used = seen if mask is None else seen & _at(mask, directions)
-            write_image(mask_path(f, lens), used.astype(np.uint8) * 255)
+            shown.write("raw", paths, lambda: load_raw(frames, f))
 
-    of_all_frames(write, len(frames))
+        def used() -> list[np.ndarray]:
+            if frames.mask_paths[f] is None:
+                return [seen for seen, _ in circles]
+            return [seen & shown.mask.ravel()[places] for seen, places in circles]
 
+        masks = [mask_path(f, lens) for lens in range(len(circles))]
+        shown.write_masks(("raw", seen_deg), masks, used)
 
-def _shown(lens: Fisheye, seen_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where a lens's picture is to be used, (h, w) bool, and in which directions, (h, w, 3)."""
-    pixels = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
-    directions = unproject(lens, np.stack(pixels, axis=-1))
-    ahead = directions @ rotation_of(lens)[:, 2]
-    return ahead > np.cos(np.deg2rad(seen_deg)), directions.astype(np.float32)
+    return write
 
 
-def _at(mask: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """A panorama's mask (H, 2 H) bool in directions (h, w, 3)."""
-    height, width = mask.shape
-    places = np.minimum(erp_from_bearings(directions, width, height), (width - 1, height - 1))
-    columns, rows = np.moveaxis(places, -1, 0).astype(int)
-    return mask[rows, columns]
+def _circle(
+    lens: Fisheye, seen_deg: float, width: int, height: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where a lens's picture is to be used, (h, w) bool, and which of a panorama's pixels, counted
+    row by row, are there, (h, w) int32."""
+    seen = np.empty((lens.height, lens.width), bool)
+    pixels = np.empty((lens.height, lens.width), np.int32)
+    for top in range(0, lens.height, _BAND):
+        rows = np.arange(top, min(top + _BAND, lens.height)) + 0.5
+        grid = np.meshgrid(np.arange(lens.width) + 0.5, rows)
+        directions = unproject(lens, np.stack(grid, axis=-1))
+        part = slice(top, top + len(rows))
+        seen[part] = directions @ rotation_of(lens)[:, 2] > np.cos(np.deg2rad(seen_deg))
+        places = erp_from_bearings(directions.astype(np.float32), width, height)
+        u, v = np.moveaxis(np.minimum(places, (width - 1, height - 1)), -1, 0).astype(int)
+        pixels[part] = v * width + u
+    return seen, pixels

@@ -1,17 +1,20 @@
 """Cut the six pinhole faces of a frame out of its panorama."""
 
-import functools
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
 
 from gsba.camera.rig import CubeRig
-from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings
+from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings, low_passed
 from gsba.camera.straighten import PAD
+from gsba.camera.tables import table
 from gsba.config import CubemapSettings
 from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.types import FACES, FrameSet
+
+_BAND = 256  # rows of which coordinates are held in double precision
 
 
 def rig_for(frames: FrameSet, settings: CubemapSettings) -> CubeRig:
@@ -62,36 +65,44 @@ def cut(erp: np.ndarray, rig: CubeRig) -> np.ndarray:
     Returns:
         (6, size, size[, C]) uint8, in FACES order.
     """
-    width = dense_enough(erp.shape[1], rig.focal)
-    height = width // 2
-    if width < erp.shape[1]:
-        erp = cv2.resize(erp, (width, height), interpolation=cv2.INTER_AREA)
-    padded = around_sphere(erp, PAD)
-    maps = _face_maps(rig, width, height)
-    return np.stack(
-        [
-            cv2.remap(padded, maps[face, 0], maps[face, 1], cv2.INTER_CUBIC)
-            for face in range(len(FACES))
-        ]
-    )
+    faces = np.empty((len(FACES), rig.size, rig.size, *erp.shape[2:]), np.uint8)
+    padded = around_sphere(low_passed(erp, rig.focal), PAD)
+    for face, (u, v) in zip(faces, _maps_into(padded, rig), strict=True):
+        cv2.remap(padded, u, v, cv2.INTER_CUBIC, dst=face)
+    return faces
+
+
+def cut_padded(padded: np.ndarray, rig: CubeRig, out: np.ndarray) -> Iterator[np.ndarray]:
+    """As `cut`, of a panorama with PAD pixels around it: one face after the other, all in `out`
+    (size, size[, C])."""
+    inner = padded[PAD:-PAD, PAD:-PAD]
+    small = low_passed(inner, rig.focal)
+    if small is not inner:
+        padded = around_sphere(small, PAD)
+    for u, v in _maps_into(padded, rig):
+        yield cv2.remap(padded, u, v, cv2.INTER_CUBIC, dst=out)
 
 
 def cut_mask(mask: np.ndarray, rig: CubeRig) -> np.ndarray:
     """Nearest-neighbour faces (6, size, size) of an ERP mask (H, 2H), bool or float32 weights."""
-    height, width = mask.shape
     padded = around_sphere(mask.astype(np.uint8) if mask.dtype == bool else mask, PAD)
-    maps = _face_maps(rig, width, height)
+    maps = _maps_into(padded, rig)
     faces = [cv2.remap(padded, u, v, cv2.INTER_NEAREST) for u, v in maps]
     return np.stack(faces).astype(mask.dtype)
 
 
-@functools.lru_cache(maxsize=2)
+def _maps_into(padded: np.ndarray, rig: CubeRig) -> np.ndarray:
+    return _face_maps(rig, padded.shape[1] - 2 * PAD, padded.shape[0] - 2 * PAD)
+
+
+@table(maxsize=2)
 def _face_maps(rig: CubeRig, width: int, height: int) -> np.ndarray:
     """Sampling positions (6, 2, size, size) float32 in the padded panorama, OpenCV pixels."""
     centres = np.arange(rig.size) + 0.5
-    grid = np.stack(np.meshgrid(centres, centres), axis=-1)
     maps = np.empty((len(FACES), 2, rig.size, rig.size), np.float32)
     for face in range(len(FACES)):
-        erp_pixels = erp_from_bearings(rig.bearings(grid, face), width, height)
-        maps[face] = np.moveaxis(erp_pixels - 0.5 + PAD, -1, 0)
+        for top in range(0, rig.size, _BAND):
+            grid = np.stack(np.meshgrid(centres, centres[top : top + _BAND]), axis=-1)
+            erp_pixels = erp_from_bearings(rig.bearings(grid, face), width, height)
+            maps[face, :, top : top + _BAND] = np.moveaxis(erp_pixels - 0.5 + PAD, -1, 0)
     return maps

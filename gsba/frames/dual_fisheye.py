@@ -1,12 +1,11 @@
 """Panoramas of raw pairs: each direction from the lens that faces it, nothing blended."""
 
-import functools
-
 import cv2
 import numpy as np
 
 from gsba.camera.fisheye import Pair, project
 from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.tables import table
 from gsba.frames.raw_pairs import decode_pair
 from gsba.types import FrameSet
 
@@ -43,12 +42,15 @@ def load_joined(frames: FrameSet, f: int, gray: bool, width: int) -> np.ndarray:
     return np.concatenate([left, front, right], axis=1)
 
 
-@functools.lru_cache(maxsize=2)
+@table(maxsize=2)
 def clear_of_seam(height: int) -> np.ndarray:
     """Where windows of a panorama of raw pairs are of one lens alone, (height, 2 height) bool."""
-    pixels = np.stack(np.meshgrid(np.arange(2 * height) + 0.5, np.arange(height) + 0.5), axis=-1)
-    ahead = bearings_from_erp(pixels, 2 * height, height)[..., 2]
-    clear = np.abs(ahead) > np.sin(SEAM)
+    clear = np.empty((height, 2 * height), bool)
+    for top in range(0, height, _BAND):
+        rows = np.arange(top, min(top + _BAND, height)) + 0.5
+        pixels = np.stack(np.meshgrid(np.arange(2 * height) + 0.5, rows), axis=-1)
+        ahead = bearings_from_erp(pixels, 2 * height, height)[..., 2]
+        clear[top : top + len(rows)] = np.abs(ahead) > np.sin(SEAM)
     clear.setflags(write=False)
     return clear
 
@@ -68,7 +70,7 @@ def _shrunk(picture: np.ndarray, share: float) -> np.ndarray:
     return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
 
 
-@functools.lru_cache(maxsize=2)
+@table(maxsize=2)
 def _maps(pair: Pair, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Places in either picture of half a panorama (H, W / 2, 2) float32, OpenCV pixels; columns of
     the back one from the right edge of the front one on."""

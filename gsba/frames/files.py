@@ -4,6 +4,7 @@ import mmap
 import re
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -56,7 +57,11 @@ def goes_out_as_it_is(source: Path, target: Path) -> bool:
 
 
 def decode(
-    path: Path, size: tuple[int, int], gray: bool = False, at_least: int | None = None
+    path: Path,
+    size: tuple[int, int],
+    gray: bool = False,
+    at_least: int | None = None,
+    room: np.ndarray | None = None,
 ) -> np.ndarray:
     """Pixels of an image as shown: turned by the orientation tag, 16 bits scaled to 8.
 
@@ -66,6 +71,7 @@ def decode(
         gray: one channel instead of RGB.
         at_least: width that is enough: a JPEG is decoded at a half, a quarter or an eighth of its
             size, which is fast, as long as it stays that wide.
+        room: (N,) uint8, as many as there are values: where those of most JPEGs then lie.
 
     Returns:
         (H, W, 3) uint8 RGB, or (H, W) uint8.
@@ -87,7 +93,7 @@ def decode(
     if header.kind == "JPEG":
         part = max(k for k in (1, 2, 4, 8) if k == 1 or size[0] >= k * (at_least or size[0]))
         stored = (size[1], size[0]) if header.swapped else size
-        pixels = _decoded_jpeg(encoded, path, stored, part, gray)
+        pixels = _decoded_jpeg(encoded, path, stored, part, gray, room)
     else:
         pixels = _decoded(encoded, path, gray)
     upright = header.kind == "TIFF"  # which OpenCV turns, asked or not
@@ -124,7 +130,12 @@ def _decoded(encoded: bytes, path: Path, gray: bool) -> np.ndarray:
 
 
 def _decoded_jpeg(
-    encoded: bytes, path: Path, size: tuple[int, int], part: int, gray: bool
+    encoded: bytes,
+    path: Path,
+    size: tuple[int, int],
+    part: int,
+    gray: bool,
+    room: np.ndarray | None,
 ) -> np.ndarray:
     """Pixels of a JPEG at 1 / part of its size; what a decoder would make up is refused."""
     import simplejpeg
@@ -133,7 +144,8 @@ def _decoded_jpeg(
         if simplejpeg.decode_jpeg_header(encoded, strict=False)[2] in ("CMYK", "YCCK"):
             return _decoded(encoded, path, gray)
         least = {"min_width": -(-size[0] // part), "min_height": -(-size[1] // part)}
-        wanted = partial(simplejpeg.decode_jpeg, encoded, "GRAY" if gray else "RGB", **least)
+        how: dict[str, Any] = {**least, "buffer": room}
+        wanted = partial(simplejpeg.decode_jpeg, encoded, "GRAY" if gray else "RGB", **how)
         try:
             pixels = wanted()
         except ValueError as error:

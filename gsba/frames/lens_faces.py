@@ -16,5 +16,5 @@ def cut(frames: FrameSet, f: int, cutter: ViewCutter) -> list[np.ndarray]:
         cutter: of that frame.
     """
     if frames.fisheyes is not None:
-        return cutter.cut_raw(load_raw(frames, f))
+        return list(cutter.cut_raw(load_raw(frames, f)))
     return cutter.cut(load_erp(frames, f))

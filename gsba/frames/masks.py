@@ -1,5 +1,6 @@
 """Equirectangular masks: white = use, black = do not, light grey = use with less weight."""
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -100,9 +101,17 @@ def _load_levels(frames: FrameSet, f: int) -> np.ndarray | None:
     if path is None:
         return None
     size = (frames.width, frames.height) if frames.panoramic else image_size(path)
+    written = path.stat().st_mtime_ns if path.exists() else None
+    return _levels_in(path, size, written)
+
+
+@functools.lru_cache(maxsize=1)
+def _levels_in(path: Path, size: tuple[int, int], written: int | None) -> np.ndarray:
+    """What a file written at that time holds: one mask of all frames is decoded once."""
     values = decode(path, size, gray=True)
     if values.max() == 1:
         raise GsbaError(f"{path}: mask holds 0 and 1; write 255 where pixels are to be used")
+    values.setflags(write=False)
     return values
 
 

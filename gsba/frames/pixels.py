@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from gsba.camera.straighten import straightened
+from gsba.camera.sphere import around_sphere
+from gsba.camera.straighten import PAD, straightened, straightened_inside
+from gsba.frames.buffers import Buffers
 from gsba.frames.dual_fisheye import load_joined
 from gsba.frames.files import decode
 from gsba.types import FrameSet
@@ -29,6 +31,26 @@ def load_erp(frames: FrameSet, f: int, gray: bool = False, width: int | None = N
     if width is not None and width < erp.shape[1]:
         erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
     return straightened(erp, frames.correction) if frames.correction else erp
+
+
+def load_padded(frames: FrameSet, f: int, buffers: Buffers) -> np.ndarray:
+    """As `load_erp`, in colour, with PAD pixels of wrap-around: (height + 2 PAD, width + 2 PAD, 3).
+
+    It lies in the thread's buffers: the next one takes its place. A JPEG is decoded at the end of
+    the memory through which it is then moved, so that a frame is held once.
+    """
+    shape = (frames.height + 2 * PAD, frames.width + 2 * PAD, 3)
+    padded = buffers.array("padded", shape)
+    if frames.fisheyes is not None:
+        return around_sphere(load_erp(frames, f), PAD, padded)
+    size = frames.width, frames.height
+    room = padded.reshape(-1)[-3 * frames.width * frames.height :]
+    around_sphere(decode(frames.paths[f][0], size, room=room), PAD, padded)
+    if not frames.correction:
+        return padded
+    straight = buffers.array("straight", shape)
+    inner = straight[PAD:-PAD, PAD:-PAD]
+    return around_sphere(straightened_inside(padded, frames.correction, inner), PAD, straight)
 
 
 def load_faces(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:

@@ -11,7 +11,7 @@ from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.disk import write_json, write_text
-from gsba.export import ExportFormat, export, of_one_lens, write_points
+from gsba.export import ExportFormat, export_all, of_one_lens, write_points
 from gsba.pipeline.map import Map
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
@@ -76,8 +76,7 @@ def write(run: Run, prior: Prior, world: Map, result: Reconstruction, lenses: Le
     if shown.fisheyes is not None:
         write_json(out / CALIBRATION, _calibration(shown.fisheyes, world, result, lenses, settings))
     placement = place(main, shown, settings.placement, settings.camera.baseline())
-    for name in settings.export.formats:
-        _export(run, ExportFormat(name), main, shown, placement, lenses.taken(rows))
+    _export(run, main, shown, placement, lenses.taken(rows))
     report = _report(run, prior, world, result)
     write_json(out / "report.json", report)
     page = report | {"frames": [report["frames"][f] for f in rows]}
@@ -152,24 +151,27 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
 
 
 def _export(
-    run: Run,
-    to: ExportFormat,
-    main: Reconstruction,
-    shown: FrameSet,
-    placement: Placement,
-    lenses: Lenses,
+    run: Run, main: Reconstruction, shown: FrameSet, placement: Placement, lenses: Lenses
 ) -> None:
-    folder, name = run.store.root / to.value, f"export-{to.value}"
-    if not folder.exists():
-        run.store.forget(name)
-    size, images = run.settings.export.face_size, run.settings.export.images
+    """Datasets in all formats; the first that is not there yet has the others written with it."""
+    store, size, images = run.store, run.settings.export.face_size, run.settings.export.images
     seen_by = lenses if of_one_lens(images, shown) else ONE_CENTRE
-
-    def compute() -> Counts:
-        export(main, shown, folder, to, size, placement, lenses=seen_by, images=images)
-        return Counts(len(run.frames), len(shown), "frames")
-
     key = [size, placement.to_json(), *(["of one lens"] if seen_by else [])]
     key += {"fisheye": ["raw"], "panorama": ["panorama"]}.get(images, [])
-    run.store.stage(name, key, compute, Counts, run.chain.latest)
-    run.store.claim(folder)
+    folders = {ExportFormat(name): store.root / name for name in run.settings.export.formats}
+    waiting = {}
+    for to, folder in folders.items():
+        if not folder.exists():
+            store.forget(f"export-{to.value}")
+        if not store.is_stored(f"export-{to.value}", key, Counts, run.chain.latest):
+            waiting[to] = folder
+
+    def compute() -> Counts:
+        if waiting:
+            export_all(main, shown, waiting, size, placement, lenses=seen_by, images=images)
+            waiting.clear()
+        return Counts(len(run.frames), len(shown), "frames")
+
+    for to, folder in folders.items():
+        store.stage(f"export-{to.value}", key, compute, Counts, run.chain.latest)
+        store.claim(folder)

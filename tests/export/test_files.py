@@ -192,18 +192,18 @@ def test_face_size_defaults_to_a_quarter_and_is_even(frames):
 def test_an_interrupted_export_leaves_nothing_and_keeps_the_last(
     tmp_path, frames, monkeypatch, to, failure, raised
 ):
-    from gsba.export import images
+    from gsba.export import pictures
 
     written = []
 
-    def write(path, image):
+    def write(path, content):
         if len(written) == 20:
             raise failure
         written.append(path)
-        return whole(path, image)
+        return whole(path, content)
 
-    whole = images.write_image
-    monkeypatch.setattr(images, "write_image", write)
+    whole = pictures.write_bytes
+    monkeypatch.setattr(pictures, "write_bytes", write)
     with pytest.raises(raised):
         export(reconstruction(), frames, tmp_path / "out", ExportFormat(to))
     assert _entries(tmp_path) == []

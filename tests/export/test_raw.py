@@ -9,7 +9,8 @@ from export_scene import panoramas
 from PIL import Image
 from two_fisheyes import made_pair, picture, write
 
-from gsba.export.raw import write_raw
+from gsba.export.images import write_pictures
+from gsba.export.raw import raw_writer
 from gsba.types import FrameSet
 
 PAIR = made_pair(120)
@@ -35,12 +36,13 @@ def _frames(folder: Path, layout: str) -> tuple[FrameSet, list[np.ndarray]]:
 def test_each_lens_has_a_picture_of_its_own(tmp_path: Path, layout: str) -> None:
     frames, shown = _frames(tmp_path, layout)
     suffix = "jpg" if layout == "webp" else "png"
-    write_raw(
+    writer = raw_writer(
         frames,
         lambda f, lens: tmp_path / f"out{lens}.{suffix}",
         lambda f, lens: tmp_path / f"mask{lens}.png",
         link=True,
     )
+    write_pictures(frames, [writer])
     for lens, wanted in enumerate(shown):
         read = pycolmap.Bitmap.read(tmp_path / f"out{lens}.{suffix}", True)
         assert read is not None

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsba.frames import masks
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.frames.scan import scan
@@ -360,6 +361,24 @@ def test_one_mask_for_all(folder: Path, tmp_path: Path) -> None:
     assert mask is not None and mask.dtype == bool and mask.shape == (32, 64)
     assert mask[:16].all() and not mask[16:].any()
     assert load_mask(scan(folder, fps=1), 0) is None
+
+
+def test_a_mask_of_all_frames_is_decoded_once_as_long_as_it_stays(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, read, decode = write_mask(tmp_path / "mask.png"), [], masks.decode
+    monkeypatch.setattr(masks, "decode", lambda *a, **k: read.append(a) or decode(*a, **k))
+    frames = scan(folder, fps=1, masks=path)
+    first, second = load_mask(frames, 0), load_mask(frames, 1)
+    assert first is not None and second is not None and np.array_equal(first, second)
+    assert len(read) == 1
+    write_mask(path, white=0)
+    os.utime(path, ns=(0, 0))
+    changed = load_mask(frames, 1)
+    assert changed is not None and not changed.any()
+    path.unlink()
+    with pytest.raises(GsbaError, match=r"mask.png: cannot be read"):
+        load_mask(frames, 0)
 
 
 @pytest.mark.parametrize("pattern", ["{}.png", "{}.jpg.png"])

@@ -19,6 +19,7 @@ from gsba.bundle.prior_factors import X
 from gsba.camera.rig import CubeRig
 from gsba.config_file import load_config
 from gsba.evaluate.trajectory import evaluate
+from gsba.export import pictures
 from gsba.frames import cubemap
 from gsba.log import GsbaError
 from gsba.store.store import load_stage
@@ -181,6 +182,31 @@ def test_cube_faces_serve_as_well(case: Case, tmp_path: Path, missing: tuple[str
     assert case.errors(out).ate.rmse < before.ate.rmse / 10
     model = pycolmap.Reconstruction(out / "colmap/sparse/0")
     assert model.num_images() == (6 - len(missing)) * NUM_FRAMES
+
+
+def test_formats_added_later_are_written_together(
+    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, read, load = case.copy(tmp_path / "run"), [], pictures.load_padded
+    monkeypatch.setattr(
+        pictures, "load_padded", lambda frames, f, *a: read.append(f) or load(frames, f, *a)
+    )
+    formats = {"formats": ("colmap", "colmap-flat", "nerfstudio")}
+    settings = SETTINGS.model_copy(update={"export": SETTINGS.export.model_copy(update=formats)})
+    assert computed_stages(case.refine(out, settings)) == [
+        "export-colmap-flat",
+        "export-nerfstudio",
+    ]
+    assert sorted(read) == list(range(NUM_FRAMES))
+    for f in range(NUM_FRAMES):
+        (name,) = [p.name for p in (out / "colmap/images/front").glob(f"*{f:04d}.*")]
+        stem, _, suffix = name.rpartition(".")
+        wanted = (out / "colmap/images/front" / name).read_bytes()
+        for to in ("colmap-flat", "nerfstudio"):
+            assert (out / to / "images" / f"{stem}_front.{suffix}").read_bytes() == wanted
+    shutil.rmtree(out / "nerfstudio")
+    assert computed_stages(case.refine(out, settings)) == ["export-nerfstudio"]
+    assert (out / "nerfstudio/transforms.json").is_file()
 
 
 def test_masks_reach_features_and_exports(case: Case, tmp_path: Path) -> None:
