@@ -126,22 +126,12 @@ def refine(
         overrides = [*overrides, f'camera.name="{camera}"']
     settings = _settings(config, overrides, factors)
     from gsba import pipeline
+    from gsba.pipeline.workers import connected
 
-    pipeline.refine(
-        frames,
-        trajectory,
-        out,
-        settings,
-        keyframes=keyframes,
-        masks=masks,
-        segment=segment,
-        timestamps=timestamps,
-        fps=fps,
-        calibration=calibration,
-        imu=imu,
-        fresh=fresh,
-        cluster=cluster,
-    )
+    given = {"keyframes": keyframes, "masks": masks, "segment": segment, "timestamps": timestamps}
+    given |= {"fps": fps, "calibration": calibration, "imu": imu, "fresh": fresh}
+    with connected(cluster) as client:
+        pipeline.refine(frames, trajectory, out, settings, client=client, **given)
     typer.echo(_summary(out))
 
 

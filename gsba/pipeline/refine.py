@@ -70,19 +70,16 @@ def refine(
     imu: Path | None = None,
     fresh: bool = False,
     extra_factors: ExtraFactors | None = None,
-    cluster: str | None = None,
     client: "Client | None" = None,
 ) -> RunResult:
     """Refine the pose of every frame, and write poses, cloud, report and datasets to `out`.
-
-    A second call with the same `out` re-runs only what depends on settings that changed.
 
     Args:
         frames: folder of 2:1 panoramas, raw fisheyes or cube faces, or a video, for `out`/frames.
         trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig. Several are pieces of one run
             on one clock, and the first one's world is kept. None = start from the images alone:
             the first step's length is the unit and the first frame the world.
-        out: folder of the run.
+        out: folder of the run; a second call re-runs what depends on settings that changed.
         settings: see `gsba.config`.
         keyframes: second trajectory file of the same run, with its keyframes: they lead.
         masks: one ERP mask for all frames, or a folder of one for each, white = use; "carrier" (or
@@ -94,9 +91,7 @@ def refine(
         imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
         fresh: forget an earlier run in `out`.
         extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
-        cluster: address of a Dask scheduler whose workers do what can be shared out, see
-            `gsba.pipeline.workers.connect`; None = threads here.
-        client: of such a scheduler, in place of its address.
+        client: of a Dask scheduler whose workers take what can be shared out; None = threads here.
 
     Raises:
         GsbaError: an input or setting that cannot be used.
@@ -114,8 +109,7 @@ def refine(
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, calibration)
     check(settings.placement, frame_set, settings.camera.baseline())
     coarse = inputs.coarse_poses(frame_set, given, settings)
-    hire = workers.hire(cluster, client, frames, settings.solver.threads())
-    with RunStore(out, origin, fresh, hire) as store:
+    with RunStore(out, origin, fresh, workers.hire(client, frames, settings)) as store:
         frame_set, journal = merging.before(store, frame_set, chosen), Journal()
         if chosen.distractors:
             frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)

@@ -12,11 +12,12 @@ import os
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from gsba.config import RefineSettings
 from gsba.disk import write_text
 from gsba.log import GsbaError, track
 from gsba.store import shards
@@ -48,25 +49,40 @@ _SIGHT_S = 30.0  # for a disk shared by machines to show what another one has wr
 
 
 def hire(
-    address: str | None, client: "Client | None", frames: Path, num_threads: int
+    client: "Client | None", frames: Path, settings: RefineSettings
 ) -> Callable[[Path], Workers]:
     """What makes the workers of a run, given the folder of its shards.
 
     Args:
-        address: see `connect`; None = the client's, or threads here.
-        client: of a scheduler that the caller has.
+        client: of a scheduler; None = threads here.
         frames: of the run, which workers read.
-        num_threads: of this process.
+        settings: of the run.
     """
 
     def make(folder: Path) -> Workers:
-        if address is not None:
-            return Cluster(connect(address), folder, frames, ours=True)
-        if client is not None:
-            return Cluster(client, folder, frames)
-        return shards.Threads(num_threads)
+        if client is None:
+            return shards.Threads(settings.solver.threads())
+        return Cluster(client, folder, frames)
 
     return make
+
+
+@contextmanager
+def connected(address: str | None) -> Iterator["Client | None"]:
+    """`connect` for as long as it lasts, workers that were started for it included; None for
+    none."""
+    if address is None:
+        yield None
+        return
+    client: Any = connect(address)
+    cluster = client.cluster
+    try:
+        yield client
+    finally:
+        with suppress(Exception):  # whatever is left of them
+            client.close()
+            if cluster is not None:
+                cluster.close()
 
 
 def connect(address: str) -> "Client":
@@ -149,24 +165,19 @@ class Cluster:
         client: of the scheduler.
         folder: of shards, in the run's folder.
         frames: of the run.
-        ours: whether scheduler and workers are to be given up with the run.
 
     Raises:
         GsbaError: workers that do not see these, or have another version of gsba.
     """
 
-    def __init__(self, client: "Client", folder: Path, frames: Path, ours: bool = False) -> None:
+    def __init__(self, client: "Client", folder: Path, frames: Path) -> None:
         self._client: Any = client  # its methods are typed as coroutines
-        self._folder, self._ours = folder.absolute(), ours
+        self._folder = folder.absolute()
         self._cpu_seconds = 0.0
         self._done: dict[str, int] = {}
-        try:
-            _leave_task()
-            _prepare(client)
-            self._check(frames.absolute())
-        except BaseException:
-            self.close()
-            raise
+        _leave_task()
+        _prepare(client)
+        self._check(frames.absolute())
 
     def map_shards(self, job: Job[R]) -> Iterator[R]:
         """See `gsba.store.shards.Workers`."""
@@ -175,14 +186,6 @@ class Cluster:
     def spent(self) -> Spent:
         """See `gsba.store.shards.Workers`."""
         return Spent(self._cpu_seconds, dict(self._done))
-
-    def close(self) -> None:
-        """See `gsba.store.shards.Workers`."""
-        if self._ours:
-            with suppress(Exception):  # whatever is left of them
-                self._client.close()
-                if self._client.cluster is not None:
-                    self._client.cluster.close()
 
     def _results(self, job: Job[R]) -> Iterator[R]:
         """Results of all items in order, a window of shards at work ahead of them."""

@@ -83,10 +83,6 @@ class Workers(Protocol):
         """So far, elsewhere."""
         ...
 
-    def close(self) -> None:
-        """Let go of what was started for them."""
-        ...
-
 
 @dataclass(frozen=True, slots=True)
 class Threads:
@@ -107,9 +103,6 @@ class Threads:
     def spent(self) -> Spent:
         """Nothing is done elsewhere."""
         return Spent()
-
-    def close(self) -> None:
-        """Threads end with their job."""
 
 
 def blocks_of_frames(frames: np.ndarray) -> list[tuple[int, int]]:

@@ -83,7 +83,6 @@ class RunStore:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.workers.close()
         os.close(self._lock)
 
     @contextmanager

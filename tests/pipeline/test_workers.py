@@ -11,9 +11,10 @@ import pytest
 from shard_jobs import Squares
 from tiny_run import Case
 
+from gsba.config import RefineSettings
 from gsba.log import GsbaError
 from gsba.pipeline import workers
-from gsba.pipeline.workers import Cluster, connect
+from gsba.pipeline.workers import Cluster, connect, connected
 from gsba.store.shards import Threads
 from gsba.store.store import RunStore
 
@@ -176,20 +177,22 @@ def test_a_folder_that_workers_do_not_see_is_named(client, tmp_path: Path) -> No
         Cluster(client, tmp_path / "shards", tmp_path / "elsewhere")
 
 
-def test_a_run_starts_workers_and_lets_them_go(tmp_path: Path) -> None:
+def test_workers_are_started_and_let_go(tmp_path: Path) -> None:
     """`--cluster local:1`; a stage says how many workers took part."""
     job = _squares(tmp_path)
-    hire = workers.hire("local:1", None, tmp_path, 1)
-    with RunStore(tmp_path / "run", {"frames": tmp_path}, hire=hire) as store:
-        given = store.workers
+    with connected(None) as nobody:
+        assert nobody is None
+    with connected("local:1") as client:
+        hire = workers.hire(client, tmp_path, RefineSettings())
+        with RunStore(tmp_path / "run", {"frames": tmp_path}, hire=hire) as store:
 
-        def compute() -> np.ndarray:
-            return np.stack(list(given.map_shards(job)))
+            def compute() -> np.ndarray:
+                return np.stack(list(store.workers.map_shards(job)))
 
-        assert store.stage("squares", None, compute, np.ndarray).shape == (9, 1000)
-        assert store.records["squares"].workers == 1
+            assert store.stage("squares", None, compute, np.ndarray).shape == (9, 1000)
+            assert store.records["squares"].workers == 1
         assert not list((tmp_path / "run/stages/shards").glob("*"))
-    assert isinstance(given, Cluster) and given._client.status == "closed"
+    assert client is not None and client.status == "closed"
 
 
 @pytest.mark.parametrize(
