@@ -12,6 +12,7 @@ import numpy as np
 from gsba.log import GsbaError
 from gsba.scans.fit import Fit, approach, settle
 from gsba.scans.judge import Grid, Verdict, verdict
+from gsba.scans.noise import noise_of
 from gsba.scans.search import Guess, candidates, distance
 from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3
@@ -26,7 +27,7 @@ _SAME = 0.05  # of the cloud's size: fits nearer than this are one
 _RIVALS = 0.8  # of the best one's share: placements that explain less are none
 _LEAST_SHARE = 0.25  # of the cloud, explained
 _LEAST_AGREEMENT = 0.65  # explained, of what the scan says something about
-_LEAST_LEAD = 3.5  # standard errors over any rival
+_MOST_DOUBT = 0.01  # chance that a placement leads although another is as good, over all others
 
 
 class NoPlacementError(GsbaError):
@@ -40,11 +41,11 @@ class Registration:
     fit: Fit
     verdict: Verdict
     rivals: int  # other placements that explain about as much
-    lead: float  # standard errors over the best of them; infinite = there is none
+    doubt: float  # chance of leading the nearest of them so, were that as good; 0 = there is none
 
     def __str__(self) -> str:
         found, sigmas = self.fit.similarity, self.fit.sigmas
-        lead = f", {self.lead:.1f} sigmas before the next" if self.rivals else ""
+        lead = f", the next as good by {100 * self.doubt:.2g} % chance" if self.rivals else ""
         return (
             f"{100 * self.verdict.share:.0f} % of the cloud explained{lead}; scale "
             f"{found.scale:.6g} to {100 * sigmas[6]:.2g} %, place to {max(sigmas[3:6]):.2g} units"
@@ -56,13 +57,13 @@ class Registration:
         return {
             "explained": round(self.verdict.share, 4),
             "contradicted": round(float(self.verdict.contradicted.mean()), 4),
-            "residual_sigma": self.fit.sigma,
+            "residual_sigma": self.fit.noise.sigma,
             "scale_sigma": float(sigmas[6] * self.fit.similarity.scale),
             "rotation_sigmas_deg": np.degrees(sigmas[:3]).tolist(),
             "translation_sigmas": sigmas[3:6].tolist(),
             "about": self.fit.middle.tolist(),
             "rivals": self.rivals,
-            "lead_sigmas": round(self.lead, 2) if self.rivals else None,
+            "doubt": self.doubt if self.rivals else None,
         }
 
 
@@ -86,24 +87,30 @@ def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registrati
     """
     near = _laid(candidates(cloud, scan, guess or Guess(), _TRIED), cloud, scan)
     grid = Grid(scan)
-    shares = [verdict(fit, cloud, scan, grid, sigma).share for fit, sigma in near]
+    noises = [noise_of(fit, cloud, scan, sigma) for fit, sigma in near]
+    shares = [
+        verdict(fit, cloud, scan, grid, noise).share
+        for (fit, _), noise in zip(near, noises, strict=True)
+    ]
     order = np.argsort([-share for share in shares], kind="stable")[:_JUDGED]
     fits = [settle(near[n][0], cloud, scan, near[n][1]) for n in order]
     if not fits:
         raise NoPlacementError("nothing in it resembles the run: " + _ADVICE)
-    sigma = fits[0].sigma  # one for all, so that their likelihoods compare
-    verdicts = [verdict(fit.similarity, cloud, scan, grid, sigma) for fit in fits]
-    best = _best(verdicts)
-    least = _RIVALS * verdicts[best].share
-    leads = [verdicts[best].lead(v) for v in _others(verdicts, best) if v.share >= least]
-    found = Registration(fits[best], verdicts[best], len(leads), min(leads, default=np.inf))
-    for fit, said in zip(fits, verdicts, strict=True):
+    noise = fits[0].noise  # one for all, so that their likelihoods compare
+    verdicts = [verdict(fit.similarity, cloud, scan, grid, noise) for fit in fits]
+    doubts = np.array([[a.doubt(b) for b in verdicts] for a in verdicts])
+    shares = np.array([said.share for said in verdicts])
+    rivals = (shares >= _RIVALS * shares.max()) & ~np.eye(len(fits), dtype=bool)
+    worst = np.max(doubts, axis=1, where=rivals, initial=0.0)
+    best = int(np.argmin(np.where(shares >= _RIVALS * shares.max(), worst, 2.0)))
+    found = Registration(fits[best], verdicts[best], int(rivals[best].sum()), float(worst[best]))
+    for n, (fit, said) in enumerate(zip(fits, verdicts, strict=True)):
         logger.debug(
-            "scale %.5g: %.3f explained, %.3f contradicted, %.1f sigmas behind",
+            "scale %.5g: %.3f explained, %.3f contradicted, %.2g that the best only leads by chance",
             fit.similarity.scale,
             said.share,
             said.contradicted.mean(),
-            verdicts[best].lead(said),
+            doubts[best, n],
         )
     _check(found)
     return found
@@ -120,10 +127,10 @@ def _check(found: Registration) -> None:
             f"on the scan's surfaces, and {100 * said.contradicted.mean():.0f} % contradict it: "
             + _ADVICE
         )
-    if found.lead < _LEAST_LEAD:
+    if found.doubt > _MOST_DOUBT / max(found.rivals, 1):
         raise NoPlacementError(
-            f"several placements explain the run about equally (the best leads by "
-            f"{found.lead:.1f} standard errors, {_LEAST_LEAD:g} are needed): " + _ADVICE
+            f"several placements explain the run about equally (that the best leads by chance has a "
+            f"probability of {found.doubt:.2g}): " + _ADVICE
         )
 
 
@@ -136,16 +143,3 @@ def _laid(starts: Sequence[Sim3], cloud: Cloud, scan: Scan) -> list[tuple[Sim3, 
         if 1 / _STRAY < fit.scale / start.scale < _STRAY and not any(same):
             near.append((fit, sigma))
     return near
-
-
-def _best(verdicts: Sequence[Verdict]) -> int:
-    """The one that no other with a like share leads; they come by falling share."""
-    best, least = 0, _RIVALS * verdicts[0].share
-    for n, said in enumerate(verdicts):
-        if said.share >= least and said.lead(verdicts[best]) > 0:
-            best = n
-    return best
-
-
-def _others(verdicts: Sequence[Verdict], best: int) -> Iterator[Verdict]:
-    return (said for n, said in enumerate(verdicts) if n != best)
