@@ -6,7 +6,8 @@ from scipy.spatial import KDTree
 from gsba.scans.types import NEIGHBOURS
 
 _CHUNK = 50_000  # points at once
-_ROUGH = 3.0  # times the median scatter about a plane: what scatters more shares none
+_FLAT = 0.1  # of all places, at least, are flat: their scatter is noise
+_ROUGH = 3.5  # times that: neighbours that scatter more share no plane
 
 
 def on_planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -30,6 +31,6 @@ def on_planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         offsets.append(np.einsum("ni,ni->n", axes[:, :, 0], middles - some))
         scatters.append(np.sqrt(np.maximum(values[:, 0], 0)))
     across, off, scatter = (np.concatenate(parts) for parts in (normals, offsets, scatters))
-    flat = scatter <= _ROUGH * np.median(scatter)
+    flat = scatter <= _ROUGH * np.quantile(scatter, _FLAT)
     laid = points + np.where(flat, off, 0)[:, None] * across
     return laid, across, np.where(flat, 0, scatter)
