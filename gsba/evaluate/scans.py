@@ -9,6 +9,8 @@ from gsba.bundle.triangulation import points_under
 from gsba.scans.distances import Distances, distances_to
 from gsba.scans.files import normals_of
 from gsba.scans.fit import approach, settle
+from gsba.scans.judge import SIGMAS
+from gsba.scans.noise import Noise, residuals_of
 from gsba.scans.registration import Registration, register
 from gsba.scans.search import Guess
 from gsba.scans.types import Cloud, Scan, cloud_of
@@ -75,7 +77,7 @@ def scan_errors(
     cloud = cloud_of(reconstruction, normals_of)
     found = register(cloud, scan, guess)
     at = found.fit.similarity
-    after = _distances(at, cloud, scan, found.fit.sigma)
+    after = _distances(at, cloud, scan, found.fit.noise)
     before = None
     if coarse_T_rigs is not None:
         points = points_under(reconstruction, coarse_T_rigs)[cloud.rows]
@@ -87,13 +89,15 @@ def scan_errors(
         width = _BEFORE * cloud.size * at.scale
         near, sigma = approach(at, coarse, scan, width)
         fit = settle(near, coarse, scan, sigma)
-        before = _distances(fit.similarity, coarse, scan, found.fit.sigma)
+        before = _distances(fit.similarity, coarse, scan, found.fit.noise)
     return ScanErrors(found, after, before, at.points(cloud.points))
 
 
-def _distances(at: Sim3, cloud: Cloud, scan: Scan, sigma: float) -> Distances:
-    values = distances_to(scan, at.points(cloud.points))
-    return Distances(values, float(np.mean(values <= 3 * sigma)))
+def _distances(at: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> Distances:
+    carried, nearest, _, _ = residuals_of(at, cloud, scan)
+    values = distances_to(scan, carried)
+    sigmas = np.sqrt(noise.variances(at, cloud, scan, nearest))
+    return Distances(values, float(np.mean(values <= SIGMAS * sigmas)))
 
 
 def format_scan(errors: ScanErrors) -> str:

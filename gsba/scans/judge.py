@@ -63,7 +63,9 @@ def _chance(gains: np.ndarray) -> float:
     from scipy.stats import wilcoxon
 
     gains = gains[gains != 0]
-    return float(wilcoxon(gains, alternative="greater").pvalue) if len(gains) else 1.0
+    if not len(gains):
+        return 1.0
+    return float(np.asarray(wilcoxon(gains, alternative="greater"))[1])
 
 
 class Grid:

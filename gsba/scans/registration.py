@@ -26,7 +26,7 @@ _STRAY = 1.2  # of a scale, from candidate to fit: more is a collapse
 _SAME = 0.05  # of the cloud's size: fits nearer than this are one
 _RIVALS = 0.8  # of the best one's share: placements that explain less are none
 _LEAST_SHARE = 0.25  # of the cloud, explained
-_LEAST_AGREEMENT = 0.65  # explained, of what the scan says something about
+_LEAST_AGREEMENT = 0.75  # explained, of what the scan says something about
 _MOST_DOUBT = 0.01  # chance that a placement leads although another is as good, over all others
 
 
@@ -42,6 +42,7 @@ class Registration:
     verdict: Verdict
     rivals: int  # other placements that explain about as much
     doubt: float  # chance of leading the nearest of them so, were that as good; 0 = there is none
+    rival: Sim3 | None = None  # that one
 
     def __str__(self) -> str:
         found, sigmas = self.fit.similarity, self.fit.sigmas
@@ -85,35 +86,46 @@ def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registrati
     Raises:
         NoPlacementError: no placement explains enough, or several do about as well.
     """
-    near = _laid(candidates(cloud, scan, guess or Guess(), _TRIED), cloud, scan)
-    grid = Grid(scan)
-    noises = [noise_of(fit, cloud, scan, sigma) for fit, sigma in near]
-    shares = [
-        verdict(fit, cloud, scan, grid, noise).share
-        for (fit, _), noise in zip(near, noises, strict=True)
-    ]
-    order = np.argsort([-share for share in shares], kind="stable")[:_JUDGED]
-    fits = [settle(near[n][0], cloud, scan, near[n][1]) for n in order]
+    guess, grid = guess or Guess(), Grid(scan)
+    fits = _likeliest(cloud, scan, guess, grid, _JUDGED)
     if not fits:
         raise NoPlacementError("nothing in it resembles the run: " + _ADVICE)
     noise = fits[0].noise  # one for all, so that their likelihoods compare
     verdicts = [verdict(fit.similarity, cloud, scan, grid, noise) for fit in fits]
     doubts = np.array([[a.doubt(b) for b in verdicts] for a in verdicts])
     shares = np.array([said.share for said in verdicts])
-    rivals = (shares >= _RIVALS * shares.max()) & ~np.eye(len(fits), dtype=bool)
-    worst = np.max(doubts, axis=1, where=rivals, initial=0.0)
-    best = int(np.argmin(np.where(shares >= _RIVALS * shares.max(), worst, 2.0)))
-    found = Registration(fits[best], verdicts[best], int(rivals[best].sum()), float(worst[best]))
+    able = shares >= _RIVALS * shares.max()
+    worst = np.max(doubts, axis=1, where=able & ~np.eye(len(fits), dtype=bool), initial=0.0)
+    best = int(np.argmin(np.where(able, worst, 2.0)))
+    rivals = able & (np.arange(len(fits)) != best)
+    next_ = int(np.argmax(np.where(rivals, doubts[best], -1.0)))
+    rival = fits[next_].similarity if rivals.any() else None
+    found = Registration(fits[best], verdicts[best], int(rivals.sum()), float(worst[best]), rival)
     for n, (fit, said) in enumerate(zip(fits, verdicts, strict=True)):
         logger.debug(
-            "scale %.5g: %.3f explained, %.3f contradicted, %.2g that the best only leads by chance",
+            "scale %.5g: %.3f explained, %.3f contradicted, %.2g to be as good as the best",
             fit.similarity.scale,
             said.share,
             said.contradicted.mean(),
             doubts[best, n],
         )
     _check(found)
+    if guess.similarity is None:
+        _check_handed(found, cloud, scan, guess, grid)
+    _check_alone(found)
     return found
+
+
+def _likeliest(cloud: Cloud, scan: Scan, guess: Guess, grid: Grid, most: int) -> list[Fit]:
+    """Placements that explain most of a cloud, the best first."""
+    near = _laid(candidates(cloud, scan, guess, _TRIED), cloud, scan)
+    noises = [noise_of(fit, cloud, scan, sigma) for fit, sigma in near]
+    shares = [
+        verdict(fit, cloud, scan, grid, noise).share
+        for (fit, _), noise in zip(near, noises, strict=True)
+    ]
+    order = np.argsort([-share for share in shares], kind="stable")[:most]
+    return [settle(near[n][0], cloud, scan, noises[n].sigma) for n in order]
 
 
 _ADVICE = "check that it is of the same place, or tell where: --pairs, --gps or --up auto"
@@ -127,10 +139,35 @@ def _check(found: Registration) -> None:
             f"on the scan's surfaces, and {100 * said.contradicted.mean():.0f} % contradict it: "
             + _ADVICE
         )
-    if found.doubt > _MOST_DOUBT / max(found.rivals, 1):
+
+
+def _check_handed(found: Registration, cloud: Cloud, scan: Scan, guess: Guess, grid: Grid) -> None:
+    """Refuse a scan that the cloud in a mirror fits better: it cannot be of the same place."""
+    twin, axis = cloud.mirrored(), guess.axis
+    if axis is not None:
+        axis = axis[0] * [-1, 1, 1], axis[1]
+    for fit in _likeliest(twin, scan, Guess(scale=guess.scale, axis=axis), grid, 1):
+        said = verdict(fit.similarity, twin, scan, grid, found.fit.noise)
+        doubt = said.doubt(found.verdict)
+        logger.debug("in a mirror: %.3f explained, %.2g that it leads by chance", said.share, doubt)
+        if said.share > found.verdict.share and doubt < _MOST_DOUBT:
+            raise NoPlacementError(
+                "the run in a mirror fits better: the scan is of another building, or its world is "
+                "left-handed: change the sign of one of its axes"
+            )
+
+
+def _check_alone(found: Registration) -> None:
+    """Refuse a place that others explain as well."""
+    if found.rival is not None and found.doubt > _MOST_DOUBT / found.rivals:
+        best = found.fit.similarity
+        cosine = (np.trace(best.rotation.T @ found.rival.rotation) - 1) / 2
+        turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         raise NoPlacementError(
-            f"several placements explain the run about equally (that the best leads by chance has a "
-            f"probability of {found.doubt:.2g}): " + _ADVICE
+            f"several placements explain the run about equally: with {100 * found.doubt:.2g} % "
+            f"chance one turned by {turn:.0f} deg, at {found.rival.scale / best.scale:.3g} times "
+            "the scale, is as good: tell where by --pairs or --gps, or by --up auto if one of them is not "
+            "upright; or give a scan with colours"
         )
 
 

@@ -37,8 +37,8 @@ class Scan:
     def reaches(self) -> np.ndarray:
         """How far (M,) around each point its plane holds: as far as its neighbours are."""
         parts = np.array_split(self.points, -(-len(self.points) // _CHUNK))
-        last = [min(NEIGHBOURS, len(self.points))]
-        return np.concatenate([self.tree.query(part, last)[0][:, 0] for part in parts])
+        some = min(NEIGHBOURS, len(self.points))
+        return np.concatenate([self.tree.query(part, some)[0][:, -1] for part in parts])
 
     @cached_property
     def reach(self) -> float:
@@ -75,6 +75,17 @@ class Cloud:
     def at(self, points: np.ndarray) -> "Cloud":
         """The same with its points elsewhere (N, 3)."""
         return replace(self, points=points)
+
+    def mirrored(self) -> "Cloud":
+        """The same with x the other way: of a place that no turn makes into this one."""
+        flip = np.array([-1.0, 1, 1])
+        return replace(
+            self,
+            points=self.points * flip,
+            covariances=self.covariances * np.outer(flip, flip),
+            eyes=self.eyes * flip,
+            normals=self.normals * flip,
+        )
 
     def taken(self, rows: np.ndarray) -> "Cloud":
         """Some of the points, by index (N',)."""
