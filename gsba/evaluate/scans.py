@@ -32,6 +32,7 @@ class ScanErrors:
     after: Distances
     before: Distances | None  # the same points under the poses before; None = there were none
     cloud: np.ndarray  # (N, 3) float64, refined, world of the scan less its offset
+    rows: np.ndarray  # (N,) int64: which points of the reconstruction these are
 
     @property
     def furthest(self) -> float:
@@ -48,10 +49,15 @@ class ScanErrors:
         }
 
     def colors(self) -> np.ndarray:
-        """Of the cloud's points by their distance, (N, 3) uint8 RGB: blue is near, red far."""
-        at = np.clip(self.after.values / max(self.furthest, 1e-12), 0, 1) * (len(_STOPS) - 1)
-        columns = [np.interp(at, np.arange(len(_STOPS)), stop) for stop in _STOPS.T]
-        return np.round(np.stack(columns, axis=1)).astype(np.uint8)
+        """Of the cloud's points, see `colors_of`."""
+        return colors_of(self.after.values, self.furthest)
+
+
+def colors_of(distances: np.ndarray, furthest: float) -> np.ndarray:
+    """Colours (N, 3) uint8 RGB of distances (N,): blue is near, red as far as `furthest`."""
+    at = np.clip(distances / max(furthest, 1e-12), 0, 1) * (len(_STOPS) - 1)
+    columns = [np.interp(at, np.arange(len(_STOPS)), stop) for stop in _STOPS.T]
+    return np.round(np.stack(columns, axis=1)).astype(np.uint8)
 
 
 def scan_errors(
@@ -90,7 +96,7 @@ def scan_errors(
         near, sigma = approach(at, coarse, scan, width)
         fit = settle(near, coarse, scan, sigma)
         before = _distances(fit.similarity, coarse, scan, found.fit.noise)
-    return ScanErrors(found, after, before, at.points(cloud.points))
+    return ScanErrors(found, after, before, at.points(cloud.points), cloud.rows)
 
 
 def _distances(at: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> Distances:

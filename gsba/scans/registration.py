@@ -166,8 +166,8 @@ def _check_alone(found: Registration) -> None:
         raise NoPlacementError(
             f"several placements explain the run about equally: with {100 * found.doubt:.2g} % "
             f"chance one turned by {turn:.0f} deg, at {found.rival.scale / best.scale:.3g} times "
-            "the scale, is as good: tell where by --pairs or --gps, or by --up auto if one of them is not "
-            "upright; or give a scan with colours"
+            "the scale, is as good: tell where by --pairs or --gps, or by --up auto if one of them "
+            "is not upright; or give a scan with colours"
         )
 
 
