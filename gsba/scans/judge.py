@@ -45,7 +45,7 @@ class Verdict:
         return float(self.explained.sum() / max(said, 1))
 
     def doubt(self, other: "Verdict") -> float:
-        """Chance of such a lead over another placement, were the other as good.
+        """P value of the lead over another placement: its chance, were the other as good.
 
         Of Wilcoxon's signed ranks (Biometrics Bulletin 1, 1945) of log likelihood ratios by cell:
         no piece of furniture has more than one say, however many points it has. Points are those

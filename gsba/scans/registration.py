@@ -41,12 +41,12 @@ class Registration:
     fit: Fit
     verdict: Verdict
     rivals: int  # other placements that explain about as much
-    doubt: float  # chance of leading the nearest of them so, were that as good; 0 = there is none
+    doubt: float  # p value of the lead over the nearest of them; 0 = there is none
     rival: Sim3 | None = None  # that one
 
     def __str__(self) -> str:
         found, sigmas = self.fit.similarity, self.fit.sigmas
-        lead = f", the next as good by {100 * self.doubt:.2g} % chance" if self.rivals else ""
+        lead = f", before the next at p = {self.doubt:.2g}" if self.rivals else ""
         return (
             f"{100 * self.verdict.share:.0f} % of the cloud explained{lead}; scale "
             f"{found.scale:.6g} to {100 * sigmas[6]:.2g} %, place to {max(sigmas[3:6]):.2g} units"
@@ -164,10 +164,10 @@ def _check_alone(found: Registration) -> None:
         cosine = (np.trace(best.rotation.T @ found.rival.rotation) - 1) / 2
         turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         raise NoPlacementError(
-            f"several placements explain the run about equally: with {100 * found.doubt:.2g} % "
-            f"chance one turned by {turn:.0f} deg, at {found.rival.scale / best.scale:.3g} times "
-            "the scale, is as good: tell where by --pairs or --gps, or by --up auto if one of them "
-            "is not upright; or give a scan with colours"
+            f"several placements explain the run about equally: the best leads another, turned by "
+            f"{turn:.0f} deg at {found.rival.scale / best.scale:.3g} times the scale, at p = "
+            f"{found.doubt:.2g} only: tell where by --pairs or --gps, or by --up auto if one of "
+            "them is not upright; or give a scan with colours"
         )
 
 

@@ -77,6 +77,25 @@ def test_a_wrong_building_is_refused(size: tuple[float, float, float]) -> None:
         register(cloud(SIZE, HALL, 3), scan(size, OTHER, 3, missing=0.1))
 
 
+def test_a_building_in_a_mirror_is_refused() -> None:
+    """Its outer walls all fit."""
+    surfaces, flip = scan(SIZE, HALL, 6, Sim3(), missing=0.0), np.array([-1.0, 1, 1])
+    mirrored = Scan(surfaces.points * flip, surfaces.normals * flip)
+    assert register(cloud(SIZE, HALL, 6), surfaces).verdict.agreement > 0.8
+    with pytest.raises(NoPlacementError):
+        register(cloud(SIZE, HALL, 6), mirrored)
+
+
+def test_a_lead_has_a_p_value() -> None:
+    """The hall is not what it is after half a turn; an empty box is, whatever its noise."""
+    half = Sim3(1.0, np.diag([-1.0, -1, 1]), np.array([6.0, 4, 0]))
+    for boxes, least, most in ((HALL, 0.0, 1e-6), ((), 0.05, 0.95)):
+        surfaces, run = scan(SIZE, boxes, 6, Sim3(), missing=0.0), cloud(SIZE, boxes, 6)
+        grid, noise = Grid(surfaces), Noise(0.005)
+        here, turned = (verdict(at, run, surfaces, grid, noise) for at in (Sim3(), half))
+        assert least <= here.doubt(turned) <= most
+
+
 def test_what_is_known_beforehand_rules_the_rest_out() -> None:
     assert Guess(scale=2.0).allows(Sim3(2.1)) and not Guess(scale=2.0).allows(Sim3(2.5))
     up = np.array([0.0, 0, 1])
