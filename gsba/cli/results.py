@@ -230,6 +230,7 @@ def _against_scan(run: Path, path: Path, json_file: Path | None) -> None:
     from gsba.disk import write_json
     from gsba.evaluate.scans import format_scan, scan_errors
     from gsba.export.ply import write_splat_points
+    from gsba.report.html import add_scan
     from gsba.scans import in_file, read_scan
     from gsba.store.finished import load_run
     from gsba.trajectory.files import read_trajectory
@@ -243,8 +244,12 @@ def _against_scan(run: Path, path: Path, json_file: Path | None) -> None:
     with in_file(path):
         errors = scan_errors(reconstruction, surfaces, coarse)
     content = {"scan": str(path), "offset": surfaces.offset.tolist(), **errors.to_json()}
-    for file in filter(None, (run / "scan.json", json_file)):
-        write_json(file, content)
+    if json_file is not None:
+        write_json(json_file, content)
+    points = {"of": len(reconstruction.points_world), "furthest": errors.furthest}
+    points |= {"rows": errors.rows.tolist(), "distances": errors.after.values.round(6).tolist()}
+    write_json(run / "scan.json", content | {"points": points})
+    add_scan(run / "report.html", content)
     write_splat_points(run / "scan.ply", errors.cloud, errors.colors())
     typer.echo(format_scan(errors))
     typer.echo(f"{run / 'scan.json'} holds the histograms, {run / 'scan.ply'} the coloured cloud.")

@@ -176,11 +176,13 @@ def _rgb(texture: np.ndarray) -> np.ndarray:
 
 
 def _looked_up(texture: np.ndarray, uvs: np.ndarray) -> np.ndarray:
-    """Colours (N, 3) at texture coordinates (N, 2), repeating; v is up from the last row."""
-    height, width = texture.shape[:2]
-    at = np.mod(uvs, 1.0) * [width, height] - 0.5
+    """Colours (N, 3) at texture coordinates (N, 2), repeating.
+
+    v counts from the first row: open3d turns pictures over as it reads them.
+    """
+    at = np.mod(uvs, 1.0) * texture.shape[1::-1] - 0.5
     shape = -(-len(at) // _REMAPPED), _REMAPPED  # cv2 takes pictures, no lists
     x = np.resize(at[:, 0], shape).astype(np.float32)
-    y = np.resize(height - 1 - at[:, 1], shape).astype(np.float32)
+    y = np.resize(at[:, 1], shape).astype(np.float32)
     found = cv2.remap(texture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     return found.reshape(-1, 3)[: len(at)]

@@ -9,6 +9,8 @@ from gsba.bundle.triangulation import points_under
 from gsba.scans.distances import Distances, distances_to
 from gsba.scans.files import normals_of
 from gsba.scans.fit import approach, settle
+from gsba.scans.judge import SIGMAS
+from gsba.scans.noise import Noise, residuals_of
 from gsba.scans.registration import Registration, register
 from gsba.scans.search import Guess
 from gsba.scans.types import Cloud, Scan, cloud_of
@@ -30,6 +32,7 @@ class ScanErrors:
     after: Distances
     before: Distances | None  # the same points under the poses before; None = there were none
     cloud: np.ndarray  # (N, 3) float64, refined, world of the scan less its offset
+    rows: np.ndarray  # (N,) int64: which points of the reconstruction these are
 
     @property
     def furthest(self) -> float:
@@ -46,10 +49,15 @@ class ScanErrors:
         }
 
     def colors(self) -> np.ndarray:
-        """Of the cloud's points by their distance, (N, 3) uint8 RGB: blue is near, red far."""
-        at = np.clip(self.after.values / max(self.furthest, 1e-12), 0, 1) * (len(_STOPS) - 1)
-        columns = [np.interp(at, np.arange(len(_STOPS)), stop) for stop in _STOPS.T]
-        return np.round(np.stack(columns, axis=1)).astype(np.uint8)
+        """Of the cloud's points, see `colors_of`."""
+        return colors_of(self.after.values, self.furthest)
+
+
+def colors_of(distances: np.ndarray, furthest: float) -> np.ndarray:
+    """Colours (N, 3) uint8 RGB of distances (N,): blue is near, red as far as `furthest`."""
+    at = np.clip(distances / max(furthest, 1e-12), 0, 1) * (len(_STOPS) - 1)
+    columns = [np.interp(at, np.arange(len(_STOPS)), stop) for stop in _STOPS.T]
+    return np.round(np.stack(columns, axis=1)).astype(np.uint8)
 
 
 def scan_errors(
@@ -75,7 +83,7 @@ def scan_errors(
     cloud = cloud_of(reconstruction, normals_of)
     found = register(cloud, scan, guess)
     at = found.fit.similarity
-    after = _distances(at, cloud, scan, found.fit.sigma)
+    after = _distances(at, cloud, scan, found.fit.noise)
     before = None
     if coarse_T_rigs is not None:
         points = points_under(reconstruction, coarse_T_rigs)[cloud.rows]
@@ -87,13 +95,15 @@ def scan_errors(
         width = _BEFORE * cloud.size * at.scale
         near, sigma = approach(at, coarse, scan, width)
         fit = settle(near, coarse, scan, sigma)
-        before = _distances(fit.similarity, coarse, scan, found.fit.sigma)
-    return ScanErrors(found, after, before, at.points(cloud.points))
+        before = _distances(fit.similarity, coarse, scan, found.fit.noise)
+    return ScanErrors(found, after, before, at.points(cloud.points), cloud.rows)
 
 
-def _distances(at: Sim3, cloud: Cloud, scan: Scan, sigma: float) -> Distances:
-    values = distances_to(scan, at.points(cloud.points))
-    return Distances(values, float(np.mean(values <= 3 * sigma)))
+def _distances(at: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> Distances:
+    carried, nearest, _, _ = residuals_of(at, cloud, scan)
+    values = distances_to(scan, carried)
+    sigmas = np.sqrt(noise.variances(at, cloud, scan, nearest))
+    return Distances(values, float(np.mean(values <= SIGMAS * sigmas)))
 
 
 def format_scan(errors: ScanErrors) -> str:

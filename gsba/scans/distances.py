@@ -49,10 +49,10 @@ class Distances:
 def distances_to(scan: Scan, points: np.ndarray) -> np.ndarray:
     """Distances (N,) of points (N, 3) to a scan's surfaces.
 
-    To the plane of the nearest point where that is as near as points of the scan are to each other,
-    so that its spacing adds nothing; else to the point itself.
+    To the plane of the nearest point as far as its neighbours reach, so that the scan's spacing
+    adds nothing; else to the point itself.
     """
     gaps, nearest = scan.tree.query(points)
     off = np.einsum("ni,ni->n", scan.normals[nearest], points - scan.points[nearest])
     along = np.sqrt(np.maximum(gaps**2 - off**2, 0))
-    return np.where(along <= 2 * scan.spacing, np.abs(off), gaps)
+    return np.where(along <= scan.reaches[nearest], np.abs(off), gaps)

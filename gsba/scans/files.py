@@ -12,6 +12,7 @@ import numpy as np
 
 from gsba.frames.times import read_lines
 from gsba.log import GsbaError, brief
+from gsba.scans.surfaces import on_planes
 from gsba.scans.types import Scan
 
 logger = logging.getLogger(__name__)
@@ -21,7 +22,6 @@ SUFFIXES = (".ply", *CLOUDS, *LASER, *MESHES)
 _MOST_POINTS = 400_000  # of a thinned scan
 _SAMPLES = 1_000_000  # on a mesh, before it is thinned
 _FAR = 1e4  # coordinates beyond lose digits as float32: an offset is kept apart
-_NEIGHBOURS = 24  # that a normal rests on
 _MIN_POINTS = 1000
 _MIN_PAIRS = 3
 
@@ -96,7 +96,7 @@ def read_scan(path: Path) -> Scan:
     """A scan's surfaces, thinned to some 400,000 points with normals.
 
     Meshes are sampled evenly over their surfaces. Of clouds, each point left is the mean of a cell,
-    its normal that of the plane through its neighbours.
+    laid on the plane through its neighbours, see `gsba.scans.surfaces`.
 
     Raises:
         GsbaError: no such file, none that is understood, or too little in it.
@@ -123,15 +123,19 @@ def read_scan(path: Path) -> Scan:
     if len(cloud.points) < _MIN_POINTS:
         raise GsbaError(f"{path}: holds {len(cloud.points)} points; a scan has {_MIN_POINTS}")
     cloud = _thinned(cloud)
+    scatters = None
     if mesh is None:
-        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NEIGHBOURS))
-    points, normals = np.array(cloud.points), np.array(cloud.normals)
+        points, normals, scatters = on_planes(np.asarray(cloud.points))
+    else:
+        points, normals = np.array(cloud.points), np.array(cloud.normals)
     lengths = np.linalg.norm(normals, axis=1)
     good = np.isfinite(lengths) & (lengths > 0.1)
     light = np.array(cloud.colors).mean(axis=1)[good] if cloud.has_colors() else None
     if light is not None and np.ptp(light) == 0:
         light = None
-    scan = Scan(points[good], normals[good] / lengths[good, None], offset, light)
+    if scatters is not None:
+        scatters = scatters[good]
+    scan = Scan(points[good], normals[good] / lengths[good, None], offset, light, scatters)
     logger.info("%s: %d points, %.3g apart", path, len(points), scan.spacing)
     return scan
 

@@ -1,9 +1,11 @@
 """Point to plane with scale: a cloud onto a scan, robust, with covariance."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from gsba.scans.noise import LEAST_SIGMA, Noise, noise_of, residuals_of
 from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3
 
@@ -12,7 +14,7 @@ _SETTLED = 1e-6  # of the size: a smaller step ends a round
 _FEW_STEPS, _MAX_STEPS = 3, 6  # of a width
 _LAST = 6  # rounds of the whole cloud, the width being what the residuals scatter by
 _SOME = 1200  # points before
-_CELLS = 4  # of a cloud's size: within, errors count as one
+_CELLS = (8, 4, 2, 1)  # of a cloud's size: within, errors count as one
 _MEDIAN_NORMAL = 0.6745  # of |x|, x unit normal
 
 
@@ -21,7 +23,7 @@ class Fit:
     """A similarity that carries a cloud onto a scan."""
 
     similarity: Sim3  # scan = similarity of the cloud
-    sigma: float  # of the residuals beyond the points' own noise, unit of the scan
+    noise: Noise
     covariance: np.ndarray  # (7, 7): turn (radians, axes of the scan), shift of the middle (unit of
     # the scan), log scale
     middle: np.ndarray  # (3,) float64, scan: what the turn and the scale leave in place
@@ -30,28 +32,6 @@ class Fit:
     def sigmas(self) -> np.ndarray:
         """Standard deviations (7,), see `covariance`."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0))
-
-
-def residuals_of(
-    fit: Sim3, cloud: Cloud, scan: Scan, reach: float = np.inf
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What is nearest to a cloud that a similarity carries.
-
-    Returns:
-        carried points (N, 3), rows (N,) of the scan's points nearest to them, distances (N,) to
-        their planes and to themselves; the latter infinite beyond `reach`.
-    """
-    carried = fit.points(cloud.points)
-    gaps, nearest = scan.tree.query(carried, distance_upper_bound=reach)
-    nearest = np.minimum(nearest, len(scan.points) - 1)
-    offsets = carried - scan.points[nearest]
-    return carried, nearest, np.einsum("ni,ni->n", scan.normals[nearest], offsets), gaps
-
-
-def own_variances(fit: Sim3, cloud: Cloud, normals: np.ndarray) -> np.ndarray:
-    """Variances (N,) along normals (N, 3) of the scan that the cloud's own noise makes."""
-    turned = normals @ fit.rotation
-    return fit.scale**2 * np.einsum("ni,nij,nj->n", turned, cloud.covariances, turned)
 
 
 def approach(start: Sim3, cloud: Cloud, scan: Scan, width: float) -> tuple[Sim3, float]:
@@ -65,10 +45,10 @@ def approach(start: Sim3, cloud: Cloud, scan: Scan, width: float) -> tuple[Sim3,
         start: near the answer: within some widths.
         width: of the loss at first, unit of the scan.
     """
-    least = 0.1 * scan.spacing
+    least = LEAST_SIGMA * scan.spacing
     fit, some = start, cloud.taken(np.arange(0, len(cloud.points), -(-len(cloud.points) // _SOME)))
     while True:
-        fit = _settle(fit, some, scan, width, _FEW_STEPS)
+        fit = _settle(fit, some, scan, Noise(width), _FEW_STEPS)
         sigma = max(scatter(fit, some, scan, width), least)
         if width <= 1.5 * sigma:
             return fit, sigma
@@ -79,15 +59,15 @@ def settle(start: Sim3, cloud: Cloud, scan: Scan, sigma: float) -> Fit:
     """The whole cloud onto the scan, from nearby; see `approach`."""
     fit = start
     for _ in range(_LAST):
-        sigma = max(scatter(fit, cloud, scan, sigma), 0.1 * scan.spacing)
-        fit = _settle(fit, cloud, scan, sigma, _MAX_STEPS)
-    return _with_covariance(fit, cloud, scan, sigma)
+        noise = noise_of(fit, cloud, scan, sigma)
+        fit, sigma = _settle(fit, cloud, scan, noise, _MAX_STEPS), noise.sigma
+    return _with_covariance(fit, cloud, scan, noise)
 
 
-def _settle(fit: Sim3, cloud: Cloud, scan: Scan, sigma: float, most: int) -> Sim3:
+def _settle(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise, most: int) -> Sim3:
     """Steps of one width, until they no longer move anything."""
     for _ in range(most):
-        fit, moved = _step(fit, cloud, scan, sigma)
+        fit, moved = _step(fit, cloud, scan, noise)
         if moved < _SETTLED * cloud.size * fit.scale:
             break
     return fit
@@ -95,34 +75,40 @@ def _settle(fit: Sim3, cloud: Cloud, scan: Scan, sigma: float, most: int) -> Sim
 
 def scatter(fit: Sim3, cloud: Cloud, scan: Scan, width: float) -> float:
     """Standard deviation of the distances to the planes, of points within three widths."""
-    reach = 3 * width + 3 * scan.spacing
-    _, nearest, off, gaps = residuals_of(fit, cloud, scan, reach)
-    near = (np.abs(off) < 3 * width) & (gaps < reach)
-    near &= own_variances(fit, cloud, scan.normals[nearest]) < width**2
+    _, nearest, off, gaps = residuals_of(fit, cloud, scan, 3 * width + scan.reach)
+    near = (np.abs(off) < 3 * width) & (gaps < 3 * width + scan.reaches[nearest])
+    near &= Noise(0.0).variances(fit, cloud, scan, nearest) < width**2
     return float(np.median(np.abs(off[near])) / _MEDIAN_NORMAL) if near.sum() > 20 else width
 
 
-def _weighted(
-    fit: Sim3, cloud: Cloud, scan: Scan, sigma: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Jacobians (N, 7), residuals, weights, carried points and their middle."""
-    reach = 4 * sigma + 3 * scan.spacing
-    carried, nearest, off, gaps = residuals_of(fit, cloud, scan, reach)
+class _Weighted(NamedTuple):
+    """A step's equations."""
+
+    jacobians: np.ndarray  # (N, 7)
+    off: np.ndarray  # (N,) residuals
+    variances: np.ndarray  # (N,)
+    weights: np.ndarray  # (N,)
+    carried: np.ndarray  # (N, 3)
+    middle: np.ndarray  # (3,)
+
+
+def _weighted(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> _Weighted:
+    reach = 4 * noise.sigma
+    carried, nearest, off, gaps = residuals_of(fit, cloud, scan, reach + scan.reach)
     normals = scan.normals[nearest]
-    variances = sigma**2 + own_variances(fit, cloud, normals)
+    variances = noise.variances(fit, cloud, scan, nearest)
     weights = 1 / variances / (1 + off**2 / variances) ** 2
-    weights[gaps >= reach] = 0.0
-    total = max(weights.sum(), 1e-300)
-    middle = weights @ carried / total
+    weights[gaps >= reach + scan.reaches[nearest]] = 0.0
+    middle = weights @ carried / max(weights.sum(), 1e-300)
     arms = carried - middle
     along = np.einsum("ni,ni->n", normals, arms)
     jacobians = np.column_stack([np.cross(arms, normals), normals, along])
-    return jacobians, off, weights, carried, middle
+    return _Weighted(jacobians, off, variances, weights, carried, middle)
 
 
-def _step(fit: Sim3, cloud: Cloud, scan: Scan, sigma: float) -> tuple[Sim3, float]:
+def _step(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> tuple[Sim3, float]:
     """One step of Gauss-Newton, and how far it moves points at most."""
-    jacobians, off, weights, _, middle = _weighted(fit, cloud, scan, sigma)
+    jacobians, off, _, weights, _, middle = _weighted(fit, cloud, scan, noise)
     size = cloud.size * fit.scale
     units = np.array([1 / size] * 3 + [1.0] * 3 + [1 / size])
     jacobians = jacobians * units
@@ -144,23 +130,25 @@ def moved_by(fit: Sim3, step: np.ndarray, middle: np.ndarray) -> Sim3:
     return Sim3(stretch * fit.scale, turn @ fit.rotation, shift)
 
 
-def _with_covariance(fit: Sim3, cloud: Cloud, scan: Scan, sigma: float) -> Fit:
+def _with_covariance(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> Fit:
     """With the sandwich of clustered errors (Liang and Zeger, Biometrika 73, 1986).
 
     What neighbours have in common (a piece of wall, a mistaken normal) is no independent evidence:
-    residuals of a cell count as one.
+    residuals of a cell count as one. How large cells must be is found by making them larger, as
+    Flyvbjerg and Petersen do (J. Chem. Phys. 91, 1989): the largest variances are taken.
     """
-    jacobians, off, weights, carried, middle = _weighted(fit, cloud, scan, sigma)
-    normals = jacobians[:, 3:6]
+    jacobians, off, variances, weights, carried, middle = _weighted(fit, cloud, scan, noise)
     gradients = jacobians * (weights * off)[:, None]
-    cells = cells_of(carried, fit.scale * cloud.size / _CELLS)
-    sums = np.zeros((cells.max() + 1, 7))
-    np.add.at(sums, cells, gradients)
-    variances = sigma**2 + own_variances(fit, cloud, normals)
     slopes = weights * (1 - 3 * off**2 / variances) / (1 + off**2 / variances)
     hessian = (jacobians * slopes[:, None]).T @ jacobians
     inverse = np.linalg.pinv(hessian, rcond=1e-14, hermitian=True)
-    return Fit(fit, sigma, inverse @ (sums.T @ sums) @ inverse, middle)
+    found = []
+    for part in _CELLS:
+        cells = cells_of(carried, fit.scale * cloud.size / part)
+        sums = np.zeros((cells.max() + 1, 7))
+        np.add.at(sums, cells, gradients)
+        found.append(inverse @ (sums.T @ sums) @ inverse)
+    return Fit(fit, noise, max(found, key=lambda c: float(np.trace(c[3:6, 3:6]))), middle)
 
 
 def cells_of(points: np.ndarray, edge: float) -> np.ndarray:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ndtri
-from scipy.stats import rankdata
 
-from gsba.scans.fit import cells_of, own_variances, residuals_of
+from gsba.scans.fit import cells_of
+from gsba.scans.noise import Noise, reach_of, residuals_of
 from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3
 
@@ -18,11 +18,8 @@ SIGMAS = 3.0  # from its surface that an explained point may be
 _CELLS_ALONG = 400  # of the scan's grid along its extent, at most
 _BEYOND = 1.0  # of a cloud's size: how far behind a point surfaces contradict it
 _LEAST_SINE = 0.15  # of a ray to a surface that it crosses
-_REACH = 0.02  # of a cloud's size: how far surfaces count as near
-_ALIKE = 0.7  # cosine between a point's normal and its surface's
-_INLIERS = 0.8  # share of near points that are on their surface
 _LEAST_ALIKE = 100  # near points whose brightness can be compared
-_CELLS = 4  # of a cloud's size: points within share their luck
+_CELLS = (2, 4)  # to a cloud's size: points within share their luck
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +28,9 @@ class Verdict:
 
     explained: np.ndarray  # (N,) bool
     contradicted: np.ndarray  # (N,) bool
-    near: np.ndarray  # (N,) bool: beside a surface of the same normal
-    logs: np.ndarray  # (N,) float64, log likelihood of its distance, times the reach; of points
-    # that are not near as of such far ones
-    cells: np.ndarray  # (N,) int64, of points nearby, in the cloud's own world
+    told: np.ndarray  # (N,) bool: beside a surface, or hidden by one
+    logs: np.ndarray  # (N,) float64, of likelihoods of their distances over those of any others
+    cells: tuple[np.ndarray, ...]  # each (N,) int64: points nearby, in the cloud's own world
 
     @property
     def share(self) -> float:
@@ -47,23 +43,28 @@ class Verdict:
         said = self.explained.sum() + self.contradicted.sum()
         return float(self.explained.sum() / max(said, 1))
 
-    def lead(self, other: "Verdict") -> float:
-        """By how many standard errors this explains the cloud better than another placement.
+    def doubt(self, other: "Verdict") -> float:
+        """P value of the lead over another placement: its chance, were the other as good.
 
-        Vuong's test of models that are not nested (Econometrica 57, 1989), with cells as the
-        independent draws: no single piece of furniture makes more than one. Points compared are
-        those that both are judged by, as what is missing in the scan at one place and not at the
-        other tells nothing; or those of them with a surface near in both, whichever tells more.
+        Of Wilcoxon's signed ranks (Biometrics Bulletin 1, 1945) of log likelihood ratios by cell:
+        no piece of furniture has more than one say, however many points it has. Points are those
+        that both placements are told of, as what is missing in the scan at one place and not at
+        the other tells nothing. The largest for some sizes of cells is taken, as a lead that large
+        cells do not show may come from errors that small ones share.
         """
-        near = self.near & other.near
-        judged = near | (
-            (self.explained | self.contradicted) & (other.explained | other.contradicted)
-        )
-        return max((self._lead(other, both) for both in (near, judged)), key=abs)
+        both = self.told & other.told
+        gains = (self.logs - other.logs)[both]
+        return max(_chance(np.bincount(c[both], gains)) for c in self.cells)
 
-    def _lead(self, other: "Verdict", both: np.ndarray) -> float:
-        gains = np.bincount(self.cells[both], (self.logs - other.logs)[both])
-        return float(gains.sum()) / max(float(np.linalg.norm(gains)), 1e-9)
+
+def _chance(gains: np.ndarray) -> float:
+    """P value of gains (C,) being no better than symmetric around zero."""
+    from scipy.stats import wilcoxon
+
+    gains = gains[gains != 0]
+    if not len(gains):
+        return 1.0
+    return float(np.asarray(wilcoxon(gains, alternative="greater"))[1])
 
 
 class Grid:
@@ -107,36 +108,34 @@ class Grid:
         return first
 
 
-def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: Grid, sigma: float) -> Verdict:
+def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: Grid, noise: Noise) -> Verdict:
     """What a scan says of a cloud.
 
     Args:
-        sigma: of distances from explained points to their surface, beside their own noise.
+        noise: of distances from explained points to their surface.
     """
     carried, nearest, off, gaps = residuals_of(fit, cloud, scan)
-    normals = scan.normals[nearest]
-    sigmas = np.sqrt(sigma**2 + own_variances(fit, cloud, normals))
-    turned = np.einsum("ni,ni->n", normals, cloud.normals @ fit.rotation.T)
-    off = np.where(gaps > 4 * scan.spacing, gaps, np.abs(off))
-    explained = off <= SIGMAS * sigmas
+    variances = noise.variances(fit, cloud, scan, nearest)
+    sigmas, size = np.sqrt(variances), cloud.size * fit.scale
+    along = np.sqrt(np.maximum(gaps**2 - off**2, 0))
+    here = along <= scan.reaches[nearest]
+    explained = here & (np.abs(off) <= SIGMAS * sigmas)
     eyes = fit.points(cloud.eyes)
     ways = carried - eyes
     lengths = np.maximum(np.linalg.norm(ways, axis=1), 1e-12)[:, None]
-    first = grid.first_crossings(eyes, carried + _BEYOND * cloud.size * fit.scale * ways / lengths)
-    first *= 1 + _BEYOND * cloud.size * fit.scale / lengths[:, 0]  # of the way to the point
+    first = grid.first_crossings(eyes, carried + _BEYOND * size * ways / lengths)
+    first *= 1 + _BEYOND * size / lengths[:, 0]  # of the way to the point
     margins = (SIGMAS * sigmas + 2 * grid.edge) / lengths[:, 0]
-    crossed = (first < 1 - margins) | ((first > 1 + margins) & np.isfinite(first))
-    reach = max(_REACH * cloud.size * fit.scale, 3 * scan.spacing)
-    near = (gaps <= reach) & (np.abs(turned) > _ALIKE)
-    likely = _INLIERS * np.exp(-0.5 * (off / sigmas) ** 2) / (np.sqrt(2 * np.pi) * sigmas)
-    return Verdict(
-        explained,
-        ~explained & (crossed | (gaps <= reach)),
-        near,
-        np.log(np.where(near, likely * reach, 0) + (1 - _INLIERS) / 2)
-        + _alike(cloud, scan, nearest, near),
-        cells_of(cloud.points, cloud.size / _CELLS),
-    )
+    hidden = first < 1 - margins
+    behind = (first > 1 + margins) & np.isfinite(first)
+    reach = reach_of(fit, cloud)
+    near = here & (np.abs(off) <= reach)
+    contradicted = ~explained & (hidden | behind | near)
+    logs = np.where(near, noise.logs(off, variances, reach), np.log(1 - noise.inliers))
+    logs += _alike(cloud, scan, nearest, near)
+    told = near | hidden
+    cells = tuple(cells_of(cloud.points, cloud.size / part) for part in _CELLS)
+    return Verdict(explained, contradicted, told, np.where(told, logs, 0.0), cells)
 
 
 def _alike(cloud: Cloud, scan: Scan, nearest: np.ndarray, near: np.ndarray) -> np.ndarray:
@@ -156,4 +155,6 @@ def _alike(cloud: Cloud, scan: Scan, nearest: np.ndarray, near: np.ndarray) -> n
 
 def _normal(values: np.ndarray) -> np.ndarray:
     """Values (N,) made normal by their ranks, those alike sharing theirs."""
+    from scipy.stats import rankdata  # takes long to import
+
     return ndtri((rankdata(values) - 0.5) / len(values))

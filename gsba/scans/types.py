@@ -10,7 +10,10 @@ from scipy.spatial import KDTree
 from gsba.log import GsbaError
 from gsba.types import Reconstruction
 
+NEIGHBOURS = 24  # of a scan's point, that tell of the surface around it
 MIN_POINTS = 300  # of a cloud that can be registered
+_CHUNK = 50_000  # points looked up at once
+_RAYS = 3  # of a point: two meet anywhere
 _SURE = 0.02  # of the cloud's size: standard deviation of a point beyond which it is left out
 
 
@@ -22,11 +25,29 @@ class Scan:
     normals: np.ndarray  # (M, 3) float64, unit, of either sign
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) float64
     brightness: np.ndarray | None = None  # (M,) float64, of any scale; None = it has no colours
+    scatters: np.ndarray | None = None  # (M,) float64, standard deviations of neighbours about the
+    # plane of a point where they share none, else 0; None = 0 everywhere
 
     @cached_property
     def tree(self) -> KDTree:
         """Of the points."""
         return KDTree(self.points)
+
+    @cached_property
+    def reaches(self) -> np.ndarray:
+        """How far (M,) around each point its plane holds: as far as its neighbours are."""
+        parts = np.array_split(self.points, -(-len(self.points) // _CHUNK))
+        some = min(NEIGHBOURS, len(self.points))
+        return np.concatenate([self.tree.query(part, some)[0][:, -1] for part in parts])
+
+    @cached_property
+    def reach(self) -> float:
+        """That of all but the few sparsest places."""
+        return float(np.quantile(self.reaches, 0.99))
+
+    def variances(self, rows: np.ndarray) -> np.ndarray:
+        """Of the planes at points, by index (N,), along their normals: where there is none."""
+        return np.zeros(len(rows)) if self.scatters is None else self.scatters[rows] ** 2
 
     @cached_property
     def spacing(self) -> float:
@@ -54,6 +75,17 @@ class Cloud:
     def at(self, points: np.ndarray) -> "Cloud":
         """The same with its points elsewhere (N, 3)."""
         return replace(self, points=points)
+
+    def mirrored(self) -> "Cloud":
+        """The same with x the other way: of a place that no turn makes into this one."""
+        flip = np.array([-1.0, 1, 1])
+        return replace(
+            self,
+            points=self.points * flip,
+            covariances=self.covariances * np.outer(flip, flip),
+            eyes=self.eyes * flip,
+            normals=self.normals * flip,
+        )
 
     def taken(self, rows: np.ndarray) -> "Cloud":
         """Some of the points, by index (N',)."""
@@ -95,7 +127,7 @@ def cloud_of(
     covariances = np.einsum("nij,nj,nkj->nik", axes, 1 / values, axes)
     first = np.searchsorted(owners, np.arange(len(result.points_world)))
     counts = np.bincount(owners, minlength=len(result.points_world))
-    seen = counts >= 2
+    seen = counts >= _RAYS
     middle = np.minimum(first + counts // 2, max(len(owners) - 1, 0))
     every = np.flatnonzero(seen)
     cloud = Cloud(

@@ -80,6 +80,18 @@ class View:
             point_shading="flat",
             precision="float32",
         )
+        if self.scene.judged is not None:
+            points, colors = self.scene.judged
+            self.nodes["/judged"] = self.server.scene.add_point_cloud(
+                "/judged",
+                (self.scale * points).astype(np.float32),
+                colors,
+                point_size=0.025 * self.size,
+                point_shape="circle",
+                point_shading="flat",
+                precision="float32",
+                visible=False,
+            )
 
     def _add_paths(self) -> None:
         """Lines through the poses before and after, and a pyramid that looks ahead in each rig."""
@@ -163,6 +175,7 @@ class View:
             self._add_switch("Rigs", "/rigs")
             self._add_switch("Rig axes", "/axes")
             self._add_switch("Cloud", "/cloud")
+            self._add_switch("Distance to the scan", "/judged")
             size = gui.add_slider("Point size", 0.1, 5.0, 0.1, 1.0)
             size.on_update(lambda _: self._resize_points(size.value))
             for splat in scene.splats:

@@ -1,5 +1,6 @@
 """What there is to see of a finished run, as arrays in one world."""
 
+import json
 import logging
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 
 from gsba.camera.optics import ONE_EYE, Optics
 from gsba.camera.views import View
+from gsba.evaluate.scans import colors_of
 from gsba.frames import cubemap, lens_faces
 from gsba.frames.masks import load_mask
 from gsba.geometry import rotation_from_quaternion
@@ -53,6 +55,8 @@ class Scene:
     grounds: str  # what places the world, for people
     step: float  # median distance of neighbouring frames, > 0: how large to draw things
     optics: Optics = ONE_EYE  # of the frames, unit of the world
+    judged: tuple[np.ndarray, np.ndarray] | None = None  # points (N, 3) and colours (N, 3) uint8
+    # by their distance to a scan; None = compared with none
 
 
 def load_scene(run: Path) -> Scene:
@@ -86,7 +90,24 @@ def load_scene(run: Path) -> Scene:
         grounds=grounds,
         step=float(np.median(moving)) if len(moving) else 1.0,
         optics=Optics.of(lenses, placed),
+        judged=_judged(run, placed),
     )
+
+
+def _judged(run: Path, placed: Reconstruction) -> tuple[np.ndarray, np.ndarray] | None:
+    """What `gsba evaluate --scan` has found of the run's points, if they are still these."""
+    path = run / "scan.json"
+    if not path.exists():
+        return None
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))["points"]
+        rows, distances = np.array(found["rows"], np.int64), np.array(found["distances"])
+        if found["of"] != len(placed.points_world):
+            logger.warning("%s is of an earlier run: its colours are left out", path)
+            return None
+        return placed.points_world[rows], colors_of(distances, found["furthest"])
+    except (OSError, ValueError, KeyError, TypeError, IndexError):
+        raise GsbaError(f"{path}: cannot be read: evaluate with --scan again") from None
 
 
 _UPS = {"-y": np.array([0.0, -1, 0]), "y": np.array([0.0, 1, 0]), "z": np.array([0.0, 0, 1])}

@@ -8,6 +8,7 @@ import pytest
 
 from gsba.demo import make_mesh_walk
 from gsba.demo.free_path import free_path
+from gsba.demo.mesh_walk import MeshScene
 from gsba.log import GsbaError
 from gsba.trajectory.files import read_trajectory
 
@@ -67,3 +68,30 @@ def test_what_cannot_be_walked_is_refused(tmp_path: Path) -> None:
     with pytest.raises(GsbaError, match="no such file"):
         make_mesh_walk(tmp_path / "walk", tmp_path / "none.obj")
     assert not (tmp_path / "walk").exists()
+
+
+@pytest.mark.parametrize("suffix", ["obj", "glb"])
+def test_textures_stand_upright(tmp_path: Path, suffix: str) -> None:
+    """A wall ahead of a camera in a world with y up, its picture red above and blue below."""
+    pytest.importorskip("open3d", reason="open3d is not installed: pip install 'gsba[scan]'")
+    picture = np.zeros((64, 64, 3), np.uint8)
+    picture[:32, :, 0], picture[32:, :, 2] = 255, 255
+    corners = np.array([[-1.0, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1]])
+    uvs = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])  # v up, as OBJ has it
+    path = tmp_path / f"wall.{suffix}"
+    if suffix == "obj":
+        cv2.imwrite(str(tmp_path / "wall.png"), picture[..., ::-1])
+        (tmp_path / "wall.mtl").write_text("newmtl wall\nmap_Kd wall.png\n")
+        lines = ["mtllib wall.mtl", "usemtl wall", *(f"v {x} {y} {z}" for x, y, z in corners)]
+        lines += [f"vt {u} {v}" for u, v in uvs] + ["f 1/1 2/2 3/3", "f 1/1 3/3 4/4"]
+        path.write_text("\n".join([*lines, ""]))
+    else:
+        trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
+        image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
+        material = trimesh.visual.material.PBRMaterial(baseColorTexture=image.fromarray(picture))
+        mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+        mesh.visual = trimesh.visual.TextureVisuals(uv=uvs, material=material)
+        mesh.export(path)
+    seen = MeshScene(path).picture(np.diag([1.0, -1, -1, 1]), 64)
+    assert seen[12, 32, 0] > 200 > 50 > seen[12, 32, 2]
+    assert seen[20, 32, 2] > 200 > 50 > seen[20, 32, 0]

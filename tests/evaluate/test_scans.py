@@ -50,7 +50,7 @@ def test_distances_after_and_before(monkeypatch: pytest.MonkeyPatch) -> None:
     content = errors.to_json()
     for part in (content["after"], content["before"]):
         assert sum(part["histogram"]["counts"]) == part["points"]
-    assert content["registration"]["lead_sigmas"] is None or content["registration"]["rivals"]
+    assert content["registration"]["doubt"] is None or content["registration"]["rivals"]
     colors = errors.colors()
     near, far = np.argmin(errors.after.values), np.argmax(errors.after.values)
     assert colors[near, 2] > colors[near, 0] and colors[far, 0] > colors[far, 2]

@@ -16,7 +16,8 @@ import pytest
 
 from gsba.camera.sphere import bearings_from_erp
 from gsba.config import RefineSettings
-from gsba.report.html import figures, pictures, residual_sphere, write_html
+from gsba.log import GsbaError
+from gsba.report.html import add_scan, figures, pictures, residual_sphere, write_html
 from gsba.report.report import build_report
 from gsba.store.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseStatus, Reconstruction
@@ -258,6 +259,22 @@ def test_script_runs(page: Path) -> None:
     tiles, title, worst, rows, note = _run_script(page)
     assert (tiles, title, worst, rows) == (6, page.parent.name, pictures.NUM_PICTURES, 2)
     assert note == ["a note with <b>markup</b> & </script>"]  # a text, not markup
+
+
+def test_distances_to_a_scan_are_added(page: Path, tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    shutil.copy(page, path)
+    part = {"points": 10, "median": 0.25, "percentile90": 1.5, "explained": 0.5}
+    part |= {"histogram": {"edges": [0.0, 1.0, 2.0], "counts": [8, 1, 1]}}
+    for before in (part, None):
+        add_scan(path, {"scan": "hall.laz", "before": before, "after": part, "points": {}})
+        shown = {"scan": "hall.laz", "before": before, "after": part}
+        assert _data(path.read_text(encoding="utf-8"))["scan"] == shown
+        assert _run_script(path)[0] == 6
+    add_scan(tmp_path / "none.html", {})  # no page, nothing to do
+    path.write_text("<html>")
+    with pytest.raises(GsbaError, match="is no page of a run"):
+        add_scan(path, {})
 
 
 def test_browser_shows_it(page: Path) -> None:

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from gsba.cli import app
 from gsba.log import GsbaError
 from gsba.scans import check_scan, distances_to, files, read_pairs, read_scan
+from gsba.scans.surfaces import on_planes
 from gsba.scans.types import Scan
 
 FAR = np.array([412_300.0, 5_655_800.0, 110.0])
@@ -119,3 +120,16 @@ def test_distances_are_to_surfaces_and_not_to_the_next_point() -> None:
 def test_settings_that_exclude_one_another(tmp_path: Path) -> None:
     told = CliRunner().invoke(app, ["export", str(tmp_path), "--to", "tum", "--pairs", "p.txt"])
     assert told.exit_code == 1 and "error: " in told.output
+
+
+def test_noise_shrinks_on_planes_and_steps_stay() -> None:
+    """Two floors with a step of ten times the noise between them."""
+    rng = np.random.default_rng(3)
+    flat = np.column_stack([rng.uniform(0, 2, (20_000, 2)), np.zeros(20_000)])
+    flat[:, 2] = np.where(flat[:, 0] < 1, 0.0, 0.05)
+    laid, normals, scatters = on_planes(flat + 0.005 * rng.standard_normal(flat.shape))
+    inner = np.abs(flat[:, 0] - 1) > 0.1
+    assert np.std(laid[inner, 2] - flat[inner, 2]) < 0.005 / 3
+    assert np.median(np.abs(normals[inner, 2])) > 0.98 and (scatters[inner] == 0).mean() > 0.95
+    exact = on_planes(flat)[0]
+    assert np.abs(exact - flat).max() < 1e-9  # nothing is smoothed but noise

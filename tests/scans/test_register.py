@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gsba.scans.fit import _weighted, moved_by, settle
 from gsba.scans.judge import Grid, verdict
+from gsba.scans.noise import Noise
 from gsba.scans.registration import NoPlacementError, register
 from gsba.scans.search import Guess, main_axes
 from gsba.scans.types import Scan
@@ -47,7 +48,7 @@ def test_a_place_is_found_though_a_third_is_missing_and_furniture_moved(seed: in
 def test_chance_has_no_say() -> None:
     first, second = (register(cloud(SIZE, HALL, 0), scan(SIZE, MOVED, 0)) for _ in range(2))
     np.testing.assert_array_equal(first.fit.similarity.new_T_old, second.fit.similarity.new_T_old)
-    assert first.lead == second.lead
+    assert first.doubt == second.doubt
 
 
 def test_a_room_that_looks_the_same_turned_is_refused_unless_told() -> None:
@@ -76,6 +77,25 @@ def test_a_wrong_building_is_refused(size: tuple[float, float, float]) -> None:
         register(cloud(SIZE, HALL, 3), scan(size, OTHER, 3, missing=0.1))
 
 
+def test_a_building_in_a_mirror_is_refused() -> None:
+    """Its outer walls all fit."""
+    surfaces, flip = scan(SIZE, HALL, 6, Sim3(), missing=0.0), np.array([-1.0, 1, 1])
+    mirrored = Scan(surfaces.points * flip, surfaces.normals * flip)
+    assert register(cloud(SIZE, HALL, 6), surfaces).verdict.agreement > 0.8
+    with pytest.raises(NoPlacementError):
+        register(cloud(SIZE, HALL, 6), mirrored)
+
+
+def test_a_lead_has_a_p_value() -> None:
+    """The hall is not what it is after half a turn; an empty box is, whatever its noise."""
+    half = Sim3(1.0, np.diag([-1.0, -1, 1]), np.array([6.0, 4, 0]))
+    for boxes, least, most in ((HALL, 0.0, 1e-6), ((), 0.05, 0.95)):
+        surfaces, run = scan(SIZE, boxes, 6, Sim3(), missing=0.0), cloud(SIZE, boxes, 6)
+        grid, noise = Grid(surfaces), Noise(0.005)
+        here, turned = (verdict(at, run, surfaces, grid, noise) for at in (Sim3(), half))
+        assert least <= here.doubt(turned) <= most
+
+
 def test_what_is_known_beforehand_rules_the_rest_out() -> None:
     assert Guess(scale=2.0).allows(Sim3(2.1)) and not Guess(scale=2.0).allows(Sim3(2.5))
     up = np.array([0.0, 0, 1])
@@ -87,7 +107,7 @@ def test_what_is_known_beforehand_rules_the_rest_out() -> None:
 
 def test_residuals_follow_their_jacobian() -> None:
     run, surfaces = cloud(SIZE, HALL, 4, num=300), scan(SIZE, HALL, 4, missing=0.0)
-    jacobians, _, weights, carried, middle = _weighted(INTO_SCAN, run, surfaces, 0.02)
+    jacobians, _, _, weights, carried, middle = _weighted(INTO_SCAN, run, surfaces, Noise(0.02))
     rows, near = surfaces.tree.query(carried)[1], weights > 0
     h = 1e-6
     for k in range(7):
@@ -121,7 +141,7 @@ def test_rays_through_a_wall_contradict() -> None:
     run = replace(run, eyes=np.tile(np.array(SIZE) / 2, (600, 1)))
     wall = np.array([[[4.5, 0, 0], [0, 4, 0], [0, 0, 2.6], [1, 0, 0]]])
     points, normals = sampled(np.random.default_rng(0), wall, 4000)
-    said = verdict(Sim3(), run, surfaces := Scan(points, normals), Grid(surfaces), 1e-3)
+    said = verdict(Sim3(), run, surfaces := Scan(points, normals), Grid(surfaces), Noise(1e-3))
     inner = (np.abs(run.points - [6, 2, 1.3]) < [0.01, 1, 0.6]).all(axis=1)
     assert inner.sum() > 5 and said.contradicted[inner].all() and not said.explained[inner].any()
     assert not said.contradicted[run.points[:, 0] < 2.0].any()

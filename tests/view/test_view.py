@@ -360,3 +360,22 @@ def test_ctrl_c_ends_it_quietly(run: Path) -> None:
     finally:
         process.kill()
     assert (process.returncode, rest.strip(), errors) == (0, "", "")
+
+
+def test_distances_to_a_scan_colour_the_points(run: Path, scene: view.Scene) -> None:
+    num, path = len(scene.reconstruction.points_world), run / "scan.json"
+    points = {"of": num, "furthest": 1.0, "rows": [2, 0], "distances": [0.0, 5.0]}
+    assert scene.judged is None
+    try:
+        path.write_text(json.dumps({"points": points}))
+        judged = view.load_scene(run).judged
+        assert judged is not None
+        np.testing.assert_array_equal(judged[0], scene.reconstruction.points_world[[2, 0]])
+        assert judged[1][0, 2] > judged[1][0, 0] and judged[1][1, 0] > judged[1][1, 2]
+        path.write_text(json.dumps({"points": points | {"of": num + 1}}))
+        assert view.load_scene(run).judged is None  # of an earlier run
+        path.write_text("{}")
+        with pytest.raises(GsbaError, match=r"scan\.json: cannot be read"):
+            view.load_scene(run)
+    finally:
+        path.unlink()

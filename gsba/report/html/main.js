@@ -27,6 +27,21 @@ function mapLegend() {
   if (D.map.up < .5) el("map-legend").append(make("span", {}, "the rigs agree on no up: shown as the path lies"));
 }
 
+function scan() {
+  const { before, after } = D.scan, parts = before ? [before, after] : [after];
+  const names = before ? ["before", "after"] : ["after"];
+  el("scan-lead").textContent = `From the points to the surfaces of ${D.scan.scan}, in its units. `
+    + parts.map((p, i) => `${names[i]}: median ${num(p.median)}, nine in ten within ${num(p.percentile90)}`).join("; ") + ".";
+  const edges = after.histogram.edges, table = el("distances");
+  const most = Math.max(...parts.flatMap(p => p.histogram.counts.map(n => n / p.points)), 1e-9);
+  const bar = (p, k, colour) => make("td", {}, make("div", { class: "bar" },
+    make("i", { style: `background:var(--${colour});width:${100 * p.histogram.counts[k] / p.points / most}%` })));
+  table.append(make("tr", {}, make("th", { class: "n" }, "Distance"), ...names.map(n => make("th", {}, `Points ${n}`))));
+  after.histogram.counts.forEach((_, k) => table.append(make("tr", {},
+    make("td", { class: "n" }, k + 1 < edges.length ? `to ${num(edges[k + 1])}` : "beyond"),
+    ...parts.map((p, i) => bar(p, k, names[i])))));
+}
+
 function worst() {
   const lengths = D.worst.flatMap(w => w.vectors.map(v => Math.hypot(v[2], v[3]))).sort((a, b) => a - b);
   const median = lengths[lengths.length >> 1] || 1;
@@ -149,6 +164,8 @@ matrix(el("matrix"), el("matrix-scale"));
 sphere(el("sphere"), el("sphere-scale"), D.sphere);
 if (D.field) sphere(el("field"), el("field-scale"), D.field);
 else el("field-card").remove();
+if (D.scan) scan();
+else el("scan").remove();
 worst();
 cost();
 stages();

@@ -19,6 +19,7 @@ logger = logging.getLogger(__name__)
 
 _PARTS = {"/*STYLE*/": ("style.css",), "/*SCRIPT*/": ("base.js", "charts.js", "main.js")}
 _DATA = "/*DATA*/"
+_BEFORE_DATA, _AFTER_DATA = '<script type="application/json" id="data">', "</script>"
 
 
 def write_html(
@@ -47,9 +48,34 @@ def write_html(
         "field": figures.field_sphere(reconstruction.correction),
         "erp_width": frames.panorama_width,
         "worst": _worst(frames, reconstruction),
+        "scan": None,
     }
-    text = _assembled(json.dumps(plain(data, digits=6), allow_nan=False, separators=(",", ":")))
-    write_text(path, text)
+    write_text(path, _assembled(_dumped(data)))
+
+
+def add_scan(path: Path, content: Mapping[str, Any]) -> None:
+    """Show distances to a scan on a run's page.
+
+    Args:
+        path: the page, written by `write_html`; without one nothing is done.
+        content: of scan.json.
+
+    Raises:
+        GsbaError: the page is none, or cannot be written.
+    """
+    if not path.exists():
+        return
+    try:
+        text = path.read_text(encoding="utf-8")
+        data = json.loads(text.partition(_BEFORE_DATA)[2].partition(_AFTER_DATA)[0])
+        data["scan"] = {name: content[name] for name in ("scan", "before", "after")}
+    except (OSError, ValueError, KeyError, TypeError):
+        raise GsbaError(f"{path}: is no page of a run: refine again") from None
+    write_text(path, _assembled(_dumped(data)))
+
+
+def _dumped(data: Mapping[str, Any]) -> str:
+    return json.dumps(plain(data, digits=6), allow_nan=False, separators=(",", ":"))
 
 
 def _assembled(data: str) -> str:
