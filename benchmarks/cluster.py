@@ -26,7 +26,7 @@ from distributed import Client, LocalCluster
 import gsba
 from benchmarks.common import write_table
 from gsba.config import RefineSettings
-from gsba.pipeline.workers import Cluster
+from gsba.store.cluster import Cluster
 from gsba.store.shards import even_blocks
 
 OUTPUTS = "trajectory.tum", "poses.csv", "points.ply"

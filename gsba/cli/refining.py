@@ -126,7 +126,7 @@ def refine(
         overrides = [*overrides, f'camera.name="{camera}"']
     settings = _settings(config, overrides, factors)
     from gsba import pipeline
-    from gsba.pipeline.workers import connected
+    from gsba.store.cluster import connected
 
     given = {"keyframes": keyframes, "masks": masks, "segment": segment, "timestamps": timestamps}
     given |= {"fps": fps, "calibration": calibration, "imu": imu, "fresh": fresh}

@@ -20,6 +20,7 @@ _WHAT = {
     "splat": "splats on a GPU",
     "view": "a run in the browser",
     "plot": "figures",
+    "cluster": "work shared out to other processes or machines",
     "imu": "gyros of raw videos",
     "scan": "laser scans and meshes",
 }

@@ -20,13 +20,14 @@ from gsba.loop_closure import connectivity
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
 from gsba.photometric import direct
-from gsba.pipeline import backend, frontend, inputs, outputs, workers
+from gsba.pipeline import backend, frontend, inputs, outputs
 from gsba.pipeline.frontend import Seen
 from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import ExtraFactors, Prior
 from gsba.pipeline.run import Journal, Run
 from gsba.placement.placement import check
+from gsba.store import cluster
 from gsba.store.store import RunStore
 from gsba.trajectory.axes import quarter_turn
 from gsba.types import (
@@ -109,7 +110,7 @@ def refine(
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, calibration)
     check(settings.placement, frame_set, settings.camera.baseline())
     coarse = inputs.coarse_poses(frame_set, given, settings)
-    with RunStore(out, origin, fresh, workers.hire(client, frames, settings)) as store:
+    with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
         frame_set, journal = merging.before(store, frame_set, chosen), Journal()
         if chosen.distractors:
             frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
