@@ -84,7 +84,8 @@ def stages(out: Path) -> tuple[float, float, float, float]:
     for stage in json.loads((out / "report.json").read_text())["stages"]:
         row = int(stage["name"].rstrip("0123456789") not in shared)
         found[row] += stage["seconds"], stage["cpu_seconds"]
-    return tuple(found.ravel().tolist())
+    (wall, cpu), (wall_else, cpu_else) = found.tolist()
+    return wall, cpu, wall_else, cpu_else
 
 
 def asleep(num: int, slots: int, seconds: float) -> tuple[float, float]:
