@@ -250,6 +250,10 @@ def _version(package: str) -> str | None:
 
 def plain(value: Any, digits: int = 17) -> Any:
     """Values JSON can hold, floats to `digits`; what is not finite becomes null."""
+    if type(value) is float:  # nearly all of them
+        if not math.isfinite(value):
+            return None
+        return value if digits >= 17 else float(f"{value:.{digits}g}")
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -265,6 +269,4 @@ def plain(value: Any, digits: int = 17) -> Any:
         return [plain(item, digits) for item in value]
     if isinstance(value, Enum):
         return value.value
-    if isinstance(value, float):
-        return float(f"{value:.{digits}g}") if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value
