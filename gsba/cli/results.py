@@ -157,6 +157,16 @@ def _length(text: str | None) -> float | str | None:
 ScanFile = Annotated[
     Path | None, typer.Option(help="A scan of the place: how far the run's points are off it.")
 ]
+ScanPairs = Annotated[
+    Path | None,
+    typer.Option(help="With --scan: points picked in both, to look there.", metavar="FILE"),
+]
+ScanGps = Annotated[
+    str | None, typer.Option(help="With --scan: positions, or exif, to look there.", metavar="FILE")
+]
+ScanUp = Annotated[
+    str | None, typer.Option(help="With --scan: auto = it is upright.", metavar="auto")
+]
 Depth = Annotated[
     Path | None,
     typer.Option(help="True depth maps: also say how far pixels are moved.", metavar="DIR"),
@@ -172,6 +182,9 @@ def evaluate(
         Path | None, typer.Option("--json", help="Write the numbers here too.", metavar="FILE")
     ] = None,
     scan: ScanFile = None,
+    pairs: ScanPairs = None,
+    gps: ScanGps = None,
+    up: ScanUp = None,
     splat: Annotated[
         bool, typer.Option("--splat", help="Train splats on poses, and measure held-out frames.")
     ] = False,
@@ -189,8 +202,11 @@ def evaluate(
     if splat:
         settings = splat_settings(iterations, face_size, backend, max_gaussians)
         evaluate_splat(estimate, against or [], settings, lpips or [])
+    known = {name: str(x) for name, x in (("pairs", pairs), ("gps", gps), ("up", up)) if x}
     if scan is not None:
-        _against_scan(estimate, scan, json_file if truth is None else None)
+        _against_scan(estimate, scan, known, json_file if truth is None else None)
+    elif known:
+        raise GsbaError("--pairs, --gps and --up tell where to look in a scan: give --scan FILE")
     if truth is None:
         if not splat and scan is None:
             raise GsbaError("nothing to compare with: give --truth FILE, --scan FILE, or --splat")
@@ -225,24 +241,33 @@ def evaluate(
         typer.echo(judged)
 
 
-def _against_scan(run: Path, path: Path, json_file: Path | None) -> None:
-    """Measure a run on a scan: a table, RUN/scan.json, and its cloud in colours of distance."""
+def _against_scan(run: Path, path: Path, known: dict[str, str], json_file: Path | None) -> None:
+    """Measure a run on a scan: a table, RUN/scan.json, and its cloud in colours of distance.
+
+    Args:
+        known: settings of its placement, that tell where to look.
+    """
+    from gsba.config_file import validated
     from gsba.disk import write_json
     from gsba.evaluate.scans import format_scan, scan_errors
     from gsba.export.ply import write_splat_points
+    from gsba.placement import check, guess_in_scan
     from gsba.report.html import add_scan
     from gsba.scans import in_file, read_scan
     from gsba.store.finished import load_run
     from gsba.trajectory.files import read_trajectory
 
     reconstruction, frames = load_run(run)
+    settings = validated({"placement": {"scan": str(path), **known}}).placement
+    check(settings, frames)
     before = run / "coarse.tum"
     coarse = read_trajectory(before).world_T_rigs if before.exists() else None
     if coarse is not None and len(coarse) != len(frames):
         raise GsbaError(f"{before}: is of other frames: refine again")
     surfaces = read_scan(path)
+    guess, _ = guess_in_scan(reconstruction, frames, settings, surfaces)
     with in_file(path):
-        errors = scan_errors(reconstruction, surfaces, coarse)
+        errors = scan_errors(reconstruction, surfaces, coarse, guess)
     content = {"scan": str(path), "offset": surfaces.offset.tolist(), **errors.to_json()}
     if json_file is not None:
         write_json(json_file, content)

@@ -6,12 +6,13 @@ Gives a `Placement`, which moves poses, points and covariances.
 
 from gsba.placement.exif import read_exif_gps
 from gsba.placement.gps import GpsFixes, local_from_geodetic, read_gps
-from gsba.placement.placement import Placement, check, place, read_placement
+from gsba.placement.placement import Placement, check, guess_in_scan, place, read_placement
 
 __all__ = [
     "GpsFixes",
     "Placement",
     "check",
+    "guess_in_scan",
     "local_from_geodetic",
     "place",
     "read_exif_gps",

@@ -21,7 +21,7 @@ from gsba.placement.gps import GpsFixes, local_from_geodetic, read_gps
 from gsba.scans.files import check_scan, normals_of, read_pairs, read_scan, upwards
 from gsba.scans.registration import in_file, register
 from gsba.scans.search import Guess
-from gsba.scans.types import cloud_of
+from gsba.scans.types import Scan, cloud_of
 from gsba.similarity import (
     Sim3,
     extents,
@@ -431,32 +431,46 @@ def _in_scan(
     """The world of a scan, what is known of the run's beforehand telling where to look."""
     assert settings.scan is not None
     path = Path(settings.scan)
-    guess, grounds, up = Guess(), {}, None
-    axis = UPS[upwards(path)]
-    if settings.pairs is not None:
-        guess = _by_pairs(reconstruction, frames, Path(settings.pairs))
-        grounds = {"pairs": settings.pairs}
-    elif settings.gps is not None:
-        upright = _upright(reconstruction, frames) if settings.up == "auto" else Placement()
-        earth = _on_earth(reconstruction, frames, Path(settings.gps), upright)
-        turn = _least_turn(np.array([0.0, 0, 1]), axis)
-        guess = Guess(scale=earth.similarity.scale, rotation=turn @ earth.similarity.rotation)
-        grounds = earth.grounds
-    elif settings.up == "auto":
-        upright = _upright(reconstruction, frames)
-        guess = Guess(axis=(upright.similarity.rotation.T @ _UP_WORLD, axis))
-        grounds = upright.grounds
-    if settings.up == "auto":
-        up = upwards(path)
     scan = read_scan(path)
+    guess, grounds = guess_in_scan(reconstruction, frames, settings, scan)
     with in_file(path):
-        if settings.pairs is not None:
-            guess = guess.without(scan.offset)
         found = register(cloud_of(reconstruction, normals_of), scan, guess)
     logger.info("--align-scan %s: %s", path, found)
     grounds |= {"scan": {"file": str(path), **found.to_json()}}
+    up = upwards(path) if settings.up == "auto" else None
     unit = "units of the scan"
     return Placement(found.fit.similarity, unit, up, scan.offset, grounds=grounds)
+
+
+def guess_in_scan(
+    reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings, scan: Scan
+) -> tuple[Guess, dict[str, Any]]:
+    """Where to look for a run in a scan, by `pairs`, else `gps`, else `up`.
+
+    Args:
+        reconstruction, frames: of the run.
+        settings: `scan` names the file of the scan.
+
+    Returns:
+        The guess, in the scan's world less its offset, and what it rests on.
+
+    Raises:
+        GsbaError: files that cannot be used, or frames that say no way up.
+    """
+    axis = UPS[upwards(Path(settings.scan or ""))]
+    if settings.pairs is not None:
+        guess = _by_pairs(reconstruction, frames, Path(settings.pairs))
+        return guess.without(scan.offset), {"pairs": settings.pairs}
+    if settings.gps is not None:
+        upright = _upright(reconstruction, frames) if settings.up == "auto" else Placement()
+        earth = _on_earth(reconstruction, frames, Path(settings.gps), upright)
+        turn = _least_turn(np.array([0.0, 0, 1]), axis)
+        rotation = turn @ earth.similarity.rotation
+        return Guess(scale=earth.similarity.scale, rotation=rotation), earth.grounds
+    if settings.up == "auto":
+        upright = _upright(reconstruction, frames)
+        return Guess(axis=(upright.similarity.rotation.T @ _UP_WORLD, axis)), upright.grounds
+    return Guess(), {}
 
 
 def _by_pairs(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Guess:

@@ -1,15 +1,20 @@
 """A run measured on a scan: near where its points are, far where they were before."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scan_world import HALL, INTO_SCAN, SIZE, cloud, scan
 
+from gsba.config import PlacementSettings
 from gsba.evaluate import scans
 from gsba.evaluate.scans import format_scan, scan_errors
 from gsba.geometry import pose
-from gsba.types import PoseStatus, Reconstruction
+from gsba.placement import guess_in_scan
+from gsba.scans.search import Guess
+from gsba.scans.types import Scan
+from gsba.types import FrameSet, PoseStatus, Reconstruction
 
 
 def _run() -> Reconstruction:
@@ -57,3 +62,25 @@ def test_distances_after_and_before(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "before" in format_scan(errors)
     alone = scan_errors(dataclasses.replace(run), surfaces)
     assert alone.before is None and alone.to_json()["before"] is None
+
+
+def test_pairs_tell_where_to_look(tmp_path: Path) -> None:
+    """In the world of the scan's file, whose offset is kept apart."""
+    run, pairs = _run(), tmp_path / "pairs.txt"
+    picked = run.world_T_rigs[:4, :3, 3]
+    lines = zip(picked.tolist(), INTO_SCAN.points(picked).tolist(), strict=True)
+    pairs.write_text(
+        "".join(f"{','.join(map(repr, a))} {','.join(map(repr, b))}\n" for a, b in lines)
+    )
+    names = tuple(f"{f:02}" for f in range(12))
+    frames = FrameSet(names, ((),) * 12, np.arange(12.0), "erp", (), 64, 32, (None,) * 12)
+    offset = np.array([5.0, -7.0, 11.0])
+    far = Scan(np.zeros((1, 3)), np.ones((1, 3)), offset)
+    known = PlacementSettings(scan="scan.ply", pairs=str(pairs))
+    guess, grounds = guess_in_scan(run, frames, known, far)
+    assert guess.similarity is not None and grounds == {"pairs": str(pairs)}
+    np.testing.assert_allclose(guess.similarity.scale, INTO_SCAN.scale)
+    moved = INTO_SCAN.translation - offset
+    np.testing.assert_allclose(guess.similarity.translation, moved, atol=1e-9)
+    nothing, _ = guess_in_scan(run, frames, PlacementSettings(scan="scan.ply"), far)
+    assert nothing == Guess()

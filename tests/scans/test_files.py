@@ -120,6 +120,8 @@ def test_distances_are_to_surfaces_and_not_to_the_next_point() -> None:
 def test_settings_that_exclude_one_another(tmp_path: Path) -> None:
     told = CliRunner().invoke(app, ["export", str(tmp_path), "--to", "tum", "--pairs", "p.txt"])
     assert told.exit_code == 1 and "error: " in told.output
+    told = CliRunner().invoke(app, ["evaluate", str(tmp_path), "--pairs", "p.txt"])
+    assert told.exit_code == 1 and "give --scan FILE" in told.output
 
 
 def test_noise_shrinks_on_planes_and_steps_stay() -> None:
