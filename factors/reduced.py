@@ -148,9 +148,10 @@ class ReducedSystem:
     def _gathered(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         """Off-diagonal blocks (P, 6, 6) of all; those of one block of factors that has them all,
         gigabytes of many laps, are not copied."""
-        slots, flip = self._block_slots[0] if len(parts) == 1 else ((), np.zeros(0))
-        if len(slots) == len(self._pairs) and not flip.any():
-            return parts[0]
+        if len(parts) == 1:
+            slots, flip = self._block_slots[0]
+            if len(slots) == len(self._pairs) and not flip.any():
+                return parts[0]
         out = np.zeros((len(self._pairs), DIM, DIM))
         for part, (slots, flip) in zip(parts, self._block_slots, strict=True):
             _add_blocks(out, slots, flip, part)

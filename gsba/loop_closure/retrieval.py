@@ -4,8 +4,9 @@ Looks are compared as vectors of locally aggregated descriptors (VLAD: Jegou et 
 normalised word by word as in Arandjelovic and Zisserman, CVPR 2013) over whole panoramas.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,22 +23,22 @@ _ROUNDING = 1e-5  # of descriptors, float32 and of length one: a shorter sum has
 def looks_of(frames: SearchableFrames, num_frames: int, seed: int, workers: Workers) -> np.ndarray:
     """What each panorama looks like, whatever its heading: (F, D) float32 of length one."""
     share = max(_SAMPLES // max(num_frames, 1), 8)
-    samples = _SampleJob(frames, np.arange(num_frames), share, seed)
-    sample = np.concatenate(list(workers.map_shards(samples)))
-    words = _words(sample, np.random.default_rng(seed))
-    looks = workers.map_shards(_LookJob(frames, np.arange(num_frames), words))
+    draw = partial(_drawn, share=share, seed=seed)
+    everyone = np.arange(num_frames)
+    sample = np.concatenate(list(workers.map_shards(_LookJob("sampling", frames, everyone, draw))))
+    aggregate = partial(_seen, words=_words(sample, np.random.default_rng(seed)))
+    looks = workers.map_shards(_LookJob("looks", frames, everyone, aggregate))
     return np.array(list(looks), np.float32)
 
 
 @dataclass(frozen=True, slots=True)
-class _SampleJob:
-    """The job of drawing descriptors of each frame."""
+class _LookJob:
+    """The job of looking at the descriptors of each frame."""
 
+    title: str
     frames: SearchableFrames
     chosen: np.ndarray  # (F,) frames
-    share: int  # descriptors of each
-    seed: int
-    title: str = "sampling"
+    look: Callable[[np.ndarray, int], np.ndarray]  # at descriptors (K, D) of a frame
     returns: Any = np.ndarray
 
     def __len__(self) -> int:
@@ -45,32 +46,7 @@ class _SampleJob:
 
     def __call__(self, item: int) -> np.ndarray:
         frame = int(self.chosen[item])
-        rng = np.random.default_rng([self.seed, frame])
-        return rng.permutation(self.frames[frame].descriptors)[: self.share]
-
-    def blocks(self) -> Sequence[tuple[int, int]]:
-        return blocks_of_frames(self.chosen)
-
-    def part(self, start: int, stop: int) -> "_SampleJob":
-        chosen = self.chosen[start:stop]
-        return replace(self, chosen=chosen, frames=self.frames.taken(chosen.tolist()))
-
-
-@dataclass(frozen=True, slots=True)
-class _LookJob:
-    """The job of aggregating the descriptors of each frame."""
-
-    frames: SearchableFrames
-    chosen: np.ndarray  # (F,) frames
-    words: np.ndarray  # (W, D)
-    title: str = "looks"
-    returns: Any = np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.chosen)
-
-    def __call__(self, item: int) -> np.ndarray:
-        return _aggregate(self.frames[int(self.chosen[item])].descriptors, self.words)
+        return self.look(self.frames[frame].descriptors, frame)
 
     def blocks(self) -> Sequence[tuple[int, int]]:
         return blocks_of_frames(self.chosen)
@@ -78,6 +54,16 @@ class _LookJob:
     def part(self, start: int, stop: int) -> "_LookJob":
         chosen = self.chosen[start:stop]
         return replace(self, chosen=chosen, frames=self.frames.taken(chosen.tolist()))
+
+
+def _drawn(descriptors: np.ndarray, frame: int, share: int, seed: int) -> np.ndarray:
+    """Some descriptors of a frame, the same whoever draws them."""
+    return np.random.default_rng([seed, frame]).permutation(descriptors)[:share]
+
+
+def _seen(descriptors: np.ndarray, _frame: int, words: np.ndarray) -> np.ndarray:
+    """What a frame looks like, whichever it is."""
+    return _aggregate(descriptors, words)
 
 
 def _words(sample: np.ndarray, rng: np.random.Generator, rounds: int = 12) -> np.ndarray:

@@ -254,8 +254,8 @@ class SearchableFrames:
         axes: np.ndarray | None = None,
     ) -> None:
         if axes is None:
-            first = load(0)
-            axes = principal_axes(first.descriptors) if len(first) else None
+            first = load(0).descriptors
+            axes = principal_axes(first) if len(first) else np.eye(first.shape[1], dtype=np.float32)
         self._get = lru_cache(capacity)(lambda frame: searchable(load(frame), axes, strongest))
         self._features = lru_cache(max(capacity // 8, 2))(load)
         self._load, self._axes, self._capacity = load, axes, capacity

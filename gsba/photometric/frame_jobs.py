@@ -40,7 +40,7 @@ def cut(
     """
     patches = _room(len(hosts), settings)
     rows = _by_frame(hosts, greys.num_frames)
-    job = _CutJob(name, greys, rows.frames, rows, origins, spreads, settings)
+    job = _CutJob(name, greys, rows, origins, spreads, settings)
     whole = patches.templates
     for chosen, found in zip(rows.each(), workers.map_shards(job), strict=True):
         arrays = whole.grey, whole.by_x, whole.by_y, whole.inverses, whole.states
@@ -67,7 +67,7 @@ def align(
         name, greys, settings, workers: as for `cut`.
     """
     rows = _by_frame(seeing, greys.num_frames)
-    job = _AlignJob(name, greys, rows.frames, rows, patches, sightings, settings)
+    job = _AlignJob(name, greys, rows, patches, sightings, settings)
     for chosen, found in zip(rows.each(), workers.map_shards(job), strict=True):
         arrays = sightings.warps, sightings.scores, sightings.variances, sightings.states
         for array, part in zip(arrays, found, strict=True):
@@ -109,39 +109,50 @@ def _by_frame(frame_of: np.ndarray, num_frames: int) -> _Rows:
 
 
 @dataclass(frozen=True, slots=True)
-class _CutJob:
-    """The job of cutting templates."""
+class _FrameJob:
+    """A job of which each frame with rows is an item."""
 
     title: str
     greys: Greys
-    frames: np.ndarray  # (N,) that have any
     rows: _Rows
+
+    @property
+    def returns(self) -> Any:
+        return tuple[np.ndarray, ...]
+
+    def __len__(self) -> int:
+        return len(self.rows.frames)
+
+    def blocks(self) -> Sequence[tuple[int, int]]:
+        return blocks_of_frames(self.rows.frames)
+
+    def image(self, item: int) -> tuple[SphereImage, np.ndarray | None]:
+        """Of a frame, and where it may be used."""
+        grey, mask = self.greys[int(self.rows.frames[item])]
+        return SphereImage.of(grey, smooth=True), mask
+
+
+@dataclass(frozen=True, slots=True)
+class _CutJob(_FrameJob):
+    """The job of cutting templates."""
+
     origins: np.ndarray  # (J, 3)
     spreads: np.ndarray  # (J, 3, 2)
     settings: PatchSettings
-    returns: Any = tuple[np.ndarray, ...]
-
-    def __len__(self) -> int:
-        return len(self.frames)
 
     def __call__(self, item: int) -> tuple[np.ndarray, ...]:
         rows = self.rows.of(item)
-        image, mask = _image(self.greys, int(self.rows.frames[item]))
         found = _room(len(rows), self.settings)
         every, least = np.arange(len(rows)), self.settings.min_contrast
-        found.cut(image, mask, every, self.origins[rows], self.spreads[rows], least)
+        found.cut(*self.image(item), every, self.origins[rows], self.spreads[rows], least)
         own = found.templates
         return own.grey, own.by_x, own.by_y, own.inverses, own.states
-
-    def blocks(self) -> Sequence[tuple[int, int]]:
-        return blocks_of_frames(self.frames)
 
     def part(self, start: int, stop: int) -> "_CutJob":
         chosen, rows = self.rows.taken(start, stop)
         return replace(
             self,
-            greys=self.greys.taken(self.frames[start:stop]),
-            frames=self.frames[start:stop],
+            greys=self.greys.taken(self.rows.frames[start:stop]),
             rows=rows,
             origins=self.origins[chosen],
             spreads=self.spreads[chosen],
@@ -149,31 +160,19 @@ class _CutJob:
 
 
 @dataclass(frozen=True, slots=True)
-class _AlignJob:
+class _AlignJob(_FrameJob):
     """The job of aligning templates."""
 
-    title: str
-    greys: Greys
-    frames: np.ndarray  # (N,) that should show any
-    rows: _Rows
     patches: PatchSet
     sightings: Sightings
     settings: PatchSettings
-    returns: Any = tuple[np.ndarray, ...]
-
-    def __len__(self) -> int:
-        return len(self.frames)
 
     def __call__(self, item: int) -> tuple[np.ndarray, ...]:
         rows = self.rows.of(item)
-        image, mask = _image(self.greys, int(self.rows.frames[item]))
         own = Sightings(*(column[rows] for column in self.sightings))
         reach, every = _SEARCH * self.settings.max_shift_px, np.arange(len(rows))
-        self.patches.align(image, mask, every, own, reach, _STEPS, _TOLERANCE)
+        self.patches.align(*self.image(item), every, own, reach, _STEPS, _TOLERANCE)
         return own.warps, own.scores, own.variances, own.states
-
-    def blocks(self) -> Sequence[tuple[int, int]]:
-        return blocks_of_frames(self.frames)
 
     def part(self, start: int, stop: int) -> "_AlignJob":
         chosen, rows = self.rows.taken(start, stop)
@@ -181,14 +180,8 @@ class _AlignJob:
         used, templates = np.unique(own.templates, return_inverse=True)
         return replace(
             self,
-            greys=self.greys.taken(self.frames[start:stop]),
-            frames=self.frames[start:stop],
+            greys=self.greys.taken(self.rows.frames[start:stop]),
             rows=rows,
             patches=self.patches.taken(used),
             sightings=own._replace(templates=templates),
         )
-
-
-def _image(greys: Greys, frame: int) -> tuple[SphereImage, np.ndarray | None]:
-    grey, mask = greys[frame]
-    return SphereImage.of(grey, smooth=True), mask

@@ -163,7 +163,7 @@ def _export(
     for to, folder in folders.items():
         if not folder.exists():
             store.forget(f"export-{to.value}")
-        if not store.is_stored(f"export-{to.value}", key, Counts, run.chain.latest):
+        if store.stored(f"export-{to.value}", key, Counts, run.chain.latest) is None:
             waiting[to] = folder
 
     def compute() -> Counts:

@@ -12,6 +12,7 @@ import os
 import pickle
 import socket
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -93,10 +94,10 @@ class Threads:
     def map_shards(self, job: Job[R]) -> Iterator[R]:
         """See `Workers`."""
         with ThreadPoolExecutor(self.num_threads) as pool:
-            running = [pool.submit(job, item) for item in range(len(job))]
+            running = deque(pool.submit(job, item) for item in range(len(job)))
             try:
-                for future in track(running, job.title):
-                    yield future.result()
+                for _ in track(range(len(job)), job.title):
+                    yield running.popleft().result()  # held no longer than it is used
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)
 

@@ -129,13 +129,6 @@ class RunStore:
         self._note(record)
         return value
 
-    def is_stored(
-        self, name: str, settings: object, returns: type[T], after: Sequence[str] = ()
-    ) -> bool:
-        """Whether `stage` finds the result that it is asked for so."""
-        path = _stage_path(self.root, self._prefix + name)
-        return _load_if_current(path, self._key(name, settings, after), returns) is not None
-
     def per_frame(
         self,
         name: str,

@@ -341,3 +341,19 @@ def test_frames_are_read_once_while_they_fit(scene: Scene) -> None:
 
 def _reader(frames: list[Features]) -> Callable[[int], Features]:
     return lambda frame: frames[frame]
+
+
+def test_some_frames_need_no_other(scene: Scene) -> None:
+    """What workers elsewhere get does not read frame 0 again, even where that is blank."""
+    blank = features_of(np.zeros((0, 3)), scene.descriptors[:0])
+    every = [blank, scene.first(), scene.second()]
+    frames = SearchableFrames(_reader(every))
+    reads: list[int] = []
+
+    def load(frame: int) -> Features:
+        reads.append(frame)
+        return every[frame]
+
+    some = SearchableFrames(load, axes=frames._axes).taken([1, 2])
+    np.testing.assert_array_equal(some[1].descriptors, frames[1].descriptors)
+    assert reads == [1]
