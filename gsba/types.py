@@ -35,15 +35,6 @@ class Counts:
     unit: str  # what is counted: "frames", "matches", ...
     dropped: Mapping[str, int] = field(default_factory=dict)  # reason -> how many
 
-    def __add__(self, other: "Counts") -> "Counts":
-        """Of both together."""
-        reasons = [
-            *self.dropped,
-            *(reason for reason in other.dropped if reason not in self.dropped),
-        ]
-        dropped = {r: self.dropped.get(r, 0) + other.dropped.get(r, 0) for r in reasons}
-        return Counts(self.received + other.received, self.kept + other.kept, self.unit, dropped)
-
 
 @dataclass(frozen=True, slots=True)
 class Fisheye:

@@ -1,6 +1,5 @@
 """From poses to correspondences: neighbours in time, closed loops, and the map itself."""
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -54,37 +53,24 @@ def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     """Match frames close in space but far in time, as far as drift leaves them predictable.
 
     Only known points are looked for, as far around their predicted bearing as drift can have moved
-    them. What repeats at a distance, arches or columns, is further off than that. Each visit to a
-    place is matched with the one before; frames that this links to nothing earlier are tried with
-    all their nearest.
+    them. What repeats at a distance, arches or columns, is further off than that.
 
     Args:
         context: of the run.
         solved: poses and points that are right between neighbours.
     """
-    settings, depth = context.settings.pairs, solved.median_depth()
-    positions = solved.world_T_rigs[:, :3, 3]
-    found = _match_predicted(context, solved, pairs.last_visits(positions, depth, settings))
-    nearest = found.missing(pairs.covisible(positions, depth, settings)[1])
-    again = nearest[pairs.unlinked(nearest, found.matches.pairs, settings)]
-    if len(again) == 0:
-        return found
-    more = _match_predicted(context, solved, again)
-    return replace(VerifiedPairs.joined([found, more]), counts=found.counts + more.counts)
-
-
-def _match_predicted(context: MatchContext, solved: Solution, chosen: np.ndarray) -> VerifiedPairs:
-    """Verified matches of pairs (P, 2) where drift can have moved known points."""
-    world_T_rigs, settings = solved.world_T_rigs, context.settings.pairs
+    settings, keypoints = context.settings, context.keypoints
+    world_T_rigs, positions = solved.world_T_rigs, solved.world_T_rigs[:, :3, 3]
     depth = solved.median_depth()
-    steps = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
+    chosen = pairs.closing(positions, depth, settings.pairs)
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     along = np.concatenate([[0], np.cumsum(steps)])
-    drifts = settings.drift * (along[chosen[:, 1]] - along[chosen[:, 0]])
+    drifts = settings.pairs.drift * (along[chosen[:, 1]] - along[chosen[:, 0]])
     gates = [
-        Gate.around_points(np.deg2rad(settings.loop_deg) + 2 * drift / max(depth, 1e-12))
+        Gate.around_points(np.deg2rad(settings.pairs.loop_deg) + 2 * drift / max(depth, 1e-12))
         for drift in drifts
     ]
-    known = solved.points_by_keypoint(context.keypoints)
+    known = solved.points_by_keypoint(keypoints)
     found = context.match(chosen, world_T_rigs, gates, known)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
     return verified(found, f0_T_f1s, drifts, context)

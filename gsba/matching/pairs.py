@@ -1,13 +1,13 @@
 """Which frames to match with which."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable
 
 import numpy as np
 
 from gsba.config import PairSettings
 
 _GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-_SURROUNDINGS = (1.0, 0.5, 0.25)  # parts of the reach in which a place counts as met again
+_HERE = 0.125  # part of the reach within which a place counts as the same
 
 
 def adjacent(num_frames: int, reach: int = 2) -> np.ndarray:
@@ -38,17 +38,18 @@ def covisible(
     ).reshape(-1, 2)
     lengths = np.linalg.norm(rigs_in_world[window[:, 0]] - rigs_in_world[window[:, 1]], axis=1)
     window = window[(lengths < reach) | (window[:, 1] - window[:, 0] <= 2)]
-    return window, _loops(rigs_in_world, reach, settings)
+
+    def far_in_time(f: int, near: np.ndarray, _distances: np.ndarray) -> np.ndarray:
+        return np.abs(near - f) > settings.window
+
+    return window, _nearest(rigs_in_world, reach, settings, far_in_time)
 
 
-def last_visits(
-    rigs_in_world: np.ndarray, median_depth: float, settings: PairSettings
-) -> np.ndarray:
-    """Pairs that close loops with as little drift between their frames as there can be.
+def closing(rigs_in_world: np.ndarray, median_depth: float, settings: PairSettings) -> np.ndarray:
+    """Pairs that close loops while drift between far frames is unknown.
 
-    A frame is paired with the visit to its surroundings that was last: however often a place is met
-    again, each visit has its own pairs with the one before. Surroundings are taken widely and more
-    closely, as what was last near may lie behind a wall.
+    However often a place is met again, each visit is paired with the ones before and after alone:
+    drift is least between these, and they imply the others.
 
     Args:
         rigs_in_world, median_depth, settings: as for `covisible`.
@@ -56,28 +57,17 @@ def last_visits(
     Returns:
         Pairs (L, 2) int32, f0 < f1, the closest in space first.
     """
-    found: dict[tuple[int, int], float] = {}
-    if settings.max_loop_neighbours == 0:
-        return _closest_first(found)
+
+    def next_visits(f: int, near: np.ndarray, distances: np.ndarray) -> np.ndarray:
+        apart = np.abs(near - f) > settings.window
+        here = max(_HERE * reach, 2 * distances[apart].min(initial=np.inf))
+        met = near[apart & (distances <= here)]
+        last = met[met < f].max(initial=0) - settings.window
+        following = met[met > f].min(initial=len(rigs_in_world)) + settings.window
+        return apart & (near >= last) & (near <= following)
+
     reach = settings.max_baseline_depths * median_depth
-    for f, (near, distances) in enumerate(_surroundings(rigs_in_world, reach)):
-        earlier = near < f - settings.window
-        for share in _SURROUNDINGS:
-            rows = np.flatnonzero(earlier & (distances <= share * reach))
-            visits = np.split(rows, np.flatnonzero(np.diff(near[rows]) > 1) + 1)
-            if len(rows):
-                row = visits[-1][np.argmin(distances[visits[-1]])]
-                found[int(near[row]), f] = float(distances[row])
-    return _closest_first(found)
-
-
-def unlinked(chosen: np.ndarray, linked: np.ndarray, settings: PairSettings) -> np.ndarray:
-    """Rows of pairs (P, 2) whose later frame has no loop (L, 2) to an earlier one, nor those
-    around it."""
-    around = settings.window // 4
-    has = np.sort(linked[:, 1])
-    first = np.searchsorted(has, chosen[:, 1] - around)
-    return np.flatnonzero(np.searchsorted(has, chosen[:, 1] + around, "right") == first)
+    return _nearest(rigs_in_world, reach, settings, next_visits)
 
 
 def by_place(pairs: np.ndarray, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
@@ -110,31 +100,27 @@ def by_place(pairs: np.ndarray, num_frames: int) -> tuple[np.ndarray, np.ndarray
     return order, first[order]
 
 
-def _loops(rigs_in_world: np.ndarray, reach: float, settings: PairSettings) -> np.ndarray:
-    """Nearest neighbours in space that are further apart in time than the window."""
-    found: dict[tuple[int, int], float] = {}
-    for f, (near, distances) in enumerate(_surroundings(rigs_in_world, reach)):
-        apart = np.abs(near - f) > settings.window
-        near, distances = near[apart], distances[apart]
-        for n in np.argsort(distances, kind="stable")[: settings.max_loop_neighbours]:
-            g = int(near[n])
-            found[min(f, g), max(f, g)] = float(distances[n])
-    return _closest_first(found)
+def _nearest(
+    rigs_in_world: np.ndarray,
+    reach: float,
+    settings: PairSettings,
+    chosen: Callable[[int, np.ndarray, np.ndarray], np.ndarray],
+) -> np.ndarray:
+    """Pairs (L, 2) int32 of each frame and its nearest in space among those chosen.
 
-
-def _surroundings(
-    rigs_in_world: np.ndarray, reach: float
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """For each frame those within reach (N,), ascending, and their distances (N,)."""
+    Args:
+        chosen: of a frame, the frames within reach (N,), ascending, and their distances: (N,) bool.
+    """
     from scipy.spatial import KDTree
 
     tree = KDTree(rigs_in_world)
-    for position in rigs_in_world:
+    found: dict[tuple[int, int], float] = {}
+    for f, position in enumerate(rigs_in_world):
         near = np.array(tree.query_ball_point(position, reach, return_sorted=True), np.int64)
-        yield near, np.linalg.norm(rigs_in_world[near] - position, axis=1)
-
-
-def _closest_first(found: Mapping[tuple[int, int], float]) -> np.ndarray:
-    """Pairs (P, 2) int32 by their distances."""
+        distances = np.linalg.norm(rigs_in_world[near] - position, axis=1)
+        rows = np.flatnonzero(chosen(f, near, distances))
+        for row in rows[np.argsort(distances[rows])[: settings.max_loop_neighbours]]:
+            g = int(near[row])
+            found[min(f, g), max(f, g)] = float(distances[row])
     ordered = sorted(found, key=lambda pair: (found[pair], pair))
     return np.array(ordered, np.int32).reshape(-1, 2)
