@@ -60,8 +60,7 @@ def closing(rigs_in_world: np.ndarray, median_depth: float, settings: PairSettin
 
     def next_visits(f: int, near: np.ndarray, distances: np.ndarray) -> np.ndarray:
         apart = np.abs(near - f) > settings.window
-        here = max(_HERE * reach, 2 * distances[apart].min(initial=np.inf))
-        met = near[apart & (distances <= here)]
+        met = near[apart & (distances <= _HERE * reach)]
         last = met[met < f].max(initial=0) - settings.window
         following = met[met > f].min(initial=len(rigs_in_world)) + settings.window
         return apart & (near >= last) & (near <= following)
