@@ -5,7 +5,7 @@ A point seen along `a` in frame 0 must lie, in frame 1, on the great circle thro
 never compared: this is the speed, and the defence against repeated structure.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from threading import Lock
@@ -218,6 +218,14 @@ def one_to_one(pairs: np.ndarray, similarity: np.ndarray) -> np.ndarray:
     return pairs[np.argsort(pairs[:, 0])].astype(np.int32)
 
 
+class Points(Protocol):
+    """Scene points of the keypoints of frames, see `match_pair`."""
+
+    def __getitem__(self, frame: int, /) -> np.ndarray:
+        """Those of one frame (K_f, 3), its rig frame, NaN where unknown."""
+        ...
+
+
 class Matcher(Protocol):
     """Finds corresponding keypoints of two frames whose relative pose is predicted.
 
@@ -331,7 +339,7 @@ class MatchContext:
         pairs: np.ndarray,
         world_T_rigs: np.ndarray,
         gates: Sequence[Gate],
-        points_rig: Sequence[np.ndarray] | None = None,
+        points_rig: Points | None = None,
         *,
         strongest: bool = False,
         guided_only: bool = False,
@@ -355,7 +363,7 @@ def match(
     frames: SearchableFrames,
     settings: MatchingSettings,
     workers: Workers,
-    points_rig: Sequence[np.ndarray] | None = None,
+    points_rig: Points | None = None,
     matcher: Matcher = guided,
 ) -> Matches:
     """Match frame pairs.
@@ -367,17 +375,14 @@ def match(
         frames: features.
         settings: similarity and distinctiveness.
         workers: who do it.
-        points_rig: (F) arrays (K_f, 3), see `match_pair`; frame 0 of a pair must be known.
+        points_rig: of each frame (K_f, 3), see `match_pair`.
         matcher: compares two frames.
     """
     f0_T_f1s = inverse(world_T_rigs[pairs[:, 0]]) @ world_T_rigs[pairs[:, 1]]
     order, places = by_place(pairs, len(world_T_rigs))  # those that share frames follow one another
-    points = None
-    if points_rig is not None:
-        points = {int(f0): points_rig[f0] for f0 in np.unique(pairs[:, 0])}
     chosen = [gates[p] for p in order]
     geometry = pairs[order], places, f0_T_f1s[order], chosen
-    job = _PairJob(*geometry, frames, settings, points, matcher)
+    job = _PairJob(*geometry, frames, settings, points_rig, matcher)
     rows = [_NO_MATCHES] * len(pairs)
     for p, matched in zip(order, workers.map_shards(job), strict=True):
         rows[p] = matched
@@ -394,7 +399,7 @@ class _PairJob:
     gates: Sequence[Gate]  # (P)
     frames: SearchableFrames
     settings: MatchingSettings
-    points: Mapping[int, np.ndarray] | None  # of first frames, (K, 3)
+    points: Points | None  # of first frames
     matcher: Matcher
     title: str = "matching"
     returns: Any = np.ndarray
