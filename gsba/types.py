@@ -364,14 +364,31 @@ class Solution:
         offsets = points[tracks.points] - self.world_T_rigs[tracks.frames, :3, 3]
         return float(np.median(np.linalg.norm(offsets, axis=1))) if len(offsets) else 0.0
 
-    def points_by_keypoint(self, keypoints: Keypoints) -> list[np.ndarray]:
+    def points_by_keypoint(self, keypoints: Keypoints) -> "KnownPoints":
         """For each frame (K_f, 3): its keypoints' points in its rig frame, NaN where unknown."""
-        tracks = self.landmarks.tracks
-        known = np.full((len(keypoints.faces), 3), np.nan)
-        world_T_rig = self.world_T_rigs[tracks.frames]
-        offsets = self.landmarks.points_world[tracks.points] - world_T_rig[:, :3, 3]
-        known[keypoints.rows(tracks)] = np.einsum("oji,oj->oi", world_T_rig[:, :3, :3], offsets)
-        return np.split(known, keypoints.starts[1:-1])
+        frames = self.landmarks.tracks.frames
+        order = np.argsort(frames, kind="stable")
+        starts = np.searchsorted(frames[order], np.arange(len(self.world_T_rigs) + 1))
+        return KnownPoints(self, np.diff(keypoints.starts), order, starts)
+
+
+@dataclass(frozen=True, slots=True)
+class KnownPoints:
+    """Points of the keypoints of each frame: made when they are asked for, not held."""
+
+    solved: Solution
+    sizes: np.ndarray  # (F,) keypoints
+    order: np.ndarray  # (O,) observations, frame by frame
+    starts: np.ndarray  # (F + 1,): frame f's are order[starts[f]:starts[f + 1]]
+
+    def __getitem__(self, frame: int) -> np.ndarray:
+        """Of one frame (K_f, 3), in its rig frame, NaN where unknown."""
+        landmarks, world_T_rig = self.solved.landmarks, self.solved.world_T_rigs[frame]
+        rows = self.order[self.starts[frame] : self.starts[frame + 1]]
+        offsets = landmarks.points_world[landmarks.tracks.points[rows]] - world_T_rig[:3, 3]
+        known = np.full((self.sizes[frame], 3), np.nan)
+        known[landmarks.tracks.keypoints[rows]] = offsets @ world_T_rig[:3, :3]
+        return known
 
 
 @dataclass(frozen=True, slots=True)

@@ -80,7 +80,8 @@ class _Joining:
         self.times, self.depth = timestamps, solved.median_depth()
         self.looks = looks_of(context.strongest, num, context.settings.seed, context.workers)
         self.poses = solved.world_T_rigs.copy()
-        self.known = solved.points_by_keypoint(context.keypoints)  # rig frames, own units
+        known = solved.points_by_keypoint(context.keypoints)
+        self.known = [known[f] for f in range(num)]  # rig frames, own units
         self.moves = [Sim3()] * num  # of each frame, so far
         self.components = np.full(num, -1)
         self.met, self.alone = np.zeros(num, bool), np.zeros(num, bool)

@@ -62,7 +62,7 @@ def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     settings, keypoints = context.settings, context.keypoints
     world_T_rigs, positions = solved.world_T_rigs, solved.world_T_rigs[:, :3, 3]
     depth = solved.median_depth()
-    chosen = pairs.covisible(positions, depth, settings.pairs)[1]
+    chosen = pairs.closing(positions, depth, settings.pairs)
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     along = np.concatenate([[0], np.cumsum(steps)])
     drifts = settings.pairs.drift * (along[chosen[:, 1]] - along[chosen[:, 0]])

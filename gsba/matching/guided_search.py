@@ -5,11 +5,11 @@ A point seen along `a` in frame 0 must lie, in frame 1, on the great circle thro
 never compared: this is the speed, and the defence against repeated structure.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from threading import Lock
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -19,9 +19,11 @@ from gsba.config import MatchingSettings, RefineSettings
 from gsba.features.extraction import FrameFeatures
 from gsba.geometry import inverse
 from gsba.matching._search_kernels import HEAD, Cells, Limits, Rows, passes, search
+from gsba.matching.pairs import by_place
 from gsba.store.shards import Workers, blocks_of_frames
 from gsba.types import Features, Keypoints, Matches
 
+T = TypeVar("T")
 _CELLS = 8  # cells along a face's side
 _NO_MATCHES = np.zeros((0, 2), np.int32)
 
@@ -216,6 +218,14 @@ def one_to_one(pairs: np.ndarray, similarity: np.ndarray) -> np.ndarray:
     return pairs[np.argsort(pairs[:, 0])].astype(np.int32)
 
 
+class Points(Protocol):
+    """Scene points of the keypoints of frames, see `match_pair`."""
+
+    def __getitem__(self, frame: int, /) -> np.ndarray:
+        """Those of one frame (K_f, 3), its rig frame, NaN where unknown."""
+        ...
+
+
 class Matcher(Protocol):
     """Finds corresponding keypoints of two frames whose relative pose is predicted.
 
@@ -234,6 +244,19 @@ class Matcher(Protocol):
     ) -> np.ndarray:
         """Matches (m, 2) int32 of a pair of frames, sorted, one to one; see `match_pair`."""
         ...
+
+
+class _Once(Generic[T]):
+    """A value that whoever asks first makes, while others wait for it and for nothing else."""
+
+    def __init__(self, make: Callable[[], T]) -> None:
+        self._make, self._lock, self._made = make, Lock(), []
+
+    def __call__(self) -> T:
+        with self._lock:
+            if not self._made:
+                self._made.append(self._make())
+            return self._made[0]
 
 
 class SearchableFrames:
@@ -256,8 +279,10 @@ class SearchableFrames:
         if axes is None:
             first = load(0).descriptors
             axes = principal_axes(first) if len(first) else np.eye(first.shape[1], dtype=np.float32)
-        self._get = lru_cache(capacity)(lambda frame: searchable(load(frame), axes, strongest))
-        self._features = lru_cache(max(capacity // 8, 2))(load)
+        self._get = lru_cache(capacity)(
+            lambda frame: _Once(lambda: searchable(load(frame), axes, strongest))
+        )
+        self._features = lru_cache(max(capacity // 8, 2))(lambda frame: _Once(lambda: load(frame)))
         self._load, self._axes, self._capacity = load, axes, capacity
         self._lock = Lock()
         self.strongest = strongest
@@ -274,12 +299,14 @@ class SearchableFrames:
 
     def __getitem__(self, frame: int) -> Searchable:
         with self._lock:
-            return self._get(int(frame))
+            found = self._get(int(frame))
+        return found()
 
     def features(self, frame: int) -> Features:
         """All features of a frame, as they were extracted."""
         with self._lock:
-            return self._features(int(frame))
+            found = self._features(int(frame))
+        return found()
 
 
 def guided(
@@ -312,7 +339,7 @@ class MatchContext:
         pairs: np.ndarray,
         world_T_rigs: np.ndarray,
         gates: Sequence[Gate],
-        points_rig: Sequence[np.ndarray] | None = None,
+        points_rig: Points | None = None,
         *,
         strongest: bool = False,
         guided_only: bool = False,
@@ -336,7 +363,7 @@ def match(
     frames: SearchableFrames,
     settings: MatchingSettings,
     workers: Workers,
-    points_rig: Sequence[np.ndarray] | None = None,
+    points_rig: Points | None = None,
     matcher: Matcher = guided,
 ) -> Matches:
     """Match frame pairs.
@@ -348,16 +375,14 @@ def match(
         frames: features.
         settings: similarity and distinctiveness.
         workers: who do it.
-        points_rig: (F) arrays (K_f, 3), see `match_pair`; frame 0 of a pair must be known.
+        points_rig: of each frame (K_f, 3), see `match_pair`.
         matcher: compares two frames.
     """
     f0_T_f1s = inverse(world_T_rigs[pairs[:, 0]]) @ world_T_rigs[pairs[:, 1]]
-    order = np.lexsort((pairs[:, 1], pairs[:, 0]))  # pairs that share frames follow one another
-    points = None
-    if points_rig is not None:
-        points = {int(f0): points_rig[f0] for f0 in np.unique(pairs[:, 0])}
+    order, places = by_place(pairs, len(world_T_rigs))  # those that share frames follow one another
     chosen = [gates[p] for p in order]
-    job = _PairJob(pairs[order], f0_T_f1s[order], chosen, frames, settings, points, matcher)
+    geometry = pairs[order], places, f0_T_f1s[order], chosen
+    job = _PairJob(*geometry, frames, settings, points_rig, matcher)
     rows = [_NO_MATCHES] * len(pairs)
     for p, matched in zip(order, workers.map_shards(job), strict=True):
         rows[p] = matched
@@ -366,14 +391,15 @@ def match(
 
 @dataclass(frozen=True, slots=True)
 class _PairJob:
-    """The job of matching pairs, frame by frame."""
+    """The job of matching pairs, place by place."""
 
     pairs: np.ndarray  # (P, 2)
+    places: np.ndarray  # (P,) number of the frame that each goes with, see `by_place`
     f0_T_f1s: np.ndarray  # (P, 4, 4)
     gates: Sequence[Gate]  # (P)
     frames: SearchableFrames
     settings: MatchingSettings
-    points: Mapping[int, np.ndarray] | None  # of first frames, (K, 3)
+    points: Points | None  # of first frames
     matcher: Matcher
     title: str = "matching"
     returns: Any = np.ndarray
@@ -388,7 +414,7 @@ class _PairJob:
         return self.matcher(self.frames, (f0, f1), f0_T_f1, gate, self.settings, points)
 
     def blocks(self) -> Sequence[tuple[int, int]]:
-        return blocks_of_frames(self.pairs[:, 0])
+        return blocks_of_frames(self.places)
 
     def part(self, start: int, stop: int) -> "_PairJob":
         pairs, points = self.pairs[start:stop], self.points
@@ -397,6 +423,7 @@ class _PairJob:
         return replace(
             self,
             pairs=pairs,
+            places=self.places[start:stop],
             f0_T_f1s=self.f0_T_f1s[start:stop],
             gates=list(self.gates[start:stop]),
             frames=self.frames.taken(np.unique(pairs).tolist()),

@@ -1,10 +1,13 @@
 """Which frames to match with which."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from gsba.config import PairSettings
 
 _GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+_HERE = 0.125  # part of the reach within which a place counts as the same
 
 
 def adjacent(num_frames: int, reach: int = 2) -> np.ndarray:
@@ -35,19 +38,88 @@ def covisible(
     ).reshape(-1, 2)
     lengths = np.linalg.norm(rigs_in_world[window[:, 0]] - rigs_in_world[window[:, 1]], axis=1)
     window = window[(lengths < reach) | (window[:, 1] - window[:, 0] <= 2)]
-    return window, _loops(rigs_in_world, reach, settings)
+
+    def far_in_time(f: int, near: np.ndarray, _distances: np.ndarray) -> np.ndarray:
+        return np.abs(near - f) > settings.window
+
+    return window, _nearest(rigs_in_world, reach, settings, far_in_time)
 
 
-def _loops(rigs_in_world: np.ndarray, reach: float, settings: PairSettings) -> np.ndarray:
-    """Nearest neighbours in space that are further apart in time than the window."""
+def closing(rigs_in_world: np.ndarray, median_depth: float, settings: PairSettings) -> np.ndarray:
+    """Pairs that close loops while drift between far frames is unknown.
+
+    However often a place is met again, each visit is paired with the ones before and after alone:
+    drift is least between these, and they imply the others.
+
+    Args:
+        rigs_in_world, median_depth, settings: as for `covisible`.
+
+    Returns:
+        Pairs (L, 2) int32, f0 < f1, the closest in space first.
+    """
+
+    def next_visits(f: int, near: np.ndarray, distances: np.ndarray) -> np.ndarray:
+        apart = np.abs(near - f) > settings.window
+        met = near[apart & (distances <= _HERE * reach)]
+        last = met[met < f].max(initial=0) - settings.window
+        following = met[met > f].min(initial=len(rigs_in_world)) + settings.window
+        return apart & (near >= last) & (near <= following)
+
+    reach = settings.max_baseline_depths * median_depth
+    return _nearest(rigs_in_world, reach, settings, next_visits)
+
+
+def by_place(pairs: np.ndarray, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """An order of pairs in which each frame is wanted for a short while only.
+
+    Pairs of frames close in time come first, one frame after the other. For the others, frames are
+    numbered so that those with a pair get numbers close to one another (Cuthill and McKee, 1969):
+    all visits to a place follow one another.
+
+    Args:
+        pairs: (P, 2) frame indices.
+        num_frames: F.
+
+    Returns:
+        The order (P,), and for each pair in that order the number of the frame that it goes with,
+        ascending: below F where it is that of a frame in time.
+    """
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    close = np.abs(pairs[:, 1] - pairs[:, 0]) <= _GAPS[-1]
+    far = pairs[~close]
+    ends = np.concatenate([far, far[:, ::-1]])
+    graph = csr_matrix((np.ones(len(ends)), ends.T), shape=(num_frames, num_frames))
+    numbers = np.empty(num_frames, np.int64)
+    numbers[reverse_cuthill_mckee(graph, symmetric_mode=True)] = np.arange(num_frames)
+    placed = num_frames + np.sort(numbers[pairs], axis=1)
+    first, second = np.where(close[:, None], pairs, placed).T
+    order = np.lexsort((second, first))
+    return order, first[order]
+
+
+def _nearest(
+    rigs_in_world: np.ndarray,
+    reach: float,
+    settings: PairSettings,
+    chosen: Callable[[int, np.ndarray, np.ndarray], np.ndarray],
+) -> np.ndarray:
+    """Pairs (L, 2) int32 of each frame and its nearest in space among those chosen.
+
+    Args:
+        chosen: of a frame, the frames within reach (N,), ascending, and their distances: (N,) bool.
+    """
     from scipy.spatial import KDTree
 
     tree = KDTree(rigs_in_world)
     found: dict[tuple[int, int], float] = {}
     for f, position in enumerate(rigs_in_world):
-        near = [g for g in tree.query_ball_point(position, reach) if abs(g - f) > settings.window]
+        near = np.array(tree.query_ball_point(position, reach, return_sorted=True), np.int64)
         distances = np.linalg.norm(rigs_in_world[near] - position, axis=1)
-        for n in np.argsort(distances)[: settings.max_loop_neighbours]:
-            found[min(f, near[n]), max(f, near[n])] = float(distances[n])
+        rows = np.flatnonzero(chosen(f, near, distances))
+        for row in rows[np.argsort(distances[rows])[: settings.max_loop_neighbours]]:
+            g = int(near[row])
+            found[min(f, g), max(f, g)] = float(distances[row])
     ordered = sorted(found, key=lambda pair: (found[pair], pair))
     return np.array(ordered, np.int32).reshape(-1, 2)

@@ -1,13 +1,16 @@
 """Closing loops: known points where they must appear, not what looks like them elsewhere."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from synthetic import bearings_of, features_of, unit, with_noise
 
 from gsba.camera.rig import owner_faces
 from gsba.config import PairSettings, RefineSettings
 from gsba.features import detection
-from gsba.geometry import pose
+from gsba.geometry import inverse, pose
 from gsba.matching import correspondences
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.store.shards import Threads
@@ -46,6 +49,23 @@ def _loops_to_last(shift: float, loop_deg: float = 2.0) -> tuple[VerifiedPairs, 
     context = MatchContext(frames, frames, keypoints, settings, Threads(1))
     found = correspondences.match_loops(context, solved)
     return found, np.flatnonzero(found.matches.pairs[:, 1] == LAST)
+
+
+def test_points_are_known_where_tracks_see_them() -> None:
+    _, keypoints, solved = _scene(shift=0)
+    turned = solved.world_T_rigs.copy()
+    turned[:, :3, :3] = Rotation.random(LAST + 1, rng=2).as_matrix()
+    landmarks, whole = solved.landmarks, solved.landmarks.tracks
+    tracks = whole.of(np.ones(NUM, bool), whole.frames != whole.points % LAST)
+    solved = replace(solved, world_T_rigs=turned, landmarks=replace(landmarks, tracks=tracks))
+    known = solved.points_by_keypoint(keypoints)
+    expected = np.full((LAST + 1, NUM, 3), np.nan)
+    for point, frame, keypoint in zip(tracks.points, tracks.frames, tracks.keypoints, strict=True):
+        there = inverse(turned[frame]) @ [*landmarks.points_world[point], 1]
+        expected[frame, keypoint] = there[:3]
+    assert np.isnan(expected).any() and np.isfinite(expected).any()
+    for frame in range(LAST + 1):
+        np.testing.assert_allclose(known[frame], expected[frame], atol=1e-12)
 
 
 def test_loops_are_closed_by_known_points() -> None:

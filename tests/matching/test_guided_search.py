@@ -1,6 +1,8 @@
 """Guided matching: what the gate lets in, what it keeps out, and each keypoint once."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
 
 import numpy as np
 import pytest
@@ -337,6 +339,21 @@ def test_frames_are_read_once_while_they_fit(scene: Scene) -> None:
     for frame in (0, 1, 0, 1, 2, 1, 0):
         frames[frame]
     assert reads[1:] == [0, 1, 2, 0]
+
+
+def test_a_frame_being_read_holds_up_no_other(scene: Scene) -> None:
+    """Each of two reads waits until the other has begun."""
+    meeting = Barrier(2, timeout=60)
+
+    def load(frame: int) -> Features:
+        if frame:
+            meeting.wait()
+        return scene.first()
+
+    frames = SearchableFrames(load)
+    with ThreadPoolExecutor(3) as pool:
+        found = list(pool.map(frames.__getitem__, (1, 2, 1)))  # one frame is read once for both
+    assert found[0] is found[2] and found[0] is not found[1]
 
 
 def _reader(frames: list[Features]) -> Callable[[int], Features]:

@@ -1,5 +1,7 @@
 """Which frames are matched: neighbours in time, and places met again."""
 
+from functools import lru_cache
+
 import numpy as np
 from synthetic import loop_walk
 
@@ -63,3 +65,69 @@ def test_without_points_nothing_is_near() -> None:
 def test_loops_can_be_switched_off() -> None:
     settings = SETTINGS.model_copy(update={"max_loop_neighbours": 0})
     assert len(pairs.covisible(loop_walk(24)[:, :3, 3], 3.0, settings)[1]) == 0
+
+
+def _laps(num: int, length: int = 40, radius: float = 8.0) -> np.ndarray:
+    """Positions (F, 3) of a walk in circles, each a little off the others."""
+    frames = np.arange(num * length)
+    angles = 2 * np.pi * frames / length
+    off = np.random.default_rng(1).normal(scale=0.05, size=(len(frames), 3))
+    return radius * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles]) + off
+
+
+def test_each_visit_is_closed_with_those_beside_it() -> None:
+    """However many laps: the others follow from these, and drift is least between these."""
+    positions = _laps(6)
+    closing = pairs.closing(positions, 4.0, SETTINGS)
+    gaps = closing[:, 1] - closing[:, 0]
+    assert gaps.min() > SETTINGS.window and gaps.max() <= 40 + SETTINGS.window
+    crossed = {tuple(pair) for pair in (closing // 40).tolist()}
+    assert {(lap, lap + 1) for lap in range(5)} <= crossed  # every lap is tied to the next
+    distances = np.linalg.norm(positions[closing[:, 0]] - positions[closing[:, 1]], axis=1)
+    assert (np.diff(distances) >= 0).all()
+    everything = pairs.covisible(positions, 4.0, SETTINGS)[1]
+    assert (everything[:, 1] - everything[:, 0]).max() > 100
+
+
+def test_a_place_met_again_once_is_closed_with_all_that_is_near() -> None:
+    positions = loop_walk(24)[:, :3, 3]
+    every = pairs.covisible(positions, 3.0, SETTINGS)[1]
+    np.testing.assert_array_equal(pairs.closing(positions, 3.0, SETTINGS), every)
+
+
+def test_what_was_only_met_from_afar_hides_no_former_visit() -> None:
+    """An aisle beside this one, passed since, is no reason to leave out the last time here."""
+    along = np.arange(20)[:, None] * [1.0, 0.0, 0.0]
+    beside, away = (along + np.array([0.0, off, 0.0]) for off in (3.5, 100.0))
+    positions = np.concatenate([along, away, beside, away, along])
+    closing = _as_set(pairs.closing(positions, 4.0, SETTINGS))
+    assert {(f, f + 80) for f in range(20)} <= closing
+
+
+def test_frames_are_wanted_for_a_short_while() -> None:
+    """Walking in circles wants each frame once; one lap after the other, once in each lap."""
+    positions = _laps(8)
+    window, loops = pairs.covisible(positions, 4.0, SETTINGS)
+    chosen = np.concatenate([window, loops])
+    order, places = pairs.by_place(chosen, len(positions))
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(chosen)))
+    assert (np.diff(places) >= 0).all()
+    close = chosen[order, 1] - chosen[order, 0] <= 32
+    np.testing.assert_array_equal(places[close], chosen[order[close], 0])
+    assert (places[~close] >= len(positions)).all()
+    by_time = np.lexsort((loops[:, 1], loops[:, 0]))
+    met = pairs.by_place(loops, len(positions))[0]
+    assert _reads(loops[met], 64) < 1.2 * len(positions) < _reads(loops[by_time], 64) / 2
+
+
+def _reads(chosen: np.ndarray, kept: int) -> int:
+    """How often frames are read that take part in pairs (P, 2), if so many are kept."""
+    read = lru_cache(kept)(lambda frame: frame)
+    for frame in chosen.ravel().tolist():
+        read(frame)
+    return read.cache_info().misses
+
+
+def test_no_pairs_have_an_order() -> None:
+    order, places = pairs.by_place(np.zeros((0, 2), np.int32), 3)
+    assert len(order) == len(places) == 0
