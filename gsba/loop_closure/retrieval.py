@@ -61,7 +61,7 @@ class _LookJob:
 
 def _drawn(descriptors: np.ndarray, frame: int, share: int, seed: int) -> np.ndarray:
     """Some descriptors of a frame, the same whoever draws them."""
-    return np.random.default_rng([seed, frame]).permutation(descriptors)[:share]
+    return np.random.default_rng([seed, frame]).permutation(descriptors)[:share].copy()
 
 
 def _seen(descriptors: np.ndarray, _frame: int, words: np.ndarray) -> np.ndarray:
