@@ -130,8 +130,9 @@ def rig_vector(pose, point):
 
 
 @_part
-def invert_symmetric(v, damping):
-    """Inverse (6 values 00 01 02 11 12 22) of a symmetric 3x3 given so, damped by its trace.
+def inverse_root(v, damping):
+    """Lower triangle (6 values 00 10 20 11 21 22) whose square R^T R is the inverse of a symmetric
+    3x3 (6 values 00 01 02 11 12 22), damped by its trace.
 
     At least `_LEAST_HESSIAN` of the trace is added, so that a direction which no observation
     constrains (one ray, no parallax) stays finite and moves no pose.
@@ -146,7 +147,13 @@ def invert_symmetric(v, damping):
     i00, i11, i22 = 1 / l00, 1 / l11, 1 / l22
     i10 = -l10 * i00 * i11
     i21 = -l21 * i11 * i22
-    i20 = -(l20 * i00 + l21 * i10) * i22
+    return i00, i10, -(l20 * i00 + l21 * i10) * i22, i11, i21, i22
+
+
+@_part
+def invert_symmetric(v, damping):
+    """Inverse (6 values 00 01 02 11 12 22) of a symmetric 3x3 given so, see `inverse_root`."""
+    i00, i10, i20, i11, i21, i22 = inverse_root(v, damping)
     return (
         i00 * i00 + i10 * i10 + i20 * i20, i10 * i11 + i20 * i21, i20 * i22,
         i11 * i11 + i21 * i21, i21 * i22, i22 * i22,
@@ -230,16 +237,16 @@ def _take_product(Y, W, B):
 
 @_kernel
 def linearize_range(
-    first, last, obs, visits, points, poses, W, inverses, shifts, diagonal, gradient, costs,
-    point_costs,
+    first, last, obs, visits, points, poses, W, inverses, roots, shifts, diagonal, gradient,
+    costs, point_costs,
 ):  # fmt: skip
     """Add the poses' own part of landmarks first..last, and note what eliminates these.
 
     Args:
         visits: of a run of landmarks, these among them.
         W (V, 3, 6): written, of each visit the Hessian between landmark and pose.
-        inverses (L, 6), shifts (L, 3): written, of each landmark of the run the inverse of its
-            Hessian and that times its gradient.
+        inverses (L, 6), roots (L, 6), shifts (L, 3): written, of each landmark of the run the
+            inverse of its Hessian, the root of that, and it times the gradient.
         diagonal (F, 6, 6), gradient (F, 6), costs (T,): accumulated.
         point_costs (J,): written for the range.
     """
@@ -275,9 +282,9 @@ def linearize_range(
                 for c in range(6):
                     H[i, c] += ai * a[c] + bi * b[c]
         point_costs[j] = cost
-        inverse = invert_symmetric(normal, 0.0)
+        root, inverse = inverse_root(normal, 0.0), invert_symmetric(normal, 0.0)
         for c in range(6):
-            inverses[row, c] = inverse[c]
+            roots[row, c], inverses[row, c] = root[c], inverse[c]
         x, y, z = times_symmetric(inverse, normal[6], normal[7], normal[8])
         shifts[row, 0], shifts[row, 1], shifts[row, 2] = x, y, z
 
@@ -532,7 +539,8 @@ def draw_run(obs, visits, points, poses, U, roots, seed, out):
     What `invert_symmetric` adds to a landmark's Hessian counts as an observation of it.
 
     Args:
-        U (V, 3, 6), roots (L, 6): as `factors._schur_kernels.project_visits` leaves them.
+        U (V, 3, 6): as `factors._schur_kernels.project_visits` leaves it.
+        roots (L, 6): as `linearize_range` does.
         seed: uint64.
     """
     num = out.shape[2]
@@ -567,8 +575,8 @@ def draw_run(obs, visits, points, poses, U, roots, seed, out):
             for c in range(3):
                 u[c, r] += least if (bits >> np.uint64(3 * r + c)) & np.uint64(1) else -least
             x, y, z = u[0, r], u[1, r], u[2, r]
-            u[0, r] = root[0] * x + root[1] * y + root[3] * z
-            u[1, r], u[2, r] = root[2] * y + root[4] * z, root[5] * z
+            u[0, r], u[1, r] = root[0] * x, root[1] * x + root[3] * y
+            u[2, r] = root[2] * x + root[4] * y + root[5] * z
         for e in range(visits.offsets[row], visits.offsets[row + 1]):
             to, v = out[visits.frames[e]], U[e]
             for i in range(6):

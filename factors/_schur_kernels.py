@@ -1,7 +1,7 @@
 """Compiled passes over landmarks' Schur complement that is kept as products.
 
-Of each visit of a landmark by a frame, U = L^T W (3, 6) is kept, where W is the Hessian between
-landmark and pose and L L^T the inverse of the landmark's own. The complement takes U_f^T U_g from
+Of each visit of a landmark by a frame, U = R W (3, 6) is kept, where W is the Hessian between
+landmark and pose and R^T R the inverse of the landmark's own. The complement takes U_f^T U_g from
 the poses' Hessian wherever frames f and g see the landmark.
 """
 
@@ -24,30 +24,24 @@ def _take_squares(U, out):
 
 
 @_kernel
-def project_visits(visits, W, inverses, shifts, roots, diagonal, gradient):
+def project_visits(visits, W, roots, shifts, diagonal, gradient):
     """Take the landmarks of a run from the poses' own Hessian and gradient; W becomes U.
 
     Args:
-        W (V, 3, 6), inverses (L, 6), shifts (L, 3): as `factors._kernels.linearize_range` leaves
+        W (V, 3, 6), roots (L, 6), shifts (L, 3): as `factors._kernels.linearize_range` leaves
             them.
-        roots (L, 6): written, lower Cholesky factors of the inverses, 00 10 11 20 21 22.
         diagonal (F, 6, 6), gradient (F, 6): accumulated.
     """
     for j in range(len(visits.offsets) - 1):
-        v = inverses[j]
-        l00 = np.sqrt(v[0])
-        l10, l20 = v[1] / l00, v[2] / l00
-        l11 = np.sqrt(max(v[3] - l10 * l10, 0.0))
-        l21 = (v[4] - l10 * l20) / l11 if l11 > 0 else 0.0
-        l22 = np.sqrt(max(v[5] - l20 * l20 - l21 * l21, 0.0))
-        root, shift = roots[j], shifts[j]
-        root[0], root[1], root[2], root[3], root[4], root[5] = l00, l10, l11, l20, l21, l22
+        shift = shifts[j]
+        r00, r10, r20 = roots[j, 0], roots[j, 1], roots[j, 2]
+        r11, r21, r22 = roots[j, 3], roots[j, 4], roots[j, 5]
         for e in range(visits.offsets[j], visits.offsets[j + 1]):
             f, w = visits.frames[e], W[e]
             for i in range(6):
                 x, y, z = w[0, i], w[1, i], w[2, i]
                 gradient[f, i] -= x * shift[0] + y * shift[1] + z * shift[2]
-                w[0, i], w[1, i], w[2, i] = l00 * x + l10 * y + l20 * z, l11 * y + l21 * z, l22 * z
+                w[0, i], w[1, i], w[2, i] = r00 * x, r10 * x + r11 * y, r20 * x + r21 * y + r22 * z
             _take_squares(w, diagonal[f])
 
 

@@ -321,7 +321,7 @@ def _eliminate_run(
     """Add the landmarks of a run, eliminated; W is scratch for the visits of any run."""
     _, _, diagonal, _, gradient = pattern
     num = len(run.offsets) - 1
-    inverses, shifts = np.empty((num, 6)), np.empty((num, 3))
+    inverses, roots, shifts = np.empty((num, 6)), np.empty((num, 6)), np.empty((num, 3))
     offsets = obs.offsets[run.first : run.first + num + 1]
     ranges, rows = balanced_ranges(offsets - offsets[0], _RANGE), balanced_ranges(run.row_offsets)
 
@@ -329,7 +329,7 @@ def _eliminate_run(
         sums = np.zeros_like(diagonal), np.zeros_like(gradient), np.zeros_like(costs)
         first, last = run.first + ranges[i][0], run.first + ranges[i][1]
         linearize_range(
-            first, last, obs, run, points, poses, W, inverses, shifts, *sums, point_costs
+            first, last, obs, run, points, poses, W, inverses, roots, shifts, *sums, point_costs
         )
         return sums
 
@@ -367,10 +367,10 @@ def complement_of(
         inverses, shifts = np.empty((landmarks, 6)), np.empty((landmarks, 3))
         linearize_range(
             run.first, run.first + landmarks, obs, run, points, poses, projected[i], inverses,
-            shifts, *sums, point_costs,
+            roots[i], shifts, *sums, point_costs,
         )  # fmt: skip
         out = np.zeros_like(taken)
-        project_visits(run, projected[i], inverses, shifts, roots[i], out, sums[1])
+        project_visits(run, projected[i], roots[i], shifts, out, sums[1])
         return *sums, out
 
     for part in map_in_threads(add, len(visits), num_threads):

@@ -25,6 +25,7 @@ _STEP_TOLERANCE = 1e-2  # of a step by conjugate gradients: the next step is fro
 _OPERATIONS_PER_BYTE = 4.0  # that a core does on dense blocks while it reads one from memory
 _LEAST_ITERATIONS = 10  # of conjugate gradients that must be cheaper than half a factorization
 _MOST_OPERATIONS = 4e9  # of a factorization: landmarks that fill in more are kept as products
+_MOST_OF_INVERSE = 1.5e11  # the same of one for covariances, which takes as long as many steps
 _TIED = 1e-3  # landmarks that a native factor counts for where groups are found
 _HELD_ITERATIONS = 300  # of conjugate gradients on these; they take ten or twenty
 _DRAW_TOLERANCE = 1e-3  # of errors that are drawn: no single motion of thousands may be missed
@@ -89,17 +90,21 @@ class ReducedSystem:
         self._coarse: Coarse | None = None  # of some system met before, where some are not
         self._cholesky: BlockCholesky | None = None
         self._factorized = False  # whether the Cholesky factor is of some system met before
-        self._set_pairs()
-        landmarks = [isinstance(block, LandmarkBlock) for block in self._blocks]
-        if any(landmarks) and (all(landmarks) or not pairs) and self._fills_in():
+        landmarks = [block for block in self._blocks if isinstance(block, LandmarkBlock)]
+        can_hold = landmarks and (len(landmarks) == len(self._blocks) or not pairs)
+        if can_hold and self._fills_in(landmarks, _MOST_OF_INVERSE if pairs else _MOST_OPERATIONS):
             self._hold_landmarks()
         else:
+            self._set_pairs()
             self._set_cholesky()
 
-    def _fills_in(self) -> bool:
-        """Whether a factorization takes long: at least the squares of how full the rows are."""
-        least = DIM**3 * len(self._pairs) ** 2 / max(self._num, 1)
-        return least > _MOST_OPERATIONS or self._factor().num_operations > _MOST_OPERATIONS
+    def _fills_in(self, landmarks: Sequence[LandmarkBlock], most: float) -> bool:
+        """Whether a factorization takes more operations: squares of how full rows are, at least."""
+        least = max(DIM**3 * len(block.shared) ** 2 / self._num for block in landmarks)
+        if least > most:
+            return True
+        self._set_pairs()
+        return self._factor().num_operations > most
 
     def _factor(self) -> BlockCholesky:
         if self._cholesky is None:
@@ -137,6 +142,7 @@ class ReducedSystem:
         self._diagonal = np.zeros((self._num, DIM, DIM))
         self._gradient = np.zeros((self._num, DIM))
         self._off_diagonal = np.zeros((0, DIM, DIM))  # frees that of before
+        self._jacobian = csr_matrix((0, len(self._column_blocks)))  # of the graph
         costs: dict[str, float] = {}
         parts, self._complements = [], []
         for i, (block, rows) in enumerate(zip(self._blocks, self._block_rows, strict=True)):
@@ -345,7 +351,7 @@ class ReducedSystem:
             right = np.sqrt(added)[..., None] * rng.normal(size=(*added.shape, _DRAWN_AT_ONCE))
             for complement, rows, _ in self._complements:
                 right[rows] += complement.draw(int(rng.integers(1 << 62)), _DRAWN_AT_ONCE)
-            errors = rng.normal(size=(self._jacobian.shape[0], _DRAWN_AT_ONCE))
+            errors = rng.normal(size=(len(self._jacobian.indptr) - 1, _DRAWN_AT_ONCE))
             np.add.at(right, (self._column_blocks, self._column_offsets), self._jacobian.T @ errors)
             found = self._solve_held(added, right, _DRAW_TOLERANCE, _HELD_ITERATIONS)
             if found is None:

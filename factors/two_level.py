@@ -34,7 +34,7 @@ class Coarse:
 
     def solve(self, residual: np.ndarray) -> np.ndarray:
         """Motion (N, 6, R) of groups under forces (N, 6, R)."""
-        flat = residual.reshape(self.motion.shape[0], -1)
+        flat = residual.reshape(-1, residual.shape[2])
         moved = trsm(1.0, self.lower, np.asfortranarray(self.motion.T @ flat), lower=1)
         moved = trsm(1.0, self.lower, moved, lower=1, trans_a=1, overwrite_b=1)
         return (self.motion @ moved).reshape(residual.shape)
