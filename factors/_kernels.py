@@ -12,6 +12,7 @@ from factors._observations import BEARING, MIN_DEPTH
 from factors.compiled import kernel_and_part
 
 _EPS = 1e-300  # guards divisions by a squared norm
+_LEAST_HESSIAN = 1e-12  # of a landmark's trace
 
 _kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
 
@@ -129,13 +130,14 @@ def rig_vector(pose, point):
 
 
 @_part
-def invert_symmetric(v, damping):
-    """Inverse (6 values 00 01 02 11 12 22) of a symmetric 3x3 given so, damped by its trace.
+def inverse_root(v, damping):
+    """Lower triangle (6 values 00 10 20 11 21 22) whose square R^T R is the inverse of a symmetric
+    3x3 (6 values 00 01 02 11 12 22), damped by its trace.
 
-    At least 1e-12 of the trace is added, so that a direction which no observation constrains
-    (one ray, no parallax) stays finite and moves no pose.
+    At least `_LEAST_HESSIAN` of the trace is added, so that a direction which no observation
+    constrains (one ray, no parallax) stays finite and moves no pose.
     """
-    eps = (1e-12 + damping) * (v[0] + v[3] + v[5]) + 1e-200
+    eps = (_LEAST_HESSIAN + damping) * (v[0] + v[3] + v[5]) + 1e-200
     a, b, c, d, e, f = v[0] + eps, v[1], v[2], v[3] + eps, v[4], v[5] + eps
     l00 = np.sqrt(a)
     l10, l20 = b / l00, c / l00
@@ -145,7 +147,13 @@ def invert_symmetric(v, damping):
     i00, i11, i22 = 1 / l00, 1 / l11, 1 / l22
     i10 = -l10 * i00 * i11
     i21 = -l21 * i11 * i22
-    i20 = -(l20 * i00 + l21 * i10) * i22
+    return i00, i10, -(l20 * i00 + l21 * i10) * i22, i11, i21, i22
+
+
+@_part
+def invert_symmetric(v, damping):
+    """Inverse (6 values 00 01 02 11 12 22) of a symmetric 3x3 given so, see `inverse_root`."""
+    i00, i10, i20, i11, i21, i22 = inverse_root(v, damping)
     return (
         i00 * i00 + i10 * i10 + i20 * i20, i10 * i11 + i20 * i21, i20 * i22,
         i11 * i11 + i21 * i21, i21 * i22, i22 * i22,
@@ -229,16 +237,16 @@ def _take_product(Y, W, B):
 
 @_kernel
 def linearize_range(
-    first, last, obs, visits, points, poses, W, inverses, shifts, diagonal, gradient, costs,
-    point_costs,
+    first, last, obs, visits, points, poses, W, inverses, roots, shifts, diagonal, gradient,
+    costs, point_costs,
 ):  # fmt: skip
     """Add the poses' own part of landmarks first..last, and note what eliminates these.
 
     Args:
         visits: of a run of landmarks, these among them.
         W (V, 3, 6): written, of each visit the Hessian between landmark and pose.
-        inverses (L, 6), shifts (L, 3): written, of each landmark of the run the inverse of its
-            Hessian and that times its gradient.
+        inverses (L, 6), roots (L, 6), shifts (L, 3): written, of each landmark of the run the
+            inverse of its Hessian, the root of that, and it times the gradient.
         diagonal (F, 6, 6), gradient (F, 6), costs (T,): accumulated.
         point_costs (J,): written for the range.
     """
@@ -274,9 +282,9 @@ def linearize_range(
                 for c in range(6):
                     H[i, c] += ai * a[c] + bi * b[c]
         point_costs[j] = cost
-        inverse = invert_symmetric(normal, 0.0)
+        root, inverse = inverse_root(normal, 0.0), invert_symmetric(normal, 0.0)
         for c in range(6):
-            inverses[row, c] = inverse[c]
+            roots[row, c], inverses[row, c] = root[c], inverse[c]
         x, y, z = times_symmetric(inverse, normal[6], normal[7], normal[8])
         shifts[row, 0], shifts[row, 1], shifts[row, 2] = x, y, z
 
@@ -512,3 +520,65 @@ def residuals_range(first, last, obs, points, poses, residuals, valid):
         for o in range(obs.offsets[j], obs.offsets[j + 1]):
             dx, dy, dz = rig_vector(poses[obs.frames[o]], points[j])
             valid[o], residuals[o, 0], residuals[o, 1] = _seen_residual(obs, o, dx, dy, dz)[:3]
+
+
+@_part
+def _random_bits(seed):
+    """64 random bits of a number: the finalizer of SplitMix64 (Steele, Lea, Flood, 2014)."""
+    x = seed * np.uint64(0x9E3779B97F4A7C15)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
+
+
+@_kernel
+def draw_run(obs, visits, points, poses, U, roots, seed, out):
+    """Add to out (F, 6, R), R <= 21, vectors whose covariance is the Schur complement of a run.
+
+    J^T e of signs e that are as likely up as down: as good as normal ones where many are added.
+    What `invert_symmetric` adds to a landmark's Hessian counts as an observation of it.
+
+    Args:
+        U (V, 3, 6): as `factors._schur_kernels.project_visits` leaves it.
+        roots (L, 6): as `linearize_range` does.
+        seed: uint64.
+    """
+    num = out.shape[2]
+    a, b, u = np.empty(6), np.empty(6), np.empty((3, num))
+    normal = np.empty(9)
+    for j in range(visits.first, visits.first + len(visits.offsets) - 1):
+        point, row = points[j], j - visits.first
+        u[:], normal[:] = 0.0, 0.0
+        for o in range(obs.offsets[j], obs.offsets[j + 1]):
+            f = obs.frames[o]
+            dx, dy, dz = rig_vector(poses[f], point)
+            valid, r0, r1, a0, a1, a2, b0, b1, b2 = _seen_residual(obs, o, dx, dy, dz)
+            if not valid:
+                continue
+            weight = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)[1]
+            w = np.sqrt(weight)
+            _pose_row(a0, a1, a2, dx, dy, dz, a)
+            _pose_row(b0, b1, b2, dx, dy, dz, b)
+            rows = _add_normal(normal, poses[f], a0, a1, a2, b0, b1, b2, r0, r1, weight)
+            bits = _random_bits(seed + np.uint64(o))
+            for r in range(num):
+                s0 = w if (bits >> np.uint64(r)) & np.uint64(1) else -w
+                s1 = w if (bits >> np.uint64(32 + r)) & np.uint64(1) else -w
+                for c in range(3):
+                    u[c, r] += s0 * rows[c] + s1 * rows[3 + c]
+                for i in range(6):
+                    out[f, i, r] += s0 * a[i] + s1 * b[i]
+        root = roots[row]
+        least = np.sqrt(_LEAST_HESSIAN * (normal[0] + normal[3] + normal[5]))
+        bits = _random_bits(~(seed + np.uint64(j)))
+        for r in range(num):
+            for c in range(3):
+                u[c, r] += least if (bits >> np.uint64(3 * r + c)) & np.uint64(1) else -least
+            x, y, z = u[0, r], u[1, r], u[2, r]
+            u[0, r], u[1, r] = root[0] * x, root[1] * x + root[3] * y
+            u[2, r] = root[2] * x + root[4] * y + root[5] * z
+        for e in range(visits.offsets[row], visits.offsets[row + 1]):
+            to, v = out[visits.frames[e]], U[e]
+            for i in range(6):
+                for r in range(num):
+                    to[i, r] -= v[0, i] * u[0, r] + v[1, i] * u[1, r] + v[2, i] * u[2, r]

@@ -165,14 +165,14 @@ def visits_of(offsets: np.ndarray, frames: np.ndarray, num_frames: int, most: in
 
 def covisible_pairs(
     offsets: np.ndarray, frames: np.ndarray, num_frames: int
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frame pairs f < g that see a landmark in common, as sorted CSR rows.
 
     Args:
         offsets (J + 1,), frames (O,): observations by landmark.
 
     Returns:
-        starts (F + 1,) and columns (P,), int64.
+        starts (F + 1,) and columns (P,), int64; how many landmarks each two share, (P,) float32.
     """
     num_points = len(offsets) - 1
     owners = np.repeat(np.arange(num_points), np.diff(offsets))
@@ -184,7 +184,7 @@ def covisible_pairs(
     upper = shared.indices > rows
     starts = np.zeros(num_frames + 1, dtype=np.int64)
     np.cumsum(np.bincount(rows[upper], minlength=num_frames), out=starts[1:])
-    return starts, shared.indices[upper].astype(np.int64)
+    return starts, shared.indices[upper].astype(np.int64), shared.data[upper]
 
 
 def check_term(term: Term, num_frames: int, num_points: int) -> None:

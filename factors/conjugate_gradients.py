@@ -11,68 +11,72 @@ _kernel, _ = kernel_and_part()
 
 
 def conjugate_gradients(
-    diagonal: np.ndarray,
-    off_diagonal: np.ndarray,
-    pairs: np.ndarray,
+    multiply: Callable[[np.ndarray], np.ndarray],
     right: np.ndarray,
     precondition: Callable[[np.ndarray], np.ndarray],
     tolerance: float,
     max_iterations: int,
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Solve H x = right. Hestenes and Stiefel, 1952.
+    """Solve H x = right for several right sides at once. Hestenes and Stiefel, 1952.
 
     Args:
-        diagonal: (N, 6, 6), symmetric blocks H[i, i].
-        off_diagonal: (P, 6, 6), blocks H[i, j] of the pairs.
-        pairs: (P, 2) int64, i < j.
-        right: (N, 6).
-        precondition: about H^-1 applied to (N, 6), symmetric positive definite.
-        tolerance: of the residual in the preconditioner's norm, part of what it is at x = 0.
+        multiply: H applied to (N, 6, R), symmetric positive definite.
+        right: (N, 6, R).
+        precondition: about H^-1 applied to (N, 6, R), symmetric positive definite.
+        tolerance: of each residual in the preconditioner's norm, part of what it is at x = 0.
         max_iterations: products with H.
 
     Returns:
-        x (N, 6) and the residual right - H x; None where they do not get that far, or where H turns
-        out not to be positive definite.
+        x (N, 6, R) and the residual right - H x; None where they do not get that far, or where H
+        turns out not to be positive definite.
     """
     x, residual = np.zeros_like(right), right.copy()
     better = precondition(residual)
-    direction, product = better.copy(), np.empty_like(right)
-    squared = float(np.vdot(residual, better))
+    direction = better.copy()
+    squared = _products(residual, better)
     enough = tolerance**2 * squared
-    if not squared > 0:  # also where it is not a number
-        return (x, residual) if squared == 0 else None
+    if not np.all(squared > 0):  # also where it is not a number
+        return (x, residual) if not np.any(right) else None
     for _ in range(max_iterations):
-        _multiply(diagonal, off_diagonal, pairs, direction, product)
-        curvature = float(np.vdot(direction, product))
-        if not curvature > 0:
+        product = multiply(direction)
+        curvature = _products(direction, product)
+        if not np.all(curvature > 0):
             return None
         step = squared / curvature
         x += step * direction
         residual -= step * product
         better = precondition(residual)
-        before, squared = squared, float(np.vdot(residual, better))
-        if squared <= enough:
+        before, squared = squared, _products(residual, better)
+        if np.all(squared <= enough):
             return x, residual
         direction *= squared / before
         direction += better
     return None
 
 
+def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Inner products (R,) of as many vectors each."""
+    return np.einsum("nir,nir->r", a, b)
+
+
 @_kernel
-def _multiply(diagonal, off_diagonal, pairs, x, out):
-    """out = H x."""
-    for n in range(len(diagonal)):
-        for r in range(DIM):
-            total = 0.0
-            for c in range(DIM):
-                total += diagonal[n, r, c] * x[n, c]
-            out[n, r] = total
-    for p in range(len(pairs)):
-        i, j, block = pairs[p, 0], pairs[p, 1], off_diagonal[p]
-        xi, xj, yi, yj = x[i], x[j], out[i], out[j]
-        for r in range(DIM):
-            total, a = 0.0, xi[r]
-            for c in range(DIM):
-                total += block[r, c] * xj[c]
-                yj[c] += block[r, c] * a
-            yi[r] += total
+def multiply_blocks(diagonal, off_diagonal, pairs, x):
+    """H x of blocks H[i, i] (N, 6, 6) and H[i, j] (P, 6, 6) of pairs (P, 2), i < j; x (N, 6, R)."""
+    out = np.zeros_like(x)
+    for s in range(x.shape[2]):
+        for n in range(len(diagonal)):
+            for r in range(DIM):
+                total = 0.0
+                for c in range(DIM):
+                    total += diagonal[n, r, c] * x[n, c, s]
+                out[n, r, s] = total
+        for p in range(len(pairs)):
+            i, j, block = pairs[p, 0], pairs[p, 1], off_diagonal[p]
+            xi, xj, yi, yj = x[i], x[j], out[i], out[j]
+            for r in range(DIM):
+                total, a = 0.0, xi[r, s]
+                for c in range(DIM):
+                    total += block[r, c] * xj[c, s]
+                    yj[c, s] += block[r, c] * a
+                yi[r, s] += total
+    return out

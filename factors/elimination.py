@@ -43,7 +43,7 @@ def eliminate(
     order = np.lexsort((frames, points))
     frames, points = np.asarray(frames)[order].astype(np.int64), np.asarray(points)[order]
     offsets = np.flatnonzero(np.diff(points, prepend=-1, append=-1))
-    starts, columns = covisible_pairs(offsets, frames, num_frames)
+    starts, columns, _ = covisible_pairs(offsets, frames, num_frames)
     diagonal, gradient = np.zeros((num_frames, own, own)), np.zeros((num_frames, own))
     upper, to_shared = np.zeros((len(columns), own, own)), np.zeros((num_frames, own, common))
     shared, shared_gradient = np.zeros((common, common)), np.zeros(common)

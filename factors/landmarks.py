@@ -6,7 +6,13 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from factors._kernels import eliminate_rows, linearize_range, polish_range, residuals_range
+from factors._kernels import (
+    draw_run,
+    eliminate_rows,
+    linearize_range,
+    polish_range,
+    residuals_range,
+)
 from factors._observations import (
     Observations,
     Term,
@@ -16,15 +22,17 @@ from factors._observations import (
     sort_observations,
     visits_of,
 )
+from factors._schur_kernels import project_visits
 from factors._terms import pose_rows
 from factors.block import PoseSystem
 from factors.reduced_factor import reduced_factor
 from factors.robust import RobustLoss
+from factors.schur_complement import SchurComplement
 from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 
 _POLISH_TOLERANCE = 1e-12  # of a landmark's cost
 _HOST_POLISH_STEPS = 50  # at each evaluation: an error is a function of the poses alone
-_VISITS = 1 << 18  # of landmarks that are eliminated together: 38 MB
+_VISITS = 1 << 17  # of landmarks that are eliminated together: 19 MB
 _RANGE = 1 << 14  # least observations that a thread adds up on its own
 _PROPOSAL_TOLERANCE = 1e-6  # of a landmark's cost: further steps gain less than the poses do
 
@@ -37,7 +45,7 @@ class LandmarkBlock:
 
     Attributes:
         pose_keys: (F,) keys of the Pose3 variables `world_T_rig`.
-        pairs: (P, 2) int64, rows f < g of pose_keys that see a landmark in common.
+        shared: (P,) float32, how many landmarks each two of `pairs` have in common.
         points_world: (J, 3) float64, current landmarks in the order given.
     """
 
@@ -79,14 +87,23 @@ class LandmarkBlock:
         )
         self._points = points[self._point_order]
         self._visits = visits_of(self._obs.offsets, self._obs.frames, len(self.pose_keys), _VISITS)
-        self._row_starts, self._columns = covisible_pairs(
+        self._row_starts, self._columns, self.shared = covisible_pairs(
             self._obs.offsets, self._obs.frames, len(self.pose_keys)
         )
-        rows = np.repeat(np.arange(len(self.pose_keys)), np.diff(self._row_starts))
-        self.pairs = np.column_stack([rows, self._columns]).astype(np.int64)
         self._trial: tuple[np.ndarray, np.ndarray] | None = None
         self._poses: np.ndarray | None = None
         self._point_costs = np.full(len(points), np.inf)
+
+    @property
+    def pairs(self) -> np.ndarray:
+        """(P, 2) int64, rows f < g of pose_keys that see a landmark in common."""
+        rows = np.repeat(np.arange(len(self.pose_keys)), np.diff(self._row_starts))
+        return np.column_stack([rows, self._columns])
+
+    @property
+    def visits(self) -> Sequence[Visits]:
+        """Of its landmarks by frames, in runs."""
+        return self._visits
 
     @property
     def points_world(self) -> np.ndarray:
@@ -106,6 +123,17 @@ class LandmarkBlock:
             len(self.families), self.num_threads,
         )  # fmt: skip
         return PoseSystem(*system, self._named(costs))
+
+    def eliminate(
+        self, values: gtsam.Values
+    ) -> tuple[SchurComplement, np.ndarray, dict[str, float]]:
+        """As `linearize`, the Hessian not written out: it, the gradient (F, 6), and costs."""
+        self._poses = pose_rows(values, self.pose_keys)
+        complement, gradient, costs, self._point_costs = complement_of(
+            self._obs, self._visits, self._points, self._poses, len(self.families),
+            self.num_threads,
+        )  # fmt: skip
+        return complement, gradient, self._named(costs)
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Robust cost at `values`, `steps (F, 6)` from the linearization, landmarks moved along."""
@@ -293,7 +321,7 @@ def _eliminate_run(
     """Add the landmarks of a run, eliminated; W is scratch for the visits of any run."""
     _, _, diagonal, _, gradient = pattern
     num = len(run.offsets) - 1
-    inverses, shifts = np.empty((num, 6)), np.empty((num, 3))
+    inverses, roots, shifts = np.empty((num, 6)), np.empty((num, 6)), np.empty((num, 3))
     offsets = obs.offsets[run.first : run.first + num + 1]
     ranges, rows = balanced_ranges(offsets - offsets[0], _RANGE), balanced_ranges(run.row_offsets)
 
@@ -301,7 +329,7 @@ def _eliminate_run(
         sums = np.zeros_like(diagonal), np.zeros_like(gradient), np.zeros_like(costs)
         first, last = run.first + ranges[i][0], run.first + ranges[i][1]
         linearize_range(
-            first, last, obs, run, points, poses, W, inverses, shifts, *sums, point_costs
+            first, last, obs, run, points, poses, W, inverses, roots, shifts, *sums, point_costs
         )
         return sums
 
@@ -312,3 +340,50 @@ def _eliminate_run(
         for target, more in zip((diagonal, gradient, costs), part, strict=True):
             target += more
     run_in_threads(reduce, len(rows), num_threads)
+
+
+def complement_of(
+    obs: Observations,
+    visits: Sequence[Visits],
+    points: np.ndarray,
+    poses: np.ndarray,
+    num_families: int,
+    num_threads: int,
+) -> tuple[SchurComplement, np.ndarray, np.ndarray, np.ndarray]:
+    """As `eliminate_points`, the system kept as products.
+
+    Returns:
+        It, the gradient (F, 6); robust costs of families (T,) and of landmarks (J,).
+    """
+    num = len(poses)
+    own, taken, gradient = np.zeros((num, 6, 6)), np.zeros((num, 6, 6)), np.zeros((num, 6))
+    costs, point_costs = np.zeros(num_families), np.empty(len(points))
+    projected = [np.empty((len(run.frames), 3, 6)) for run in visits]
+    roots = [np.empty((len(run.offsets) - 1, 6)) for run in visits]
+
+    def add(i: int) -> tuple[np.ndarray, ...]:
+        run, landmarks = visits[i], len(roots[i])
+        sums = np.zeros_like(own), np.zeros_like(gradient), np.zeros_like(costs)
+        inverses, shifts = np.empty((landmarks, 6)), np.empty((landmarks, 3))
+        linearize_range(
+            run.first, run.first + landmarks, obs, run, points, poses, projected[i], inverses,
+            roots[i], shifts, *sums, point_costs,
+        )  # fmt: skip
+        out = np.zeros_like(taken)
+        project_visits(run, projected[i], roots[i], shifts, out, sums[1])
+        return *sums, out
+
+    for part in map_in_threads(add, len(visits), num_threads):
+        for target, more in zip((own, gradient, costs, taken), part, strict=True):
+            target += more
+
+    def draw(seed: int, num_draws: int) -> np.ndarray:
+        def work(i: int) -> np.ndarray:
+            out = np.zeros((num, 6, num_draws))
+            draw_run(obs, visits[i], points, poses, projected[i], roots[i], np.uint64(seed), out)
+            return out
+
+        return sum(map_in_threads(work, len(visits), num_threads), np.zeros((num, 6, num_draws)))
+
+    complement = SchurComplement(own, own + taken, visits, projected, draw, num_threads)
+    return complement, gradient, costs, point_costs

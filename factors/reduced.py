@@ -7,10 +7,15 @@ import gtsam
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from factors._terms import pose_rows
 from factors.block import Block
 from factors.cholesky import DIM, BlockCholesky
 from factors.compiled import kernel_and_part
-from factors.conjugate_gradients import conjugate_gradients
+from factors.conjugate_gradients import conjugate_gradients, multiply_blocks
+from factors.groups import covisible_groups
+from factors.landmarks import LandmarkBlock
+from factors.schur_complement import GroupVisits, group_visits
+from factors.two_level import Coarse, coarse_system
 
 _kernel, _ = kernel_and_part()
 
@@ -19,6 +24,13 @@ _MIN_DIAGONAL = 1e-6  # least curvature that damping is proportional to, per sig
 _STEP_TOLERANCE = 1e-2  # of a step by conjugate gradients: the next step is from there anyway
 _OPERATIONS_PER_BYTE = 4.0  # that a core does on dense blocks while it reads one from memory
 _LEAST_ITERATIONS = 10  # of conjugate gradients that must be cheaper than half a factorization
+_MOST_OPERATIONS = 4e9  # of a factorization: landmarks that fill in more are kept as products
+_MOST_OF_INVERSE = 1.5e11  # the same of one for covariances, which takes as long as many steps
+_TIED = 1e-3  # landmarks that a native factor counts for where groups are found
+_HELD_ITERATIONS = 300  # of conjugate gradients on these; they take ten or twenty
+_DRAW_TOLERANCE = 1e-3  # of errors that are drawn: no single motion of thousands may be missed
+_LEAST_DRAWS = 200  # whose spread is taken for a covariance
+_DRAWN_AT_ONCE = 20
 
 
 class ReducedSystem:
@@ -26,6 +38,10 @@ class ReducedSystem:
 
     Every variable takes whole 6x6 blocks: a Pose3 one, smaller ones are filled up with an
     identity that stays apart, larger ones are split. `first_block` maps a key to its first block.
+
+    Where frames see so much in common that a factorization would fill in, what landmarks say of
+    them is not written out, but kept as products; steps and covariances are then found by
+    iterations (`factors.two_level`).
     """
 
     def __init__(
@@ -67,24 +83,75 @@ class ReducedSystem:
         ]
         self._padding = self._padded_entries(counts)
         self._asked = np.array([self.first_block[key] for key in paired], np.int64).reshape(-1, 2)
-        self._set_pairs(
-            [*factor_keys, *map(list, pairs)], dict(zip(self.keys, counts, strict=True))
-        )
         self._set_columns(all_dims)
-        self._cholesky = BlockCholesky(self._num, self._pairs)
+        blocks_of = dict(zip(self.keys, counts, strict=True))
+        self._factor_pairs = self._pairs_of([*factor_keys, *map(list, pairs)], blocks_of)
+        self._held: dict[int, list[GroupVisits]] = {}  # of blocks that are not written out
+        self._coarse: Coarse | None = None  # of some system met before, where some are not
+        self._cholesky: BlockCholesky | None = None
         self._factorized = False  # whether the Cholesky factor is of some system met before
-        bytes_read = 8 * (2 * self._cholesky.num_entries + DIM * DIM * len(self._pairs))
-        cheaper = self._cholesky.num_operations / (2 * _OPERATIONS_PER_BYTE * max(bytes_read, 1))
+        landmarks = [block for block in self._blocks if isinstance(block, LandmarkBlock)]
+        can_hold = landmarks and (len(landmarks) == len(self._blocks) or not pairs)
+        if can_hold and self._fills_in(landmarks, _MOST_OF_INVERSE if pairs else _MOST_OPERATIONS):
+            self._hold_landmarks()
+        else:
+            self._set_pairs()
+            self._set_cholesky()
+
+    def _fills_in(self, landmarks: Sequence[LandmarkBlock], most: float) -> bool:
+        """Whether a factorization takes more operations: squares of how full rows are, at least."""
+        least = max(DIM**3 * len(block.shared) ** 2 / self._num for block in landmarks)
+        if least > most:
+            return True
+        self._set_pairs()
+        return self._factor().num_operations > most
+
+    def _factor(self) -> BlockCholesky:
+        if self._cholesky is None:
+            self._cholesky = BlockCholesky(self._num, self._pairs)
+        return self._cholesky
+
+    def _set_cholesky(self) -> None:
+        """Choose between factorizations, and iterations that former ones precondition."""
+        cholesky = self._factor()
+        bytes_read = 8 * (2 * cholesky.num_entries + DIM * DIM * len(self._pairs))
+        cheaper = cholesky.num_operations / (2 * _OPERATIONS_PER_BYTE * max(bytes_read, 1))
         self._max_iterations = int(cheaper) if cheaper >= _LEAST_ITERATIONS else 0
+
+    def _hold_landmarks(self) -> None:
+        """Leave what landmarks say as products, by groups of frames that share the most."""
+        landmarks = {
+            i: block for i, block in enumerate(self._blocks) if isinstance(block, LandmarkBlock)
+        }
+        shares = [
+            (self._block_rows[i][block.pairs], block.shared) for i, block in landmarks.items()
+        ]
+        poses = np.zeros(self._num, bool)
+        for i in landmarks:
+            poses[self._block_rows[i]] = True
+        tied = self._factor_pairs[poses[self._factor_pairs].all(axis=1)]
+        self._groups = covisible_groups(self._num, [*shares, (tied, np.full(len(tied), _TIED))])
+        self._cholesky = None
+        for i, block in landmarks.items():
+            labels = self._groups.labels[self._block_rows[i]]
+            self._held[i] = group_visits(block.visits, labels, self._groups.num)
+        self._set_pairs()
 
     def linearize(self, values: gtsam.Values) -> dict[str, float]:
         """Assemble H and the gradient at `values`; returns the cost of each family."""
         self._diagonal = np.zeros((self._num, DIM, DIM))
         self._gradient = np.zeros((self._num, DIM))
         self._off_diagonal = np.zeros((0, DIM, DIM))  # frees that of before
+        self._jacobian = csr_matrix((0, len(self._column_blocks)))  # of the graph
         costs: dict[str, float] = {}
-        parts = []
-        for block, rows in zip(self._blocks, self._block_rows, strict=True):
+        parts, self._complements = [], []
+        for i, (block, rows) in enumerate(zip(self._blocks, self._block_rows, strict=True)):
+            if i in self._held and isinstance(block, LandmarkBlock):
+                complement, gradient, found = block.eliminate(values)
+                self._gradient[rows] += gradient
+                self._complements.append((complement, rows, self._held[i]))
+                _add_costs(costs, found)
+                continue
             system = block.linearize(values)
             self._diagonal[rows] += system.diagonal
             self._gradient[rows] += system.gradient
@@ -95,6 +162,15 @@ class ReducedSystem:
             self._add_graph(values)
             _add_costs(costs, {GRAPH: self._graph.error(values)})
         self._diagonal[self._padding[0], self._padding[1], self._padding[1]] = 1.0
+        self._written = self._diagonal  # all of it, but for landmarks that are held
+        if self._held:
+            self._diagonal = self._written.copy()
+            for complement, rows, _ in self._complements:
+                self._diagonal[rows] += complement.diagonal
+            poses = np.zeros((self._num, 12))
+            for i in self._held:
+                poses[self._block_rows[i]] = pose_rows(values, self._blocks[i].pose_keys)
+            self._bases = self._groups.bases(poses)
         return costs
 
     def solve(self, damping: float) -> np.ndarray | None:
@@ -105,31 +181,87 @@ class ReducedSystem:
         """
         curvature = np.einsum("nii->ni", self._diagonal)
         added = damping * np.maximum(curvature, _MIN_DIAGONAL)
-        damped = self._diagonal.copy()
-        np.einsum("nii->ni", damped)[:] += added
-        found = self._solve_by_iterations(damped) or self._solve_directly(damped)
+        if self._held:
+            found = self._step_held(added)
+        else:
+            damped = self._diagonal.copy()
+            np.einsum("nii->ni", damped)[:] += added
+            found = self._solve_by_iterations(damped) or self._solve_directly(damped)
         if found is None:
             return None
-        steps, residual = found
+        steps, residual = (part.reshape(-1, DIM) for part in found)
         # c(0) - c(x) = -g^T x - x^T H x / 2, with (H + D) x = -g - residual
         self._predicted = 0.5 * float((steps * (added * steps - self._gradient + residual)).sum())
         return steps
+
+    def _solve_held(
+        self, added: np.ndarray, right: np.ndarray, tolerance: float, max_iterations: int
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Solutions (N, 6, R) with `added (N, 6)` to the diagonal, and what they leave of `right`.
+
+        None where they take too long by the groups' system as it is, or there is no inverse.
+        """
+        diagonal, written = self._diagonal.copy(), self._written.copy()
+        for blocks in (diagonal, written):
+            np.einsum("nii->ni", blocks)[:] += added
+        if self._coarse is None:
+            given = self._off_diagonal, self._pairs, self._complements, self._groups, self._bases
+            self._coarse = coarse_system(written, *given)
+        try:
+            inverses = np.linalg.inv(diagonal)
+        except np.linalg.LinAlgError:
+            return None
+        coarse, self._iterations = self._coarse, 0
+        if coarse is None:
+            return None
+
+        def multiply(x: np.ndarray) -> np.ndarray:
+            self._iterations += 1
+            out = multiply_blocks(written, self._off_diagonal, self._pairs, x)
+            for complement, rows, _ in self._complements:
+                out[rows] += complement.times(x[rows])
+            return out
+
+        def precondition(residual: np.ndarray) -> np.ndarray:
+            return inverses @ residual + coarse.solve(residual)
+
+        return conjugate_gradients(multiply, right, precondition, tolerance, max_iterations)
+
+    def _step_held(self, added: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Step by the groups' system of one before, unless a new one would have taken less."""
+        right = -self._gradient[..., None]
+        if self._coarse is not None:
+            found = self._solve_held(added, right, _STEP_TOLERANCE, self._max_iterations)
+            if found is not None:
+                return found
+            self._coarse = None
+        found = self._solve_held(added, right, _STEP_TOLERANCE, _HELD_ITERATIONS)
+        self._max_iterations = 2 * self._iterations
+        return found
 
     def _solve_by_iterations(self, damped: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Step and what it leaves of the gradient; None where a factorization is cheaper."""
         if not self._factorized or not self._max_iterations:
             return None
+        factor = self._factor()
+
+        def multiply(x: np.ndarray) -> np.ndarray:
+            return multiply_blocks(damped, self._off_diagonal, self._pairs, x)
+
+        def precondition(residual: np.ndarray) -> np.ndarray:
+            return factor.solve(residual[..., 0])[..., None]
+
+        right = -self._gradient[..., None]
         return conjugate_gradients(
-            damped, self._off_diagonal, self._pairs, -self._gradient, self._cholesky.solve,
-            _STEP_TOLERANCE, self._max_iterations,
-        )  # fmt: skip
+            multiply, right, precondition, _STEP_TOLERANCE, self._max_iterations
+        )
 
     def _solve_directly(self, damped: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Step, leaving nothing; None if singular."""
-        self._factorized = self._cholesky.factorize(damped, self._off_diagonal)
+        self._factorized = self._factor().factorize(damped, self._off_diagonal)
         if not self._factorized:
             return None
-        steps = self._cholesky.solve(-self._gradient)
+        steps = self._factor().solve(-self._gradient)
         return (steps, np.zeros_like(steps)) if np.all(np.isfinite(steps)) else None
 
     def predicted_decrease(self) -> float:
@@ -192,14 +324,40 @@ class ReducedSystem:
         idle = np.logical_not(np.any(self._diagonal, axis=(1, 2)))
         diagonal = np.where(idle[:, None, None], np.eye(DIM), self._diagonal)
         np.einsum("nii->ni", diagonal)[:] *= 1 + damping
-        self._factorized = self._cholesky.factorize(diagonal, self._off_diagonal)
-        if not self._factorized:
-            return None
-        inverse, between = self._cholesky.inverse_blocks(self._asked)
-        drawn = self._cholesky.draw(rng.normal(size=(num_draws, self._num, DIM)))
+        if self._held:
+            found = self._drawn(np.einsum("nii->ni", diagonal - self._diagonal), num_draws, rng)
+            if found is None:
+                return None
+            drawn = found
+            i, j = self._asked.T
+            inverse = np.einsum("dnr,dnc->nrc", drawn, drawn) / len(drawn)
+            between = np.einsum("dnr,dnc->nrc", drawn[:, i], drawn[:, j]) / len(drawn)
+        else:
+            self._factorized = self._factor().factorize(diagonal, self._off_diagonal)
+            if not self._factorized:
+                return None
+            inverse, between = self._factor().inverse_blocks(self._asked)
+            drawn = self._factor().draw(rng.normal(size=(num_draws, self._num, DIM)))
         inverse[idle], drawn[:, idle] = np.nan, np.nan
         between[idle[self._asked].any(axis=1)] = np.nan
         return inverse, between, drawn
+
+    def _drawn(
+        self, added: np.ndarray, num_draws: int, rng: np.random.Generator
+    ) -> np.ndarray | None:
+        """Vectors (D, N, 6) of covariance (H + added)^-1: the same of J^T e, e of all factors."""
+        draws, self._coarse = [], None
+        for _ in range(0, max(num_draws, _LEAST_DRAWS), _DRAWN_AT_ONCE):
+            right = np.sqrt(added)[..., None] * rng.normal(size=(*added.shape, _DRAWN_AT_ONCE))
+            for complement, rows, _ in self._complements:
+                right[rows] += complement.draw(int(rng.integers(1 << 62)), _DRAWN_AT_ONCE)
+            errors = rng.normal(size=(len(self._jacobian.indptr) - 1, _DRAWN_AT_ONCE))
+            np.add.at(right, (self._column_blocks, self._column_offsets), self._jacobian.T @ errors)
+            found = self._solve_held(added, right, _DRAW_TOLERANCE, _HELD_ITERATIONS)
+            if found is None:
+                return None
+            draws.append(np.moveaxis(found[0], 2, 0))
+        return np.concatenate(draws)
 
     def _padded_entries(self, counts: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """(block, coordinate) of the entries that belong to no variable."""
@@ -211,8 +369,8 @@ class ReducedSystem:
         table = np.array(pads, dtype=np.int64).reshape(-1, 2)
         return table[:, 0], table[:, 1]
 
-    def _set_pairs(self, factor_keys: list[list[int]], counts: dict[int, int]) -> None:
-        """Pattern of the off-diagonal blocks, and where each block's pairs lie in it."""
+    def _pairs_of(self, factor_keys: list[list[int]], counts: dict[int, int]) -> np.ndarray:
+        """Pairs (P, 2) of blocks that factors of these keys tie, ascending."""
         shared = {
             pair
             for keys in factor_keys
@@ -221,10 +379,15 @@ class ReducedSystem:
                 2,
             )
         }
-        placed = [np.array(sorted(shared), dtype=np.int64).reshape(-1, 2)]
+        return np.array(sorted(shared), dtype=np.int64).reshape(-1, 2)
+
+    def _set_pairs(self) -> None:
+        """Pattern of the off-diagonal blocks, and where those of what is written out lie in it."""
+        placed = [self._factor_pairs]
         placed += [
             rows[block.pairs].reshape(-1, 2)
-            for block, rows in zip(self._blocks, self._block_rows, strict=True)
+            for i, (block, rows) in enumerate(zip(self._blocks, self._block_rows, strict=True))
+            if i not in self._held
         ]
         codes = [self._pair_codes(pairs) for pairs in placed]
         self._codes = np.unique(np.concatenate(codes))
@@ -255,6 +418,7 @@ class ReducedSystem:
             (entries, (rows.astype(np.int64) - 1, columns.astype(np.int64) - 1)),
             shape=(int(rows.max(initial=1)), num + 1),
         )
+        self._jacobian = augmented[:, :num]
         product = (augmented.T @ augmented).tocoo()
         i, j, x = product.row, product.col, product.data
         right = (j == num) & (i < num)  # the last column is -r

@@ -10,6 +10,7 @@ from gsba.types import Counts, Keypoints, Landmarks, Reconstruction, Tracks
 
 _kernel, _part = kernel_and_part()
 _MAX_HYPOTHESES = 12  # pairs of observations tried per track
+_AT_ONCE = 1 << 18  # observations whose poses are looked up: 34 MB
 
 
 def triangulate(
@@ -39,9 +40,7 @@ def triangulate(
         origins_rig: (O, 3) rig frame, where each ray starts; None = the rig's centre.
     """
     starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
-    world_T_lenses = moved_to(world_T_rigs[tracks.frames], origins_rig)
-    rays = np.einsum("oij,oj->oi", world_T_lenses[:, :3, :3], bearings_rig)
-    centres = world_T_lenses[:, :3, 3]
+    rays, centres = _rays(world_T_rigs, tracks.frames, bearings_rig, origins_rig)
     points = np.zeros((tracks.num_points, 3))
     inliers = np.zeros(len(rays), np.int64)
     parallaxes = np.zeros(tracks.num_points)
@@ -66,6 +65,20 @@ def triangulate(
     numbers = {reason: int(flag.sum()) for reason, flag in dropped.items()}
     counts = Counts(tracks.num_points, survivors.num_points, "tracks", numbers)
     return Landmarks(points[kept], survivors, counts)
+
+
+def _rays(
+    world_T_rigs: np.ndarray, frames: np.ndarray, bearings: np.ndarray, origins: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (O, 3) of rays in the world, and where they start (O, 3)."""
+    rays, centres = np.empty((len(frames), 3)), np.empty((len(frames), 3))
+    for first in range(0, len(frames), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        starts = None if origins is None else origins[some]
+        world_T_lenses = moved_to(world_T_rigs[frames[some]], starts)
+        rays[some] = np.einsum("oij,oj->oi", world_T_lenses[:, :3, :3], bearings[some])
+        centres[some] = world_T_lenses[:, :3, 3]
+    return rays, centres
 
 
 def _within_camera(

@@ -188,7 +188,8 @@ class _Joining:
         best = sorted(meetings, key=lambda meeting: -len(meeting.own))[:_BEST]
         reach = range(-_BESIDE + 1, _BESIDE)
         found = {(m.f + i, m.g + j) for m in best for i in reach for j in reach}
-        found &= {(int(f), int(g)) for f in rows for g in inside}
+        free, taken = set(rows.tolist()), set(inside.tolist())
+        found = {(f, g) for f, g in found if f in free and g in taken}
         found -= {(int(f), int(g)) for f, g in chosen}
         return np.array(sorted(found), np.int32).reshape(-1, 2)
 

@@ -26,9 +26,12 @@ def looks_of(frames: SearchableFrames, num_frames: int, seed: int, workers: Work
     draw = partial(_drawn, share=share, seed=seed)
     everyone = np.arange(num_frames)
     sample = np.concatenate(list(workers.map_shards(_LookJob("sampling", frames, everyone, draw))))
-    aggregate = partial(_seen, words=_words(sample, np.random.default_rng(seed)))
-    looks = workers.map_shards(_LookJob("looks", frames, everyone, aggregate))
-    return np.array(list(looks), np.float32)
+    words = _words(sample, np.random.default_rng(seed))
+    job = _LookJob("looks", frames, everyone, partial(_seen, words=words))
+    looks = np.empty((num_frames, words.size), np.float32)
+    for row, look in zip(looks, workers.map_shards(job), strict=True):
+        row[:] = look
+    return looks
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +61,7 @@ class _LookJob:
 
 def _drawn(descriptors: np.ndarray, frame: int, share: int, seed: int) -> np.ndarray:
     """Some descriptors of a frame, the same whoever draws them."""
-    return np.random.default_rng([seed, frame]).permutation(descriptors)[:share]
+    return np.random.default_rng([seed, frame]).permutation(descriptors)[:share].copy()
 
 
 def _seen(descriptors: np.ndarray, _frame: int, words: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factors.cholesky import BlockCholesky
-from factors.conjugate_gradients import conjugate_gradients
+from factors.conjugate_gradients import conjugate_gradients, multiply_blocks
 from factors.supernodes import find_supernodes
 
 Pairs = list[tuple[int, int]]
@@ -89,18 +89,26 @@ def test_conjugate_gradients_reach_the_solution_and_say_what_is_left() -> None:
     system = System("random")
     inverses = np.linalg.inv(system.diagonal)
 
-    def precondition(x: np.ndarray) -> np.ndarray:
-        return np.einsum("nij,nj->ni", inverses, x)
+    def times(x: np.ndarray) -> np.ndarray:
+        return multiply_blocks(system.diagonal, system.off_diagonal, system.pairs, x)
 
-    given = system.diagonal, system.off_diagonal, system.pairs, system.right, precondition
+    right = np.stack([system.right, system.right[::-1]], axis=2)
+    given = times, right, lambda x: inverses @ x
     found = conjugate_gradients(*given, 1e-12, 100)
     assert found is not None
     x, residual = found
-    assert np.allclose(system.matrix @ x.ravel(), system.right.ravel(), atol=1e-10)
+    assert np.allclose(system.matrix @ flat(x), flat(right), atol=1e-10)
     rough = conjugate_gradients(*given, 1e-2, 100)
     assert rough is not None
-    left = system.right.ravel() - system.matrix @ rough[0].ravel()
-    assert np.allclose(rough[1].ravel(), left, atol=1e-12)
-    assert np.linalg.norm(residual) < np.linalg.norm(left) < 0.1 * np.linalg.norm(system.right)
+    left = flat(right) - system.matrix @ flat(rough[0])
+    assert np.allclose(flat(rough[1]), left, atol=1e-12)
+    assert np.linalg.norm(residual) < np.linalg.norm(left) < 0.1 * np.linalg.norm(right)
     assert conjugate_gradients(*given, 1e-12, 2) is None
-    assert conjugate_gradients(-given[0], *given[1:], 1e-2, 100) is None
+    assert conjugate_gradients(lambda x: -times(x), *given[1:], 1e-2, 100) is None
+    nothing = conjugate_gradients(times, 0 * right, given[2], 1e-2, 100)
+    assert nothing is not None and not np.any(nothing[0])
+
+
+def flat(x: np.ndarray) -> np.ndarray:
+    """Vectors (6 N, R) of (N, 6, R)."""
+    return x.reshape(-1, x.shape[2])
