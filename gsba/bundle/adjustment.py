@@ -27,6 +27,7 @@ logger = logging.getLogger(__name__)
 _LEAST = 1e-3  # times its claimed sigma: no observation is better than that
 _WIDE = 20.0  # gate in sigmas for observations whose noise is not known yet
 DRAWS = 500  # errors of all poses, that tell how those of different ones belong together
+_AT_ONCE = 1 << 18  # observations whose residuals are found together
 _REDUNDANT = 0.1  # least share of residual dimensions left over by the unknowns
 
 
@@ -220,16 +221,20 @@ def _noise(
         chosen: (O,) bool, observations whose spread is asked for; all share one redundancy.
     """
     tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
-    points, bearings = landmarks.points_world[tracks.points], keypoints.bearings_rig[rows]
-    world_T_rig = world_T_rigs[tracks.frames]
-    offsets = np.einsum("oji,oj->oi", world_T_rig[:, :3, :3], points - world_T_rig[:, :3, 3])
-    if keypoints.origins_rig is not None:
-        offsets -= keypoints.origins_rig[rows]
-    residuals = np.einsum("oij,oj->oi", tangent_basis(bearings), offsets)
-    residuals /= np.linalg.norm(offsets, axis=1, keepdims=True)  # sines: the angles are small
+    residuals = np.empty((len(rows), 2))
+    for first in range(0, len(rows), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        points = landmarks.points_world[tracks.points[some]]
+        poses, bearings = world_T_rigs[tracks.frames[some]], keypoints.bearings_rig[rows[some]]
+        offsets = np.einsum("oji,oj->oi", poses[:, :3, :3], points - poses[:, :3, 3])
+        if keypoints.origins_rig is not None:
+            offsets -= keypoints.origins_rig[rows[some]]
+        sines = np.einsum("oij,oj->oi", tangent_basis(bearings), offsets)  # the angles are small
+        sines /= np.linalg.norm(offsets, axis=1, keepdims=True)
+        residuals[some] = _whitened(sines, keypoints, rows[some])
     unknowns = 3 * landmarks.tracks.num_points + 6 * len(world_T_rigs)
     redundancy = max(1 - unknowns / residuals.size, _REDUNDANT)
-    spread = 1.4826 * np.median(np.abs(_whitened(residuals, keypoints, rows)[chosen]))
+    spread = 1.4826 * np.median(np.abs(residuals[chosen]))
     return float(spread / np.sqrt(redundancy))
 
 
