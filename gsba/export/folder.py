@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,7 +33,8 @@ def output_folder(out: Path, to: str) -> Iterator[Path]:
         _require_replaceable(out)
         out.parent.mkdir(parents=True, exist_ok=True)
         _remove_stale(out)
-        partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
+        # A name that is never used again: workers elsewhere may still be at an earlier one.
+        partial = out.with_name(f".{out.name}.partial-{os.getpid()}-{uuid.uuid4().hex[:8]}")
         partial.mkdir()
         try:
             yield partial
