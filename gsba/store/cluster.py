@@ -9,8 +9,10 @@ time, however many a job has.
 import importlib
 import logging
 import os
+import shutil
 import statistics
 import time
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -22,6 +24,7 @@ from gsba.disk import write_text
 from gsba.log import GsbaError, track
 from gsba.store import shards
 from gsba.store.shards import Job, Manifest, Spent, Workers
+from gsba.types import FrameSet
 from gsba.version import __version__
 
 if TYPE_CHECKING:
@@ -65,6 +68,26 @@ def hire(
         return Cluster(client, folder, frames)
 
     return make
+
+
+@contextmanager
+def hired(client: "Client | None", out: Path, frames: FrameSet) -> Iterator["Cluster | None"]:
+    """Workers who write what goes to `out`, with their shards beside it meanwhile.
+
+    Args:
+        client: of a scheduler; None = nobody is hired.
+        out: a folder on a disk that workers share; it need not be there.
+        frames: which they read.
+    """
+    if client is None:
+        yield None
+        return
+    out = out.resolve()
+    folder = out.with_name(f".{out.name}.shards-{uuid.uuid4().hex[:8]}")
+    try:
+        yield Cluster(client, folder, frames.paths[0][0])
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager
