@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gsba.disk import disk_errors
+from gsba.disk import disk_errors, remove_temporaries
 from gsba.log import GsbaError
 from gsba.version import __version__
 
@@ -43,6 +43,7 @@ def output_folder(out: Path, to: str) -> Iterator[Path]:
             (partial / MARKER).write_text(json.dumps(marker, indent=1) + "\n")
             _require_replaceable(out)
             _swap_in(partial, out)
+            remove_temporaries(out)  # of workers that were killed
         finally:
             shutil.rmtree(partial, ignore_errors=True)
 
