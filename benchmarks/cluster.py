@@ -29,7 +29,7 @@ from gsba.config import RefineSettings
 from gsba.store.cluster import Cluster
 from gsba.store.shards import even_blocks
 
-OUTPUTS = "trajectory.tum", "poses.csv", "points.ply"
+OUTPUTS = "trajectory.tum", "poses.csv", "points.ply", "colmap/**/*"
 WRITTEN = 100_000  # bytes that a generated shard leaves
 
 
@@ -129,7 +129,8 @@ def main() -> None:
     for num in options.workers:
         out = options.out / f"workers{num}"
         figures = refine(options.frames, options.slam, out, num)
-        written = [(out / name).read_bytes() for name in OUTPUTS]
+        paths = sorted(path for name in OUTPUTS for path in out.glob(name) if path.is_file())
+        written = [path.read_bytes() for path in paths]
         first = first or written
         same = "yes" if written == first else "NO"
         who = f"{num} processes" if num else "a thread here"

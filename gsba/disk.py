@@ -30,19 +30,21 @@ def disk_errors(path: Path) -> Iterator[None]:
         raise GsbaError(f"cannot write {path}: {error.strerror or error}") from error
 
 
-def atomic_write(path: Path, write: Callable[[Path], object]) -> None:
+def atomic_write(path: Path, write: Callable[[Path], object], parents: bool = True) -> None:
     """Write a file beside `path` and rename it into place, so that `path` is never half-written.
 
     Args:
-        path: final file; missing parent folders are made.
+        path: final file.
         write: called with a temporary path of the same folder and suffix.
+        parents: whether missing parent folders are made.
     Raises:
         GsbaError: full disk, no permission and the like.
     """
     # Processes of several machines may write the same file at a time.
     temporary = path.with_name(f"{_TEMPORARY}{uuid.uuid4().hex[:8]}-{path.name}")
     with disk_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+        if parents:
+            path.parent.mkdir(parents=True, exist_ok=True)
         try:
             write(temporary)
             temporary.replace(path)
@@ -55,9 +57,9 @@ def write_text(path: Path, text: str) -> None:
     atomic_write(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
-def write_bytes(path: Path, content: bytes) -> None:
+def write_bytes(path: Path, content: bytes, parents: bool = True) -> None:
     """Write a file's content atomically; see `atomic_write`."""
-    atomic_write(path, lambda temporary: temporary.write_bytes(content))
+    atomic_write(path, lambda temporary: temporary.write_bytes(content), parents)
 
 
 def write_json(path: Path, content: object) -> None:

@@ -184,8 +184,33 @@ def shown_in_pictures(reconstruction: Reconstruction, lenses: Lenses) -> Reconst
     return replace(reconstruction, observation_bearings=shown, observation_origins=origins)
 
 
-def scenes_of(reconstruction: Reconstruction) -> Callable[[int], np.ndarray]:
-    """Points (N, 3) that a frame sees, in its rig frame, by its index."""
+@dataclass(frozen=True, slots=True)
+class Scenes:
+    """Points that frames see."""
+
+    world_T_rigs: np.ndarray  # (F, 4, 4) float64
+    points_world: np.ndarray  # (J, 3) float64
+    seen: np.ndarray  # (O,) which of them, frame by frame
+    bounds: np.ndarray  # (F + 1,) int64: frame f sees seen[bounds[f]:bounds[f + 1]]
+
+    def __call__(self, f: int) -> np.ndarray:
+        """Those of a frame (N, 3), in its rig frame."""
+        pose = self.world_T_rigs[f]
+        return (self.points_world[self._of(f)] - pose[:3, 3]) @ pose[:3, :3]
+
+    def taken(self, rows: np.ndarray) -> "Scenes":
+        """The same of some frames (F',)."""
+        seen = [self._of(f) for f in rows]
+        points, numbers = np.unique(np.concatenate(seen), return_inverse=True)
+        bounds = np.cumsum([0, *map(len, seen)])
+        return Scenes(self.world_T_rigs[rows], self.points_world[points], numbers, bounds)
+
+    def _of(self, f: int) -> np.ndarray:
+        return self.seen[self.bounds[f] : self.bounds[f + 1]]
+
+
+def scenes_of(reconstruction: Reconstruction) -> Scenes:
+    """What its frames see."""
     poses, points = reconstruction.world_T_rigs, reconstruction.points_world
     return scenes_around(
         poses, points, reconstruction.observation_points, reconstruction.observation_frames
@@ -194,16 +219,11 @@ def scenes_of(reconstruction: Reconstruction) -> Callable[[int], np.ndarray]:
 
 def scenes_around(
     world_T_rigs: np.ndarray, points_world: np.ndarray, points: np.ndarray, frames: np.ndarray
-) -> Callable[[int], np.ndarray]:
+) -> Scenes:
     """As `scenes_of`, of poses (F, 4, 4), points (J, 3), and which (O,) of either is observed."""
     order = np.argsort(frames, kind="stable")
-    ends = np.searchsorted(frames[order], np.arange(len(world_T_rigs) + 1))
-
-    def scene(f: int) -> np.ndarray:
-        seen, pose = points[order[ends[f] : ends[f + 1]]], world_T_rigs[f]
-        return (points_world[seen] - pose[:3, 3]) @ pose[:3, :3]
-
-    return scene
+    bounds = np.searchsorted(frames[order], np.arange(len(world_T_rigs) + 1))
+    return Scenes(world_T_rigs, points_world, points[order], bounds)
 
 
 def observed_points(reconstruction: Reconstruction) -> np.ndarray:

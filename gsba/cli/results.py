@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gsba.cli.app import command
+from gsba.cli.refining import Cluster
 from gsba.cli.splat import (
     BackendName,
     FaceSize,
@@ -45,6 +46,14 @@ Images = Annotated[
         metavar="auto|cube|lenses|fisheye|panorama",
     ),
 ]
+Between = Annotated[
+    tuple[str, str] | None,
+    typer.Option(help="Two frames, or points x,y,z of the run's world.", metavar="A B"),
+]
+Gps = Annotated[
+    str | None,
+    typer.Option(help="CSV, GPX, or exif (of the frames): metres east, north, up.", metavar="FILE"),
+]
 AlignScan = Annotated[
     str | None,
     typer.Option(help="PLY, PCD, LAS, LAZ, OBJ or GLB: its world and unit.", metavar="SCAN"),
@@ -74,16 +83,8 @@ def export(
     up: Annotated[str, typer.Option(help="auto: turn the world upright; none: leave it.")] = "none",
     scale: Length = None,
     baseline: Millimetres = None,
-    between: Annotated[
-        tuple[str, str] | None,
-        typer.Option(help="Two frames, or points x,y,z of the run's world.", metavar="A B"),
-    ] = None,
-    gps: Annotated[
-        str | None,
-        typer.Option(
-            help="CSV, GPX, or exif (of the frames): metres east, north, up.", metavar="FILE"
-        ),
-    ] = None,
+    between: Between = None,
+    gps: Gps = None,
     align: Annotated[
         str | None, typer.Option(help="True poses: their world and unit.", metavar="TRUTH.tum")
     ] = None,
@@ -92,6 +93,7 @@ def export(
     link: Annotated[
         bool, typer.Option("--link", help="Hard links to unchanged frames, not copies.")
     ] = False,
+    cluster: Cluster = None,
 ) -> None:
     """Write a finished run as a dataset for another program, placed where you want it."""
     from gsba.config_file import validated
@@ -106,6 +108,7 @@ def export(
     dataset = {"face_size": face_size, "images": images, "formats": [to]}
     settings = validated({"placement": asked, "export": dataset}).placement
     from gsba.placement.placement import place
+    from gsba.store.cluster import connected, hired
     from gsba.store.finished import load_run
 
     reconstruction, frames, *_ = load_run(run)
@@ -114,7 +117,8 @@ def export(
     said = _baseline(run, baseline) if scale == "lens" else None
     placement = place(reconstruction, frames, settings, said)
     given = reconstruction, frames, folder, ExportFormat(to), face_size, placement, link, lenses
-    write(*given, images=images)
+    with connected(cluster) as client, hired(client, folder, frames) as workers:
+        write(*given, images=images, workers=workers)
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
     typer.echo(f"{to}: {folder}")

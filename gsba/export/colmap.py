@@ -18,7 +18,7 @@ Image f * C + c + 1 is face c of frame f, point j + 1 is point j.
 """
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,14 +29,16 @@ from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.one_centre import seen_from_the_middle
 from gsba.camera.sphere import erp_from_bearings
 from gsba.camera.views import View, scenes_of, seen_from_lenses, shown_in_pictures, views_for
-from gsba.export.images import FrameWriter, face_size_for, panorama_writer, suffix_of, view_writer
+from gsba.export.images import face_size_for, has_masks, panorama_writer, view_writer
+from gsba.export.pictures import Files, FrameWriter
 from gsba.export.ply import write_splat_points
-from gsba.export.raw import LENSES, raw_lenses, raw_writer
+from gsba.export.raw import LENSES, RawPictures, raw_lenses
 from gsba.geometry import inverse, pose, quaternion_from_rotation
 from gsba.log import GsbaError
 from gsba.types import Fisheye, FrameSet, Reconstruction
 
 TEST_EVERY = 8  # frames, as the trainers' own hold-out
+_BY_VIEW, _FLAT = "{view}/{name}{suffix}", "{name}_{view}{suffix}"  # names of images
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +63,12 @@ def write_colmap(
 ) -> FrameWriter:
     """Write the rig layout into `partial`, all but the pictures."""
     views = views_for(frames, face_size_for(frames, face_size), lenses)
-    names = [[f"{view.name}/{_file(frames, f)}" for view in views] for f in range(len(frames))]
+    files = _files(partial, _BY_VIEW, [view.name for view in views], has_masks(frames))
     seen, sensors = seen_from_lenses(reconstruction, lenses), list(map(_pinhole, views))
-    write_model(partial / "sparse" / "0", seen, sensors, names)
-    text = json.dumps(_rig_config(sensors, [view.name for view in views]), indent=1) + "\n"
+    write_model(partial / "sparse" / "0", seen, sensors, _names(files, frames))
+    text = json.dumps(_rig_config(sensors, files.views), indent=1) + "\n"
     (partial / "rig_config.json").write_text(text)
-    return _named_views(partial, frames, views, names, link, lenses, scenes_of(reconstruction))
+    return view_writer(files, frames, views, lenses, link, scenes_of(reconstruction))
 
 
 def write_colmap_flat(
@@ -79,11 +81,8 @@ def write_colmap_flat(
 ) -> FrameWriter:
     """Write the layout with unique base names into `partial`, all but the pictures."""
     views = views_for(frames, face_size_for(frames, face_size), lenses)
-    names = [
-        [f"{name}_{view.name}{suffix_of(frames, f)}" for view in views]
-        for f, name in enumerate(frames.names)
-    ]
-    model = partial / "sparse" / "0"
+    files = _files(partial, _FLAT, [view.name for view in views], has_masks(frames))
+    names, model = _names(files, frames), partial / "sparse" / "0"
     seen = seen_from_lenses(reconstruction, lenses)
     write_model(model, seen, list(map(_pinhole, views)), names)
     write_splat_points(
@@ -91,7 +90,7 @@ def write_colmap_flat(
     )
     held_out = [name for of_frame in names[::TEST_EVERY] for name in of_frame]
     (model / "test.txt").write_text("\n".join(held_out) + "\n")
-    return _named_views(partial, frames, views, names, link, lenses, scenes_of(reconstruction))
+    return view_writer(files, frames, views, lenses, link, scenes_of(reconstruction))
 
 
 def write_colmap_raw(
@@ -105,12 +104,8 @@ def write_colmap_raw(
     """Write the rig layout of the raw fisheyes themselves into `partial`, or the flat one, all but
     the pictures."""
     sensors = _raw_sensors(frames, lenses)
-    named = "{name}_{lens}{suffix}" if flat else "{lens}/{name}{suffix}"
-    names = [
-        [named.format(name=name, lens=lens, suffix=suffix_of(frames, f)) for lens in LENSES]
-        for f, name in enumerate(frames.names)
-    ]
-    model = partial / "sparse" / "0"
+    files = _files(partial, _FLAT if flat else _BY_VIEW, LENSES, masked=True)
+    names, model = _names(files, frames), partial / "sparse" / "0"
     write_model(model, shown_in_pictures(reconstruction, lenses), sensors, names)
     if flat:
         held_out = [name for of_frame in names[::TEST_EVERY] for name in of_frame]
@@ -121,12 +116,7 @@ def write_colmap_raw(
     else:
         text = json.dumps(_rig_config(sensors, LENSES), indent=1) + "\n"
         (partial / "rig_config.json").write_text(text)
-    return raw_writer(
-        frames,
-        lambda f, lens: partial / "images" / names[f][lens],
-        lambda f, lens: partial / "masks" / f"{names[f][lens]}.png",
-        link,
-    )
+    return RawPictures(files, link)
 
 
 def write_colmap_erp(
@@ -141,17 +131,10 @@ def write_colmap_erp(
         raise GsbaError("colmap-erp needs panoramas, these frames are cube faces: use colmap")
     size = (frames.width, frames.height)
     sensor = Sensor("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), np.eye(4))
-    names = [_file(frames, f) for f in range(len(frames))]
+    files = _files(partial, "{name}{suffix}", ("",), has_masks(frames))
     seen = seen_from_the_middle(reconstruction) if lenses else reconstruction
-    write_model(partial / "sparse" / "0", seen, [sensor], [[name] for name in names])
-    return panorama_writer(
-        frames,
-        lambda f: partial / "images" / names[f],
-        lambda f: partial / "masks" / f"{names[f]}.png",
-        link,
-        lenses,
-        scenes_of(reconstruction),
-    )
+    write_model(partial / "sparse" / "0", seen, [sensor], _names(files, frames))
+    return panorama_writer(files, frames, link, lenses, scenes_of(reconstruction))
 
 
 def write_model(
@@ -318,26 +301,12 @@ def _rig_config(sensors: Sequence[Sensor], names: Sequence[str]) -> list[dict]:
     return [{"cameras": configs}]
 
 
-def _file(frames: FrameSet, f: int) -> str:
-    return f"{frames.names[f]}{suffix_of(frames, f)}"
+def _files(partial: Path, name: str, views: Sequence[str], masked: bool) -> Files:
+    """Pictures by the pattern of their names."""
+    return Files(partial, views, f"images/{name}", f"masks/{name}.png" if masked else "")
 
 
-def _named_views(
-    partial: Path,
-    frames: FrameSet,
-    views: tuple[View, ...],
-    names: list[list[str]],
-    link: bool,
-    lenses: Lenses,
-    scenes: Callable[[int], np.ndarray],
-) -> FrameWriter:
-    place = {view.name: c for c, view in enumerate(views)}
-    return view_writer(
-        frames,
-        views,
-        lenses,
-        lambda f, view: partial / "images" / names[f][place[view]],
-        lambda f, view: partial / "masks" / f"{names[f][place[view]]}.png",
-        link,
-        scenes,
-    )
+def _names(files: Files, frames: FrameSet) -> list[list[str]]:
+    """Image names, by frame and view."""
+    every = [files.images(frames, f) for f in range(len(frames))]
+    return [[path.removeprefix("images/") for path in of_frame] for of_frame in every]

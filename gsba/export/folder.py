@@ -3,11 +3,12 @@
 import json
 import os
 import shutil
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gsba.disk import disk_errors
+from gsba.disk import disk_errors, remove_temporaries
 from gsba.log import GsbaError
 from gsba.version import __version__
 
@@ -32,7 +33,8 @@ def output_folder(out: Path, to: str) -> Iterator[Path]:
         _require_replaceable(out)
         out.parent.mkdir(parents=True, exist_ok=True)
         _remove_stale(out)
-        partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
+        # A name that is never used again: workers elsewhere may still be at an earlier one.
+        partial = out.with_name(f".{out.name}.partial-{os.getpid()}-{uuid.uuid4().hex[:8]}")
         partial.mkdir()
         try:
             yield partial
@@ -41,6 +43,7 @@ def output_folder(out: Path, to: str) -> Iterator[Path]:
             (partial / MARKER).write_text(json.dumps(marker, indent=1) + "\n")
             _require_replaceable(out)
             _swap_in(partial, out)
+            remove_temporaries(out)  # of workers that were killed
         finally:
             shutil.rmtree(partial, ignore_errors=True)
 

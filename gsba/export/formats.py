@@ -11,9 +11,11 @@ import numpy as np
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import FORMATS_OF
 from gsba.export.folder import output_folder
-from gsba.export.images import FrameWriter, write_pictures
+from gsba.export.images import write_pictures
+from gsba.export.pictures import FrameWriter
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement
+from gsba.store.shards import Workers
 from gsba.types import FrameSet, PoseStatus, Reconstruction
 
 logger = logging.getLogger(__name__)
@@ -40,6 +42,7 @@ def export(
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
     images: str = "auto",
+    workers: Workers | None = None,
 ) -> None:
     """Write a reconstruction in another program's format, all frames of it.
 
@@ -57,14 +60,14 @@ def export(
             and panoramas stitched at the map's depth.
         images: as `export.images` says it: fisheye for raw ones as they are, panorama for panoramas
             alone, else faces.
+        workers: who write pictures; None = threads here.
 
     Raises:
-        GsbaError: `out` is in use, the format does not fit the frames, or the disk refuses;
-            nothing is left behind then.
+        GsbaError: `out` is in use or not seen by a worker, the format does not fit the frames, or
+            the disk refuses; nothing is left behind then.
     """
-    export_all(
-        reconstruction, frames, {to: out}, face_size, placement, link, lenses=lenses, images=images
-    )
+    given = reconstruction, frames, {to: out}, face_size, placement, link, lenses, images
+    export_all(*given, workers)
 
 
 def export_all(
@@ -76,12 +79,13 @@ def export_all(
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
     images: str = "auto",
+    workers: Workers | None = None,
 ) -> None:
     """As `export`, in several formats at once: every picture is read, cut and encoded once.
 
     Args:
         outs: folder of each format.
-        reconstruction, frames, face_size, placement, link, lenses, images: as of `export`.
+        reconstruction, frames, face_size, placement, link, lenses, images, workers: as of `export`.
 
     Raises:
         GsbaError: as of `export`; none of the folders is written then.
@@ -110,7 +114,7 @@ def export_all(
             else:
                 writers += _write(*given, face_size, z_up, link, seen_by)
             placement.write(partial / "transform.json")
-        write_pictures(frames, writers)
+        write_pictures(frames, writers, workers)
     for to, out in outs.items():
         num_points = len(reconstruction.points_world)
         logger.info("%s: %d frames, %d points, in %s", to, len(frames), num_points, out)

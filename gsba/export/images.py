@@ -11,9 +11,9 @@ they are hard links: then an edit of one is an edit of the other.
 import fcntl
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -22,21 +22,20 @@ import numpy as np
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.one_centre import Stitcher
 from gsba.camera.rig import CubeRig
-from gsba.camera.views import View, ViewCutter
-from gsba.export.pictures import Pictures, Shown
+from gsba.camera.views import Scenes, View, ViewCutter
+from gsba.disk import atomic_write
+from gsba.export.pictures import Files, FrameWriter, Pictures, Shown
 from gsba.frames.buffers import give_back_freed_memory
 from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.files import goes_out_as_it_is
 from gsba.frames.pixels import load_faces
-from gsba.log import GsbaError, track
+from gsba.log import GsbaError
+from gsba.store.shards import Threads, Workers
 from gsba.types import FACES, FrameSet
 
 MIN_FACE_SIZE = 16  # pixels
 _FICLONE = 0x40049409  # of Linux: a file that shares another's blocks until one is written to
-_INSTEAD = {".webp": ".jpg", ".tif": ".png", ".tiff": ".png"}
 _AT_ONCE = 4  # frames at most: an 8K panorama, a face and what is encoded take 130 MB
-
-FrameWriter = Callable[[Shown], None]  # writes what a dataset shows of a frame
 
 
 def face_size_for(frames: FrameSet, face_size: int | None) -> int:
@@ -60,91 +59,83 @@ def of_one_lens(images: str, frames: FrameSet) -> bool:
     )
 
 
-def suffix_of(frames: FrameSet, f: int) -> str:
-    """Suffix of the exported images of a frame: that of the input, or a kind that all can read."""
-    suffix = frames.paths[f][0].suffix
-    return _INSTEAD.get(suffix.lower(), suffix)
-
-
 def has_masks(frames: FrameSet) -> bool:
     """Whether any frame has a mask; then every exported image gets one."""
     return any(path is not None for path in frames.mask_paths)
 
 
 def view_writer(
+    files: Files,
     frames: FrameSet,
     views: tuple[View, ...],
     lenses: Lenses,
-    image_path: Callable[[int, str], Path],
-    mask_path: Callable[[int, str], Path],
     link: bool = False,
-    scenes: Callable[[int], np.ndarray] | None = None,
+    scenes: Scenes | None = None,
 ) -> FrameWriter:
     """Writes every view of a frame, and its mask where the frames have masks.
 
     Args:
+        files: where they go.
         frames: panoramas, or faces of which the missing ones stay missing.
         views: of `gsba.camera.views.views_for`.
         lenses: of these frames.
-        image_path: file of the image, by frame index and view name.
-        mask_path: file of the mask (PNG, 0 = ignore, 255 = use).
         link: hard links to images that leave unchanged.
-        scenes: points (N, 3) around a frame, rig frame, by its index: how far things are.
+        scenes: what these frames see: how far things are.
     """
     if lenses and frames.panoramic:
-        return _lens_face_writer(frames, views, lenses, image_path, mask_path, scenes)
-    return _cube_face_writer(frames, views[0].width, image_path, mask_path, link)
+        return _LensFaces(files, lenses, scenes, views)
+    return _CubeFaces(files, views[0].width, link)
 
 
-def _cube_face_writer(
-    frames: FrameSet,
-    size: int,
-    image_path: Callable[[int, str], Path],
-    mask_path: Callable[[int, str], Path],
-    link: bool,
-) -> FrameWriter:
-    from gsba.frames import cubemap
+@dataclass(frozen=True, slots=True)
+class _CubeFaces(FrameWriter):
+    size: int  # pixels
+    link: bool
 
-    rig, faces = CubeRig(size, np.pi / 2), frames.faces or FACES
-    chosen = [FACES.index(face) for face in faces]
+    def __call__(self, shown: Shown) -> None:
+        from gsba.frames import cubemap
 
-    def write(shown: Shown) -> None:
-        f = shown.f
-        paths = [image_path(f, face) for face in faces]
+        f, frames, size, paths = shown.f, shown.frames, self.size, self.images(shown)
+        rig = CubeRig(size, np.pi / 2)
         if frames.panoramic:
             room = shown.room("face", (size, size, 3))
             shown.write(size, paths, lambda: cubemap.cut_padded(shown.padded, rig, room))
         elif size == frames.width and all(map(goes_out_as_it_is, frames.paths[f], paths)):
             for source, path in zip(frames.paths[f], paths, strict=True):
-                pass_on(source, path, link)
+                pass_on(source, path, self.link)
         else:
             shown.write(size, paths, lambda: _resized(load_faces(frames, f), size))
-        if has_masks(frames):
-            masks = [mask_path(f, face) for face in faces]
-            shown.write_masks(size, masks, lambda: cut_mask(f, shown)[chosen])
 
-    def cut_mask(f: int, shown: Shown) -> np.ndarray:
-        if frames.mask_paths[f] is None:
-            return np.ones((len(FACES), size, size), bool)
-        return cubemap.cut_mask(shown.mask, rig)
+        def cut_mask() -> np.ndarray:
+            if frames.mask_paths[f] is None:
+                return np.ones((len(masks), size, size), bool)
+            chosen = [FACES.index(face) for face in frames.faces or FACES]
+            return cubemap.cut_mask(shown.mask, rig)[chosen]
 
-    return write
+        if masks := self.masks(shown):
+            shown.write_masks(size, masks, cut_mask)
 
 
-def _lens_face_writer(
-    frames: FrameSet,
-    views: tuple[View, ...],
-    lenses: Lenses,
-    image_path: Callable[[int, str], Path],
-    mask_path: Callable[[int, str], Path],
-    scenes: Callable[[int], np.ndarray] | None,
-) -> FrameWriter:
-    def write(shown: Shown) -> None:
-        f = shown.f
+@dataclass(frozen=True, slots=True)
+class _OfLenses(FrameWriter):
+    lenses: Lenses
+    scenes: Scenes | None  # None = all is far
+
+    def taken(self, rows: np.ndarray) -> FrameWriter:
+        scenes = self.scenes and self.scenes.taken(rows)
+        return replace(self, lenses=self.lenses.taken(rows), scenes=scenes)
+
+
+@dataclass(frozen=True, slots=True)
+class _LensFaces(_OfLenses):
+    views: tuple[View, ...]
+
+    def __call__(self, shown: Shown) -> None:
+        f, frames, size = shown.f, shown.frames, self.views[0].width
 
         @cache
         def cutter() -> ViewCutter:
-            return ViewCutter(views, lenses, f, None if scenes is None else scenes(f))
+            return ViewCutter(self.views, self.lenses, f, self.scenes and self.scenes(f))
 
         def cut() -> Iterator[np.ndarray]:
             if frames.fisheyes is not None:
@@ -154,47 +145,38 @@ def _lens_face_writer(
         def cut_mask() -> Iterator[np.ndarray]:
             return (part.astype(np.uint8) * 255 for part in cutter().cut_mask(shown.mask))
 
-        size = views[0].width
-        shown.write(("of lenses", size), [image_path(f, view.name) for view in views], cut)
-        if has_masks(frames):
-            paths = [mask_path(f, view.name) for view in views]
-            shown.write(("masks of lenses", size), paths, cut_mask)
-
-    return write
+        shown.write(("of lenses", size), self.images(shown), cut)
+        if masks := self.masks(shown):
+            shown.write(("masks of lenses", size), masks, cut_mask)
 
 
-def write_pictures(frames: FrameSet, writers: Sequence[FrameWriter]) -> None:
-    """Write what all datasets of an export show, frame by frame."""
-    pictures = Pictures(frames)
+def write_pictures(
+    frames: FrameSet, writers: Sequence[FrameWriter], workers: Workers | None = None
+) -> None:
+    """Write what all datasets of an export show, frame by frame.
 
-    def write(f: int) -> None:
-        shown = Shown(pictures, f)
-        for writer in writers:
-            writer(shown)
-
-    if writers:
-        give_back_freed_memory()
-        of_all_frames(write, len(frames))
-
-
-def of_all_frames(write: Callable[[int], None], num_frames: int) -> None:
-    """Write frames, a few at a time."""
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, _AT_ONCE)) as pool:
-        running = [pool.submit(write, f) for f in range(num_frames)]
-        try:
-            for future in track(running, "writing images"):
-                future.result()
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    Args:
+        frames: what they show.
+        writers: of the datasets, whose folders are there.
+        workers: who do it, on a disk that they share; None = threads here.
+    """
+    if not writers:
+        return
+    for writer in writers:
+        writer.files.make_folders(frames)
+    workers = (workers or Threads(os.cpu_count() or 1)).at_most(_AT_ONCE)
+    workers.must_see([writer.files.folder for writer in writers])
+    give_back_freed_memory()
+    for _ in workers.map_shards(Pictures(frames, writers)):
+        pass
 
 
 def panorama_writer(
+    files: Files,
     frames: FrameSet,
-    image_path: Callable[[int], Path],
-    mask_path: Callable[[int], Path],
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
-    scenes: Callable[[int], np.ndarray] | None = None,
+    scenes: Scenes | None = None,
 ) -> FrameWriter:
     """Copies the panorama of a frame, and writes its mask where the frames have masks.
 
@@ -202,43 +184,40 @@ def panorama_writer(
     anew; those of two lenses are stitched by `gsba.camera.one_centre`.
 
     Args:
+        files: where they go.
         frames: panoramas.
-        image_path: file of the image, by frame index.
-        mask_path: file of the mask (PNG, 0 = ignore, 255 = use).
         link: hard links instead of copies.
         lenses: of these frames.
-        scenes: points (N, 3) around a frame, rig frame, by its index: how far things are.
+        scenes: what these frames see: how far things are.
     """
-    if lenses:
-        return _stitched_writer(frames, image_path, mask_path, lenses, scenes)
+    return _Stitched(files, lenses, scenes) if lenses else _Panoramas(files, link)
 
-    def write(shown: Shown) -> None:
-        f = shown.f
-        source, path = frames.paths[f][0], image_path(f)
+
+@dataclass(frozen=True, slots=True)
+class _Panoramas(FrameWriter):
+    link: bool
+
+    def __call__(self, shown: Shown) -> None:
+        frames, (path,) = shown.frames, self.images(shown)
+        source = frames.paths[shown.f][0]
         as_it_is = not (frames.correction or frames.fisheyes) and goes_out_as_it_is(source, path)
         if as_it_is:
-            pass_on(source, path, link)
+            pass_on(source, path, self.link)
         else:
             shown.write("panorama", [path], lambda: [shown.erp])
-        if has_masks(frames):
-            shown.write_masks("panorama", [mask_path(f)], lambda: [shown.mask])
-
-    return write
+        if masks := self.masks(shown):
+            shown.write_masks("panorama", masks, lambda: [shown.mask])
 
 
-def _stitched_writer(
-    frames: FrameSet,
-    image_path: Callable[[int], Path],
-    mask_path: Callable[[int], Path],
-    lenses: Lenses,
-    scenes: Callable[[int], np.ndarray] | None,
-) -> FrameWriter:
-    def write(shown: Shown) -> None:
-        f = shown.f
+@dataclass(frozen=True, slots=True)
+class _Stitched(_OfLenses):
+    def __call__(self, shown: Shown) -> None:
+        f, frames = shown.f, shown.frames
 
         @cache
         def stitcher() -> Stitcher:
-            return Stitcher(lenses, f, np.zeros((0, 3)) if scenes is None else scenes(f))
+            scene = np.zeros((0, 3)) if self.scenes is None else self.scenes(f)
+            return Stitcher(self.lenses, f, scene)
 
         def stitched() -> list[np.ndarray]:
             if frames.fisheyes is not None:
@@ -248,18 +227,19 @@ def _stitched_writer(
         def mask() -> list[np.ndarray]:
             return [stitcher().stitched_mask(shown.mask).astype(np.uint8) * 255]
 
-        shown.write("stitched", [image_path(f)], stitched)
-        if has_masks(frames):
-            shown.write("stitched mask", [mask_path(f)], mask)
-
-    return write
+        shown.write("stitched", self.images(shown), stitched)
+        if masks := self.masks(shown):
+            shown.write("stitched mask", masks, mask)
 
 
 def pass_on(source: Path, path: Path, link: bool) -> None:
     """Give `path` the content of `source`; without a second one on disk where that can be."""
     if not source.is_file():
         raise GsbaError(f"{source}: is gone; it was there when the run began")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic_write(path, lambda temporary: _pass_on(source, temporary, link), parents=False)
+
+
+def _pass_on(source: Path, path: Path, link: bool) -> None:
     if link:
         with suppress(OSError):  # another file system
             os.link(source.resolve(), path)

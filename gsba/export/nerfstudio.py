@@ -18,7 +18,7 @@ height. That is gsplat's ROLLING_TOP_TO_BOTTOM, with the inverses (in axes y dow
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,17 +26,11 @@ import numpy as np
 
 from gsba.camera.fisheye import rotation_of
 from gsba.camera.lens import ONE_CENTRE, Lenses
-from gsba.camera.views import View, scenes_of, seen_from_lenses, views_for
-from gsba.export.images import (
-    FrameWriter,
-    face_size_for,
-    has_masks,
-    panorama_writer,
-    suffix_of,
-    view_writer,
-)
+from gsba.camera.views import Scenes, View, scenes_of, seen_from_lenses, views_for
+from gsba.export.images import face_size_for, has_masks, panorama_writer, view_writer
+from gsba.export.pictures import Files, FrameWriter
 from gsba.export.ply import write_splat_points
-from gsba.export.raw import LENSES, raw_lenses, raw_writer
+from gsba.export.raw import LENSES, RawPictures, raw_lenses
 from gsba.geometry import pose
 from gsba.types import Fisheye, FrameSet, Reconstruction
 
@@ -97,37 +91,25 @@ def write_nerfstudio_raw(
     """Write cloud and transforms.json of raw fisheyes into `partial`, all but the pictures."""
     pair = raw_lenses(frames)
     out_R_world = _write_cloud(partial, reconstruction, z_up)
-
-    def image(f: int, lens: int) -> str:
-        return f"images/{frames.names[f]}_{LENSES[lens]}{suffix_of(frames, f)}"
-
-    def mask(f: int, lens: int) -> str:
-        return f"masks/{frames.names[f]}_{LENSES[lens]}.png"
-
+    files = _files(partial, LENSES, masked=True)
     moving = lenses.twists is not None and lenses.sweeps is not None
     entries = []
     for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
         rigs = lenses.swept(f) if moving else None
+        images, masks = files.images(frames, f), files.masks(frames, f)
         for number, (lens, sign) in enumerate(zip(pair, (1.0, -1.0), strict=True)):
             rig_T_lens = pose(rotation_of(lens), sign * lenses.centre)
-            entry = _entry(image(f, number), out_R_world, world_T_rig @ rig_T_lens)
+            entry = _entry(images[number], out_R_world, world_T_rig @ rig_T_lens)
             if rigs is not None:
                 for name, rig_T_rig in zip(("start", "end"), rigs[number], strict=True):
                     matrix = _matrix(out_R_world, world_T_rig @ rig_T_rig @ rig_T_lens)
                     entry[f"transform_matrix_{name}"] = matrix
-            entries.append({**entry, **_fisheye(lens), "mask_path": mask(f, number)})
+            entries.append({**entry, **_fisheye(lens), "mask_path": masks[number]})
     camera: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE", "is_fisheye": True}
     if moving:
         camera["rolling_shutter"] = [0, 0, 1, 0]
     _write_transforms(partial / "transforms.json", camera, entries, len(frames), out_R_world)
-    writer = raw_writer(
-        frames,
-        lambda f, lens: partial / image(f, lens),
-        lambda f, lens: partial / mask(f, lens),
-        link,
-        _SEEN_DEG,
-    )
-    return [writer]
+    return [RawPictures(files, link, _SEEN_DEG)]
 
 
 def _write_cloud(partial: Path, reconstruction: Reconstruction, z_up: bool) -> np.ndarray:
@@ -146,38 +128,25 @@ def _write_face_dataset(
     out_R_world: np.ndarray,
     link: bool,
     lenses: Lenses,
-    scenes: Callable[[int], np.ndarray],
+    scenes: Scenes,
 ) -> FrameWriter:
-    def image(f: int, face: str) -> str:
-        return f"images/{frames.names[f]}_{face}{suffix_of(frames, f)}"
-
-    def mask(f: int, face: str) -> str:
-        return f"masks/{frames.names[f]}_{face}.png"
-
+    files = _files(partial, [view.name for view in views], has_masks(frames))
     # OPENCV without distortion is a pinhole, under the one name that all readers know.
     camera = {"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
     if not lenses:
         camera |= _intrinsics(views[0])
     entries = []
     for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
-        for view in views:
-            world_T_view = world_T_rig @ view.rig_T_view
-            entry = _entry(image(f, view.name), out_R_world, world_T_view)
+        images, masks = files.images(frames, f), files.masks(frames, f)
+        for number, view in enumerate(views):
+            entry = _entry(images[number], out_R_world, world_T_rig @ view.rig_T_view)
             if lenses:  # views differ
                 entry |= _intrinsics(view)
-            if has_masks(frames):
-                entry["mask_path"] = mask(f, view.name)
+            if masks:
+                entry["mask_path"] = masks[number]
             entries.append(entry)
     _write_transforms(partial / "transforms.json", camera, entries, len(frames), out_R_world)
-    return view_writer(
-        frames,
-        views,
-        lenses,
-        lambda f, face: partial / image(f, face),
-        lambda f, face: partial / mask(f, face),
-        link,
-        scenes,
-    )
+    return view_writer(files, frames, views, lenses, link, scenes)
 
 
 def _write_erp_dataset(
@@ -189,31 +158,27 @@ def _write_erp_dataset(
     link: bool,
     which: str,
 ) -> FrameWriter:
-    def image(f: int) -> str:
-        return f"images{which}/{frames.names[f]}{suffix_of(frames, f)}"
-
-    def mask(f: int) -> str:
-        return f"masks{which}/{frames.names[f]}.png"
-
+    mask = f"masks{which}/{{name}}.png" if has_masks(frames) else ""
+    files = Files(partial, ("",), f"images{which}/{{name}}{{suffix}}", mask)
     width, height = frames.width, frames.height
     camera = {"camera_model": "EQUIRECTANGULAR", "fl_x": width / 2, "fl_y": float(height)}
     camera |= {"cx": width / 2, "cy": height / 2, "w": width, "h": height}
     entries = []
     for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
-        entry = _entry(image(f), out_R_world, world_T_rig)
-        if has_masks(frames):
-            entry["mask_path"] = mask(f)
+        (image,), masks = files.images(frames, f), files.masks(frames, f)
+        entry = _entry(image, out_R_world, world_T_rig)
+        if masks:
+            entry["mask_path"] = masks[0]
         entries.append(entry)
     path = partial / f"transforms{which}.json"
     _write_transforms(path, camera, entries, len(entries), out_R_world)
-    return panorama_writer(
-        frames,
-        lambda f: partial / image(f),
-        lambda f: partial / mask(f),
-        link,
-        lenses,
-        scenes_of(reconstruction),
-    )
+    return panorama_writer(files, frames, link, lenses, scenes_of(reconstruction))
+
+
+def _files(partial: Path, views: Sequence[str], masked: bool) -> Files:
+    """Pictures with unique base names."""
+    mask = "masks/{name}_{view}.png" if masked else ""
+    return Files(partial, views, "images/{name}_{view}{suffix}", mask)
 
 
 def _intrinsics(view: View) -> dict[str, Any]:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from gsba.camera.lens import Lenses
 from gsba.camera.views import scenes_of
-from gsba.export.images import FrameWriter, panorama_writer, suffix_of
+from gsba.export.images import has_masks, panorama_writer
+from gsba.export.pictures import Files, FrameWriter
 from gsba.trajectory.files import write_tum
 from gsba.types import FrameSet, Reconstruction, Trajectory
 
@@ -33,11 +34,6 @@ def write_with_poses(
         writer = csv.writer(file)
         writer.writerow(["name", "timestamp"])
         writer.writerows(zip(frames.names, map(float, frames.timestamps), strict=True))
-    return panorama_writer(
-        frames,
-        lambda f: images / f"{frames.names[f]}{suffix_of(frames, f)}",
-        lambda f: partial / "masks" / f"{frames.names[f]}.png",
-        link,
-        lenses,
-        scenes_of(reconstruction),
-    )
+    mask = "masks/{name}.png" if has_masks(frames) else ""
+    files = Files(partial, ("",), "images/{name}{suffix}", mask)
+    return panorama_writer(files, frames, link, lenses, scenes_of(reconstruction))

@@ -3,7 +3,10 @@
 import threading
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from types import NoneType
+from typing import Any
 
 import numpy as np
 
@@ -12,21 +15,106 @@ from gsba.disk import encoded_image, write_bytes
 from gsba.frames.buffers import Buffers
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_padded
+from gsba.store.shards import even_blocks
 from gsba.types import FrameSet
+
+_INSTEAD = {".webp": ".jpg", ".tif": ".png", ".tiff": ".png"}
+
+
+@dataclass(frozen=True, slots=True)
+class Files:
+    """Where a dataset has its pictures.
+
+    Patterns are filled with the `name` of a frame, the `suffix` of its exported images, and the
+    `view`.
+    """
+
+    folder: Path  # of the dataset, absolute
+    views: Sequence[str]  # pictures of a frame; one "" where the pattern has none
+    image: str  # pattern of paths in the folder
+    mask: str  # the same of masks (PNG, 0 = ignore, 255 = use); "" = there are none
+
+    def images(self, frames: FrameSet, f: int) -> list[str]:
+        """Paths in the folder of a frame's images, by view."""
+        return self._filled(self.image, frames, f)
+
+    def masks(self, frames: FrameSet, f: int) -> list[str]:
+        """The same of its masks; [] = there are none."""
+        return self._filled(self.mask, frames, f) if self.mask else []
+
+    def make_folders(self, frames: FrameSet) -> None:
+        """Make all that pictures go to."""
+        for path in {*self.images(frames, 0), *self.masks(frames, 0)}:
+            (self.folder / path).parent.mkdir(parents=True, exist_ok=True)
+
+    def _filled(self, pattern: str, frames: FrameSet, f: int) -> list[str]:
+        known = {"name": frames.names[f], "suffix": suffix_of(frames, f)}
+        return [pattern.format(view=view, **known) for view in self.views]
+
+
+def suffix_of(frames: FrameSet, f: int) -> str:
+    """Suffix of the exported images of a frame: that of the input, or a kind that all can read."""
+    suffix = frames.paths[f][0].suffix
+    return _INSTEAD.get(suffix.lower(), suffix)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameWriter:
+    """Writes what a dataset shows of a frame."""
+
+    files: Files
+
+    def __call__(self, shown: "Shown") -> None:
+        """Write it, into folders that are there."""
+        raise NotImplementedError
+
+    def taken(self, rows: np.ndarray) -> "FrameWriter":
+        """What writes some frames (F',), renumbered; it can be pickled."""
+        return self
+
+    def images(self, shown: "Shown") -> list[Path]:
+        """Where the images of a frame go."""
+        return [self.files.folder / name for name in self.files.images(shown.frames, shown.f)]
+
+    def masks(self, shown: "Shown") -> list[Path]:
+        """Where its masks go; [] = there are none."""
+        return [self.files.folder / name for name in self.files.masks(shown.frames, shown.f)]
 
 
 class Pictures:
-    """What the frames of one export have in common.
+    """The job of writing what several datasets show of each frame.
 
     A thread holds one panorama, in memory that it uses for the next frame again.
     """
 
-    def __init__(self, frames: FrameSet) -> None:
-        self.frames = frames
+    title = "writing images"
+    returns: Any = NoneType
+
+    def __init__(self, frames: FrameSet, writers: Sequence[FrameWriter]) -> None:
+        self.frames, self._writers = frames, writers
         self.buffers = Buffers()
         self._uses = Counter(frames.mask_paths)
         self._masks: dict[Hashable, list[bytes]] = {}
         self._lock = threading.Lock()
+
+    def __reduce__(self) -> tuple[object, ...]:  # memory and masks are made anew
+        return Pictures, (self.frames, self._writers)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __call__(self, item: int) -> None:
+        shown = Shown(self, item)
+        for writer in self._writers:
+            writer(shown)
+
+    def blocks(self) -> Sequence[tuple[int, int]]:
+        return even_blocks(len(self.frames))
+
+    def part(self, start: int, stop: int) -> "Pictures":
+        rows = np.arange(start, stop)
+        writers = [writer.taken(rows) for writer in self._writers]
+        return Pictures(self.frames.taken(rows, absolute=True), writers)
 
     def same_mask(self, f: int) -> bool:
         """Whether another frame has the mask of frame f."""
@@ -44,8 +132,8 @@ class Shown:
     """One frame of an export, for the datasets that show it."""
 
     def __init__(self, pictures: Pictures, f: int) -> None:
-        self.f = f
-        self._pictures, self._frames = pictures, pictures.frames
+        self.f, self.frames = f, pictures.frames
+        self._pictures = pictures
         self._padded: np.ndarray | None = None
         self._files: dict[Hashable, list[bytes]] = {}
 
@@ -53,7 +141,7 @@ class Shown:
     def padded(self) -> np.ndarray:
         """The panorama (h + 2 PAD, 2 h + 2 PAD, 3) uint8 RGB, until the thread's next frame."""
         if self._padded is None:
-            self._padded = load_padded(self._frames, self.f, self._pictures.buffers)
+            self._padded = load_padded(self.frames, self.f, self._pictures.buffers)
         return self._padded
 
     @property
@@ -64,8 +152,8 @@ class Shown:
     @property
     def mask(self) -> np.ndarray:
         """Where the panorama may be used, (h, 2 h) bool."""
-        found = load_mask(self._frames, self.f)
-        size = self._frames.height, self._frames.width
+        found = load_mask(self.frames, self.f)
+        size = self.frames.height, self.frames.width
         return np.ones(size, bool) if found is None else found
 
     def room(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -84,7 +172,7 @@ class Shown:
         for path, image in zip(paths, make(), strict=True):
             content = encoded_image(image, path)
             self._files[key].append(content)
-            write_bytes(path, content)
+            write_bytes(path, content, parents=False)
 
     def write_masks(
         self, key: Hashable, paths: Sequence[Path], make: Callable[[], Iterable[np.ndarray]]
@@ -95,7 +183,7 @@ class Shown:
             pairs = zip(make(), paths, strict=True)
             return [encoded_image(part.astype(np.uint8) * 255, path) for part, path in pairs]
 
-        key = "mask", key, self._frames.mask_paths[self.f]
+        key = "mask", key, self.frames.mask_paths[self.f]
         if self._pictures.same_mask(self.f):
             _write(paths, self._pictures.masks(key, encode))
         else:
@@ -104,4 +192,4 @@ class Shown:
 
 def _write(paths: Sequence[Path], contents: Sequence[bytes]) -> None:
     for path, content in zip(paths, contents, strict=True):
-        write_bytes(path, content)
+        write_bytes(path, content, parents=False)

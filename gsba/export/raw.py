@@ -1,14 +1,14 @@
 """Raw fisheyes of an export, as they are, with masks of what their circles hold."""
 
-from collections.abc import Callable
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
 from gsba.camera.fisheye import Pair, rotation_of, unproject
 from gsba.camera.sphere import erp_from_bearings
-from gsba.export.images import FrameWriter, pass_on
-from gsba.export.pictures import Shown
+from gsba.camera.tables import table
+from gsba.export.images import pass_on
+from gsba.export.pictures import FrameWriter, Shown
 from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.files import goes_out_as_it_is
 from gsba.log import GsbaError
@@ -30,48 +30,36 @@ def raw_lenses(frames: FrameSet) -> Pair:
     return frames.fisheyes
 
 
-def raw_writer(
-    frames: FrameSet,
-    image_path: Callable[[int, int], Path],
-    mask_path: Callable[[int, int], Path],
-    link: bool = False,
-    seen_deg: float = SEEN_DEG,
-) -> FrameWriter:
+@dataclass(frozen=True, slots=True)
+class RawPictures(FrameWriter):
     """Copies both pictures of a frame, and writes masks of where they show something.
 
     Pictures side by side in one image, and those that trainers misread, are written anew.
-
-    Args:
-        frames: raw pairs.
-        image_path: file of the image, by frame index and lens.
-        mask_path: file of the mask (PNG, 0 = ignore, 255 = use).
-        link: hard links instead of copies.
-        seen_deg: from a lens's axis, beyond which masks leave its picture out.
     """
-    size = frames.width, frames.height
-    circles = [_circle(lens, seen_deg, *size) for lens in raw_lenses(frames)]
 
-    def write(shown: Shown) -> None:
-        f = shown.f
+    link: bool = False  # hard links instead of copies
+    seen_deg: float = SEEN_DEG  # from a lens's axis, beyond which masks leave its picture out
+
+    def __call__(self, shown: Shown) -> None:
+        f, frames, paths = shown.f, shown.frames, self.images(shown)
         sources = frames.paths[f]
-        paths = [image_path(f, lens) for lens in range(len(sources))]
         if sources[0] != sources[1] and all(map(goes_out_as_it_is, sources, paths)):
             for source, path in zip(sources, paths, strict=True):
-                pass_on(source, path, link)
+                pass_on(source, path, self.link)
         else:
             shown.write("raw", paths, lambda: load_raw(frames, f))
 
         def used() -> list[np.ndarray]:
+            size = frames.width, frames.height
+            circles = [_circle(lens, self.seen_deg, *size) for lens in raw_lenses(frames)]
             if frames.mask_paths[f] is None:
                 return [seen for seen, _ in circles]
             return [seen & shown.mask.ravel()[places] for seen, places in circles]
 
-        masks = [mask_path(f, lens) for lens in range(len(circles))]
-        shown.write_masks(("raw", seen_deg), masks, used)
-
-    return write
+        shown.write_masks(("raw", self.seen_deg), self.masks(shown), used)
 
 
+@table(maxsize=4)
 def _circle(
     lens: Fisheye, seen_deg: float, width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -168,7 +168,8 @@ def _export(
 
     def compute() -> Counts:
         if waiting:
-            export_all(main, shown, waiting, size, placement, lenses=seen_by, images=images)
+            how = {"lenses": seen_by, "images": images, "workers": store.workers}
+            export_all(main, shown, waiting, size, placement, **how)
             waiting.clear()
         return Counts(len(run.frames), len(shown), "frames")
 

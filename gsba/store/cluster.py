@@ -9,9 +9,11 @@ time, however many a job has.
 import importlib
 import logging
 import os
+import shutil
 import statistics
 import time
-from collections.abc import Callable, Iterator
+import uuid
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +24,7 @@ from gsba.disk import write_text
 from gsba.log import GsbaError, track
 from gsba.store import shards
 from gsba.store.shards import Job, Manifest, Spent, Workers
+from gsba.types import FrameSet
 from gsba.version import __version__
 
 if TYPE_CHECKING:
@@ -65,6 +68,26 @@ def hire(
         return Cluster(client, folder, frames)
 
     return make
+
+
+@contextmanager
+def hired(client: "Client | None", out: Path, frames: FrameSet) -> Iterator["Cluster | None"]:
+    """Workers who write what goes to `out`, with their shards beside it meanwhile.
+
+    Args:
+        client: of a scheduler; None = nobody is hired.
+        out: a folder on a disk that workers share; it need not be there.
+        frames: which they read.
+    """
+    if client is None:
+        yield None
+        return
+    out = out.resolve()
+    folder = out.with_name(f".{out.name}.shards-{uuid.uuid4().hex[:8]}")
+    try:
+        yield Cluster(client, folder, frames.paths[0][0])
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager
@@ -177,7 +200,7 @@ class Cluster:
         self._done: dict[str, int] = {}
         _leave_task()
         _prepare(client)
-        self._check(frames.absolute())
+        self._check(frames)
 
     def map_shards(self, job: Job[R]) -> Iterator[R]:
         """See `gsba.store.shards.Workers`."""
@@ -186,6 +209,35 @@ class Cluster:
     def spent(self) -> Spent:
         """See `gsba.store.shards.Workers`."""
         return Spent(self._cpu_seconds, dict(self._done))
+
+    def at_most(self, num: int) -> "Cluster":
+        """Nothing is done in this process."""
+        return self
+
+    def must_see(self, paths: Sequence[Path]) -> None:
+        """See `gsba.store.shards.Workers`; versions are compared as well."""
+
+        def ask(paths: list[str]) -> tuple[str, list[str]]:  # as text: gsba may be another there
+            import os
+
+            try:
+                from gsba.version import __version__ as version
+            except ImportError:
+                version = ""
+            return version, [path for path in paths if not os.path.exists(path)]
+
+        answers = self._client.run(ask, [str(path.absolute()) for path in paths])
+        for worker, (version, unseen) in answers.items():
+            if version != __version__:
+                has = f"gsba {version}" if version else "no gsba"
+                raise GsbaError(
+                    f"worker {worker} has {has}, this machine {__version__}: install the same"
+                )
+            if unseen:
+                raise GsbaError(
+                    f"worker {worker} does not see {Path(unseen[0])}: put it on a disk that all "
+                    "workers share, under the same path"
+                )
 
     def _results(self, job: Job[R]) -> Iterator[R]:
         """Results of all items in order, a window of shards at work ahead of them."""
@@ -303,34 +355,13 @@ class Cluster:
 
     def _check(self, frames: Path) -> None:
         """Refuse workers that could not work, before any does."""
-        token = self._folder / "seen"
-        write_text(token, __version__)
-
-        def ask(paths: list[str]) -> tuple[str, list[str]]:  # as text: gsba may be another there
-            import os
-
-            try:
-                from gsba.version import __version__ as version
-            except ImportError:
-                version = ""
-            return version, [path for path in paths if not os.path.exists(path)]
-
         if not self._client.nthreads():
             logger.info("waiting for workers")
             self._client.wait_for_workers(1)
-        answers = self._client.run(ask, [str(token), str(frames)])
+        token = self._folder / "seen"
+        write_text(token, __version__)
+        self.must_see([token, frames])
         token.unlink(missing_ok=True)
-        for worker, (version, unseen) in answers.items():
-            if version != __version__:
-                has = f"gsba {version}" if version else "no gsba"
-                raise GsbaError(
-                    f"worker {worker} has {has}, this machine {__version__}: install the same"
-                )
-            if unseen:
-                raise GsbaError(
-                    f"worker {worker} does not see {Path(unseen[0])}: put it on a disk that all "
-                    "workers share, under the same path"
-                )
 
 
 def _leave_task() -> None:

@@ -84,6 +84,18 @@ class Workers(Protocol):
         """So far, elsewhere."""
         ...
 
+    def at_most(self, num: int) -> "Workers":
+        """The same, at so many items at a time in this process."""
+        ...
+
+    def must_see(self, paths: Sequence[Path]) -> None:
+        """Refuse workers that do not see these.
+
+        Raises:
+            GsbaError: one does not.
+        """
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class Threads:
@@ -104,6 +116,13 @@ class Threads:
     def spent(self) -> Spent:
         """Nothing is done elsewhere."""
         return Spent()
+
+    def at_most(self, num: int) -> "Threads":
+        """See `Workers`."""
+        return Threads(min(self.num_threads, num))
+
+    def must_see(self, paths: Sequence[Path]) -> None:
+        """This process sees them."""
 
 
 def blocks_of_frames(frames: np.ndarray) -> list[tuple[int, int]]:

@@ -196,11 +196,11 @@ def test_an_interrupted_export_leaves_nothing_and_keeps_the_last(
 
     written = []
 
-    def write(path, content):
+    def write(path, content, **options):
         if len(written) == 20:
             raise failure
         written.append(path)
-        return whole(path, content)
+        return whole(path, content, **options)
 
     whole = pictures.write_bytes
     monkeypatch.setattr(pictures, "write_bytes", write)

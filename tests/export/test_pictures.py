@@ -10,7 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from export_scene import HEIGHT, NUM_FRAMES, WIDTH, panoramas, reconstruction
+from export_scene import HEIGHT, NUM_FRAMES, WIDTH, cube_frames, panoramas, reconstruction
+from scipy.spatial.transform import Rotation
+from shard_jobs import Parts
 
 from factors.sphere_field import num_harmonics
 from gsba.camera.lens import ONE_CENTRE, Lenses
@@ -24,6 +26,14 @@ from gsba.types import FrameSet
 FORMATS = [ExportFormat.COLMAP, ExportFormat.COLMAP_FLAT, ExportFormat.NERFSTUDIO]
 BENT = tuple(0.004 * np.random.default_rng(3).normal(size=num_harmonics(3)))
 TWO = Lenses(np.array([0.01, -0.02, 0.2]), band_rad=np.deg2rad(3))
+MOVING = replace(
+    TWO,
+    sweeps=np.array([[0, 1.0, 0], [0, 1.0, 0]]),
+    twists=0.02 * np.random.default_rng(4).normal(size=(NUM_FRAMES, 6)),
+    axes=Rotation.from_rotvec(
+        0.1 * np.random.default_rng(5).normal(size=(NUM_FRAMES, 3))
+    ).as_matrix(),
+)
 PADDED = 3 * (HEIGHT + 8) * (WIDTH + 8)  # bytes
 
 
@@ -138,6 +148,38 @@ def _peak(call: Callable[[], object]) -> int:
         return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("kind", "lenses", "to", "chosen"),
+    [
+        ("plain", ONE_CENTRE, "nerfstudio", "auto"),
+        ("corrected", ONE_CENTRE, "colmap-erp", "auto"),
+        ("masks of their own", ONE_CENTRE, "colmap-flat", "auto"),
+        ("masks of their own", MOVING, "colmap", "lenses"),
+        ("masks of their own", MOVING, "colmap-erp", "panorama"),
+        ("faces", ONE_CENTRE, "colmap", "auto"),
+    ],
+)
+def test_parts_write_what_the_whole_does(tmp_path, kind, lenses, to, chosen):
+    frames = cube_frames(tmp_path / "cube") if kind == "faces" else _frames(tmp_path, kind)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    options = {"lenses": lenses, "images": chosen}
+    scene = reconstruction()
+    origins = lenses.origins(scene.observation_bearings, scene.observation_frames)
+    scene = replace(scene, observation_origins=origins)
+    export(scene, frames, whole, ExportFormat(to), **options)
+    export(scene, frames, parts, ExportFormat(to), **options, workers=Parts(1))
+    assert _written(whole) == _written(parts)
+
+
+def test_whoever_is_late_makes_no_folders(tmp_path):
+    """A worker whose frames another one has written meanwhile, or that does not see the disk."""
+    files = pictures.Files(tmp_path / "out", ("",), "images/{name}{suffix}", "")
+    writer = images.panorama_writer(files, _frames(tmp_path, "plain"))
+    with pytest.raises(GsbaError, match=r"cannot write .*out/images/frame_0000.jpg: No such file"):
+        pictures.Pictures(_frames(tmp_path, "plain"), [writer])(0)
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_one_format_cannot_take_leaves_none_written(tmp_path):

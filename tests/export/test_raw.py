@@ -10,7 +10,8 @@ from PIL import Image
 from two_fisheyes import made_pair, picture, write
 
 from gsba.export.images import write_pictures
-from gsba.export.raw import raw_writer
+from gsba.export.pictures import Files
+from gsba.export.raw import RawPictures
 from gsba.types import FrameSet
 
 PAIR = made_pair(120)
@@ -36,13 +37,8 @@ def _frames(folder: Path, layout: str) -> tuple[FrameSet, list[np.ndarray]]:
 def test_each_lens_has_a_picture_of_its_own(tmp_path: Path, layout: str) -> None:
     frames, shown = _frames(tmp_path, layout)
     suffix = "jpg" if layout == "webp" else "png"
-    writer = raw_writer(
-        frames,
-        lambda f, lens: tmp_path / f"out{lens}.{suffix}",
-        lambda f, lens: tmp_path / f"mask{lens}.png",
-        link=True,
-    )
-    write_pictures(frames, [writer])
+    files = Files(tmp_path, "01", "out{view}{suffix}", "mask{view}.png")
+    write_pictures(frames, [RawPictures(files, link=True)])
     for lens, wanted in enumerate(shown):
         read = pycolmap.Bitmap.read(tmp_path / f"out{lens}.{suffix}", True)
         assert read is not None

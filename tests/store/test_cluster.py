@@ -4,11 +4,12 @@ import json
 import sys
 import types
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+from dask_workers import some_workers
 from shard_jobs import Squares
 from tiny_run import Case
 
@@ -24,27 +25,9 @@ distributed = pytest.importorskip("distributed", reason="needs the extra cluster
 pytestmark = pytest.mark.slow
 
 
-@contextmanager
-def _client(num: int = 2, **settings: object) -> Iterator["distributed.Client"]:
-    """Of a scheduler with worker processes of one thread each, under settings of Dask."""
-    import dask
-
-    with (
-        dask.config.set({key.replace("__", "."): value for key, value in settings.items()}),
-        distributed.LocalCluster(
-            n_workers=num,
-            threads_per_worker=1,
-            dashboard_address=":0",
-            silence_logs=50,
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        yield client
-
-
 @pytest.fixture(scope="module")
 def client() -> Iterator["distributed.Client"]:
-    with _client() as client:
+    with some_workers() as client:
         yield client
 
 
@@ -75,13 +58,15 @@ def test_a_run_is_the_same_to_the_byte(case: Case, client, tmp_path: Path) -> No
     """All stages that are shared out, with people to be masked; and nothing is left behind."""
     case.refine(tmp_path / "here", masks="distractors")
     case.refine(tmp_path / "there", masks="distractors", client=client)
-    for name in ("trajectory.tum", "poses.csv", "points.ply"):
+    model = ["sparse/0/images.bin", "images/front/000003.jpg", "masks/up/000007.jpg.png"]
+    for name in ("trajectory.tum", "poses.csv", "points.ply", *(f"colmap/{n}" for n in model)):
         here, there = ((tmp_path / run / name).read_bytes() for run in ("here", "there"))
         assert here == there, name
     assert not list((tmp_path / "there" / "stages" / "shards").glob("*"))
     stages = json.loads((tmp_path / "there" / "report.json").read_text())["stages"]
     shared = {stage["name"].rstrip("12") for stage in stages if stage["workers"]}
     assert shared >= {"features", "neighbours", "adjacent", "near", "align", "distractors"}
+    assert "export-colmap" in shared
 
 
 @pytest.mark.parametrize("mishap", ["dies", "dies_while_writing"])
@@ -95,7 +80,7 @@ def test_killed_workers_cost_time_alone(client, tmp_path: Path, mishap: str) -> 
 def test_a_worker_lost_from_sight_is_replaced(tmp_path: Path) -> None:
     """Compiled code that holds the interpreter's lock keeps it from answering."""
     job = _squares(tmp_path, "keeps_the_lock", 4)
-    with _client(distributed__scheduler__worker_ttl="2s") as client:
+    with some_workers(distributed__scheduler__worker_ttl="2s") as client:
         _assert_squares(list(_cluster(client, tmp_path).map_shards(job)))
 
 
@@ -111,7 +96,7 @@ def test_a_shard_that_kills_every_worker_is_named(tmp_path: Path, monkeypatch) -
     monkeypatch.setattr(workers, "_ATTEMPTS", 2)
     job = Squares(np.arange(9), tmp_path / "log", "always dies", 4)
     with (
-        _client(distributed__scheduler__allowed_failures=0) as client,
+        some_workers(distributed__scheduler__allowed_failures=0) as client,
         pytest.raises(GsbaError, match="every worker dies on squares, 4 to 5"),
     ):
         list(_cluster(client, tmp_path).map_shards(job))
@@ -119,20 +104,20 @@ def test_a_shard_that_kills_every_worker_is_named(tmp_path: Path, monkeypatch) -
 
 def test_workers_do_not_pause_for_memory(tmp_path: Path) -> None:
     """One that does would wait for ever: compiled code and caches do not give it back."""
-    with _client(1, distributed__worker__memory__pause=0.001) as client:
+    with some_workers(1, distributed__worker__memory__pause=0.001) as client:
         _assert_squares(list(_cluster(client, tmp_path).map_shards(_squares(tmp_path))))
 
 
 def test_a_disk_that_refuses_is_said_and_the_rest_is_kept(tmp_path: Path) -> None:
     job = _squares(tmp_path, "finds_no_space", 4)
     with (
-        _client(1) as client,
+        some_workers(1) as client,
         pytest.raises(GsbaError, match=r"cannot write .*shards.*File too large"),
     ):
         list(_cluster(client, tmp_path).map_shards(job))
     assert not list(tmp_path.rglob(".gsba-tmp-*"))
     before = job.done()
-    with _client(1) as client:
+    with some_workers(1) as client:
         _assert_squares(list(_cluster(client, tmp_path).map_shards(job)))
     again = job.done()
     assert again.count(0) == before.count(0) == 1  # finished before, not done again
@@ -164,7 +149,7 @@ def test_a_worker_that_asks_for_others_does_not_wait_for_itself(tmp_path: Path) 
         cluster = Cluster(get_client(), Path(folder) / "shards", Path(folder))
         return [int(one[0]) for one in cluster.map_shards(job)]
 
-    with _client(1) as client:
+    with some_workers(1) as client:
         assert client.submit(nested, str(tmp_path)).result(60) == [n * n for n in range(9)]
 
 
