@@ -12,7 +12,7 @@ from gsba.features import detection
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.loop_closure import loops
 from gsba.loop_closure.pose_graph import Loop
-from gsba.loop_closure.retrieval import _aggregate, looks_of
+from gsba.loop_closure.retrieval import _aggregate, _drawn, looks_of
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.similarity import relative_map
 from gsba.store.shards import Threads
@@ -115,6 +115,11 @@ def test_a_map_torn_in_two_is_joined_where_it_meets(heading: float) -> None:
     rays = bearings_of_each(solved.landmarks.points_world[tracks.points], solved, tracks)
     seen = keypoints.bearings_rig[keypoints.rows(tracks)]
     assert np.median(np.linalg.norm(rays - seen, axis=1)) < 2e-3
+
+
+def test_descriptors_that_are_drawn_hold_no_others() -> None:
+    drawn = _drawn(np.eye(50, dtype=np.float32), 3, share=4, seed=0)
+    assert drawn.shape == (4, 50) and drawn.base is None
 
 
 def bearings_of_each(points: np.ndarray, solved: Solution, tracks: Tracks) -> np.ndarray:
