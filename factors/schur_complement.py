@@ -77,9 +77,14 @@ class SchurComplement:
             over = by_group.over
             sums = np.empty((len(over.frames), 3, GROUP_DIM))
             sum_over_groups(run, by_group.order, over, labels, bases, projected, sums)
-            rows = balanced_ranges(over.row_offsets)
+            _take_run(over, sums, target, self.num_threads)
 
-            def work(i: int, over=over, sums=sums, rows=rows) -> None:
-                take_groups(*rows[i], over, sums, target)
 
-            run_in_threads(work, len(rows), self.num_threads)
+def _take_run(over: Visits, sums: np.ndarray, target: np.ndarray, num_threads: int) -> None:
+    """Take the landmarks of a run from what groups feel, some rows of these at a time."""
+    rows = balanced_ranges(over.row_offsets)
+
+    def work(i: int) -> None:
+        take_groups(*rows[i], over, sums, target)
+
+    run_in_threads(work, len(rows), num_threads)
