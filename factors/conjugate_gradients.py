@@ -16,6 +16,7 @@ def conjugate_gradients(
     precondition: Callable[[np.ndarray], np.ndarray],
     tolerance: float,
     max_iterations: int,
+    truncate: bool = False,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Solve H x = right for several right sides at once. Hestenes and Stiefel, 1952.
 
@@ -25,6 +26,7 @@ def conjugate_gradients(
         precondition: about H^-1 applied to (N, 6, R), symmetric positive definite.
         tolerance: of each residual in the preconditioner's norm, part of what it is at x = 0.
         max_iterations: products with H.
+        truncate: take what they have by then: less than asked, yet nearer than x = 0.
 
     Returns:
         x (N, 6, R) and the residual right - H x; None where they do not get that far, or where H
@@ -51,7 +53,7 @@ def conjugate_gradients(
             return x, residual
         direction *= squared / before
         direction += better
-    return None
+    return (x, residual) if truncate else None
 
 
 def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -195,7 +195,12 @@ class ReducedSystem:
         return steps
 
     def _solve_held(
-        self, added: np.ndarray, right: np.ndarray, tolerance: float, max_iterations: int
+        self,
+        added: np.ndarray,
+        right: np.ndarray,
+        tolerance: float,
+        max_iterations: int = _HELD_ITERATIONS,
+        truncate: bool = False,
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Solutions (N, 6, R) with `added (N, 6)` to the diagonal, and what they leave of `right`.
 
@@ -225,7 +230,9 @@ class ReducedSystem:
         def precondition(residual: np.ndarray) -> np.ndarray:
             return inverses @ residual + coarse.solve(residual)
 
-        return conjugate_gradients(multiply, right, precondition, tolerance, max_iterations)
+        return conjugate_gradients(
+            multiply, right, precondition, tolerance, max_iterations, truncate
+        )
 
     def _step_held(self, added: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Step by the groups' system of one before, unless a new one would have taken less."""
@@ -235,7 +242,7 @@ class ReducedSystem:
             if found is not None:
                 return found
             self._coarse = None
-        found = self._solve_held(added, right, _STEP_TOLERANCE, _HELD_ITERATIONS)
+        found = self._solve_held(added, right, _STEP_TOLERANCE, truncate=True)
         self._max_iterations = 2 * self._iterations
         return found
 
@@ -353,7 +360,7 @@ class ReducedSystem:
                 right[rows] += complement.draw(int(rng.integers(1 << 62)), _DRAWN_AT_ONCE)
             errors = rng.normal(size=(len(self._jacobian.indptr) - 1, _DRAWN_AT_ONCE))
             np.add.at(right, (self._column_blocks, self._column_offsets), self._jacobian.T @ errors)
-            found = self._solve_held(added, right, _DRAW_TOLERANCE, _HELD_ITERATIONS)
+            found = self._solve_held(added, right, _DRAW_TOLERANCE)
             if found is None:
                 return None
             draws.append(np.moveaxis(found[0], 2, 0))

@@ -104,6 +104,11 @@ def test_conjugate_gradients_reach_the_solution_and_say_what_is_left() -> None:
     assert np.allclose(flat(rough[1]), left, atol=1e-12)
     assert np.linalg.norm(residual) < np.linalg.norm(left) < 0.1 * np.linalg.norm(right)
     assert conjugate_gradients(*given, 1e-12, 2) is None
+    short = conjugate_gradients(*given, 1e-12, 2, truncate=True)
+    assert short is not None
+    assert np.allclose(flat(short[1]), flat(right) - system.matrix @ flat(short[0]), atol=1e-12)
+    model = 0.5 * flat(short[0]) * (system.matrix @ flat(short[0])) - flat(short[0]) * flat(right)
+    assert np.all(model.sum(axis=0) < 0)  # lower than where nothing is done
     assert conjugate_gradients(lambda x: -times(x), *given[1:], 1e-2, 100) is None
     nothing = conjugate_gradients(times, 0 * right, given[2], 1e-2, 100)
     assert nothing is not None and not np.any(nothing[0])
