@@ -132,7 +132,7 @@ class PatchSet:
             rows: (N,) of templates.
             variances: (N,) of the residual, in the template's grey values.
         """
-        return self.templates.inverses[rows][:, :2, :2] * np.asarray(variances)[:, None, None]
+        return self.templates.inverses[:, :2, :2][rows] * np.asarray(variances)[:, None, None]
 
 
 def expect(templates: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> Sightings:

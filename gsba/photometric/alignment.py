@@ -16,6 +16,8 @@ from gsba.photometric.references import references, visible_frames
 from gsba.store.shards import Workers
 from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
 
+_UNCERTAIN = "position too uncertain"
+_AT_ONCE = 1 << 17  # sightings that are judged together: some 80 MB
 _LEAST_SIGMA = 0.03  # pixels: what sampling and a plane for the surface cost the best of patches
 
 _STRAIGHT = SphereField.none()
@@ -158,6 +160,26 @@ def _accepted(
     settings: PatchSettings,
 ) -> tuple[np.ndarray, _Observed, dict[str, int]]:
     """Rows (N,) of the sightings to believe, as observations, and why others fell."""
+    parts, dropped = [], dict.fromkeys([*REASONS.values(), _UNCERTAIN], 0)
+    for first in range(0, max(len(seeing), 1), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        there = Sightings(*(array[some] for array in sightings))
+        kept, bearings, covariances = _believed(patches, there, pixel, settings, dropped)
+        parts.append((first + kept, bearings, covariances))
+    kept, bearings, covariances = (np.concatenate(column) for column in zip(*parts, strict=True))
+    found = _Observed(sightings.templates[kept], seeing[kept], bearings, covariances)
+    return kept, found, dropped
+
+
+def _believed(
+    patches: PatchSet,
+    sightings: Sightings,
+    pixel: float,
+    settings: PatchSettings,
+    dropped: dict[str, int],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows (N,) of the sightings to believe, their bearings (N, 3) and covariances (N, 2, 2); why
+    others fell is added to what was dropped."""
     bearings, by_shift = found_at(sightings)
     axes = tangent_basis(bearings) @ by_shift
     of_shifts = patches.shift_covariances(sightings.templates, sightings.variances)
@@ -169,14 +191,13 @@ def _accepted(
     aligned = sightings.states == ALIGNED
     tests["look different"] &= ~aligned | (sightings.scores > settings.min_zncc)
     tests["found too far off"] &= ~aligned | (shifts < settings.max_shift_px * pixel)
-    tests["position too uncertain"] = ~aligned | (worst < settings.max_sigma_px * pixel)
-    left, dropped = np.ones(len(seeing), bool), {}
+    tests[_UNCERTAIN] = ~aligned | (worst < settings.max_sigma_px * pixel)
+    left = np.ones(len(bearings), bool)
     for reason, passed in tests.items():
-        dropped[reason] = int(np.count_nonzero(left & ~passed))
+        dropped[reason] += int(np.count_nonzero(left & ~passed))
         left &= passed
     kept = np.flatnonzero(left)
-    found = _Observed(sightings.templates[kept], seeing[kept], bearings[kept], covariances[kept])
-    return kept, found, dropped
+    return kept, bearings[kept], covariances[kept]
 
 
 def _at_hosts(
