@@ -80,6 +80,7 @@ def align(
     frame_jobs.align(name, greys, seeing, patches, sightings, settings, workers)
     kept, found, dropped = _accepted(patches, sightings, seeing, 2 * np.pi / greys.width, settings)
     at_hosts = _at_hosts(patches, sightings, kept, hosts, origins, spreads)
+    del patches, sightings, origins, spreads  # gigabytes, of thousands of frames
     former = _former(landmarks, keypoints, noise, [found, at_hosts], greys.num_frames)
     counts = Counts(len(seeing), len(found.points), "observations", dropped)
     colors = keypoints.colors[keypoints.rows(landmarks.tracks)[rows]]
