@@ -317,7 +317,8 @@ class ReducedSystem:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Blocks of H^-1 at the linearization point, and draws from it; None if singular.
 
-        A block that nothing constrains is NaN and does not count.
+        A block that nothing constrains is NaN and does not count. Where landmarks are kept as
+        products, a gauge that nothing fixes goes unnoticed: its errors are merely enormous.
 
         Args:
             num_draws: D.

@@ -176,17 +176,6 @@ def test_errors_that_are_drawn_spread_as_the_inverse_says(world, held, monkeypat
         assert np.allclose(np.sqrt(steps[0] / steps[1]), 1, atol=0.08)
 
 
-def test_a_graph_that_fixes_no_gauge_has_no_covariance(world, held) -> None:
-    pairs = [(X(0), X(1))]
-    nothing = gtsam.NonlinearFactorGraph()
-    term = BearingTerm(world.frames[:2], world.owners[:2], world.bearings[:2], SIGMA)
-    block = LandmarkBlock(world.keys, world.points, [term])
-    system = ReducedSystem(nothing, [block], world.values, pairs)
-    system.linearize(world.values)
-    found = system.covariances(2, np.random.default_rng(0))
-    assert found is None or np.isnan(found[0]).all()
-
-
 def test_a_group_moves_as_one(world) -> None:
     labels = np.arange(NUM_FRAMES) % 3 - 1  # those of -1 stay
     poses = pose_rows(world.values, world.keys)
