@@ -100,7 +100,7 @@ class ReducedSystem:
 
     def _fills_in(self, landmarks: Sequence[LandmarkBlock], most: float) -> bool:
         """Whether a factorization takes more operations: squares of how full rows are, at least."""
-        least = max(DIM**3 * len(block.shared) ** 2 / self._num for block in landmarks)
+        least = max(DIM**3 * len(block.shared) ** 2 / max(self._num, 1) for block in landmarks)
         if least > most:
             return True
         self._set_pairs()
