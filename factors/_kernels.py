@@ -151,13 +151,19 @@ def inverse_root(v, damping):
 
 
 @_part
-def invert_symmetric(v, damping):
-    """Inverse (6 values 00 01 02 11 12 22) of a symmetric 3x3 given so, see `inverse_root`."""
-    i00, i10, i20, i11, i21, i22 = inverse_root(v, damping)
+def squared_root(root):
+    """R^T R (6 values 00 01 02 11 12 22) of a lower triangle as of `inverse_root`."""
+    i00, i10, i20, i11, i21, i22 = root
     return (
         i00 * i00 + i10 * i10 + i20 * i20, i10 * i11 + i20 * i21, i20 * i22,
         i11 * i11 + i21 * i21, i21 * i22, i22 * i22,
     )  # fmt: skip
+
+
+@_part
+def invert_symmetric(v, damping):
+    """Inverse (6 values 00 01 02 11 12 22) of a symmetric 3x3 given so, see `inverse_root`."""
+    return squared_root(inverse_root(v, damping))
 
 
 @_part
@@ -282,7 +288,8 @@ def linearize_range(
                 for c in range(6):
                     H[i, c] += ai * a[c] + bi * b[c]
         point_costs[j] = cost
-        root, inverse = inverse_root(normal, 0.0), invert_symmetric(normal, 0.0)
+        root = inverse_root(normal, 0.0)
+        inverse = squared_root(root)
         for c in range(6):
             roots[row, c], inverses[row, c] = root[c], inverse[c]
         x, y, z = times_symmetric(inverse, normal[6], normal[7], normal[8])

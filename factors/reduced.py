@@ -91,20 +91,18 @@ class ReducedSystem:
         self._cholesky: BlockCholesky | None = None
         self._factorized = False  # whether the Cholesky factor is of some system met before
         landmarks = [block for block in self._blocks if isinstance(block, LandmarkBlock)]
-        can_hold = landmarks and (len(landmarks) == len(self._blocks) or not pairs)
-        if can_hold and self._fills_in(landmarks, _MOST_OF_INVERSE if pairs else _MOST_OPERATIONS):
+        can_hold = len(landmarks) > 0 and (len(landmarks) == len(self._blocks) or not pairs)
+        most = _MOST_OF_INVERSE if pairs else _MOST_OPERATIONS
+        # At least, a factorization takes the squares of how full rows are.
+        fullest = max((len(block.shared) for block in landmarks), default=0)
+        fills_in = can_hold and DIM**3 * fullest**2 > most * self._num
+        if not fills_in:
+            self._set_pairs()
+            fills_in = can_hold and self._factor().num_operations > most
+        if fills_in:
             self._hold_landmarks()
         else:
-            self._set_pairs()
             self._set_cholesky()
-
-    def _fills_in(self, landmarks: Sequence[LandmarkBlock], most: float) -> bool:
-        """Whether a factorization takes more operations: squares of how full rows are, at least."""
-        least = max(DIM**3 * len(block.shared) ** 2 / max(self._num, 1) for block in landmarks)
-        if least > most:
-            return True
-        self._set_pairs()
-        return self._factor().num_operations > most
 
     def _factor(self) -> BlockCholesky:
         if self._cholesky is None:
