@@ -4,14 +4,17 @@
     python -m benchmarks.laps WALK --out WORK [--frames 200 400 800] [--markdown FILE]
 
 Each row is a whole run (`gsba refine`, no dataset) of the walk's first frames from a spoiled
-trajectory. CPU seconds are the stages' own, of the run's report; "solving" is what grows with the
-places' visits: `closed`, `refined`, `aligned`, `reconstruction`.
+trajectory whose steps are as good at any length: drift grows as the root of the path. CPU seconds
+are the stages' own, of the run's report; "solving" is what grows with the places' visits:
+`closed`, `refined`, `aligned`, `reconstruction`.
 """
 
 import argparse
 import json
 import sys
 from pathlib import Path
+
+import numpy as np
 
 from benchmarks.common import measure, refine_command, write_table
 from gsba.demo.degrade import degrade
@@ -26,6 +29,7 @@ GROUPS = {
     ),
     "patches": ("align",),
 }  # fmt: skip
+DRIFT_OF = 200  # frames of a walk whose drift is that of `degrade`
 
 
 def cut(walk: Path, num: int, folder: Path, seed: int) -> tuple[Path, Path, Path]:
@@ -41,7 +45,17 @@ def cut(walk: Path, num: int, folder: Path, seed: int) -> tuple[Path, Path, Path
     whole = read_trajectory(walk / "groundtruth.tum")
     truth = Trajectory(whole.timestamps[:num], whole.world_T_rigs[:num])
     write_tum(folder / "truth.tum", truth)
-    write_tum(folder / "slam.tum", degrade(truth, seed, num_jumps=2, num_lost=num // 50))
+    growth = np.sqrt(num / DRIFT_OF)
+    spoiled = degrade(
+        truth,
+        seed,
+        rotation_drift_deg=2.0 * growth,
+        translation_drift=0.015 / growth,  # of the path's length
+        scale_drift=0.02 * growth,
+        num_jumps=2,
+        num_lost=num // 50,
+    )
+    write_tum(folder / "slam.tum", spoiled)
     return images, folder / "slam.tum", folder / "truth.tum"
 
 
