@@ -100,7 +100,8 @@ def find_walk(name: str, data: Path, out: Path) -> Walk:
         raise GsbaError(f"{folder} is absent")
     truth, mask = folder / "groundtruth.tum", folder / "mask.png"
     reference = truth if truth.exists() else folder / "peer_colmap.tum"
-    return Walk(name, folder, RECORDED[name], reference, mask if mask.exists() else None)
+    trajectories = RECORDED.get(name, ("slam.tum",))
+    return Walk(name, folder, trajectories, reference, mask if mask.exists() else None)
 
 
 class Bench:
@@ -232,7 +233,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     every = ",".join((*RECORDED, *WALKS))
     parser.add_argument("--data", type=Path, default=DATA, help="recorded sequences")
-    parser.add_argument("--sequences", type=_split, default=every, help=every)
+    others = f"{every}, or another folder of --data with images, slam.tum and groundtruth.tum"
+    parser.add_argument("--sequences", type=_split, default=every, help=others)
     parser.add_argument("--peers", type=_split, default=",".join(MODES), help=",".join(MODES))
     parser.add_argument("--no-peers", dest="peers", action="store_const", const=[])
     sets = ",".join(FACTOR_SETS)
@@ -243,7 +245,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
-    known = ((options.sequences, every), (options.peers, ",".join(MODES)), (options.factors, sets))
+    known = ((options.peers, ",".join(MODES)), (options.factors, sets))
     for asked, allowed in known:
         if unknown := set(asked) - set(allowed.split(",")):
             parser.error(f"{', '.join(sorted(unknown))}: use some of {allowed}")
