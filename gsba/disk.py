@@ -1,10 +1,14 @@
 """Files written beside their place and renamed into it; failures of the disk in one line."""
 
 import errno
+import fcntl
 import json
+import logging
+import os
+import shutil
 import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +16,8 @@ from gsba.log import GsbaError
 
 if TYPE_CHECKING:
     import numpy as np
+
+logger = logging.getLogger(__name__)
 
 _TEMPORARY = ".gsba-tmp-"  # prefix of files still being written
 
@@ -96,3 +102,38 @@ def remove_temporaries(folder: Path) -> None:
     """Delete what a killed process left half-written under `folder`."""
     for path in folder.rglob(f"{_TEMPORARY}*"):
         path.unlink(missing_ok=True)
+
+
+def hold_folder(folder: Path) -> int:
+    """Hold a folder against other processes, until what is returned is closed or this one dies.
+
+    The kernel keeps the lock, so it is never stale.
+
+    Returns:
+        File descriptor of the lock.
+    Raises:
+        GsbaError: a live process holds it.
+    """
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(lock)
+        raise GsbaError(
+            f"{folder} is in use by another gsba process: wait for it to end"
+        ) from error
+    except OSError as error:  # some network file systems cannot lock
+        logger.warning("%s cannot be locked (%s): let no second process use it", folder, error)
+    return lock
+
+
+def remove_unheld(folders: Iterable[Path]) -> None:
+    """Delete folders that no process holds any more, see `hold_folder`."""
+    for folder in folders:
+        with suppress(OSError):
+            lock = os.open(folder, os.O_RDONLY)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder, ignore_errors=True)
+            finally:
+                os.close(lock)

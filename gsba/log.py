@@ -16,6 +16,10 @@ class GsbaError(Exception):
     """Input or setting that cannot be used: one line saying what, where and what to do."""
 
 
+class StoppedError(GsbaError):
+    """Work that something outside ended, and that goes on where it stopped if run again."""
+
+
 def show_log(level: int = logging.INFO) -> None:
     """Send the log of gsba and its factors to stderr, below the progress bar on a terminal.
 

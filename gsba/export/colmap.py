@@ -186,7 +186,7 @@ def write_model(
             model.add_image(image)
         model.register_frame(f + 1)
     _add_points(model, reconstruction, images, rows)
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     model.write_binary(folder)
 
 

@@ -8,34 +8,38 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gsba.disk import disk_errors, remove_temporaries
-from gsba.log import GsbaError
+from gsba.disk import disk_errors, hold_folder, remove_temporaries, remove_unheld
+from gsba.log import GsbaError, StoppedError
 from gsba.version import __version__
 
 MARKER = "export.json"  # {"gsba": version, "format": name, "wrote": top-level entries}
 
 
 @contextmanager
-def output_folder(out: Path, to: str) -> Iterator[Path]:
+def output_folder(out: Path, to: str, key: str) -> Iterator[Path]:
     """Folder to write an export into; it becomes `out` when the block ends without an exception.
 
-    An earlier export at `out` is replaced, and stays as it is until then. After an error or an
-    interrupt nothing is left behind.
+    An earlier export at `out` is replaced, and stays as it is until then. After an error nothing
+    is left behind. What an interrupt leaves is hidden beside `out`: the next call with the same
+    key gets the folder as it was, one with another key has it deleted.
 
     Args:
         out: final folder; missing parents are made.
         to: name of the format, for the marker.
+        key: of all that pictures in the folder depend on.
     Raises:
-        GsbaError: `out` is something else than an earlier export, or the disk refuses.
+        GsbaError: `out` is something else than an earlier export, is being written by another
+            process, or the disk refuses.
     """
     out = out.resolve()
     with disk_errors(out):
         _require_replaceable(out)
         out.parent.mkdir(parents=True, exist_ok=True)
-        _remove_stale(out)
-        # A name that is never used again: workers elsewhere may still be at an earlier one.
-        partial = out.with_name(f".{out.name}.partial-{os.getpid()}-{uuid.uuid4().hex[:8]}")
-        partial.mkdir()
+        partial = out.with_name(f".{out.name}.partial-{key[:16]}")
+        partial.mkdir(exist_ok=True)
+        lock = hold_folder(partial)
+        remove_unheld(set(out.parent.glob(f".{out.name}.partial-*")) - {partial})
+        finished = True
         try:
             yield partial
             wrote = sorted([entry.name for entry in partial.iterdir()] + [MARKER])
@@ -44,8 +48,13 @@ def output_folder(out: Path, to: str) -> Iterator[Path]:
             _require_replaceable(out)
             _swap_in(partial, out)
             remove_temporaries(out)  # of workers that were killed
+        except BaseException as error:
+            finished = isinstance(error, Exception) and not isinstance(error, StoppedError)
+            raise
         finally:
-            shutil.rmtree(partial, ignore_errors=True)
+            if finished:
+                shutil.rmtree(partial, ignore_errors=True)
+            os.close(lock)
 
 
 def _require_replaceable(out: Path) -> None:
@@ -70,7 +79,7 @@ def _swap_in(partial: Path, out: Path) -> None:
     if not out.exists():
         partial.rename(out)
         return
-    old = out.with_name(f".{out.name}.partial-{os.getpid()}-old")
+    old = out.with_name(f".{out.name}.partial-old-{uuid.uuid4().hex[:8]}")
     out.rename(old)
     try:
         partial.rename(out)
@@ -78,22 +87,3 @@ def _swap_in(partial: Path, out: Path) -> None:
         old.rename(out)
         raise
     shutil.rmtree(old, ignore_errors=True)
-
-
-def _remove_stale(out: Path) -> None:
-    """Delete what killed exports to the same place left half-written."""
-    prefix = f".{out.name}.partial-"
-    for path in out.parent.glob(f"{prefix}*"):
-        pid = path.name.removeprefix(prefix).partition("-")[0]
-        if pid.isdigit() and (int(pid) == os.getpid() or not _is_alive(int(pid))):
-            shutil.rmtree(path, ignore_errors=True)
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True

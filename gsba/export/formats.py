@@ -15,8 +15,10 @@ from gsba.export.images import write_pictures
 from gsba.export.pictures import FrameWriter
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement
-from gsba.store.shards import Workers
+from gsba.store.shards import Workers, content_digest
+from gsba.store.store import fingerprint
 from gsba.types import FrameSet, PoseStatus, Reconstruction
+from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
 
@@ -64,7 +66,8 @@ def export(
 
     Raises:
         GsbaError: `out` is in use or not seen by a worker, the format does not fit the frames, or
-            the disk refuses; nothing is left behind then.
+            the disk refuses; nothing is left behind then. An interrupted export goes on where it
+            was when it is called again in the same way.
     """
     given = reconstruction, frames, {to: out}, face_size, placement, link, lenses, images
     export_all(*given, workers)
@@ -102,10 +105,14 @@ def export_all(
     placement = placement or Placement()
     reconstruction = placement.apply(reconstruction)
     seen_by, z_up = lenses.scaled(placement.similarity.scale), placement.up == "z"
+    files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)
+    read = fingerprint(path for path in files if path and path.exists())  # not all formats do
+    key = __version__, reconstruction, frames, read, face_size, z_up, link, seen_by, images
     writers: list[FrameWriter] = []
     with ExitStack() as folders:
         for to, out in outs.items():
-            partial = folders.enter_context(output_folder(out, to.value))
+            folder = output_folder(out, to.value, content_digest(to.value, *key))
+            partial = folders.enter_context(folder)
             given = partial, reconstruction, frames, to
             if images == "fisheye":
                 writers += _write_raw(*given, z_up, link, seen_by)

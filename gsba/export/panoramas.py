@@ -29,7 +29,7 @@ def write_with_poses(
     and into `masks` is to be written frame by frame."""
     write_poses(partial, reconstruction, frames)
     images = partial / "images"
-    images.mkdir()
+    images.mkdir(exist_ok=True)
     with (images / "timestamps.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["name", "timestamp"])

@@ -80,6 +80,10 @@ class FrameWriter:
         """Where its masks go; [] = there are none."""
         return [self.files.folder / name for name in self.files.masks(shown.frames, shown.f)]
 
+    def wrote(self, shown: "Shown") -> bool:
+        """Whether an export that was stopped has written all of this frame."""
+        return all(path.exists() for path in (*self.images(shown), *self.masks(shown)))
+
 
 class Pictures:
     """The job of writing what several datasets show of each frame.
@@ -106,7 +110,8 @@ class Pictures:
     def __call__(self, item: int) -> None:
         shown = Shown(self, item)
         for writer in self._writers:
-            writer(shown)
+            if not writer.wrote(shown):
+                writer(shown)
 
     def blocks(self) -> Sequence[tuple[int, int]]:
         return even_blocks(len(self.frames))

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from gsba.config import RefineSettings
-from gsba.disk import write_text
-from gsba.log import GsbaError, track
+from gsba.disk import disk_errors, hold_folder, remove_unheld, write_text
+from gsba.log import GsbaError, StoppedError, track
 from gsba.store import shards
 from gsba.store.shards import Job, Manifest, Spent, Workers
 from gsba.types import FrameSet
@@ -83,11 +83,16 @@ def hired(client: "Client | None", out: Path, frames: FrameSet) -> Iterator["Clu
         yield None
         return
     out = out.resolve()
-    folder = out.with_name(f".{out.name}.shards-{uuid.uuid4().hex[:8]}")
+    with disk_errors(out):
+        remove_unheld(out.parent.glob(f".{out.name}.shards-*"))  # of exports that were killed
+        folder = out.with_name(f".{out.name}.shards-{uuid.uuid4().hex[:8]}")
+        folder.mkdir(parents=True)
+        lock = hold_folder(folder)
     try:
         yield Cluster(client, folder, frames.paths[0][0])
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+        os.close(lock)
 
 
 @contextmanager
@@ -296,7 +301,7 @@ class Cluster:
                     break
                 died += 1
                 if died == _ATTEMPTS:
-                    raise GsbaError(
+                    raise StoppedError(
                         f"every worker dies on {shard.items}: look for what ends it in its log; "
                         "too little memory is the usual cause"
                     )
@@ -320,7 +325,7 @@ class Cluster:
             return None
         if error is not None:
             raise error
-        raise GsbaError(
+        raise StoppedError(
             f"lost the scheduler during {shard.items}: run again; what is finished is kept"
         )
 

@@ -4,9 +4,7 @@
 of something else is refused and `--fresh` deletes nothing but our own.
 """
 
-import fcntl
 import json
-import logging
 import os
 import shutil
 from collections.abc import Mapping
@@ -14,12 +12,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gsba.disk import disk_errors, remove_temporaries, write_text
+from gsba.disk import (
+    disk_errors,
+    hold_folder,
+    remove_temporaries,
+    remove_unheld,
+    write_text,
+)
 from gsba.log import GsbaError
 from gsba.store.records import RecordError, typed
 from gsba.version import __version__
-
-logger = logging.getLogger(__name__)
 
 MARKER = "gsba.json"
 STAGES = "stages"  # subfolder of intermediate results; all of it is gsba's
@@ -41,7 +43,7 @@ def open_run_folder(root: Path, origin: Mapping[str, Path], fresh: bool) -> int:
     with disk_errors(root):
         _require_ours_or_empty(root)
         root.mkdir(parents=True, exist_ok=True)
-        lock = _acquire_lock(root)
+        lock = hold_folder(root)
     try:
         marker = read_marker(root)
         if marker and fresh:
@@ -103,24 +105,12 @@ def _require_ours_or_empty(root: Path) -> None:
         raise GsbaError(f"{root} is not empty and not a gsba run: choose another --out")
 
 
-def _acquire_lock(root: Path) -> int:
-    """Lock the folder itself: the kernel frees it when the holder dies, so it is never stale."""
-    lock = os.open(root, os.O_RDONLY)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(lock)
-        raise GsbaError(f"{root} is in use by another gsba process: wait for it to end") from error
-    except OSError as error:  # some network file systems cannot lock
-        logger.warning("%s cannot be locked (%s): let no second process use it", root, error)
-    return lock
-
-
 def _remove_claimed(root: Path, marker: Mapping[str, Any]) -> None:
     """Delete the files gsba wrote, then the folders this left empty."""
     with disk_errors(root):
         if (root / STAGES).exists():
             shutil.rmtree(root / STAGES)
+        remove_unheld(root.glob(".*.partial-*"))  # exports that were stopped
         for name in marker["wrote"]:
             path = root / name
             if root.resolve() not in path.resolve().parents:

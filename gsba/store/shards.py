@@ -239,5 +239,24 @@ def _pickled(value: object) -> bytes:
     return buffer.getvalue()
 
 
+def content_digest(*values: object) -> str:
+    """SHA-256 of values that can be pickled, by what they hold."""
+    buffer = io.BytesIO()
+    digester = _Digester(buffer, protocol=5)
+    digester.fast = True
+    digester.dump(values)
+    return hashlib.sha256(buffer.getvalue()).hexdigest()
+
+
+class _Digester(pickle.Pickler):
+    """As `_Pickler`, with digests in place of arrays."""
+
+    def reducer_override(self, obj: object) -> Any:
+        if isinstance(obj, np.ndarray):
+            content = hashlib.sha256(np.ascontiguousarray(obj).tobytes()).digest()
+            return _array, (obj.dtype.str, obj.shape, content)
+        return NotImplemented
+
+
 def _array(dtype: str, shape: tuple[int, ...], content: bytes) -> np.ndarray:
     return np.frombuffer(bytearray(content), dtype).reshape(shape)
