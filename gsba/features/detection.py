@@ -1,6 +1,5 @@
 """Keypoints on cube faces, as bearings of the rig."""
 
-import ctypes
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -22,10 +21,6 @@ class FaceKeypoints:
     sigmas_px: np.ndarray  # (K,) float64, per-axis localisation noise, face pixels
     descriptors: np.ndarray  # (K, D)
     scores: np.ndarray | None = None  # (K,) float32, a network's confidence
-
-
-# Parameters of mallopt(3), from malloc.h.
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
 
 class Extractor(Protocol):
@@ -63,18 +58,6 @@ class SiftExtractor:
         sizes = np.array([k.size for k in keypoints])
         sigmas = np.hypot(self._settings.sigma_px, self._settings.sigma_per_size * sizes)
         return FaceKeypoints(pixels, sigmas, _root_sift(descriptors))
-
-
-def keep_freed_memory() -> None:
-    """Let glibc hold on to freed blocks instead of returning them to the system at once.
-
-    SIFT's pyramids allocate the same tens of megabytes for every face. Without this, fetching and
-    clearing fresh pages is a third of its time on faces of 600 pixels and more.
-    """
-    libc = ctypes.CDLL(None)
-    if hasattr(libc, "mallopt"):
-        libc.mallopt(_M_TRIM_THRESHOLD, 1 << 30)
-        libc.mallopt(_M_MMAP_THRESHOLD, 1 << 30)
 
 
 def _root_sift(descriptors: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from gsba.config import RefineSettings
 from gsba.features import detection
 from gsba.features.detection import Extractor
 from gsba.frames import cubemap
+from gsba.frames.buffers import freed_memory_kept
 from gsba.store.shards import StoredRecords
 from gsba.store.store import PerFrame, RunStore, fingerprint
 from gsba.types import Features, FrameSet
@@ -74,7 +75,6 @@ def extract(
         name: of the stage.
         chosen_frames: (F,) bool, frames treated; None = all.
     """
-    detection.keep_freed_memory()
     index = {
         frame: f
         for f, frame in enumerate(frames.names)
@@ -89,4 +89,5 @@ def extract(
     relevant = chosen.model_dump(exclude={"weights", "accept_noncommercial", "download"})
     cut = [] if frames.fisheyes is None else [list(map(asdict, frames.fisheyes))]
     key = [settings.cubemap, relevant, fingerprint(files), *cut]
-    return store.per_frame(name, key, inputs, compute, Features)
+    with freed_memory_kept():
+        return store.per_frame(name, key, inputs, compute, Features)
