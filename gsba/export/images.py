@@ -25,11 +25,11 @@ from gsba.camera.rig import CubeRig
 from gsba.camera.views import Scenes, View, ViewCutter
 from gsba.disk import atomic_write
 from gsba.export.pictures import Files, FrameWriter, Pictures, Shown
-from gsba.frames.buffers import give_back_freed_memory
 from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.files import goes_out_as_it_is
 from gsba.frames.pixels import load_faces
 from gsba.log import GsbaError
+from gsba.memory import give_back_freed_memory
 from gsba.store.shards import Threads, Workers
 from gsba.types import FACES, FrameSet
 

@@ -11,7 +11,7 @@ from gsba.config import RefineSettings
 from gsba.features import detection
 from gsba.features.detection import Extractor
 from gsba.frames import cubemap
-from gsba.frames.buffers import freed_memory_kept
+from gsba.memory import freed_memory_kept
 from gsba.store.shards import StoredRecords
 from gsba.store.store import PerFrame, RunStore, fingerprint
 from gsba.types import Features, FrameSet

@@ -25,6 +25,7 @@ from pydantic import BaseModel
 
 from gsba.disk import write_text
 from gsba.log import GsbaError
+from gsba.memory import give_back_freed_memory
 from gsba.store.folder import MARKER, STAGES, claim, is_run_folder, open_run_folder
 from gsba.store.records import FORMAT, RecordError, load_record, read_info, save_record, typed
 from gsba.store.shards import Spent, StoredRecords, Threads, Workers, even_blocks
@@ -127,6 +128,7 @@ class RunStore:
         save_record(path, value, dataclasses.asdict(record))
         self._forget_shards()
         self._note(record)
+        give_back_freed_memory()  # of this stage's threads: others do not use it
         return value
 
     def per_frame(
