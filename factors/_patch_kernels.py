@@ -190,7 +190,7 @@ def _sum_inside(coefficients, before, weights, out):
     """Values at places whose samples all lie inside the image."""
     for k in range(len(out)):
         value = np.float32(0.0)
-        first = np.uint32(before[0, k] - 1)  # of no sign: none counts from the end
+        first = np.uint32(before[0, k] - 1)  # unsigned: no check for one that counts from the end
         for i in range(4):
             c = coefficients[np.uint32(before[1, k] - 1 + i)]
             value += weights[4 + i, k] * (

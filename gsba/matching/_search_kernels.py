@@ -72,20 +72,14 @@ def search(first, second, cells, targets, only_targets, direction, limits):
         target = targets[i, 0], targets[i, 1], targets[i, 2]
         circle = _great_circle(bearing, direction, limits)
         rest0 = descriptors0[i, head:]
-        if only_targets:
-            _mark_near(balls, radii, target, limits.point, worth)
-        else:
-            _mark_in_band(balls, radii, bearing, direction, circle, limits, worth)
+        about = target, bearing, direction, circle, limits
+        _mark(balls, radii, only_targets, about, worth)
         for cell in range(len(radii)):
             if not worth[cell] or starts[cell] == starts[cell + 1]:
                 continue
             begin, end = starts[cell], starts[cell + 1]
             members = x[begin:end], y[begin:end], z[begin:end]
-            sizes = no_radii[begin:end]
-            if only_targets:
-                _mark_near(members, sizes, target, limits.point, marks)
-            else:
-                _mark_in_band(members, sizes, bearing, direction, circle, limits, marks)
+            _mark(members, no_radii[begin:end], only_targets, about, marks)
             for j in range(begin, end):
                 if not marks[j - begin]:
                     continue
@@ -95,7 +89,7 @@ def search(first, second, cells, targets, only_targets, direction, limits):
                 if dot + tails0[i] * tails1[j] < floor:  # Cauchy-Schwarz on the other axes
                     continue
                 rest1 = descriptors1[j, head:]
-                for d in range(dim - head):  # from 0: one that may be negative is looked up
+                for d in range(dim - head):  # an index that might be negative makes it gather
                     dot += rest0[d] * rest1[d]
                 if dot > next0[i]:  # asked here, as calls that pass arrays are dear
                     _offer(best0, top0, next0, i, j, dot, bearings1)
@@ -183,21 +177,17 @@ def _in_band(ball, radius, bearing, direction, circle, limits):
 
 
 @_part
-def _mark_in_band(centres, radii, bearing, direction, circle, limits, marks):
+def _mark(centres, radii, only_targets, about, marks):
     """Flags of the balls around (3, m) that pass; without branches, so that it runs in vectors."""
+    target, bearing, direction, circle, limits = about
     x, y, z = centres
-    for m in range(len(radii)):
-        ball = x[m], y[m], z[m]
-        marks[m] = _in_band(ball, radii[m], bearing, direction, circle, limits)
-
-
-@_part
-def _mark_near(centres, radii, target, reach, marks):
-    """Flags of the balls around (3, m) within reach of a target."""
-    x, y, z = centres
-    for m in range(len(radii)):
-        ball = x[m], y[m], z[m]
-        marks[m] = _distance(target, ball) <= reach + radii[m]
+    if only_targets:
+        for m in range(len(radii)):
+            marks[m] = _distance(target, (x[m], y[m], z[m])) <= limits.point + radii[m]
+    else:
+        for m in range(len(radii)):
+            ball = x[m], y[m], z[m]
+            marks[m] = _in_band(ball, radii[m], bearing, direction, circle, limits)
 
 
 @_part
