@@ -108,11 +108,26 @@ def _pixel_map(origin, spread, half, width, height, nodes, quadratics):
 
 
 @_part
-def _sample_grid(coefficients, origin, spread, reach, shift_x, shift_y, nodes, quadratics, out):
+def _scratch(reach):
+    """Room for `_sample_grid`: nodes and quadratics as `_pixel_map` says; places (2, n * n) in half
+    patches, columns and rows (2, n * n) before them, weights (8, n * n) of the samples around."""
+    n = 2 * reach + 1
+    places = np.empty((2, n * n))
+    for i in range(n):
+        for j in range(n):
+            places[0, i * n + j] = (i - reach) / (reach + 1.0)
+            places[1, i * n + j] = (j - reach) / (reach + 1.0)
+    before, weights = np.empty((2, n * n), np.int32), np.empty((8, n * n), np.float32)
+    return np.empty((3, 3, 2)), np.empty((2, 3, 3)), places, before, weights
+
+
+@_part
+def _sample_grid(coefficients, origin, spread, reach, shift_x, shift_y, scratch, out):
     """Values (n * n,) of an n x n grid of unit spacing on the plane patch, off by a shift.
 
     `out[i * n + j]` is at x = i - reach + shift_x, y = j - reach + shift_y, n = 2 reach + 1.
     """
+    nodes, quadratics, places, before, weights = scratch
     height, width = coefficients.shape
     n, half = 2 * reach + 1, reach + 1.0
     if not _pixel_map(origin, spread, half, width, height, nodes, quadratics):
@@ -121,6 +136,12 @@ def _sample_grid(coefficients, origin, spread, reach, shift_x, shift_y, nodes, q
                 x, y = i - reach + shift_x, j - reach + shift_y
                 u, v = _ray_pixel(origin, spread, x, y, width, height)
                 out[i * n + j] = _sample(coefficients, u, v)
+        return
+    inside = _find_taps(
+        quadratics, places, shift_x / half, shift_y / half, width, height, before, weights
+    )
+    if inside:
+        _sum_inside(coefficients, before, weights, out)
         return
     p, q = quadratics[0], quadratics[1]
     for i in range(n):
@@ -131,6 +152,54 @@ def _sample_grid(coefficients, origin, spread, reach, shift_x, shift_y, nodes, q
         for j in range(n):
             y = (j - reach + shift_y) / half
             out[i * n + j] = _sample(coefficients, u0 + y * (u1 + y * u2), v0 + y * (v1 + y * v2))
+
+
+@_part
+def _find_taps(quadratics, places, shift_x, shift_y, width, height, before, weights):
+    """Write columns and rows before places, and weights; False where samples lie beyond an edge.
+
+    Without branches, and without arrays that might be what it writes to: so it runs in vectors.
+    """
+    p, q = quadratics[0], quadratics[1]
+    p00, p01, p02 = p[0, 0] - 0.5, p[0, 1], p[0, 2]
+    p10, p11, p12 = p[1, 0], p[1, 1], p[1, 2]
+    p20, p21, p22 = p[2, 0], p[2, 1], p[2, 2]
+    q00, q01, q02 = q[0, 0] - 0.5, q[0, 1], q[0, 2]
+    q10, q11, q12 = q[1, 0], q[1, 1], q[1, 2]
+    q20, q21, q22 = q[2, 0], q[2, 1], q[2, 2]
+    left, right, top, bottom = width, -1, height, -1
+    for k in range(places.shape[1]):
+        x, y = places[0, k] + shift_x, places[1, k] + shift_y
+        u0, v0 = p00 + x * (p10 + x * p20), q00 + x * (q10 + x * q20)
+        u1, v1 = p01 + x * (p11 + x * p21), q01 + x * (q11 + x * q21)
+        u2, v2 = p02 + x * (p12 + x * p22), q02 + x * (q12 + x * q22)
+        u, v = u0 + y * (u1 + y * u2), v0 + y * (v1 + y * v2)
+        column, row = np.floor(u), np.floor(v)
+        a0, a1, a2, a3 = _weights(np.float32(u - column))
+        b0, b1, b2, b3 = _weights(np.float32(v - row))
+        weights[0, k], weights[1, k], weights[2, k], weights[3, k] = a0, a1, a2, a3
+        weights[4, k], weights[5, k], weights[6, k], weights[7, k] = b0, b1, b2, b3
+        before[0, k], before[1, k] = np.int32(column), np.int32(row)
+        left, right = min(left, before[0, k]), max(right, before[0, k])
+        top, bottom = min(top, before[1, k]), max(bottom, before[1, k])
+    return left >= 1 and right < width - 2 and top >= 1 and bottom < height - 2
+
+
+@_part
+def _sum_inside(coefficients, before, weights, out):
+    """Values at places whose samples all lie inside the image."""
+    for k in range(len(out)):
+        value = np.float32(0.0)
+        first = np.uint32(before[0, k] - 1)  # unsigned: no check for one that counts from the end
+        for i in range(4):
+            c = coefficients[np.uint32(before[1, k] - 1 + i)]
+            value += weights[4 + i, k] * (
+                weights[0, k] * c[first]
+                + weights[1, k] * c[first + np.uint32(1)]
+                + weights[2, k] * c[first + np.uint32(2)]
+                + weights[3, k] * c[first + np.uint32(3)]
+            )
+        out[k] = value
 
 
 @_part
@@ -195,19 +264,20 @@ def cut_templates(coefficients, mask, rows, origins, spreads, least_contrast, te
     window = templates.window
     num = len(window)
     reach = (int(np.round(np.sqrt(num))) - 1) // 2
-    nodes, quadratics = np.empty((3, 3, 2)), np.empty((2, 3, 3))
+    scratch = _scratch(reach)
+    nodes = scratch[0]
     ahead, behind = np.empty(num, np.float32), np.empty(num, np.float32)
     normal = np.empty((8, 8))
     for t in rows:
         origin, spread, values = origins[t], spreads[t], templates.grey[t]
         for axis in range(2):
             sx, sy = 0.5 * (1 - axis), 0.5 * axis
-            _sample_grid(coefficients, origin, spread, reach, sx, sy, nodes, quadratics, ahead)
-            _sample_grid(coefficients, origin, spread, reach, -sx, -sy, nodes, quadratics, behind)
+            _sample_grid(coefficients, origin, spread, reach, sx, sy, scratch, ahead)
+            _sample_grid(coefficients, origin, spread, reach, -sx, -sy, scratch, behind)
             slopes = templates.by_x[t] if axis == 0 else templates.by_y[t]
             for k in range(num):
                 slopes[k] = ahead[k] - behind[k]
-        _sample_grid(coefficients, origin, spread, reach, 0.0, 0.0, nodes, quadratics, values)
+        _sample_grid(coefficients, origin, spread, reach, 0.0, 0.0, scratch, values)
         if not _is_usable(mask, nodes):
             templates.states[t] = MASKED
             continue
@@ -274,7 +344,8 @@ def align_templates(coefficients, mask, rows, sightings, max_shift, steps, toler
     """
     window = templates.window
     reach = (int(np.round(np.sqrt(len(window)))) - 1) // 2
-    nodes, quadratics = np.empty((3, 3, 2)), np.empty((2, 3, 3))
+    scratch = _scratch(reach)
+    nodes = scratch[0]
     values = np.empty(len(window), np.float32)
     origin, spread = np.empty(3), np.empty((3, 2))
     b, step = np.empty(8), np.empty(8)
@@ -285,7 +356,7 @@ def align_templates(coefficients, mask, rows, sightings, max_shift, steps, toler
         settled, state = False, UNSTEADY
         for number in range(steps + 1):
             _place(sightings, o, origin, spread)
-            _sample_grid(coefficients, origin, spread, reach, 0.0, 0.0, nodes, quadratics, values)
+            _sample_grid(coefficients, origin, spread, reach, 0.0, 0.0, scratch, values)
             if number == 0 or settled:
                 mass, mean, square = _statistics(window, values)
                 if not square > _LEAST_GREY * mass:

@@ -1,5 +1,6 @@
 """The typer application: how commands are registered and how they fail."""
 
+import gc
 import logging
 import os
 import sys
@@ -103,6 +104,20 @@ class _Command(TyperCommand):
         """The help without Python's notation for an argument that may be repeated."""
         shown = "<list[Path]>"
         return super().get_help(ctx).replace(shown, "<path>".ljust(len(shown)))
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """For heavy imports: no garbage is looked for in what stays, now, later or at the end."""
+    collected = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if gc.get_freeze_count() == 0:  # once: what is frozen is never collected
+            gc.freeze()
+        if collected:
+            gc.enable()
 
 
 def command(function: Callable[P, None]) -> Callable[P, None]:

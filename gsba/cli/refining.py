@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gsba.cli.app import command
+from gsba.cli.app import command, loading
 from gsba.log import GsbaError
 
 if TYPE_CHECKING:
@@ -125,9 +125,9 @@ def refine(
     if camera is not None:
         overrides = [*overrides, f'camera.name="{camera}"']
     settings = _settings(config, overrides, factors)
-    from gsba import pipeline
-    from gsba.store.cluster import connected
-
+    with loading():
+        from gsba import pipeline
+        from gsba.store.cluster import connected
     given = {"keyframes": keyframes, "masks": masks, "segment": segment, "timestamps": timestamps}
     given |= {"fps": fps, "calibration": calibration, "imu": imu, "fresh": fresh}
     with connected(cluster) as client:

@@ -59,8 +59,10 @@ def search(first, second, cells, targets, only_targets, direction, limits):
     heads1 = np.ascontiguousarray(descriptors1[:, :head])
     # Less alike than this, a candidate neither wins nor stands against the least winner.
     floor = 1 - (1 - limits.similarity) / (limits.ratio * limits.ratio)
-    axes1 = np.ascontiguousarray(bearings1.T)
-    marks = np.empty(n1, np.bool_)
+    x, y, z = _columns(bearings1)
+    balls = _columns(centres)
+    no_radii = np.zeros(n1, np.float32)
+    marks, worth = np.empty(n1, np.bool_), np.empty(len(radii), np.bool_)
     best0, top0, next0 = _nothing(n0)
     best1, top1, next1 = _nothing(n1)
     for i in range(n0):
@@ -69,21 +71,15 @@ def search(first, second, cells, targets, only_targets, direction, limits):
         bearing = bearings0[i, 0], bearings0[i, 1], bearings0[i, 2]
         target = targets[i, 0], targets[i, 1], targets[i, 2]
         circle = _great_circle(bearing, direction, limits)
+        rest0 = descriptors0[i, head:]
+        about = target, bearing, direction, circle, limits
+        _mark(balls, radii, only_targets, about, worth)
         for cell in range(len(radii)):
-            if starts[cell] == starts[cell + 1]:
-                continue
-            ball, radius = (centres[cell, 0], centres[cell, 1], centres[cell, 2]), radii[cell]
-            if only_targets:
-                if _distance(target, ball) > limits.point + radius:
-                    continue
-            elif not _in_band(ball, radius, bearing, direction, circle, limits):
+            if not worth[cell] or starts[cell] == starts[cell + 1]:
                 continue
             begin, end = starts[cell], starts[cell + 1]
-            members = axes1[:, begin:end]
-            if only_targets:
-                _mark_near(members, target, limits.point, marks)
-            else:
-                _mark_in_band(members, bearing, direction, circle, limits, marks)
+            members = x[begin:end], y[begin:end], z[begin:end]
+            _mark(members, no_radii[begin:end], only_targets, about, marks)
             for j in range(begin, end):
                 if not marks[j - begin]:
                     continue
@@ -92,8 +88,9 @@ def search(first, second, cells, targets, only_targets, direction, limits):
                     dot += heads0[i, d] * heads1[j, d]
                 if dot + tails0[i] * tails1[j] < floor:  # Cauchy-Schwarz on the other axes
                     continue
-                for d in range(head, dim):
-                    dot += descriptors0[i, d] * descriptors1[j, d]
+                rest1 = descriptors1[j, head:]
+                for d in range(dim - head):  # an index that might be negative makes it gather
+                    dot += rest0[d] * rest1[d]
                 if dot > next0[i]:  # asked here, as calls that pass arrays are dear
                     _offer(best0, top0, next0, i, j, dot, bearings1)
                 if dot > next1[j]:
@@ -122,6 +119,12 @@ def passes(bearings0, bearings1, targets, only_targets, direction, limits):
             circle = _great_circle(bearing, direction, limits)
             passed[i] = _in_band(other, _ZERO, bearing, direction, circle, limits)
     return passed
+
+
+@_part
+def _columns(rows):
+    """The coordinates of points (n, 3), each in a row of its own."""
+    return rows[:, 0].copy(), rows[:, 1].copy(), rows[:, 2].copy()
 
 
 @_part
@@ -174,18 +177,17 @@ def _in_band(ball, radius, bearing, direction, circle, limits):
 
 
 @_part
-def _mark_in_band(members, bearing, direction, circle, limits, marks):
-    """Flags of the bearings (3, m) that pass; without branches, so that it runs in vectors."""
-    for m in range(members.shape[1]):
-        ball = members[0, m], members[1, m], members[2, m]
-        marks[m] = _in_band(ball, _ZERO, bearing, direction, circle, limits)
-
-
-@_part
-def _mark_near(members, target, radius, marks):
-    """Flags of the bearings (3, m) near a target."""
-    for m in range(members.shape[1]):
-        marks[m] = _distance(target, (members[0, m], members[1, m], members[2, m])) <= radius
+def _mark(centres, radii, only_targets, about, marks):
+    """Flags of the balls around (3, m) that pass; without branches, so that it runs in vectors."""
+    target, bearing, direction, circle, limits = about
+    x, y, z = centres
+    if only_targets:
+        for m in range(len(radii)):
+            marks[m] = _distance(target, (x[m], y[m], z[m])) <= limits.point + radii[m]
+    else:
+        for m in range(len(radii)):
+            ball = x[m], y[m], z[m]
+            marks[m] = _in_band(ball, radii[m], bearing, direction, circle, limits)
 
 
 @_part

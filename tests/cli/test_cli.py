@@ -1,6 +1,7 @@
 """The command line: what it answers, how fast it may not think, and how it fails."""
 
 import errno
+import gc
 import io
 import json
 import logging
@@ -19,6 +20,7 @@ from typer.testing import CliRunner, Result
 import gsba
 from gsba import log
 from gsba.cli import app
+from gsba.cli.app import loading
 from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.export import ExportFormat
@@ -220,3 +222,10 @@ def test_a_quiet_run_shows_no_bars(
     finally:
         log._console.cache_clear()
     assert ("counting" in terminal.getvalue()) is shown
+
+
+def test_garbage_is_collected_again_after_loading() -> None:
+    with pytest.raises(ImportError), loading():
+        assert not gc.isenabled()
+        raise ImportError
+    assert gc.isenabled()

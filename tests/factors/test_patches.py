@@ -74,6 +74,20 @@ def test_a_turn_of_the_camera_is_found(direction: list[float]) -> None:
     assert np.linalg.norm(bearings[0] - expected) < 0.01 * PIXEL
 
 
+def test_the_seam_is_not_seen() -> None:
+    pixels = _texture(_CENTRES)
+    longitudes = np.arange(-14, 14.1, 0.7) * PIXEL  # patches on either side, and all across
+    origins = np.stack([np.sin(longitudes), np.full(len(longitudes), 0.2), np.cos(longitudes)], 1)
+    spreads = PIXEL * np.swapaxes(tangent_basis(origins), 1, 2)
+    half_turn, every = np.diag([-1.0, 1.0, -1.0]), np.arange(len(origins))
+    ahead, behind = (PatchSet(len(origins), SIZE, 0.6, 0.15, 3.0) for _ in range(2))
+    ahead.cut(SphereImage.of(pixels), None, every, origins, spreads, 2.0)
+    turned = SphereImage.of(np.roll(pixels, HEIGHT, axis=1))
+    behind.cut(turned, None, every, origins @ half_turn, half_turn @ spreads, 2.0)
+    for there, here in zip(behind.templates[2:5], ahead.templates[2:5], strict=True):
+        np.testing.assert_allclose(there, here, atol=1e-3)
+
+
 def test_gain_and_offset_change_nothing() -> None:
     turn = Rotation.from_rotvec(np.array([0.3, 0.9, 0.1]) * PIXEL).as_matrix()
     dark = SphereImage.of(0.6 * _texture(_CENTRES @ turn) + 30)
