@@ -6,6 +6,7 @@ from contextlib import contextmanager
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3), from malloc.h
 _USUAL = 32 << 20, 64 << 20  # where glibc itself moves both thresholds in the end
+_WORTH = 256 << 20  # bytes: to fetch and clear as much again is a tenth of a second
 
 
 @contextmanager
@@ -21,14 +22,29 @@ def freed_memory_kept() -> Iterator[None]:
         yield
     finally:
         _set_thresholds(*_USUAL)
-        give_back_freed_memory()
 
 
-def give_back_freed_memory() -> None:
-    """Let glibc return what earlier stages have freed and it holds on to."""
+def give_back_freed_memory(least: int = _WORTH) -> None:
+    """Have glibc return what was freed and it holds on to, where that is so many bytes."""
     libc = ctypes.CDLL(None)
+    if hasattr(libc, "mallinfo2"):
+        libc.mallinfo2.restype = _Mallinfo
+        if libc.mallinfo2().fordblks < least:
+            return
     if hasattr(libc, "malloc_trim"):
         libc.malloc_trim(0)
+
+
+class _Mallinfo(ctypes.Structure):
+    """`struct mallinfo2` of malloc.h, over all arenas."""
+
+    _fields_ = [
+        (name, ctypes.c_size_t)
+        for name in (
+            "arena", "ordblks", "smblks", "hblks", "hblkhd",
+            "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost",
+        )
+    ]  # fmt: skip
 
 
 def _set_thresholds(mapped: int, trimmed: int) -> None:

@@ -166,7 +166,7 @@ def write_pictures(
         writer.files.make_folders(frames)
     workers = (workers or Threads(os.cpu_count() or 1)).at_most(_AT_ONCE)
     workers.must_see([writer.files.folder for writer in writers])
-    give_back_freed_memory()
+    give_back_freed_memory(0)
     for _ in workers.map_shards(Pictures(frames, writers)):
         pass
 
