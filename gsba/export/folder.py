@@ -39,7 +39,6 @@ def output_folder(out: Path, to: str, key: str) -> Iterator[Path]:
         partial.mkdir(exist_ok=True)
         lock = hold_folder(partial)
         remove_unheld(set(out.parent.glob(f".{out.name}.partial-*")) - {partial})
-        finished = True
         try:
             yield partial
             wrote = sorted([entry.name for entry in partial.iterdir()] + [MARKER])
@@ -48,12 +47,12 @@ def output_folder(out: Path, to: str, key: str) -> Iterator[Path]:
             _require_replaceable(out)
             _swap_in(partial, out)
             remove_temporaries(out)  # of workers that were killed
-        except BaseException as error:
-            finished = isinstance(error, Exception) and not isinstance(error, StoppedError)
+        except StoppedError:
+            raise
+        except Exception:
+            shutil.rmtree(partial, ignore_errors=True)
             raise
         finally:
-            if finished:
-                shutil.rmtree(partial, ignore_errors=True)
             os.close(lock)
 
 
