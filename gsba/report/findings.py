@@ -16,6 +16,8 @@ from gsba.types import CoarsePoses, FrameSet, PoseSource, PoseStatus, Reconstruc
 
 logger = logging.getLogger(__name__)
 
+_MANY = 0.1  # part of a trajectory's steps: contradicted, the rest of it is in doubt, too
+
 
 def of_trajectory(
     trust: Trust,
@@ -65,7 +67,12 @@ def _steps(trust: Trust, frames: FrameSet) -> tuple[dict[str, Any], list[str]]:
         notes.append("no frame has parallax to the next: no depth can be had, rotations only")
     if trust.held_steps.any():
         steps = ", ".join(f"{a} to {b}" for a, b in between(trust.held_steps))
-        notes.append(f"no images in common, held by the trajectory alone: {steps}")
+        seen = ~trust.unseen_steps
+        wrong, num = np.count_nonzero(trust.false_steps & seen), np.count_nonzero(seen)
+        doubt = (
+            f" (images contradict {wrong} of its other {num} steps)" if wrong > _MANY * num else ""
+        )
+        notes.append(f"no images in common, held by the trajectory alone{doubt}: {steps}")
     for note in notes:
         logger.warning(note)
     return judgement, notes

@@ -1,0 +1,31 @@
+"""What a report says of the trajectory that a run was given."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from export_scene import panoramas
+
+from gsba.report.findings import of_trajectory
+from gsba.trajectory.judgement import Trust
+
+
+@pytest.mark.parametrize(
+    ("contradicted", "doubt"), [(0, ""), (2, " (images contradict 2 of its other {} steps)")]
+)
+def test_steps_that_no_image_shows_are_in_doubt_where_others_are_wrong(
+    tmp_path: Path, contradicted: int, doubt: str
+) -> None:
+    frames = panoramas(tmp_path, ".png")
+    num = len(frames)
+    steps = np.arange(num - 1)
+    trust = replace(
+        Trust.of_all(np.tile(np.eye(4), (num, 1, 1))),
+        unseen_steps=steps == num - 2,
+        false_steps=steps < contradicted,
+    )
+    found, notes = of_trajectory(trust, None, None, (), frames)
+    assert found["unseen_steps"] == [[frames.names[-2], frames.names[-1]]]
+    alone = f"no images in common, held by the trajectory alone{doubt.format(num - 2)}"
+    assert notes == [f"{alone}: {frames.names[-2]} to {frames.names[-1]}"]
