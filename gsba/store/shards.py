@@ -24,6 +24,7 @@ import numpy as np
 
 from gsba.disk import write_bytes
 from gsba.log import GsbaError, track
+from gsba.memory import freed_memory_kept
 from gsba.store.records import RecordError, load_record, read_info, save_record
 from gsba.version import __version__
 
@@ -206,7 +207,8 @@ def run_shard(path: str) -> Manifest:
         if version != __version__:
             raise GsbaError(f"worker {worker} has gsba {__version__}, the run has {version}")
         job = pickle.load(content)
-    results = tuple(job(item) for item in range(len(job)))
+    with freed_memory_kept():  # Dask has workers return it at once
+        results = tuple(job(item) for item in range(len(job)))
     save_record(result_path(shard), results, {"key": shard.stem})
     return Manifest(worker, time.perf_counter() - wall, time.thread_time() - cpu)
 
