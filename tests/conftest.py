@@ -1,7 +1,6 @@
 """Fixtures that several files share."""
 
 import logging
-from collections.abc import Iterator
 
 import pytest
 from tiny_run import Case, make_case
@@ -14,11 +13,10 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
 
 
 @pytest.fixture(autouse=True)
-def _own_log() -> Iterator[None]:
-    """What a command does to the log ends with its test: others look at what is logged."""
-    loggers = [logging.getLogger(name) for name in ("gsba", "factors")]
-    before = [(one.handlers[:], one.level, one.propagate) for one in loggers]
-    yield
-    for one, (handlers, level, propagate) in zip(loggers, before, strict=True):
-        one.handlers[:], one.propagate = handlers, propagate
-        one.setLevel(level)
+def _untouched_log() -> None:
+    """The log as if no command had run before, in another test or a fixture of many."""
+    for name in ("gsba", "factors"):
+        logger = logging.getLogger(name)
+        logger.handlers.clear()
+        logger.setLevel(logging.NOTSET)
+        logger.propagate = True
