@@ -245,7 +245,10 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
-    known = ((options.peers, ",".join(MODES)), (options.factors, sets))
+    there = ",".join(
+        (every, *(name for name in options.sequences if (options.data / name).is_dir()))
+    )
+    known = ((options.sequences, there), (options.peers, ",".join(MODES)), (options.factors, sets))
     for asked, allowed in known:
         if unknown := set(asked) - set(allowed.split(",")):
             parser.error(f"{', '.join(sorted(unknown))}: use some of {allowed}")

@@ -18,6 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -235,29 +236,21 @@ class _Pickler(pickle.Pickler):
 
 def _pickled(value: object) -> bytes:
     buffer = io.BytesIO()
-    pickler = _Pickler(buffer, protocol=5)
-    pickler.fast = True  # no references to what was seen before
-    pickler.dump(value)
+    _pickle(value, buffer)
     return buffer.getvalue()
 
 
 def content_digest(*values: object) -> str:
     """SHA-256 of values that can be pickled, by what they hold."""
-    buffer = io.BytesIO()
-    digester = _Digester(buffer, protocol=5)
-    digester.fast = True
-    digester.dump(values)
-    return hashlib.sha256(buffer.getvalue()).hexdigest()
+    total = hashlib.sha256()
+    _pickle(values, SimpleNamespace(write=total.update))
+    return total.hexdigest()
 
 
-class _Digester(pickle.Pickler):
-    """As `_Pickler`, with digests in place of arrays."""
-
-    def reducer_override(self, obj: object) -> Any:
-        if isinstance(obj, np.ndarray):
-            content = hashlib.sha256(np.ascontiguousarray(obj).tobytes()).digest()
-            return _array, (obj.dtype.str, obj.shape, content)
-        return NotImplemented
+def _pickle(value: object, file: Any) -> None:
+    pickler = _Pickler(file, protocol=5)
+    pickler.fast = True  # no references to what was seen before
+    pickler.dump(value)
 
 
 def _array(dtype: str, shape: tuple[int, ...], content: bytes) -> np.ndarray:
