@@ -103,7 +103,8 @@ def outcome(finish: Callable[[], dict]) -> dict[str, Any]:
 def refine_command(frames: Path, run: Path, options: Sequence[str]) -> list[str]:
     """A whole run in a process of its own, without a dataset."""
     command = [sys.executable, "-c", "from gsba.cli import main; main()", "refine", str(frames)]
-    return [*command, *options, "--out", str(run), "--fresh", "--set", "export.formats=[]"]
+    options = [*options, "--out", str(run), "--fresh", "--allow-partial"]
+    return [*command, *options, "--set", "export.formats=[]"]
 
 
 def last_line(log: Path) -> str:

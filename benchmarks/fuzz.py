@@ -8,7 +8,8 @@ Case N of a seed is always the same. A walk of a few small frames, its run, a vi
 tables of all kinds are made first (`--out`, kept). Each case copies what it needs, spoils a file or
 an option, and calls the command line in this process. A worker does this behind a limit in time and
 memory; one that hangs, dies or swells costs its case, and the next one goes on. Expected is
-- exit 0, and then output that is true: finite poses, a positive scale, residuals of a solution;
+- exit 0, or 3 for a run of several maps, and then output that is true: finite poses, a positive
+  scale, residuals of a solution;
 - exit 1 with one line "error: ..." of readable length, nothing half-written, no input changed;
 - exit 2 for options that do not parse.
 Anything else is a finding. Exits with 1 where there is one.
@@ -200,7 +201,7 @@ def _complaints(case: Spoiled, result: Any, folder: Path, before: dict) -> Itera
         yield "unforeseen"
     if "out of memory" in text:
         yield "memory"
-    if result.exit_code not in (0, 1, 2):
+    if result.exit_code not in (0, 1, 2, 3):
         yield f"exit {result.exit_code}"
     if re.search(r"\.py:\d+: \w*Warning: ", text):
         yield "a warning of Python's"
@@ -210,7 +211,7 @@ def _complaints(case: Spoiled, result: Any, folder: Path, before: dict) -> Itera
             yield "not one line"
         if max(map(len, text.splitlines()), default=0) > MOST_LETTERS:
             yield "a line of thousands of letters"
-    if result.exit_code != 0:
+    if result.exit_code not in (0, 3):
         after = _contents(folder)
         changed = [p for p in before if after.get(p) != before[p] and case.keeps(Path(p))]
         if changed:
@@ -247,7 +248,9 @@ def table(outcomes: list[Outcome], seconds: float, seed: int) -> list[str]:
     )
     for family, some in [*sorted(rows.items()), ("all", outcomes)]:
         found, slowest = sum(bool(o.findings) for o in some), max(o.seconds for o in some)
-        codes = " | ".join(str(count(some, code)) for code in (0, 1, 2))
+        codes = " | ".join(
+            str(n) for n in (count(some, 0) + count(some, 3), count(some, 1), count(some, 2))
+        )
         lines.append(f"| {family} | {len(some)} | {codes} | {found} | {slowest:.1f} |")
     kinds = Counter(f.partition(":")[0] for o in outcomes for f in o.findings)
     lines += ["", "Findings: " + (", ".join(f"{n} {k}" for k, n in kinds.items()) or "none") + "."]

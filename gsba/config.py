@@ -147,13 +147,14 @@ class VerifySettings(_Settings):
     """Two-view geometry."""
 
     max_error_deg: float = Field(default=0.25, gt=0)  # RANSAC inlier threshold
-    min_inliers: int = Field(default=25, ge=8)
-    min_share: float = Field(
-        default=0.45, ge=0, le=1
-    )  # inliers among the matches of neighbours that no trajectory guided: look-alikes have 0.4
+    max_false_alarms: float = Field(
+        default=1e-3, gt=0, lt=1
+    )  # expected number of poses of a pair that chance explains as well as the one believed
+    max_error_rate: float = Field(
+        default=0.05, gt=0, lt=1
+    )  # of preferring one of two poses that explain matches equally well
     max_rotation_deg: float = Field(default=6.0, gt=0)  # disagreement with the trajectory
     max_direction_deg: float = Field(default=20.0, gt=0)  # disagreement with the trajectory
-    min_parallax_deg: float = Field(default=1.0, gt=0)  # median; below it a direction is not judged
     max_length_ratio: float = Field(default=1.5, gt=1)  # disagreement with the trajectory
     max_triplet_deg: float = Field(
         default=3.0, gt=0
@@ -232,9 +233,6 @@ class CameraSettings(_Settings):
     model: Literal["auto", "central", "two_lens"] = "auto"  # auto: two lenses where they predict
     # what they were not found from; panoramas only
     name: Literal[tuple(CAMERAS)] | None = None  # type: ignore[valid-type]  # for what is said of it
-    min_gain: float = Field(
-        default=0.01, ge=0, lt=1
-    )  # share of the robust cost of unseen observations that two centres must take off
     seam_deg: float = Field(default=4.0, ge=0, le=20)  # from the seam: pictures blended, left out
     baseline_mm: float | None = Field(
         default=None, ge=2, le=200

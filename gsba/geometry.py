@@ -128,7 +128,13 @@ def step_covariances(
     return own + shared + np.swapaxes(shared, 1, 2)
 
 
-def parallax(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.ndarray) -> float:
-    """Median angle in radians between both bearings in one orientation."""
-    chords = np.linalg.norm(bearings0 - bearings1 @ f0_T_f1[:3, :3].T, axis=1)
-    return float(2 * np.arcsin(np.median(chords) / 2))
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) at length one; 0 stays 0."""
+    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.maximum(lengths, 1e-300)
+
+
+def angles_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles (...,) in radians between vectors (..., 3); accurate near 0 and pi."""
+    across = np.linalg.norm(np.cross(a, b), axis=-1)
+    return np.arctan2(across, np.sum(a * b, axis=-1))

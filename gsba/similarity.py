@@ -224,10 +224,10 @@ def relative_map(
 
 
 def relative_similarity(
-    points0: np.ndarray, points1: np.ndarray, seed: int
+    points0: np.ndarray, points1: np.ndarray, seed: int, least: int = _MIN_POINTS
 ) -> tuple[Sim3, np.ndarray] | None:
-    """As `relative_map`: rig 1 in rig 0, with its unit; and which points (m,) agree."""
-    if len(points0) < _MIN_POINTS:
+    """As `relative_map`: rig 1 in rig 0, with its unit; and which points (m,) agree, if `least`."""
+    if len(points0) < least:
         return None
     rng = np.random.default_rng(seed)
     best = np.zeros(len(points0), bool)
@@ -236,10 +236,10 @@ def relative_similarity(
         agree = _agree(points0, points1, three)
         best = agree if agree.sum() > best.sum() else best
     for _ in range(3):
-        if best.sum() < _MIN_POINTS:
+        if best.sum() < least:
             return None
         best = _agree(points0, points1, np.flatnonzero(best))
-    if best.sum() < _MIN_POINTS:
+    if best.sum() < least:
         return None
     return similarity(points1[best], points0[best]), best
 
@@ -250,6 +250,11 @@ def _agree(points0: np.ndarray, points1: np.ndarray, chosen: np.ndarray) -> np.n
         fit = similarity(points1[chosen], points0[chosen])
     except NoSimilarityError:
         return np.zeros(len(points0), bool)
+    return agreeing_points(points0, points1, fit)
+
+
+def agreeing_points(points0: np.ndarray, points1: np.ndarray, fit: Sim3) -> np.ndarray:
+    """Which points (m, 3) of two rigs are seen alike from both (m,) bool; `fit`: rig 1 in rig 0."""
     in0, in1 = fit.points(points1), fit.points_back(points0)
     limit = np.cos(np.deg2rad(_POINT_DEG))
     return (_cosines(in0, points0) > limit) & (_cosines(in1, points1) > limit)

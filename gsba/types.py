@@ -228,13 +228,16 @@ class VerifiedPairs:
 
     matches: Matches  # inliers only
     f0_T_f1s: np.ndarray  # (P, 4, 4) float64, translation of unit length
+    direction_sigmas: np.ndarray  # (P,) float64, radians, of the translation's direction; infinite
+    # = the camera may have turned only
     counts: Counts  # of pairs
 
     @classmethod
     def none(cls) -> "VerifiedPairs":
         """What guidance finds where there is no trajectory."""
         none = np.zeros((0, 2), np.int32)
-        return cls(Matches.of_rows(none, ()), np.zeros((0, 4, 4)), Counts(0, 0, "pairs"))
+        poses, sigmas = np.zeros((0, 4, 4)), np.zeros(0)
+        return cls(Matches.of_rows(none, ()), poses, sigmas, Counts(0, 0, "pairs"))
 
     @classmethod
     def joined(cls, parts: Sequence["VerifiedPairs"]) -> "VerifiedPairs":
@@ -242,13 +245,15 @@ class VerifiedPairs:
         pairs = np.concatenate([part.matches.pairs for part in parts])
         rows = [part.matches.of(p) for part in parts for p in range(len(part.matches.pairs))]
         poses = np.concatenate([part.f0_T_f1s for part in parts])
-        every = cls(Matches.of_rows(pairs, rows), poses, parts[0].counts)
+        sigmas = np.concatenate([part.direction_sigmas for part in parts])
+        every = cls(Matches.of_rows(pairs, rows), poses, sigmas, parts[0].counts)
         return every.taken(np.lexsort((pairs[:, 0], pairs[:, 1] - pairs[:, 0])).tolist())
 
     def taken(self, rows: Sequence[int]) -> "VerifiedPairs":
         """Some of the pairs, by their indices, in the order given."""
-        poses = self.f0_T_f1s[list(rows)].reshape(-1, 4, 4)
-        return VerifiedPairs(self.matches.taken(rows), poses, self.counts)
+        chosen = np.asarray(rows, np.int64)
+        poses, sigmas = self.f0_T_f1s[chosen], self.direction_sigmas[chosen]
+        return VerifiedPairs(self.matches.taken(chosen), poses, sigmas, self.counts)
 
     def frames(self) -> set[tuple[int, int]]:
         """The frames of each pair."""
@@ -263,7 +268,11 @@ class VerifiedPairs:
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """Observations of scene points, sorted by point, then by frame."""
+    """Observations of scene points, sorted by point, then by frame; every point has one.
+
+    What makes or filters tracks keeps to that. Whoever uses them takes a point that lost all its
+    observations nonetheless as one that no frame sees.
+    """
 
     points: np.ndarray  # (O,) int32, point index j, non-decreasing
     frames: np.ndarray  # (O,) int32, frame index f
@@ -274,15 +283,24 @@ class Tracks:
         return len(self.points)
 
     def hosts(self) -> np.ndarray:
-        """First frame (J,) that sees each point: the one it goes with."""
-        return self.frames[np.searchsorted(self.points, np.arange(self.num_points))]
+        """First frame (J,) that sees each point: the one it goes with; -1 = none sees it."""
+        first = np.flatnonzero(np.diff(self.points, prepend=-1))
+        hosts = np.full(self.num_points, -1, self.frames.dtype)
+        hosts[self.points[first]] = self.frames[first]
+        return hosts
 
-    def of(self, points: np.ndarray, rows: np.ndarray | None = None) -> "Tracks":
-        """Points `points (J,)` bool alone, renumbered; of their observations `rows (O,)` bool."""
-        kept = points[self.points] if rows is None else points[self.points] & rows
-        numbers = (np.cumsum(points) - 1).astype(np.int32)[self.points[kept]]
+    def of(self, points: np.ndarray) -> "Tracks":
+        """Points `points (J,)` bool alone, renumbered, with all their observations."""
+        rows = points[self.points]
+        numbers = (np.cumsum(points) - 1).astype(np.int32)[self.points[rows]]
         num = int(np.count_nonzero(points))
-        return Tracks(numbers, self.frames[kept], self.keypoints[kept], num)
+        return Tracks(numbers, self.frames[rows], self.keypoints[rows], num)
+
+    def of_observations(self, rows: np.ndarray) -> "Tracks":
+        """Observations `rows (O,)` bool alone; points that keep none are left out."""
+        numbers = np.cumsum(np.diff(self.points[rows], prepend=-1) > 0) - 1
+        num = int(numbers[-1]) + 1 if len(numbers) else 0
+        return Tracks(numbers.astype(np.int32), self.frames[rows], self.keypoints[rows], num)
 
 
 @dataclass(frozen=True, slots=True)
@@ -436,7 +454,8 @@ class Reconstruction:
     observation_sigmas: np.ndarray  # (O,) float64, radians
     correction: tuple[float, ...] = ()  # of the frames, which these bearings have: see FrameSet
     components: np.ndarray | None = None  # (F,) int32, map that each frame is in, 0 = the largest:
-    # nothing ties one map to another, each has a world of its own; None = there is one
+    # nothing ties one map to another, each has a world of its own; None = there is one. Behind all
+    # maps each frame that is in none has a number of its own
     joint_errors: JointErrors | None = None  # those whose own covariances are above; None = none
     observation_origins: np.ndarray | None = None  # (O, 3) float64, rig frame, map units: where
     # each ray starts; None = the rig's centre
@@ -445,12 +464,43 @@ class Reconstruction:
     fisheyes: tuple[Fisheye, Fisheye] | None = None  # of raw pairs, as found: see FrameSet
     vertical: np.ndarray | None = None  # (3,) float64, unit, up or down by an accelerometer; None =
     # there was none
+    map_scales: np.ndarray | None = None  # (C,) float64, by component: the length in its world of
+    # what is one unit long in the world of the largest map; None = there is one map
+
+    @property
+    def num_maps(self) -> int:
+        """Number of maps. A frame alone is no map."""
+        if self.components is None:
+            return 1
+        return 1 + int(np.count_nonzero(np.bincount(self.components)[1:] > 1))
+
+    def map_numbers(self) -> np.ndarray:
+        """Map (F,) int64 that each frame is in, 1 = the largest; 0 = in none."""
+        if self.components is None:
+            return np.ones(len(self.world_T_rigs), np.int64)
+        return np.where(self.components < self.num_maps, self.components + 1, 0)
+
+    def frames_of_map(self, number: int) -> np.ndarray:
+        """Frames (F',) int64 of a map, 1 = the largest."""
+        return np.flatnonzero(self.map_numbers() == number)
 
     def largest_map(self) -> np.ndarray:
         """Frames (F',) int64 of the largest map: those that are exported."""
-        if self.components is None:
-            return np.arange(len(self.world_T_rigs))
-        return np.flatnonzero(self.components == 0)
+        return self.frames_of_map(1)
+
+    def of_map(self, number: int) -> "Reconstruction":
+        """One map alone, 1 = the largest, in its own world and unit."""
+        found = replace(self.taken(self.frames_of_map(number)), map_scales=None)
+        if number == 1:
+            return found
+        baseline, scale = self.lens_baseline, self.map_scale(number)
+        if baseline is not None:
+            found = replace(found, lens_baseline=(scale * baseline[0], scale * baseline[1]))
+        return replace(found, vertical=None)  # it is known in the world of the largest map
+
+    def map_scale(self, number: int) -> float:
+        """Length in the world of a map of what is one unit long in the largest map's."""
+        return 1.0 if self.map_scales is None else float(self.map_scales[number - 1])
 
     def taken(self, rows: np.ndarray) -> "Reconstruction":
         """What some frames (F',), ascending, hold of it: their poses and the points they see."""

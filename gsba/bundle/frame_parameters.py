@@ -92,10 +92,10 @@ def summed(models: Sequence[FrameModel]) -> FrameModel:
 
 
 def part_gains(models: Sequence[FrameModel], sigmas: np.ndarray) -> np.ndarray:
-    """Share of its cost that each part gains by the parameters that the others give, poses too."""
+    """What each part gains (PARTS,) by the parameters that the others give, poses too."""
     gains = []
     for p, part in enumerate(models):
         others = summed([model for q, model in enumerate(models) if q != p])
         without = part.gain(others.step(np.zeros_like(sigmas)))
-        gains.append((part.gain(others.step(sigmas)) - without) / part.system.cost)
+        gains.append(part.gain(others.step(sigmas)) - without)
     return np.array(gains)

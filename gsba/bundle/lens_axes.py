@@ -19,6 +19,7 @@ from gsba.bundle.shared_parameters import (
     Weighted,
     by_origin,
     drawn,
+    predicts,
 )
 from gsba.camera.lens import Lenses
 from gsba.types import Counts, Keypoints, Landmarks, Solution
@@ -28,7 +29,6 @@ logger = logging.getLogger(__name__)
 _MOST = 60_000  # observations that axes are found from
 _FIRST = 20_000  # the same of a first guess
 _YAWS = np.deg2rad([0.0, 45, 90, 135])  # of the axis that carries both lenses: a line
-_CLEARLY = 1.5  # times the gain of axes that are the rig's, or these are
 TURNS = np.deg2rad([0.5, 1.5, 5.0])  # of frames' axes about where they were, standard deviation
 _STANDING = 0.1  # part of a typical step, below which a frame goes nowhere
 
@@ -74,13 +74,12 @@ def guess(
         return LensAxes(so_far, np.full(PARTS, np.nan), "too few points", counts)
     starts = range(0, 3 * len(tried), 3)
     gains = np.array([_gains([part.of(slice(k, k + 3)) for part in systems]) for k in starts])
-    means = gains.mean(axis=1)
-    best = int(np.argmax(means))
-    logger.info("lens axes: gains %s %%", (100 * means).round(2).tolist())
-    found = means[best] > _CLEARLY * max(float(means[0]), 0.0) and np.all(gains[best] > 0)
-    if best == 0 or not found or means[best] < problem.settings.camera.min_gain:
-        return LensAxes(so_far, gains[0], "they look as the panorama does", counts)
-    return LensAxes(tried[best], gains[best], "", counts)
+    best = int(np.argmax(gains.sum(axis=1)))
+    shares = gains / np.array([part.cost for part in systems])
+    logger.info("lens axes: gains %s %%", (100 * shares.mean(axis=1)).round(2).tolist())
+    if not predicts(gains[best] - np.maximum(gains[0], 0)):
+        return LensAxes(so_far, shares[0], "they look as the panorama does", counts)
+    return LensAxes(tried[best], shares[best], "", counts)
 
 
 def loosened(
@@ -107,11 +106,12 @@ def loosened(
 
     models = models_of(used, keypoints, solved, problem, by_axes)
     tried = [part_gains(models, np.full(2, width)) for width in TURNS]
-    gains = max(tried, key=lambda trial: float(trial.mean()))
-    logger.info("lens axes: %s %% of unseen points' cost", (100 * gains).round(2).tolist())
-    if np.any(gains <= 0) or gains.mean() < problem.settings.camera.min_gain:
-        return LensAxes(so_far, gains, "turning them does not predict unseen points", counts)
-    return LensAxes(replace(so_far, axes=np.tile(np.eye(3), (num, 1, 1))), gains, "", counts)
+    gains = max(tried, key=lambda trial: float(trial.sum()))
+    shares = gains / np.array([model.system.cost for model in models])
+    logger.info("lens axes: %s %% of unseen points' cost", (100 * shares).round(2).tolist())
+    if not predicts(gains):
+        return LensAxes(so_far, shares, "turning them does not predict unseen points", counts)
+    return LensAxes(replace(so_far, axes=np.tile(np.eye(3), (num, 1, 1))), shares, "", counts)
 
 
 def turned(lenses: Lenses, turns: np.ndarray) -> Lenses:
@@ -143,14 +143,14 @@ def upright(directions: np.ndarray) -> np.ndarray:
 
 
 def _gains(systems: list[SharedModel]) -> np.ndarray:
-    """Share of its cost that each part gains by the centre that the others give."""
+    """What each part gains (PARTS,) by the centre that the others give."""
     gains = []
     for p, own in enumerate(systems):
         others = systems[:p] + systems[p + 1 :]
         gradient = np.sum([part.gradient for part in others], axis=0)
         hessian = np.sum([part.hessian for part in others], axis=0)
         step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(3), gradient)
-        gains.append(own.gain(step) / own.cost)
+        gains.append(own.gain(step))
     return np.array(gains)
 
 

@@ -1,8 +1,8 @@
 """The lenses' centres, found by the map: what crosses the seam, and how near and far things move.
 
 Points of the front half of the sphere are seen from one place, those of the back half from another.
-Found as what other shared parameters are: looked for where most parts of the sequence gain by what
-the others give, and believed where each does once the map was adjusted with it.
+Two centres that parts of the sequence gain by are taken on trial: the map is matched and adjusted
+with them. They are believed where they then predict parts that they were not found from.
 """
 
 import logging
@@ -12,7 +12,7 @@ import numpy as np
 
 from factors.bearing import tangent_basis
 from gsba.bundle.adjustment import Problem
-from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of, summed
+from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of, predicts, summed
 from gsba.camera.lens import Lenses
 from gsba.types import Counts, Keypoints, Landmarks, Solution
 
@@ -22,6 +22,7 @@ _MOST = 60_000  # observations that centres are found from
 _OF_MODEL = 0.005  # of the distance between lenses: its error where residuals promise none, as
 # measured on rendered walks (benchmarks/results/camera.md)
 _SIGNIFICANT = 5.0  # standard deviations from one centre, or there is one
+_ON_TRIAL = 3.0  # the same of centres that matches are found and judged with before they are taken
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +92,10 @@ def estimate(
     strength = float(np.sqrt(found @ np.linalg.solve(covariance, found)))
     reason = ""
     if chosen.model == "auto" and so_far.cut_by is None:  # raw pairs are of two
-        needed = PARTS if so_far else PARTS - 1  # a wrong camera bends some part, too
-        if np.count_nonzero(gains > 0) < needed or shares.mean() < chosen.min_gain:
+        # Matches that one centre has chosen hide the lenses from some parts of the sequence.
+        if not (predicts(gains) if so_far else gains.sum() > 0):
             reason = "it does not predict parts of the sequence that it was not found from"
-        elif strength < _SIGNIFICANT:
+        elif strength < (_SIGNIFICANT if so_far else _ON_TRIAL):
             reason = f"one centre is as likely: {strength:.1f} standard deviations"
     where, untaken = np.array2string(found, precision=5), reason and f"; not taken: {reason}"
     gained = 100 * float(shares.mean())
@@ -152,14 +153,15 @@ def stitched_for(
     for p, part in enumerate(systems):
         others = systems[:p] + systems[p + 1 :]
         without = part.gain(_step([each.of(slice(3)) for each in others]))
-        gains.append((part.gain(_step(others)) - without) / part.cost)
+        gains.append(part.gain(_step(others)) - without)
     nearness, gains = float(found[3]), np.array(gains)
+    shares = gains / np.array([part.cost for part in systems])
     logger.info("stitched for a nearness of %.3f (sigma %.3f)", nearness, sigma)
     reason = ""
-    if np.any(gains <= 0) or nearness < _SIGNIFICANT * sigma:
+    if not predicts(gains) or nearness < _SIGNIFICANT * sigma:
         reason = "as well stitched at infinity"
     taken = replace(so_far, centre=so_far.centre + found[:3], nearness=nearness)
-    return StitchRadius(so_far if reason else taken, nearness, sigma, gains, reason)
+    return StitchRadius(so_far if reason else taken, nearness, sigma, shares, reason)
 
 
 def by_nearness(bearings_rig: np.ndarray, origins_rig: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from itertools import product
 import numpy as np
 
 from gsba.bundle.adjustment import Problem
-from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of
+from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of, predicts
 from gsba.camera.lens import Lenses, rows_run
 from gsba.config import CameraSettings
 from gsba.types import Counts, Keypoints, Landmarks, Solution, Turning
@@ -82,9 +82,10 @@ def estimate(
     best = int(np.argmax(gains.sum(axis=0)))
     duration, sigma = float(durations[best]), float(sigmas[best])
     sign = -1.0 if duration < 0 else 1.0  # rows are read the other way
-    found = Readout(lenses, abs(duration), sigma, gains=gains[:, best], counts=counts)
+    shares = gains[:, best] / np.array([part.cost for part in systems])
+    found = Readout(lenses, abs(duration), sigma, gains=shares, counts=counts)
     logger.info("readout: %.2f ms (sigma %.2f)", 1e3 * abs(duration), 1e3 * sigma)
-    if np.any(found.gains <= 0) or abs(duration) < _SIGNIFICANT * sigma:
+    if not predicts(gains[:, best]) or abs(duration) < _SIGNIFICANT * sigma:
         return replace(found, reason="motion during the readout does not predict unseen parts")
     if problem.settings.camera.sweep is not None and duration < 0:
         return replace(found, reason="rows are read the other way than camera.sweep says")
@@ -135,15 +136,14 @@ def velocities(
 
 def _durations(systems: list[SharedModel]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Duration and its deviation (W,) for each way of reading alone, and what each part gains
-    (PARTS, W), as a share of its cost, by what the others say."""
+    (PARTS, W) by what the others say."""
     gradients = np.array([part.gradient for part in systems])
     curvatures = np.array([np.diagonal(part.hessian) for part in systems])
-    costs = np.array([part.cost for part in systems])
     total, curved = gradients.sum(axis=0), np.maximum(curvatures.sum(axis=0), 1e-300)
     others = -(total - gradients) / np.maximum(curved - curvatures, 1e-300)
     gains = -(gradients * others + 0.5 * curvatures * others**2)
     bend = float(np.mean([part.curvature for part in systems]))
-    return -total / curved / bend, (bend * curved) ** -0.5, gains / costs[:, None]
+    return -total / curved / bend, (bend * curved) ** -0.5, gains
 
 
 def _ways(camera: CameraSettings, lenses: Lenses) -> list[np.ndarray]:

@@ -55,7 +55,7 @@ def assemble(
     placed, points_world, stretch = _placed(adjustment, coarse.world_T_rigs, known, groups)
     rows = keypoints.rows(landmarks.tracks)
     points = landmarks.tracks.points
-    lengths = np.bincount(points, minlength=len(landmarks.points_world))
+    lengths = np.maximum(np.bincount(points, minlength=len(landmarks.points_world)), 1)
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
     origins = keypoints.origins_of(rows)
     poses = moved_to(adjustment.world_T_rigs[landmarks.tracks.frames], origins)
@@ -78,7 +78,14 @@ def assemble(
         components,
         joint_errors and joint_errors.scaled(stretch),
         None if origins is None else stretch[landmarks.tracks.frames, 3:] * origins,
+        map_scales=None if components is None else _map_scales(stretch[:, 3], components),
     )
+
+
+def _map_scales(stretches: np.ndarray, components: np.ndarray) -> np.ndarray:
+    """Scale (C,) of each map's world relative to the largest one's, by each frame's own (F,)."""
+    scales = stretches[np.unique(components, return_index=True)[1]]
+    return scales / scales[0]
 
 
 def world_scale(solved: Solution, result: Reconstruction) -> float:

@@ -12,7 +12,13 @@ import numpy as np
 
 from factors.bearing import tangent_basis
 from gsba.bundle.adjustment import Problem
-from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of, summed
+from gsba.bundle.shared_parameters import (
+    PARTS,
+    SharedModel,
+    models_of,
+    predicts,
+    summed,
+)
 from gsba.camera.fisheye import PARAMETERS, Pair, by_parameters, changed, difference, recalibrated
 from gsba.camera.lens import Lenses, facing
 from gsba.types import Counts, Keypoints, Landmarks, Solution
@@ -73,21 +79,22 @@ def estimate(
     for p, part in enumerate(systems):
         others = systems[:p] + systems[p + 1 :]
         alone = np.concatenate([np.zeros(FREE), _centre_step(others)])
-        gains.append((part.gain(_step(others, off)) - part.gain(alone)) / part.cost)
+        gains.append(part.gain(_step(others, off)) - part.gain(alone))
     found, gains = _step(systems, off), np.array(gains)
+    shares = gains / np.array([part.cost for part in systems])
     reason = ""
-    if so_far.fisheyes is None and np.any(gains <= 0):
+    if so_far.fisheyes is None and not predicts(gains):
         reason = "it does not predict parts of the sequence that it was not found from"
     logger.info(
         "lenses: focal lengths %+.3f and %+.3f %%, %.2f %% of unseen parts' cost%s",
         *(100 * (off + found[:FREE])[[0, OF_FRONT]]),
-        100 * float(gains.mean()),
+        100 * float(shares.mean()),
         reason and f"; not taken: {reason}",
     )
     lenses = so_far if reason else moved(so_far, found[:FREE])
     if not reason:
         lenses = replace(lenses, centre=so_far.centre + found[FREE:])
-    return SelfCalibration(lenses, gains, reason, counts)
+    return SelfCalibration(lenses, shares, reason, counts)
 
 
 def by_lenses(bearings_rig: np.ndarray, shown: np.ndarray, lenses: Lenses) -> np.ndarray:

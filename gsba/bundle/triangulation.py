@@ -53,7 +53,7 @@ def triangulate(
         )
 
     run_in_threads(work, len(ranges), num_threads)
-    lengths = np.add.reduceat(inliers, starts[:-1]) if len(rays) else np.zeros(0, int)
+    lengths = np.bincount(tracks.points[inliers > 0], minlength=tracks.num_points)
     short = lengths < settings.min_track_length
     flat = ~short & (parallaxes < np.deg2rad(settings.min_parallax_deg))
     dropped = {"observations disagree": short, "parallax too small": flat}
@@ -61,7 +61,7 @@ def triangulate(
         inside = _within_camera(tracks, inliers > 0, points, centres, origins_rig)
         dropped["within the camera"] = inside & ~short & ~flat
     kept = ~np.any(list(dropped.values()), axis=0)
-    survivors = tracks.of(kept, inliers.astype(bool))
+    survivors = tracks.of_observations(kept[tracks.points] & (inliers > 0))
     numbers = {reason: int(flag.sum()) for reason, flag in dropped.items()}
     counts = Counts(tracks.num_points, survivors.num_points, "tracks", numbers)
     return Landmarks(points[kept], survivors, counts)

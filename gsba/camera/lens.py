@@ -203,12 +203,11 @@ class Lenses:
         return replace(keypoints, bearings_rig=directions, origins_rig=origins)
 
     def clear(self, tracks: Tracks, keypoints: Keypoints) -> Tracks:
-        """Tracks without the observations where both lenses are blended."""
+        """Tracks without the observations, and the points, seen only where lenses are blended."""
         if not self.band_rad:
             return tracks
         bearings = keypoints.bearings_rig[keypoints.rows(tracks)]
-        every = np.ones(tracks.num_points, bool)
-        return tracks.of(every, ~self.blended(bearings, tracks.frames))
+        return tracks.of_observations(~self.blended(bearings, tracks.frames))
 
     def scaled(self, scale: float) -> "Lenses":
         """The same in a unit of which a map unit has `scale`."""

@@ -56,3 +56,12 @@ def owner_faces(bearings_rig: np.ndarray) -> np.ndarray:
     """Index into FACES of the face that owns each bearing (..., 3): its largest component."""
     assert len(FACES) == 6
     return np.argmax(bearings_rig @ RIG_R_FACE[:, :, 2].T, axis=-1).astype(np.uint8)
+
+
+def cells_of(bearings_rig: np.ndarray, per_side: int) -> np.ndarray:
+    """Cell (N,) int64 of each bearing (N, 3): faces divided into as many equal angles a side."""
+    faces = owner_faces(bearings_rig)
+    local = np.einsum("kji,kj->ki", RIG_R_FACE[faces], bearings_rig)
+    angles = np.arctan2(local[:, :2], local[:, 2:]) / (np.pi / 2) + 0.5
+    across = np.clip((angles * per_side).astype(int), 0, per_side - 1)
+    return (faces.astype(int) * per_side + across[:, 1]) * per_side + across[:, 0]

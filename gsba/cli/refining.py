@@ -1,6 +1,7 @@
 """Commands that refine: `refine`, `demo`, `show-config`."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +13,9 @@ from gsba.log import GsbaError
 if TYPE_CHECKING:
     from gsba.config import RefineSettings
     from gsba.demo.two_lenses import TwoLenses
+    from gsba.pipeline import RunResult
+
+PARTIAL = 3  # exit code of a run that is exported with less than nine tenths of its frames
 
 Config = Annotated[Path | None, typer.Option(help="TOML file of settings.", metavar="FILE")]
 Overrides = Annotated[
@@ -74,6 +78,13 @@ Cluster = Annotated[
         metavar="ADDRESS",
     ),
 ]
+AllowPartial = Annotated[
+    bool,
+    typer.Option(
+        "--allow-partial",
+        help="Exit with 0 also where less than nine tenths of the frames are in one map.",
+    ),
+]
 Segment = Annotated[
     str | None,
     typer.Option(help="Your own masks of faces: called with IMAGES MASKS.", metavar="COMMAND"),
@@ -114,9 +125,13 @@ def refine(
     accept_noncommercial: Consent = False,
     download: Download = False,
     cluster: Cluster = None,
+    allow_partial: AllowPartial = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Replace an earlier run.")] = False,
 ) -> None:
-    """Refine the pose of every frame; the same call again resumes."""
+    """Refine the pose of every frame; the same call again resumes.
+
+    The exit code is 3 where less than nine tenths of the frames are in the map that is exported.
+    """
     if (not trajectory) != no_trajectory:
         raise GsbaError("give either a TRAJECTORY or --no-trajectory")
     if keyframes is not None and no_trajectory:
@@ -131,17 +146,24 @@ def refine(
     given = {"keyframes": keyframes, "masks": masks, "segment": segment, "timestamps": timestamps}
     given |= {"fps": fps, "calibration": calibration, "imu": imu, "fresh": fresh}
     with connected(cluster) as client:
-        pipeline.refine(frames, trajectory, out, settings, client=client, **given)
-    typer.echo(_summary(out))
+        result = pipeline.refine(frames, trajectory, out, settings, client=client, **given)
+    _conclude([result], allow_partial)
 
 
-def _summary(out: Path) -> str:
-    """One line on a finished run."""
-    summary = json.loads((out / "report.json").read_text())["summary"]
-    residual, found = summary["median_residual_deg"], "rotations only, no points"
-    if residual is not None:
-        found = f"{summary['points']} points, median residual {residual:.4f} deg"
-    return f"{summary['refined']} of {summary['frames']} frames refined, {found}: {out}"
+def _conclude(results: "Sequence[RunResult]", allow_partial: bool) -> None:
+    """Print what finished runs come down to; exit with PARTIAL where one of them is partial."""
+    from gsba.report.maps import MIN_SHARE_IN_ONE_MAP, format_outcome
+
+    for result in results:
+        typer.echo(format_outcome(result.report, result.out))
+    if allow_partial or not any(result.partial for result in results):
+        return
+    typer.echo(
+        f"less than {MIN_SHARE_IN_ONE_MAP:.0%} of the frames are in the map that was exported: "
+        f"exit code {PARTIAL}, or 0 with --allow-partial",
+        err=True,
+    )
+    raise typer.Exit(PARTIAL)
 
 
 @command
@@ -161,6 +183,7 @@ def demo(
         Path | None,
         typer.Option(help="Walk through this instead: OBJ, GLB or PLY with colours."),
     ] = None,
+    allow_partial: AllowPartial = False,
 ) -> None:
     """Render a walk with exact truth, spoil its trajectory as SLAM would, refine and compare."""
     from gsba.config import CameraSettings, RefineSettings
@@ -185,12 +208,13 @@ def demo(
         runs = {"one centre": (central, one), "two lenses": (run, RefineSettings())}
     truth = read_trajectory(walk.truth_path)
     rows = {"before": compare(read_trajectory(walk.slam_path), truth)}
-    residuals, report = [], {}
+    residuals, report, results = [], {}, []
     for name, (folder, settings) in runs.items():
-        pipeline.refine(walk.frames_dir, walk.slam_path, folder, settings, fresh=True)
+        result = pipeline.refine(walk.frames_dir, walk.slam_path, folder, settings, fresh=True)
         rows[name] = compare(read_trajectory(folder / "trajectory.tum"), truth)
-        report = json.loads((folder / "report.json").read_text())
+        report = result.report
         residuals.append(report["summary"]["median_residual_deg"])
+        results.append(result)
     residuals.insert(0, report["summary"]["median_residual_deg_coarse"])
     pixels = [f"{degrees * width / 360:.3f}" for degrees in residuals]
     typer.echo(format_table(rows, extra={"reproj. px": pixels}))
@@ -199,6 +223,9 @@ def demo(
         typer.echo(_found_lenses(report["camera"], rows["two lenses"].scale, walk.lenses))
         where += f", as seen from one centre in {central}"
     typer.echo(f"Frames, trajectories and truth in {out / 'walk'}, {where}.")
+    _conclude(
+        [result for result in results if len(result.maps) > 1 or result.partial], allow_partial
+    )
 
 
 def _found_lenses(found: dict[str, Any], scale: float, lenses: "TwoLenses") -> str:

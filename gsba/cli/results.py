@@ -1,7 +1,7 @@
 """Commands on finished runs: `export`, `evaluate`."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -76,7 +76,8 @@ def export(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Folder to write; RUN/FORMAT by default.")
+        Path | None,
+        typer.Option(help="Folder to write; by default RUN/FORMAT, RUN/FORMAT-map2 of map 2."),
     ] = None,
     face_size: Annotated[int | None, typer.Option(help="Pixels of a cube face.")] = None,
     images: Images = "auto",
@@ -93,6 +94,15 @@ def export(
     link: Annotated[
         bool, typer.Option("--link", help="Hard links to unchanged frames, not copies.")
     ] = False,
+    map_number: Annotated[
+        int,
+        typer.Option(
+            "--map",
+            help="Which map of a run that holds several, as its report numbers them; 1: the "
+            "largest.",
+            metavar="NUMBER",
+        ),
+    ] = 1,
     cluster: Cluster = None,
 ) -> None:
     """Write a finished run as a dataset for another program, placed where you want it."""
@@ -111,11 +121,11 @@ def export(
     from gsba.store.cluster import connected, hired
     from gsba.store.finished import load_run
 
-    reconstruction, frames, *_ = load_run(run)
-    lenses = _lenses(run, reconstruction, frames, images)
-    folder = out or run / to
+    reconstruction, frames, *_ = load_run(run, map_number)
+    lenses = _lenses(run, reconstruction, frames, images, map_number)
+    folder = out or run / (to if map_number == 1 else f"{to}-map{map_number}")
     said = _baseline(run, baseline) if scale == "lens" else None
-    placement = place(reconstruction, frames, settings, said)
+    placement = replace(place(reconstruction, frames, settings, said), map_number=map_number)
     given = reconstruction, frames, folder, ExportFormat(to), face_size, placement, link, lenses
     with connected(cluster) as client, hired(client, folder, frames) as workers:
         write(*given, images=images, workers=workers)
@@ -125,7 +135,7 @@ def export(
 
 
 def _lenses(
-    run: Path, reconstruction: "Reconstruction", frames: "FrameSet", images: str
+    run: Path, reconstruction: "Reconstruction", frames: "FrameSet", images: str, map_number: int
 ) -> "Lenses":
     """What images are cut as seen from: one centre, or the lenses that the run found."""
     from gsba.camera.lens import ONE_CENTRE
@@ -135,7 +145,7 @@ def _lenses(
         return ONE_CENTRE
     from gsba.store.finished import load_lenses
 
-    lenses = load_lenses(run, reconstruction)
+    lenses = load_lenses(run, reconstruction, map_number)
     if not lenses and images not in ("auto", "panorama"):
         raise GsbaError(f"{run}: no two lenses were found: export it without --images {images}")
     return lenses

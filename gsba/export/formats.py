@@ -15,6 +15,7 @@ from gsba.export.images import write_pictures
 from gsba.export.pictures import FrameWriter
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement
+from gsba.store.finished import lenses_of_map, one_map
 from gsba.store.shards import Workers, content_digest
 from gsba.store.store import fingerprint
 from gsba.types import FrameSet, PoseStatus, Reconstruction
@@ -45,8 +46,9 @@ def export(
     lenses: Lenses = ONE_CENTRE,
     images: str = "auto",
     workers: Workers | None = None,
+    map_number: int = 1,
 ) -> None:
-    """Write a reconstruction in another program's format, all frames of it.
+    """Write a reconstruction in another program's format, all frames of one of its maps.
 
     Args:
         reconstruction: poses and cloud; nerfstudio's format alone turns its world, as the
@@ -63,14 +65,15 @@ def export(
         images: as `export.images` says it: fisheye for raw ones as they are, panorama for panoramas
             alone, else faces.
         workers: who write pictures; None = threads here.
+        map_number: which map of a reconstruction that holds several, 1 = the largest.
 
     Raises:
-        GsbaError: `out` is in use or not seen by a worker, the format does not fit the frames, or
-            the disk refuses; nothing is left behind then. An interrupted export goes on where it
-            was when it is called again in the same way.
+        GsbaError: `out` is in use or not seen by a worker, the format does not fit the frames,
+            there is no such map, or the disk refuses; nothing is left behind then. An interrupted
+            export goes on where it was when it is called again in the same way.
     """
     given = reconstruction, frames, {to: out}, face_size, placement, link, lenses, images
-    export_all(*given, workers)
+    export_all(*given, workers, map_number)
 
 
 def export_all(
@@ -83,18 +86,24 @@ def export_all(
     lenses: Lenses = ONE_CENTRE,
     images: str = "auto",
     workers: Workers | None = None,
+    map_number: int = 1,
 ) -> None:
     """As `export`, in several formats at once: every picture is read, cut and encoded once.
 
     Args:
         outs: folder of each format.
-        reconstruction, frames, face_size, placement, link, lenses, images, workers: as of `export`.
+        reconstruction, frames, face_size, placement, link, lenses, images, workers, map_number: as
+            of `export`.
 
     Raises:
         GsbaError: as of `export`; none of the folders is written then.
     """
     for to in outs:
         _require_fitting(to, frames, images)
+    whole = reconstruction
+    reconstruction, frames = one_map(whole, frames, map_number, "the reconstruction")
+    if lenses:
+        lenses = lenses_of_map(lenses, whole, map_number)
     unrefined = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
     if len(unrefined):
         names = ", ".join(frames.names[f] for f in unrefined[:5])
@@ -102,7 +111,7 @@ def export_all(
         logger.warning("%d frames go out with unrefined poses: %s%s", len(unrefined), names, more)
     if len(reconstruction.points_world) == 0:
         logger.warning("no points: the poses alone go out, and trainers need a start cloud")
-    placement = placement or Placement()
+    placement = placement or Placement(map_number=map_number)
     reconstruction = placement.apply(reconstruction)
     seen_by, z_up = lenses.scaled(placement.similarity.scale), placement.up == "z"
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)

@@ -20,7 +20,6 @@ from gsba.similarity import relative_map
 from gsba.types import Counts, Keypoints, Solution, VerifiedPairs
 
 _LOOKS = 3  # places compared for each frame
-MIN_SHARE = 0.25  # of the matches, to measure a pair at all: consistency decides
 MIN_GROUP = 3  # pairs that must agree
 RIVAL = 1.5  # by how much a group must outweigh one that contradicts it
 _TURN_DEG, _UNSEEN_TURN_DEG = 10.0, 45.0  # of the map between two frames, and per unseen step
@@ -49,7 +48,7 @@ def close(context: MatchContext, solved: Solution, unseen: np.ndarray) -> Closed
     looks = looks_of(context.strongest, num, settings.seed, context.workers)
     chosen = candidates(looks, solved, unseen, settings)
     strongest = replace(context, frames=context.strongest)
-    verified = recovery.match_anywhere(strongest, chosen, MIN_SHARE)
+    verified = recovery.match_anywhere(strongest, chosen)
     loops = _measure(verified, keypoints, solved, settings.seed)
     within = [loop for loop in loops if within_drift(loop, solved, unseen, settings)]
     agreeing = consistent(within, solved, settings.pairs.window)

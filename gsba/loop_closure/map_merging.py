@@ -7,15 +7,16 @@ alone, without a map, gets its pose from points of the map. What meets nowhere i
 trajectory where it knows better, and is a map of its own otherwise.
 """
 
+import logging
 from dataclasses import replace
 
 import numpy as np
 
-from gsba.geometry import inverse
-from gsba.loop_closure import loops
+from gsba.geometry import angles_between, inverse, unit
+from gsba.loop_closure import join_evidence, loops
 from gsba.loop_closure.connectivity import by_size
-from gsba.loop_closure.loops import MIN_SHARE
-from gsba.loop_closure.map_similarity import Meeting, agreeing, measure, refined
+from gsba.loop_closure.join_evidence import JoinEvidence, Places, Rates
+from gsba.loop_closure.map_similarity import Meeting, Proposal, alike, propose, refined
 from gsba.loop_closure.merged_map import Registered
 from gsba.loop_closure.pose_graph import Loop
 from gsba.loop_closure.registration import resect
@@ -23,8 +24,9 @@ from gsba.loop_closure.retrieval import looks_of
 from gsba.matching import recovery
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.similarity import Sim3
-from gsba.types import Counts, Solution
+from gsba.types import Counts, Matches, Solution
 
+logger = logging.getLogger(__name__)
 _LOOKS = 3  # places compared for each frame of a part; twice as many for a frame alone
 _SAMPLED = 24  # frames of a part that are looked for elsewhere
 _BESIDE = 3  # frames from a break that are compared whatever they look like
@@ -32,6 +34,8 @@ _BEST = 2  # meetings whose surroundings are compared too
 _MIN_MAP = 3  # frames of a part that is a map
 _BEHIND = 3.0  # times the pace: a frame alone is no further off than that
 _APART = 4.0  # extents between maps that nothing ties together
+_LOCAL = 12  # frames to either side of a meeting, which are asked what speaks for and against it
+_LEVEL = np.deg2rad(5.0)  # between the verticals of two parts, besides how frames tilt in each
 
 
 def merge(
@@ -81,10 +85,14 @@ class _Joining:
         self.looks = looks_of(context.strongest, num, context.settings.seed, context.workers)
         self.poses = solved.world_T_rigs.copy()
         known = solved.points_by_keypoint(context.keypoints)
-        self.known = [known[f] for f in range(num)]  # rig frames, own units
+        self.own_known = [known[f] for f in range(num)]  # rig frames, units of their parts
+        self.known = list(self.own_known)  # the same, in units of the map once carried
+        self.usual: Rates | None = None
+        self.usual_anywhere: Rates | None = None
         self.moves = [Sim3()] * num  # of each frame, so far
         self.components = np.full(num, -1)
         self.met, self.alone = np.zeros(num, bool), np.zeros(num, bool)
+        self.reasons: dict[int, str] = {}  # why a part was not carried to the map
         self.tried: set[tuple[int, int]] = set()  # part, size of the map it was compared with
         self.current = 0
 
@@ -108,7 +116,7 @@ class _Joining:
             self.tried.add((part, len(inside)))
             rows = np.flatnonzero(self.parts == part)
             if len(rows) >= _MIN_MAP and any(np.isfinite(self.known[f]).any() for f in rows):
-                move = self._similarity(rows, inside)
+                move = self._similarity(part, rows, inside)
                 if move is not None:
                     self._carry(rows, move)
                     self.met[rows] = True
@@ -124,10 +132,23 @@ class _Joining:
         for f in np.flatnonzero(self.ties).tolist():
             for inner, outer in ((f, f + 1), (f + 1, f)):
                 if self.components[inner] == self.current and self.components[outer] < 0:
-                    rows = np.flatnonzero((self.parts == self.parts[outer]) & (self.components < 0))
+                    part = int(self.parts[outer])
+                    rows = np.flatnonzero((self.parts == part) & (self.components < 0))
+                    if self._is_refuted(part, rows, self.moves[inner]):
+                        continue
                     self._carry(rows, self.moves[inner])
                     return True
         return False
+
+    def _is_refuted(self, part: int, rows: np.ndarray, move: Sim3) -> bool:
+        """Whether images contradict where the trajectory has a part of the map."""
+        if len(rows) < _MIN_MAP:
+            return False
+        inside = np.flatnonzero(self.components == self.current)
+        evidence = self._weigh(rows, inside, move)[0]
+        if evidence.refuted:
+            self.reasons[part] = f"not where the trajectory has it: {evidence}"
+        return evidence.refuted
 
     def _carry(self, rows: np.ndarray, move: Sim3) -> None:
         self.poses[rows] = move.poses(self.poses[rows])
@@ -148,37 +169,98 @@ class _Joining:
             found |= {(f, int(inside[g])) for g in near}
         return np.array(sorted(found), np.int32).reshape(-1, 2)
 
-    def _similarity(self, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
-        """What carries a part to where it meets the map; None if nothing does."""
+    def _similarity(self, part: int, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
+        """The similarity that carries a part to where it meets the map; None if none is sure."""
         sampled = np.linspace(0, len(rows) - 1, _SAMPLED).astype(int)
         sampled = rows[np.unique([*sampled, *range(_BESIDE), *range(-_BESIDE, 0)])]
         chosen = self._candidates(sampled, inside, _LOOKS)
-        strongest = replace(self.context, frames=self.context.strongest)
-        meetings = self._meetings(strongest, chosen)
-        group = agreeing(meetings, self.poses, self.depth)
-        if meetings and not group:  # too few of them, perhaps: look around the best
-            around = self._around(meetings, rows, inside, chosen)
-            meetings += self._meetings(self.context, around)
-            group = agreeing(meetings, self.poses, self.depth)
-        if not group or (self._held(rows) and not all(map(self._plausible, group))):
+        meetings = self._meetings(replace(self.context, frames=self.context.strongest), chosen)
+        found = self._best(part, meetings, rows, inside)
+        if meetings and found is None:  # too few of them, perhaps: look around the best
+            meetings += self._meetings(self.context, self._around(meetings, rows, inside, chosen))
+            found = self._best(part, meetings, rows, inside)
+        return found
+
+    def _best(
+        self, part: int, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray
+    ) -> Sim3 | None:
+        """The similarity that the surroundings of both parts confirm, if they confirm no other."""
+        weighed: list[tuple[Proposal, JoinEvidence]] = []
+        for proposal in propose(meetings, self.poses, self.depth, self.context.settings.seed):
+            if self._held(rows) and not self._plausible(proposal):
+                continue
+            groups = _around(rows, proposal.frames[0]), _around(inside, proposal.frames[1])
+            evidence, found = self._weigh(*groups, proposal.move)
+            again = self._known_by_both(found, rows)
+            if again:
+                proposal = replace(proposal, move=refined(again, proposal.move, self.poses))
+                evidence, _ = self._weigh(*groups, proposal.move)
+            if self._is_level(rows, inside, proposal.move):
+                weighed.append((proposal, evidence))
+        if not weighed:
+            self.reasons[part] = (
+                "no frame of it knows enough points that frames of another map know"
+            )
             return None
-        return refined(group, self.poses)
+        best, why = max(weighed, key=lambda one: one[1].least)
+        logger.info(
+            "a part of %d frames meets the map at frames %s: %s", len(rows), best.frames, why
+        )
+        rivals = (
+            other
+            for other, against in weighed
+            if against.confirmed and not why.beats(against)
+            if not alike(best, other, self.poses, self.depth)
+        )
+        if why.confirmed and not any(rivals):
+            return best.move
+        self.reasons[part] = "it fits two places alike" if why.confirmed else f"doubtful: {why}"
+        return None
+
+    def _is_level(self, rows: np.ndarray, inside: np.ndarray, move: Sim3) -> bool:
+        """Whether a part would stand upright on the map, as far as its frames do in themselves."""
+        down, theirs = self.poses[rows, :3, 1] @ move.rotation.T, self.poses[inside, :3, 1]
+        means = [unit(axes.mean(axis=0)) for axes in (down, theirs)]
+        spreads = [
+            np.sqrt(np.mean(angles_between(axes, mean) ** 2))
+            for axes, mean in zip((down, theirs), means, strict=True)
+        ]
+        return bool(angles_between(means[0], means[1]) < _LEVEL + 3 * np.hypot(*spreads))
+
+    def _weigh(
+        self, rows: np.ndarray, inside: np.ndarray, move: Sim3
+    ) -> tuple[JoinEvidence, Matches]:
+        """What speaks for a part being where a similarity carries it."""
+        poses, known = self.poses.copy(), list(self.known)
+        poses[rows] = move.poses(poses[rows])
+        for f in rows:
+            known[f] = move.scale * known[f]
+        usual, groups = self._usual(), (rows, inside)
+        return join_evidence.weigh(self.context, Places(poses, known), groups, usual, self.depth)
+
+    def _usual(self) -> Rates:
+        """How often points are found again within the parts, as they came."""
+        if self.usual is None:
+            places = Places(self.solved.world_T_rigs, self.own_known)
+            self.usual = join_evidence.rates(self.context, places, self.parts)
+        return self.usual
 
     def _meetings(self, context: MatchContext, chosen: np.ndarray) -> list[Meeting]:
-        """What pairs (P, 2) of a frame outside and one inside the map ask for."""
-        verified = recovery.match_anywhere(context, np.sort(chosen, axis=1), MIN_SHARE)
-        outside = set(chosen[:, 0].tolist())
+        """Points that both frames of pairs (P, 2), one outside and one inside the map, know."""
+        verified = recovery.match_anywhere(context, np.sort(chosen, axis=1), rivals=False)
+        return self._known_by_both(verified.matches, chosen[:, 0])
+
+    def _known_by_both(self, matches: Matches, outside: np.ndarray) -> list[Meeting]:
+        """Matched points that both frames of pairs know, one of them among those outside."""
         meetings = []
-        for p, (f0, f1) in enumerate(verified.matches.pairs.tolist()):
-            matched = verified.matches.of(p)
+        for p, (f0, f1) in enumerate(matches.pairs.tolist()):
+            matched = matches.of(p)
             (f, g), columns = ((f0, f1), (0, 1)) if f0 in outside else ((f1, f0), (1, 0))
             own = self.known[f][matched[:, columns[0]]]
             theirs = self.known[g][matched[:, columns[1]]]
             both = np.isfinite(own).all(axis=1) & np.isfinite(theirs).all(axis=1)
-            seed = self.context.settings.seed
-            meeting = measure(f, g, own[both], theirs[both], self.poses, seed)
-            if meeting is not None:
-                meetings.append(meeting)
+            if both.any():
+                meetings.append(Meeting(f, g, own[both], theirs[both]))
         return meetings
 
     def _around(
@@ -200,15 +282,15 @@ class _Joining:
         outside[rows] = True
         return bool((self.held & ((inside[1:] & outside[:-1]) | (inside[:-1] & outside[1:]))).any())
 
-    def _plausible(self, meeting: Meeting) -> bool:
-        """Whether a meeting asks for no more than the trajectory can have drifted."""
-        f, g, poses, settings = meeting.f, meeting.g, self.poses, self.context.settings
-        ends = {g: poses[g], f: meeting.move.poses(poses[f])}
+    def _plausible(self, proposal: Proposal) -> bool:
+        """Whether a proposal asks for no more than the trajectory can have drifted."""
+        (f, g), poses, settings = proposal.frames, self.poses, self.context.settings
+        ends = {g: poses[g], f: proposal.move.poses(poses[f])}
         first, last = sorted(ends)
         asked = inverse(ends[first]) @ ends[last]
-        loop = Loop(first, last, asked, len(meeting.own))
+        loop = Loop(first, last, asked, proposal.support)
         solved = replace(self.solved, world_T_rigs=poses)
-        even = abs(np.log(meeting.move.scale)) < np.log(settings.verify.max_length_ratio)
+        even = abs(np.log(proposal.move.scale)) < np.log(settings.verify.max_length_ratio)
         return even and loops.within_drift(loop, solved, self.held, settings)
 
     def _register(self, f: int, inside: np.ndarray) -> bool:
@@ -221,13 +303,28 @@ class _Joining:
             bearings = self.context.keypoints.bearings_of(f)[rows]
             settings = self.context.settings
             found = resect(bearings, points, settings.verify, settings.seed)
-            if found is not None and not found.reason and self._in_reach(f, found.world_T_rig):
+            if found is None or found.reason or not self._in_reach(f, found.world_T_rig):
+                continue
+            if self._shows_map(f, inside, found.world_T_rig):
                 self.moves[f] = Sim3.of(1.0, found.world_T_rig @ inverse(self.poses[f]))
                 self.poses[f] = found.world_T_rig
                 self.components[f] = self.current
                 self.met[f] = self.alone[f] = True
                 return True
         return False
+
+    def _shows_map(self, f: int, inside: np.ndarray, world_T_rig: np.ndarray) -> bool:
+        """Whether a frame alone shows what frames of the map beside it know, more than a look-alike
+        of a poster would."""
+        poses = self.poses.copy()
+        poses[f] = world_T_rig
+        if self.usual_anywhere is None:
+            places = Places(self.solved.world_T_rigs, self.own_known)
+            usual = join_evidence.rates(self.context, places, self.parts, surfaces=False)
+            self.usual_anywhere = usual
+        groups, places = (np.array([f]), inside), Places(poses, self.known)
+        given = self.context, places, groups, self.usual_anywhere, self.depth
+        return not join_evidence.weigh(*given, surfaces=False)[0].absent
 
     def _sightings(
         self, f: int, chosen: np.ndarray, strongest: bool
@@ -271,7 +368,7 @@ class _Joining:
             self.components[f] = maps + n
             self.moves[f] = self.moves[nearest]
             self.poses[f] = self.moves[f].poses(self.poses[f])
-        order = by_size(self.components)
+        reasons = self._reasons(order := by_size(self.components))
         offsets = self._side_by_side(order)
         scales = np.array([move.scale for move in self.moves])
         moves = np.array([move.new_T_old for move in self.moves])
@@ -288,6 +385,14 @@ class _Joining:
             self.alone,
             lost,
             Counts(num - 1, kept, "parts", dropped),
+            reasons,
+        )
+
+    def _reasons(self, order: np.ndarray) -> tuple[str, ...]:
+        """Why each map (order: (F,) number of each frame's) was not joined to a larger one."""
+        first = np.unique(order, return_index=True)[1]
+        return tuple(
+            "" if f == first[0] else self.reasons.get(int(self.parts[f]), "") for f in first
         )
 
     def _side_by_side(self, components: np.ndarray) -> np.ndarray:
@@ -301,6 +406,12 @@ class _Joining:
             offsets[group] = positions[groups[0]].mean(axis=0) + away
             offsets[group] -= positions[group].mean(axis=0)
         return offsets
+
+
+def _around(frames: np.ndarray, middle: int) -> np.ndarray:
+    """Frames (N,), ascending, at most so many before or after one of them: drift is small there."""
+    place = int(np.searchsorted(frames, middle))
+    return frames[max(place - _LOCAL, 0) : place + _LOCAL + 1]
 
 
 def _moved(

@@ -1,67 +1,78 @@
-"""Two maps that meet: frames of both that know the same points, and the similarity between them."""
+"""Two maps that may meet: what similarities their frames propose, and the best of each proposal."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsba.geometry import inverse, rotation_angle
-from gsba.loop_closure.loops import AGREE, AGREE_DEG, MIN_GROUP, RIVAL
-from gsba.similarity import Sim3, relative_similarity
+from gsba.loop_closure.loops import AGREE, AGREE_DEG
+from gsba.similarity import Sim3, agreeing_points, relative_similarity
 
 _AGREE_LOG = 0.15  # of scales
 _LOSS_DEG = 0.2  # scale of the robust loss: points of two maps err alike
+_LEAST_POINTS = 6  # that two frames must both know, and agree on, to propose a similarity
+_PROPOSALS = 6  # that are looked into
 
 
 @dataclass(frozen=True, slots=True)
 class Meeting:
-    """A frame outside a map and one inside that know the same points."""
+    """A frame outside a map and one inside, and matched points that both know."""
 
     f: int  # outside
     g: int  # inside
-    move: Sim3  # of the part of f into the map
     own: np.ndarray  # (m, 3) points in rig f, units of its part
     theirs: np.ndarray  # (m, 3) the same in rig g, units of the map
 
 
-def measure(
-    f: int, g: int, own: np.ndarray, theirs: np.ndarray, world_T_rigs: np.ndarray, seed: int
-) -> Meeting | None:
-    """The similarity that one pair of frames asks for; None if too few points agree.
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """A similarity that carries a part into a map."""
+
+    move: Sim3
+    frames: tuple[int, int]  # outside and inside, whose points proposed it
+    support: int  # points of all meetings that agree
+
+
+def propose(meetings: list[Meeting], poses: np.ndarray, depth: float, seed: int) -> list[Proposal]:
+    """Similarities that pairs of frames ask for, those that most points agree with first.
 
     Args:
-        f, g: frames outside and inside the map.
-        own, theirs: (m, 3) points that both know, in rig f and in rig g, each in its own units.
-        world_T_rigs: (F, 4, 4) each in its own map.
+        meetings: of frames outside and inside the map.
+        poses: (F, 4, 4) each in its own map.
+        depth: median distance of points, units of the map.
         seed: of the sampling.
     """
-    found = relative_similarity(theirs, own, seed)
-    if found is None:
-        return None
-    f_to_g, agree = found
-    f_T_own = inverse(world_T_rigs[f])
-    f_T_own[:3, 3] *= f_to_g.scale
-    move = Sim3.of(f_to_g.scale, world_T_rigs[g] @ f_to_g.new_T_old @ f_T_own)
-    return Meeting(f, g, move, own[agree], theirs[agree])
+    found = []
+    for m in meetings:
+        asked = relative_similarity(m.theirs, m.own, seed, _LEAST_POINTS)
+        if asked is None:
+            continue
+        f_T_own = inverse(poses[m.f])
+        f_T_own[:3, 3] *= asked[0].scale
+        move = Sim3.of(asked[0].scale, poses[m.g] @ asked[0].new_T_old @ f_T_own)
+        support = sum(len(each.own) for each in _agreeing(meetings, move, poses))
+        found.append(Proposal(move, (m.f, m.g), support))
+    distinct: list[Proposal] = []
+    for one in sorted(found, key=lambda proposal: -proposal.support):
+        if not any(alike(one, other, poses, depth) for other in distinct):
+            distinct.append(one)
+    return distinct[:_PROPOSALS]
 
 
-def agreeing(meetings: list[Meeting], poses: np.ndarray, depth: float) -> list[Meeting]:
-    """The meetings that carry a part to one place, if they outweigh all that say another."""
-    if not meetings:
-        return []
-    agree = np.array([[_alike(a, b, poses, depth) for b in meetings] for a in meetings])
-    weights = np.array([len(meeting.own) for meeting in meetings])
-    best = int(np.argmax(agree @ weights))
-    group = [meetings[n] for n in np.flatnonzero(agree[best])]
-    others = ~agree[best]
-    contrary = (agree[others][:, others] @ weights[others]).max() if others.any() else 0
-    distinct = min(len({m.f for m in group}), len({m.g for m in group}))
-    enough = len(group) >= MIN_GROUP and distinct >= 2
-    return group if enough and agree[best] @ weights >= RIVAL * contrary else []
+def _agreeing(meetings: list[Meeting], move: Sim3, poses: np.ndarray) -> list[Meeting]:
+    """The points of meetings that a similarity carries onto one another."""
+    found = []
+    for m in meetings:
+        world_T_f = move.poses(poses[m.f])
+        g_T_f = Sim3.of(move.scale, inverse(poses[m.g]) @ world_T_f)
+        rows = agreeing_points(m.theirs, m.own, g_T_f)
+        found.append(replace(m, own=m.own[rows], theirs=m.theirs[rows]))
+    return found
 
 
-def _alike(one: Meeting, other: Meeting, poses: np.ndarray, depth: float) -> bool:
-    """Whether two meetings carry the frames of both to the same poses."""
-    frames = poses[[one.f, other.f]]
+def alike(one: Proposal, other: Proposal, poses: np.ndarray, depth: float) -> bool:
+    """Whether two proposals carry the frames of both to the same poses."""
+    frames = poses[[one.frames[0], other.frames[0]]]
     first, second = one.move.poses(frames), other.move.poses(frames)
     turned = rotation_angle(first[0, :3, :3].T @ second[0, :3, :3])
     off = np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1).max()
@@ -70,14 +81,20 @@ def _alike(one: Meeting, other: Meeting, poses: np.ndarray, depth: float) -> boo
     return bool(near and stretched < _AGREE_LOG)
 
 
-def refined(group: list[Meeting], poses: np.ndarray) -> Sim3:
-    """The similarity under which all meetings see their points best, from either side."""
+def refined(meetings: list[Meeting], start: Sim3, poses: np.ndarray) -> Sim3:
+    """The similarity under which all meetings see their points best, from either side.
+
+    Args:
+        meetings: with points of which many agree with `start`.
+        start: similarity to start from; points that it does not carry onto one another are left
+            out.
+        poses: (F, 4, 4) each in its own map.
+    """
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    start = max(group, key=lambda meeting: len(meeting.own)).move
     inside, outside = [], []  # positions in both worlds, and who sees them
-    for m in group:
+    for m in _agreeing(meetings, start, poses):
         for world, seer, seen in ((outside, m.f, m.own), (inside, m.g, m.theirs)):
             positions = seen @ poses[seer, :3, :3].T + poses[seer, :3, 3]
             world.append(np.hstack([positions, np.tile(poses[seer, :3, 3], (len(seen), 1))]))

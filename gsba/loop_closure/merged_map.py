@@ -23,6 +23,8 @@ class Registered:
     alone: np.ndarray  # (F,) bool: got its pose from points of the map
     lost: np.ndarray  # (F,) bool: nothing could place it
     counts: Counts  # of parts
+    reasons: tuple[str, ...] = ()  # (maps) why each map, by its component, was not joined to a
+    # larger one, in words for the report; "" or missing = not known
 
     def move(self, f: int) -> Sim3:
         """What a frame was carried by, before its map was laid beside others."""

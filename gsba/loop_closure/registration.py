@@ -14,6 +14,7 @@ from gsba.geometry import inverse, pose
 
 _WIDTH = 4096  # of the virtual panorama
 _MIN_SPREAD = 0.02  # middle eigenvalue of the inliers' bearings: not in one narrow cone
+_LEAST = 25  # inliers
 _MIN_SHARE = 0.2  # of the candidates
 _RIVAL = 1.5  # by how much a pose must outweigh the next one that is elsewhere
 _ELSEWHERE = 0.3  # part of the median distance, or radians
@@ -72,18 +73,18 @@ def _estimate(
     """World_T_rig (4, 4) and inliers (m,) by LO-RANSAC."""
     import pycolmap
 
-    if len(bearings) < settings.min_inliers:
+    if len(bearings) < _LEAST:
         return None
     size = _WIDTH, _WIDTH // 2
     camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=size[0], height=size[1], params=size)
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = settings.max_error_deg * _WIDTH / 360
     options.ransac.min_num_trials, options.ransac.max_num_trials = 100, 10_000
-    options.ransac.min_inlier_ratio = settings.min_inliers / len(bearings)
+    options.ransac.min_inlier_ratio = _LEAST / len(bearings)
     options.ransac.random_seed = seed
     pixels = erp_from_bearings(bearings, *size)
     found = pycolmap.estimate_absolute_pose(pixels, points_world, camera, options)
-    if found is None or found["num_inliers"] < settings.min_inliers:
+    if found is None or found["num_inliers"] < _LEAST:
         return None
     rig_T_world = found["cam_from_world"].matrix()
     rig_T_world = pose(rig_T_world[:, :3], rig_T_world[:, 3])

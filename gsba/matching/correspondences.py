@@ -1,5 +1,6 @@
 """From poses to correspondences: neighbours in time, closed loops, and the map itself."""
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -8,6 +9,7 @@ from gsba.config import RefineSettings
 from gsba.geometry import inverse
 from gsba.matching import pairs, verification
 from gsba.matching.guided_search import Gate, MatchContext
+from gsba.matching.verification import RelativePose
 from gsba.types import Matches, Solution, VerifiedPairs
 
 _ROTATION_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # frames between those matched
@@ -30,12 +32,11 @@ def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
     agreeing = partial(
         verification.agree_with_prior,
-        keypoints=context.keypoints,
         prior_f0_T_f1s=f0_T_f1s,
         position_sigmas=np.zeros(len(chosen)),
         settings=settings.verify,
     )
-    estimates = _estimates(found, context)
+    estimates = _estimates(found, gate, context)
     neighbours = agreeing(found, estimates)
     scarce = np.diff(found.offsets) < settings.pairs.scarce_matches
     steps = chosen[:, 1] - chosen[:, 0] == 1
@@ -44,7 +45,7 @@ def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
     if len(rows) == 0:
         return neighbours
     again = context.match(chosen[rows], world_T_rigs, [gate] * len(rows))
-    for p, estimate in zip(rows, _estimates(again, context), strict=True):
+    for p, estimate in zip(rows, _estimates(again, gate, context), strict=True):
         estimates[p] = estimate
     return agreeing(_replaced(found, rows, again), estimates)
 
@@ -73,7 +74,7 @@ def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     known = solved.points_by_keypoint(keypoints)
     found = context.match(chosen, world_T_rigs, gates, known)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
-    return verified(found, f0_T_f1s, drifts, context)
+    return verified(found, gates, f0_T_f1s, drifts, context)
 
 
 def match_along_epipolars(context: MatchContext, solved: Solution) -> Matches:
@@ -114,21 +115,25 @@ def match_known_points(context: MatchContext, solved: Solution, loops_closed: bo
 
 def verified(
     found: Matches,
+    gates: Sequence[Gate],
     f0_T_f1s: np.ndarray | None,
     sigmas: np.ndarray | None,
     context: MatchContext,
+    rivals: bool = False,
 ) -> VerifiedPairs:
     """Matches whose geometry holds: see `verification.verify`."""
-    settings, workers = context.settings, context.workers
-    return verification.verify(
-        found, context.keypoints, f0_T_f1s, sigmas, settings.verify, settings.seed, workers
-    )
+    verify, seed = context.settings.verify, context.settings.seed
+    chances = np.array([gate.chance(np.deg2rad(verify.max_error_deg)) for gate in gates])
+    given = found, context.keypoints, f0_T_f1s, sigmas, verify, seed
+    return verification.verify(*given, context.workers, chances, rivals)
 
 
-def _estimates(found: Matches, context: MatchContext) -> list[verification.Estimate | None]:
-    """The geometry of each pair, whatever the trajectory says."""
-    settings, workers = context.settings, context.workers
-    return verification.estimate(found, context.keypoints, settings.verify, settings.seed, workers)
+def _estimates(found: Matches, gate: Gate, context: MatchContext) -> list[RelativePose | None]:
+    """The geometry of each pair within a gate, whatever the trajectory says."""
+    verify, seed = context.settings.verify, context.settings.seed
+    chances = np.full(len(found.pairs), gate.chance(np.deg2rad(verify.max_error_deg)))
+    given = found, context.keypoints, verify, seed
+    return verification.estimate(*given, context.workers, chances)
 
 
 def _shares(found: Matches, kept: VerifiedPairs) -> np.ndarray:

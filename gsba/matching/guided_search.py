@@ -14,7 +14,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from gsba.camera.lens import Lenses
-from gsba.camera.rig import RIG_R_FACE, owner_faces
+from gsba.camera.rig import cells_of
 from gsba.config import MatchingSettings, RefineSettings
 from gsba.features.extraction import FrameFeatures
 from gsba.geometry import inverse
@@ -47,6 +47,13 @@ class Gate:
     def around_points(cls, radius_rad: float) -> "Gate":
         """Around predicted points only."""
         return cls(np.pi, 1.0, np.pi, min(radius_rad, np.pi))
+
+    def chance(self, max_error_rad: float) -> float:
+        """Probability that a false match within the gate is as near to the epipolar plane of the
+        prediction as `max_error_rad`; 0 = nothing is predicted."""
+        if self.point_rad > 0:
+            return min(4 * max_error_rad / (np.pi * self.point_rad), 1.0)  # a strip of a disc
+        return 0.0 if self.rotation_rad >= np.pi else min(max_error_rad / self.rotation_rad, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,11 +88,7 @@ def searchable(
     """
     chosen = strongest_of(features, strongest)
     bearings = features.bearings_rig[chosen]
-    faces = owner_faces(bearings)
-    local = np.einsum("kji,kj->ki", RIG_R_FACE[faces], bearings)
-    angles = np.arctan2(local[:, :2], local[:, 2:]) / (np.pi / 2) + 0.5
-    cell_uv = np.clip((angles * _CELLS).astype(int), 0, _CELLS - 1)
-    cells = (faces.astype(int) * _CELLS + cell_uv[:, 1]) * _CELLS + cell_uv[:, 0]
+    cells = cells_of(bearings, _CELLS)
     order = np.argsort(cells, kind="stable")
     starts = np.searchsorted(cells[order], np.arange(6 * _CELLS * _CELLS + 1)).astype(np.int32)
     places = features.pixels[chosen, 0] + 1j * features.pixels[chosen, 1]  # one number sorts fast

@@ -59,7 +59,7 @@ def recover(
     close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
     lost = guided.missing(np.column_stack([close, close + 1]))
     alone = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
-    steps = image_steps(alone, keypoints, settings.verify)
+    steps = image_steps(alone, keypoints)
     alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
     coarse, joints = _joined(coarse, alone, steps, keypoints)
     misread.refuse_misfit(coarse, steps, settings.verify)
@@ -85,7 +85,7 @@ def recover(
         "pairs",
         {"no common geometry": len(chosen) - len(neighbours.matches.pairs)},
     )
-    neighbours = VerifiedPairs(neighbours.matches, neighbours.f0_T_f1s, counts)
+    neighbours = replace(neighbours, counts=counts)
     guessed = joining.guessed(joints, len(coarse.sources))
     guessed |= trust.unseen_steps & judgement.leaps(coarse.world_T_rigs, timestamps)
     trust = replace(trust, false_steps=trust.false_steps | guessed)
@@ -129,7 +129,7 @@ def check_clock(
     lost = guided.missing(chosen)
     if len(lost) > _MANY_LOST * len(chosen):
         guided = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
-    steps = image_steps(guided, context.keypoints, settings.verify)
+    steps = image_steps(guided, context.keypoints)
     misread.refuse_misread(coarse, steps, settings.verify)
     reach = settings.read.max_clock_shift_s
     return clock.estimate(timestamps, steps, trajectory, coarse.time_offset, reach)
@@ -144,12 +144,10 @@ def _match_along(
     gates = [Gate(np.deg2rad(prior.rotation_deg), prior.direction, limit)] * len(chosen)
     found = context.match(chosen, world_T_rigs, gates)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
-    return verified(found, f0_T_f1s, np.zeros(len(chosen)), context)
+    return verified(found, gates, f0_T_f1s, np.zeros(len(chosen)), context)
 
 
-def match_anywhere(
-    context: MatchContext, chosen: np.ndarray, min_share: float | None = None
-) -> VerifiedPairs:
+def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = True) -> VerifiedPairs:
     """Match whole panoramas without any prediction, and verify their geometry alone.
 
     The strongest features are tried first, and all for pairs that those do not settle.
@@ -157,18 +155,15 @@ def match_anywhere(
     Args:
         context: of the run.
         chosen: (P, 2) frame indices.
-        min_share: part of the matches that must be of one geometry; None = as for neighbours.
+        rivals: whether another pose that explains about as many matches speaks against a pair.
     """
-    if min_share is not None:
-        least = context.settings.verify.model_copy(update={"min_share": min_share})
-        context = replace(context, settings=context.settings.model_copy(update={"verify": least}))
     nowhere = np.tile(np.eye(4), (len(context.keypoints.starts) - 1, 1, 1))
 
     def match(some: np.ndarray, strongest: bool) -> VerifiedPairs:
         gates = [Gate.anywhere()] * len(some)
         # Nothing predicts which faces a learned matcher should compare.
         found = context.match(some, nowhere, gates, strongest=strongest, guided_only=True)
-        return verified(found, None, None, context)
+        return verified(found, gates, None, None, context, rivals)
 
     first = match(chosen, strongest=True)
     if context.strongest is context.frames:
@@ -180,7 +175,7 @@ def match_anywhere(
 def _judge(
     found: VerifiedPairs, keypoints: Keypoints, coarse: CoarsePoses, settings: RefineSettings
 ) -> Trust:
-    steps = image_steps(found, keypoints, settings.verify)
+    steps = image_steps(found, keypoints)
     logs, sigmas = length_ratios(found, steps, keypoints)
     return judgement.judge(coarse, steps, logs, sigmas, settings.verify, settings.priors)
 
@@ -197,7 +192,7 @@ def _supported(
     present = found.frames()
     if {(f - 1, f + 1), (f, f + 2)} & present:
         return True
-    steps = image_steps(found, keypoints, settings.verify)
+    steps = image_steps(found, keypoints)
     if not steps.directed[f]:
         return True  # a turn on the spot: whole panoramas agree on one rotation
     sigmas = length_ratios(found, steps, keypoints)[1]
@@ -208,6 +203,6 @@ def _consistent(
     found: VerifiedPairs, steps: Steps, keypoints: Keypoints, settings: RefineSettings
 ) -> VerifiedPairs:
     """Pairs without those over two steps that a repeated structure made up: see `off_steps`."""
-    off = off_steps(found, steps, keypoints, settings.verify)
+    off = off_steps(found, steps)
     false = off > np.deg2rad(settings.verify.max_triplet_deg)
     return found.taken(np.flatnonzero(~false).tolist()) if false.any() else found

@@ -1,4 +1,8 @@
-"""Two-view verification on bearings, and agreement with the trajectory."""
+"""Two-view verification on bearings.
+
+A relative pose is believed where chance does not explain its inliers, no other pose explains about
+as many of the other matches, and the trajectory does not contradict it.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -6,12 +10,33 @@ from typing import Any
 
 import numpy as np
 
+from gsba.camera.rig import cells_of
 from gsba.config import VerifySettings
-from gsba.geometry import inverse, parallax, pose, rotation_angle
+from gsba.geometry import inverse, nearest_rotation, pose, rotation_angle
+from gsba.significance import least_agreeing, outweighs
 from gsba.store.shards import ITEMS, Workers, even_blocks
 from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
 
-Estimate = tuple[np.ndarray, np.ndarray]  # f0_T_f1 (4, 4), inlier mask (m,); see `relative_pose`
+_SAMPLE = 5  # matches that determine a relative pose
+_CELLS = 16  # along a face's side: all matches within one cell, 6 degrees, are one witness
+_BAND = 3.0  # inlier thresholds around the epipolar planes of a pose: no rival has matches there
+_MODEL_SIGMA = np.deg2rad(0.15)  # of bearings from one centre: lenses are centimetres apart
+_MEDIANS = 1.3863, 0.4549  # of chi-square distributions with two and with one degree of freedom
+_RATIO_SIGMA = 2.75  # standard deviation of the logarithm of the ratio of two such sample medians,
+# times the root of the sample's size
+_TURN_SIGMAS = 4.75  # of that ratio: one turn in a million is taken for a walk
+_REFITS = 5  # of a rotation, without the matches that are furthest off
+
+
+@dataclass(frozen=True, slots=True)
+class RelativePose:
+    """How one frame lies in another, as their matches say."""
+
+    f0_T_f1: np.ndarray  # (4, 4) float64, translation of unit length
+    inliers: np.ndarray  # (m,) bool
+    direction_sigma: float  # radians, of the translation's direction; infinite = the camera may
+    # have turned only
+    rivalled: bool  # another pose explains about as many of the other matches
 
 
 def verify(
@@ -22,30 +47,29 @@ def verify(
     settings: VerifySettings,
     seed: int,
     workers: Workers,
+    chances: np.ndarray,
+    rivals: bool = False,
 ) -> VerifiedPairs:
     """Estimate a relative pose per pair by LO-RANSAC and keep pairs that agree with the prior.
 
     Args:
         matches: putative matches.
         keypoints: of all frames.
-        prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = none is believed, and
-            a pair needs `min_share` of its matches instead.
+        prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = none is believed.
         position_sigmas: (P,) how far the prior's relative position may be off, map units; decides
             how much its direction is worth.
         settings: thresholds.
         seed: of the sampling.
         workers: who do it.
+        chances, rivals: see `estimate`.
     """
-    estimates = estimate(matches, keypoints, settings, seed, workers)
-    return agree_with_prior(
-        matches, estimates, keypoints, prior_f0_T_f1s, position_sigmas, settings
-    )
+    estimates = estimate(matches, keypoints, settings, seed, workers, chances, rivals)
+    return agree_with_prior(matches, estimates, prior_f0_T_f1s, position_sigmas, settings)
 
 
 def agree_with_prior(
     matches: Matches,
-    estimates: Sequence[Estimate | None],
-    keypoints: Keypoints,
+    estimates: Sequence[RelativePose | None],
     prior_f0_T_f1s: np.ndarray | None,
     position_sigmas: np.ndarray | None,
     settings: VerifySettings,
@@ -54,47 +78,78 @@ def agree_with_prior(
 
     Args:
         estimates: of `estimate`, for each pair.
-        matches, keypoints, prior_f0_T_f1s, position_sigmas, settings: as for `verify`.
+        matches, prior_f0_T_f1s, position_sigmas, settings: as for `verify`.
     """
-    kept = []
-    dropped = {"too few matches": 0, "rotation contradicts": 0, "direction contradicts": 0}
+    kept, kept_poses = [], []
+    dropped: dict[str, int] = {
+        "too few matches": 0,
+        "two poses fit": 0,
+        "rotation contradicts": 0,
+        "direction contradicts": 0,
+    }
     for p, found in enumerate(estimates):
         if found is None:
-            dropped["too few matches"] += 1
-            continue
-        f0_T_f1, inliers = found
-        rows = matches.of(p)[inliers]
-        if prior_f0_T_f1s is None or position_sigmas is None:
-            if inliers.mean() < settings.min_share:
-                dropped["too few matches"] += 1
-            else:
-                kept.append((p, f0_T_f1, rows))
-            continue
-        prior = prior_f0_T_f1s[p]
-        turn = rotation_angle(prior[:3, :3].T @ f0_T_f1[:3, :3])
-        if turn > np.deg2rad(settings.max_rotation_deg):
-            dropped["rotation contradicts"] += 1
-        elif parallax(f0_T_f1, *keypoints.matched(matches.pairs[p], rows)) > np.deg2rad(
-            settings.min_parallax_deg
-        ) and not _direction_agrees(prior[:3, 3], f0_T_f1[:3, 3], position_sigmas[p], settings):
-            dropped["direction contradicts"] += 1
+            reason = "too few matches"
+        elif found.rivalled:
+            reason = "two poses fit"
+        elif prior_f0_T_f1s is None or position_sigmas is None:
+            reason = ""
         else:
-            kept.append((p, f0_T_f1, rows))
-    index = [p for p, _, _ in kept]
-    verified = Matches.of_rows(matches.pairs[index], [rows for _, _, rows in kept])
-    poses = np.array([f0_T_f1 for _, f0_T_f1, _ in kept]).reshape(-1, 4, 4)
-    return VerifiedPairs(verified, poses, Counts(len(matches.pairs), len(kept), "pairs", dropped))
+            reason = _contradiction(found, prior_f0_T_f1s[p], position_sigmas[p], settings)
+        if found is None or reason:
+            dropped[reason] += 1
+        else:
+            kept.append(p)
+            kept_poses.append(found)
+    rows = [matches.of(p)[found.inliers] for p, found in zip(kept, kept_poses, strict=True)]
+    return VerifiedPairs(
+        Matches.of_rows(matches.pairs[kept], rows),
+        np.array([found.f0_T_f1 for found in kept_poses]).reshape(-1, 4, 4),
+        np.array([found.direction_sigma for found in kept_poses], np.float64),
+        Counts(len(matches.pairs), len(kept), "pairs", dropped),
+    )
+
+
+def _contradiction(
+    found: RelativePose, prior: np.ndarray, position_sigma: float, settings: VerifySettings
+) -> str:
+    """Why a pose does not fit a prior (4, 4) whose position is known to `position_sigma`; "" = it
+    fits."""
+    turn = rotation_angle(prior[:3, :3].T @ found.f0_T_f1[:3, :3])
+    if turn > np.deg2rad(settings.max_rotation_deg):
+        return "rotation contradicts"
+    direction, length = found.f0_T_f1[:3, 3], float(np.linalg.norm(prior[:3, 3]))
+    if length <= 3 * position_sigma or np.isinf(found.direction_sigma):
+        return ""  # the prior or the images do not know the direction
+    allowed = np.deg2rad(settings.max_direction_deg) + 3 * found.direction_sigma
+    allowed += np.arcsin(3 * position_sigma / length)
+    angle = np.arctan2(np.linalg.norm(np.cross(prior[:3, 3], direction)), prior[:3, 3] @ direction)
+    return "" if angle < allowed else "direction contradicts"
 
 
 def estimate(
-    matches: Matches, keypoints: Keypoints, settings: VerifySettings, seed: int, workers: Workers
-) -> list[Estimate | None]:
-    """`relative_pose` of every pair, whatever the prior says."""
+    matches: Matches,
+    keypoints: Keypoints,
+    settings: VerifySettings,
+    seed: int,
+    workers: Workers,
+    chances: np.ndarray,
+    rivals: bool = False,
+) -> list[RelativePose | None]:
+    """`relative_pose` of every pair, whatever the prior says.
+
+    Args:
+        matches, keypoints, settings, seed, workers: as for `verify`.
+        chances: (P,) probability that a false match which the search let pass agrees with a pose
+            near the predicted one; 0 = nothing was predicted.
+        rivals: whether to look for other poses that speak against these.
+    """
 
     def rays(p: int) -> tuple[np.ndarray, np.ndarray]:
         return keypoints.matched(matches.pairs[p], matches.of(p))
 
-    return list(workers.map_shards(_PoseJob(len(matches.pairs), rays, settings, seed)))
+    job = _PoseJob(len(matches.pairs), rays, settings, seed, chances, rivals)
+    return list(workers.map_shards(job))
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,38 +160,93 @@ class _PoseJob:
     rays: Callable[[int], tuple[np.ndarray, np.ndarray]]  # of a pair, (m, 3) in either frame
     settings: VerifySettings
     seed: int
+    chances: np.ndarray
+    rivals: bool
     title: str = "verifying"
-    returns: Any = Estimate | None
+    returns: Any = RelativePose | None
 
     def __len__(self) -> int:
         return self.num
 
-    def __call__(self, p: int) -> Estimate | None:
-        return relative_pose(*self.rays(p), self.settings, self.seed)
+    def __call__(self, p: int) -> RelativePose | None:
+        chance = float(self.chances[p])
+        return relative_pose(*self.rays(p), self.settings, self.seed, chance, self.rivals)
 
     def blocks(self) -> Sequence[tuple[int, int]]:
         return even_blocks(self.num, ITEMS)
 
     def part(self, start: int, stop: int) -> "_PoseJob":
         rays = [self.rays(p) for p in range(start, stop)]
-        return replace(self, num=len(rays), rays=rays.__getitem__)
+        return replace(self, num=len(rays), rays=rays.__getitem__, chances=self.chances[start:stop])
 
 
 def relative_pose(
-    bearings0: np.ndarray, bearings1: np.ndarray, settings: VerifySettings, seed: int
-) -> Estimate | None:
-    """f0_T_f1 (4, 4) with unit translation and inlier mask (m,), or None if too few agree."""
+    bearings0: np.ndarray,
+    bearings1: np.ndarray,
+    settings: VerifySettings,
+    seed: int,
+    chance: float = 0.0,
+    rivals: bool = False,
+) -> RelativePose | None:
+    """The relative pose that most matches agree on, or None where chance explains as many.
+
+    Args:
+        bearings0, bearings1: (m, 3) unit, rays of the matches in either frame.
+        settings: thresholds.
+        seed: of the sampling.
+        chance, rivals: see `estimate`.
+    """
+    found = _significant(bearings0, bearings1, settings, seed, chance)
+    if found is None:
+        return None
+    f0_T_f1, inliers = found
+    sigma = _direction_sigma(f0_T_f1, bearings0[inliers], bearings1[inliers])
+    rivalled = rivals and _is_rivalled(f0_T_f1, bearings0, bearings1, inliers, settings, seed)
+    return RelativePose(f0_T_f1, inliers, sigma, rivalled)
+
+
+def _significant(
+    bearings0: np.ndarray,
+    bearings1: np.ndarray,
+    settings: VerifySettings,
+    seed: int,
+    chance: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """f0_T_f1 (4, 4) with unit translation and inliers (m,) bool of the best pose; None where
+    chance explains as many."""
+    largest, witnesses = np.sin(np.deg2rad(settings.max_error_deg)), _witnesses(bearings0)
+
+    def needed(of_match: float) -> int:
+        of_witness = 1 - (1 - of_match) ** (len(bearings0) / witnesses)
+        return least_agreeing(witnesses, of_witness, _SAMPLE, settings.max_false_alarms)
+
+    if len(bearings0) <= _SAMPLE or needed(max(chance, largest)) > witnesses:
+        return None
+    found = _ransac(bearings0, bearings1, needed(max(chance, largest)), settings, seed)
+    if found is None:
+        return None
+    # Where bearings crowd around one plane, any of them agrees with poses along it.
+    sines = _normals(found[0], bearings0) @ (found[0][:3, :3] @ bearings1.T)
+    np.fill_diagonal(sines, np.inf)
+    agreeing = np.count_nonzero(np.abs(sines) < largest) / (sines.size - len(sines))
+    enough = _witnesses(bearings0[found[1]]) >= needed(max(chance, agreeing, largest))
+    return found if enough else None
+
+
+def _ransac(
+    bearings0: np.ndarray, bearings1: np.ndarray, least: int, settings: VerifySettings, seed: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """f0_T_f1 (4, 4) and inliers (m,) bool of the pose that most matches agree with, `least` of
+    them or more."""
     import pycolmap
 
-    if len(bearings0) < settings.min_inliers:
-        return None
     options = pycolmap.RANSACOptions()
     options.max_error = np.deg2rad(settings.max_error_deg)
     options.min_num_trials, options.max_num_trials = 100, 3000
-    options.min_inlier_ratio = settings.min_inliers / len(bearings0)  # with fewer it is refused
+    options.min_inlier_ratio = least / len(bearings0)
     options.random_seed = seed
     found = pycolmap.estimate_relative_pose(bearings0, bearings1, options)
-    if found is None or found["num_inliers"] < settings.min_inliers:
+    if found is None:
         return None
     f1_T_f0 = found["cam2_from_cam1"].matrix()
     f0_T_f1 = inverse(pose(f1_T_f0[:, :3], f1_T_f0[:, 3]))
@@ -144,13 +254,75 @@ def relative_pose(
     return f0_T_f1, np.asarray(found["inlier_mask"], bool)
 
 
-def _direction_agrees(
-    prior: np.ndarray, direction: np.ndarray, sigma: float, settings: VerifySettings
+def _witnesses(bearings: np.ndarray) -> int:
+    """Cells of the sphere that bearings (m, 3) fall into."""
+    return len(np.unique(cells_of(bearings, _CELLS)))
+
+
+def _normals(f0_T_f1: np.ndarray, bearings0: np.ndarray) -> np.ndarray:
+    """Unit normals (m, 3) of the epipolar planes of bearings (m, 3), frame 0."""
+    normals = np.cross(f0_T_f1[:3, 3], bearings0)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+
+
+def _is_rivalled(
+    f0_T_f1: np.ndarray,
+    bearings0: np.ndarray,
+    bearings1: np.ndarray,
+    inliers: np.ndarray,
+    settings: VerifySettings,
+    seed: int,
 ) -> bool:
-    """Whether a unit direction fits a relative position known to `sigma`."""
-    length = np.linalg.norm(prior)
-    if length <= 3 * sigma:  # the prior does not know the direction
-        return True
-    allowed = np.deg2rad(settings.max_direction_deg) + np.arcsin(3 * sigma / length)
-    angle = np.arctan2(np.linalg.norm(np.cross(prior, direction)), prior @ direction)
-    return bool(angle < allowed)
+    """Whether matches that a pose does not explain agree on another that explains about as many.
+
+    A pose that repeated structure makes up has the true one as its rival, and the other way round.
+    """
+    sines = np.sum(_normals(f0_T_f1, bearings0) * (bearings1 @ f0_T_f1[:3, :3].T), axis=1)
+    rest = np.abs(sines) > np.sin(_BAND * np.deg2rad(settings.max_error_deg))
+    rival = _significant(bearings0[rest], bearings1[rest], settings, seed)
+    if rival is None:
+        return False
+    support, against = _witnesses(bearings0[inliers]), _witnesses(bearings0[rest][rival[1]])
+    return not outweighs(support, against, settings.max_error_rate)
+
+
+def _direction_sigma(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.ndarray) -> float:
+    """Standard deviation (rad) of the translation's direction; infinite where a rotation will do.
+
+    Under a rotation alone, what it leaves over of bearings is noise in two directions; under a
+    translation, only what lies across the epipolar planes is. Medians of both are compared.
+    """
+    rotation, planes = f0_T_f1[:3, :3], _normals(f0_T_f1, bearings0)
+    across = np.sum(planes * (bearings1 @ rotation.T), axis=1)
+    turned = bearings1 @ _rotation(bearings0, bearings1).T
+    left = np.median(np.sum((bearings0 - turned) ** 2, axis=1)) / _MEDIANS[0]
+    noise = np.median(across**2) / _MEDIANS[1]
+    noise, left = noise + _MODEL_SIGMA**2, left + _MODEL_SIGMA**2
+    num = _witnesses(bearings0)
+    if np.log(left / noise) < _TURN_SIGMAS * _RATIO_SIGMA / np.sqrt(num):
+        return np.inf
+    return _direction_error(f0_T_f1, bearings0, bearings1) * np.sqrt(noise * len(bearings0) / num)
+
+
+def _rotation(bearings0: np.ndarray, bearings1: np.ndarray) -> np.ndarray:
+    """f0_R_f1 (3, 3) that carries most bearings (m, 3) of frame 1 onto those of frame 0."""
+    near = np.ones(len(bearings0), bool)
+    rotation = np.eye(3)
+    for _ in range(_REFITS):
+        rotation = nearest_rotation(bearings0[near].T @ bearings1[near])
+        off = np.linalg.norm(bearings0 - bearings1 @ rotation.T, axis=1)
+        near = off <= np.median(off)
+    return rotation
+
+
+def _direction_error(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.ndarray) -> float:
+    """Largest standard deviation of the direction for bearings with noise of one radian."""
+    rotation, direction = f0_T_f1[:3, :3], f0_T_f1[:3, 3]
+    planes, rays1 = _normals(f0_T_f1, bearings0), bearings1 @ rotation.T
+    lengths = np.linalg.norm(np.cross(direction, bearings0), axis=1, keepdims=True)
+    by_direction = np.cross(bearings0, rays1) / np.maximum(lengths, 1e-6)
+    basis = np.linalg.svd(direction[None])[2][1:]  # of the plane across the direction
+    jacobian = np.hstack([np.cross(rays1, planes), by_direction @ basis.T])
+    information = jacobian.T @ jacobian
+    information += 1e-9 * np.trace(information) * np.eye(_SAMPLE)
+    return float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(information)[3:, 3:])[-1]))

@@ -99,6 +99,8 @@ def _views(
     costs = np.empty(near.shape[1])
     num = 0
     for j in range(len(points)):
+        if starts[j] == starts[j + 1]:
+            continue
         host = frames[rows[j]]
         va = points[j] - centres[host]
         listed[host] = j

@@ -164,7 +164,7 @@ def align_imu(run: Run, seen: Seen, prior: Prior, near: VerifiedPairs) -> Prior:
     readings, times = run.imu, run.frames.timestamps
     if readings is None:
         return prior
-    steps = image_steps(near, seen.keypoints, run.settings.verify)
+    steps = image_steps(near, seen.keypoints)
 
     def compute() -> Alignment:
         return align(times, steps.f_T_nexts[:, :3, :3], steps.verified, readings)

@@ -20,6 +20,7 @@ from gsba.report import findings
 from gsba.report.camera_findings import of_camera, of_lenses
 from gsba.report.html import residual_sphere, write_html
 from gsba.report.imu_findings import of_gyro
+from gsba.report.maps import MapSummary, is_partial, summarize_maps
 from gsba.report.report import build_report, plain, write_poses
 from gsba.trajectory.files import write_tum
 from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
@@ -53,6 +54,12 @@ class RunResult:
     coarse: CoarsePoses  # before
     reconstruction: Reconstruction  # after
     report: dict[str, Any]  # the content of report.json
+    maps: tuple[MapSummary, ...]  # of the reconstruction, the largest first: it is exported
+
+    @property
+    def partial(self) -> bool:
+        """Whether less than nine tenths of the frames are in the map that is exported."""
+        return is_partial(self.maps, len(self.frames))
 
 
 def write(run: Run, prior: Prior, world: Map, result: Reconstruction, lenses: Lenses) -> RunResult:
@@ -63,7 +70,7 @@ def write(run: Run, prior: Prior, world: Map, result: Reconstruction, lenses: Le
     """
     store, settings, coarse = run.store, run.settings, prior.coarse
     frames, out, rows = world.straightened(run.frames), store.root, result.largest_map()
-    main, shown = result.taken(rows), frames.taken(rows)
+    main, shown = result.of_map(1), frames.taken(rows)
     write_tum(out / "trajectory.tum", Trajectory(shown.timestamps, main.world_T_rigs))
     start = replace(coarse, world_T_rigs=coarse.world_T_rigs[rows], sources=coarse.sources[rows])
     (out / "coarse.tum").unlink(missing_ok=True)
@@ -83,7 +90,13 @@ def write(run: Run, prior: Prior, world: Map, result: Reconstruction, lenses: Le
     write_html(out / "report.html", shown, start, main, page)
     for name in (*_OUTPUTS, CALIBRATION):
         store.claim(out / name)
-    return RunResult(out, frames, coarse, result, report)
+    maps = summarize_maps(result, frames, _reasons(prior))
+    return RunResult(out, frames, coarse, result, report, maps)
+
+
+def _reasons(prior: Prior) -> tuple[str, ...]:
+    """Why maps were not joined, the largest first."""
+    return () if prior.merged is None else prior.merged.reasons
 
 
 def _calibration(
@@ -105,7 +118,7 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
     undone = [n for n, rounds in journal.rounds.items() if not all(r.accepted for r in rounds)]
     undone += [name for name in journal.undone if name not in undone]
     trajectory, notes = findings.of_trajectory(
-        prior.trust, prior.clock, prior.merged, prior.joints, frames
+        prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.absent
     )
     camera = None
     if world.centres is not None:
@@ -145,6 +158,7 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
         stitching=world.stitching and findings.of_field(world.stitching),
         camera=camera,
         gyro=gyro,
+        reasons=_reasons(prior),
     )
     report["residual_sphere"] = plain(residual_sphere(result), digits=4)
     return report
@@ -171,7 +185,9 @@ def _export(
             how = {"lenses": seen_by, "images": images, "workers": store.workers}
             export_all(main, shown, waiting, size, placement, **how)
             waiting.clear()
-        return Counts(len(run.frames), len(shown), "frames")
+        apart = len(run.frames) - len(shown)
+        dropped = {"in another map or in none": apart} if apart else {}
+        return Counts(len(run.frames), len(shown), "frames", dropped)
 
     for to, folder in folders.items():
         store.stage(f"export-{to.value}", key, compute, Counts, run.chain.latest)

@@ -260,13 +260,17 @@ def _find_camera(
     guess = backend.guess_axes(run, looking, prior, "axes", matches, solved)
     band, better, gates = np.deg2rad(settings.camera.seam_deg), solved, settings.rounds.loops
     looking = seen.through(replace(guess.lenses, band_rad=float(band)))
-    for n in range(2):  # at first some part of the sequence may be bent against them
+    for n in range(2):  # on trial, then judged by what is matched with them
         found = backend.find_lenses(run, looking, prior, f"lenses{n}", matches, better)
         if not found.lenses:
             return seen, Map.of(solved, seen.shown, found)
         looking = seen.through(found.lenses)
         better = backend.adjust(run, looking, prior, f"lensed{n}", matches, better, gates)
         gates = settings.rounds.dense
+        if n == 0:
+            along = frontend.match_along_epipolars(run, looking, better, "adjacent_lenses")
+            wide = frontend.match_known_points(run, looking, better, "wide_lenses")
+            matches = [along, wide]
     radius = backend.find_stitch_radius(run, looking, prior, "stitch_radius", matches, better)
     if not radius.reason:
         looking = seen.through(radius.lenses)

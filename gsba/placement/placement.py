@@ -61,6 +61,7 @@ class Placement:
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,), unit of the placed
     origin: tuple[float, float, float] | None = None  # latitude, longitude, altitude of placed 0
     grounds: dict[str, Any] = field(default_factory=dict)  # what it rests on, and how well
+    map_number: int = 1  # map of the run that is placed: each has a world of its own; 1 = largest
 
     @property
     def matrix(self) -> np.ndarray:
@@ -107,6 +108,7 @@ class Placement:
             "offset": self.offset.tolist(),
             "origin": None if self.origin is None else dict(zip(names, self.origin, strict=True)),
             "grounds": self.grounds,
+            "map": self.map_number,
         }
 
     def write(self, path: Path) -> None:
@@ -135,6 +137,7 @@ def read_placement(path: Path) -> Placement:
             np.array(content["offset"], np.float64).reshape(3),
             origin,
             content["grounds"],
+            int(content.get("map", 1)),
         )
     except OSError as error:
         raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None

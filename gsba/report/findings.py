@@ -25,6 +25,7 @@ def of_trajectory(
     merged: Registered | None,
     joints: tuple[Joint, ...],
     frames: FrameSet,
+    absent: bool = False,
 ) -> tuple[dict[str, Any], list[str]]:
     """What images say of the trajectory, for report.json, and what to note of it.
 
@@ -34,8 +35,9 @@ def of_trajectory(
         merged: parts of the map that were joined; None = it never was in parts.
         joints: how its pieces were joined.
         frames: of the run.
+        absent: there is no trajectory: images contradict none of its frames and steps.
     """
-    found, notes = _steps(trust, frames)
+    found, notes = _steps(trust, frames, absent)
     if clock is not None:
         found |= {"clock": _clock(clock)}
         if clock.verdict == "corrected":
@@ -47,17 +49,17 @@ def of_trajectory(
     return found | maps, notes + more
 
 
-def _steps(trust: Trust, frames: FrameSet) -> tuple[dict[str, Any], list[str]]:
+def _steps(trust: Trust, frames: FrameSet, absent: bool) -> tuple[dict[str, Any], list[str]]:
     """The judgement by the names of frames, for the report, and what to note of it."""
     names = np.array(frames.names)
 
     def between(chosen: np.ndarray) -> list[Any]:
         return [[names[f], names[f + 1]] for f in np.flatnonzero(chosen).tolist()]
 
-    false = names[trust.false_frames].tolist()
+    false = [] if absent else names[trust.false_frames].tolist()
     judgement = {
         "false_frames": false,
-        "false_steps": between(trust.false_steps),
+        "false_steps": [] if absent else between(trust.false_steps),
         "unseen_steps": between(trust.unseen_steps),
     }
     notes = []
@@ -112,10 +114,13 @@ def _maps(
     if lost:
         notes.append(f"could not be registered, not exported: {', '.join(lost)}")
     if count > 1:
-        parts = "; ".join(f"{m[0]} to {m[-1]} ({len(m)} frames)" for m in maps[1:])
+        parts = "; ".join(
+            f"map {n} from {m[0]} to {m[-1]} ({len(m)} frames)" for n, m in enumerate(maps[1:], 2)
+        )
         notes.append(
-            f"nothing ties {count} places together: each is refined, the largest with "
-            f"{len(maps[0])} frames is exported, the others are in poses.csv: {parts}"
+            f"nothing ties {count} places together: each is a map of its own, and map 1 with its "
+            f"{len(maps[0])} frames is exported; the others are in poses.csv, and are exported by "
+            f"gsba export --map NUMBER: {parts}"
         )
     return judgement, notes
 
@@ -169,7 +174,8 @@ def of_frames(
     """
     absent = coarse.sources == PoseSource.NONE
     filled = np.flatnonzero((coarse.sources != PoseSource.SLAM) & ~absent)
-    lost = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
+    unrefined = reconstruction.pose_statuses == PoseStatus.UNREFINED
+    lost = np.flatnonzero(unrefined & (reconstruction.map_numbers() > 0))
     notes = []
     if absent.all():
         notes.append("no trajectory: started from the images alone, in units of their own")

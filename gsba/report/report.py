@@ -19,6 +19,7 @@ from pydantic import BaseModel
 from gsba.bundle.triangulation import points_under
 from gsba.disk import atomic_write
 from gsba.geometry import angular_errors, moved_to, quaternion_from_rotation
+from gsba.report.maps import summarize_maps
 from gsba.store.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
 from gsba.version import __version__
@@ -94,6 +95,7 @@ def build_report(
     stitching: Mapping[str, Any] | None = None,
     camera: Mapping[str, Any] | None = None,
     gyro: Mapping[str, Any] | None = None,
+    reasons: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Content of report.json: plain values only.
 
@@ -109,6 +111,7 @@ def build_report(
         stitching: the field of directions, see `gsba.report.findings.of_field`.
         camera: where its lenses are, see `gsba.report.findings.of_camera`.
         gyro: that rode along, see `gsba.report.imu_findings.of_gyro`.
+        reasons: why maps were not joined, see `gsba.report.maps.summarize_maps`.
     """
     quality = frame_quality(reconstruction)
     stage_rows = [
@@ -118,6 +121,7 @@ def build_report(
         "gsba": __version__,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "summary": _summary(frames, coarse, reconstruction),
+        "maps": summarize_maps(reconstruction, frames, reasons),
         "gauge": gauge,
         "notes": notes,
         "trajectory": trajectory,
@@ -138,19 +142,23 @@ def build_report(
 def _summary(
     frames: FrameSet, coarse: CoarsePoses, reconstruction: Reconstruction
 ) -> dict[str, Any]:
-    """What a run comes down to."""
-    residuals = np.degrees(angular_residuals(reconstruction))
-    lengths = np.bincount(
-        reconstruction.observation_points, minlength=len(reconstruction.points_world)
-    )
+    """Counts of a run's frames, and counts and residuals of the map that is exported."""
+    rows, main = reconstruction.largest_map(), reconstruction.of_map(1)
+    residuals = np.degrees(angular_residuals(main))
+    lengths = np.bincount(main.observation_points, minlength=len(main.points_world))
+    numbers = reconstruction.map_numbers()
     return {
         "frames": len(frames),
-        "refined": np.count_nonzero(reconstruction.pose_statuses == PoseStatus.REFINED),
+        "exported": len(rows),
+        "refined": np.count_nonzero(main.pose_statuses == PoseStatus.REFINED),
+        "maps": reconstruction.num_maps,
+        "frames_in_other_maps": np.count_nonzero(numbers > 1),
+        "frames_in_no_map": np.count_nonzero(numbers == 0),
         "points": len(lengths),
         "observations": len(residuals),
         "mean_track_length": lengths.mean() if len(lengths) else math.nan,
         "median_residual_deg": np.median(residuals) if len(residuals) else math.nan,
-        "median_residual_deg_coarse": median_residual_deg(reconstruction, coarse.world_T_rigs),
+        "median_residual_deg_coarse": median_residual_deg(main, coarse.world_T_rigs[rows]),
     }
 
 
@@ -161,7 +169,7 @@ def write_poses(
 
     Covariances are of the tangent [rotation (radians), translation (map units)] in the rig frame;
     the upper triangle is written row by row. Cells of unknown values are empty. Frames of the same
-    `map` share a world; 0 is the largest.
+    `map` share a world; 1 is the largest, and frames that are in none have an empty cell.
     """
     quality = frame_quality(reconstruction)
     rows, columns = np.triu_indices(6)
@@ -176,7 +184,7 @@ def write_poses(
             reconstruction.pose_covariances[:, rows, columns],
         ]
     )
-    maps = reconstruction.components
+    maps = reconstruction.map_numbers()
     header = ["frame", "timestamp", "status", "source", "num_observations", "median_residual_deg"]
     header += ["tx", "ty", "tz", "qw", "qx", "qy", "qz"]
     header += [f"std_{axis}_deg" for axis in _AXES[:3]] + [f"std_{axis}" for axis in _AXES[3:]]
@@ -194,7 +202,7 @@ def write_poses(
                     [name, repr(float(frames.timestamps[f])), status, source]
                     + [int(quality.num_observations[f]), _cell(quality.median_residuals_deg[f])]
                     + [_cell(value) for value in numbers[f]]
-                    + [0 if maps is None else int(maps[f])]
+                    + [int(maps[f]) or ""]
                 )
 
     atomic_write(path, write)

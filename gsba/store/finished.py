@@ -11,11 +11,15 @@ from gsba.store.store import load_stage
 from gsba.types import FrameSet, Reconstruction
 
 
-def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:
-    """Result of a finished run and the frames it was made from: the largest of its maps.
+def load_run(out: Path, map_number: int = 1) -> tuple[Reconstruction, FrameSet]:
+    """Result of a finished run and the frames it was made from, those of one map.
+
+    Args:
+        out: folder of the run.
+        map_number: which of its maps, 1 = the largest.
 
     Raises:
-        GsbaError: `out` is no finished run, or was edited.
+        GsbaError: `out` is no finished run, or was edited; there is no such map.
     """
     reconstruction = load_stage(out, "reconstruction", Reconstruction)
     frames = load_stage(out, "frames", FrameSet)
@@ -23,10 +27,7 @@ def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:
         raise GsbaError(f"{out}: its results do not fit together: refine again with --fresh")
     fisheyes = reconstruction.fisheyes or frames.fisheyes
     frames = replace(frames, correction=reconstruction.correction, fisheyes=fisheyes)
-    main, shown = (
-        reconstruction.taken(reconstruction.largest_map()),
-        frames.taken(reconstruction.largest_map()),
-    )
+    main, shown = one_map(reconstruction, frames, map_number, str(out))
     if not (np.isfinite(main.world_T_rigs).all() and np.isfinite(main.points_world).all()):
         raise GsbaError(f"{out}: its poses or points are no numbers: refine again with --fresh")
     if not (np.isfinite(shown.timestamps).all() and (np.diff(shown.timestamps) > 0).all()):
@@ -34,16 +35,44 @@ def load_run(out: Path) -> tuple[Reconstruction, FrameSet]:
     return main, shown
 
 
-def load_lenses(out: Path, main: Reconstruction) -> Lenses:
-    """What the frames of a finished run's largest map are stitched from, in that map's unit.
+def one_map(
+    reconstruction: Reconstruction, frames: FrameSet, map_number: int, name: str
+) -> tuple[Reconstruction, FrameSet]:
+    """A map of a reconstruction, 1 = the largest, and its frames; `name` it in a refusal.
+
+    Raises:
+        GsbaError: there is no such map.
+    """
+    num = reconstruction.num_maps
+    if not 1 <= map_number <= num:
+        raise GsbaError(
+            f"{name} has no map {map_number}: it has {num}, numbered from the largest, 1"
+        )
+    return reconstruction.of_map(map_number), frames.taken(reconstruction.frames_of_map(map_number))
+
+
+def load_lenses(out: Path, main: Reconstruction, map_number: int = 1) -> Lenses:
+    """What the frames of a finished run's map are stitched from, in that map's unit.
+
+    Args:
+        out: folder of the run.
+        main, map_number: the map, as `load_run` gives it.
 
     Raises:
         GsbaError: the run found two lenses, and does not hold them.
     """
     if main.lens_baseline is None:
         return ONE_CENTRE
-    lenses = load_stage(out, "lenses", Lenses)
-    return lenses.taken(load_stage(out, "reconstruction", Reconstruction).largest_map())
+    lenses, whole = (
+        load_stage(out, "lenses", Lenses),
+        load_stage(out, "reconstruction", Reconstruction),
+    )
+    return lenses_of_map(lenses, whole, map_number)
+
+
+def lenses_of_map(lenses: Lenses, whole: Reconstruction, map_number: int) -> Lenses:
+    """The lenses of all frames, in the largest map's unit, for one map's frames, in its unit."""
+    return lenses.taken(whole.frames_of_map(map_number)).scaled(whole.map_scale(map_number))
 
 
 def _fit_together(reconstruction: Reconstruction, frames: FrameSet) -> bool:
@@ -70,6 +99,18 @@ def _fit_together(reconstruction: Reconstruction, frames: FrameSet) -> bool:
     return (
         all(array.shape == shape for array, shape in shapes)
         and len(frames.paths) == len(frames.mask_paths) == num > 0
-        and (result.components is None or result.components.shape == (num,))
+        and _numbered(result.components, result.map_scales, num)
         and all(i.size == 0 or (i.min() >= 0 and i.max() < most) for i, most in indices)
     )
+
+
+def _numbered(components: np.ndarray | None, scales: np.ndarray | None, num: int) -> bool:
+    """Whether each of `num` frames has a component, counted from 0, and each of these a scale."""
+    if components is None:
+        return scales is None
+    numbers = np.unique(components)
+    if components.shape != (num,) or not np.array_equal(numbers, np.arange(len(numbers))):
+        return False
+    if scales is None:
+        return True
+    return scales.shape == numbers.shape and bool((scales > 0).all() and np.isfinite(scales).all())

@@ -82,7 +82,8 @@ def judge(
     if not own.any() or (found.verified.any() and not found.directed.any()):
         return _from_images_alone(coarse, slam, found, logs, sigmas)
     wrong = found.verified & (turned > np.deg2rad(verify.max_rotation_deg))
-    wrong |= found.directed & (off > np.deg2rad(verify.max_direction_deg))
+    unsure = 3 * np.where(found.directed, found.direction_sigmas, 0.0)
+    wrong |= found.directed & (off > np.deg2rad(verify.max_direction_deg) + unsure)
     known = own[:-1] & own[1:]
     noise = np.where(known, np.where(wrong, 10 * priors.translation, priors.translation), np.inf)
     lengths = step_lengths(slam_lengths, noise, logs, sigmas)
@@ -93,7 +94,7 @@ def judge(
     wrong |= found.directed & linked & (strain > np.log(verify.max_length_ratio))
     unseen = ~found.verified
     rough = wrong | (found.verified & (turned > _ROUGH * np.deg2rad(priors.rotation_deg)))
-    rough |= found.directed & (off > np.arctan(_ROUGH * priors.translation))
+    rough |= found.directed & (off > np.arctan(_ROUGH * priors.translation) + unsure)
     rough |= found.directed & linked & (strain > _ROUGH * priors.translation)
     chosen = slam.copy()
     if wrong.any() or unseen.any():

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.config import VerifySettings
-from gsba.geometry import inverse, nearest_rotation, parallax
+from gsba.geometry import inverse, nearest_rotation
 from gsba.types import Keypoints, VerifiedPairs
 
 _MIN_COMMON = 8  # points that two steps must share to compare their lengths
@@ -27,54 +26,56 @@ class Steps:
 
     f_T_nexts: np.ndarray  # (F - 1, 4, 4) float64, translation of unit length
     verified: np.ndarray  # (F - 1,) bool: the images gave one
-    directed: np.ndarray  # (F - 1,) bool: with parallax enough to know the direction
+    direction_sigmas: np.ndarray  # (F - 1,) float64, radians, of the directions; infinite = the
+    # camera may have turned only
+
+    @property
+    def directed(self) -> np.ndarray:
+        """Steps (F - 1,) bool whose direction is known."""
+        return np.isfinite(self.direction_sigmas)
 
 
-def image_steps(pairs: VerifiedPairs, keypoints: Keypoints, settings: VerifySettings) -> Steps:
+def image_steps(pairs: VerifiedPairs, keypoints: Keypoints) -> Steps:
     """Relative poses of neighbours among verified pairs.
 
     Args:
         pairs: of frames at most a few apart.
         keypoints: of all frames.
-        settings: least parallax at which a direction is known.
     """
     num = max(len(keypoints.starts) - 2, 0)
     f_T_nexts = np.tile(np.eye(4), (num, 1, 1))
-    verified, directed = np.zeros(num, bool), np.zeros(num, bool)
+    verified, sigmas = np.zeros(num, bool), np.full(num, np.inf)
     for p, (f0, f1) in enumerate(pairs.matches.pairs):
         if f1 - f0 != 1:
             continue
         f0_T_f1 = pairs.f0_T_f1s[p]
         rays0, bearings1 = keypoints.matched(pairs.matches.pairs[p], pairs.matches.of(p))
-        f_T_nexts[f0], verified[f0] = f0_T_f1, True
+        f_T_nexts[f0], verified[f0], sigmas[f0] = f0_T_f1, True, pairs.direction_sigmas[p]
         turn = nearest_rotation(rays0.T @ bearings1)
         if np.median(np.linalg.norm(rays0 - bearings1 @ turn.T, axis=1)) < _STILL:
             f_T_nexts[f0, :3, :3] = turn  # an essential matrix knows it less well
-        directed[f0] = parallax(f0_T_f1, rays0, bearings1) > np.deg2rad(settings.min_parallax_deg)
-    return Steps(f_T_nexts, verified, directed)
+    return Steps(f_T_nexts, verified, sigmas)
 
 
-def off_steps(
-    pairs: VerifiedPairs, found: Steps, keypoints: Keypoints, settings: VerifySettings
-) -> np.ndarray:
+def off_steps(pairs: VerifiedPairs, found: Steps) -> np.ndarray:
     """How far pairs over two steps are from what those steps, whatever their lengths, allow.
 
     Frame f + 2 lies, as f sees it, between the directions of both steps. A pair that repeated
     structure made up agrees with neither, though it may be within what the trajectory allows.
 
     Returns:
-        (P,) radians; 0 for other pairs, and where a direction is not known.
+        (P,) radians, less what the directions are unsure by (three standard deviations); 0 for
+        other pairs, and where a direction is not known.
     """
     out = np.zeros(len(pairs.matches.pairs))
     for p, (f0, f2) in enumerate(pairs.matches.pairs):
-        if f2 - f0 != 2 or not found.directed[f0 : f0 + 2].all():
+        sigmas = np.array([pairs.direction_sigmas[p], *found.direction_sigmas[f0 : f0 + 2]])
+        if f2 - f0 != 2 or not np.isfinite(sigmas).all():
             continue
-        f0_T_f2 = pairs.f0_T_f1s[p]
-        both = keypoints.matched(pairs.matches.pairs[p], pairs.matches.of(p))
-        if parallax(f0_T_f2, *both) > np.deg2rad(settings.min_parallax_deg):
-            first = found.f_T_nexts[f0]
-            second = first[:3, :3] @ found.f_T_nexts[f0 + 1, :3, 3]
-            out[p] = _angle_to_arc(f0_T_f2[:3, 3], first[:3, 3], second)
+        first = found.f_T_nexts[f0]
+        second = first[:3, :3] @ found.f_T_nexts[f0 + 1, :3, 3]
+        off = _angle_to_arc(pairs.f0_T_f1s[p][:3, 3], first[:3, 3], second)
+        out[p] = max(off - 3 * float(np.linalg.norm(sigmas)), 0.0)
     return out
 
 

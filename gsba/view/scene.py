@@ -62,8 +62,9 @@ class Scene:
 def load_scene(run: Path) -> Scene:
     """Everything of a finished run that can be shown.
 
-    The world is that of the run's last export which placed it elsewhere (upright, in metres, by
-    GPS or truth), or else the run's own; splats in RUN/splat are carried along.
+    Of several maps the largest is shown. Its world is that of the run's last export which placed it
+    elsewhere (upright, in metres, by GPS or truth), or else the run's own; splats in RUN/splat are
+    carried along.
 
     Raises:
         GsbaError: no finished run, or a splat or transform.json that cannot be read.
@@ -169,6 +170,8 @@ def _latest_placement(run: Path) -> tuple[Placement, str]:
     files = sorted(run.glob("*/transform.json"), key=lambda path: path.stat().st_mtime_ns)
     for path in reversed(files):
         placement = read_placement(path)
+        if placement.map_number != 1:
+            continue
         if placement.up is not None or not np.array_equal(placement.matrix, np.eye(4)):
             return placement, f"placed as in {path.parent.name}"
     return Placement(), "in the world of the trajectory"

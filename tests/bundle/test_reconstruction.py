@@ -8,8 +8,10 @@ from scipy.spatial.transform import Rotation
 from synthetic import World, make_world
 
 from gsba.bundle.reconstruction import assemble
+from gsba.camera.lens import Lenses
 from gsba.geometry import angular_errors, inverse, pose
 from gsba.log import GsbaError
+from gsba.store.finished import lenses_of_map
 from gsba.types import (
     CoarsePoses,
     Counts,
@@ -175,3 +177,40 @@ def test_a_small_map_that_fits_no_trajectory_stays_as_it_was_solved(world: World
         _adjustment(world), np.zeros((10, 6, 6)), world.keypoints, poses, 12, components=groups
     )
     np.testing.assert_array_equal(found.world_T_rigs[7:], world.world_T_rigs[7:])
+
+
+def test_each_map_has_its_own_unit(world: World) -> None:
+    """A second map that the trajectory has three times as large as the solution, beside the first:
+    what is as long in both, like the distance of two lenses, is in the unit of either."""
+    coarse = _in_slam(world.world_T_rigs)
+    coarse[6:, :3, 3] *= 3
+    poses = CoarsePoses(coarse, np.full(10, PoseSource.SLAM, np.uint8), 0.0)
+    groups = np.repeat([0, 1], [6, 4]).astype(np.int32)
+    given = _adjustment(world), np.zeros((10, 6, 6)), world.keypoints, poses, 12
+    whole = assemble(*given, components=groups)
+    assert whole.map_scales is not None
+    np.testing.assert_allclose(whole.map_scales, [1, 3], rtol=1e-9)
+    whole = replace(whole, lens_baseline=(0.25, 0.01), vertical=np.array([0.0, 1, 0]))
+    largest, other = whole.of_map(1), whole.of_map(2)
+    assert whole.num_maps == 2 and whole.map_numbers().tolist() == [1] * 6 + [2] * 4
+    assert largest.lens_baseline == (0.25, 0.01) and largest.vertical is whole.vertical
+    assert other.lens_baseline == pytest.approx((0.75, 0.03)) and other.vertical is None
+    np.testing.assert_array_equal(other.world_T_rigs, whole.world_T_rigs[6:])
+    for part in (largest, other):
+        assert part.components is None and part.map_scales is None and part.num_maps == 1
+    lenses = Lenses(np.array([0.0, 0, 0.125]), twists=np.arange(60.0).reshape(10, 6))
+    of_other = lenses_of_map(lenses, whole, 2)
+    assert 2 * of_other.centre[2] == pytest.approx(other.lens_baseline[0])
+    assert of_other.twists is not None and lenses.twists is not None
+    np.testing.assert_allclose(of_other.twists[:, :3], lenses.twists[6:, :3])
+    np.testing.assert_allclose(of_other.twists[:, 3:], 3 * lenses.twists[6:, 3:])
+
+
+def test_a_frame_alone_is_no_map(world: World) -> None:
+    coarse = CoarsePoses(_in_slam(world.world_T_rigs), np.zeros(10, np.uint8), 0.0)
+    groups = np.array([0, 0, 0, 0, 0, 1, 1, 1, 3, 2], np.int32)
+    given = _adjustment(world), np.zeros((10, 6, 6)), world.keypoints, coarse, 12
+    found = assemble(*given, components=groups)
+    assert found.num_maps == 2
+    assert found.map_numbers().tolist() == [1, 1, 1, 1, 1, 2, 2, 2, 0, 0]
+    assert found.frames_of_map(2).tolist() == [5, 6, 7]

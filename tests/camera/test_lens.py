@@ -133,7 +133,9 @@ def test_tracks_lose_what_is_blended() -> None:
     keypoints, lenses = _keypoints(bearings), TWO
     tracks = Tracks(np.arange(10), np.repeat([0, 1], 5), np.tile(np.arange(5), 2), 10)
     kept = lenses.clear(tracks, keypoints)
-    assert kept.num_points == 10 and kept.points.tolist() == [0, 1, 2, 3, 6, 7, 8, 9]
+    assert kept.num_points == 8 and kept.points.tolist() == list(range(8))
+    assert kept.frames.tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
+    assert kept.keypoints.tolist() == [0, 1, 2, 3, 1, 2, 3, 4]
     seen = lenses.seen(keypoints)
     assert seen.origins_rig is not None
     np.testing.assert_allclose(seen.origins_rig[:, 2], np.repeat([-0.04, 0.04], 5))

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from gsba import pipeline
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.cli import app
@@ -24,6 +25,7 @@ from gsba.demo.two_lenses import SWEEP, TwoLenses, render_stitched
 from gsba.demo.walk import walk_poses
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.log import GsbaError
+from gsba.report.maps import summarize_maps
 from gsba.types import Trajectory
 
 WIDTH, FRAMES = 256, 6
@@ -449,3 +451,23 @@ def test_demo_says_what_was_found_beside_what_is_true():
     read = found | {"readout": {"taken": True, "ms": 12.3, "ms_sigma": 0.2}}
     line = _found_lenses(read, 2.0, TwoLenses())
     assert line.endswith("true 32), rows read in 12.30 ms (sigma 0.20; true 12).")
+
+
+def test_demo_ends_like_refine_where_its_walk_falls_apart(tmp_path, monkeypatch):
+    refine = pipeline.refine
+
+    def refine_in_parts(*arguments, **options):
+        """A run of which one frame in three is in no map."""
+        result = refine(*arguments, **options)
+        whole = replace(result.reconstruction, components=np.array([0, 0, 1], np.int32))
+        maps = summarize_maps(whole, result.frames)
+        summary = result.report["summary"] | {"frames_in_no_map": 1, "refined": 2}
+        return replace(result, maps=maps, report=result.report | {"summary": summary})
+
+    few = ["-q", "demo", "--frames", "3", "--width", "256", "--out", str(tmp_path / "demo")]
+    assert CliRunner().invoke(app, few).exit_code == 0
+    monkeypatch.setattr(pipeline, "refine", refine_in_parts)
+    result = CliRunner().invoke(app, few)
+    assert result.exit_code == 3 and "2 of 3 frames refined (1 in no map)" in result.stdout
+    assert result.stderr.splitlines()[-1].endswith("exit code 3, or 0 with --allow-partial")
+    assert CliRunner().invoke(app, [*few, "--allow-partial"]).exit_code == 0

@@ -16,11 +16,15 @@ from gsba.cli import app
 from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
+from gsba.export import ExportFormat, export
 from gsba.geometry import pose, rotation_angle
+from gsba.log import GsbaError
 from gsba.similarity import Sim3
+from gsba.store.store import load_stage
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.trajectory.joining import IMAGES
-from gsba.types import PoseStatus, Trajectory
+from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
+from gsba.view import load_scene
 
 SCALE = 1.7
 MOVE = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -3.0, 8.0]))
@@ -36,6 +40,10 @@ def _refine(out: Path, frames: Path, *trajectories: Path, options: tuple[str, ..
     for change in SET:
         command += ["--set", change]
     return CliRunner().invoke(app, [str(part) for part in command])
+
+
+def _gsba(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["--quiet", *map(str, arguments)])
 
 
 def _report(out: Path) -> dict:
@@ -64,37 +72,130 @@ def test_two_files_with_worlds_of_their_own_are_joined(case: Case, tmp_path: Pat
     case.assert_as_good(out)
 
 
-def test_of_two_places_the_larger_is_exported_and_the_other_listed(
-    case: Case, tmp_path: Path
-) -> None:
-    """Behind the walk comes its mirror image, which no rigid camera can see there."""
-    frames, others = tmp_path / "frames", NUM_FRAMES - 2
+ALONE = ("--no-trajectory", "--fps", "2")
+OTHERS = NUM_FRAMES - 2  # frames of the second place
+NAMES = [f"{f:06d}" for f in range(NUM_FRAMES + OTHERS)]
+
+
+@pytest.fixture(scope="module")
+def two_places(case: Case, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
+    """Behind the walk comes its mirror image, which no rigid camera can see there: a run."""
+    folder = tmp_path_factory.mktemp("two-places")
+    frames = folder / "frames"
     frames.mkdir()
     for path in sorted(case.frames.glob("*.jpg")):
         (frames / path.name).symlink_to(path)
-        number = int(path.stem) - (NUM_FRAMES - others)
+        number = int(path.stem) - (NUM_FRAMES - OTHERS)
         if number >= 0:
             image = cv2.imread(str(path))
             assert image is not None
             cv2.imwrite(str(frames / f"{NUM_FRAMES + number:06d}.jpg"), image[:, ::-1])
-    out = tmp_path / "run"
-    result = _refine(out, frames, options=("--no-trajectory", "--fps", "2"))
-    assert result.exit_code == 0, result.output
-    names = [f"{f:06d}" for f in range(NUM_FRAMES + others)]
+    out = folder / "run"
+    return out, _refine(out, frames, options=ALONE)
+
+
+def test_of_two_places_the_larger_is_exported_and_the_other_listed(
+    case: Case, two_places: tuple[Path, Result]
+) -> None:
+    out, _ = two_places
     report = _report(out)
-    assert report["trajectory"]["maps"] == [names[:NUM_FRAMES], names[NUM_FRAMES:]]
-    assert report["summary"]["refined"] == len(names)
+    assert report["trajectory"]["maps"] == [NAMES[:NUM_FRAMES], NAMES[NUM_FRAMES:]]
     assert any("nothing ties 2 places together" in note for note in report["notes"])
     case.assert_as_good(out)
     with (out / "poses.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [row["map"] for row in rows] == ["0"] * NUM_FRAMES + ["1"] * others
+    assert [row["map"] for row in rows] == ["1"] * NUM_FRAMES + ["2"] * OTHERS
     assert all(int(row["num_observations"]) > 100 for row in rows)
     images = {path.name[:6] for path in (out / "colmap-flat/images").iterdir()}
-    assert images == set(names[:NUM_FRAMES])
+    assert images == set(NAMES[:NUM_FRAMES])
     reconstruction, shown = load_run(out)
-    assert shown.names == tuple(names[:NUM_FRAMES]) and len(reconstruction.points_world) > 100
+    assert shown.names == tuple(NAMES[:NUM_FRAMES]) and len(reconstruction.points_world) > 100
     assert reconstruction.observation_frames.max() == NUM_FRAMES - 1
+
+
+def test_what_is_counted_is_what_is_exported(
+    two_places: tuple[Path, Result], tmp_path: Path
+) -> None:
+    out, result = two_places
+    assert result.exit_code == 3
+    first, header, *maps = result.stdout.splitlines()
+    assert first.startswith(
+        f"{NUM_FRAMES} of {len(NAMES)} frames refined ({OTHERS} in another map)"
+    )
+    assert header.split()[:5] == ["map", "frames", "steps", "points", "extent"]
+    assert [row.split()[:3] for row in maps] == [
+        ["1", str(NUM_FRAMES), str(NUM_FRAMES - 1)],
+        ["2", str(OTHERS), str(OTHERS - 1)],
+    ]
+    assert "exit code 3, or 0 with --allow-partial" in result.stderr
+    report = _report(out)
+    summary, (largest, other) = report["summary"], report["maps"]
+    assert (summary["refined"], summary["exported"], summary["maps"]) == (NUM_FRAMES, NUM_FRAMES, 2)
+    assert (summary["frames_in_other_maps"], summary["frames_in_no_map"]) == (OTHERS, 0)
+    assert largest["spans"] == [[NAMES[0], NAMES[NUM_FRAMES - 1]]]
+    assert other["spans"] == [[NAMES[NUM_FRAMES], NAMES[-1]]] and other["reason"] is None
+    main, _ = load_run(out)
+    assert summary["points"] == largest["points"] == len(main.points_world)
+    assert summary["observations"] == len(main.observation_points)
+    assert report["trajectory"]["false_steps"] == report["trajectory"]["false_frames"] == []
+    again = _refine(out, out.parent / "frames", options=(*ALONE, "--allow-partial"))
+    assert again.exit_code == 0 and "exit code" not in again.stderr
+    assert again.stdout.splitlines()[0] == first
+
+
+def test_each_map_is_exported_on_request(two_places: tuple[Path, Result], tmp_path: Path) -> None:
+    out, _ = two_places
+    other, shown = load_run(out, 2)
+    assert shown.names == tuple(NAMES[NUM_FRAMES:])
+    for to in ("colmap", "colmap-flat", "colmap-erp", "nerfstudio", "ply", "tum"):
+        result = _gsba("export", out, "--to", to, "--map", "2")
+        assert result.exit_code == 0 and result.stdout.strip() == f"{to}: {out / to}-map2"
+        folder = out / f"{to}-map2"
+        assert json.loads((folder / "transform.json").read_text())["map"] == 2
+    images = {path.name[:6] for path in (out / "colmap-flat-map2/images").iterdir()}
+    assert images == set(NAMES[NUM_FRAMES:])
+    written = read_trajectory(out / "tum-map2/trajectory.tum")
+    np.testing.assert_allclose(written.world_T_rigs, other.world_T_rigs, atol=1e-9)
+    assert (out / "colmap-flat/images").is_dir()  # that of the largest map stays
+    # The library does the same, of a run read back and of one in memory.
+    whole = load_stage(out, "reconstruction", Reconstruction)
+    frames = load_stage(out, "frames", FrameSet)
+    export(whole, frames, tmp_path / "tum", ExportFormat.TUM, map_number=2)
+    texts = [path / "trajectory.tum" for path in (tmp_path / "tum", out / "tum-map2")]
+    assert texts[0].read_bytes() == texts[1].read_bytes()
+    export(whole, frames, tmp_path / "largest", ExportFormat.TUM)
+    largest = read_trajectory(tmp_path / "largest/trajectory.tum")
+    assert len(largest.timestamps) == NUM_FRAMES
+
+
+@pytest.mark.parametrize("number", ["0", "3", "-1"])
+def test_a_map_that_there_is_not_is_refused(two_places: tuple[Path, Result], number: str) -> None:
+    out, _ = two_places
+    result = _gsba("export", out, "--to", "tum", "--map", number)
+    assert result.exit_code == 1 and not result.stdout
+    message = f"{out} has no map {number}: it has 2, numbered from the largest, 1"
+    assert result.stderr == f"error: {message}\n"
+    whole = load_stage(out, "reconstruction", Reconstruction)
+    frames, folder = load_stage(out, "frames", FrameSet), out.parent / "none"
+    with pytest.raises(GsbaError, match=f"reconstruction has no map {number}: it has 2"):
+        export(whole, frames, folder, ExportFormat.TUM, map_number=int(number))
+    assert not folder.exists()
+
+
+def test_the_viewer_shows_the_largest_map_where_its_own_export_is(
+    two_places: tuple[Path, Result],
+) -> None:
+    out, _ = two_places
+    before = load_scene(out)
+    ends = NAMES[NUM_FRAMES], NAMES[-1]
+    scaled = ("--scale", "3", "--between", *ends)
+    assert _gsba("export", out, "--to", "tum", "--map", "2", *scaled).exit_code == 0
+    after = load_scene(out)
+    assert after.unit == before.unit
+    np.testing.assert_array_equal(
+        after.reconstruction.world_T_rigs, before.reconstruction.world_T_rigs
+    )
+    assert len(after.frames) == NUM_FRAMES
 
 
 def test_a_tripod_gives_rotations_only(tmp_path: Path) -> None:

@@ -38,4 +38,5 @@ const event = { offsetX: 120, offsetY: 80, clientX: 10, clientY: 10, deltaY: 50,
 for (const node of all) for (const kind of ["pointermove", "pointerdown", "pointermove", "pointerup", "wheel", "keydown", "dblclick", "pointerenter", "pointerleave", "change", "click"])
   for (const f of node.listeners[kind] ?? []) f(event);
 if (errors.length) throw new Error("not finite: " + errors.slice(0, 3));
-console.log(JSON.stringify([byId.tiles.children.length, byId.run.textContent, byId.worst?.children.length, byId.stages.children.length, byId.notes?.children[0]?.children]));
+console.log(JSON.stringify([byId.tiles.children.length, byId.run.textContent, byId.worst?.children.length, byId.stages.children.length, byId.notes?.children[0]?.children,
+  byId.tiles.children[0].children[2].children[0], byId["maps-table"]?.children.map(row => row.children.map(cell => cell.children[0]))]));

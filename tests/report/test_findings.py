@@ -29,3 +29,16 @@ def test_steps_that_no_image_shows_are_in_doubt_where_others_are_wrong(
     assert found["unseen_steps"] == [[frames.names[-2], frames.names[-1]]]
     alone = f"no images in common, held by the trajectory alone{doubt.format(num - 2)}"
     assert notes == [f"{alone}: {frames.names[-2]} to {frames.names[-1]}"]
+
+
+def test_without_a_trajectory_images_contradict_nothing(tmp_path: Path) -> None:
+    frames = panoramas(tmp_path, ".png")
+    num = len(frames)
+    every = np.ones(num - 1, bool)
+    trust = Trust.of_all(np.tile(np.eye(4), (num, 1, 1)))
+    trust = replace(trust, false_steps=every, unseen_steps=np.arange(num - 1) == 2)
+    found, _ = of_trajectory(trust, None, None, (), frames, absent=True)
+    assert found["false_steps"] == found["false_frames"] == []
+    assert found["unseen_steps"] == [[frames.names[2], frames.names[3]]]
+    found, _ = of_trajectory(trust, None, None, (), frames)
+    assert len(found["false_steps"]) == num - 1

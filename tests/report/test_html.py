@@ -255,8 +255,43 @@ def _run_script(path: Path) -> list:
     return json.loads(done.stdout)
 
 
+def test_several_maps_are_listed_and_the_largest_is_drawn(tmp_path: Path) -> None:
+    frames, result = scene.panoramas(tmp_path / "images"), scene.reconstruction()
+    result = dataclasses.replace(
+        result,
+        components=np.array([0, 0, 0, 0, 0, 1, 1, 2, 0], np.int32),
+        pose_statuses=np.where(np.arange(9) == 8, PoseStatus.UNREFINED, PoseStatus.REFINED),
+    )
+    coarse = CoarsePoses(result.world_T_rigs, np.zeros(len(frames), np.uint8), 0.0)
+    report = build_report(
+        settings=RefineSettings(),
+        frames=frames,
+        coarse=coarse,
+        reconstruction=result,
+        stages=[],
+        counts={},
+        solver=[],
+        gauge="",
+        reasons=("", "</script> two surfaces"),
+    )
+    report["residual_sphere"] = residual_sphere(result)
+    rows, path = result.largest_map(), tmp_path / "report.html"
+    own = dataclasses.replace(
+        coarse, world_T_rigs=coarse.world_T_rigs[rows], sources=coarse.sources[rows]
+    )
+    write_html(path, frames.taken(rows), own, result.of_map(1), report)
+    *_, apart, maps = _run_script(path)
+    assert apart == "1 held by the trajectory, 2 in other maps, 1 in no map"
+    assert maps[0][0] == "Map" and maps[0][-1] == "Why it was not joined"
+    names = frames.names
+    assert maps[1][:4] == ["1", "6", "5", "4"] and maps[2][:4] == ["2", "2", "2", "1"]
+    assert maps[1][-2:] == [f"{names[0]} to {names[4]}, {names[8]}", ""]
+    assert maps[2][-2:] == [f"{names[5]} to {names[6]}", "</script> two surfaces"]
+
+
 def test_script_runs(page: Path) -> None:
-    tiles, title, worst, rows, note = _run_script(page)
+    tiles, title, worst, rows, note, apart, maps = _run_script(page)
+    assert apart == "1 held by the trajectory" and maps is None
     assert (tiles, title, worst, rows) == (6, page.parent.name, pictures.NUM_PICTURES, 2)
     assert note == ["a note with <b>markup</b> & </script>"]  # a text, not markup
 

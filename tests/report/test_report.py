@@ -2,7 +2,7 @@
 
 import csv
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -139,3 +139,13 @@ def test_poses_read_back(tmp_path: Path) -> None:
     assert float(rows[0]["std_tz"]) == 3.0
     assert rows[3]["cov_rx_rx"] == "" and rows[3]["median_residual_deg"] == ""
     assert sum(name.startswith("cov_") for name in rows[0]) == 21
+    assert [row["map"] for row in rows] == ["1"] * NUM_FRAMES
+
+
+def test_poses_name_the_map_of_each_frame(tmp_path: Path) -> None:
+    frames, coarse, reconstruction = _world()
+    components = np.array([1, 0, 0, 2], np.int32)  # the first and the last frame are alone
+    reconstruction = replace(reconstruction, components=components)
+    write_poses(tmp_path / "poses.csv", frames, coarse, reconstruction)
+    with (tmp_path / "poses.csv").open(newline="", encoding="utf-8") as file:
+        assert [row["map"] for row in csv.DictReader(file)] == ["", "1", "1", ""]

@@ -72,6 +72,8 @@ def test_an_edited_record_is_no_result(run: Path, change: Callable[[dict], Any])
         ("observation_frames", np.zeros(1, np.int32), "do not fit together"),
         ("points_world", np.array(1.0), "do not fit together"),
         ("components", np.zeros(1, np.int32), "do not fit together"),
+        ("components", np.full(scene.NUM_FRAMES, 7, np.int32), "do not fit together"),
+        ("map_scales", np.ones(2), "do not fit together"),
         ("joint_errors", JointErrors(np.zeros((0, 0)), np.zeros((0, 0))), "do not fit together"),
         ("world_T_rigs", np.full((scene.NUM_FRAMES, 4, 4), np.nan), "are no numbers"),
     ],

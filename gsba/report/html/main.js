@@ -5,16 +5,28 @@ function tiles() {
   const length = path => path.reduce((sum, p, i) => i ? sum + Math.hypot(...p.map((v, k) => v - path[i - 1][k])) : 0, 0);
   const seconds = D.report.stages.reduce((sum, stage) => sum + stage.seconds, 0);
   const px = degrees => degrees === null ? "–" : `${num(degrees * pxPerDeg)} px`;
+  const apart = [[s.exported - s.refined, "held by the trajectory"], [s.frames_in_other_maps, "in other maps"], [s.frames_in_no_map, "in no map"]]
+    .filter(([count]) => count).map(([count, where]) => `${num(count)} ${where}`).join(", ");
   const rows = [
-    ["Frames refined", `${num(s.refined)} / ${num(s.frames)}`, s.refined === s.frames ? "all of them" : `${s.frames - s.refined} held by the trajectory`],
+    ["Frames refined", `${num(s.refined)} / ${num(s.frames)}`, apart || "all of them"],
     ["Median residual", px(s.median_residual_deg), `was ${px(s.median_residual_deg_coarse)} under the SLAM poses`],
     ["Largest move", num(Math.max(...F.moved)), `map units, on a path of ${num(length(D.map.after))}`],
     ["Points", num(s.points), `in ${num(+(s.mean_track_length || 0).toFixed(1))} frames each on average`],
-    ["Observations", num(s.observations), `${num(Math.round(s.observations / s.frames))} a frame`],
+    ["Observations", num(s.observations), `${num(Math.round(s.observations / s.exported))} a frame`],
     ["Time", seconds < 90 ? `${num(seconds)} s` : `${num(seconds / 60)} min`, `${num(D.report.machine.cpus)} cores`],
   ];
   for (const [label, value, more] of rows)
     el("tiles").append(make("div", { class: "tile" }, make("span", { class: "label" }, label), make("b", {}, value), make("span", {}, more)));
+}
+
+function maps() {
+  const table = el("maps-table"), reasons = D.report.maps.some(m => m.reason);
+  const names = ["Map", "Frames", "Refined", "Steps", "Points", "Extent", "First to last frame", ...(reasons ? ["Why it was not joined"] : [])];
+  table.append(make("tr", {}, ...names.map((t, i) => make("th", i < 6 ? { class: "n" } : {}, t))));
+  for (const m of D.report.maps) table.append(make("tr", {},
+    ...[m.map, m.frames, m.refined, m.steps, m.points, m.extent].map(v => make("td", { class: "n" }, num(v))),
+    make("td", {}, m.spans.map(([a, b]) => a === b ? a : `${a} to ${b}`).join(", ")),
+    reasons ? make("td", {}, m.reason || "") : null));
 }
 
 function mapLegend() {
@@ -151,6 +163,8 @@ el("gauge").textContent = `${D.report.gauge}. The numbers behind this page are i
 el("settings").textContent = JSON.stringify({ settings: D.report.settings, machine: D.report.machine, versions: D.report.versions }, null, 1);
 for (const note of D.report.notes) el("notes").append(make("p", { class: "note" }, note));
 tiles();
+if (D.report.maps.length > 1) maps();
+else el("maps").remove();
 mapLegend();
 worldMap(el("top"), 0, 1);
 worldMap(el("side"), 0, 2);

@@ -1,0 +1,111 @@
+"""The maps of a run, as its report lists them: frames in one world each, the largest exported."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gsba.types import FrameSet, PoseStatus, Reconstruction
+
+MIN_SHARE_IN_ONE_MAP = 0.9  # of a run's frames: a run with fewer in its largest map is partial
+_SHOWN_SPANS = 3  # of a map's frames, in a line of the table for people
+
+
+@dataclass(frozen=True, slots=True)
+class MapSummary:
+    """One map of a run. Lengths are in the map's own unit."""
+
+    map: int  # its number, 1 = the largest, which is exported
+    frames: int  # number of frames in it
+    refined: int  # number of these that images constrain
+    steps: int  # number of steps from one frame to the next in time within the map
+    points: int  # number of scene points
+    extent: float  # map units, diagonal of the box around its frames' positions
+    spans: tuple[tuple[str, str], ...]  # names of the first and last frame of each run of frames
+    reason: str | None  # why it was not joined to a larger map; None = largest map, or not known
+
+
+def summarize_maps(
+    reconstruction: Reconstruction, frames: FrameSet, reasons: Sequence[str | None] = ()
+) -> tuple[MapSummary, ...]:
+    """The maps of a reconstruction, the largest first. Frames that are in no map are left out.
+
+    Args:
+        reconstruction: all maps of a run.
+        frames: its frames.
+        reasons: why each map was not joined to a larger one, the largest first; may be shorter.
+    """
+    found = []
+    for number in range(1, reconstruction.num_maps + 1):
+        rows = reconstruction.frames_of_map(number)
+        part = reconstruction.of_map(number)
+        positions = part.world_T_rigs[:, :3, 3]
+        breaks = np.flatnonzero(np.diff(rows) > 1)
+        first, last = rows[[0, *(breaks + 1)]], rows[[*breaks, -1]]
+        found.append(
+            MapSummary(
+                number,
+                len(rows),
+                int(np.count_nonzero(part.pose_statuses == PoseStatus.REFINED)),
+                len(rows) - len(first),
+                len(part.points_world),
+                float(np.linalg.norm(np.ptp(positions, axis=0))),
+                tuple((frames.names[a], frames.names[b]) for a, b in zip(first, last, strict=True)),
+                (reasons[number - 1] or None) if number <= len(reasons) else None,
+            )
+        )
+    return tuple(found)
+
+
+def is_partial(maps: Sequence[MapSummary], num_frames: int) -> bool:
+    """Whether too few of a run's frames are in its largest map for the run to have succeeded."""
+    return maps[0].frames < MIN_SHARE_IN_ONE_MAP * num_frames
+
+
+def format_outcome(report: Mapping[str, Any], run: object) -> str:
+    """What a finished run comes down to, for a terminal.
+
+    The first line counts the frames of the map that is exported, and then those of other maps. Of
+    several maps a table follows.
+
+    Args:
+        report: content of report.json.
+        run: folder of the run, as it is shown.
+    """
+    summary, maps = report["summary"], report["maps"]
+    residual, found = summary["median_residual_deg"], "rotations only, no points"
+    if residual is not None:
+        found = f"{summary['points']} points, median residual {residual:.4f} deg"
+    apart = _apart(summary)
+    first = f"{summary['refined']} of {summary['frames']} frames refined{apart}, {found}: {run}"
+    return first if len(maps) == 1 else "\n".join([first, *_table(maps)])
+
+
+def _apart(summary: Mapping[str, Any]) -> str:
+    """The frames that are not exported, to follow the number of those that are; "" = none.
+
+    Args:
+        summary: `summary` of report.json.
+    """
+    others = summary["maps"] - 1
+    where = "another map" if others == 1 else f"{others} other maps"
+    counts = {where: summary["frames_in_other_maps"], "no map": summary["frames_in_no_map"]}
+    told = [f"{count} in {name}" for name, count in counts.items() if count]
+    return f" ({', '.join(told)})" if told else ""
+
+
+def _table(maps: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Lines that list maps, in columns."""
+    names = ("map", "frames", "steps", "points")
+    rows = [[*names, "extent", "first to last frame", "why it was not joined"]]
+    for one in maps:
+        spans = [a if a == b else f"{a} to {b}" for a, b in one["spans"]]
+        more = [f"{len(spans) - _SHOWN_SPANS} more"] if len(spans) > _SHOWN_SPANS else []
+        where = ", ".join([*spans[:_SHOWN_SPANS], *more])
+        counts = [str(one[name]) for name in names]
+        rows.append([*counts, f"{one['extent']:.4g}", where, one["reason"] or ""])
+    if not any(row[-1] for row in rows[1:]):
+        rows = [row[:-1] for row in rows]
+    widths = [max(len(row[c]) for row in rows) for c in range(len(rows[0]))]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
