@@ -49,8 +49,7 @@ def assemble(
     landmarks, seen = adjustment.landmarks, adjustment.observations()
     refined = seen >= min_observations
     known = refined & (coarse.sources == PoseSource.SLAM)
-    if false_frames is not None:
-        known &= ~false_frames
+    known &= True if false_frames is None else ~false_frames
     groups = np.zeros(len(seen), np.int32) if components is None else components
     placed, points_world, stretch = _placed(adjustment, coarse.world_T_rigs, known, groups)
     rows = keypoints.rows(landmarks.tracks)

@@ -58,6 +58,14 @@ AlignScan = Annotated[
     str | None,
     typer.Option(help="PLY, PCD, LAS, LAZ, OBJ or GLB: its world and unit.", metavar="SCAN"),
 ]
+MapNumber = Annotated[
+    int,
+    typer.Option(
+        "--map",
+        help="Which map of a run, as its report numbers them; 1: the largest.",
+        metavar="NUMBER",
+    ),
+]
 Pairs = Annotated[
     str | None,
     typer.Option(
@@ -94,15 +102,7 @@ def export(
     link: Annotated[
         bool, typer.Option("--link", help="Hard links to unchanged frames, not copies.")
     ] = False,
-    map_number: Annotated[
-        int,
-        typer.Option(
-            "--map",
-            help="Which map of a run that holds several, as its report numbers them; 1: the "
-            "largest.",
-            metavar="NUMBER",
-        ),
-    ] = 1,
+    map_number: MapNumber = 1,
     cluster: Cluster = None,
 ) -> None:
     """Write a finished run as a dataset for another program, placed where you want it."""

@@ -125,12 +125,22 @@ def test_strangers_stay_apart() -> None:
 
 
 def test_strangers_that_the_trajectory_ties_together_stay_where_it_has_them() -> None:
+    context, whole, late = _scene(strange=True)
+    far = _torn(whole, late, 1.0, pose(np.eye(3), np.array([0.0, 40.0, 0.0])))
+    held = NOBODY.copy()
+    held[HALF - 1] = True
+    found = map_merging.merge(context, far, _halves(), held, ~BREAK, TIMES)
+    assert not found.components.any() and not found.met[HALF:].any()
+    np.testing.assert_allclose(found.solved.world_T_rigs, far.world_T_rigs, atol=1e-12)
+
+
+def test_what_the_trajectory_puts_into_a_place_that_looks_otherwise_is_apart() -> None:
     context, whole, _ = _scene(strange=True)
     held = NOBODY.copy()
     held[HALF - 1] = True
     found = map_merging.merge(context, whole, _halves(), held, ~BREAK, TIMES)
-    assert not found.components.any() and not found.met[HALF:].any()
-    np.testing.assert_allclose(found.solved.world_T_rigs, TRUTH, atol=1e-12)
+    np.testing.assert_array_equal(found.components, np.arange(NUM) >= HALF)
+    assert found.reasons[0] == "" and "not where the trajectory has it" in found.reasons[1]
 
 
 def test_a_join_that_asks_for_more_than_drift_is_not_believed_against_the_trajectory() -> None:

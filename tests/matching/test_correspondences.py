@@ -56,7 +56,7 @@ def test_points_are_known_where_tracks_see_them() -> None:
     turned = solved.world_T_rigs.copy()
     turned[:, :3, :3] = Rotation.random(LAST + 1, rng=2).as_matrix()
     landmarks, whole = solved.landmarks, solved.landmarks.tracks
-    tracks = whole.of(np.ones(NUM, bool), whole.frames != whole.points % LAST)
+    tracks = whole.of_observations(whole.frames != whole.points % LAST)
     solved = replace(solved, world_T_rigs=turned, landmarks=replace(landmarks, tracks=tracks))
     known = solved.points_by_keypoint(keypoints)
     expected = np.full((LAST + 1, NUM, 3), np.nan)

@@ -39,7 +39,7 @@ def test_the_pose_is_found_among_outliers(seed: int) -> None:
     bearings0, bearings1, true = _see(F0_T_F1, 0.4, seed)
     estimate = verification.relative_pose(bearings0, bearings1, SETTINGS, 0)
     assert estimate is not None
-    found, inliers = estimate
+    found, inliers = estimate.f0_T_f1, estimate.inliers
     # 120 bearings of 0.017 degrees with some 10 degrees of parallax.
     assert np.degrees(rotation_angle(found[:3, :3].T @ F0_T_F1[:3, :3])) < 0.05
     assert _direction_error(found, F0_T_F1) < 0.3
@@ -49,12 +49,81 @@ def test_the_pose_is_found_among_outliers(seed: int) -> None:
     assert inliers[~true].sum() <= 4
 
 
-def test_too_few_matches_make_no_pose() -> None:
+def test_five_matches_prove_nothing() -> None:
     bearings0, bearings1, _ = _see(F0_T_F1, 0.0)
-    few = SETTINGS.min_inliers - 1
-    assert verification.relative_pose(bearings0[:few], bearings1[:few], SETTINGS, 0) is None
-    noise0, noise1, _ = _see(F0_T_F1, 1.0)
-    assert verification.relative_pose(noise0, noise1, SETTINGS, 0) is None
+    assert verification.relative_pose(bearings0[:5], bearings1[:5], SETTINGS, 0) is None
+
+
+@pytest.mark.parametrize("num", [10, 50, 200, 1000])
+def test_chance_makes_no_pose(num: int) -> None:
+    for seed in range(10):
+        noise0, noise1, _ = _see(F0_T_F1, 1.0, seed, num)
+        assert verification.relative_pose(noise0, noise1, SETTINGS, seed) is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_minority_that_chance_does_not_explain_is_believed(seed: int) -> None:
+    bearings0, bearings1, _ = _see(F0_T_F1, 0.7, seed, 400)
+    found = verification.relative_pose(bearings0, bearings1, SETTINGS, 0, rivals=True)
+    assert found is not None and not found.rivalled
+    assert _direction_error(found.f0_T_f1, F0_T_F1) < 1.0
+
+
+def test_matches_of_one_spot_are_one_witness() -> None:
+    """Two hundred matches on a poster some degrees wide fit many poses."""
+    rng = np.random.default_rng(0)
+    points = np.array([0, 0, 5.0]) + rng.uniform(-0.15, 0.15, (NUM, 3))
+    bearings0 = with_noise(unit(points), SIGMA, rng)
+    bearings1 = with_noise(bearings_of(points, F0_T_F1), SIGMA, rng)
+    assert verification.relative_pose(bearings0, bearings1, SETTINGS, 0) is None
+
+
+def test_what_the_search_let_pass_proves_less() -> None:
+    """A search along predicted directions makes false matches agree with poses near by."""
+    bearings0, bearings1, _ = _see(F0_T_F1, 0.7, num=100)
+    found = [
+        verification.relative_pose(bearings0, bearings1, SETTINGS, 0, chance)
+        for chance in (0.0, 0.5)
+    ]
+    assert found[0] is not None and found[1] is None
+
+
+def _two_poses(support: float) -> tuple[np.ndarray, np.ndarray]:
+    """Matches of which a share agrees with one pose, and the rest with another."""
+    other = pose(Rotation.from_rotvec([0, -0.6, 0]).as_matrix(), np.array([-0.5, 0, 0.5]))
+    num = round(support * NUM)
+    one, two = _see(F0_T_F1, 0.0, 0, num), _see(other, 0.0, 1, NUM - num)
+    bearings0, bearings1 = (np.concatenate([one[n], two[n]]) for n in (0, 1))
+    return bearings0, bearings1
+
+
+@pytest.mark.parametrize(("support", "rivalled"), [(0.5, True), (0.53, True), (0.75, False)])
+def test_a_pose_must_outweigh_another(support: float, rivalled: bool) -> None:
+    found = verification.relative_pose(*_two_poses(support), SETTINGS, 0, rivals=True)
+    assert found is not None and found.rivalled is rivalled
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_turning_is_told_from_walking(seed: int) -> None:
+    """Whatever noise there is: parallax is known by what a rotation leaves over."""
+    for baseline in (0.0, 0.3):
+        f0_T_f1 = F0_T_F1.copy()
+        f0_T_f1[:3, 3] *= baseline
+        bearings0, bearings1, _ = _see(f0_T_f1, 0.3, seed, 400)
+        found = verification.relative_pose(bearings0, bearings1, SETTINGS, 0)
+        assert found is not None and np.isfinite(found.direction_sigma) == (baseline > 0)
+
+
+def test_directions_are_as_sure_as_they_say() -> None:
+    errors = []
+    for seed in range(30):
+        bearings0, bearings1, _ = _see(F0_T_F1, 0.2, seed)
+        found = verification.relative_pose(bearings0, bearings1, SETTINGS, 0)
+        assert found is not None
+        angle = np.deg2rad(_direction_error(found.f0_T_f1, F0_T_F1))
+        errors.append(angle / found.direction_sigma)
+    # Bearings of one ideal centre: less noise than the model of lenses allows for.
+    assert 0.05 < np.sqrt(np.mean(np.square(errors))) < 1.5
 
 
 def _run(
@@ -81,7 +150,7 @@ def _run(
         np.concatenate([np.zeros((0, 2), np.int32), *rows]),
     )
     spread = np.zeros(len(views)) if sigmas is None else np.array(sigmas)
-    how = SETTINGS, 0, Threads(1)
+    how = SETTINGS, 0, Threads(1), np.zeros(len(views))
     return verification.verify(matches, keypoints, np.array(priors), spread, *how)
 
 
@@ -165,4 +234,4 @@ def test_the_seed_decides() -> None:
     bearings0, bearings1, _ = _see(F0_T_F1, 0.4)
     first, again = (verification.relative_pose(bearings0, bearings1, SETTINGS, 7) for _ in range(2))
     assert first is not None and again is not None
-    np.testing.assert_array_equal(first[0], again[0])
+    np.testing.assert_array_equal(first.f0_T_f1, again.f0_T_f1)

@@ -256,7 +256,7 @@ def test_real_map_agrees_with_its_keyframe_file() -> None:
 
 @needs_shared
 def test_real_files_survive_writing(tmp_path: Path) -> None:
-    files = sorted(SHARED.glob("*/*.tum")) + sorted(SHARED.glob("*/**/*_*.txt"))
+    files = sorted(SHARED.glob("*/*.tum")) + sorted(SHARED.glob("*/**/*trajectory*.txt"))
     assert len(files) > 10
     for path in files:
         trajectory = read_trajectory(path)

@@ -42,14 +42,14 @@ def _seen(missing: tuple[int, ...] = ()) -> tuple[VerifiedPairs, Keypoints]:
         rows,
     )
     counts = Counts(NUM_FRAMES - 1, len(steps), "pairs")
-    return VerifiedPairs(matches, f0_T_f1s, counts), keypoints
+    return VerifiedPairs(matches, f0_T_f1s, np.zeros(len(steps)), counts), keypoints
 
 
 def _judge(slam: np.ndarray, missing: tuple[int, ...] = (), lost: tuple[int, ...] = ()) -> Trust:
     pairs, keypoints = _seen(missing)
     sources = np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8)
     sources[list(lost)] = PoseSource.INTERPOLATED
-    found = image_steps(pairs, keypoints, VERIFY)
+    found = image_steps(pairs, keypoints)
     logs, sigmas = length_ratios(pairs, found, keypoints)
     coarse = CoarsePoses(slam, sources, 0.0)
     return judgement.judge(coarse, found, logs, sigmas, VERIFY, PRIORS)
@@ -61,7 +61,7 @@ def _slam(seed: int = 0) -> np.ndarray:
 
 def test_ratios_of_lengths_come_from_common_points() -> None:
     pairs, keypoints = _seen()
-    found = image_steps(pairs, keypoints, VERIFY)
+    found = image_steps(pairs, keypoints)
     logs, sigmas = length_ratios(pairs, found, keypoints)
     true = np.linalg.norm(np.diff(TRUTH[:, :3, 3], axis=0), axis=1)
     assert found.verified.all() and found.directed.all() and np.isfinite(sigmas).all()
@@ -190,8 +190,8 @@ def test_a_turn_on_the_spot_is_seen_as_one() -> None:
     rough = Rotation.from_rotvec([0.001, 0, 0]).as_matrix()
     f0_T_f1 = pose(turn @ rough, np.array([0.0, 0, 1]))[None]
     matches = Matches(np.array([[0, 1]], np.int32), np.array([0, NUM_POINTS]), rows)
-    pairs = VerifiedPairs(matches, f0_T_f1, Counts(1, 1, "pairs"))
-    found = image_steps(pairs, keypoints, VERIFY)
+    pairs = VerifiedPairs(matches, f0_T_f1, np.array([np.inf]), Counts(1, 1, "pairs"))
+    found = image_steps(pairs, keypoints)
     assert found.verified[0] and not found.directed[0]
     error = np.degrees(rotation_angle(found.f_T_nexts[0, :3, :3].T @ turn))
     assert error < 0.01  # 80 bearings of 0.017 degrees
@@ -203,7 +203,9 @@ def test_a_turn_on_the_spot_is_seen_as_one() -> None:
     assert np.degrees(rotation_angle(between.T @ turn)) < 0.01
 
 
-def _over_two_steps(f0: int, direction: np.ndarray) -> tuple[VerifiedPairs, Keypoints]:
+def _over_two_steps(
+    f0: int, direction: np.ndarray, sigma: float = 0.0
+) -> tuple[VerifiedPairs, Keypoints]:
     """Steps as seen, and a pair over two of them in a direction of its own."""
     pairs, keypoints = _seen()
     f0_T_f2 = inverse(TRUTH[f0]) @ TRUTH[f0 + 2]
@@ -215,7 +217,8 @@ def _over_two_steps(f0: int, direction: np.ndarray) -> tuple[VerifiedPairs, Keyp
         np.concatenate([pairs.matches.keypoints, rows]),
     )
     poses = np.concatenate([pairs.f0_T_f1s, f0_T_f2[None]])
-    return VerifiedPairs(matches, poses, pairs.counts), keypoints
+    sigmas = np.append(pairs.direction_sigmas, sigma)
+    return VerifiedPairs(matches, poses, sigmas, pairs.counts), keypoints
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0, 4.0])
@@ -224,8 +227,8 @@ def test_a_pair_over_two_steps_lies_between_them_whatever_their_lengths(share: f
     turned = inverse(TRUTH[7]) @ TRUTH[8]
     between = unit(unit(first) + share * unit(turned[:3, :3] @ second))
     pairs, keypoints = _over_two_steps(7, between)
-    found = image_steps(pairs, keypoints, VERIFY)
-    assert off_steps(pairs, found, keypoints, VERIFY).max() < np.deg2rad(0.01)
+    found = image_steps(pairs, keypoints)
+    assert off_steps(pairs, found).max() < np.deg2rad(0.01)
 
 
 @pytest.mark.parametrize("degrees", [1.0, 5.0, 20.0, 120.0])
@@ -235,9 +238,21 @@ def test_a_pair_over_two_steps_that_leaves_them_is_as_far_off(degrees: float) ->
     middle, normal = unit(unit(first) + unit(second)), unit(np.cross(first, second))
     angle = np.deg2rad(degrees)
     pairs, keypoints = _over_two_steps(7, np.cos(angle) * middle + np.sin(angle) * normal)
-    found = image_steps(pairs, keypoints, VERIFY)
-    off = off_steps(pairs, found, keypoints, VERIFY)
+    found = image_steps(pairs, keypoints)
+    off = off_steps(pairs, found)
     assert off[:-1].max() == 0
     wanted = min(angle, np.arccos(np.cos(angle) * (middle @ unit(first))))
     assert off[-1] == pytest.approx(wanted if degrees < 90 else off[-1], abs=1e-6)
     assert off[-1] > 0.9 * min(angle, np.pi / 2)
+
+
+@pytest.mark.parametrize("sigma", [np.deg2rad(1.0), np.inf])
+def test_a_pair_is_as_far_off_steps_as_its_direction_surely_is(sigma: float) -> None:
+    first, second = (inverse(TRUTH[7:9]) @ TRUTH[8:10])[:, :3, 3]
+    second = (inverse(TRUTH[7]) @ TRUTH[8])[:3, :3] @ second
+    middle, normal = unit(unit(first) + unit(second)), unit(np.cross(first, second))
+    angle = np.deg2rad(5.0)
+    direction = np.cos(angle) * middle + np.sin(angle) * normal
+    pairs, keypoints = _over_two_steps(7, direction, sigma)
+    off = off_steps(pairs, image_steps(pairs, keypoints))[-1]
+    assert off == pytest.approx(max(angle - 3 * sigma, 0), abs=1e-6)
