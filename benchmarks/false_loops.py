@@ -35,7 +35,8 @@ def forge(context: MatchContext, solved: Solution, pairs: list[tuple[int, int]])
         f0_T_f1[:3, 3] /= np.linalg.norm(f0_T_f1[:3, 3])
         poses.append(f0_T_f1)
     matches = Matches.of_rows(np.array(pairs, np.int32), rows)
-    return VerifiedPairs(matches, np.array(poses), Counts(len(pairs), len(pairs), "pairs"))
+    counts = Counts(len(pairs), len(pairs), "pairs")
+    return VerifiedPairs(matches, np.array(poses), np.zeros(len(pairs)), counts)
 
 
 @contextmanager
@@ -59,7 +60,8 @@ def forged_loops(first: int, far: int, count: int) -> Iterator[list[int]]:
             np.concatenate([ours.keypoints, theirs.keypoints]),
         )
         poses = np.concatenate([found.f0_T_f1s, false.f0_T_f1s])
-        return VerifiedPairs(both, poses, found.counts)
+        sigmas = np.concatenate([found.direction_sigmas, false.direction_sigmas])
+        return VerifiedPairs(both, poses, sigmas, found.counts)
 
     with patch.object(correspondences, "match_loops", match_loops):
         yield sizes

@@ -17,6 +17,7 @@ from gsba.trajectory.steps import Steps, image_steps, length_ratios, off_steps
 from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
 
 _PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
+_WIDER = 2, 4, 8  # frames
 _MANY_LOST = 0.2  # part of the neighbours
 
 
@@ -59,6 +60,7 @@ def recover(
     close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
     lost = guided.missing(np.column_stack([close, close + 1]))
     alone = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
+    alone = _with_wider(context, alone)
     steps = image_steps(alone, keypoints)
     alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
     coarse, joints = _joined(coarse, alone, steps, keypoints)
@@ -90,6 +92,22 @@ def recover(
     guessed |= trust.unseen_steps & judgement.leaps(coarse.world_T_rigs, timestamps)
     trust = replace(trust, false_steps=trust.false_steps | guessed)
     return Recovered(neighbours, trust, coarse, joints)
+
+
+def _with_wider(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
+    """Neighbours, and where most of them are too close to tell walking from turning, pairs of
+    frames further apart over those."""
+    for gap in _WIDER:
+        steps = image_steps(found, context.keypoints)
+        short = steps.verified & ~steps.directed
+        if 2 * np.count_nonzero(short) <= np.count_nonzero(steps.verified):
+            break
+        first = np.arange(len(short) + 1 - gap)
+        over = [short[f : f + gap].any() and steps.verified[f : f + gap].all() for f in first]
+        chosen = first[np.array(over, bool)]
+        wider = found.missing(np.column_stack([chosen, chosen + gap]))
+        found = VerifiedPairs.joined([found, match_anywhere(context, wider)])
+    return found
 
 
 def _joined(

@@ -38,6 +38,8 @@ class Steps:
 def image_steps(pairs: VerifiedPairs, keypoints: Keypoints) -> Steps:
     """Relative poses of neighbours among verified pairs.
 
+    Where a step is too short to have a direction, it has that of the closest pairs over it.
+
     Args:
         pairs: of frames at most a few apart.
         keypoints: of all frames.
@@ -54,7 +56,43 @@ def image_steps(pairs: VerifiedPairs, keypoints: Keypoints) -> Steps:
         turn = nearest_rotation(rays0.T @ bearings1)
         if np.median(np.linalg.norm(rays0 - bearings1 @ turn.T, axis=1)) < _STILL:
             f_T_nexts[f0, :3, :3] = turn  # an essential matrix knows it less well
+    short = verified & ~np.isfinite(sigmas)
+    if short.any():
+        _direct(f_T_nexts, sigmas, short, verified, pairs)
     return Steps(f_T_nexts, verified, sigmas)
+
+
+def _direct(
+    f_T_nexts: np.ndarray,
+    sigmas: np.ndarray,
+    short: np.ndarray,
+    verified: np.ndarray,
+    pairs: VerifiedPairs,
+) -> None:
+    """Give short steps (F - 1,) bool the mean direction, and its spread, of pairs over them."""
+    gaps = np.diff(pairs.matches.pairs, axis=1)[:, 0]
+    start_R_f = np.concatenate([np.eye(3)[None], f_T_nexts[:, :3, :3]])
+    for f in range(1, len(start_R_f)):
+        start_R_f[f] = start_R_f[f - 1] @ start_R_f[f]
+    for gap in np.unique(gaps[gaps > 1]):
+        sums, squares, counts = (
+            np.zeros((len(short), 3)),
+            np.zeros(len(short)),
+            np.zeros(len(short)),
+        )
+        for p in np.flatnonzero((gaps == gap) & np.isfinite(pairs.direction_sigmas)):
+            first, last = pairs.matches.pairs[p]
+            if verified[first:last].all():
+                sums[first:last] += start_R_f[first] @ pairs.f0_T_f1s[p][:3, 3]
+                squares[first:last] += pairs.direction_sigmas[p] ** 2
+                counts[first:last] += 1
+        known = short & (counts > 0)
+        lengths = np.linalg.norm(sums[known], axis=1)
+        f_T_nexts[known, :3, 3] = np.einsum("fji,fj->fi", start_R_f[:-1][known], sums[known])
+        f_T_nexts[known, :3, 3] /= lengths[:, None]
+        spread = 2 * (1 - lengths / counts[known])
+        sigmas[known] = np.sqrt(squares[known] / counts[known] + spread)
+        short = short & ~known
 
 
 def off_steps(pairs: VerifiedPairs, found: Steps) -> np.ndarray:
