@@ -17,6 +17,7 @@ from gsba.geometry import inverse
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.types import Matches
 
+LOCAL = 12  # frames to either side of a meeting, which are asked what speaks for and against it
 _REACH = 2.0  # local depths between two frames that are compared
 _NEAREST = 3  # frames that each frame is compared with
 _MOST_PAIRS = 150
@@ -180,6 +181,12 @@ def weigh(
     squares = float(np.sum((excess - share * expected) ** 2))
     squares += unseen**2 * (share**2 + (1 - share) ** 2)
     return JoinEvidence(share, float(np.sqrt(squares)) / total, len(cells)), found
+
+
+def around(frames: np.ndarray, middle: int) -> np.ndarray:
+    """Frames (N,), ascending, at most so many before or after one of them: drift is small there."""
+    place = int(np.searchsorted(frames, middle))
+    return frames[max(place - LOCAL, 0) : place + LOCAL + 1]
 
 
 def nearest_pairs(places: Places, one: np.ndarray, other: np.ndarray) -> np.ndarray:

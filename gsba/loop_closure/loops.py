@@ -5,13 +5,16 @@ tested against the map: repeated structure makes perfect loops to the wrong plac
 for more drift than the path can have, or disagree with one another.
 """
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle
+from gsba.loop_closure import join_evidence
 from gsba.loop_closure.connectivity import parted
+from gsba.loop_closure.join_evidence import LOCAL, Places, around
 from gsba.loop_closure.pose_graph import Loop, bend, met
 from gsba.loop_closure.retrieval import looks_of
 from gsba.matching import recovery
@@ -19,6 +22,7 @@ from gsba.matching.guided_search import MatchContext
 from gsba.similarity import relative_map
 from gsba.types import Counts, Keypoints, Solution, VerifiedPairs
 
+logger = logging.getLogger(__name__)
 _LOOKS = 3  # places compared for each frame
 MIN_GROUP = 3  # pairs that must agree
 RIVAL = 1.5  # by how much a group must outweigh one that contradicts it
@@ -52,7 +56,8 @@ def close(context: MatchContext, solved: Solution, unseen: np.ndarray) -> Closed
     loops = _measure(verified, keypoints, solved, settings.seed)
     within = [loop for loop in loops if within_drift(loop, solved, unseen, settings)]
     agreeing = consistent(within, solved, settings.pairs.window)
-    believed = met(agreeing, solved, unseen)
+    upheld = _upheld(context, solved, agreeing)
+    believed = met(upheld, solved, unseen)
     counts = Counts(
         len(chosen),
         len(believed),
@@ -61,7 +66,8 @@ def close(context: MatchContext, solved: Solution, unseen: np.ndarray) -> Closed
             "no common geometry": len(chosen) - len(loops),
             "further than drift": len(loops) - len(within),
             "contradicted": len(within) - len(agreeing),
-            "bend confirmed steps": len(agreeing) - len(believed),
+            "refuted by what is around": len(agreeing) - len(upheld),
+            "bend confirmed steps": len(upheld) - len(believed),
         },
     )
     pairs = np.array([(loop.f0, loop.f1) for loop in believed], np.int32).reshape(-1, 2)
@@ -169,6 +175,31 @@ def consistent(loops: list[Loop], solved: Solution, window: int) -> list[Loop]:
         if len(group) >= MIN_GROUP and weight >= RIVAL * contrary:
             believed.append(loops[i])
     return believed
+
+
+def _upheld(context: MatchContext, solved: Solution, loops: list[Loop]) -> list[Loop]:
+    """Loops that the surroundings of both places do not refute, weighed stretch by stretch."""
+    if not loops:
+        return loops
+    poses, frames = solved.world_T_rigs, np.arange(len(solved.world_T_rigs))
+    known, depth = solved.points_by_keypoint(context.keypoints), solved.median_depth()
+    usual = join_evidence.rates(context, Places(poses, known), frames // (2 * LOCAL))
+    rest, upheld = sorted(loops, key=lambda loop: -loop.support), list[Loop]()
+    while rest:
+        best = rest[0]
+        beside = [max(abs(loop.f0 - best.f0), abs(loop.f1 - best.f1)) <= LOCAL for loop in rest]
+        groups = around(frames, best.f0), around(frames, best.f1)
+        groups = groups[0], np.setdiff1d(groups[1], groups[0])
+        moved = poses.copy()
+        moved[groups[1]] = (
+            poses[best.f0] @ best.f0_T_f1 @ inverse(poses[best.f1]) @ poses[groups[1]]
+        )
+        evidence, _ = join_evidence.weigh(context, Places(moved, known), groups, usual, depth)
+        logger.info("a loop of frames %d and %d: %s", best.f0, best.f1, evidence)
+        if not evidence.refuted:
+            upheld += [loop for loop, near in zip(rest, beside, strict=True) if near]
+        rest = [loop for loop, near in zip(rest, beside, strict=True) if not near]
+    return upheld
 
 
 def _closes(one: Loop, other: Loop, poses: np.ndarray, depth: float) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 from gsba.geometry import angles_between, inverse, unit
 from gsba.loop_closure import join_evidence, loops
 from gsba.loop_closure.connectivity import by_size
-from gsba.loop_closure.join_evidence import JoinEvidence, Places, Rates
+from gsba.loop_closure.join_evidence import JoinEvidence, Places, Rates, around
 from gsba.loop_closure.map_similarity import Meeting, Proposal, alike, propose, refined
 from gsba.loop_closure.merged_map import Registered
 from gsba.loop_closure.pose_graph import Loop
@@ -34,7 +34,6 @@ _BEST = 2  # meetings whose surroundings are compared too
 _MIN_MAP = 3  # frames of a part that is a map
 _BEHIND = 3.0  # times the pace: a frame alone is no further off than that
 _APART = 4.0  # extents between maps that nothing ties together
-_LOCAL = 12  # frames to either side of a meeting, which are asked what speaks for and against it
 _LEVEL = np.deg2rad(5.0)  # between the verticals of two parts, besides how frames tilt in each
 
 
@@ -189,7 +188,7 @@ class _Joining:
         for proposal in propose(meetings, self.poses, self.depth, self.context.settings.seed):
             if self._held(rows) and not self._plausible(proposal):
                 continue
-            groups = _around(rows, proposal.frames[0]), _around(inside, proposal.frames[1])
+            groups = around(rows, proposal.frames[0]), around(inside, proposal.frames[1])
             evidence, found = self._weigh(*groups, proposal.move)
             again = self._known_by_both(found, rows)
             if again:
@@ -406,12 +405,6 @@ class _Joining:
             offsets[group] = positions[groups[0]].mean(axis=0) + away
             offsets[group] -= positions[group].mean(axis=0)
         return offsets
-
-
-def _around(frames: np.ndarray, middle: int) -> np.ndarray:
-    """Frames (N,), ascending, at most so many before or after one of them: drift is small there."""
-    place = int(np.searchsorted(frames, middle))
-    return frames[max(place - _LOCAL, 0) : place + _LOCAL + 1]
 
 
 def _moved(
