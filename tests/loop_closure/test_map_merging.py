@@ -4,66 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from synthetic import bearings_of, features_of, loop_walk, unit, with_noise
+from two_maps import HALF, MOVE, NUM, SCALE, TRUTH, scene, torn
 
-from gsba.config import PairSettings, RefineSettings
-from gsba.features import detection
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.merged_map import Registered, follow
-from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.similarity import Sim3
-from gsba.store.shards import Threads
 from gsba.trajectory.joining import GUESS, PLACES, Joint
 from gsba.trajectory.judgement import Trust
-from gsba.types import CoarsePoses, Counts, Landmarks, PoseSource, Solution, Tracks
+from gsba.types import CoarsePoses, PoseSource, Solution, Tracks
 
-NUM, POINTS, HALF = 40, 1500, 20
-TRUTH = loop_walk(NUM)
 TIMES = np.arange(NUM, dtype=float)
 NOBODY = np.zeros(NUM - 1, bool)
 BREAK = np.arange(NUM - 1) == HALF - 1
-SETTINGS = RefineSettings(pairs=PairSettings(window=8, max_baseline_depths=0.8))
-SCALE = 1.7
-MOVE = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -3.0, 8.0]))
-
-
-def _scene(strange: bool = False) -> tuple[MatchContext, Solution, np.ndarray]:
-    """Once around, mapped in two halves; `strange`: the second half looks like nothing else.
-
-    Returns the map in one world, and the point that each of its landmarks is.
-    """
-    rng = np.random.default_rng(0)
-    near = TRUTH[rng.integers(0, NUM, POINTS), :3, 3]
-    points = near + rng.uniform(0.8, 2.5, (POINTS, 1)) * unit(rng.normal(size=(POINTS, 3)))
-    looks = (200 * rng.random((2, POINTS, 64)) ** 4).astype(np.uint8)
-    frames, rows = [], []
-    for f, world_T_rig in enumerate(TRUTH):
-        seen = np.flatnonzero(np.linalg.norm(points - world_T_rig[:3, 3], axis=1) < 2.6)
-        late = int(f >= HALF)
-        bearings = with_noise(bearings_of(points[seen], world_T_rig), 3e-4, rng)
-        frames.append(features_of(bearings, looks[late if strange else 0][seen]))
-        own = 2 * seen + late
-        rows.append(np.column_stack([own, np.full(len(seen), f), np.arange(len(seen))]))
-    table = np.concatenate(rows)
-    table = table[np.lexsort((table[:, 1], table[:, 0]))].astype(np.int32)
-    kept, renumbered = np.unique(table[:, 0], return_inverse=True)
-    own = Tracks(renumbered.astype(np.int32), table[:, 1], table[:, 2], len(kept))
-    landmarks = Landmarks(points[kept // 2], own, Counts(len(kept), len(kept), "tracks"))
-    among = SearchableFrames(frames.__getitem__)
-    context = MatchContext(among, among, detection.gather(frames), SETTINGS, Threads(1))
-    return context, Solution(TRUTH, landmarks, 1.0, ()), kept % 2 == 1
-
-
-def _torn(solved: Solution, late: np.ndarray, scale: float, move: np.ndarray) -> Solution:
-    """The second half in a world and scale of its own."""
-    poses, points = solved.world_T_rigs.copy(), solved.landmarks.points_world.copy()
-    poses[HALF:] = Sim3.of(scale, move).poses(poses[HALF:])
-    points[late] = scale * points[late] @ move[:3, :3].T + move[:3, 3]
-    return replace(
-        solved, world_T_rigs=poses, landmarks=replace(solved.landmarks, points_world=points)
-    )
 
 
 def _halves(alone: tuple[int, ...] = ()) -> np.ndarray:
@@ -100,9 +53,9 @@ def _errors(found: Registered, true: np.ndarray = TRUTH) -> tuple[float, float]:
 
 @pytest.mark.parametrize("scale", [1.0, SCALE, 0.3])
 def test_two_maps_of_any_scale_are_joined_where_they_meet(scale: float) -> None:
-    context, whole, late = _scene()
-    torn = _torn(whole, late, scale, MOVE)
-    found = map_merging.merge(context, torn, _halves(), NOBODY, ~BREAK, TIMES)
+    context, whole, late = scene()
+    parts = torn(whole, late, scale, MOVE)
+    found = map_merging.merge(context, parts, _halves(), NOBODY, ~BREAK, TIMES)
     assert not found.components.any() and found.met.all() and not found.lost.any()
     np.testing.assert_allclose(found.scales[HALF:], 1 / scale, rtol=0.005)
     off, turned = _errors(found)
@@ -112,9 +65,9 @@ def test_two_maps_of_any_scale_are_joined_where_they_meet(scale: float) -> None:
 
 
 def test_strangers_stay_apart() -> None:
-    context, whole, late = _scene(strange=True)
+    context, whole, late = scene(strange=True)
     found = map_merging.merge(
-        context, _torn(whole, late, SCALE, MOVE), _halves(), NOBODY, ~BREAK, TIMES
+        context, torn(whole, late, SCALE, MOVE), _halves(), NOBODY, ~BREAK, TIMES
     )
     np.testing.assert_array_equal(found.components, np.arange(NUM) >= HALF)
     assert found.counts.dropped == {"frames alone": 0, "apart": 1}
@@ -125,8 +78,8 @@ def test_strangers_stay_apart() -> None:
 
 
 def test_strangers_that_the_trajectory_ties_together_stay_where_it_has_them() -> None:
-    context, whole, late = _scene(strange=True)
-    far = _torn(whole, late, 1.0, pose(np.eye(3), np.array([0.0, 40.0, 0.0])))
+    context, whole, late = scene(strange=True)
+    far = torn(whole, late, 1.0, pose(np.eye(3), np.array([0.0, 40.0, 0.0])))
     held = NOBODY.copy()
     held[HALF - 1] = True
     found = map_merging.merge(context, far, _halves(), held, ~BREAK, TIMES)
@@ -135,7 +88,7 @@ def test_strangers_that_the_trajectory_ties_together_stay_where_it_has_them() ->
 
 
 def test_what_the_trajectory_puts_into_a_place_that_looks_otherwise_is_apart() -> None:
-    context, whole, _ = _scene(strange=True)
+    context, whole, _ = scene(strange=True)
     held = NOBODY.copy()
     held[HALF - 1] = True
     found = map_merging.merge(context, whole, _halves(), held, ~BREAK, TIMES)
@@ -144,22 +97,22 @@ def test_what_the_trajectory_puts_into_a_place_that_looks_otherwise_is_apart() -
 
 
 def test_a_join_that_asks_for_more_than_drift_is_not_believed_against_the_trajectory() -> None:
-    context, whole, late = _scene()
-    far = _torn(whole, late, 1.0, pose(np.eye(3), np.array([0.0, 40.0, 0.0])))
+    context, whole, late = scene()
+    far = torn(whole, late, 1.0, pose(np.eye(3), np.array([0.0, 40.0, 0.0])))
     held = NOBODY.copy()
     held[HALF - 1] = True
     step = far.world_T_rigs[HALF, :3, 3] - far.world_T_rigs[HALF - 1, :3, 3]
     assert np.linalg.norm(step) > 40  # the trajectory vouches for a long step: as long may it err
     joined = map_merging.merge(context, far, _halves(), held, ~BREAK, TIMES)
     assert joined.met.all()
-    turned = _torn(whole, late, 3.0, np.eye(4))
+    turned = torn(whole, late, 3.0, np.eye(4))
     kept = map_merging.merge(context, turned, _halves(), held, ~BREAK, TIMES)
     assert not kept.met[HALF:].any()
     np.testing.assert_allclose(kept.solved.world_T_rigs, turned.world_T_rigs, atol=1e-12)
 
 
 def test_frames_alone_are_registered_against_the_map() -> None:
-    context, whole, _ = _scene()
+    context, whole, _ = scene()
     alone = (7, 13, 14)
     whole = _without_map(whole, alone)
     found = map_merging.merge(context, whole, _halves(alone), NOBODY, NOBODY, TIMES)
@@ -170,7 +123,7 @@ def test_frames_alone_are_registered_against_the_map() -> None:
 
 
 def test_a_frame_of_elsewhere_is_not_registered() -> None:
-    context, whole, _ = _scene(strange=True)
+    context, whole, _ = scene(strange=True)
     parts_of = (np.arange(NUM) == 30).astype(int)
     rest = _without_map(whole, tuple(range(HALF, NUM)))
     found = map_merging.merge(context, rest, parts_of, NOBODY, NOBODY, TIMES)
@@ -180,7 +133,7 @@ def test_a_frame_of_elsewhere_is_not_registered() -> None:
 
 
 def test_a_frame_with_too_few_points_stays_where_its_steps_have_it() -> None:
-    context, whole, _ = _scene(strange=True)
+    context, whole, _ = scene(strange=True)
     parts_of = (np.arange(NUM) == 30).astype(int)
     rest = _without_map(whole, tuple(range(HALF, NUM)))
     found = map_merging.merge(context, rest, parts_of, NOBODY, ~NOBODY, TIMES)
@@ -193,16 +146,16 @@ def _trust(poses: np.ndarray, unseen: np.ndarray) -> Trust:
 
 
 def test_a_piece_of_the_trajectory_goes_where_its_frames_were_carried() -> None:
-    context, whole, late = _scene()
-    torn = _torn(whole, late, SCALE, MOVE)
+    context, whole, late = scene()
+    parts = torn(whole, late, SCALE, MOVE)
     unseen = NOBODY.copy()
     unseen[HALF - 1] = True
     segments = (np.arange(NUM) >= HALF).astype(np.int32)
     slam = np.full(NUM, PoseSource.SLAM, np.uint8)
-    coarse = CoarsePoses(torn.world_T_rigs, slam, 0.0, segments)
+    coarse = CoarsePoses(parts.world_T_rigs, slam, 0.0, segments)
     joints = (Joint(HALF, NUM - 1, 2.0, MOVE, GUESS),)
-    found = map_merging.merge(context, torn, _halves(), NOBODY, ~BREAK, TIMES)
-    moved, trust, joints = follow(found, coarse, _trust(torn.world_T_rigs, unseen), joints)
+    found = map_merging.merge(context, parts, _halves(), NOBODY, ~BREAK, TIMES)
+    moved, trust, joints = follow(found, coarse, _trust(parts.world_T_rigs, unseen), joints)
     np.testing.assert_allclose(moved.world_T_rigs, found.solved.world_T_rigs, atol=1e-9)
     assert joints[0].how == PLACES and trust.false_steps[HALF - 1]
     # What the piece's own poses were before the guess now lies where the map has them.

@@ -1,0 +1,69 @@
+"""What the surroundings say of joins: of true ones, of look-alikes, and of places out of sight."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from two_maps import HALF, NUM, TRUTH, scene
+
+from gsba.geometry import pose
+from gsba.loop_closure import join_evidence
+from gsba.loop_closure.join_evidence import JoinEvidence, Places, around
+from gsba.matching.guided_search import MatchContext
+
+PARTS = (np.arange(NUM) >= HALF).astype(int)
+ENDS = np.arange(6), np.arange(NUM - 6, NUM)  # of a walk around: they see the same place
+
+
+def _places(strange: bool = False) -> tuple[MatchContext, Places, float]:
+    context, solved, _ = scene(strange)
+    known = solved.points_by_keypoint(context.keypoints)
+    return context, Places(TRUTH, known), solved.median_depth()
+
+
+def _weighed(move: np.ndarray, strange: bool = False) -> JoinEvidence:
+    """Of both ends, the last frames carried off."""
+    context, places, depth = _places(strange)
+    usual = join_evidence.rates(context, places, PARTS)
+    poses = places.world_T_rigs.copy()
+    poses[HALF:] = move @ poses[HALF:]
+    moved = replace(places, world_T_rigs=poses)
+    return join_evidence.weigh(context, moved, ENDS, usual, depth)[0]
+
+
+def test_points_are_found_again_within_parts_and_hardly_by_chance() -> None:
+    context, places, _ = _places()
+    usual = join_evidence.rates(context, places, PARTS)
+    assert np.median(usual.within) > 0.6 and usual.chance < 0.02
+
+
+def test_a_true_join_is_confirmed() -> None:
+    found = _weighed(np.eye(4))
+    assert found.confirmed and not found.refuted and found.share > 0.8
+
+
+def test_a_place_that_looks_otherwise_is_refuted() -> None:
+    found = _weighed(np.eye(4), strange=True)
+    assert found.refuted and found.share < 0.1 and not found.confirmed
+
+
+@pytest.mark.parametrize("degrees", [20.0, 90.0, 180.0])
+def test_a_false_join_is_refuted(degrees: float) -> None:
+    centre = TRUTH[0, :3, 3]
+    turn = Rotation.from_rotvec([0, np.deg2rad(degrees), 0]).as_matrix()
+    found = _weighed(pose(turn, centre - turn @ centre))
+    assert found.refuted and _weighed(np.eye(4)).beats(found)
+
+
+def test_places_out_of_sight_say_nothing() -> None:
+    found = _weighed(pose(np.eye(3), np.array([0.0, 40.0, 0.0])))
+    assert found.witnesses == 0
+    assert not (found.confirmed or found.refuted or found.absent)
+    assert "no frames of both" in str(found)
+
+
+def test_frames_around_one_are_of_its_group() -> None:
+    frames = np.array([2, 3, 5, *range(10, 60)])
+    assert around(frames, 5).tolist() == frames[:15].tolist()
+    assert around(frames, 58).tolist() == frames[-14:].tolist()
