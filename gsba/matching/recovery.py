@@ -72,10 +72,11 @@ def recover(
     again = again[again[:, 1] - again[:, 0] == 2]
     over = _match_along(context, trust.world_T_rigs, again)
     neighbours = VerifiedPairs.joined([alone, _consistent(over, steps, keypoints, settings)])
+    alike = judgement.confirmed(coarse, steps, settings.priors)
     doubtful = {
         (f0, f1)
         for f0, f1 in lost.tolist()
-        if not _supported((f0, f1), neighbours, keypoints, settings)
+        if not (alike[f0] or _supported((f0, f1), neighbours, keypoints, settings))
     }
     if doubtful:
         frames = map(tuple, neighbours.matches.pairs.tolist())

@@ -115,6 +115,16 @@ def judge(
     return Trust(start, wrong, named, unseen, lengths, False)
 
 
+def confirmed(coarse: CoarsePoses, found: Steps, priors: PriorSettings) -> np.ndarray:
+    """Steps (F - 1,) bool that images and trajectory have alike, within the latter's noise."""
+    slam = inverse(coarse.world_T_rigs[:-1]) @ coarse.world_T_rigs[1:]
+    turned, off = _disagreement(slam, found)
+    own = coarse.sources == PoseSource.SLAM
+    close = turned < _ROUGH * np.deg2rad(priors.rotation_deg)
+    close &= off < np.arctan(_ROUGH * priors.translation) + 3 * found.direction_sigmas
+    return found.directed & close & own[:-1] & own[1:]
+
+
 def _from_images_alone(
     coarse: CoarsePoses, slam: np.ndarray, found: Steps, logs: np.ndarray, sigmas: np.ndarray
 ) -> Trust:
