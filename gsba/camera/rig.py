@@ -65,3 +65,8 @@ def cells_of(bearings_rig: np.ndarray, per_side: int) -> np.ndarray:
     angles = np.arctan2(local[:, :2], local[:, 2:]) / (np.pi / 2) + 0.5
     across = np.clip((angles * per_side).astype(int), 0, per_side - 1)
     return (faces.astype(int) * per_side + across[:, 1]) * per_side + across[:, 0]
+
+
+def witnesses(bearings_rig: np.ndarray, per_side: int) -> int:
+    """Cells that bearings (N, 3) fall into: what lies in one errs together."""
+    return len(np.unique(cells_of(bearings_rig, per_side)))

@@ -13,6 +13,7 @@ from gsba.matching.verification import RelativePose
 from gsba.types import Matches, Solution, VerifiedPairs
 
 _ROTATION_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # frames between those matched
+_JOIN = np.deg2rad(4.0)  # that parts of a map may be off as they were joined
 _ROTATION_DEG = 2.0  # around where a chain of turns sees a keypoint
 
 
@@ -89,6 +90,26 @@ def match_along_epipolars(context: MatchContext, solved: Solution) -> Matches:
         for length in lengths
     ]
     return context.match(chosen, poses, gates)
+
+
+def match_across(context: MatchContext, solved: Solution, parts: np.ndarray) -> VerifiedPairs:
+    """Match frames of parts of a map that were joined, close in space, and verify them.
+
+    Known points are looked for as far around their predicted bearing as a join may be off.
+
+    Args:
+        context: of the run.
+        solved: the joined map.
+        parts: (F,) the part that each frame was in before.
+    """
+    poses, depth = solved.world_T_rigs, solved.median_depth()
+    chosen = np.concatenate(pairs.covisible(poses[:, :3, 3], depth, context.settings.pairs))
+    chosen = chosen[parts[chosen[:, 0]] != parts[chosen[:, 1]]]
+    gates = [Gate.around_points(_JOIN)] * len(chosen)
+    known = solved.points_by_keypoint(context.keypoints)
+    found = context.match(chosen, poses, gates, known)
+    f0_T_f1s = inverse(poses[chosen[:, 0]]) @ poses[chosen[:, 1]]
+    return verified(found, gates, f0_T_f1s, np.full(len(chosen), _JOIN * depth), context)
 
 
 def match_known_points(context: MatchContext, solved: Solution, loops_closed: bool) -> Matches:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba.camera.rig import cells_of
+from gsba.camera.rig import witnesses
 from gsba.config import VerifySettings
 from gsba.geometry import inverse, nearest_rotation, pose, rotation_angle
 from gsba.significance import least_agreeing, outweighs
@@ -214,13 +214,13 @@ def _significant(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """f0_T_f1 (4, 4) with unit translation and inliers (m,) bool of the best pose; None where
     chance explains as many."""
-    largest, witnesses = np.sin(np.deg2rad(settings.max_error_deg)), _witnesses(bearings0)
+    largest, num = np.sin(np.deg2rad(settings.max_error_deg)), witnesses(bearings0, _CELLS)
 
     def needed(of_match: float) -> int:
-        of_witness = 1 - (1 - of_match) ** (len(bearings0) / witnesses)
-        return least_agreeing(witnesses, of_witness, _SAMPLE, settings.max_false_alarms)
+        of_witness = 1 - (1 - of_match) ** (len(bearings0) / num)
+        return least_agreeing(num, of_witness, _SAMPLE, settings.max_false_alarms)
 
-    if len(bearings0) <= _SAMPLE or needed(max(chance, largest)) > witnesses:
+    if len(bearings0) <= _SAMPLE or needed(max(chance, largest)) > num:
         return None
     found = _ransac(bearings0, bearings1, needed(max(chance, largest)), settings, seed)
     if found is None:
@@ -229,7 +229,7 @@ def _significant(
     sines = _normals(found[0], bearings0) @ (found[0][:3, :3] @ bearings1.T)
     np.fill_diagonal(sines, np.inf)
     agreeing = np.count_nonzero(np.abs(sines) < largest) / (sines.size - len(sines))
-    enough = _witnesses(bearings0[found[1]]) >= needed(max(chance, agreeing, largest))
+    enough = witnesses(bearings0[found[1]], _CELLS) >= needed(max(chance, agreeing, largest))
     return found if enough else None
 
 
@@ -252,11 +252,6 @@ def _ransac(
     f0_T_f1 = inverse(pose(f1_T_f0[:, :3], f1_T_f0[:, 3]))
     f0_T_f1[:3, 3] /= max(np.linalg.norm(f0_T_f1[:3, 3]), 1e-12)
     return f0_T_f1, np.asarray(found["inlier_mask"], bool)
-
-
-def _witnesses(bearings: np.ndarray) -> int:
-    """Cells of the sphere that bearings (m, 3) fall into."""
-    return len(np.unique(cells_of(bearings, _CELLS)))
 
 
 def _normals(f0_T_f1: np.ndarray, bearings0: np.ndarray) -> np.ndarray:
@@ -282,8 +277,9 @@ def _is_rivalled(
     rival = _significant(bearings0[rest], bearings1[rest], settings, seed)
     if rival is None:
         return False
-    support, against = _witnesses(bearings0[inliers]), _witnesses(bearings0[rest][rival[1]])
-    return not outweighs(support, against, settings.max_error_rate)
+    support, against = bearings0[inliers], bearings0[rest][rival[1]]
+    numbers = witnesses(support, _CELLS), witnesses(against, _CELLS)
+    return not outweighs(*numbers, settings.max_error_rate)
 
 
 def _direction_sigma(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.ndarray) -> float:
@@ -298,7 +294,7 @@ def _direction_sigma(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.n
     left = np.median(np.sum((bearings0 - turned) ** 2, axis=1)) / _MEDIANS[0]
     noise = np.median(across**2) / _MEDIANS[1]
     noise, left = noise + _MODEL_SIGMA**2, left + _MODEL_SIGMA**2
-    num = _witnesses(bearings0)
+    num = witnesses(bearings0, _CELLS)
     if np.log(left / noise) < _TURN_SIGMAS * _RATIO_SIGMA / np.sqrt(num):
         return np.inf
     return _direction_error(f0_T_f1, bearings0, bearings1) * np.sqrt(noise * len(bearings0) / num)

@@ -194,6 +194,12 @@ def match_along_epipolars(
     return run.stage(name, run.matching_key(), compute, Matches)
 
 
+def match_across(run: Run, seen: Seen, solved: Solution, parts: np.ndarray) -> Matches:
+    """Verified matches of frames whose parts (F,) of the map were joined."""
+    compute = partial(correspondences.match_across, seen.context, solved, parts)
+    return run.stage("across", run.matching_key(), compute, VerifiedPairs).matches
+
+
 def match_known_points(
     run: Run, seen: Seen, solved: Solution, name: str, loops_closed: bool = True
 ) -> Matches:

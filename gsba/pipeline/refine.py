@@ -200,9 +200,9 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     known = frontend.match_known_points(run, seen, solved, "near", loops_closed=False)
     solved = backend.adjust(run, seen, prior, "dense", [along, known], solved, rounds.dense)
     # One map, its loops closed; closer looks where images hold it poorly.
-    prior, solved, (along, known) = _merge_maps(run, seen, prior, near, solved, (along, known))
+    prior, solved, matches = _merge_maps(run, seen, prior, near, solved, [along, known])
     prior, solved, loops = frontend.close_loops(run, seen, prior, solved)
-    matches = [along, known, loops]
+    along, matches = matches[0], [*matches, loops]
     solved = backend.adjust(run, seen, prior, "closed", matches, solved, rounds.loops)
     prior = backend.align_imu(run, prior, solved, "imu_closed")
     seen, world = _find_camera(run, seen, prior, matches, solved)
@@ -236,15 +236,19 @@ def _merge_maps(
     prior: Prior,
     near: VerifiedPairs,
     solved: Solution,
-    matches: tuple[Matches, Matches],
-) -> tuple[Prior, Solution, tuple[Matches, Matches]]:
+    matches: list[Matches],
+) -> tuple[Prior, Solution, list[Matches]]:
     """Parts of the map that nothing ties together, joined where they meet; and their matches."""
     parts = backend.scattered(run, prior, near, solved)
     if parts is None:
         return prior, solved, matches
     prior, solved = backend.merge_maps(run, seen, prior, solved, parts)
+    across = frontend.match_across(run, seen, solved, parts)
+    along, known = (connectivity.within(some, parts) for some in matches)
+    matches, gates = [along, known, across], run.settings.rounds.loops
+    solved = backend.adjust(run, seen, prior, "joined", matches, solved, gates)
     along = frontend.match_along_epipolars(run, seen, solved, "adjacent2")
-    return prior, solved, (along, connectivity.within(matches[1], parts))
+    return prior, solved, [along, known, across]
 
 
 def _find_camera(
