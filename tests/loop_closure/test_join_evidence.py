@@ -18,7 +18,7 @@ ENDS = np.arange(6), np.arange(NUM - 6, NUM)  # of a walk around: they see the s
 
 def _places(strange: bool = False) -> tuple[MatchContext, Places, float]:
     context, solved, _ = scene(strange)
-    known = solved.points_by_keypoint(context.keypoints)
+    known = list(solved.points_by_keypoint(context.keypoints))
     return context, Places(TRUTH, known), solved.median_depth()
 
 
