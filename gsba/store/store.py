@@ -24,7 +24,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 from pydantic import BaseModel
 
 from gsba.disk import write_text
-from gsba.log import GsbaError
+from gsba.log import GsbaError, brief
 from gsba.memory import give_back_freed_memory
 from gsba.store.folder import MARKER, STAGES, claim, is_run_folder, open_run_folder
 from gsba.store.records import FORMAT, RecordError, load_record, read_info, save_record, typed
@@ -337,7 +337,8 @@ def load_stage(root: Path, name: str, returns: type[T]) -> T:
         return load_record(_stage_path(root, name), returns)
     except RecordError as error:
         raise GsbaError(
-            f"{root} has no usable {name!r} result: run gsba refine with --out {root} to the end"
+            f"{root} has no usable {name!r} result ({brief(str(error), 200)}): run gsba refine "
+            f"with --out {root} to the end"
         ) from error
 
 
