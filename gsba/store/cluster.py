@@ -45,6 +45,7 @@ _QUEUES = {  # kind of address -> module and class that starts workers
     "htcondor": ("dask_jobqueue", "HTCondorCluster"),
     "kubernetes": ("dask_kubernetes.operator", "KubeCluster"),
 }
+_ADDRESS = re.compile(r"(tcp|tls|wss?|ucx)://[^\s/:][^\s/]*")
 _AHEAD = 3  # shards for each thread that are written and asked for before they are needed
 _ATTEMPTS = 5  # at a shard that workers died on
 _LATE = 4.0  # times as long as others: a shard is given to another worker as well
@@ -160,7 +161,7 @@ def _scheduler_address(address: str) -> str:
     if address.endswith(".json"):
         found = json.loads(Path(address).read_text(encoding="utf-8"))
         found = found.get("address") if isinstance(found, dict) else None
-    if not isinstance(found, str) or not re.fullmatch(r"(tcp|tls|wss?|ucx)://[^\s/:][^\s/]*", found):
+    if not isinstance(found, str) or not _ADDRESS.fullmatch(found):
         raise ValueError("no address of the form tcp://HOST:PORT")
     return found
 
