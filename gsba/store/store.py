@@ -26,7 +26,14 @@ from pydantic import BaseModel
 from gsba.disk import write_text
 from gsba.log import GsbaError, brief
 from gsba.memory import give_back_freed_memory
-from gsba.store.folder import MARKER, STAGES, claim, is_run_folder, open_run_folder
+from gsba.store.folder import (
+    MARKER,
+    STAGES,
+    claim,
+    is_run_folder,
+    open_run_folder,
+    refuse_foreign,
+)
 from gsba.store.records import FORMAT, RecordError, load_record, read_info, save_record, typed
 from gsba.store.shards import Spent, StoredRecords, Threads, Workers, even_blocks
 from gsba.version import __version__
@@ -329,10 +336,11 @@ def load_stage(root: Path, name: str, returns: type[T]) -> T:
     """Result of a finished stage of a run, whatever its settings; for export and evaluate.
 
     Raises:
-        GsbaError: `root` is no gsba run, or the stage is missing or damaged.
+        GsbaError: `root` is no gsba run or holds links, or the stage is missing or damaged.
     """
     if not is_run_folder(root):
         raise GsbaError(f"{root} is not a gsba run: it has no {MARKER}")
+    refuse_foreign(root)
     try:
         return load_record(_stage_path(root, name), returns)
     except RecordError as error:
