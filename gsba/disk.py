@@ -22,6 +22,10 @@ logger = logging.getLogger(__name__)
 _TEMPORARY = ".gsba-tmp-"  # prefix of files still being written
 
 
+class FullDiskError(GsbaError):
+    """No space is left."""
+
+
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
     """Turn an OSError of writing to `path` into one line that says what to do."""
@@ -29,9 +33,8 @@ def disk_errors(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise GsbaError(
-                f"no space left while writing {path}: free some and run again; "
-                "finished stages are kept"
+            raise FullDiskError(
+                f"no space left while writing {path}: free some and run again"
             ) from error
         raise GsbaError(f"cannot write {path}: {error.strerror or error}") from error
 

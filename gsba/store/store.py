@@ -23,7 +23,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from pydantic import BaseModel
 
-from gsba.disk import write_text
+from gsba.disk import FullDiskError, write_text
 from gsba.log import GsbaError, brief
 from gsba.memory import give_back_freed_memory
 from gsba.store.folder import (
@@ -90,8 +90,10 @@ class RunStore:
     def __enter__(self) -> "RunStore":
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, _: Any = None, error: BaseException | None = None, __: Any = None) -> None:
         os.close(self._lock)
+        if isinstance(error, FullDiskError):
+            raise FullDiskError(f"{error}; finished stages are kept") from error
 
     @contextmanager
     def named(self, prefix: str) -> Iterator[None]:
