@@ -40,7 +40,7 @@ FAMILIES = {  # beside the usual hundred cases
 }
 _SCANS = ("cloud.pcd", "binary.pcd", "cloud.ply", "mesh.obj", "cloud.las", "cloud.laz")
 if importlib.util.find_spec("open3d") and importlib.util.find_spec("laspy"):
-    FAMILIES["scans"] = 6
+    FAMILIES["scans"] = 2  # seconds each
 _NAMES = (
     "../x",
     "../../out/x",
@@ -130,6 +130,12 @@ def _unharmed(here: Path, _: Any = None) -> str | None:
     whole = (here / "elsewhere/precious.npz").read_text() == "precious"
     alone = sorted(path.name for path in (here / "elsewhere").iterdir()) == ["precious.npz"]
     return None if whole and alone else "a file elsewhere was written or deleted"
+
+
+def _refined(here: Path, _: Any) -> str | None:
+    """What is wrong with poses of pictures that show next to nothing."""
+    found = read_trajectory(here / "out/trajectory.tum").world_T_rigs
+    return None if np.isfinite(found).all() else "poses"
 
 
 def _names(draft: Draft) -> Spoiled:
@@ -233,12 +239,7 @@ def _calibrations(draft: Draft) -> Spoiled:
         spoil_file(draft, name)
     draft.arguments = ["--quiet", "refine", "strangers/raw", "slam.tum", "--fps", "2"]
     draft.arguments += ["--out", "out", "--calibration", name, *small_settings()]
-
-    def check(here: Path, _: Any) -> str | None:
-        found = read_trajectory(here / "out/trajectory.tum").world_T_rigs
-        return None if np.isfinite(found).all() else "poses"
-
-    return draft.done("calibrations", check, resumes=True)
+    return draft.done("calibrations", _refined, resumes=True)
 
 
 def _tiffs(draft: Draft) -> Spoiled:
@@ -275,7 +276,7 @@ def _tiffs(draft: Draft) -> Spoiled:
     draft.arguments = ["--quiet", "refine", "flat", "slam.tum", "--fps", "2", "--out", "out"]
     gps = ["--set", "placement.gps=exif"] if draft.rng.random() < 0.3 else []
     draft.arguments += [*small_settings(), *gps]
-    return draft.done("tiffs", lambda *_: "frames that show nothing were refined", resumes=True)
+    return draft.done("tiffs", _refined, resumes=True)
 
 
 def _clusters(draft: Draft) -> Spoiled:

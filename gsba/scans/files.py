@@ -224,7 +224,8 @@ def _of_laser(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     try:
         file = laspy.read(path)
         names = set(file.point_format.dimension_names)
-        points = np.array(file.xyz, np.float64)
+        with np.errstate(all="ignore"):  # what is no number then is left out
+            points = np.array(file.xyz, np.float64)
         seen = ("red", "green", "blue") if {"red", "green", "blue"} <= names else ("intensity",) * 3
         colors = np.stack([np.asarray(file[name], np.float64) for name in seen], axis=1)
     except Exception as error:  # of the parser, each in its own words
