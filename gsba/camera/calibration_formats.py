@@ -20,6 +20,7 @@ from gsba.types import Fisheye
 
 _log = logging.getLogger(__name__)
 
+_FURTHEST = 1e6  # of a pose's numbers, in any unit
 _SQUARE = 0.01  # relative, by which both focal lengths of a camera may differ
 _SEEN = np.deg2rad(95.0)  # from a lens's axis, as far as it is asked
 _WORST_FIT = 0.1  # pixels, of another camera model taken for ours
@@ -268,7 +269,8 @@ def _rigid(a_T_b: np.ndarray) -> np.ndarray:
         ValueError: it is none.
     """
     turn = a_T_b[:3, :3]
-    if not np.isfinite(a_T_b).all() or np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3:
+    small = bool((np.abs(a_T_b) < _FURTHEST).all())  # no NaN either
+    if not small or np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3:
         raise ValueError("the pose of a lens is no rigid motion")
     if np.linalg.det(turn) < 0:
         raise ValueError("the pose of a lens mirrors")

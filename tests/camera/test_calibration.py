@@ -280,6 +280,10 @@ BAD_OURS = {
         lambda t: t["lenses"]["front"].update(rig_T_lens=np.full((4, 4), 0.5).tolist()),
         "no rigid motion",
     ),
+    "huge pose": (
+        lambda t: t["lenses"]["front"].update(rig_T_lens=np.full((4, 4), 1e300).tolist()),
+        "no rigid motion",
+    ),
     "mirror": (
         lambda t: t["lenses"]["front"].update(rig_T_lens=np.diag([-1.0, 1, 1, 1]).tolist()),
         "mirrors",
@@ -293,7 +297,7 @@ BAD_OURS = {
 
 
 def _check_refused(path: Path, message: str) -> None:
-    with pytest.raises(GsbaError, match=message) as caught:
+    with np.errstate(over="raise"), pytest.raises(GsbaError, match=message) as caught:
         read_calibration(path)
     line = str(caught.value)
     assert "\n" not in line and line.startswith(str(path))
