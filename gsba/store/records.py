@@ -80,6 +80,8 @@ def load_record(path: Path, returns: type[T]) -> T:
 def _reading(path: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(path) as archive:
+            if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
+                raise ValueError("compressed, as no record is: it may unpack to any size")
             yield archive
     except (OSError, EOFError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise RecordError(f"{path}: {error}") from error  # trees and arrays of another shape

@@ -124,6 +124,18 @@ def test_faces_that_are_none_are_refused(run: Path) -> None:
         load_run(run)
 
 
+def test_records_that_were_packed_are_refused(run: Path) -> None:
+    """A kilobyte of zip can be a gigabyte of zeros."""
+    path = run / "stages/reconstruction.npz"
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    with pytest.raises(GsbaError, match="may unpack to any size"):
+        load_run(run)
+
+
 @pytest.mark.parametrize("time", [np.inf, np.nan, 0.0])
 def test_frames_in_no_order_of_time_are_refused(run: Path, time: float) -> None:
     frames = load_run(run)[1]
