@@ -8,6 +8,7 @@ checksums reveal truncated or flipped bytes.
 """
 
 import json
+import os
 import tokenize
 import types
 import typing
@@ -174,7 +175,7 @@ def _decode_scalar(tree: Any, hint: Any) -> Any:
         _require(type(tree) is hint, tree, hint)
         return tree
     if hint is Path:
-        _require(isinstance(tree, str), tree, hint)
+        _require(isinstance(tree, str) and b"\0" not in os.fsencode(tree), tree, hint)
         return Path(tree)
     if isinstance(hint, type) and issubclass(hint, Enum):
         return hint(tree)

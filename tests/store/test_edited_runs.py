@@ -118,6 +118,16 @@ def test_names_that_leave_the_folder_are_refused(
     assert len(line) == 1 and "cannot be the name of a frame" in line[0], told.stderr
 
 
+@pytest.mark.parametrize("path", ["a\0b", "\ud800", 3, None])
+def test_paths_that_no_file_can_have_are_refused(run: Path, path: object) -> None:
+    def change(tree: dict[str, Any]) -> None:
+        tree["value"]["paths"][3] = [path]
+
+    _edit(run / "stages/frames.npz", change)
+    with pytest.raises(GsbaError, match="has no usable 'frames' result"):
+        load_run(run)
+
+
 def test_faces_that_are_none_are_refused(run: Path) -> None:
     _edit(run / "stages/frames.npz", lambda tree: tree["value"].update(faces=["../front"]))
     with pytest.raises(GsbaError, match=r"'\.\./front' is no face of a cube"):
