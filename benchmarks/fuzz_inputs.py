@@ -77,7 +77,7 @@ class Spoiled:
 
 
 @dataclass
-class _Draft:
+class Draft:
     """A case while it is drawn; `make` is the steps in order."""
 
     rng: np.random.Generator
@@ -91,7 +91,7 @@ class _Draft:
     def copy(self, *names: str) -> None:
         """Bring prepared files or folders."""
         for name in names:
-            self.steps.append(lambda source, here, name=name: _copied(source / name, here / name))
+            self.steps.append(lambda source, here, name=name: copied(source / name, here / name))
 
     def edit(self, name: str, change: Callable[[bytes], bytes], what: str) -> None:
         self.said.append(f"{name} {what}")
@@ -119,10 +119,10 @@ def spoil(number: int, seed: int, family: str | None = None) -> Spoiled:
     names = list(FAMILIES)
     shares = np.array(list(FAMILIES.values())) / sum(FAMILIES.values())
     chosen = str(rng.choice(names, p=shares))
-    return _DRAWN[family or chosen](_Draft(rng))
+    return DRAWN[family or chosen](Draft(rng))
 
 
-def _settings(draft: _Draft) -> Spoiled:
+def _settings(draft: Draft) -> Spoiled:
     """Overrides and files of settings, printed and read back."""
     draft.arguments = ["show-config"]
     keys, text = list(_flat(RefineSettings().model_dump())), []
@@ -137,7 +137,7 @@ def _settings(draft: _Draft) -> Spoiled:
             draft.arguments += ["--set", f"{key}={value}"]
     else:
         whole = "\n".join(f"{key} = {value}" for key, value in text).encode("utf-8", "replace")
-        change = _bytes(draft) if draft.rng.random() < 0.3 else lambda data: data
+        change = change_bytes(draft) if draft.rng.random() < 0.3 else lambda data: data
         draft.steps.append(lambda _, here: _written(here / "s.toml", change(whole)))
         draft.arguments += ["--config", "s.toml"]
     if draft.rng.random() < 0.15:
@@ -156,12 +156,12 @@ def _settings(draft: _Draft) -> Spoiled:
     return draft.done("settings", check)
 
 
-def _trajectories(draft: _Draft) -> Spoiled:
+def _trajectories(draft: Draft) -> Spoiled:
     """Poses of every format, read and compared with the truth."""
     name = draft.pick(["slam.tum", "slam.tum", "map.msg"])
     draft.copy(name, "truth.tum")
     spoiled = draft.pick([name, name, name, "truth.tum"])
-    _spoil_file(draft, spoiled)
+    spoil_file(draft, spoiled)
     draft.arguments = ["evaluate", name, "--truth", "truth.tum", "--json", "numbers.json"]
 
     def check(here: Path, _: Any) -> str | None:
@@ -173,7 +173,7 @@ def _trajectories(draft: _Draft) -> Spoiled:
     return draft.done("trajectories", check)
 
 
-def _starts(draft: _Draft) -> Spoiled:
+def _starts(draft: Draft) -> Spoiled:
     """Calls of refine on frames that show nothing: all but the last should be refused earlier."""
     draft.copy("flat", "slam.tum", "times.csv", "mask.png", "poses.kitti", "keyframes.tum")
     when = draft.pick([["--fps", "2"], ["--timestamps", "times.csv"], []])
@@ -181,40 +181,40 @@ def _starts(draft: _Draft) -> Spoiled:
     options = [*when, *(poses or ["--no-trajectory"])]
     how = int(draft.rng.integers(7))
     if how == 0 and poses:
-        _spoil_file(draft, poses[0])
+        spoil_file(draft, poses[0])
     elif how == 1:
         options = [*poses, "--timestamps", "times.csv"]
-        _spoil_file(draft, "times.csv")
+        spoil_file(draft, "times.csv")
     elif how == 2:
         options = [*poses, "--fps", draft.pick([*WORDS, "1e-300", "0.01", "20", "2000", "1e300"])]
     elif how == 3:
         options += ["--masks", draft.pick(["mask.png", "flat", "x", "carrier", "", "slam.tum"])]
-        _spoil_file(draft, "mask.png")
+        spoil_file(draft, "mask.png")
     elif how == 4 and poses == ["slam.tum"]:
         options += ["--keyframes", "keyframes.tum"]
-        _spoil_file(draft, "keyframes.tum")
+        spoil_file(draft, "keyframes.tum")
     elif how == 5:
         _spoil_names(draft, "flat")
     else:
         key = draft.pick(["read.clock_offset_s", "seed", "placement.gps", "placement.align"])
         options += ["--set", f"{key}={draft.pick(WORDS)}"]
-    draft.arguments = ["--quiet", "refine", "flat", *options, "--out", "out", *_small()]
+    draft.arguments = ["--quiet", "refine", "flat", *options, "--out", "out", *small_settings()]
     draft.said.append(" ".join(options)[:120])
     return draft.done("starts", lambda *_: "frames that show nothing were refined", resumes=True)
 
 
-def _images(draft: _Draft) -> Spoiled:
+def _images(draft: Draft) -> Spoiled:
     """A picture whose bytes are spoiled, among good ones: refused, or decoded and of no use."""
     draft.copy("noisy", "slam.tum")
     name = draft.pick(["0.jpg", "1.png", "2.jpg"])
-    draft.edit(f"noisy/{name}", _bytes(draft), "bytes")
+    draft.edit(f"noisy/{name}", change_bytes(draft), "bytes")
     gps = ["--set", "placement.gps=exif"] if draft.rng.random() < 0.3 else []
     draft.arguments = ["--quiet", "refine", "noisy", "slam.tum", "--fps", "2", "--out", "out"]
-    draft.arguments += [*_small(), *gps]
+    draft.arguments += [*small_settings(), *gps]
     return draft.done("images", lambda *_: "noise was refined", resumes=True)
 
 
-def _placements(draft: _Draft) -> Spoiled:
+def _placements(draft: Draft) -> Spoiled:
     """Exports placed by spoiled tables and extreme options."""
     draft.copy("gps.csv", "track.gpx", "truth.tum")
     way = draft.pick(["gps.csv", "gps.csv", "track.gpx", "truth.tum", "between", "between"])
@@ -227,7 +227,7 @@ def _placements(draft: _Draft) -> Spoiled:
         options = ["--scale", draft.pick([*numbers, "1", "2", "3"]), "--between", *ends]
     else:
         options = ["--align" if way == "truth.tum" else "--gps", way]
-        _spoil_file(draft, way)
+        spoil_file(draft, way)
     up = draft.pick([[], [], [], ["--up", draft.pick(["auto", "none", "", "x"])]])
     to = draft.pick(["tum", "tum", "ply", draft.pick(["", "x", "nerfstudio"])])
     size = draft.pick(
@@ -235,10 +235,10 @@ def _placements(draft: _Draft) -> Spoiled:
     )
     draft.arguments = ["--quiet", "export", _RUN, "--to", to, "--out", "out", *up, *options, *size]
     draft.said.append(" ".join([*up, *options])[:120])
-    return draft.done("placements", _placed)
+    return draft.done("placements", check_export)
 
 
-def _edited(draft: _Draft) -> Spoiled:
+def _edited(draft: Draft) -> Spoiled:
     """A finished run with a file that was edited or damaged."""
     draft.copy("light")
     name = draft.pick(
@@ -246,33 +246,35 @@ def _edited(draft: _Draft) -> Spoiled:
     )
     how = int(draft.rng.integers(3))
     if name == "trajectory.tum":
-        _spoil_file(draft, f"light/{name}")
+        spoil_file(draft, f"light/{name}")
     elif how == 0:
-        draft.edit(f"light/{name}", _bytes(draft), "bytes")
+        draft.edit(f"light/{name}", change_bytes(draft), "bytes")
     elif name.endswith(".json"):
-        draft.edit(f"light/{name}", _tree(draft), "tree")
+        draft.edit(f"light/{name}", change_tree(draft), "tree")
     elif how == 1:
-        draft.edit(f"light/{name}", _member(draft, "manifest.json", _tree(draft)), "manifest")
+        draft.edit(
+            f"light/{name}", change_member(draft, "manifest.json", change_tree(draft)), "manifest"
+        )
     else:
-        draft.edit(f"light/{name}", _member(draft, None, _array(draft)), "array")
+        draft.edit(f"light/{name}", change_member(draft, None, _array(draft)), "array")
     if draft.rng.random() < 0.3 or name == "trajectory.tum":
         draft.copy("truth.tum")
         draft.arguments = ["evaluate", "light", "--truth", "truth.tum", "--json", "numbers.json"]
         return draft.done("edited runs", lambda *_: None)
     draft.arguments = ["--quiet", "export", "light", "--to", draft.pick(["tum", "ply"])]
     draft.arguments += ["--out", "out"]
-    return draft.done("edited runs", _placed)
+    return draft.done("edited runs", check_export)
 
 
-def _depths(draft: _Draft) -> Spoiled:
+def _depths(draft: Draft) -> Spoiled:
     """True depth maps that are none."""
     draft.copy("depth", "truth.tum", "slam.tum")
     name = f"depth/{int(draft.rng.integers(NUM)):06d}.npz"
     how = int(draft.rng.integers(4))
     if how == 0:
-        draft.edit(name, _bytes(draft), "bytes")
+        draft.edit(name, change_bytes(draft), "bytes")
     elif how == 1:
-        draft.edit(name, _member(draft, None, _array(draft)), "array")
+        draft.edit(name, change_member(draft, None, _array(draft)), "array")
     elif how == 2:
         draft.edit(name, lambda _: draft.pick([b"", b"range", b"\x93NUMPY", b"PK"]), "text")
     else:
@@ -287,12 +289,12 @@ def _depths(draft: _Draft) -> Spoiled:
     return draft.done("depth maps", check)
 
 
-def _videos(draft: _Draft) -> Spoiled:
+def _videos(draft: Draft) -> Spoiled:
     """A video whose bytes are spoiled, or odd wishes for its frames."""
     draft.copy("walk.mp4", "slam.tum")
     draft.arguments = ["--quiet", "extract", "walk.mp4", "--out", "out"]
     if draft.rng.random() < 0.7:
-        draft.edit("walk.mp4", _bytes(draft), "bytes")
+        draft.edit("walk.mp4", change_bytes(draft), "bytes")
     numbers = [*WORDS, "0.5", "2", "1e6", "99999"]
     for option in ("--fps", "--every", "--from", "--to", "--width", "--at"):
         if draft.rng.random() < 0.15:
@@ -312,11 +314,11 @@ def _videos(draft: _Draft) -> Spoiled:
     return draft.done("videos", check, resumes=True)
 
 
-def _splats(draft: _Draft) -> Spoiled:
+def _splats(draft: Draft) -> Spoiled:
     """A splat whose file is spoiled, rendered."""
     draft.copy("splat.ply")
     if draft.rng.random() < 0.5:
-        draft.edit("splat.ply", _bytes(draft), "bytes")
+        draft.edit("splat.ply", change_bytes(draft), "bytes")
     else:
         words = [b"property", b"float", b"vertex", b"ply", b"format", b"end_header", b"x"]
         old, new = draft.pick(words), draft.pick([b"", b"double", b"nan", b"-1", b"9" * 50])
@@ -332,13 +334,13 @@ def _splats(draft: _Draft) -> Spoiled:
     return draft.done("splats", check, limit_s=60.0)
 
 
-def _runs(draft: _Draft) -> Spoiled:
+def _runs(draft: Draft) -> Spoiled:
     """Whole runs on what reads well and may mean nothing: other clocks, worlds and settings."""
     draft.copy("slam.tum", "times.csv")
     options: list[str] = []
     how = int(draft.rng.integers(4))
     if how == 0:
-        _spoil_file(draft, "slam.tum", draft.pick([_columns, _lines]))
+        spoil_file(draft, "slam.tum", draft.pick([_columns, _lines]))
     elif how == 1:
         options = ["--fps", draft.pick(["0.01", "0.1", "0.5", "1", "4", "20", "200", "0.002"])]
     elif how == 2:
@@ -357,7 +359,7 @@ def _runs(draft: _Draft) -> Spoiled:
         origin = {"frames": str(source / "frames")}
         if with_features:
             origin |= {"trajectory": str((here / "slam.tum").resolve())}
-        _copied(source / "run/stages/features", here / "out/stages/features")
+        copied(source / "run/stages/features", here / "out/stages/features")
         marker = {"gsba": "", "origin": origin, "wrote": []}
         (here / "out/gsba.json").write_text(json.dumps(marker))
 
@@ -384,7 +386,7 @@ def _runs(draft: _Draft) -> Spoiled:
     return draft.done("runs", check, limit_s=240.0, resumes=True)
 
 
-_DRAWN: Mapping[str, Callable[[_Draft], Spoiled]] = {
+DRAWN: Mapping[str, Callable[[Draft], Spoiled]] = {
     "settings": _settings,
     "trajectories": _trajectories,
     "starts": _starts,
@@ -407,7 +409,7 @@ def located(arguments: Sequence[str], prepared: Path) -> list[str]:
     return [known.get(argument, argument) for argument in arguments]
 
 
-def _small() -> list[str]:
+def small_settings() -> list[str]:
     """Settings under which looking for features in a tiny frame takes no time."""
     sizes = [f"cubemap.{name}_face_size=64" for name in ("min", "max")]
     return [part for size in [*sizes, "features.max_per_face=16"] for part in ("--set", size)]
@@ -422,7 +424,7 @@ def _flat(tree: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, Any]]
             yield f"{place}{key}", value
 
 
-def _extreme(draft: _Draft) -> str:
+def _extreme(draft: Draft) -> str:
     """A setting at or beyond the ends of what may be: most of these must still do."""
     skipped = ("video.", "export.", "placement.", "splat.", "photometric.", "solver.num", "factors")
     numbers = [
@@ -436,18 +438,18 @@ def _extreme(draft: _Draft) -> str:
     return f"{key}={round(value * factor) if isinstance(value, int) else value * factor}"
 
 
-def _spoil_file(
-    draft: _Draft, name: str, how: Callable[[_Draft], Callable[[bytes], bytes]] | None = None
+def spoil_file(
+    draft: Draft, name: str, how: Callable[[Draft], Callable[[bytes], bytes]] | None = None
 ) -> None:
     """Spoil a table or a file of bytes in one of the ways there are."""
-    ways = [_bytes, _word, _word, _lines, _columns, _encoded]
+    ways = [change_bytes, _word, _word, _lines, _columns, _encoded]
     if name.endswith((".msg", ".png")):
-        ways = [_bytes]
+        ways = [change_bytes]
     chosen = how or draft.pick(ways)
     draft.edit(name, chosen(draft), chosen.__name__.strip("_"))
 
 
-def _bytes(draft: _Draft) -> Callable[[bytes], bytes]:
+def change_bytes(draft: Draft) -> Callable[[bytes], bytes]:
     """Flip, cut, repeat, blank or insert some bytes."""
     how, at, long = int(draft.rng.integers(6)), draft.rng.random(), int(draft.rng.integers(1, 200))
     noise = draft.rng.bytes(long)
@@ -466,7 +468,7 @@ def _bytes(draft: _Draft) -> Callable[[bytes], bytes]:
     return change
 
 
-def _word(draft: _Draft) -> Callable[[bytes], bytes]:
+def _word(draft: Draft) -> Callable[[bytes], bytes]:
     """Put an odd word where another was."""
     at, word = draft.rng.random(2), draft.pick([*WORDS, "\x00", "a" * 140_000])
 
@@ -482,7 +484,7 @@ def _word(draft: _Draft) -> Callable[[bytes], bytes]:
     return change
 
 
-def _lines(draft: _Draft) -> Callable[[bytes], bytes]:
+def _lines(draft: Draft) -> Callable[[bytes], bytes]:
     """Drop, repeat, shuffle or reverse lines."""
     how, at = int(draft.rng.integers(6)), draft.rng.random(2)
     order = draft.rng.permutation(400)
@@ -503,7 +505,7 @@ def _lines(draft: _Draft) -> Callable[[bytes], bytes]:
     return change
 
 
-def _columns(draft: _Draft) -> Callable[[bytes], bytes]:
+def _columns(draft: Draft) -> Callable[[bytes], bytes]:
     """Scale or shift a column of numbers, or exchange two."""
     factor = draft.pick([1e3, 1e6, 1e9, 1e-3, 1e-9, 1e150, 1e-150, -1.0, 0.0, 1e15, 1e-6, 10.0])
     shift = draft.pick([0.0, 0.0, 1e9, 1e16, -1e3, 0.25, 3.0])
@@ -529,7 +531,7 @@ def _columns(draft: _Draft) -> Callable[[bytes], bytes]:
     return change
 
 
-def _encoded(draft: _Draft) -> Callable[[bytes], bytes]:
+def _encoded(draft: Draft) -> Callable[[bytes], bytes]:
     """Another encoding, other ends of lines, other separators."""
     ways: list[Callable[[str], bytes]] = [
         lambda text: text.encode("utf-16"),
@@ -548,7 +550,7 @@ def _encoded(draft: _Draft) -> Callable[[bytes], bytes]:
     return lambda data: way(data.decode("utf-8", "replace"))
 
 
-def _tree(draft: _Draft) -> Callable[[bytes], bytes]:
+def change_tree(draft: Draft) -> Callable[[bytes], bytes]:
     """Put an odd value somewhere into a JSON tree."""
     value, turns = draft.pick(TREES), draft.rng.random(6)
 
@@ -568,7 +570,7 @@ def _tree(draft: _Draft) -> Callable[[bytes], bytes]:
     return change
 
 
-def _array(draft: _Draft) -> Callable[[bytes], bytes]:
+def _array(draft: Draft) -> Callable[[bytes], bytes]:
     """Another array in the place of one: other shapes, types and values."""
     how, at = int(draft.rng.integers(11)), draft.rng.random()
 
@@ -596,8 +598,8 @@ def _array(draft: _Draft) -> Callable[[bytes], bytes]:
     return change
 
 
-def _member(
-    draft: _Draft, name: str | None, change: Callable[[bytes], bytes]
+def change_member(
+    draft: Draft, name: str | None, change: Callable[[bytes], bytes]
 ) -> Callable[[bytes], bytes]:
     """Change one member of a zip archive; None = any array."""
     at = draft.rng.random()
@@ -617,7 +619,7 @@ def _member(
     return changed
 
 
-def _spoil_names(draft: _Draft, folder: str) -> None:
+def _spoil_names(draft: Draft, folder: str) -> None:
     """Rename, add or remove files of a folder of frames."""
     how = int(draft.rng.integers(6))
     odd = draft.pick([b"\xff.jpg", b"a\n.jpg", b"..jpg", b"x_front.jpg", b"9" * 200 + b".jpg"])
@@ -643,7 +645,7 @@ def _spoil_names(draft: _Draft, folder: str) -> None:
     draft.steps.append(step)
 
 
-def _placed(here: Path, _: Any) -> str | None:
+def check_export(here: Path, _: Any) -> str | None:
     """What is wrong with an export."""
     if not (here / "out/transform.json").exists():
         return "no transform.json"
@@ -670,7 +672,7 @@ def _lines_of(path: Path) -> list[str]:
     return path.read_text(encoding="utf-8").splitlines()
 
 
-def _copied(source: Path, target: Path) -> None:
+def copied(source: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     if source.is_dir():
         shutil.copytree(source, target, dirs_exist_ok=True)
@@ -701,7 +703,7 @@ def prepare(out: Path) -> None:
     settings = RefineSettings.model_validate(SETTINGS)
     result = refine(out / "frames", out / "slam.tum", out / "run", settings)
     for name in ("gsba.json", "stages/reconstruction.npz", "stages/frames.npz", "trajectory.tum"):
-        _copied(out / "run" / name, out / "light" / name)
+        copied(out / "run" / name, out / "light" / name)
     cloud = result.reconstruction
     write_ply(out / "splat.ply", from_cloud(cloud.points_world[:40], cloud.point_colors[:40], 1))
     load_run(out / "light")

@@ -408,7 +408,7 @@ class ExportSettings(_Settings):
 class SplatSettings(_Settings):
     """Training of a Gaussian splat: the rates of Kerbl et al., 2023, times scaled to the length."""
 
-    iterations: int = Field(default=7000, ge=1)  # views shown, one at a time
+    iterations: int = Field(default=7000, ge=1, le=10**7)  # views shown, one at a time
     face_size: int = Field(default=256, ge=16, le=_MAX_FACE)  # pixels
     backend: Literal["auto", "gsplat", "cpu"] = "auto"
     held_out_every: int = Field(default=8, ge=2)  # whole panoramas kept for evaluation

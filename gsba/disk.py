@@ -22,6 +22,10 @@ logger = logging.getLogger(__name__)
 _TEMPORARY = ".gsba-tmp-"  # prefix of files still being written
 
 
+class FullDiskError(GsbaError):
+    """No space is left."""
+
+
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
     """Turn an OSError of writing to `path` into one line that says what to do."""
@@ -29,9 +33,8 @@ def disk_errors(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise GsbaError(
-                f"no space left while writing {path}: free some and run again; "
-                "finished stages are kept"
+            raise FullDiskError(
+                f"no space left while writing {path}: free some and run again"
             ) from error
         raise GsbaError(f"cannot write {path}: {error.strerror or error}") from error
 
@@ -104,6 +107,38 @@ def remove_temporaries(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def refuse_links(folder: Path, below: bool = False) -> None:
+    """Refuse a folder that gsba writes if it holds anything but files and folders.
+
+    Through a link, files elsewhere would be replaced or deleted; a pipe is waited for for ever.
+
+    Args:
+        folder: which need not be there.
+        below: look into its folders too.
+
+    Raises:
+        GsbaError: naming the link, pipe or device; `folder` itself may not be one either.
+    """
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise _not_ours(folder)
+    waiting = [folder] if folder.exists() else []
+    with disk_errors(folder):
+        while waiting:
+            with os.scandir(waiting.pop()) as entries:
+                for entry in entries:
+                    if entry.is_dir(follow_symlinks=False):
+                        waiting += [Path(entry.path)] if below else []
+                    elif not entry.is_file(follow_symlinks=False):
+                        raise _not_ours(Path(entry.path))
+
+
+def _not_ours(path: Path) -> GsbaError:
+    kind = "a link" if path.is_symlink() else "no folder, or no ordinary file,"
+    return GsbaError(
+        f"{path} is {kind} where gsba keeps its own files: move it away, or use another folder"
+    )
+
+
 def hold_folder(folder: Path) -> int:
     """Hold a folder against other processes, until what is returned is closed or this one dies.
 
@@ -114,7 +149,7 @@ def hold_folder(folder: Path) -> int:
     Raises:
         GsbaError: a live process holds it.
     """
-    lock = os.open(folder, os.O_RDONLY)
+    lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
@@ -131,7 +166,7 @@ def remove_unheld(folders: Iterable[Path]) -> None:
     """Delete folders that no process holds any more, see `hold_folder`."""
     for folder in folders:
         with suppress(OSError):
-            lock = os.open(folder, os.O_RDONLY)
+            lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 shutil.rmtree(folder, ignore_errors=True)

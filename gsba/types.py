@@ -1,5 +1,6 @@
 """Records that stages hand to one another. Arrays inside; one comment per field."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 FACES = ("front", "right", "back", "left", "up", "down")
+_NO_FILE_NAME = re.compile(r"[/\x00-\x1f\x7f-\x9f\ud800-\udfff]|^\.{0,2}$")
 
 
 class PoseSource(IntEnum):
@@ -54,7 +56,11 @@ class Fisheye:
 
 @dataclass(frozen=True, slots=True)
 class FrameSet:
-    """The captured frames on disk, in time order. No pixels are held."""
+    """The captured frames on disk, in time order. No pixels are held.
+
+    Raises:
+        ValueError: a name or a face that no file can be named after; exports are.
+    """
 
     names: tuple[str, ...]  # (F,) unique, without folder or extension
     paths: tuple[tuple[Path, ...], ...]  # (F,)(1) for "erp", (F,)(2) for "fisheye": front and
@@ -73,6 +79,14 @@ class FrameSet:
     )
     fisheyes: tuple[Fisheye, Fisheye] | None = None  # front and back, by which panoramas are cut
     # out of "fisheye" frames
+
+    def __post_init__(self) -> None:
+        for name in self.names:
+            if _NO_FILE_NAME.search(name):
+                raise ValueError(f"{name!r:.60} cannot be the name of a frame")
+        for face in self.faces:
+            if face not in FACES:
+                raise ValueError(f"{face!r:.60} is no face of a cube")
 
     def __len__(self) -> int:
         return len(self.names)

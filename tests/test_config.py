@@ -8,6 +8,7 @@ import pytest
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from gsba import config_file
+from gsba.cli.splat import splat_settings
 from gsba.config import RefineSettings
 from gsba.config_file import load_config, to_toml
 from gsba.log import GsbaError
@@ -173,3 +174,9 @@ def test_sections_under_their_former_names_are_read(
     path.write_text("[align]\nrounds = 1\n[patches]\nrounds = 2\n")
     with pytest.raises(GsbaError, match="align is the former name of patches"):
         load_config(path)
+
+
+@pytest.mark.parametrize("iterations", ["0", "10000001", "1" + 20 * "0"])
+def test_no_training_takes_for_ever(iterations: str) -> None:
+    with pytest.raises(GsbaError, match=r"--iterations \d+: Input should be (less|greater)"):
+        splat_settings(int(iterations), None, "cpu")

@@ -1,8 +1,8 @@
 """What is known of a raw pair's lenses, in files.
 
-Takes JSON of our own form, whose rig keeps its axes: `rig_T_lens` in metres, unless `unit` is
-"map". Or what Kalibr and COLMAP write, see `gsba.camera.calibration_formats`. The rig's origin is
-laid into the middle between the lenses.
+Takes JSON of our own form, whose rig keeps its axes: `rig_T_lens` in metres, unless `unit` says cm,
+mm, in, ft, or "map" for lengths of no known unit. Or what Kalibr and COLMAP write, see
+`gsba.camera.calibration_formats`. The rig's origin is laid into the middle between the lenses.
 """
 
 import json
@@ -19,6 +19,7 @@ from gsba.camera.calibration_formats import (
     from_colmap_model,
     from_kalibr,
     lens_of,
+    metres_of,
 )
 from gsba.camera.fisheye import Pair, rotation_of
 from gsba.geometry import pose
@@ -30,6 +31,7 @@ _WANTED = (
     "it is to be lenses.front and lenses.back, each with width, height, f, cx, cy, k and "
     "rig_T_lens, a Kalibr camchain of cam0 and cam1, or a COLMAP rig"
 )
+_MOST_BYTES = 1 << 18  # of a file; YAML takes a second for each hundred thousand
 _ASIDE = np.deg2rad(20.0)  # at most, of a lens's axis from that of the rig
 
 
@@ -135,7 +137,11 @@ def _tree(path: Path) -> Any:
         GsbaError: neither, or it cannot be read.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open("rb") as file:
+            content = file.read(_MOST_BYTES + 1)
+        if len(content) > _MOST_BYTES:
+            raise GsbaError(f"{path}: is larger than any calibration, {_MOST_BYTES >> 10} kB")
+        text = content.decode("utf-8")
     except OSError as error:
         raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
     except ValueError:
@@ -153,8 +159,19 @@ def _tree(path: Path) -> Any:
 def _yaml(text: str) -> Any:
     import yaml
 
+    class Loader(yaml.SafeLoader):
+        """No aliases: few of them can stand for gigabytes."""
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                mark = self.peek_event().start_mark
+                raise ValueError(
+                    f"line {mark.line + 1} holds an alias; write out what it stands for"
+                )
+            return super().compose_node(parent, index)
+
     try:
-        return yaml.safe_load(text)
+        return yaml.load(text, Loader)
     except yaml.YAMLError as error:
         raise ValueError(str(error)) from None
 
@@ -167,16 +184,16 @@ def _of_tree(tree: Any, path: Path) -> Pair:
         return from_colmap_config([tree], path)
     if any(re.fullmatch(r"cam\d+", str(name)) for name in tree):
         return from_kalibr(tree, path)
-    metric = tree.get("unit", "m") == "m"
-    front, back = (_lens(tree["lenses"][name], metric) for name in ("front", "back"))
+    metres = metres_of(tree.get("unit", "m"))
+    front, back = (_lens(tree["lenses"][name], metres) for name in ("front", "back"))
     return front, back
 
 
-def _lens(tree: Mapping[str, Any], metric: bool) -> Fisheye:
+def _lens(tree: Mapping[str, Any], metres: float) -> Fisheye:
     size = tree.get("width") or tree["size"], tree.get("height") or tree["size"]
     rig_T_lens = np.array(tree["rig_T_lens"], dtype=np.float64).reshape(4, 4)
-    lens = lens_of(size, tree["f"], (tree["cx"], tree["cy"]), tree["k"], rig_T_lens)
-    return lens if metric else replace(lens, centre=(0.0, 0.0, 0.0))
+    rig_T_lens[:3, 3] *= metres
+    return lens_of(size, tree["f"], (tree["cx"], tree["cy"]), tree["k"], rig_T_lens)
 
 
 def _one_line(error: Exception) -> str:

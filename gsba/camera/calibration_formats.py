@@ -15,15 +15,17 @@ import numpy as np
 
 from gsba.camera.fisheye import Pair
 from gsba.geometry import inverse, pose, rotation_from_quaternion
-from gsba.log import GsbaError
+from gsba.log import GsbaError, brief
 from gsba.types import Fisheye
 
 _log = logging.getLogger(__name__)
 
+_FURTHEST = 1e6  # of a pose's numbers, in any unit
 _SQUARE = 0.01  # relative, by which both focal lengths of a camera may differ
 _SEEN = np.deg2rad(95.0)  # from a lens's axis, as far as it is asked
 _WORST_FIT = 0.1  # pixels, of another camera model taken for ours
 _MODEL = "OPENCV_FISHEYE"
+_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048, "map": 0.0}
 
 
 def lens_of(
@@ -70,6 +72,17 @@ def lens_of(
     return Fisheye(width, height, f, (x, y), (k1, k2, k3, k4), (a, b, c), (d, e, g))
 
 
+def metres_of(unit: Any) -> float:
+    """Metres in a unit that a file names; 0 for "map", as nobody knows how long its lengths are.
+
+    Raises:
+        ValueError: it is none of those known.
+    """
+    if not isinstance(unit, str) or unit not in _METRES:
+        raise ValueError(f"unit {brief(repr(unit))} is not known: use {', '.join(_METRES)}")
+    return _METRES[unit]
+
+
 def from_kalibr(tree: Mapping[str, Any], path: Path) -> Pair:
     """The lenses of a camchain: `cam0` is the front one, `cam1` the back one.
 
@@ -92,7 +105,7 @@ def from_colmap_config(tree: Sequence[Any], path: Path) -> Pair:
     """The lenses of one rig of a `rig_config.json`: its `ref_sensor` is the front one.
 
     COLMAP knows pictures' sizes from the pictures; here `width` and `height` stand beside
-    `camera_params`. Lengths are metres, unless the rig's `unit` is "map".
+    `camera_params`. Lengths are metres, unless the rig's `unit` says otherwise, see `metres_of`.
 
     Raises:
         GsbaError: of other cameras than these.
@@ -124,8 +137,7 @@ def from_colmap_config(tree: Sequence[Any], path: Path) -> Pair:
             raise KeyError("cam_from_rig_rotation")
         poses.append(pose(rotation_from_quaternion(wxyz / np.linalg.norm(wxyz)), at))
     front_T_back = _rigid(poses[0]) @ inverse(_rigid(poses[1]))
-    if tree[0].get("unit", "m") != "m":
-        front_T_back[:3, 3] = 0
+    front_T_back[:3, 3] *= metres_of(tree[0].get("unit", "m"))
     return _in_rig((lenses[0], lenses[1]), front_T_back, path)
 
 
@@ -257,7 +269,8 @@ def _rigid(a_T_b: np.ndarray) -> np.ndarray:
         ValueError: it is none.
     """
     turn = a_T_b[:3, :3]
-    if not np.isfinite(a_T_b).all() or np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3:
+    small = bool((np.abs(a_T_b) < _FURTHEST).all())  # no NaN either
+    if not small or np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3:
         raise ValueError("the pose of a lens is no rigid motion")
     if np.linalg.det(turn) < 0:
         raise ValueError("the pose of a lens mirrors")

@@ -234,9 +234,13 @@ def _against_truth(estimate: Path, truth: Path, depth: Path | None, json_file: P
     from gsba.evaluate.pixels import depth_maps, induced_errors
     from gsba.evaluate.trajectory import evaluate as compare
     from gsba.evaluate.trajectory import format_table
+    from gsba.store.folder import refuse_foreign
     from gsba.trajectory.files import read_trajectory
 
-    path = estimate / "trajectory.tum" if estimate.is_dir() else estimate
+    path = estimate
+    if estimate.is_dir():
+        refuse_foreign(estimate)
+        path = estimate / "trajectory.tum"
     found, true = read_trajectory(path), read_trajectory(truth)
     errors, induced = compare(found, true), None
     if depth is not None:

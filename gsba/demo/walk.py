@@ -32,6 +32,7 @@ WOBBLE_UNITS = 0.025  # of the position, per axis, standard deviation
 EXPOSURE_SWING = 0.05  # relative
 NOISE = 2.0  # grey values, standard deviation
 JPEG_QUALITY = 95
+MOST_FRAMES, MOST_WIDTH = 100_000, 16_384
 
 logger = logging.getLogger(__name__)
 
@@ -252,9 +253,9 @@ def check_walk(out: Path, num_frames: int, width: int, seed: int) -> None:
     """Raise GsbaError for numbers out of range, and a folder that holds something else."""
     if seed < 0:
         raise GsbaError(f"seed {seed}: must be 0 or more")
-    if num_frames < 3:
-        raise GsbaError(f"a walk of {num_frames} frames: at least 3 are needed")
-    if width < 64 or width % 2:
-        raise GsbaError(f"frames {width} px wide: an even number of at least 64 is needed")
+    if not 3 <= num_frames <= MOST_FRAMES:
+        raise GsbaError(f"a walk of {num_frames} frames: 3 to {MOST_FRAMES} can be rendered")
+    if not 64 <= width <= MOST_WIDTH or width % 2:
+        raise GsbaError(f"frames {width} px wide: an even number of 64 to {MOST_WIDTH} is needed")
     if out.exists() and not (out / "groundtruth.tum").is_file() and any(out.iterdir()):
         raise GsbaError(f"{out}: holds something else than a walk; name another folder")

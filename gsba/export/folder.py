@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gsba.disk import disk_errors, hold_folder, remove_temporaries, remove_unheld
+from gsba.disk import disk_errors, hold_folder, refuse_links, remove_temporaries, remove_unheld
 from gsba.log import GsbaError, StoppedError
 from gsba.version import __version__
 
@@ -36,6 +36,7 @@ def output_folder(out: Path, to: str, key: str) -> Iterator[Path]:
         _require_replaceable(out)
         out.parent.mkdir(parents=True, exist_ok=True)
         partial = out.with_name(f".{out.name}.partial-{key[:16]}")
+        refuse_links(partial, below=True)  # a stranger may have left it
         partial.mkdir(exist_ok=True)
         lock = hold_folder(partial)
         remove_unheld(set(out.parent.glob(f".{out.name}.partial-*")) - {partial})

@@ -8,6 +8,8 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from gsba.log import GsbaError
 
 MAX_PIXELS = 1 << 28  # of one image: 768 MB of colours
@@ -27,10 +29,13 @@ _TIFF_TYPES = {1: 1, 3: 2, 4: 4, 16: 8}  # bytes of an unsigned number
 _WIDTH, _HEIGHT, _BITS, _COMPRESSION, _COLOURS = 256, 257, 258, 259, 262
 _ORIENTATION, _SAMPLES, _PLANES, _FORMAT = 274, 277, 284, 339
 _STRIPS, _STRIP_SIZES, _TILES, _TILE_SIZES = 273, 279, 324, 325
+_TIFF_PARTS = {_STRIPS, _STRIP_SIZES, _TILES, _TILE_SIZES}
 _TIFF_TAGS = {
     *(_WIDTH, _HEIGHT, _BITS, _COMPRESSION, _COLOURS, _ORIENTATION, _SAMPLES, _PLANES, _FORMAT),
-    *(_STRIPS, _STRIP_SIZES, _TILES, _TILE_SIZES),
+    *_TIFF_PARTS,
 }
+_MOST_TAGS, _MOST_VALUES = 4096, 64  # of a directory; of a tag that lists no parts
+_NOTHING = np.zeros(0, np.uint64)
 _TIFF_COMPRESSIONS = {1, 5, 7, 8, 32773, 32946}  # none, LZW, JPEG, deflate, PackBits, old deflate
 
 Bytes = mmap.mmap | bytes
@@ -218,18 +223,22 @@ def _tiff(data: Bytes) -> Header:
         what = f"compression {tags[_COMPRESSION][0]}"
     if what:
         raise _Unread(f"a TIFF of {what}; save it as PNG, or as TIFF of 8 or 16 bits with LZW")
-    for starts, sizes in ((_STRIPS, _STRIP_SIZES), (_TILES, _TILE_SIZES)):
-        for start, size in zip(tags.get(starts, ()), tags.get(sizes, ()), strict=False):
-            if start + size > len(data):
-                raise _CutOff
+    for parts, part_sizes in ((_STRIPS, _STRIP_SIZES), (_TILES, _TILE_SIZES)):
+        starts, sizes = tags.get(parts, _NOTHING), tags.get(part_sizes, _NOTHING)
+        starts, sizes = (values[: min(len(starts), len(sizes))] for values in (starts, sizes))
+        if ((starts > len(data)) | (sizes > len(data) - np.minimum(starts, len(data)))).any():
+            raise _CutOff
     if _STRIPS not in tags and _TILES not in tags:
         raise ValueError
-    width, height = (tags.get(tag, (0,))[0] for tag in (_WIDTH, _HEIGHT))
+    width, height = (int(tags.get(tag, (0,))[0]) for tag in (_WIDTH, _HEIGHT))
     return _shown("TIFF", width, height, _turn(tags), False)
 
 
-def _directory(data: Bytes) -> dict[int, tuple[int, ...]]:
-    """The tags of a TIFF's first directory that are asked for here; of EXIF data too."""
+def _directory(data: Bytes) -> dict[int, np.ndarray]:
+    """The tags of a TIFF's first directory that are asked for here; of EXIF data too.
+
+    Of a tag that is there more than once the first counts, as for other readers.
+    """
     starts = {b"II": "little", b"MM": "big"}
     order = starts.get(data[:2])
     if order not in ("little", "big"):
@@ -243,17 +252,23 @@ def _directory(data: Bytes) -> dict[int, tuple[int, ...]]:
     big = number(2, 2) == 43
     wide, of_count, entry = (8, 8, 20) if big else (4, 2, 12)
     first = number(8 if big else 4, wide)
-    tags: dict[int, tuple[int, ...]] = {}
-    for k in range(number(first, of_count)):
+    tags: dict[int, np.ndarray] = {}
+    num = number(first, of_count)
+    if num > _MOST_TAGS:
+        raise ValueError
+    for k in range(num):
         at = first + of_count + k * entry
         tag, size, count = number(at, 2), _TIFF_TYPES.get(number(at + 2, 2)), number(at + 4, wide)
-        if tag not in _TIFF_TAGS or size is None or not count:
+        if tag not in _TIFF_TAGS or tag in tags or size is None or not count:
             continue
+        if count > _MOST_VALUES and tag not in _TIFF_PARTS:
+            raise ValueError
         at += 4 + wide
         place = at if size * count <= wide else number(at, wide)
         if place + size * count > len(data):
             raise _CutOff
-        tags[tag] = tuple(number(place + i * size, size) for i in range(count))
+        kind = np.dtype(f"{'<' if order == 'little' else '>'}u{size}")
+        tags[tag] = np.frombuffer(data[place : place + size * count], kind).astype(np.uint64)
     return tags
 
 
@@ -265,6 +280,6 @@ def _orientation(exif: bytes) -> int:
         return 1
 
 
-def _turn(tags: dict[int, tuple[int, ...]]) -> int:
-    turn = tags.get(_ORIENTATION, (1,))[0]
+def _turn(tags: dict[int, np.ndarray]) -> int:
+    turn = int(tags.get(_ORIENTATION, (1,))[0])
     return turn if 1 <= turn <= 8 else 1

@@ -12,7 +12,9 @@ import numpy as np
 
 from gsba.frames.times import read_lines
 from gsba.log import GsbaError, brief
+from gsba.scans.claims import check_claims
 from gsba.scans.surfaces import on_planes
+from gsba.scans.trial import limited, try_in_process
 from gsba.scans.types import Scan
 
 logger = logging.getLogger(__name__)
@@ -21,6 +23,7 @@ CLOUDS, MESHES, LASER = (".pcd",), (".obj", ".glb", ".gltf"), (".las", ".laz")
 SUFFIXES = (".ply", *CLOUDS, *LASER, *MESHES)
 _MOST_POINTS = 400_000  # of a thinned scan
 _SAMPLES = 1_000_000  # on a mesh, before it is thinned
+_FURTHEST = 1e9  # units from the origin of a file that a scan may be
 _FAR = 1e4  # coordinates beyond lose digits as float32: an offset is kept apart
 _MIN_POINTS = 1000
 _MIN_PAIRS = 3
@@ -82,6 +85,8 @@ def check_scan(path: Path) -> None:
     """Raise GsbaError where a scan cannot be one: by its name, or what reads it is missing."""
     if path.suffix.lower() not in SUFFIXES:
         raise GsbaError(f"{path}: is no scan: give one of {', '.join(SUFFIXES)}")
+    if path.exists() and not path.is_file():
+        raise GsbaError(f"{path}: cannot be read (it is no file)")
     try:
         with path.open("rb"):
             pass
@@ -102,10 +107,8 @@ def read_scan(path: Path) -> Scan:
         GsbaError: no such file, none that is understood, or too little in it.
     """
     check_scan(path)
-    o3d, suffix = open3d(), path.suffix.lower()
-    mesh = None
-    if suffix in MESHES or suffix == ".ply":
-        mesh = read_mesh(path, empty=suffix == ".ply")
+    try_in_process(path)
+    o3d, (mesh, points, colors) = open3d(), _content(path)
     if mesh is not None:
         vertices = np.asarray(mesh.vertices)
         offset = _offset(vertices)
@@ -113,16 +116,11 @@ def read_scan(path: Path) -> Scan:
         o3d.utility.random.seed(0)
         cloud = mesh.sample_points_uniformly(_SAMPLES, use_triangle_normal=True)
     else:
-        points, colors = (_of_laser if suffix in LASER else _of_cloud)(path)
-        good = np.isfinite(points).all(axis=1)
-        points, colors = points[good], None if colors is None else colors[good]
         offset = _offset(points)
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points - offset))
         if colors is not None:
             cloud.colors = o3d.utility.Vector3dVector(colors)
-    if len(cloud.points) < _MIN_POINTS:
-        raise GsbaError(f"{path}: holds {len(cloud.points)} points; a scan has {_MIN_POINTS}")
-    cloud = _thinned(cloud)
+    cloud = _thinned(cloud, path)
     scatters = None
     if mesh is None:
         points, normals, scatters = on_planes(np.asarray(cloud.points))
@@ -130,6 +128,8 @@ def read_scan(path: Path) -> Scan:
         points, normals = np.array(cloud.points), np.array(cloud.normals)
     lengths = np.linalg.norm(normals, axis=1)
     good = np.isfinite(lengths) & (lengths > 0.1)
+    if good.sum() < _MIN_POINTS:
+        raise GsbaError(f"{path}: has {good.sum()} points on surfaces; a scan has {_MIN_POINTS}")
     light = np.array(cloud.colors).mean(axis=1)[good] if cloud.has_colors() else None
     if light is not None and np.ptp(light) == 0:
         light = None
@@ -140,21 +140,60 @@ def read_scan(path: Path) -> Scan:
     return scan
 
 
-def read_mesh(path: Path, empty: bool = False) -> Any:
+def read_mesh(path: Path) -> Any:
     """Triangles of a mesh file with what colours them, as open3d's TriangleMesh.
-
-    Args:
-        empty: give None for a file that has none: it is a cloud.
 
     Raises:
         GsbaError: it cannot be read, or holds no triangles.
     """
+    try_in_process(path)
+    mesh = _mesh(path)
+    if mesh is None:
+        raise GsbaError(f"{path}: holds no triangles that open3d can read")
+    return mesh
+
+
+def read_on_trial(path: str) -> None:
+    """Read a scan or mesh in this process, which ends with that; see `gsba.scans.trial`."""
+    open3d()
+    limited(Path(path), _content)
+
+
+def _content(path: Path) -> tuple[Any, np.ndarray, np.ndarray | None]:
+    """The mesh of a file, or None; points and colours (M, 3) of a cloud, or None.
+
+    Raises:
+        GsbaError: it cannot be read, or holds neither.
+    """
+    suffix = path.suffix.lower()
+    mesh = _mesh(path) if suffix in MESHES or suffix == ".ply" else None
+    if mesh is not None:
+        return mesh, np.zeros((0, 3)), None
+    if suffix in MESHES:
+        raise GsbaError(f"{path}: holds no triangles that open3d can read")
+    check_claims(path)
+    points, colors = (_of_laser if suffix in LASER else _of_cloud)(path)
+    good = (np.abs(points) < _FURTHEST).all(axis=1)
+    return None, points[good], None if colors is None else colors[good]
+
+
+def _mesh(path: Path) -> Any:
+    """A file's triangles; None where there are none.
+
+    Raises:
+        GsbaError: they have corners that are not there, or at no place.
+    """
     mesh = open3d().io.read_triangle_mesh(str(path), enable_post_processing=True)
-    if len(mesh.triangles):
-        return mesh
-    if empty:
+    triangles, vertices = np.asarray(mesh.triangles), np.asarray(mesh.vertices)
+    if not len(triangles):
         return None
-    raise GsbaError(f"{path}: holds no triangles that open3d can read")
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise GsbaError(f"{path}: has triangles whose corners are not there; export it again")
+    if not (np.abs(vertices) < _FURTHEST).all():
+        raise GsbaError(f"{path}: has corners that are no numbers or beyond {_FURTHEST:g} units")
+    if not mesh.get_surface_area() > 0:
+        raise GsbaError(f"{path}: its triangles have no surface")
+    return mesh
 
 
 def normals_of(points: np.ndarray) -> np.ndarray:
@@ -185,7 +224,8 @@ def _of_laser(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     try:
         file = laspy.read(path)
         names = set(file.point_format.dimension_names)
-        points = np.array(file.xyz, np.float64)
+        with np.errstate(all="ignore"):  # what is no number then is left out
+            points = np.array(file.xyz, np.float64)
         seen = ("red", "green", "blue") if {"red", "green", "blue"} <= names else ("intensity",) * 3
         colors = np.stack([np.asarray(file[name], np.float64) for name in seen], axis=1)
     except Exception as error:  # of the parser, each in its own words
@@ -201,10 +241,18 @@ def _offset(points: np.ndarray) -> np.ndarray:
     return np.round(middle, -2) if np.abs(middle).max() > _FAR else np.zeros(3)
 
 
-def _thinned(cloud: Any) -> Any:
-    """At most so many points, one for each cell that has some."""
-    extent = float(np.ptp(np.asarray(cloud.points), axis=0).max())
-    cell = extent / 1000
-    while len(cloud.points) > _MOST_POINTS:
+def _thinned(cloud: Any, path: Path) -> Any:
+    """At most so many points, one for each cell that has some, and no two at one place.
+
+    Raises:
+        GsbaError: too few are left.
+    """
+    points = np.asarray(cloud.points)
+    cell = float(np.ptp(points, axis=0).max()) / 1000 if len(points) else 0.0
+    while cell and len(cloud.points) > _MOST_POINTS:
         cloud, cell = cloud.voxel_down_sample(cell), cell * 1.3
+    cloud = cloud.remove_duplicated_points()
+    num = len(cloud.points)
+    if num < _MIN_POINTS:
+        raise GsbaError(f"{path}: holds {num} points at different places; a scan has {_MIN_POINTS}")
     return cloud

@@ -9,6 +9,7 @@ from gsba.similarity import Sim3
 
 LEAST_SIGMA = 0.1  # of the distance between the scan's points
 _REACH = 0.02  # of a cloud's size: how far surfaces count as near
+_FAR = 20.0  # of logarithms from where they start: nothing in double precision tells these apart
 _FEW = 50  # points that tell nothing of their noise
 
 
@@ -52,7 +53,9 @@ def noise_of(fit: Sim3, cloud: Cloud, scan: Scan, sigma: float) -> Noise:
     least = LEAST_SIGMA * scan.spacing
 
     def noise(x: np.ndarray) -> Noise:
-        return Noise(max(float(np.exp(x[0])), least), float(np.exp(x[1])), 1 / (1 + np.exp(-x[2])))
+        shared, factor, odds = np.clip(x, low, high)
+        share = 1 / (1 + float(np.exp(-odds)))
+        return Noise(max(float(np.exp(shared)), least), float(np.exp(factor)), share)
 
     def cost(x: np.ndarray) -> float:
         tried = noise(x)
@@ -60,6 +63,7 @@ def noise_of(fit: Sim3, cloud: Cloud, scan: Scan, sigma: float) -> Noise:
         return 0.01 * float(x[1] ** 2) - float(logs.mean())
 
     start = np.array([np.log(max(sigma, least)), 0.5, 1.4])
+    low, high = start - _FAR, start + _FAR
     return noise(minimize(cost, start, method="Nelder-Mead", options={"xatol": 0.01}).x)
 
 

@@ -7,8 +7,10 @@ time, however many a job has.
 """
 
 import importlib
+import json
 import logging
 import os
+import re
 import shutil
 import statistics
 import time
@@ -21,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from gsba.config import RefineSettings
 from gsba.disk import disk_errors, hold_folder, remove_unheld, write_text
-from gsba.log import GsbaError, StoppedError, track
+from gsba.log import GsbaError, StoppedError, brief, track
 from gsba.store import shards
 from gsba.store.shards import Job, Manifest, Spent, Workers
 from gsba.types import FrameSet
@@ -43,11 +45,14 @@ _QUEUES = {  # kind of address -> module and class that starts workers
     "htcondor": ("dask_jobqueue", "HTCondorCluster"),
     "kubernetes": ("dask_kubernetes.operator", "KubeCluster"),
 }
+_ADDRESS = re.compile(r"(tcp|tls|wss?|ucx)://[^\s/:][^\s/]*")
 _AHEAD = 3  # shards for each thread that are written and asked for before they are needed
 _ATTEMPTS = 5  # at a shard that workers died on
 _LATE = 4.0  # times as long as others: a shard is given to another worker as well
 _LEAST_LATE_S = 60.0
 _LOOK_S = 5.0  # between looks at what is late
+_ANSWER_S = 20.0  # for a scheduler to answer at all
+_MOST_LOCAL, _MOST_QUEUED = 256, 100_000  # workers that may be asked for
 _SIGHT_S = 30.0  # for a disk shared by machines to show what another one has written
 
 
@@ -130,20 +135,35 @@ def connect(address: str) -> "Client":
         raise GsbaError("--cluster needs Dask: pip install 'gsba[cluster]'") from None
     kind, _, count = address.partition(":")
     if kind == "local" or kind in _QUEUES:
-        if not count.isdecimal() or int(count) == 0:
-            raise GsbaError(f"--cluster {address}: say how many workers, as in {kind}:8")
+        most = _MOST_LOCAL if kind == "local" else _MOST_QUEUED
+        if not count.isdecimal() or len(count) > 9 or not 0 < int(count) <= most:
+            raise GsbaError(
+                f"--cluster {address}: say how many workers, 1 to {most}, as in {kind}:8"
+            )
         return Client(_local(int(count)) if kind == "local" else _queued(kind, int(count)))
     try:
-        if address.endswith(".json"):
-            return Client(scheduler_file=address, timeout=_SIGHT_S)
-        if "://" not in address:
-            raise ValueError("no address")
-        return Client(address, timeout=_SIGHT_S)
-    except (OSError, ValueError) as error:
+        return Client(_scheduler_address(address), timeout=_ANSWER_S)
+    except Exception as error:  # of sockets, certificates and plugins, each in its own words
+        reason = brief(" ".join(str(error).split()) or type(error).__name__, 200)
         raise GsbaError(
-            f"--cluster {address}: no scheduler answers there ({error}); pass tcp://HOST:PORT, "
+            f"--cluster {address}: no scheduler answers there ({reason}); pass tcp://HOST:PORT, "
             "its FILE.json, local:N or slurm:N"
         ) from error
+
+
+def _scheduler_address(address: str) -> str:
+    """Where a scheduler listens: as given, or as its file says.
+
+    Raises:
+        OSError, ValueError: there is no such file, or neither holds an address.
+    """
+    found: Any = address
+    if address.endswith(".json"):
+        found = json.loads(Path(address).read_text(encoding="utf-8"))
+        found = found.get("address") if isinstance(found, dict) else None
+    if not isinstance(found, str) or not _ADDRESS.fullmatch(found):
+        raise ValueError("no address of the form tcp://HOST:PORT")
+    return found
 
 
 def _local(num: int) -> Any:
@@ -182,6 +202,7 @@ class _Shard:
     """A part of a job on its way."""
 
     path: Path
+    digest: str  # SHA-256 of its content
     items: str  # what it holds, for people
     futures: list["Future"]  # one, or twins of one that is late; none once it is finished
 
@@ -265,16 +286,16 @@ class Cluster:
     def _ask(self, job: Job[Any], start: int, stop: int) -> _Shard:
         """A shard, asked for unless it is finished."""
         part = job.part(start, stop)
-        path = shards.write_shard(part, self._folder)
-        shard = _Shard(path, f"{job.title}, {start} to {stop - 1}", [])
+        path, digest = shards.write_shard(part, self._folder)
+        shard = _Shard(path, digest, f"{job.title}, {start} to {stop - 1}", [])
         if shards.load_shard(path, part.returns) is None:
-            shard.futures.append(self._submit(path, None))
+            shard.futures.append(self._submit(shard, None))
         return shard
 
-    def _submit(self, path: Path, workers: list[str] | None) -> "Future":
-        name = f"gsba-{path.stem}-{time.monotonic_ns()}"
+    def _submit(self, shard: _Shard, workers: list[str] | None) -> "Future":
+        path, name = shard.path, f"gsba-{shard.path.stem}-{time.monotonic_ns()}"
         return self._client.submit(
-            shards.run_shard, str(path), key=name, workers=workers, pure=False
+            shards.run_shard, str(path), shard.digest, key=name, workers=workers, pure=False
         )
 
     def _wait(self, shard: _Shard, returns: Any, lasted: list[float]) -> tuple[Any, ...]:
@@ -306,7 +327,7 @@ class Cluster:
                         "too little memory is the usual cause"
                     )
                 logger.warning("a worker died on %s: again", shard.items)
-                shard.futures.append(self._submit(shard.path, None))
+                shard.futures.append(self._submit(shard, None))
             self._help_if_late(shard, time.monotonic() - began, lasted)
         return self._load(shard, returns)
 
@@ -342,7 +363,7 @@ class Cluster:
         others = [worker for worker in self._client.nthreads() if worker not in has]
         if has and others:
             logger.warning("%s is late: given to another worker as well", shard.items)
-            shard.futures.append(self._submit(shard.path, others))
+            shard.futures.append(self._submit(shard, others))
 
     def _load(self, shard: _Shard, returns: Any) -> tuple[Any, ...]:
         """What a worker has stored, as soon as this machine sees it."""

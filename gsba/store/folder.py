@@ -15,6 +15,7 @@ from typing import Any
 from gsba.disk import (
     disk_errors,
     hold_folder,
+    refuse_links,
     remove_temporaries,
     remove_unheld,
     write_text,
@@ -37,7 +38,8 @@ def open_run_folder(root: Path, origin: Mapping[str, Path], fresh: bool) -> int:
     Returns:
         File descriptor of the lock: closing it (or dying) releases the folder.
     Raises:
-        GsbaError: the folder belongs to another run, to something else, or to a live process.
+        GsbaError: the folder belongs to another run, to something else, or to a live process; it
+            holds links or pipes.
     """
     resolved = {name: str(path.resolve()) for name, path in origin.items()}
     with disk_errors(root):
@@ -45,6 +47,8 @@ def open_run_folder(root: Path, origin: Mapping[str, Path], fresh: bool) -> int:
         root.mkdir(parents=True, exist_ok=True)
         lock = hold_folder(root)
     try:
+        refuse_foreign(root)
+        refuse_links(root / STAGES, below=True)
         marker = read_marker(root)
         if marker and fresh:
             _remove_claimed(root, marker)
@@ -65,6 +69,12 @@ def open_run_folder(root: Path, origin: Mapping[str, Path], fresh: bool) -> int:
 def is_run_folder(root: Path) -> bool:
     """Whether gsba has ever taken this folder for a run."""
     return (root / MARKER).is_file()
+
+
+def refuse_foreign(root: Path) -> None:
+    """Raise GsbaError for links and pipes in a run's folder and in that of its stages."""
+    refuse_links(root.resolve())
+    refuse_links(root / STAGES)
 
 
 def claim(root: Path, path: Path) -> None:

@@ -8,6 +8,7 @@ checksums reveal truncated or flipped bytes.
 """
 
 import json
+import os
 import tokenize
 import types
 import typing
@@ -80,6 +81,8 @@ def load_record(path: Path, returns: type[T]) -> T:
 def _reading(path: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(path) as archive:
+            if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
+                raise ValueError("compressed, as no record is: it may unpack to any size")
             yield archive
     except (OSError, EOFError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise RecordError(f"{path}: {error}") from error  # trees and arrays of another shape
@@ -172,7 +175,7 @@ def _decode_scalar(tree: Any, hint: Any) -> Any:
         _require(type(tree) is hint, tree, hint)
         return tree
     if hint is Path:
-        _require(isinstance(tree, str), tree, hint)
+        _require(isinstance(tree, str) and b"\0" not in os.fsencode(tree), tree, hint)
         return Path(tree)
     if isinstance(hint, type) and issubclass(hint, Enum):
         return hint(tree)

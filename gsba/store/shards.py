@@ -7,6 +7,7 @@ its content, so that a block that is finished is never worked on again, whoever 
 """
 
 import hashlib
+import hmac
 import io
 import os
 import pickle
@@ -171,21 +172,22 @@ class Manifest:
     cpu_seconds: float
 
 
-def write_shard(job: Job[R], folder: Path) -> Path:
-    """Write a part of a job for a worker, unless it is there.
+def write_shard(job: Job[R], folder: Path) -> tuple[Path, str]:
+    """Write a part of a job for a worker.
 
     Args:
         job: the part.
         folder: of shards, on a disk that workers share.
 
     Returns:
-        Its file; the result goes to `result_path` of it.
+        Its file, whose result goes to `result_path` of it, and the SHA-256 of its content, which
+        `run_shard` is to be told by other ways than this disk.
     """
     content = f"{__version__}\n".encode() + _pickled(job)
-    path = folder.absolute() / f"{hashlib.sha256(content).hexdigest()[:32]}.job"
-    if not path.exists():
-        write_bytes(path, content)
-    return path
+    digest = hashlib.sha256(content).hexdigest()
+    path = folder.absolute() / f"{digest[:32]}.job"
+    write_bytes(path, content)
+    return path, digest
 
 
 def result_path(shard: Path) -> Path:
@@ -193,21 +195,31 @@ def result_path(shard: Path) -> Path:
     return shard.with_suffix(".npz")
 
 
-def run_shard(path: str) -> Manifest:
+def run_shard(path: str, digest: str) -> Manifest:
     """Work on a shard, and store what is found beside it; what a worker elsewhere calls.
 
+    A job can run any code, so that none is loaded but what the caller has made: anybody may have
+    written into the folder of a run that was copied from elsewhere.
+
+    Args:
+        path: of the shard.
+        digest: SHA-256 of its content, as `write_shard` gave it to the caller.
+
     Raises:
-        GsbaError: a file that this worker does not see, or one of another version of gsba.
+        GsbaError: a file that this worker does not see, one of another version of gsba, or one
+            that the caller has not written.
     """
     shard, worker = Path(path), f"{socket.gethostname()}:{os.getpid()}"
     if not shard.exists():
         raise GsbaError(f"worker {worker} does not see {path}: put the run on a shared disk")
     wall, cpu = time.perf_counter(), time.thread_time()
-    with shard.open("rb") as content:
-        version = content.readline().decode().strip()
-        if version != __version__:
-            raise GsbaError(f"worker {worker} has gsba {__version__}, the run has {version}")
-        job = pickle.load(content)
+    content = shard.read_bytes()
+    if not hmac.compare_digest(hashlib.sha256(content).hexdigest(), digest):
+        raise GsbaError(f"{path} is not what this run wrote there: end what else writes to it")
+    version, _, pickled = content.partition(b"\n")
+    if version != __version__.encode():
+        raise GsbaError(f"worker {worker} has gsba {__version__}, the run has {version.decode()}")
+    job = pickle.loads(pickled)
     with freed_memory_kept():  # Dask has workers return it at once
         results = tuple(job(item) for item in range(len(job)))
     save_record(result_path(shard), results, {"key": shard.stem})

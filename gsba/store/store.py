@@ -23,10 +23,17 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from pydantic import BaseModel
 
-from gsba.disk import write_text
-from gsba.log import GsbaError
+from gsba.disk import FullDiskError, write_text
+from gsba.log import GsbaError, brief
 from gsba.memory import give_back_freed_memory
-from gsba.store.folder import MARKER, STAGES, claim, is_run_folder, open_run_folder
+from gsba.store.folder import (
+    MARKER,
+    STAGES,
+    claim,
+    is_run_folder,
+    open_run_folder,
+    refuse_foreign,
+)
 from gsba.store.records import FORMAT, RecordError, load_record, read_info, save_record, typed
 from gsba.store.shards import Spent, StoredRecords, Threads, Workers, even_blocks
 from gsba.version import __version__
@@ -83,8 +90,10 @@ class RunStore:
     def __enter__(self) -> "RunStore":
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, _: Any = None, error: BaseException | None = None, __: Any = None) -> None:
         os.close(self._lock)
+        if isinstance(error, FullDiskError):
+            raise FullDiskError(f"{error}; finished stages are kept") from error
 
     @contextmanager
     def named(self, prefix: str) -> Iterator[None]:
@@ -329,15 +338,17 @@ def load_stage(root: Path, name: str, returns: type[T]) -> T:
     """Result of a finished stage of a run, whatever its settings; for export and evaluate.
 
     Raises:
-        GsbaError: `root` is no gsba run, or the stage is missing or damaged.
+        GsbaError: `root` is no gsba run or holds links, or the stage is missing or damaged.
     """
     if not is_run_folder(root):
         raise GsbaError(f"{root} is not a gsba run: it has no {MARKER}")
+    refuse_foreign(root)
     try:
         return load_record(_stage_path(root, name), returns)
     except RecordError as error:
         raise GsbaError(
-            f"{root} has no usable {name!r} result: run gsba refine with --out {root} to the end"
+            f"{root} has no usable {name!r} result ({brief(str(error), 200)}): run gsba refine "
+            f"with --out {root} to the end"
         ) from error
 
 

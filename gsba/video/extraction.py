@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba.config import VideoSettings
-from gsba.disk import disk_errors, remove_temporaries, write_bytes, write_text
+from gsba.disk import disk_errors, refuse_links, remove_temporaries, write_bytes, write_text
 from gsba.frames.times import read_times
 from gsba.log import GsbaError, track
 from gsba.store.records import RecordError, typed
@@ -258,6 +258,7 @@ def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
     remove_temporaries(out)
     if not any(out.iterdir()):
         return None
+    refuse_links(out)
     try:
         marker = json.loads((out / MARKER).read_text(encoding="utf-8"))
         counts = typed(marker["counts"], Counts | None)  # type: ignore[arg-type]

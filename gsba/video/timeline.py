@@ -164,7 +164,7 @@ def _opened(video: Path) -> Iterator[tuple[Any, list[Any]]]:
     """Container and its video streams; every failure of FFmpeg is one line."""
     av = _pyav()
     try:
-        with av.open(str(video)) as container:
+        with av.open(str(video), metadata_errors="replace") as container:
             streams = [s for s in container.streams.video if not _is_cover(s)]
             if not streams:
                 raise GsbaError(f"{video}: holds no video stream")

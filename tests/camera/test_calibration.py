@@ -49,7 +49,9 @@ def _check_same(found: Pair, expected: Pair, atol: float = 1e-9) -> None:
 
 
 def _write(path: Path, tree: Any) -> Path:
-    text = yaml.safe_dump(tree) if path.suffix in (".yaml", ".yml") else json.dumps(tree)
+    text = json.dumps(tree)
+    if path.suffix in (".yaml", ".yml"):
+        text = yaml.safe_dump(json.loads(text))  # without aliases of lists that are one object
     path.write_text(text)
     return path
 
@@ -144,6 +146,51 @@ def test_lengths_of_a_map_are_not_metres(tmp_path: Path) -> None:
     _check_same(found, (replace(PAIR[0], centre=(0, 0, 0)), replace(PAIR[1], centre=(0, 0, 0))))
 
 
+@pytest.mark.parametrize(
+    ("unit", "metres"), [("cm", 0.01), ("mm", 0.001), ("in", 0.0254), ("ft", 0.3048)]
+)
+def test_lengths_of_known_units_become_metres(tmp_path: Path, unit: str, metres: float) -> None:
+    tree = calibration_json(PAIR, CENTRE / metres, unit, {})
+    _check_same(read_calibration(_write(tmp_path / "lenses.json", tree)), PAIR)
+    tree = _rig_config()
+    tree[0]["unit"] = unit
+    for camera in tree[0]["cameras"]:
+        if "cam_from_rig_translation" in camera:
+            camera["cam_from_rig_translation"] = [
+                x / metres for x in camera["cam_from_rig_translation"]
+            ]
+    _check_same(read_calibration(_write(tmp_path / "rig_config.json", tree)), PAIR)
+
+
+@pytest.mark.parametrize("unit", ["furlong", "M", "", None, 3, ["m"], {"m": 1}, "x" * 100_000])
+def test_lengths_of_unknown_units_are_refused(tmp_path: Path, unit: Any) -> None:
+    rig = _rig_config()
+    rig[0]["unit"] = unit
+    for tree in (_ours() | {"unit": unit}, rig):
+        with pytest.raises(GsbaError, match=r"unit .* is not known: use m, cm, mm, in") as told:
+            read_calibration(_write(tmp_path / "lenses.json", tree))
+        assert len(str(told.value)) < 600
+
+
+def test_aliases_of_yaml_are_refused(tmp_path: Path) -> None:
+    """Nine lines of them stand for a list of a billion."""
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{k}: &a{k} [{', '.join(10 * [f'*a{k - 1}'])}]" for k in range(1, 10)]
+    path = tmp_path / "cam.yaml"
+    path.write_text("\n".join([*lines, "cam0: *a9"]))
+    with pytest.raises(GsbaError, match=r"line 2 holds an alias; write out what it stands for"):
+        read_calibration(path)
+
+
+def test_files_that_are_too_large_for_a_calibration_are_not_parsed(tmp_path: Path) -> None:
+    path = tmp_path / "cam.yaml"
+    path.write_text(yaml.safe_dump(_kalibr()) + "#" * (1 << 18))
+    with pytest.raises(GsbaError, match=r"is larger than any calibration, 256 kB"):
+        read_calibration(path)
+    with pytest.raises(GsbaError, match=r"is larger than any calibration"):
+        read_calibration(Path("/dev/zero"))
+
+
 def test_one_size_and_two_terms_are_enough(tmp_path: Path) -> None:
     tree = _ours()
     for lens in tree["lenses"].values():
@@ -233,6 +280,10 @@ BAD_OURS = {
         lambda t: t["lenses"]["front"].update(rig_T_lens=np.full((4, 4), 0.5).tolist()),
         "no rigid motion",
     ),
+    "huge pose": (
+        lambda t: t["lenses"]["front"].update(rig_T_lens=np.full((4, 4), 1e300).tolist()),
+        "no rigid motion",
+    ),
     "mirror": (
         lambda t: t["lenses"]["front"].update(rig_T_lens=np.diag([-1.0, 1, 1, 1]).tolist()),
         "mirrors",
@@ -246,7 +297,7 @@ BAD_OURS = {
 
 
 def _check_refused(path: Path, message: str) -> None:
-    with pytest.raises(GsbaError, match=message) as caught:
+    with np.errstate(over="raise"), pytest.raises(GsbaError, match=message) as caught:
         read_calibration(path)
     line = str(caught.value)
     assert "\n" not in line and line.startswith(str(path))

@@ -221,6 +221,8 @@ def test_walk_is_reproducible_and_replaces_only_walks(walk, tmp_path):
         {"num_frames": 2},
         {"width": 32},
         {"width": 257},
+        {"width": 2**40},
+        {"num_frames": 10**9},
     ],
 )
 def test_walk_refuses_bad_settings(tmp_path, setting):

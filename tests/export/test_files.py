@@ -202,8 +202,9 @@ def test_an_export_that_does_not_end_keeps_the_last_one(
 
     whole = pictures.write_bytes
     monkeypatch.setattr(pictures, "write_bytes", write)
-    with pytest.raises(raised):
+    with pytest.raises(raised) as told:
         export(reconstruction(), frames, tmp_path / "out", ExportFormat(to))
+    assert "kept" not in str(told.value)  # of one export nothing is
     hidden = [path.name.startswith(".out.partial-") for path in tmp_path.iterdir()]
     assert hidden == ([True] if raised is KeyboardInterrupt else [])
     export(reconstruction(), frames, tmp_path / "out", ExportFormat.PLY)

@@ -186,17 +186,31 @@ def test_workers_are_started_and_let_go(tmp_path: Path) -> None:
     ("address", "message"),
     [
         ("tcp://127.0.0.1:9", "no scheduler answers there"),
-        ("nowhere", r"no scheduler answers there \(no address\); pass tcp://HOST:PORT"),
-        ("local:many", "say how many workers, as in local:8"),
-        ("slurm:0", "say how many workers, as in slurm:8"),
+        ("nowhere", r"no scheduler answers there \(no address .*\); pass tcp://HOST:PORT"),
+        ("tls://", "no address of the form tcp://HOST:PORT"),
+        ("tls://127.0.0.1:9", "no scheduler answers there"),
+        ("tcp://127.0.0.1:99999", "no scheduler answers there"),
+        ("tcp://127.0.0.1:x", "no scheduler answers there"),
+        ("nobody://127.0.0.1:9", "no address of the form tcp://HOST:PORT"),
+        ("{folder}/missing.json", r"missing\.json: no scheduler answers there \(.*No such file"),
+        ("{folder}/empty.json", r"empty\.json: no scheduler answers there \(no address"),
+        ("{folder}/list.json", r"list\.json: no scheduler answers there"),
+        ("{folder}/text.json", r"text\.json: no scheduler answers there"),
+        ("local:many", "say how many workers, 1 to 256, as in local:8"),
+        ("local:1000000000", "say how many workers, 1 to 256, as in local:8"),
+        ("slurm:0", "say how many workers, 1 to 100000, as in slurm:8"),
         ("oar:4", "needs dask-jobqueue: pip install dask-jobqueue"),
     ],
 )
-def test_addresses_that_lead_nowhere(address: str, message: str, monkeypatch) -> None:
-    monkeypatch.setattr(workers, "_SIGHT_S", 0.5)
+def test_addresses_that_lead_nowhere(
+    address: str, message: str, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr(workers, "_ANSWER_S", 0.5)
     monkeypatch.setitem(sys.modules, "dask_jobqueue", None)
+    for name, content in (("empty", "{}"), ("list", "[" * 100_000), ("text", "\udcff")):
+        (tmp_path / f"{name}.json").write_text(content, errors="surrogateescape")
     with pytest.raises(GsbaError, match=message):
-        connect(address)
+        connect(address.format(folder=tmp_path))
 
 
 def test_queues_are_configured_by_dask_and_asked_for_workers(monkeypatch) -> None:

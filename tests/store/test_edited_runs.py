@@ -10,8 +10,10 @@ from typing import Any
 import export_scene as scene
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from gsba import load_run
+from gsba.cli import app
 from gsba.log import GsbaError
 from gsba.placement.placement import read_placement
 from gsba.store.folder import open_run_folder
@@ -84,6 +86,63 @@ def test_arrays_that_do_not_fit_are_refused(
     edited = dataclasses.replace(scene.reconstruction(), **{field: value})
     save_record(run / "stages/reconstruction.npz", edited, {})
     with pytest.raises(GsbaError, match=f"{message}.* --fresh"):
+        load_run(run)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../stolen",
+        "../../stolen",
+        "/tmp/stolen",
+        "a/b",
+        "..",
+        ".",
+        "",
+        "a\nb",
+        "a\0b",
+        "{0}/stolen",
+    ],
+)
+@pytest.mark.parametrize("to", ["colmap", "nerfstudio"])
+def test_names_that_leave_the_folder_are_refused(
+    run: Path, tmp_path: Path, to: str, name: str
+) -> None:
+    """Exports name pictures after frames: the run of a stranger must not say where they go."""
+    name = name.format(tmp_path)
+    _edit(run / "stages/frames.npz", lambda tree: tree["value"]["names"].__setitem__(3, name))
+    before = sorted(tmp_path.rglob("*"))
+    told = CliRunner().invoke(app, ["export", str(run), "--to", to, "--out", str(tmp_path / "o/u")])
+    assert told.exit_code == 1 and sorted(tmp_path.rglob("*")) == before
+    line = told.stderr.splitlines()
+    assert len(line) == 1 and "cannot be the name of a frame" in line[0], told.stderr
+
+
+@pytest.mark.parametrize("path", ["a\0b", "\ud800", 3, None])
+def test_paths_that_no_file_can_have_are_refused(run: Path, path: object) -> None:
+    def change(tree: dict[str, Any]) -> None:
+        tree["value"]["paths"][3] = [path]
+
+    _edit(run / "stages/frames.npz", change)
+    with pytest.raises(GsbaError, match="has no usable 'frames' result"):
+        load_run(run)
+
+
+def test_faces_that_are_none_are_refused(run: Path) -> None:
+    _edit(run / "stages/frames.npz", lambda tree: tree["value"].update(faces=["../front"]))
+    with pytest.raises(GsbaError, match=r"'\.\./front' is no face of a cube"):
+        load_run(run)
+
+
+def test_records_that_were_packed_are_refused(run: Path) -> None:
+    """A kilobyte of zip can be a gigabyte of zeros."""
+    path = run / "stages/reconstruction.npz"
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    with pytest.raises(GsbaError, match="may unpack to any size"):
         load_run(run)
 
 

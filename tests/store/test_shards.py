@@ -1,6 +1,7 @@
 """Jobs in parts: the same content has the same name, and travels whole."""
 
 import dataclasses
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -16,25 +17,39 @@ def _job(tmp_path: Path, numbers: np.ndarray) -> Squares:
     return Squares(numbers, tmp_path / "log")
 
 
+def _named(job: Squares, folder: Path) -> Path:
+    return shards.write_shard(job, folder)[0]
+
+
+class _Planted:
+    """What leaves a file behind where it is unpickled."""
+
+    def __init__(self, at: Path) -> None:
+        self.at = at
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (self.at,)
+
+
 def test_a_part_is_named_after_its_content(tmp_path: Path) -> None:
     numbers = np.arange(10.0)
-    path = shards.write_shard(_job(tmp_path, numbers), tmp_path)
+    path = _named(_job(tmp_path, numbers), tmp_path)
     strided = np.arange(20.0).reshape(10, 2)[:, 0] / 2
-    assert shards.write_shard(_job(tmp_path, strided), tmp_path) == path
-    assert shards.write_shard(_job(tmp_path, numbers + 1), tmp_path) != path
-    assert shards.write_shard(_job(tmp_path, numbers.astype(np.float32)), tmp_path) != path
+    assert _named(_job(tmp_path, strided), tmp_path) == path
+    assert _named(_job(tmp_path, numbers + 1), tmp_path) != path
+    assert _named(_job(tmp_path, numbers.astype(np.float32)), tmp_path) != path
     text = "".join(["squ", "ares"])  # equal, and another object
     other = dataclasses.replace(_job(tmp_path, numbers), mishap=text, title=text)
     same = dataclasses.replace(_job(tmp_path, numbers), mishap="squares", title="squares")
-    paths = {shards.write_shard(job, tmp_path) for job in (other, same)}
+    paths = {_named(job, tmp_path) for job in (other, same)}
     assert len(paths) == 1
 
 
 def test_a_shard_travels_by_its_files(tmp_path: Path) -> None:
     job = _job(tmp_path, np.arange(5)).part(1, 4)
-    path = shards.write_shard(job, tmp_path)
+    path, digest = shards.write_shard(job, tmp_path)
     assert shards.load_shard(path, np.ndarray) is None
-    manifest = shards.run_shard(str(path))
+    manifest = shards.run_shard(str(path), digest)
     found = shards.load_shard(path, np.ndarray)
     assert found is not None and [int(one[0]) for one in found] == [1, 4, 9]
     assert manifest.cpu_seconds >= 0 and ":" in manifest.worker
@@ -43,12 +58,31 @@ def test_a_shard_travels_by_its_files(tmp_path: Path) -> None:
 
 
 def test_what_a_worker_cannot_use_is_said(tmp_path: Path, monkeypatch) -> None:
-    path = shards.write_shard(_job(tmp_path, np.arange(5)), tmp_path)
+    path, digest = shards.write_shard(_job(tmp_path, np.arange(5)), tmp_path)
     monkeypatch.setattr(shards, "__version__", "0.0.7")
     with pytest.raises(GsbaError, match=r"has gsba 0\.0\.7, the run has"):
-        shards.run_shard(str(path))
+        shards.run_shard(str(path), digest)
     with pytest.raises(GsbaError, match=r"does not see .*gone\.job: put the run on a shared disk"):
-        shards.run_shard(str(tmp_path / "gone.job"))
+        shards.run_shard(str(tmp_path / "gone.job"), digest)
+
+
+def test_no_job_runs_but_what_the_caller_wrote(tmp_path: Path) -> None:
+    """A folder of shards may be a stranger's: what lies there under a right name is not right."""
+    mark, job = tmp_path / "mark", _job(tmp_path, np.arange(5))
+    path, digest = shards.write_shard(job, tmp_path)
+    wanted = path.read_bytes()
+    planted = shards.__version__.encode() + b"\n" + pickle.dumps(_Planted(mark))
+    pickle.loads(planted.partition(b"\n")[2])
+    assert mark.exists()  # the plant works
+    mark.unlink()
+    path.write_bytes(planted)
+    with pytest.raises(GsbaError, match=r"\.job is not what this run wrote there"):
+        shards.run_shard(str(path), digest)
+    assert not mark.exists()
+    assert shards.write_shard(job, tmp_path) == (path, digest)  # replaces it
+    assert path.read_bytes() == wanted
+    shards.run_shard(str(path), digest)
+    assert not mark.exists()
 
 
 def test_blocks_cover_all_items_in_order() -> None:

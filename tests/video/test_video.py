@@ -316,6 +316,16 @@ def test_broken_files_are_one_line(film: Path, tmp_path: Path) -> None:
     _fails(_gsba("extract", odd, "--out", tmp_path / "f"), "no decoder for its pictures")
 
 
+def test_names_of_another_encoding_do_not_matter(film: Path, tmp_path: Path) -> None:
+    """Or a byte of the metadata that is damaged."""
+    data = film.read_bytes()
+    assert b"VideoHandler" in data
+    odd = tmp_path / "odd.mp4"
+    odd.write_bytes(data.replace(b"VideoHandler", b"Vid\xe9oHandle\xff"))
+    assert _gsba("extract", odd, "--out", tmp_path / "f").exit_code == 0
+    assert _indices(tmp_path / "f")
+
+
 def test_a_truncated_video_says_how_far_it_goes(film: Path, tmp_path: Path) -> None:
     whole = tmp_path / "whole.mkv"
     with av.open(str(film)) as source, av.open(str(whole), "w") as target:

@@ -1,0 +1,381 @@
+"""Cases of files that a stranger has made: for `fuzz.py`, beside those of `fuzz_inputs.py`."""
+
+import importlib.util
+import json
+import os
+import struct
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import fuzz_inputs as usual
+import numpy as np
+import yaml
+from fuzz_inputs import (
+    TREES,
+    WORDS,
+    Draft,
+    Spoiled,
+    change_bytes,
+    change_member,
+    change_tree,
+    small_settings,
+    spoil_file,
+)
+
+from gsba.camera.calibration import calibration_json
+from gsba.store.finished import load_run
+from gsba.trajectory.files import read_trajectory
+from gsba.types import Fisheye
+
+FAMILIES = {  # beside the usual hundred cases
+    **usual.FAMILIES,
+    "names": 8,
+    "links": 10,
+    "calibrations": 14,
+    "tiffs": 8,
+    "clusters": 6,
+    "numbers": 8,
+}
+_SCANS = ("cloud.pcd", "binary.pcd", "cloud.ply", "mesh.obj", "cloud.las", "cloud.laz")
+if importlib.util.find_spec("open3d") and importlib.util.find_spec("laspy"):
+    FAMILIES["scans"] = 2  # seconds each
+_NAMES = (
+    "../x",
+    "../../out/x",
+    "/tmp/gsba-fuzz-x",
+    "a/b",
+    "..",
+    ".",
+    "",
+    "a\nb",
+    "a\0b",
+    "~",
+    "a b",
+)
+
+
+def spoil(number: int, seed: int, family: str | None = None) -> Spoiled:
+    """Case `number` of a seed, of one family or of all in their proportions."""
+    rng = np.random.default_rng([seed, number])
+    shares = np.array(list(FAMILIES.values())) / sum(FAMILIES.values())
+    chosen = str(rng.choice(list(FAMILIES), p=shares))
+    return {**usual.DRAWN, **_DRAWN}[family or chosen](Draft(rng))
+
+
+def prepare(out: Path) -> None:
+    """Make what cases are spoiled from, once."""
+    usual.prepare(out)
+    if (out / "strangers").exists():
+        return
+    front = Fisheye(
+        32, 32, 9.0, (16.0, 16.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.01)
+    )
+    back = Fisheye(
+        32, 32, 9.0, (16.0, 16.0), (0.0, 0.0, 0.0, 0.0), (0.0, np.pi, 0.0), (0.0, 0.0, -0.01)
+    )
+    tree = calibration_json((front, back), np.array([0, 0, 0.01]), "m", {})
+    made = out / "strangers"
+    made.mkdir()
+    (made / "lenses.json").write_text(json.dumps(tree))
+    camera = {"camera_model": "pinhole", "distortion_model": "equidistant", "resolution": [32, 32]}
+    camera |= {"intrinsics": [9.0, 9.0, 15.5, 15.5], "distortion_coeffs": [0.0, 0.0, 0.0, 0.0]}
+    turned = np.diag([-1.0, 1, -1, 1]).tolist()
+    chain = {"cam0": camera, "cam1": camera | {"T_cn_cnm1": turned}}
+    (made / "chain.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(chain))))
+    (made / "scheduler.json").write_text(json.dumps({"type": "Scheduler", "address": "tls://"}))
+    (made / "precious.txt").write_text("precious")
+    cv2.imwrite(str(made / "a.tif"), np.full((32, 64, 3), 90, np.uint8))
+    for lens in ("front", "back"):
+        (made / "raw" / lens).mkdir(parents=True)
+        for number in range(usual.NUM):
+            disc = cv2.circle(np.zeros((32, 32, 3), np.uint8), (16, 16), 15, (90, 90, 90), -1)
+            cv2.imwrite(str(made / f"raw/{lens}/{number}.png"), disc)
+    _make_scans(made, load_run(out / "run")[0].points_world)
+
+
+def _make_scans(made: Path, points: np.ndarray) -> None:
+    """Scans of a run's points in the forms that are read."""
+    num, points = len(points), points.astype(np.float32)
+    head = f"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {num}\nHEIGHT 1\n"
+    head += f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {num}\nDATA "
+    lines = "".join(f"{x} {y} {z}\n" for x, y, z in points)
+    (made / "cloud.pcd").write_text(f"{head}ascii\n{lines}")
+    (made / "binary.pcd").write_bytes(f"{head}binary\n".encode() + points.tobytes())
+    properties = "".join(f"property float {axis}\n" for axis in "xyz")
+    start = f"ply\nformat ascii 1.0\nelement vertex {num}\n{properties}end_header\n"
+    (made / "cloud.ply").write_text(start + lines)
+    corners = "".join(f"v {x} {y} {z}\n" for x, y, z in points[:300])
+    faces = "".join(f"f {k} {k + 1} {k + 2}\n" for k in range(1, 299))
+    (made / "mesh.obj").write_text(corners + faces)
+    if "scans" in FAMILIES:
+        import laspy  # pyright: ignore[reportMissingImports]
+
+        header = laspy.LasHeader(point_format=2, version="1.4")
+        header.scales = np.full(3, 1e-4)
+        laser = laspy.LasData(header)
+        laser.x, laser.y, laser.z = points.T
+        for suffix in ("las", "laz"):
+            laser.write(str(made / f"cloud.{suffix}"))
+
+
+def _copy(draft: Draft, name: str) -> None:
+    """Bring a prepared file of a stranger."""
+    draft.steps.append(lambda source, here: usual.copied(source / "strangers" / name, here / name))
+
+
+def _unharmed(here: Path, _: Any = None) -> str | None:
+    """What a command may not have touched."""
+    whole = (here / "elsewhere/precious.npz").read_text() == "precious"
+    alone = sorted(path.name for path in (here / "elsewhere").iterdir()) == ["precious.npz"]
+    return None if whole and alone else "a file elsewhere was written or deleted"
+
+
+def _refined(here: Path, _: Any) -> str | None:
+    """What is wrong with poses of pictures that show next to nothing."""
+    found = read_trajectory(here / "out/trajectory.tum").world_T_rigs
+    return None if np.isfinite(found).all() else "poses"
+
+
+def _names(draft: Draft) -> Spoiled:
+    """A run whose frames have names that lead elsewhere."""
+    draft.copy("light")
+    name, at = draft.pick([*_NAMES, *WORDS]), draft.rng.random()
+    key = draft.pick(["names", "names", "names", "faces", "layout", "paths", "mask_paths"])
+
+    def change(data: bytes) -> bytes:
+        tree = json.loads(data)
+        if key == "faces":
+            tree["value"][key] = [name]
+        elif key == "layout":
+            tree["value"][key] = name
+        else:
+            rows = tree["value"][key]
+            rows[int(at * len(rows))] = [name] if key == "paths" else name
+        return json.dumps(tree).encode()
+
+    draft.edit("light/stages/frames.npz", change_member(draft, "manifest.json", change), "names")
+    draft.said.append(f"{key}: {name[:40]!r}")
+    draft.arguments = ["--quiet", "export", "light", "--out", "out", "--face-size", "16"]
+    draft.arguments += ["--to", draft.pick(["colmap", "nerfstudio", "colmap-erp", "tum"])]
+
+    def check(here: Path, _: Any) -> str | None:
+        wrong = {path.name for path in here.iterdir()} - {"light", "out"}
+        return f"wrote {wrong}" if wrong or Path("/tmp/gsba-fuzz-x").exists() else None
+
+    return draft.done("names", check)
+
+
+def _links(draft: Draft) -> Spoiled:
+    """Links, pipes and folders where a run keeps its files."""
+    draft.copy("light", "truth.tum", "flat", "slam.tum")
+    places = ["stages", "stages/frames.npz", "stages/shards", "stages/features", "stages/x.npz"]
+    place = draft.pick([*places, "masks", "gsba.json", "trajectory.tum", "config.toml", "colmap"])
+    kind = draft.pick(["link", "link", "file link", "pipe", "folder", "loop"])
+    command = draft.pick(["export", "evaluate", "refine", "fresh"])
+    options = {
+        "export": ["export", "light", "--to", "colmap", "--face-size", "16"],
+        "evaluate": ["evaluate", "light", "--truth", "truth.tum"],
+        "refine": ["refine", "flat", "slam.tum", "--fps", "2", "--out", "light"],
+        "fresh": ["refine", "flat", "slam.tum", "--fps", "2", "--out", "light", "--fresh"],
+    }
+
+    def step(source: Path, here: Path) -> None:
+        (here / "elsewhere").mkdir()
+        (here / "elsewhere/precious.npz").write_text("precious")
+        path = here / "light" / place
+        if path.exists():
+            path.rename(here / f"before-{path.name}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if kind == "pipe":
+            os.mkfifo(path)
+        elif kind == "folder":
+            path.mkdir()
+        else:
+            to = {"link": "elsewhere", "file link": "elsewhere/precious.npz", "loop": "light"}[kind]
+            path.symlink_to(here / to)
+
+    draft.steps.append(step)
+    draft.arguments = ["--quiet", *options[command]]
+    draft.arguments += small_settings() if "refine" in options[command] else []
+    draft.said.append(f"{command} with a {kind} at {place}")
+    spoiled = draft.done("links", _unharmed, resumes=True)
+    return _Ours(**{name: getattr(spoiled, name) for name in spoiled.__dataclass_fields__})
+
+
+class _Ours(Spoiled):
+    """A case whose run folder is written to; what lies elsewhere is not."""
+
+    def keeps(self, path: Path) -> bool:
+        return "light" not in path.parts
+
+
+def _calibrations(draft: Draft) -> Spoiled:
+    """Lenses of raw pictures, spoiled."""
+    name = draft.pick(["lenses.json", "chain.yaml"])
+    draft.copy("strangers/raw", "slam.tum")
+    _copy(draft, name)
+    how = int(draft.rng.integers(5))
+    if how == 0 and name == "lenses.json":
+        draft.edit(name, change_tree(draft), "tree")
+    elif how == 1 and name == "lenses.json":
+        unit = draft.pick(["mm", "cm", "furlong", "map", "M", *TREES])
+        draft.edit(
+            name,
+            lambda data: json.dumps(json.loads(data) | {"unit": unit}).encode(),
+            f"unit {unit!r:.30}",
+        )
+    elif how == 2 and name == "chain.yaml":
+        odd = [b"a: &a [*a]\n", b"? [\n" * 9000, b"!!python/object/apply:os.abort []\n", b"--- 1\n"]
+        bombs = b"".join(
+            b"a%d: &a%d [%s]\n" % (k, k, b",".join([b"*a%d" % (k - 1)] * 9)) for k in range(1, 10)
+        )
+        start = draft.pick(
+            [*odd, b"a0: &a0 [x]\n" + bombs, b"- " * 200_000, b"x: " + b"1:" * 90_000]
+        )
+        draft.edit(name, lambda data: start + data, f"begins with {start[:20]!r}")
+    else:
+        spoil_file(draft, name)
+    draft.arguments = ["--quiet", "refine", "strangers/raw", "slam.tum", "--fps", "2"]
+    draft.arguments += ["--out", "out", "--calibration", name, *small_settings()]
+    return draft.done("calibrations", _refined, resumes=True)
+
+
+def _tiffs(draft: Draft) -> Spoiled:
+    """Pictures as TIFF: damaged, or with a directory that asks for much."""
+    draft.copy("flat", "slam.tum")
+    _copy(draft, "a.tif")
+    if draft.rng.random() < 0.5:
+        draft.edit("a.tif", change_bytes(draft), "bytes")
+    else:
+        tags = [256, 257, 258, 259, 262, 273, 274, 277, 278, 279, 284, 322, 324, 325, 339, 34665]
+        counts = [0, 1, 3, 65_535, 499_000, 900_000, 2**31, 2**32 - 1]
+        entries = [
+            (
+                draft.pick(tags),
+                draft.pick([1, 3, 4, 16, 0, 12]),
+                draft.pick(counts),
+                draft.pick(counts),
+            )
+            for _ in range(draft.pick([1, 20, 3000]))
+        ]
+        fixed = [(256, 3, 1, 64), (257, 3, 1, 32), (258, 3, 1, 8), (262, 3, 1, 1)]
+        entries = draft.pick([entries, fixed + entries, fixed + entries[:1] * 3000])
+        whole = b"II*\0" + struct.pack("<IH", 8, len(entries))
+        whole += b"".join(struct.pack("<HHII", *entry) for entry in entries)
+        draft.edit("a.tif", lambda _: whole + bytes(2_000_000), f"{len(entries)} tags")
+
+    def step(_: Path, here: Path) -> None:
+        for path in (here / "flat").iterdir():
+            path.unlink()
+        for number in range(4):
+            (here / f"flat/{number}.tif").write_bytes((here / "a.tif").read_bytes())
+
+    draft.steps.append(step)
+    draft.arguments = ["--quiet", "refine", "flat", "slam.tum", "--fps", "2", "--out", "out"]
+    gps = ["--set", "placement.gps=exif"] if draft.rng.random() < 0.3 else []
+    draft.arguments += [*small_settings(), *gps]
+    return draft.done("tiffs", _refined, resumes=True)
+
+
+def _clusters(draft: Draft) -> Spoiled:
+    """Schedulers that are none."""
+    draft.copy("flat", "slam.tum")
+    _copy(draft, "scheduler.json")
+    odd = [
+        f"{kind}:{word}" for kind in ("local", "slurm", "tcp") for word in WORDS if word != "1e18"
+    ]
+    odd = [address for address in odd if address not in ("local:1", "local:٣")]
+    places = [
+        "tls://",
+        "tcp://",
+        "tcp:///",
+        "tcp://:",
+        "tcp://::1",
+        "ucx://x",
+        "inproc://x",
+        "x.json",
+        ".",
+    ]
+    address = draft.pick([*odd, *places, *["scheduler.json"] * 20])
+    if address == "scheduler.json":
+        way = draft.pick(
+            [change_tree(draft), change_bytes(draft), lambda _: draft.pick([b"{}", b""])]
+        )
+        draft.edit(address, way, "spoiled")
+    draft.said.append(f"--cluster {address[:40]}")
+    draft.arguments = ["--quiet", "refine", "flat", "slam.tum", "--fps", "2", "--out", "out"]
+    draft.arguments += ["--cluster", address, *small_settings()]
+    return draft.done("clusters", lambda *_: "frames that show nothing were refined", resumes=True)
+
+
+def _numbers(draft: Draft) -> Spoiled:
+    """Sizes of what is to be made that nobody means."""
+    large = [str(10**k) for k in (6, 9, 12, 20, 400)]
+    number = draft.pick([*WORDS, *large, "-5", "1", "2"])
+    commands = [
+        ["demo", "--out", "out", "--frames", number],
+        [
+            "demo",
+            "--out",
+            "out",
+            "--frames",
+            "4",
+            "--width",
+            draft.pick([*large, "1", "-2", "33", "x"]),
+        ],
+        ["train", usual._RUN, "--iterations", draft.pick([*large[2:], "0", "-1", "x"])],
+        ["train", usual._RUN, "--iterations", "1", "--face-size", draft.pick([*large, "0", "x"])],
+        [
+            "export",
+            usual._RUN,
+            "--to",
+            "tum",
+            "--out",
+            "out",
+            "--map",
+            draft.pick([*large, number]),
+        ],
+    ]
+    draft.arguments = ["--quiet", *draft.pick(commands)]
+    draft.said.append(" ".join(draft.arguments)[:120])
+    return draft.done("numbers", lambda *_: None, resumes=True)
+
+
+def _scans(draft: Draft) -> Spoiled:
+    """Scans that are damaged, or of another place."""
+    name = draft.pick(_SCANS)
+    draft.copy("light", "truth.tum")
+    _copy(draft, name)
+    if name in ("cloud.pcd", "cloud.ply", "mesh.obj"):
+        spoil_file(draft, name)
+    else:
+        draft.edit(name, draft.pick([change_bytes, _head])(draft), "bytes")
+    draft.arguments = ["--quiet", "evaluate", "light", "--scan", name]
+    return draft.done("scans", lambda *_: None, limit_s=60.0)
+
+
+def _head(draft: Draft) -> Callable[[bytes], bytes]:
+    """Change bytes of the header alone: counts, sizes, offsets."""
+    places = draft.rng.integers(0, 380, int(draft.rng.integers(1, 6)))
+    values = [draft.pick([0, 1, 127, 128, 255, 57, 48]) for _ in places]
+
+    def change(data: bytes) -> bytes:
+        spoiled = bytearray(data)
+        for at, value in zip(places, values, strict=True):
+            spoiled[int(at) % len(spoiled)] = value
+        return bytes(spoiled)
+
+    return change
+
+
+_DRAWN: Mapping[str, Callable[[Draft], Spoiled]] = {
+    "names": _names,
+    "links": _links,
+    "calibrations": _calibrations,
+    "tiffs": _tiffs,
+    "clusters": _clusters,
+    "numbers": _numbers,
+    "scans": _scans,
+}
