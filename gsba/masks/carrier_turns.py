@@ -7,10 +7,10 @@ each frame's shift against it are found in turn, every pixel weighted by how wel
 
 import numpy as np
 
-WIDTH = 512  # pixels across the pictures that shifts are found in
+WIDTH = 256  # pixels across the pictures that shifts are found in
 _TOP = 0.7  # of the height: rows from here down are compared
-_REFERENCES = 5  # frames tried as the first template
-_ROUNDS = 6
+_REFERENCES = 3  # frames tried as the first template
+_ROUNDS = 4
 _FLOOR_LEVELS = 4.0  # grey levels: pixels that stay better than that all count the same
 
 
