@@ -17,7 +17,7 @@ from gsba.masks.fixed_structure import FixedStructure
 _PAD = 32  # pixels around the sphere
 _CERTAIN, _CERTAIN_WEAK = 0.75, 0.6  # least correlations that only a carrier has, see docs/masks.md
 _LIKELY_WEAK = 0.2  # least weak correlation of what is joined to such a place
-_SPILL = 7  # pixels by which fixed structure reaches over the outline
+_SPILL = 6  # pixels by which fixed structure reaches over the outline
 _REACH = 20  # pixels from fixed structure within which the outline is looked for
 _MOVING = 3.0  # times the carrier's own change: more is the world
 _LEAST_CHANGE = 1.0  # grey levels, of a carrier without noise
@@ -47,7 +47,7 @@ def outline_carrier(pictures: np.ndarray, structure: FixedStructure) -> np.ndarr
     )
     likely = (strong > _CERTAIN) | ((strong > _LIKELY_WEAK) & (weak > _LIKELY_WEAK))
     likely = _parts_with(likely, sure > 0.5)
-    core = _around(cv2.erode, likely, np.ones((3, 3), np.uint8), iterations=_SPILL) > 0
+    core = _shrunk(likely, _SPILL)
     if not core.any():
         return nothing
     median = np.median(pictures, axis=0).astype(np.uint8)
@@ -60,15 +60,13 @@ def outline_carrier(pictures: np.ndarray, structure: FixedStructure) -> np.ndarr
     return _around(cv2.dilate, found, np.ones((3, 3), np.uint8), iterations=_GROWN) > 0
 
 
-def _cut(
-    median: np.ndarray, core: np.ndarray, likely: np.ndarray, moves: np.ndarray
-) -> np.ndarray:
+def _cut(median: np.ndarray, core: np.ndarray, likely: np.ndarray, moves: np.ndarray) -> np.ndarray:
     """The carrier (h, w) bool by colours and edges of the median picture (h, w, 3) uint8."""
     distance = _around(cv2.distanceTransform, ~likely, cv2.DIST_L2, 5)
     far = distance > _REACH
     inside = _enclosed(~far)
     labels = np.full(core.shape, cv2.GC_PR_BGD, np.uint8)
-    labels[inside] = cv2.GC_PR_FGD
+    labels[inside | _shrunk(likely, _SPILL // 2)] = cv2.GC_PR_FGD
     labels[(far & ~inside) | moves] = cv2.GC_BGD
     labels[core] = cv2.GC_FGD
     smooth = _around(cv2.GaussianBlur, median, (0, 0), 1.0, crop=False)
@@ -84,6 +82,10 @@ def _change(pictures: np.ndarray, median: np.ndarray) -> np.ndarray:
     rows = np.array_split(np.arange(len(median)), 8)  # little memory at a time
     parts = [np.abs(pictures[:, r].astype(np.int16) - median[r]).mean(axis=-1) for r in rows]
     return np.concatenate([np.median(part, axis=0) for part in parts]).astype(np.float32)
+
+
+def _shrunk(places: np.ndarray, pixels: int) -> np.ndarray:
+    return _around(cv2.erode, places, np.ones((3, 3), np.uint8), iterations=pixels) > 0
 
 
 def _around(work, image: np.ndarray, *arguments, crop: bool = True, **options) -> np.ndarray:

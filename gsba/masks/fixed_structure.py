@@ -1,10 +1,10 @@
 """How well local structure keeps its direction, in the camera's frame, while the camera moves.
 
-Around every direction, the gradients of each frame are correlated with their median over the frames.
-What rides with the camera agrees in nearly every frame. The world agrees in none, but for edges that
-the motion shifts along themselves: a rail at the horizon, the line where a corridor meets its floor.
-They agree along one direction alone, so the gradients along the weaker principal direction of the
-structure tensor (Förstner, Gülch, ISPRS 1987) are correlated apart.
+Around every direction, the gradients of each frame are correlated with their median over the
+frames. What rides with the camera agrees in nearly every frame. The world agrees in none, but for
+edges that the motion shifts along themselves: a rail at the horizon, the line where a corridor
+meets its floor. They agree along one direction alone, so the gradients along the weaker principal
+direction of the structure tensor (Förstner, Gülch, ISPRS 1987) are correlated apart.
 """
 
 from dataclasses import dataclass
@@ -18,10 +18,9 @@ from gsba.camera.sphere import around_sphere
 WIDTH = 256  # pixels across the pictures that are compared
 _PAD = 16  # pixels around them
 _SMOOTHING = 0.7  # pixels, standard deviation, before gradients are taken
-_WINDOW = 2.0  # pixels, standard deviation, of what lies around a direction
-_NOISE = 4.5  # grey levels per pixel and channel: gradients of noise, JPEG and smooth shading
+_WINDOW, _WINDOW_SIZE = 2.0, (7, 7)  # pixels, standard deviation and extent, around a direction
+_NOISE = 3.0  # grey levels per pixel and channel: gradients of noise, JPEG and smooth shading
 _WORST = 0.1  # quantile of the frames: a passing shadow or hand may hide the carrier in so many
-_blur = partial(cv2.GaussianBlur, ksize=(0, 0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +40,7 @@ def measure_fixed_structure(pictures: np.ndarray) -> FixedStructure:
     """
     across, down = np.stack([_gradients(picture) for picture in pictures], axis=1)
     u, v = np.median(across, axis=0), np.median(down, axis=0)
-    window = partial(_blur, sigmaX=_WINDOW)
+    window = partial(cv2.GaussianBlur, ksize=_WINDOW_SIZE, sigmaX=_WINDOW)
     uu, uv, vv = (window(_dot(a, b)) for a, b in ((u, u), (u, v), (v, v)))
     strong_angle = 0.5 * np.arctan2(2 * uv, uu - vv)
     a, b = -np.sin(strong_angle)[..., None], np.cos(strong_angle)[..., None]
@@ -65,7 +64,7 @@ def measure_fixed_structure(pictures: np.ndarray) -> FixedStructure:
 def _gradients(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Gradients to the right and down, (h + 2 _PAD, 2h + 2 _PAD, 3) float32, levels per pixel."""
     padded = around_sphere(picture, _PAD).astype(np.float32)
-    smooth = _blur(padded, sigmaX=_SMOOTHING)
+    smooth = cv2.GaussianBlur(padded, (0, 0), _SMOOTHING)
     return cv2.Sobel(smooth, -1, 1, 0, scale=1 / 8), cv2.Sobel(smooth, -1, 0, 1, scale=1 / 8)
 
 
