@@ -18,7 +18,6 @@ from gsba.disk import write_image
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
-from gsba.masks import fixed_structure
 from gsba.masks.carrier_outline import certain_places, outline_carrier
 from gsba.masks.carrier_turns import band_of, find_turns
 from gsba.masks.fixed_structure import FixedStructure, measure_fixed_structure
@@ -33,9 +32,10 @@ _STAYS, _MOVES = 0.75, 0.5  # correlation of structure that stays; of structure 
 _MIN_MOVING = 1 / 3  # of the textured directions: fewer do not tell a carrier from what is far away
 _STANDING = 0.9  # of the textured directions that stay: the camera stands
 _MIN_TEXTURED = 0.02  # of all directions
+_STRUCTURE, _STRUCTURE_TURNED = 256, 128  # pixels across the pictures that are compared: the
+# camera's tilt, which turns leave, moves the carrier by a pixel of these
 _LEAST_TURN = np.deg2rad(2.0)  # less is the noise of finding turns
-_LEAST_GAIN = 1.05  # of how well pixels stay: what turning must bring to be believed
-_MORE = 1.5  # times as many certain places must be found with turns as without
+_MIN_FRAMES_TURNED = 12  # fewer agree by chance once turns are free
 
 
 class UnknownCarrierError(GsbaError):
@@ -79,14 +79,13 @@ def find_carrier(frames: FrameSet) -> Carrier:
         )
     chosen = np.unique(np.linspace(0, len(frames) - 1, _MAX_FRAMES).astype(int))
     pictures = np.stack([_load(frames, f) for f in track(chosen, "looking for the carrier")])
-    structure, turns = _measure(pictures), np.zeros(len(frames))
-    turned = _turned_back(pictures)
-    if turned is not None:
-        unturned, structure_turned = certain_places(structure).sum(), _measure(turned)
-        if certain_places(structure_turned).sum() > _MORE * unturned:
+    structure, turns = _measure(pictures, _STRUCTURE), np.zeros(len(frames))
+    if not certain_places(structure).any() and len(pictures) >= _MIN_FRAMES_TURNED:
+        turned = _turned_back(pictures)
+        other = None if turned is None else _first_certain(turned)
+        if other is not None:
             bands = [band_of(_load(frames, f)) for f in track(range(len(frames)), "its turns")]
-            turns = find_turns(np.stack(bands))[0]
-            structure, pictures = structure_turned, turned
+            turns, structure, pictures = find_turns(np.stack(bands)), other, turned
     _check_moving(structure)
     found = outline_carrier(pictures, structure)
     share = float(found.mean())
@@ -148,17 +147,25 @@ def _load(frames: FrameSet, f: int) -> np.ndarray:
     return picture
 
 
-def _measure(pictures: np.ndarray) -> FixedStructure:
-    size = fixed_structure.WIDTH, fixed_structure.WIDTH // 2
+def _measure(pictures: np.ndarray, width: int) -> FixedStructure:
+    size = width, width // 2
     small = [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in pictures]
     return measure_fixed_structure(np.stack(small))
 
 
+def _first_certain(pictures: np.ndarray) -> FixedStructure | None:
+    """Structure in the finest pictures in which something is certain to stay."""
+    for width in (_STRUCTURE, _STRUCTURE_TURNED):
+        structure = _measure(pictures, width)
+        if certain_places(structure).any():
+            return structure
+    return None
+
+
 def _turned_back(pictures: np.ndarray) -> np.ndarray | None:
-    """Pictures with the carrier turned to one direction; None where turning explains nothing."""
-    turns, gain = find_turns(np.stack([band_of(picture) for picture in pictures]))
-    logger.debug("gain of turning %.2f, by %.1f deg", gain, np.rad2deg(np.ptp(turns)))
-    if np.ptp(turns) < _LEAST_TURN or gain < _LEAST_GAIN:
+    """Pictures with the carrier turned to one direction; None where it does not turn."""
+    turns = find_turns(np.stack([band_of(picture) for picture in pictures]))
+    if np.ptp(turns) < _LEAST_TURN:
         return None
     back = -turns / (2 * np.pi) * pictures.shape[2]
     return np.stack([np.roll(p, round(by), axis=1) for p, by in zip(pictures, back, strict=True)])

@@ -15,7 +15,6 @@ import numpy as np
 
 from gsba.camera.sphere import around_sphere
 
-WIDTH = 256  # pixels across the pictures that are compared
 _PAD = 16  # pixels around them
 _SMOOTHING = 0.7  # pixels, standard deviation, before gradients are taken
 _WINDOW, _WINDOW_SIZE = 2.0, (7, 7)  # pixels, standard deviation and extent, around a direction
@@ -36,7 +35,8 @@ def measure_fixed_structure(pictures: np.ndarray) -> FixedStructure:
     """Correlate frames, direction by direction.
 
     Args:
-        pictures: (K, h, 2h, 3) uint8 panoramas, WIDTH across.
+        pictures: (K, h, 2h, 3) uint8 panoramas, some hundred pixels across: structure counts as
+            fixed up to about half a pixel.
     """
     across, down = np.stack([_gradients(picture) for picture in pictures], axis=1)
     u, v = np.median(across, axis=0), np.median(down, axis=0)
