@@ -38,10 +38,6 @@ _LEAST_TURN = np.deg2rad(2.0)  # less is the noise of finding turns
 _MIN_FRAMES_TURNED = 12  # fewer agree by chance once turns are free
 
 
-class UnknownCarrierError(GsbaError):
-    """Frames that do not tell what carries the camera."""
-
-
 @dataclass(frozen=True, slots=True)
 class Carrier:
     """Pixels that are not of the world."""
@@ -67,25 +63,22 @@ def find_carrier(frames: FrameSet) -> Carrier:
         frames: panoramas or raw pairs.
 
     Raises:
-        UnknownCarrierError: cube faces, too few frames, no texture, or too little that moves.
+        GsbaError: cube faces, too few frames, no texture, or too little that moves.
     """
     if not frames.panoramic:
-        raise UnknownCarrierError(
-            "the carrier is looked for in panoramas; these frames are cube faces"
-        )
+        raise GsbaError("the carrier is looked for in panoramas; these frames are cube faces")
     if len(frames) < _MIN_FRAMES:
-        raise UnknownCarrierError(
+        raise GsbaError(
             f"{len(frames)} frames do not tell what is fixed to the camera: give {_MIN_FRAMES}"
         )
     chosen = np.unique(np.linspace(0, len(frames) - 1, _MAX_FRAMES).astype(int))
     pictures = np.stack([_load(frames, f) for f in track(chosen, "looking for the carrier")])
     structure, turns = _measure(pictures, _STRUCTURE), np.zeros(len(frames))
     if not certain_places(structure).any() and len(pictures) >= _MIN_FRAMES_TURNED:
-        turned = _turned_back(pictures)
-        other = None if turned is None else _first_certain(turned)
-        if other is not None:
+        below = _measure_turned(pictures)
+        if below is not None:
             bands = [band_of(_load(frames, f)) for f in track(range(len(frames)), "its turns")]
-            turns, structure, pictures = find_turns(np.stack(bands)), other, turned
+            turns, (pictures, structure) = find_turns(np.stack(bands)), below
     _check_moving(structure)
     found = outline_carrier(pictures, structure)
     share = float(found.mean())
@@ -153,46 +146,42 @@ def _measure(pictures: np.ndarray, width: int) -> FixedStructure:
     return measure_fixed_structure(np.stack(small))
 
 
-def _first_certain(pictures: np.ndarray) -> FixedStructure | None:
-    """Structure in the finest pictures in which something is certain to stay."""
-    for width in (_STRUCTURE, _STRUCTURE_TURNED):
-        structure = _measure(pictures, width)
-        if certain_places(structure).any():
-            return structure
-    return None
-
-
-def _turned_back(pictures: np.ndarray) -> np.ndarray | None:
-    """Pictures with the carrier turned to one direction; None where it does not turn."""
+def _measure_turned(pictures: np.ndarray) -> tuple[np.ndarray, FixedStructure] | None:
+    """Pictures with the carrier turned to one direction, and their structure; None = it stays."""
     turns = find_turns(np.stack([band_of(picture) for picture in pictures]))
     if np.ptp(turns) < _LEAST_TURN:
         return None
     back = -turns / (2 * np.pi) * pictures.shape[2]
-    return np.stack([np.roll(p, round(by), axis=1) for p, by in zip(pictures, back, strict=True)])
+    turned = [np.roll(p, round(by), axis=1) for p, by in zip(pictures, back, strict=True)]
+    for width in (_STRUCTURE, _STRUCTURE_TURNED):
+        structure = _measure(np.stack(turned), width)
+        if certain_places(structure).any():
+            return np.stack(turned), structure
+    return None
 
 
 def _check_moving(structure: FixedStructure) -> None:
     """Refuse frames in which too little moves for what stays to be the carrier.
 
     Raises:
-        UnknownCarrierError: saying how much stays.
+        GsbaError: saying how much stays.
     """
     heights = (np.arange(len(structure.strong)) + 0.5) / len(structure.strong)
     weights = structure.textured * np.sin(np.pi * heights)[:, None]  # solid angles
     if weights.mean() < _MIN_TEXTURED:
-        raise UnknownCarrierError("the frames show too little texture to tell what stays in place")
+        raise GsbaError("the frames show too little texture to tell what stays in place")
     staying, moving = (
         float((weights * places).sum() / weights.sum())
         for places in (structure.strong > _STAYS, structure.strong < _MOVES)
     )
     logger.debug("textured: %.0f%% stay, %.0f%% move", 100 * staying, 100 * moving)
     if staying > _STANDING:
-        raise UnknownCarrierError(
+        raise GsbaError(
             f"the frames hardly differ ({100 * staying:.0f}% of what has texture stays in its "
             "direction): the camera must move for its carrier to stand out"
         )
     if moving < _MIN_MOVING:
-        raise UnknownCarrierError(
+        raise GsbaError(
             f"{100 * staying:.0f}% of what has texture stays in its direction and only "
             f"{100 * moving:.0f}% moves: most of the picture is a vehicle, or far away, or the "
             "camera hardly moves; give a mask of what carries it (--masks FILE)"

@@ -37,12 +37,12 @@ def outline_carrier(pictures: np.ndarray, structure: FixedStructure) -> np.ndarr
         pictures: (K, h, 2h, 3) uint8 panoramas in which it does not move.
         structure: of these pictures, smaller.
     """
-    nothing = np.zeros(pictures.shape[1:3], bool)
-    size = nothing.shape[1], nothing.shape[0]
+    height, width = pictures.shape[1:3]
+    nothing = np.zeros((height, width), bool)
     if not certain_places(structure).any():
         return nothing
     sure, strong, weak = (
-        cv2.resize(x.astype(np.float32), size)
+        cv2.resize(x.astype(np.float32), (width, height))
         for x in (certain_places(structure), structure.strong, structure.weak)
     )
     likely = (strong > _CERTAIN) | ((strong > _LIKELY_WEAK) & (weak > _LIKELY_WEAK))

@@ -18,7 +18,6 @@ from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
 from gsba.masks.carrier import (
     Carrier,
-    UnknownCarrierError,
     carrier_mask,
     find_carrier,
     no_carrier,
@@ -170,7 +169,7 @@ def _carrier(store: RunStore, frames: FrameSet, required: bool, name: str = "car
     def compute() -> Carrier:
         try:
             return find_carrier(frames)
-        except UnknownCarrierError as error:
+        except GsbaError as error:
             if required:
                 raise
             logger.info("nothing is masked: %s", error)

@@ -83,9 +83,8 @@ def refine(
         out: folder of the run; a second call re-runs what depends on settings that changed.
         settings: see `gsba.config`.
         keyframes: second trajectory file of the same run, with its keyframes: they lead.
-        masks: one ERP mask for all frames, or a folder of one for each, white = use; "auto" to find
-            what carries the camera ("carrier" refuses frames that do not tell), "distractors" what
-            moves; or several of these. "none" = no masks.
+        masks: one ERP mask for all frames, or a folder of one for each, white = use; "auto" finds
+            what carries the camera, "distractors" what moves; or several of these; or "none".
         segment: a command or a callable that masks faces; see `gsba.masks.segmentation.segmented`.
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
