@@ -26,7 +26,7 @@ from gsba.types import FrameSet
 logger = logging.getLogger(__name__)
 
 _WIDTH = 512  # pixels across the pictures in which the outline is found
-_MAX_FRAMES = 32
+_MAX_FRAMES = 20
 _MIN_FRAMES = 6  # fewer agree by chance
 _STAYS, _MOVES = 0.75, 0.5  # correlation of structure that stays; of structure that moves, at most
 _MIN_MOVING = 1 / 3  # of the textured directions: fewer do not tell a carrier from what is far away
@@ -80,7 +80,8 @@ def find_carrier(frames: FrameSet) -> Carrier:
             bands = [band_of(_load(frames, f)) for f in track(range(len(frames)), "its turns")]
             turns, (pictures, structure) = find_turns(np.stack(bands)), below
     _check_moving(structure)
-    found = outline_carrier(pictures, structure)
+    median = np.median(pictures, axis=0).astype(np.uint8)
+    found = outline_carrier(pictures, median, structure)
     share = float(found.mean())
     reason = "" if found.any() else "nothing turns with the camera"
     turns = turns if found.any() else np.zeros(len(frames))
@@ -92,7 +93,6 @@ def find_carrier(frames: FrameSet) -> Carrier:
             "look at carrier_check.jpg",
             100 * share,
         )
-    median = np.median(pictures, axis=0).astype(np.uint8)
     return Carrier(~found, turns, median, share, reason)
 
 
@@ -152,12 +152,13 @@ def _measure_turned(pictures: np.ndarray) -> tuple[np.ndarray, FixedStructure] |
     if np.ptp(turns) < _LEAST_TURN:
         return None
     back = -turns / (2 * np.pi) * pictures.shape[2]
-    turned = [np.roll(p, round(by), axis=1) for p, by in zip(pictures, back, strict=True)]
-    for width in (_STRUCTURE, _STRUCTURE_TURNED):
-        structure = _measure(np.stack(turned), width)
-        if certain_places(structure).any():
-            return np.stack(turned), structure
-    return None
+    rolls = zip(pictures, back, strict=True)
+    turned = np.stack([np.roll(picture, round(by), axis=1) for picture, by in rolls])
+    coarse = _measure(turned, _STRUCTURE_TURNED)
+    if not certain_places(coarse).any():
+        return None
+    fine = _measure(turned, _STRUCTURE)
+    return turned, fine if certain_places(fine).any() else coarse
 
 
 def _check_moving(structure: FixedStructure) -> None:

@@ -30,11 +30,14 @@ def certain_places(structure: FixedStructure) -> np.ndarray:
     return (structure.strong > _CERTAIN) & (structure.weak > _CERTAIN_WEAK)
 
 
-def outline_carrier(pictures: np.ndarray, structure: FixedStructure) -> np.ndarray:
+def outline_carrier(
+    pictures: np.ndarray, median: np.ndarray, structure: FixedStructure
+) -> np.ndarray:
     """What carries the camera, (h, 2h) bool; all False where there is none.
 
     Args:
         pictures: (K, h, 2h, 3) uint8 panoramas in which it does not move.
+        median: (h, 2h, 3) uint8, of these pictures.
         structure: of these pictures, smaller.
     """
     height, width = pictures.shape[1:3]
@@ -50,7 +53,6 @@ def outline_carrier(pictures: np.ndarray, structure: FixedStructure) -> np.ndarr
     core = _shrunk(likely, _SPILL)
     if not core.any():
         return nothing
-    median = np.median(pictures, axis=0).astype(np.uint8)
     change = _change(pictures, median)
     own_change = max(float(np.median(change[core])), _LEAST_CHANGE)
     moves = (_around(cv2.GaussianBlur, change, (0, 0), 1.0) > _MOVING * own_change) & ~core

@@ -1,6 +1,6 @@
 """How well local structure keeps its direction, in the camera's frame, while the camera moves.
 
-Around every direction, the gradients of each frame are correlated with their median over the
+Around every direction, the gradients of each frame are correlated with their mean over the
 frames. What rides with the camera agrees in nearly every frame. The world agrees in none, but for
 edges that the motion shifts along themselves: a rail at the horizon, the line where a corridor
 meets its floor. They agree along one direction alone, so the gradients along the weaker principal
@@ -39,7 +39,7 @@ def measure_fixed_structure(pictures: np.ndarray) -> FixedStructure:
             fixed up to about half a pixel.
     """
     across, down = np.stack([_gradients(picture) for picture in pictures], axis=1)
-    u, v = np.median(across, axis=0), np.median(down, axis=0)
+    u, v = across.mean(axis=0), down.mean(axis=0)
     window = partial(cv2.GaussianBlur, ksize=_WINDOW_SIZE, sigmaX=_WINDOW)
     uu, uv, vv = (window(_dot(a, b)) for a, b in ((u, u), (u, v), (v, v)))
     strong_angle = 0.5 * np.arctan2(2 * uv, uu - vv)
