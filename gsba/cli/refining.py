@@ -143,14 +143,8 @@ def refine(
     with loading():
         from gsba import pipeline
         from gsba.store.cluster import connected
-    given = {"keyframes": keyframes, "segment": segment, "timestamps": timestamps}
-    given |= {
-        "masks": masks or "auto",
-        "fps": fps,
-        "calibration": calibration,
-        "imu": imu,
-        "fresh": fresh,
-    }
+    given = {"keyframes": keyframes, "segment": segment, "timestamps": timestamps, "fps": fps}
+    given |= {"masks": masks or "auto", "calibration": calibration, "imu": imu, "fresh": fresh}
     with connected(cluster) as client:
         result = pipeline.refine(frames, trajectory, out, settings, client=client, **given)
     _conclude([result], allow_partial)
