@@ -48,17 +48,20 @@ def extract(
 
 @command
 def mask(
-    frames: Annotated[Path, typer.Argument(help="Folder of 2:1 panoramas.")],
+    frames: Annotated[Path, typer.Argument(help="Folder of 2:1 panoramas or raw fisheyes.")],
     out: Annotated[Path, typer.Option(help="Folder of the masks.", metavar="DIR")],
     masks: Annotated[
         Path | None, typer.Option(help="Masks of your own, merged with what is found.")
     ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Of the lenses of raw fisheyes.", metavar="FILE")
+    ] = None,
 ) -> None:
     """Find what carries the camera and write it as a mask to look at and to use."""
-    from gsba.frames.scan import find_panoramas
+    from gsba.frames.scan import scan
     from gsba.masks.carrier import find_carrier, write_carrier
 
-    found_frames = find_panoramas(frames, masks)
+    found_frames = scan(frames, masks=masks, order_suffices=True, calibration=calibration)
     carrier = find_carrier(found_frames)
     written = write_carrier(carrier, found_frames, out)
     what = carrier.reason or f"the carrier is {100 * carrier.share:.1f}% of the picture"

@@ -50,8 +50,8 @@ Keyframes = Annotated[
 Masks = Annotated[
     list[Path] | None,
     typer.Option(
-        help="One mask for all frames, or a folder; white = use. carrier (or auto), "
-        "distractors: find them. Repeatable.",
+        help="One mask for all frames, or a folder; white = use. auto: find what carries the "
+        "camera (the default; carrier: or refuse); distractors: find what moves; none. Repeatable.",
         metavar="PATH",
     ),
 ]
@@ -143,8 +143,8 @@ def refine(
     with loading():
         from gsba import pipeline
         from gsba.store.cluster import connected
-    given = {"keyframes": keyframes, "masks": masks, "segment": segment, "timestamps": timestamps}
-    given |= {"fps": fps, "calibration": calibration, "imu": imu, "fresh": fresh}
+    given = {"keyframes": keyframes, "segment": segment, "timestamps": timestamps, "fps": fps}
+    given |= {"masks": masks or "auto", "calibration": calibration, "imu": imu, "fresh": fresh}
     with connected(cluster) as client:
         result = pipeline.refine(frames, trajectory, out, settings, client=client, **given)
     _conclude([result], allow_partial)

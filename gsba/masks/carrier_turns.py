@@ -7,10 +7,10 @@ each frame's shift against it are found in turn, every pixel weighted by how wel
 
 import numpy as np
 
-WIDTH = 512  # pixels across the pictures that shifts are found in
+WIDTH = 256  # pixels across the pictures that shifts are found in
 _TOP = 0.7  # of the height: rows from here down are compared
-_REFERENCES = 5  # frames tried as the first template
-_ROUNDS = 6
+_REFERENCES = 3  # frames tried as the first template
+_ROUNDS = 4
 _FLOOR_LEVELS = 4.0  # grey levels: pixels that stay better than that all count the same
 
 
@@ -22,21 +22,19 @@ def band_of(picture: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(small[int(_TOP * len(small)) :], cv2.COLOR_RGB2GRAY).astype(np.float32)
 
 
-def find_turns(bands: np.ndarray) -> tuple[np.ndarray, float]:
+def find_turns(bands: np.ndarray) -> np.ndarray:
     """How far the carrier has turned in each frame.
 
     Args:
         bands: (F, r, WIDTH) float32 grey levels, the lowest rows of each picture.
 
     Returns:
-        Turns (F,) float64, radians, to the right of the first frame's; and by what factor pixels
-        stay better once they are taken back than in the pictures as they are.
+        Turns (F,) float64, radians, to the right of the first frame's.
     """
     levels = bands.mean(axis=(1, 2), keepdims=True)
     even = bands / np.maximum(levels, 1.0) * levels.mean()
     spectra = np.fft.rfft(even, axis=-1)
     squares = np.fft.rfft(even**2, axis=-1)
-    unturned = _steadiness(even)[1].sum()
     best, turns = 0.0, np.zeros(len(bands))
     references = np.unique(np.linspace(0, len(bands) - 1, _REFERENCES).astype(int))
     for reference in references:
@@ -48,7 +46,7 @@ def find_turns(bands: np.ndarray) -> tuple[np.ndarray, float]:
         if weights.sum() > best:
             best, turns = float(weights.sum()), 2 * np.pi / WIDTH * shifts
     turns = turns - turns[0]
-    return (turns + np.pi) % (2 * np.pi) - np.pi, best / float(unturned)
+    return (turns + np.pi) % (2 * np.pi) - np.pi
 
 
 def _steadiness(bands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

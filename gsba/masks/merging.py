@@ -16,7 +16,13 @@ from gsba.disk import write_bytes, write_image
 from gsba.frames.masks import levels_of, load_mask, load_weights
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
-from gsba.masks.carrier import Carrier, carrier_mask, find_carrier, write_carrier
+from gsba.masks.carrier import (
+    Carrier,
+    carrier_mask,
+    find_carrier,
+    no_carrier,
+    write_carrier,
+)
 from gsba.masks.distractors import (
     Distractors,
     KnownMasks,
@@ -30,7 +36,7 @@ from gsba.types import Counts, FrameSet, Solution
 
 logger = logging.getLogger(__name__)
 
-AUTO, CARRIER, DISTRACTORS = "auto", "carrier", "distractors"  # in place of a file
+AUTO, CARRIER, DISTRACTORS, NONE = "auto", "carrier", "distractors", "none"  # in place of a file
 Masks = Path | str | Sequence[Path | str] | None
 _FOLDER = "masks"
 _SHOWN, _SHOWN_WIDTH = 6, 768  # frames and pixels of the picture to look at
@@ -44,31 +50,43 @@ class Choice:
     carrier: bool
     distractors: bool
     segment: Segment | None
+    carrier_required: bool = False  # frames that do not tell what carries the camera are refused
 
 
 def choose(masks: Masks, segment: Segment | None = None) -> Choice:
     """What `--masks` and `--segment` ask for.
 
     Args:
-        masks: a file or a folder, "carrier" (or "auto"), "distractors", or several of these.
+        masks: a file or a folder, "auto", "carrier", "distractors", or several of these; "none" or
+            None = no masks. "carrier" is "auto" that refuses frames which do not tell.
         segment: see `gsba.masks.segmentation`.
 
     Raises:
-        GsbaError: two files or folders.
+        GsbaError: two files or folders, or "none" with others.
     """
     values = [masks] if isinstance(masks, Path | str) else list(masks or ())
-    words = {str(value) for value in values} & {AUTO, CARRIER, DISTRACTORS}
+    words = {str(value) for value in values} & {AUTO, CARRIER, DISTRACTORS, NONE}
     files = [Path(value) for value in values if str(value) not in words]
     if len(files) > 1:
         raise GsbaError(f"--masks {files[0]} and {files[1]}: give one file or one folder")
+    if NONE in words and len(values) > 1:
+        raise GsbaError("--masks none turns masks off: leave the other --masks out")
     return Choice(
-        files[0] if files else None, bool(words & {AUTO, CARRIER}), DISTRACTORS in words, segment
+        files[0] if files else None,
+        bool(words & {AUTO, CARRIER}),
+        DISTRACTORS in words,
+        segment,
+        CARRIER in words,
     )
 
 
 def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
-    """Frames without what is known before any solution: what is segmented, and the carrier."""
-    inputs = fingerprint(path for group in frames.paths for path in group)
+    """Frames without what is known before any solution: what is segmented, and the carrier.
+
+    Raises:
+        GsbaError: a segmentation that fails; frames that do not tell what carries the camera,
+            where that is required.
+    """
     parts: list[Callable[[int], np.ndarray | None]] = []
     names = []
     if choice.segment is not None:
@@ -76,7 +94,7 @@ def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
         parts.append(lambda f: load_segmented(found, frames, f))
         names.append("segmented")
     if choice.carrier:
-        carrier = _carrier(store, frames, inputs)
+        carrier = _carrier(store, frames, choice.carrier_required)
         if carrier.share and not (parts or carrier.turns.any() or any(frames.mask_paths)):
             frames = replace(frames, mask_paths=(store.root / "carrier.png",) * len(frames))
         elif carrier.share:
@@ -128,14 +146,44 @@ def after(
     return merged, Counts(len(results), len(results) - len(reasons), "frames", dropped)
 
 
-def _carrier(store: RunStore, frames: FrameSet, inputs: object) -> Carrier:
-    """The carrier, and its pictures in the run's folder."""
-    found = store.stage("carrier", inputs, lambda: find_carrier(frames), Carrier)
-    path = store.root / "carrier.png"
-    if not (path.exists() and store.records["carrier"].resumed):  # a new file would undo all stages
-        write_carrier(found, frames, store.root, merge=False)
-    for name in ("carrier.png", "carrier_check.jpg"):
-        store.claim(store.root / name)
+def recut(store: RunStore, frames: FrameSet, cut: int) -> FrameSet:
+    """Raw pairs whose lenses are known better, with the carrier where these see it.
+
+    Masks that hold anything else stay as they are.
+
+    Args:
+        frames: with masks of an earlier cut.
+        cut: its number, from 1.
+    """
+    earlier = ["carrier.png", *(f"carrier{n}.png" for n in range(1, cut))]
+    if not set(frames.mask_paths) <= {store.root / name for name in earlier}:
+        return frames
+    carrier = _carrier(store, frames, False, f"carrier{cut}")
+    path = store.root / f"carrier{cut}.png" if carrier.share else None
+    return replace(frames, mask_paths=(path,) * len(frames))
+
+
+def _carrier(store: RunStore, frames: FrameSet, required: bool, name: str = "carrier") -> Carrier:
+    """The carrier as stage `name`, and its pictures in the run's folder where there is one."""
+
+    def compute() -> Carrier:
+        try:
+            return find_carrier(frames)
+        except GsbaError as error:
+            if required:
+                raise
+            logger.info("nothing is masked: %s", error)
+            return no_carrier(frames, str(error))
+
+    files = fingerprint(path for group in frames.paths for path in group)
+    found = store.stage(name, (files, frames.fisheyes, required), compute, Carrier)
+    if not found.share:
+        return found
+    path = store.root / f"{name}.png"
+    if not (path.exists() and store.records[name].resumed):  # a new file would undo all stages
+        write_carrier(found, frames, store.root, merge=False, name=name)
+    for written in (path, store.root / f"{name}_check.jpg"):
+        store.claim(written)
     return found
 
 

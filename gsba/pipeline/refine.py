@@ -63,7 +63,7 @@ def refine(
     settings: RefineSettings | None = None,
     *,
     keyframes: Path | None = None,
-    masks: merging.Masks = None,
+    masks: merging.Masks = merging.AUTO,
     segment: Segment | None = None,
     timestamps: Path | None = None,
     fps: float | None = None,
@@ -83,8 +83,8 @@ def refine(
         out: folder of the run; a second call re-runs what depends on settings that changed.
         settings: see `gsba.config`.
         keyframes: second trajectory file of the same run, with its keyframes: they lead.
-        masks: one ERP mask for all frames, or a folder of one for each, white = use; "carrier" (or
-            "auto") and "distractors" to find what carries the camera or moves; or several of these.
+        masks: one ERP mask for all frames, or a folder of one for each, white = use; "auto" finds
+            what carries the camera, "distractors" what moves; or several of these; or "none".
         segment: a command or a callable that masks faces; see `gsba.masks.segmentation.segmented`.
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
@@ -148,6 +148,7 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
             run.store.stage(name, known, lambda found=better: found, _Cut, after)
         n, (fisheyes, found) = n + 1, better
         frames, again = replace(frames, fisheyes=fisheyes), Journal(dict(counts))
+        frames = merging.recut(run.store, frames, n)
         settings, extra = run.settings, run.extra_factors
         run = Run.begin(run.store, frames, prior.coarse, settings, extra, again, found, run.imu)
 

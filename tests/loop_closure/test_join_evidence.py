@@ -18,8 +18,9 @@ ENDS = np.arange(6), np.arange(NUM - 6, NUM)  # of a walk around: they see the s
 
 def _places(strange: bool = False) -> tuple[MatchContext, Places, float]:
     context, solved, _ = scene(strange)
-    known = list(solved.points_by_keypoint(context.keypoints))
-    return context, Places(TRUTH, known), solved.median_depth()
+    known = solved.points_by_keypoint(context.keypoints)
+    places = Places(TRUTH, [known[f] for f in range(NUM)])
+    return context, places, solved.median_depth()
 
 
 def _weighed(move: np.ndarray, strange: bool = False) -> JoinEvidence:

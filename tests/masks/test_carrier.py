@@ -7,7 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tiny_run import SETTINGS, Case, computed_stages
+from two_fisheyes import colours, made_pair, picture, write
 from typer.testing import CliRunner
 
 from gsba import refine
@@ -17,6 +19,8 @@ from gsba.disk import write_image
 from gsba.frames.scan import find_panoramas
 from gsba.log import GsbaError
 from gsba.masks.carrier import carrier_mask, find_carrier, write_carrier
+from gsba.masks.merging import choose
+from gsba.types import FrameSet
 
 WIDTH, HEIGHT, NUM = 512, 256, 14
 
@@ -113,6 +117,52 @@ def test_a_carrier_that_turns_below_the_picture_is_found(tmp_path: Path, look: s
     np.testing.assert_array_equal(last == 0, found[-1])
 
 
+def _head() -> np.ndarray:
+    """Something at the horizon, over the seam, with an arm that hangs from it, (H, W) bool."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    across = (u + 10) % WIDTH - 40
+    head = (across / 30) ** 2 + ((v - 120) / 35) ** 2 < 1
+    return head | ((np.abs(across - 12 - (v - 150) / 4) < 9) & (v > 140) & (v < 215))
+
+
+def _noise_frames(folder: Path, mask: np.ndarray, look: np.ndarray, num: int = 12) -> FrameSet:
+    """Panoramas of a world that is new in every frame, with `look` where `mask`."""
+    rng = np.random.default_rng(5)
+    for f in range(num):
+        world = cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH, 3)), (0, 0), 3)
+        image = np.clip(128 + 45 * world / world.std(), 0, 255)
+        image[mask] = look[mask] + rng.normal(0, 2, look[mask].shape)
+        write_image(folder / f"{f:03d}.png", np.clip(image, 0, 255).astype(np.uint8))
+    return find_panoramas(folder)
+
+
+@pytest.mark.parametrize("look", ["dark", "coloured"])
+def test_what_turns_with_the_camera_is_found_at_the_horizon(tmp_path: Path, look: str) -> None:
+    carrier = find_carrier(_noise_frames(tmp_path, _head(), _looks()[look]))
+    assert _overlap(~carrier.mask, _head()) >= 0.85 and not carrier.turns.any()
+
+
+def test_a_moving_world_alone_masks_nothing(tmp_path: Path) -> None:
+    nothing = np.zeros((HEIGHT, WIDTH), bool)
+    carrier = find_carrier(_noise_frames(tmp_path, nothing, _looks()["dark"]))
+    assert carrier.mask.all() and carrier.reason == "nothing turns with the camera"
+
+
+def test_a_rail_that_moves_along_itself_is_not_the_carrier(tmp_path: Path) -> None:
+    """A straight edge at the height of the camera stays where it is while the world moves."""
+    v, _ = np.mgrid[:HEIGHT, :WIDTH]
+    rail = np.abs(v - HEIGHT / 2) < 6
+    carrier = find_carrier(_noise_frames(tmp_path, rail, np.full((HEIGHT, WIDTH, 3), 20.0)))
+    assert carrier.mask.all()
+
+
+def test_a_vehicle_that_fills_the_view_is_said(tmp_path: Path) -> None:
+    v, _ = np.mgrid[:HEIGHT, :WIDTH]
+    frames = _noise_frames(tmp_path / "car", v > 0.3 * HEIGHT, _looks()["coloured"])
+    with pytest.raises(GsbaError, match="most of the picture is a vehicle"):
+        find_carrier(frames)
+
+
 def test_what_cannot_be_told_is_refused(tmp_path: Path, case: Case) -> None:
     standing = _walk(tmp_path / "standing", _looks()["dark"], speed=0.0)
     first = standing.paths[0][0].read_bytes()
@@ -171,3 +221,43 @@ def test_refine_leaves_the_carrier_out(case: Case, tmp_path: Path) -> None:
     assert "carrier.png" in json.loads((tmp_path / "run/gsba.json").read_text())["wrote"]
     again = refine(tmp_path / "frames", case.slam, tmp_path / "run", SETTINGS, masks="carrier")
     assert computed_stages(again) == []
+
+
+def test_masks_are_looked_for_by_default_and_can_be_turned_off(case: Case, tmp_path: Path) -> None:
+    """Where there is no carrier, looking for it changes no pose and leaves no file."""
+    plain = case.refine(tmp_path / "none", masks="none")
+    stages = [{stage["name"] for stage in r.report["stages"]} for r in (plain, case.result)]
+    assert "carrier" not in stages[0] and "carrier" in stages[1]
+    assert not any((case.result.out / name).exists() for name in ("carrier.png", "masks"))
+    poses = (case.result.out / "trajectory.tum").read_bytes()
+    assert (tmp_path / "none/trajectory.tum").read_bytes() == poses
+
+
+def test_masks_none_stands_alone() -> None:
+    assert not choose("none").carrier and choose("auto").carrier
+    with pytest.raises(GsbaError, match="turns masks off"):
+        choose(["none", "distractors"])
+
+
+def test_raw_pairs_are_taken(tmp_path: Path) -> None:
+    """Something before the front lens stays in its pictures."""
+    pair = made_pair()
+    ahead = Rotation.from_rotvec(pair[0].rotation).as_matrix()[:, 2]
+    for f, turn in enumerate(Rotation.from_rotvec(np.random.default_rng(1).normal(0, 2, (8, 3)))):
+        for name, lens in zip(("front", "back"), pair, strict=True):
+
+            def seen(directions: np.ndarray, turn: Rotation = turn) -> np.ndarray:
+                near = (directions @ ahead > np.cos(0.5))[..., None]
+                return np.where(
+                    near, colours(2 * directions), colours(directions @ turn.as_matrix())
+                )
+
+            write(tmp_path / "raw" / name / f"{f}.png", picture(lens, seen))
+    arguments = ["mask", str(tmp_path / "raw"), "--out", str(tmp_path / "m")]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.stderr
+    found = cv2.imread(str(tmp_path / "m/carrier.png"), cv2.IMREAD_UNCHANGED) == 0
+    height, width = found.shape
+    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + 0.5
+    cone = bearings_from_erp(grid, width, height)[..., 2] > np.cos(0.5)
+    assert width == 2 * height and _overlap(found, cone) >= 0.8
