@@ -183,7 +183,7 @@ def _upheld(context: MatchContext, solved: Solution, loops: list[Loop]) -> list[
         return loops
     poses, frames = solved.world_T_rigs, np.arange(len(solved.world_T_rigs))
     by_keypoint, depth = solved.points_by_keypoint(context.keypoints), solved.median_depth()
-    known = [by_keypoint[f] for f in frames]
+    known = [by_keypoint[f] for f in range(len(frames))]
     usual = join_evidence.rates(context, Places(poses, known), frames // (2 * LOCAL))
     rest, upheld = sorted(loops, key=lambda loop: -loop.support), list[Loop]()
     while rest:
