@@ -22,7 +22,7 @@ _MOST = 60_000  # observations that centres are found from
 _OF_MODEL = 0.005  # of the distance between lenses: its error where residuals promise none, as
 # measured on rendered walks (benchmarks/results/camera.md)
 _SIGNIFICANT = 5.0  # standard deviations from one centre, or there is one
-_ON_TRIAL = 3.0  # the same of centres that matches are found and judged with before they are taken
+_ON_TRIAL = 2.0  # the same of centres that matches are found and judged with before they are taken
 
 
 @dataclass(frozen=True, slots=True)

