@@ -190,7 +190,7 @@ class PatchSettings(_Settings):
     """Patches around the map's points, aligned to every frame that shows them."""
 
     rounds: int = Field(default=2, ge=0)  # of alignment and bundle adjustment; 0 = none
-    patch_size: int = Field(default=11, ge=5, le=41)  # pixels across, odd
+    patch_size: int = Field(default=15, ge=5, le=41)  # pixels across, odd
     max_width: int = Field(default=4096, ge=64)  # of a panorama; wider ones are halved till under
     max_views: int = Field(default=16, ge=1)  # frames that a point is looked for in
     near_frames: int = Field(default=40, ge=0)  # nearest in space, among which views are found

@@ -431,6 +431,8 @@ class Sighted:
     aligned: np.ndarray  # (N,) bool, which of them are new
     tracks: Tracks
     counts: Counts  # of observations
+    normals_rig: np.ndarray | None = None  # (N, 3) float32, of the surface that each shows, zero =
+    # unknown; None = all are
 
 
 @dataclass(frozen=True, slots=True)

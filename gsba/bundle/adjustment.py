@@ -28,7 +28,9 @@ _LEAST = 1e-3  # times its claimed sigma: no observation is better than that
 _WIDE = 20.0  # gate in sigmas for observations whose noise is not known yet
 DRAWS = 500  # errors of all poses, that tell how those of different ones belong together
 _AT_ONCE = 1 << 18  # observations whose residuals are found together
-_REDUNDANT = 0.1  # least share of residual dimensions left over by the unknowns
+_REDUNDANT = 0.1  # least share of residual dimensions left over by the poses
+_FLAT = 1e-12  # of the information of a point, beside it: one that rays leave open has no inverse
+_LEAST_LEFT = 1e-3  # share of a residual that a point leaves over, or it says nothing of noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,34 +217,57 @@ def _noise(
     """Noise in units of the features' sigmas: robust spread of residuals over its expectation.
 
     The points are placed by least squares: under the robust loss of the adjustment they would lie
-    closer to most of their observations than the noise allows.
+    closer to most of their observations than the noise allows. A residual e of noise sigma has the
+    covariance sigma^2 (I - J (sum J^T J)^-1 J^T), J that of the observation by its point: nothing
+    of it is left along the epipolar line where a point has two observations, nearly all where it
+    has many. So each residual is taken along the direction in which the point leaves the most of
+    it, over the square root of that eigenvalue: all observations then spread alike.
 
     Args:
-        chosen: (O,) bool, observations whose spread is asked for; all share one redundancy.
+        chosen: (O,) bool, observations whose spread is asked for.
     """
-    tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
-    residuals = np.empty((len(rows), 2))
-    for first in range(0, len(rows), _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
-        points = landmarks.points_world[tracks.points[some]]
-        poses, bearings = world_T_rigs[tracks.frames[some]], keypoints.bearings_rig[rows[some]]
-        offsets = np.einsum("oji,oj->oi", poses[:, :3, :3], points - poses[:, :3, 3])
-        if keypoints.origins_rig is not None:
-            offsets -= keypoints.origins_rig[rows[some]]
-        sines = np.einsum("oij,oj->oi", tangent_basis(bearings), offsets)  # the angles are small
-        sines /= np.linalg.norm(offsets, axis=1, keepdims=True)
-        residuals[some] = _whitened(sines, keypoints, rows[some])
-    unknowns = 3 * landmarks.tracks.num_points + 6 * len(world_T_rigs)
-    redundancy = max(1 - unknowns / residuals.size, _REDUNDANT)
-    spread = 1.4826 * np.median(np.abs(residuals[chosen]))
-    return float(spread / np.sqrt(redundancy))
+    tracks = landmarks.tracks
+    num, blocks = (
+        len(tracks),
+        [slice(first, first + _AT_ONCE) for first in range(0, len(tracks), _AT_ONCE)],
+    )
+    parts = [_by_point(landmarks, keypoints, world_T_rigs, some) for some in blocks]
+    informations = np.zeros((tracks.num_points, 3, 3))
+    for some, (_, jacobians) in zip(blocks, parts, strict=True):
+        products = np.swapaxes(jacobians, 1, 2) @ jacobians
+        np.add.at(informations, tracks.points[some], products)
+    traces = np.einsum("jii->j", informations)
+    informations += (_FLAT * traces + np.finfo(float).tiny)[:, None, None] * np.eye(3)
+    covariances = np.linalg.inv(informations)
+    spread = np.empty(num)
+    for some, (residuals, jacobians) in zip(blocks, parts, strict=True):
+        taken = jacobians @ covariances[tracks.points[some]] @ np.swapaxes(jacobians, 1, 2)
+        left, directions = np.linalg.eigh(np.eye(2) - taken)
+        along = np.einsum("oi,oi->o", directions[:, :, 1], residuals)
+        spread[some] = along / np.sqrt(np.maximum(left[:, 1], _LEAST_LEFT))
+    unknowns = 6 * len(world_T_rigs)
+    redundancy = max(1 - unknowns / max(2 * num - 3 * tracks.num_points, 1), _REDUNDANT)
+    return float(1.4826 * np.median(np.abs(spread[chosen])) / np.sqrt(redundancy))
 
 
-def _whitened(residuals: np.ndarray, keypoints: Keypoints, rows: np.ndarray) -> np.ndarray:
-    """Residuals (O, 2) in radians in units of their standard deviations."""
+def _by_point(
+    landmarks: Landmarks, keypoints: Keypoints, world_T_rigs: np.ndarray, some: slice
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whitened residuals (O, 2) of some observations, and Jacobians (O, 2, 3) by the point."""
+    tracks = landmarks.tracks
+    rows = keypoints.starts[tracks.frames[some]] + tracks.keypoints[some]
+    poses, bearings = world_T_rigs[tracks.frames[some]], keypoints.bearings_rig[rows]
+    away = landmarks.points_world[tracks.points[some]] - poses[:, :3, 3]
+    offsets = np.einsum("oji,oj->oi", poses[:, :3, :3], away)
+    if keypoints.origins_rig is not None:
+        offsets -= keypoints.origins_rig[rows]
     if keypoints.sqrt_infos is None:
-        return residuals / keypoints.sigmas_rad[rows, None]
-    return np.einsum("oij,oj->oi", keypoints.sqrt_infos[rows], residuals)
+        whitening = np.eye(2) / keypoints.sigmas_rad[rows, None, None]
+    else:
+        whitening = keypoints.sqrt_infos[rows]
+    axes = whitening @ tangent_basis(bearings)  # the angles are small
+    axes /= np.linalg.norm(offsets, axis=1)[:, None, None]
+    return np.einsum("oij,oj->oi", axes, offsets), axes @ np.swapaxes(poses[:, :3, :3], 1, 2)
 
 
 def values_of(world_T_rigs: np.ndarray) -> gtsam.Values:

@@ -77,7 +77,8 @@ def guess(
     best = int(np.argmax(gains.sum(axis=1)))
     shares = gains / np.array([part.cost for part in systems])
     logger.info("lens axes: gains %s %%", (100 * shares.mean(axis=1)).round(2).tolist())
-    if not predicts(gains[best] - np.maximum(gains[0], 0)):
+    gain = gains[best] - np.maximum(gains[0], 0)
+    if not predicts(gain.sum(keepdims=True)):  # of all: no part is sure by axes held roughly so
         return LensAxes(so_far, shares[0], "they look as the panorama does", counts)
     return LensAxes(tried[best], shares[best], "", counts)
 

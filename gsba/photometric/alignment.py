@@ -11,13 +11,17 @@ from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import PatchSettings
 from gsba.frames import panorama
-from gsba.photometric import frame_jobs
+from gsba.photometric import frame_jobs, surfaces
 from gsba.photometric.references import references, visible_frames
 from gsba.store.shards import Workers
 from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
 
 _UNCERTAIN = "position too uncertain"
 _AT_ONCE = 1 << 17  # sightings that are judged together: some 80 MB
+_ENOUGH = 100  # aligned observations with which a frame does without points that no patch confirms
+_WIDER = (
+    1.4  # times a pixel: a patch's step where it lies on its surface, not merely faces its host
+)
 _LEAST_SIGMA = 0.03  # pixels: what sampling and a plane for the surface cost the best of patches
 
 _STRAIGHT = SphereField.none()
@@ -33,6 +37,18 @@ class _Observed:
     covariances: np.ndarray  # (N, 2, 2) float64, radians squared, on tangent_basis
 
 
+@dataclass(frozen=True, slots=True)
+class _Planes:
+    """Plane patches around points, as their hosts observe them."""
+
+    origins: np.ndarray  # (J, 3) unit bearings
+    spreads: np.ndarray  # (J, 3, 2) steps across them, radians
+    slopes: np.ndarray  # (J, 2) relative depth that a step adds; 0 = the patch faces its host
+    tilted: np.ndarray  # (J, 3, 2) steps on the surface, at unit distance, rig frame of the host
+    axes_world: np.ndarray  # (J, 3, 2) the same at the point, map units
+    rays_world: np.ndarray  # (J, 3) from the host to the point, map units
+
+
 def align(
     landmarks: Landmarks,
     world_T_rigs: np.ndarray,
@@ -46,11 +62,13 @@ def align(
     workers: Workers,
     field: SphereField = _STRAIGHT,
     lenses: Lenses = ONE_CENTRE,
+    normals_rig: np.ndarray | None = None,
 ) -> Sighted:
     """Observe every point anew, in the frames that should show it.
 
-    The patch around a point is cut from the middle frame of its views, as a plane facing it; poses
-    and depth carry it into others, where shift, affine part, gain and offset are found.
+    The patch around a point is cut from the middle frame of its views, as a plane that faces it or
+    lies on the surface, where that is known; poses and depth carry it into others, where shift,
+    affine part, gain and offset are found. These affine parts tell how surfaces lie.
 
     Args:
         landmarks: points and their observations so far.
@@ -65,6 +83,7 @@ def align(
         workers: who work on frames.
         field: of the camera; keypoints are as observed, the map as corrected.
         lenses: that see the points; nothing is looked for where two pictures are blended.
+        normals_rig: (N, 3) of the surfaces that keypoints show, as in `Sighted`; None = unknown.
 
     Returns:
         Tracks of aligned observations, and of former ones where a point was not aligned.
@@ -72,85 +91,88 @@ def align(
     rows = references(landmarks, world_T_rigs)
     hosts = landmarks.tracks.frames[rows].astype(np.int64)
     extended = _extended(landmarks, keypoints, aligned, settings.min_track_length)
-    origins, spreads, seeing, sightings = _expected(
-        landmarks, world_T_rigs, rows, extended, greys.width, settings, field, lenses
+    pixel = 2 * np.pi / greys.width
+    seen_normals = (
+        None if normals_rig is None else normals_rig[keypoints.rows(landmarks.tracks)[rows]]
     )
-    title = f"{name}: templates"
-    patches = frame_jobs.cut(title, greys, hosts, origins, spreads, settings, workers)
+    planes = _planes(landmarks, world_T_rigs, hosts, seen_normals, pixel, field, lenses)
+    points, seeing = visible_frames(landmarks, world_T_rigs, rows, extended, settings)
+    if lenses:
+        at, _, _ = _carried(landmarks.points_world, planes, world_T_rigs, points, seeing, lenses)
+        blended = lenses.blended(planes.origins, hosts)[points] | lenses.blended(at, seeing)
+        points, seeing = points[~blended], seeing[~blended]
+    at, across, rays = _carried(
+        landmarks.points_world, planes, world_T_rigs, points, seeing, lenses
+    )
+    sightings = expect(points, field.observed(at), across)
+    title, cut = f"{name}: templates", (planes.origins, planes.tilted)
+    patches = frame_jobs.cut(title, greys, hosts, *cut, settings, workers)
     frame_jobs.align(name, greys, seeing, patches, sightings, settings, workers)
-    kept, found, dropped = _accepted(patches, sightings, seeing, 2 * np.pi / greys.width, settings)
-    at_hosts = _at_hosts(patches, sightings, kept, hosts, origins, spreads)
-    del patches, sightings, origins, spreads  # gigabytes, of thousands of frames
+    kept, found, dropped = _accepted(patches, sightings, seeing, pixel, settings)
+    at_hosts = _at_hosts(patches, sightings, kept, hosts, planes, pixel)
+    shown = surfaces.normals(
+        sightings, kept, rays[kept], planes.slopes, planes.origins, planes.spreads
+    )
+    normals_world = np.einsum("jab,jb->ja", world_T_rigs[hosts, :3, :3], shown)
+    del patches, sightings, planes, cut, at, across, rays  # gigabytes, of thousands of frames
     former = _former(landmarks, keypoints, noise, [found, at_hosts], greys.num_frames)
     counts = Counts(len(seeing), len(found.points), "observations", dropped)
     colors = keypoints.colors[keypoints.rows(landmarks.tracks)[rows]]
-    return _pack([found, at_hosts, former], colors, greys.num_frames, rig, counts)
+    parts = [found, at_hosts, former]
+    return _pack(parts, colors, normals_world, world_T_rigs, rig, counts)
 
 
-def _expected(
+def _planes(
     landmarks: Landmarks,
     world_T_rigs: np.ndarray,
-    rows: np.ndarray,
-    extended: np.ndarray,
-    width: int,
-    settings: PatchSettings,
-    field: SphereField,
-    lenses: Lenses,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, Sightings]:
-    """Patches (directions (J, 3) and axes (J, 3, 2)) in their hosts, and where frames (R,) should
-    show them."""
-    hosts = landmarks.tracks.frames[rows].astype(np.int64)
-    points, seeing = visible_frames(landmarks, world_T_rigs, rows, extended, settings)
-    places = landmarks.points_world
-    origins, spreads, planes = _patches(places, world_T_rigs[hosts], hosts, width, field, lenses)
-    at, across = _carried(places[points], planes[points], world_T_rigs[seeing], seeing, lenses)
-    if lenses:
-        blended = lenses.blended(origins, hosts)[points] | lenses.blended(at, seeing)
-        clear = ~blended
-        points, seeing, at, across = points[clear], seeing[clear], at[clear], across[clear]
-    return origins, spreads, seeing, expect(points, field.observed(at), across)
-
-
-def _patches(
-    points_world: np.ndarray,
-    world_T_hosts: np.ndarray,
     hosts: np.ndarray,
-    width: int,
+    normals_rig: np.ndarray | None,
+    pixel: float,
     field: SphereField,
     lenses: Lenses,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Plane patches that face their hosts, one panorama pixel to a step.
+) -> _Planes:
+    """Plane patches around the points (J), as their hosts observe them.
 
-    Returns:
-        origins (J, 3), the points' unit bearings, as observed; spreads (J, 3, 2) across them;
-        the same axes (J, 3, 2) at the points, in the world.
+    Args:
+        normals_rig: (J, 3) of the surfaces, zero = unknown; None = all are.
+        pixel: of a panorama, radians.
     """
-    offsets = points_world - world_T_hosts[:, :3, 3]
+    world_T_hosts = world_T_rigs[hosts]
+    offsets = landmarks.points_world - world_T_hosts[:, :3, 3]
     local = np.einsum("jba,jb->ja", world_T_hosts[:, :3, :3], offsets)
     if lenses:
         local = lenses.seeing(local, hosts)
     depths = np.linalg.norm(local, axis=1)
     origins = field.observed(local / np.maximum(depths, 1e-300)[:, None])
-    spreads = 2 * np.pi / width * np.swapaxes(tangent_basis(origins), 1, 2)
-    planes = world_T_hosts[:, :3, :3] @ spreads * depths[:, None, None]
-    return origins, np.ascontiguousarray(spreads), planes
+    spreads = pixel * np.swapaxes(tangent_basis(origins), 1, 2)
+    slopes = np.zeros((len(origins), 2))
+    if normals_rig is not None:
+        spreads[normals_rig.any(axis=1)] *= _WIDER
+        slopes = surfaces.slopes_of(normals_rig, origins, spreads)
+    tilted = spreads + origins[:, :, None] * slopes[:, None, :]
+    away = world_T_hosts[:, :3, :3] * depths[:, None, None]
+    rays = np.einsum("jab,jb->ja", away, origins)
+    return _Planes(origins, spreads, slopes, tilted, away @ tilted, rays)
 
 
 def _carried(
     points_world: np.ndarray,
-    planes_world: np.ndarray,
+    planes: _Planes,
     world_T_rigs: np.ndarray,
+    points: np.ndarray,
     frames: np.ndarray,
     lenses: Lenses,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Plane patches (points (O, 3) and axes (O, 3, 2)) in their rigs' frames, at unit distance."""
-    rotations = world_T_rigs[:, :3, :3]
-    origins = np.einsum("oba,ob->oa", rotations, points_world - world_T_rigs[:, :3, 3])
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Patches of points (O,) in the rigs of the frames (O,) that see them, at unit distance:
+    bearings (O, 3), axes (O, 3, 2), and rays (O, 3) to them from their hosts."""
+    rotations = world_T_rigs[frames, :3, :3]
+    origins = np.einsum("oba,ob->oa", rotations, points_world[points] - world_T_rigs[frames, :3, 3])
     if lenses:
         origins = lenses.seeing(origins, frames)
-    spreads = np.einsum("oba,obc->oac", rotations, planes_world)
-    distances = np.maximum(np.linalg.norm(origins, axis=1), 1e-300)
-    return origins / distances[:, None], spreads / distances[:, None, None]
+    distances = np.maximum(np.linalg.norm(origins, axis=1), 1e-300)[:, None]
+    across = np.einsum("oba,obc->oac", rotations, planes.axes_world[points]) / distances[:, :, None]
+    rays = np.einsum("oba,ob->oa", rotations, planes.rays_world[points]) / distances
+    return origins / distances, across, rays
 
 
 def _accepted(
@@ -206,8 +228,8 @@ def _at_hosts(
     sightings: Sightings,
     kept: np.ndarray,
     hosts: np.ndarray,
-    origins: np.ndarray,
-    spreads: np.ndarray,
+    planes: _Planes,
+    pixel: float,
 ) -> _Observed:
     """Observations of the templates found again, in the frames they are from.
 
@@ -219,10 +241,10 @@ def _at_hosts(
     sums = np.bincount(templates, sightings.variances[kept], len(hosts))
     used = np.flatnonzero(times)
     of_shifts = patches.shift_covariances(used, sums[used] / times[used])
-    axes = tangent_basis(origins[used]) @ spreads[used]
+    axes = tangent_basis(planes.origins[used]) @ planes.spreads[used]
     covariances = axes @ of_shifts @ np.swapaxes(axes, 1, 2)
-    covariances += _LEAST_SIGMA**2 * np.einsum("oij,okj->oik", axes, axes)
-    return _Observed(used, hosts[used], origins[used], covariances)
+    covariances += (_LEAST_SIGMA * pixel) ** 2 * np.eye(2)
+    return _Observed(used, hosts[used], planes.origins[used], covariances)
 
 
 def _extended(
@@ -243,11 +265,18 @@ def _former(
     found: list[_Observed],
     num_frames: int,
 ) -> _Observed:
-    """The observations so far, where there are none now."""
+    """The observations so far, where there are none now.
+
+    Points that no patch confirms are kept only for frames that have few which one does.
+    """
     tracks = landmarks.tracks
     known = np.concatenate([part.points * num_frames + part.frames for part in found])
     cells = tracks.points.astype(np.int64) * num_frames + tracks.frames
-    chosen = np.flatnonzero(~np.isin(cells, known))
+    wanted = np.zeros(tracks.num_points, bool)
+    wanted[found[0].points] = True
+    scarce = np.bincount(known % num_frames, minlength=num_frames) < _ENOUGH
+    wanted[tracks.points[scarce[tracks.frames]]] = True
+    chosen = np.flatnonzero(wanted[tracks.points] & ~np.isin(cells, known))
     rows = keypoints.rows(tracks)[chosen]
     covariances = keypoints.sigmas_rad[rows, None, None] ** 2 * np.eye(2)
     if keypoints.sqrt_infos is not None:
@@ -258,7 +287,12 @@ def _former(
 
 
 def _pack(
-    parts: list[_Observed], colors: np.ndarray, num_frames: int, rig: CubeRig, counts: Counts
+    parts: list[_Observed],
+    colors: np.ndarray,
+    normals_world: np.ndarray,
+    world_T_rigs: np.ndarray,
+    rig: CubeRig,
+    counts: Counts,
 ) -> Sighted:
     """Observations, the last part being former ones, as keypoints frame by frame and as tracks.
 
@@ -273,7 +307,7 @@ def _pack(
     order = order[seen[points[order]] > 1]
     is_new = order < len(points) - len(parts[-1].points)
     points, frames, bearings = points[order], frames[order], bearings[order]
-    starts = np.searchsorted(frames, np.arange(num_frames + 1))
+    starts = np.searchsorted(frames, np.arange(len(world_T_rigs) + 1))
     faces = owner_faces(bearings)
     lower = np.linalg.cholesky(np.linalg.inv(covariances[order]))
     keypoints = Keypoints(
@@ -293,4 +327,5 @@ def _pack(
         (by_point - starts[frames[by_point]]).astype(np.int32),
         int(compact[-1]) + 1 if len(compact) else 0,
     )
-    return Sighted(keypoints, is_new, tracks, counts)
+    normals = np.einsum("oba,ob->oa", world_T_rigs[frames, :3, :3], normals_world[points])
+    return Sighted(keypoints, is_new, tracks, counts, normals.astype(np.float32))

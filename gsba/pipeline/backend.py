@@ -372,6 +372,7 @@ def _align(run: Run, world: Map, name: str) -> Sighted:
             run.store.workers,
             world.field,
             world.lenses,
+            world.normals_rig,
         )
 
     return run.stage(name, settings.model_dump(exclude={"rounds"}), compute, Sighted)
@@ -444,7 +445,8 @@ def _adjust_aligned(run: Run, prior: Prior, world: Map, sighted: Sighted, name: 
     if not solved.carries(world.solution, run.settings.rounds.min_observations):
         run.journal.undo(name)
         return None
-    return replace(world, solution=solved, observed=keypoints, aligned=sighted.aligned)
+    shown = {"aligned": sighted.aligned, "normals_rig": sighted.normals_rig}
+    return replace(world, solution=solved, observed=keypoints, **shown)
 
 
 def _straighten(run: Run, prior: Prior, world: Map, sighted: Sighted, number: int) -> Map:

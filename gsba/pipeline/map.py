@@ -26,6 +26,7 @@ class Map:
     observed: Keypoints  # what it is made of, as observed
     frame_weights: np.ndarray  # (F,) float64, of each frame's pixels; below 1 they are doubted
     aligned: np.ndarray | None = None  # (N,) bool, observations that patches have confirmed
+    normals_rig: np.ndarray | None = None  # (N, 3) of the surfaces they show, 0 = unknown
     stitching: Stitching | None = None  # with the field that corrects them; None = not looked for
     centres: LensCentres | None = None  # of the lenses that see them; None = not looked for
     axes: LensAxes | None = None  # where these look; None = not looked for

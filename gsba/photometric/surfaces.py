@@ -1,0 +1,71 @@
+"""Surfaces around points: how patches turn when seen from elsewhere tells which way they face.
+
+A patch is a plane through a point. Its template's step (x, y) lies at the relative depth
+1 + slopes @ (x, y); slopes of zero face the host. Seen from elsewhere, depth along the host's ray
+shows as a shift: so where the true slopes differ by d from those that carried the patch, the affine
+part M of its alignment is u d^T, u the image of the host's ray in template steps. All sightings of
+a template give d by least squares. A wrong slope shifts the patch, too, by its second-order
+terms: always the same way along a floor or a wall, which bends maps.
+"""
+
+import numpy as np
+
+from factors import tangent_basis
+from factors.patches import Sightings, found_at
+
+_AFFINE_SIGMA = 0.07  # of the affine part of an alignment
+_SLOPE_SIGMA = 0.7  # of the slopes of surfaces, tangents of their tilt
+_STEEPEST = 3.0  # tangent of a tilt beyond which a patch holds too little of its surface
+
+
+def slopes_of(normals_rig: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> np.ndarray:
+    """Relative depth (J, 2) that a step across each patch adds on its surface; 0 = unknown.
+
+    Args:
+        normals_rig: (J, 3) of the surfaces, any length, rig frame of the host; zero = unknown.
+        origins: (J, 3) unit bearings of the points.
+        spreads: (J, 3, 2) steps across them, radians.
+    """
+    facing = np.einsum("ji,ji->j", normals_rig, origins)
+    across = np.einsum("ji,jic->jc", normals_rig, spreads)
+    known = facing > 0
+    slopes = -across / np.where(known, facing, 1.0)[:, None]
+    steps = np.linalg.norm(spreads[:, :, 0], axis=1)
+    steepness = np.linalg.norm(slopes, axis=1) / np.maximum(steps, 1e-300)
+    slopes *= np.minimum(1.0, _STEEPEST / np.maximum(steepness, _STEEPEST))[:, None]
+    return np.where(known[:, None], slopes, 0.0)
+
+
+def normals(
+    sightings: Sightings,
+    kept: np.ndarray,
+    rays: np.ndarray,
+    slopes: np.ndarray,
+    origins: np.ndarray,
+    spreads: np.ndarray,
+) -> np.ndarray:
+    """Normals (J, 3) of the surfaces, rig frames of the hosts, by how their patches were found.
+
+    Args:
+        sightings: of the templates, aligned.
+        kept: (N,) rows of those to believe.
+        rays: (N, 3) the template's point from its host, in the frame of the seeing, in units of
+            its distance there.
+        slopes: (J, 2) that the patches were carried with.
+        origins (J, 3), spreads (J, 3, 2): the patches in their hosts, before slopes.
+
+    Returns:
+        Normals of any length, zero where too little tells.
+    """
+    there = Sightings(*(column[kept] for column in sightings))
+    axes = tangent_basis(found_at(there)[0])
+    shown = np.linalg.solve(axes @ there.spreads, axes @ rays[:, :, None])[:, :, 0]
+    affine = np.swapaxes(there.warps[:, 2:].reshape(-1, 2, 2), 1, 2)
+    pulls, weights = np.zeros_like(slopes), np.zeros(len(slopes))
+    np.add.at(pulls, there.templates, np.einsum("oij,oi->oj", affine, shown))
+    np.add.at(weights, there.templates, np.einsum("oi,oi->o", shown, shown))
+    sizes = np.linalg.norm(spreads[:, :, 0], axis=1)
+    prior = (_AFFINE_SIGMA / (_SLOPE_SIGMA * np.maximum(sizes, 1e-300))) ** 2
+    found = slopes + (pulls - prior[:, None] * slopes) / (weights + prior)[:, None]
+    gradients = np.einsum("jic,jc->ji", spreads, found) / sizes[:, None] ** 2
+    return np.where((weights > prior)[:, None], origins - gradients, 0.0)
