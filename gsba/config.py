@@ -190,6 +190,8 @@ class PatchSettings(_Settings):
     """Patches around the map's points, aligned to every frame that shows them."""
 
     rounds: int = Field(default=2, ge=0)  # of alignment and bundle adjustment; 0 = none
+    weak_rounds: int = Field(default=4, ge=0)  # at most, of a map that images hold poorly, until
+    # the steps from frame to frame have settled
     patch_size: int = Field(default=15, ge=5, le=41)  # pixels across, odd
     max_width: int = Field(default=4096, ge=64)  # of a panorama; wider ones are halved till under
     max_views: int = Field(default=16, ge=1)  # frames that a point is looked for in
@@ -203,7 +205,7 @@ class PatchSettings(_Settings):
     grey_sigma: float = Field(default=3.0, gt=0)  # noise it is weighed against, grey values
     min_contrast: float = Field(default=2.0, gt=0)  # grey values, standard deviation in a patch
     min_zncc: float = Field(default=0.75, gt=0, lt=1)  # correlation of the aligned patches
-    max_shift_px: float = Field(default=1.5, gt=0)  # from the predicted place, panorama pixels
+    max_shift_px: float = Field(default=3.0, gt=0)  # from the predicted place, panorama pixels
     max_sigma_px: float = Field(default=0.5, gt=0)  # along the worst direction
 
     @field_validator("patch_size")

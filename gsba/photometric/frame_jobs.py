@@ -14,7 +14,7 @@ from gsba.frames.panorama import Greys
 from gsba.store.shards import Workers, blocks_of_frames
 
 _WINDOW = 0.6  # standard deviation of the patch's window, part of half a patch
-_SEARCH = 3.0  # shifts followed while aligning, in largest accepted ones
+_SEARCH = 1.5  # shifts followed while aligning, in largest accepted ones
 _STEPS = 12
 _TOLERANCE = 0.02  # of the last step, pixels
 

@@ -1,5 +1,6 @@
 """The back end of a run: from matches to poses and points, and what refines these further."""
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeVar
@@ -15,6 +16,7 @@ from gsba.bundle import (
     readout,
     rotation_only,
     self_calibration,
+    settling,
     stitching,
     tracks,
     triangulation,
@@ -58,11 +60,14 @@ from gsba.types import (
     VerifiedPairs,
 )
 
+logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 _CAMERA_ROUNDS = 3  # of what aligned patches say of the camera, and the adjustment under it
+_CAMERA_SETTLES = 2  # rounds of aligning after which it needs but one adjustment in each
 _CALIBRATIONS = 10  # the same of raw lenses, at most
 _CALIBRATED = np.deg2rad(0.001)  # change of what their pixels show that is no more worth another
+_SETTLED = 1.0  # standard deviations of steps: poses that a round moves by less are left there
 _WIDE = 30.0  # gate in standard deviations of observations that a wrong camera threw off
 
 
@@ -349,7 +354,7 @@ def _adjust_under_lenses(
         if better is None:
             return world if n else None
         done, world = self_calibration.apart(world.lenses, better.lenses) < _CALIBRATED, better
-        if n + 1 >= _CAMERA_ROUNDS and done:
+        if n + 1 >= (_CAMERA_ROUNDS if number <= _CAMERA_SETTLES else 1) and done:
             break
     return world
 
@@ -476,6 +481,20 @@ def _straighten(run: Run, prior: Prior, world: Map, sighted: Sighted, number: in
     if world.stitching is not None:  # what it gained is known best from where none was
         found = replace(found, part_gains=world.stitching.part_gains)
     return replace(world, solution=found.adjustment, observed=found.keypoints, stitching=found)
+
+
+def is_settled(run: Run, prior: Prior, before: Map, world: Map, number: int) -> bool:
+    """Whether the last round of aligning patches moved steps by less than their noise."""
+
+    def compute() -> float:
+        solved, problem = world.solution, run.problem(prior)
+        known = adjustment.pose_covariances(solved, world.keypoints(run.rig), problem, prior.parts)
+        former = before.solution.world_T_rigs
+        return settling.step_motion(former, solved.world_T_rigs, *known)
+
+    moved = run.stage(f"settled_aligned{number}", run.solving_key(), compute, float)
+    logger.info("aligned %d times, steps moved by %.2f sigma", number - 1, moved)
+    return not moved > _SETTLED
 
 
 def refine_photometric(run: Run, prior: Prior, world: Map) -> Map:

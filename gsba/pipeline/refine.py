@@ -219,10 +219,15 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
         solved = backend.adjust(run, seen, prior, name, matches, solved, rounds.refined, final)
     # Below a pixel: patches, pixels, splats.
     world = replace(world, solution=solved, observed=seen.shown)
-    for n in range(1, patch_rounds + 1):
+    most, before = patch_rounds, world
+    if patch_rounds and prior.weak_frames().any():
+        most = max(patch_rounds, run.settings.patches.weak_rounds)
+    for n in range(1, most + 1):
+        if n > patch_rounds and backend.is_settled(run, prior, before, world, n):
+            break
         if n > 1:
             prior = backend.align_imu(run, prior, world.solution, f"imu_aligned{n}")
-        world = backend.align_patches(run, prior, world, n)
+        before, world = world, backend.align_patches(run, prior, world, n)
     if "photometric" in families:
         world = backend.refine_photometric(run, prior, world)
     if "splat" in families:

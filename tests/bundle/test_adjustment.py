@@ -9,13 +9,13 @@ import pytest
 from scipy.stats import chi2
 from synthetic import RIG, World, drifted, make_world
 
-from gsba.bundle import adjustment, prior_factors
+from gsba.bundle import adjustment, prior_factors, triangulation
 from gsba.bundle.adjustment import Problem
 from gsba.bundle.optimizer import OptimizeResult
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle
 from gsba.similarity import pose_similarity
-from gsba.types import Solution
+from gsba.types import Solution, Tracks
 
 SIGMA, CLAIMED = 5e-4, 3e-4  # radians: true noise of bearings, and what keypoints say of it
 GATES = (200.0, 60.0, 20.0, 8.0, 8.0)  # in claimed sigmas: the start is some 5 degrees off
@@ -111,6 +111,26 @@ def test_the_noise_is_estimated(families: str, seed: int) -> None:
     """To 8 %: it comes out some 5 % small on these worlds."""
     _, _, solved, _ = _solved(families, seed)
     assert solved.noise * CLAIMED == pytest.approx(SIGMA, rel=0.08)
+
+
+@pytest.mark.parametrize("length", [2, 3, 5])
+def test_the_noise_does_not_depend_on_the_length_of_tracks(length: int) -> None:
+    """Points seen twice leave residuals across the epipolar line alone, half of these each."""
+    world = make_world(
+        0, num_points=6000, sigma_rad=SIGMA, claimed_sigma_rad=CLAIMED, false_share=0
+    )
+    tracks, true = world.tracks, world.world_T_rigs
+    firsts = np.searchsorted(tracks.points, tracks.points)
+    kept = np.arange(len(tracks)) - firsts < length
+    short = Tracks(
+        tracks.points[kept], tracks.frames[kept], tracks.keypoints[kept], tracks.num_points
+    )
+    limits = RefineSettings().triangulate
+    placed = triangulation.place(short, world.keypoints, true, 100.0, limits)
+    freedom = 2 * len(placed.tracks) - 3 * placed.tracks.num_points
+    redundancy = 1 - 6 * len(true) / freedom  # poses that are known take nothing
+    noise = adjustment._noise(placed, world.keypoints, true) * np.sqrt(redundancy)
+    assert noise * CLAIMED == pytest.approx(SIGMA, rel=0.03)
 
 
 def test_the_noise_does_not_depend_on_the_loss() -> None:

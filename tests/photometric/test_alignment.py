@@ -293,3 +293,57 @@ def test_cube_faces_are_aligned_like_panoramas(walk, tmp_path: Path) -> None:
     edge = np.abs(pixels - 0.5).max(axis=1) > 0.47
     assert len(errors) > 900 and np.median(errors) < 0.08
     assert np.count_nonzero(edge) > 50 and np.median(errors[edge]) < 0.1
+
+
+def _walls(centre: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays (..., 3) hit the walls of a corridor along x, and their normals, outwards."""
+    ranges = (np.sign(rays[..., 1:]) - centre[1:]) / rays[..., 1:]
+    nearest = ranges.argmin(axis=-1)
+    hits = centre + np.take_along_axis(ranges, nearest[..., None], axis=-1) * rays
+    return hits, np.sign(rays) * np.eye(3)[1 + nearest]
+
+
+def test_patches_come_to_lie_on_their_surfaces(tmp_path: Path) -> None:
+    """Walls that pass by askew: found once as if they faced the host, then as they lie."""
+    rng, rays, paths = np.random.default_rng(3), _bearings(WIDTH), []
+    world_T_rigs = np.tile(np.eye(4), (NUM, 1, 1))
+    world_T_rigs[:, 0, 3] = np.linspace(-0.75, 0.75, NUM)
+    for f, centre in enumerate(world_T_rigs[:, :3, 3]):
+        image = _grey(2.5 * _walls(centre, rays)[0]) + rng.normal(0, 2, rays.shape[:2])
+        paths.append((tmp_path / f"{f}.png",))
+        cv2.imwrite(str(paths[-1][0]), np.clip(image, 0, 255))
+    names, times = tuple(map(str, range(NUM))), np.arange(NUM, dtype=float)
+    frames = FrameSet(names, tuple(paths), times, "erp", (), WIDTH, WIDTH // 2, (None,) * NUM)
+    landmarks, keypoints = _start(world_T_rigs, num=800)
+    outwards = landmarks.points_world * np.array([0.4, 1, 1])  # towards the walls beside the walk
+    points, true = _walls(np.zeros(3), outwards / np.linalg.norm(outwards, axis=1, keepdims=True))
+    clear = np.sort(np.abs(points[:, 1:]), axis=1)[:, 0] < 0.7  # of the corridor's edges
+    landmarks = replace(landmarks, points_world=points)
+    tracks, errors, normals = landmarks.tracks, [], None
+    bearings = keypoints.bearings_rig.copy()
+    for f in range(NUM):
+        rows = np.flatnonzero(tracks.frames == f)
+        towards = points[tracks.points[rows]]
+        bearings[keypoints.rows(tracks)[rows]] = bearings_of(towards, world_T_rigs[f])
+    keypoints = replace(keypoints, bearings_rig=bearings)
+    for _ in range(2):
+        given = landmarks, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None
+        found = alignment.align(*given, SETTINGS, Threads(2), normals_rig=normals)
+        own = found.keypoints.rows(found.tracks)
+        where, there = found.keypoints.bearings_rig[own], found.tracks.frames
+        shown = [_walls(world_T_rigs[f, :3, 3], b) for f, b in zip(there, where, strict=True)]
+        hits, walls = (np.array(column) for column in zip(*shown, strict=True))
+        apart = np.linalg.norm(hits[:, None] - points, axis=2)
+        nearest = apart.argmin(axis=1)
+        good = clear[nearest] & found.aligned[own] & (apart.min(axis=1) < 0.1)
+        wanted = points[nearest] - world_T_rigs[there, :3, 3]
+        wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
+        errors.append(np.median(np.linalg.norm(where - wanted, axis=1)[good]) / PIXEL)
+        lies = found.normals_rig[own][good]
+        known = lies.any(axis=1)
+        cosines = np.einsum("oi,oi->o", lies[known], walls[good][known])
+        tilts = np.degrees(np.arccos(np.clip(cosines / np.linalg.norm(lies[known], axis=1), -1, 1)))
+        assert known.mean() > 0.8 and np.median(tilts) < 15
+        normals = np.zeros_like(keypoints.bearings_rig)
+        normals[keypoints.rows(tracks)] = true[tracks.points]
+    assert errors[1] < 0.7 * errors[0]
