@@ -90,35 +90,24 @@ def align(
     """
     rows = references(landmarks, world_T_rigs)
     hosts = landmarks.tracks.frames[rows].astype(np.int64)
+    own, pixel = keypoints.rows(landmarks.tracks)[rows], 2 * np.pi / greys.width
+    normals = np.zeros((len(rows), 3)) if normals_rig is None else normals_rig[own]
+    planes = _planes(landmarks, world_T_rigs, hosts, normals, pixel, field, lenses)
     extended = _extended(landmarks, keypoints, aligned, settings.min_track_length)
-    pixel = 2 * np.pi / greys.width
-    seen_normals = (
-        None if normals_rig is None else normals_rig[keypoints.rows(landmarks.tracks)[rows]]
-    )
-    planes = _planes(landmarks, world_T_rigs, hosts, seen_normals, pixel, field, lenses)
-    points, seeing = visible_frames(landmarks, world_T_rigs, rows, extended, settings)
-    if lenses:
-        at, _, _ = _carried(landmarks.points_world, planes, world_T_rigs, points, seeing, lenses)
-        blended = lenses.blended(planes.origins, hosts)[points] | lenses.blended(at, seeing)
-        points, seeing = points[~blended], seeing[~blended]
-    at, across, rays = _carried(
-        landmarks.points_world, planes, world_T_rigs, points, seeing, lenses
-    )
+    views = visible_frames(landmarks, world_T_rigs, rows, extended, settings)
+    points, seeing = _unblended(landmarks, planes, world_T_rigs, hosts, *views, lenses)
+    at, across, rays = _carried(landmarks, planes, world_T_rigs, points, seeing, lenses)
     sightings = expect(points, field.observed(at), across)
     title, cut = f"{name}: templates", (planes.origins, planes.tilted)
     patches = frame_jobs.cut(title, greys, hosts, *cut, settings, workers)
     frame_jobs.align(name, greys, seeing, patches, sightings, settings, workers)
     kept, found, dropped = _accepted(patches, sightings, seeing, pixel, settings)
     at_hosts = _at_hosts(patches, sightings, kept, hosts, planes, pixel)
-    shown = surfaces.normals(
-        sightings, kept, rays[kept], planes.slopes, planes.origins, planes.spreads
-    )
-    normals_world = np.einsum("jab,jb->ja", world_T_rigs[hosts, :3, :3], shown)
+    normals_world = _normals_world(sightings, kept, rays, planes, world_T_rigs[hosts])
     del patches, sightings, planes, cut, at, across, rays  # gigabytes, of thousands of frames
     former = _former(landmarks, keypoints, noise, [found, at_hosts], greys.num_frames)
+    parts, colors = [found, at_hosts, former], keypoints.colors[own]
     counts = Counts(len(seeing), len(found.points), "observations", dropped)
-    colors = keypoints.colors[keypoints.rows(landmarks.tracks)[rows]]
-    parts = [found, at_hosts, former]
     return _pack(parts, colors, normals_world, world_T_rigs, rig, counts)
 
 
@@ -126,7 +115,7 @@ def _planes(
     landmarks: Landmarks,
     world_T_rigs: np.ndarray,
     hosts: np.ndarray,
-    normals_rig: np.ndarray | None,
+    normals_rig: np.ndarray,
     pixel: float,
     field: SphereField,
     lenses: Lenses,
@@ -134,7 +123,7 @@ def _planes(
     """Plane patches around the points (J), as their hosts observe them.
 
     Args:
-        normals_rig: (J, 3) of the surfaces, zero = unknown; None = all are.
+        normals_rig: (J, 3) of the surfaces, zero = unknown.
         pixel: of a panorama, radians.
     """
     world_T_hosts = world_T_rigs[hosts]
@@ -145,18 +134,33 @@ def _planes(
     depths = np.linalg.norm(local, axis=1)
     origins = field.observed(local / np.maximum(depths, 1e-300)[:, None])
     spreads = pixel * np.swapaxes(tangent_basis(origins), 1, 2)
-    slopes = np.zeros((len(origins), 2))
-    if normals_rig is not None:
-        spreads[normals_rig.any(axis=1)] *= _WIDER
-        slopes = surfaces.slopes_of(normals_rig, origins, spreads)
+    spreads[normals_rig.any(axis=1)] *= _WIDER
+    slopes = surfaces.slopes_of(normals_rig, origins, spreads)
     tilted = spreads + origins[:, :, None] * slopes[:, None, :]
     away = world_T_hosts[:, :3, :3] * depths[:, None, None]
     rays = np.einsum("jab,jb->ja", away, origins)
     return _Planes(origins, spreads, slopes, tilted, away @ tilted, rays)
 
 
+def _unblended(
+    landmarks: Landmarks,
+    planes: _Planes,
+    world_T_rigs: np.ndarray,
+    hosts: np.ndarray,
+    points: np.ndarray,
+    frames: np.ndarray,
+    lenses: Lenses,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of views of points (O,) in frames (O,), those clear of where two pictures are blended."""
+    if not lenses:
+        return points, frames
+    at, _, _ = _carried(landmarks, planes, world_T_rigs, points, frames, lenses)
+    clear = ~(lenses.blended(planes.origins, hosts)[points] | lenses.blended(at, frames))
+    return points[clear], frames[clear]
+
+
 def _carried(
-    points_world: np.ndarray,
+    landmarks: Landmarks,
     planes: _Planes,
     world_T_rigs: np.ndarray,
     points: np.ndarray,
@@ -166,7 +170,8 @@ def _carried(
     """Patches of points (O,) in the rigs of the frames (O,) that see them, at unit distance:
     bearings (O, 3), axes (O, 3, 2), and rays (O, 3) to them from their hosts."""
     rotations = world_T_rigs[frames, :3, :3]
-    origins = np.einsum("oba,ob->oa", rotations, points_world[points] - world_T_rigs[frames, :3, 3])
+    away = landmarks.points_world[points] - world_T_rigs[frames, :3, 3]
+    origins = np.einsum("oba,ob->oa", rotations, away)
     if lenses:
         origins = lenses.seeing(origins, frames)
     distances = np.maximum(np.linalg.norm(origins, axis=1), 1e-300)[:, None]
@@ -245,6 +250,19 @@ def _at_hosts(
     covariances = axes @ of_shifts @ np.swapaxes(axes, 1, 2)
     covariances += (_LEAST_SIGMA * pixel) ** 2 * np.eye(2)
     return _Observed(used, hosts[used], planes.origins[used], covariances)
+
+
+def _normals_world(
+    sightings: Sightings,
+    kept: np.ndarray,
+    rays: np.ndarray,
+    planes: _Planes,
+    world_T_hosts: np.ndarray,
+) -> np.ndarray:
+    """Normals (J, 3) of the surfaces that patches turned out to lie on, zero = unknown."""
+    laid = planes.slopes, planes.origins, planes.spreads
+    shown = surfaces.normals(sightings, kept, rays[kept], *laid)
+    return np.einsum("jab,jb->ja", world_T_hosts[:, :3, :3], shown)
 
 
 def _extended(

@@ -1,6 +1,5 @@
 """The back end of a run: from matches to poses and points, and what refines these further."""
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeVar
@@ -16,7 +15,6 @@ from gsba.bundle import (
     readout,
     rotation_only,
     self_calibration,
-    settling,
     stitching,
     tracks,
     triangulation,
@@ -29,7 +27,6 @@ from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.readout import Readout
 from gsba.bundle.reconstruction import assemble, world_scale
 from gsba.bundle.self_calibration import SelfCalibration
-from gsba.bundle.stitching import Stitching
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.optics import Optics
 from gsba.camera.views import scenes_around
@@ -39,7 +36,7 @@ from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.merged_map import Registered, follow
 from gsba.matching import correspondences
-from gsba.photometric import alignment, direct
+from gsba.photometric import direct
 from gsba.photometric.direct import PhotometricResult
 from gsba.pipeline.frontend import Seen
 from gsba.pipeline.map import Map
@@ -54,20 +51,13 @@ from gsba.types import (
     Matches,
     PoseStatus,
     Reconstruction,
-    Sighted,
     Solution,
     Tracks,
     VerifiedPairs,
 )
 
-logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
-_CAMERA_ROUNDS = 3  # of what aligned patches say of the camera, and the adjustment under it
-_CAMERA_SETTLES = 2  # rounds of aligning after which it needs but one adjustment in each
-_CALIBRATIONS = 10  # the same of raw lenses, at most
-_CALIBRATED = np.deg2rad(0.001)  # change of what their pixels show that is no more worth another
-_SETTLED = 1.0  # standard deviations of steps: poses that a round moves by less are left there
 _WIDE = 30.0  # gate in standard deviations of observations that a wrong camera threw off
 
 
@@ -227,10 +217,11 @@ def _of_matches(
         noise = solved.noise * gate / settings.rounds.gate_scale
         return found(replace(solved, landmarks=placed, noise=noise))
 
-    return run.stage(name, _camera_key(run), compute, returns, noted=noted)
+    return run.stage(name, camera_key(run), compute, returns, noted=noted)
 
 
-def _camera_key(run: Run) -> list[object]:
+def camera_key(run: Run) -> list[object]:
+    """Settings that what is found of the camera rests on."""
     camera = run.settings.camera
     said = camera.model_dump(exclude={"name", "baseline_mm", "readout_ms"})
     return [run.solving_key(), said, camera.readout(), camera.nearness(1.0), run.settings.seed]
@@ -328,175 +319,6 @@ def align_imu(
     return replace(prior, gyro=found, turning=turning_of(readings, found, times))
 
 
-def align_patches(run: Run, prior: Prior, world: Map, number: int) -> Map:
-    """Patches around the map's points aligned to its frames, solved, straightened.
-
-    The map stays as it was where that explains less.
-    """
-    sighted = _align(run, world, f"align{number}")
-    better = _adjust_under_lenses(run, prior, world, sighted, number)
-    if better is None:
-        return world
-    return _straighten(run, prior, better, sighted, number)
-
-
-def _adjust_under_lenses(
-    run: Run, prior: Prior, world: Map, sighted: Sighted, number: int
-) -> Map | None:
-    """Bundle adjustment of aligned observations, the camera found from them beside it."""
-    name = f"aligned{number}"
-    if not world.lenses:
-        return _adjust_aligned(run, prior, world, sighted, name)
-    for n in range(_CALIBRATIONS):
-        prior = align_imu(run, prior, world.solution, f"imu_{name}_{n}", with_noise=False)
-        seen = _see_anew(run, prior, world, sighted, name, n)
-        better = _adjust_aligned(run, prior, seen, sighted, f"{name}_{n}" if n else name)
-        if better is None:
-            return world if n else None
-        done, world = self_calibration.apart(world.lenses, better.lenses) < _CALIBRATED, better
-        if n + 1 >= (_CAMERA_ROUNDS if number <= _CAMERA_SETTLES else 1) and done:
-            break
-    return world
-
-
-def _align(run: Run, world: Map, name: str) -> Sighted:
-    """Points observed anew."""
-    settings, solved = run.settings.patches, world.solution
-
-    def compute() -> Sighted:
-        return alignment.align(
-            solved.landmarks,
-            solved.world_T_rigs,
-            world.observed,
-            solved.noise,
-            run.greys,
-            run.rig,
-            name,
-            world.aligned,
-            settings,
-            run.store.workers,
-            world.field,
-            world.lenses,
-            world.normals_rig,
-        )
-
-    return run.stage(name, settings.model_dump(exclude={"rounds"}), compute, Sighted)
-
-
-def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, number: int) -> Map:
-    """The map with the camera that aligned patches ask for; its poses are yet to follow."""
-
-    def placed_anew() -> tuple[Solution, Keypoints]:
-        there = replace(sighted, keypoints=world.rays(sighted.keypoints, run.rig))
-        there = adjustment.calibrate(there, world.solution, run.settings)
-        placed = triangulation.place(
-            there.tracks,
-            there.keypoints,
-            world.solution.world_T_rigs,
-            run.settings.rounds.aligned[0],
-            run.settings.triangulate,
-            run.num_threads,
-        )
-        return replace(world.solution, noise=1.0, landmarks=placed), there.keypoints
-
-    def axes() -> LensAxes:
-        solved, keypoints = placed_anew()
-        problem = run.problem(prior)
-        return lens_axes.loosened(solved.landmarks, keypoints, solved, world.lenses, problem)
-
-    shown = stitching.corrected(sighted.keypoints, world.field, run.rig).bearings_rig
-    times = run.frames.timestamps
-
-    def rows() -> Readout:
-        solved, keypoints = placed_anew()
-        around, problem = solved.landmarks, run.problem(prior)
-        return readout.estimate(around, keypoints, shown, solved, world.lenses, times, problem)
-
-    def settle() -> Readout:
-        solved, keypoints = placed_anew()
-        problem = run.problem(prior)
-        return CameraSystem(solved, keypoints, shown, world.seeing(), times, problem).step()
-
-    def lenses() -> SelfCalibration:
-        solved, keypoints = placed_anew()
-        around, problem = solved.landmarks, run.problem(prior)
-        return self_calibration.estimate(around, keypoints, shown, solved, world.lenses, problem)
-
-    key = _camera_key(run)
-    if number == 0 and world.lenses.twists is None:
-        world = world.read(run.stage(f"readout_{name}", key, rows, Readout))
-    raw = run.frames.fisheyes is not None
-    if number == 1 and raw and world.lenses.fisheyes is None:  # the rest has settled
-        known = run.stage(f"calibrated_{name}", key, lenses, SelfCalibration)
-        world = replace(world, calibrated=known)
-        world = world.read(replace(world.seeing(), lenses=known.lenses))
-    if number == 1 and not raw and world.lenses.axes is None:
-        found = run.stage(f"axes_{name}", key, axes, LensAxes)
-        world = replace(world, axes=found).read(replace(world.seeing(), lenses=found.lenses))
-    return world.read(run.stage(f"camera_{name}_{number}", key, settle, Readout, noted=False))
-
-
-def _adjust_aligned(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str) -> Map | None:
-    """Bundle adjustment of aligned observations; None where that explains less."""
-    gates = run.settings.rounds.aligned
-
-    def compute() -> tuple[Solution, Keypoints]:
-        there = replace(sighted, keypoints=world.rays(sighted.keypoints, run.rig))
-        solved, found = adjustment.adjust_sighted(there, world.solution, run.problem(prior), gates)
-        return solved, stitching.with_noise_of(sighted.keypoints, found)
-
-    key = [run.solving_key(), gates]
-    solved, keypoints = run.stage(name, key, compute, tuple[Solution, Keypoints])
-    if not solved.carries(world.solution, run.settings.rounds.min_observations):
-        run.journal.undo(name)
-        return None
-    shown = {"aligned": sighted.aligned, "normals_rig": sighted.normals_rig}
-    return replace(world, solution=solved, observed=keypoints, **shown)
-
-
-def _straighten(run: Run, prior: Prior, world: Map, sighted: Sighted, number: int) -> Map:
-    """The map with what stitching bends taken out, where all frames share it."""
-    name, settings = f"stitching{number}", run.settings
-    looked_for = number == 1 or world.field
-    if settings.stitching.mode == "off" or run.frames.layout != "erp" or not looked_for:
-        return world
-
-    def compute() -> Stitching:
-        return stitching.estimate(
-            sighted,
-            world.observed,
-            world.solution,
-            world.field,
-            run.problem(prior),
-            world.lenses,
-        )
-
-    key = [run.solving_key(), settings.stitching, settings.rounds.aligned]
-    found = run.stage(name, key, compute, Stitching)
-    if not found.field:
-        return replace(world, stitching=found)
-    if not found.adjustment.carries(world.solution, settings.rounds.min_observations):
-        run.journal.undo(name)
-        return world
-    if world.stitching is not None:  # what it gained is known best from where none was
-        found = replace(found, part_gains=world.stitching.part_gains)
-    return replace(world, solution=found.adjustment, observed=found.keypoints, stitching=found)
-
-
-def is_settled(run: Run, prior: Prior, before: Map, world: Map, number: int) -> bool:
-    """Whether the last round of aligning patches moved steps by less than their noise."""
-
-    def compute() -> float:
-        solved, problem = world.solution, run.problem(prior)
-        known = adjustment.pose_covariances(solved, world.keypoints(run.rig), problem, prior.parts)
-        former = before.solution.world_T_rigs
-        return settling.step_motion(former, solved.world_T_rigs, *known)
-
-    moved = run.stage(f"settled_aligned{number}", run.solving_key(), compute, float)
-    logger.info("aligned %d times, steps moved by %.2f sigma", number - 1, moved)
-    return not moved > _SETTLED
-
-
 def refine_photometric(run: Run, prior: Prior, world: Map) -> Map:
     """Joint refinement by the observations so far and the grey values of patches."""
     key = [run.solving_key(), run.settings.photometric]
@@ -549,7 +371,7 @@ def measure_camera(run: Run, prior: Prior, world: Map) -> Map:
         )
         return system.covariances(prior.parts)
 
-    found = run.stage("camera", _camera_key(run), compute, CameraCovariances, noted=False)
+    found = run.stage("camera", camera_key(run), compute, CameraCovariances, noted=False)
     centres = replace(world.centres, covariance=found.centre)
     read = replace(world.seeing(), readout_sigma=found.readout_sigma)
     return replace(world, centres=centres, covariances=found).read(read)

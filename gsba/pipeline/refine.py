@@ -20,7 +20,7 @@ from gsba.loop_closure import connectivity
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
 from gsba.photometric import direct
-from gsba.pipeline import backend, frontend, inputs, outputs
+from gsba.pipeline import backend, frontend, inputs, outputs, patch_rounds
 from gsba.pipeline.frontend import Seen
 from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
@@ -187,7 +187,6 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
         GsbaError: images that do not match, or that contradict the trajectory.
     """
     rounds, families = run.settings.rounds, run.settings.direct_families()
-    patch_rounds = run.settings.patches.rounds
     # Neighbours in time, and what they say of the trajectory and its clock.
     prior, near = frontend.match_neighbours(run, seen, prior, given)
     prior, near = frontend.judge_trajectory(run, seen, prior, near)
@@ -214,20 +213,12 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     # The map matched anew from itself.
     for n in range(1, rounds.map_passes + 1):
         wide = frontend.match_known_points(run, seen, solved, f"everywhere{n}")
-        name, final = f"refined{n}", n == rounds.map_passes and patch_rounds == 0
+        name, final = f"refined{n}", n == rounds.map_passes and not run.settings.patches.rounds
         matches = [along, wide]
         solved = backend.adjust(run, seen, prior, name, matches, solved, rounds.refined, final)
     # Below a pixel: patches, pixels, splats.
     world = replace(world, solution=solved, observed=seen.shown)
-    most, before = patch_rounds, world
-    if patch_rounds and prior.weak_frames().any():
-        most = max(patch_rounds, run.settings.patches.weak_rounds)
-    for n in range(1, most + 1):
-        if n > patch_rounds and backend.is_settled(run, prior, before, world, n):
-            break
-        if n > 1:
-            prior = backend.align_imu(run, prior, world.solution, f"imu_aligned{n}")
-        before, world = world, backend.align_patches(run, prior, world, n)
+    prior, world = patch_rounds.align(run, prior, world)
     if "photometric" in families:
         world = backend.refine_photometric(run, prior, world)
     if "splat" in families:
