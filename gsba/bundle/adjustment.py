@@ -226,21 +226,19 @@ def _noise(
     Args:
         chosen: (O,) bool, observations whose spread is asked for.
     """
-    tracks = landmarks.tracks
-    num, blocks = (
-        len(tracks),
-        [slice(first, first + _AT_ONCE) for first in range(0, len(tracks), _AT_ONCE)],
-    )
-    parts = [_by_point(landmarks, keypoints, world_T_rigs, some) for some in blocks]
+    tracks, num = landmarks.tracks, len(landmarks.tracks)
+    blocks = [slice(first, first + _AT_ONCE) for first in range(0, num, _AT_ONCE)]
     informations = np.zeros((tracks.num_points, 3, 3))
-    for some, (_, jacobians) in zip(blocks, parts, strict=True):
+    for some in blocks:
+        _, jacobians = _by_point(landmarks, keypoints, world_T_rigs, some)
         products = np.swapaxes(jacobians, 1, 2) @ jacobians
         np.add.at(informations, tracks.points[some], products)
     traces = np.einsum("jii->j", informations)
     informations += (_FLAT * traces + np.finfo(float).tiny)[:, None, None] * np.eye(3)
     covariances = np.linalg.inv(informations)
     spread = np.empty(num)
-    for some, (residuals, jacobians) in zip(blocks, parts, strict=True):
+    for some in blocks:  # found anew: of all they would take gigabytes
+        residuals, jacobians = _by_point(landmarks, keypoints, world_T_rigs, some)
         taken = jacobians @ covariances[tracks.points[some]] @ np.swapaxes(jacobians, 1, 2)
         left, directions = np.linalg.eigh(np.eye(2) - taken)
         along = np.einsum("oi,oi->o", directions[:, :, 1], residuals)

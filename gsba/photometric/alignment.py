@@ -19,9 +19,7 @@ from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
 _UNCERTAIN = "position too uncertain"
 _AT_ONCE = 1 << 17  # sightings that are judged together: some 80 MB
 _ENOUGH = 100  # aligned observations with which a frame does without points that no patch confirms
-_WIDER = (
-    1.4  # times a pixel: a patch's step where it lies on its surface, not merely faces its host
-)
+_WIDER = 1.4  # pixels to a step of patches that lie on their surfaces; 1 of those facing the host
 _LEAST_SIGMA = 0.03  # pixels: what sampling and a plane for the surface cost the best of patches
 
 _STRAIGHT = SphereField.none()
