@@ -1,6 +1,7 @@
 """Commands that refine: `refine`, `demo`, `show-config`."""
 
 import json
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -97,14 +98,23 @@ def refine(
         Path,
         typer.Argument(help="Folder of 2:1 panoramas, raw fisheyes or cube faces, or a video."),
     ],
-    out: Annotated[Path, typer.Option(help="Folder of the run.", metavar="RUN")],
     trajectory: Annotated[
         list[Path] | None,
-        typer.Argument(help="TUM, KITTI or stella_vslam map.msg; several are pieces of one run."),
+        typer.Argument(
+            help="TUM, KITTI or stella_vslam map.msg; several are pieces of one run; without one "
+            "the start is found from the images."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the run; default: the name of the video, or FRAMES-run.", metavar="RUN"
+        ),
     ] = None,
     keyframes: Keyframes = None,
     no_trajectory: Annotated[
-        bool, typer.Option("--no-trajectory", help="Start from the images alone.")
+        bool,
+        typer.Option("--no-trajectory", help="Start from the images alone, as without TRAJECTORY."),
     ] = False,
     config: Config = None,
     overrides: Overrides = None,
@@ -132,10 +142,11 @@ def refine(
 
     The exit code is 3 where less than nine tenths of the frames are in the map that is exported.
     """
-    if (not trajectory) != no_trajectory:
-        raise GsbaError("give either a TRAJECTORY or --no-trajectory")
-    if keyframes is not None and no_trajectory:
+    if trajectory and no_trajectory:
+        raise GsbaError("a TRAJECTORY and --no-trajectory exclude each other: leave one out")
+    if keyframes is not None and not trajectory:
         raise GsbaError("--keyframes go with the TRAJECTORY of the same run")
+    out = out or _run_folder(frames)
     overrides = [*_networks(weights, accept_noncommercial, download), *(overrides or ())]
     if camera is not None:
         overrides = [*overrides, f'camera.name="{camera}"']
@@ -148,6 +159,16 @@ def refine(
     with connected(cluster) as client:
         result = pipeline.refine(frames, trajectory, out, settings, client=client, **given)
     _conclude([result], allow_partial)
+
+
+def _run_folder(frames: Path) -> Path:
+    """Folder of a run, in the working folder, named after its frames or its video."""
+    name = frames.resolve().stem if frames.is_file() else f"{frames.resolve().name}-run"
+    folder = Path(name)
+    if folder.resolve() == frames.resolve() or folder.is_file():
+        folder = Path(f"{name}-run")
+    logging.getLogger(__name__).info("results go to %s", folder)
+    return folder
 
 
 def _conclude(results: "Sequence[RunResult]", allow_partial: bool) -> None:

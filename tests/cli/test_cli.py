@@ -229,3 +229,39 @@ def test_garbage_is_collected_again_after_loading() -> None:
         assert not gc.isenabled()
         raise ImportError
     assert gc.isenabled()
+
+
+@pytest.fixture
+def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[object, ...]]:
+    """Frames, trajectory and folder of every call of `refine`, in place of a run."""
+    calls: list[tuple[object, ...]] = []
+
+    def record(*given: object, **_: object) -> None:
+        calls.append(given[:3])
+        raise GsbaError("recorded")
+
+    stub = types.ModuleType("gsba.pipeline")
+    setattr(stub, "refine", record)  # noqa: B010
+    monkeypatch.setitem(sys.modules, "gsba.pipeline", stub)
+    monkeypatch.setattr(gsba, "pipeline", stub, raising=False)
+    monkeypatch.chdir(tmp_path)
+    return calls
+
+
+def test_refine_needs_no_more_than_a_folder_or_a_video(
+    runs: list[tuple[object, ...]], tmp_path: Path
+) -> None:
+    (tmp_path / "clips").mkdir()
+    (tmp_path / "clips/walk.mp4").touch()
+    (tmp_path / "clips/walk").touch()
+    (tmp_path / "bare").touch()
+    for frames in ("frames", ".", "clips/walk.mp4", "clips/walk", "bare"):
+        _gsba("refine", frames)
+    folders = ["frames-run", f"{tmp_path.name}-run", "walk", "walk", "bare-run"]
+    assert [(trajectory, str(out)) for _, trajectory, out in runs] == [(None, f) for f in folders]
+
+
+def test_a_trajectory_and_none_are_not_both(runs: list[tuple[object, ...]]) -> None:
+    _fails(_gsba("refine", "frames", "slam.tum", "--no-trajectory"), "exclude each other")
+    _fails(_gsba("refine", "frames", "--keyframes", "k.tum"), "--keyframes go with the TRAJECTORY")
+    assert not runs
