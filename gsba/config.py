@@ -313,6 +313,7 @@ class SolverSettings(_Settings):
 
     max_iterations: int = Field(default=50, ge=1)
     relative_tolerance: float = Field(default=1e-5, gt=0, lt=1)  # least decrease of the cost
+    absolute_tolerance: float = Field(default=0.05, gt=0)  # the same, squared standard deviations
     loss: Literal["none", "huber", "cauchy", "geman_mcclure"] = "cauchy"
     loss_sigmas: float = Field(default=1.0, gt=0)  # scale of the loss, standard deviations
     lambda_initial: float = Field(default=1e-4, gt=0)  # damping, part of the diagonal

@@ -150,7 +150,8 @@ def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
     """Settings of a round: only the last of a run is solved to the end."""
     if last or settings.rounds.tolerance < settings.solver.relative_tolerance:
         return settings.solver
-    return settings.solver.model_copy(update={"relative_tolerance": settings.rounds.tolerance})
+    looser = {"relative_tolerance": settings.rounds.tolerance, "absolute_tolerance": np.inf}
+    return settings.solver.model_copy(update=looser)
 
 
 def landmark_block(

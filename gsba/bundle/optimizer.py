@@ -20,7 +20,8 @@ logger = logging.getLogger(__name__)
 
 _MAX_DAMPING = 1e10
 _MIN_DAMPING = 1e-12
-_FREE_DAMPING = 1e-2  # a small step says nothing about convergence where damping made it small
+_FREE_DAMPING = 1e-6  # part of the diagonal; a small step says nothing about convergence where
+# damping made it small, and a long chain of frames bends by modes this weak
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +119,7 @@ def optimize(
     damping = _Damping(settings.lambda_initial)
     history.add(values, cost, costs, damping.value, True)
     for _ in range(settings.max_iterations):
-        negligible = settings.relative_tolerance * cost
+        negligible = min(settings.relative_tolerance * cost, settings.absolute_tolerance)
         used = damping.value
         trial, trial_cost, predicted = _attempt(system, values, used)
         if not trial_cost <= cost:  # also where it is not a number
@@ -138,7 +139,7 @@ def optimize(
         cost = sum(costs.values())
         history.add(values, cost, costs, used, True)
         if converged:
-            return result(True, f"relative decrease below {settings.relative_tolerance:g}")
+            return result(True, f"decrease below {negligible:.3g}")
     return result(False, "iteration limit")
 
 

@@ -24,6 +24,8 @@ _SIGNIFICANT = 4.0  # standard deviations of the duration, or none was found
 _OWN_TURN = np.deg2rad(0.12)  # rotation during a readout, standard deviation per axis
 _UNTURNED = np.deg2rad(0.005)  # the same where a stabiliser took it out of every row
 _OWN_MOVE = 0.3  # the same of a translation about what velocities say, part of a typical one
+_ROW_SCALE_SIGMA = 0.03  # relative; a stitched picture does not tell the distortion and the field
+# of view of its lenses, on which it hangs how many rows lie between two directions
 _AXES = np.eye(3)[:2]
 
 
@@ -91,6 +93,16 @@ def estimate(
         return replace(found, reason="rows are read the other way than camera.sweep says")
     twists = abs(duration) * motion
     return replace(found, lenses=replace(lenses, sweeps=sign * ways[best], twists=twists))
+
+
+def total_sigma(found: Readout, sigma: float) -> float:
+    """Standard deviation of the duration, seconds, with that of the scale of rows.
+
+    Args:
+        sigma: by the covariance of the adjustment, in which rows are known exactly.
+    """
+    scale_sigma = 0.0 if found.lenses.cut_by is not None else _ROW_SCALE_SIGMA
+    return float(np.hypot(sigma, scale_sigma * found.readout_s))
 
 
 def own_sigmas(found: Readout, motion: np.ndarray) -> np.ndarray:

@@ -373,7 +373,8 @@ def measure_camera(run: Run, prior: Prior, world: Map) -> Map:
 
     found = run.stage("camera", camera_key(run), compute, CameraCovariances, noted=False)
     centres = replace(world.centres, covariance=found.centre)
-    read = replace(world.seeing(), readout_sigma=found.readout_sigma)
+    seeing = world.seeing()
+    read = replace(seeing, readout_sigma=readout.total_sigma(seeing, found.readout_sigma))
     return replace(world, centres=centres, covariances=found).read(read)
 
 

@@ -73,7 +73,9 @@ def align(
         (F, 4, 4) float64.
     """
     which = np.arange(len(frames))
-    settings = SolverSettings(max_iterations=MAX_STEPS, relative_tolerance=1e-5)
+    settings = SolverSettings(
+        max_iterations=MAX_STEPS, relative_tolerance=1e-5, absolute_tolerance=np.inf
+    )
     poses = world_T_rigs
     for level, size in enumerate(sizes):
         captured = capture(frames, which, size, optics)

@@ -11,7 +11,9 @@ from gsba.bundle import readout
 from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.readout import Readout
 from gsba.camera.lens import Lenses
-from gsba.types import Solution
+from gsba.types import Fisheye, Solution
+
+FISHEYE = Fisheye(960, 960, 300.0, (480.0, 480.0), (0.0,) * 4, (0.0,) * 3)
 
 LENSES, READOUT_S = Lenses(np.array([0.0, 0.0, 0.05]), band_rad=np.deg2rad(4)), 0.03
 SWEEPS = np.array([[-1.0, 0, 0], [0, 1.0, 0]])
@@ -58,3 +60,11 @@ def test_how_far_frames_own_motion_is_spread_is_found() -> None:
 def test_frames_of_one_instant_have_none(seed: int) -> None:
     found, _ = _found(LENSES, seed)
     assert found.reason and found.lenses.twists is None
+
+
+def test_rows_of_stitched_pictures_are_known_to_three_per_cent() -> None:
+    """How many rows lie between two directions hangs on lenses that a panorama does not tell."""
+    stitched = Readout(Lenses(), readout_s=0.012)
+    raw = replace(stitched, lenses=Lenses(cut_by=(FISHEYE, FISHEYE)))
+    assert readout.total_sigma(stitched, 1e-4) == pytest.approx(np.hypot(1e-4, 0.03 * 0.012))
+    assert readout.total_sigma(raw, 1e-4) == 1e-4
