@@ -18,6 +18,7 @@ from gsba.matching.guided_search import Gate, MatchContext
 from gsba.types import Matches
 
 LOCAL = 12  # frames to either side of a meeting, which are asked what speaks for and against it
+WIDER = 36  # the same where these leave it open
 _REACH = 2.0  # local depths between two frames that are compared
 _NEAREST = 3  # frames that each frame is compared with
 _MOST_PAIRS = 150
@@ -109,6 +110,11 @@ class JoinEvidence:
         return self.share + _SIGMAS * self.sigma < _LOOK_ALIKE
 
     @property
+    def decided(self) -> bool:
+        """Whether the join is confirmed or refuted."""
+        return self.confirmed or self.refuted
+
+    @property
     def absent(self) -> bool:
         """Whether surely next to nothing is found again."""
         return self.share + _SIGMAS * self.sigma < _ABSENT
@@ -183,10 +189,10 @@ def weigh(
     return JoinEvidence(share, float(np.sqrt(squares)) / total, len(cells)), found
 
 
-def around(frames: np.ndarray, middle: int) -> np.ndarray:
-    """Frames (N,), ascending, at most so many before or after one of them: drift is small there."""
+def around(frames: np.ndarray, middle: int, reach: int = LOCAL) -> np.ndarray:
+    """Frames (N,), ascending, at most `reach` before or after one of them: drift is small there."""
     place = int(np.searchsorted(frames, middle))
-    return frames[max(place - LOCAL, 0) : place + LOCAL + 1]
+    return frames[max(place - reach, 0) : place + reach + 1]
 
 
 def nearest_pairs(places: Places, one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -188,12 +188,10 @@ class _Joining:
         for proposal in propose(meetings, self.poses, self.depth, self.context.settings.seed):
             if self._held(rows) and not self._plausible(proposal):
                 continue
-            groups = around(rows, proposal.frames[0]), around(inside, proposal.frames[1])
-            evidence, found = self._weigh(*groups, proposal.move)
-            again = self._known_by_both(found, rows)
-            if again:
-                proposal = replace(proposal, move=refined(again, proposal.move, self.poses))
-                evidence, _ = self._weigh(*groups, proposal.move)
+            proposal, evidence = self._judged(proposal, rows, inside, join_evidence.LOCAL)
+            if not evidence.decided:  # more frames tell more, if drift lets them
+                wider = self._judged(proposal, rows, inside, join_evidence.WIDER)
+                proposal, evidence = max((proposal, evidence), wider, key=lambda one: one[1].least)
             if self._is_level(rows, inside, proposal.move):
                 weighed.append((proposal, evidence))
         if not weighed:
@@ -215,6 +213,24 @@ class _Joining:
             return best.move
         self.reasons[part] = "it fits two places alike" if why.confirmed else f"doubtful: {why}"
         return None
+
+    def _judged(
+        self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, reach: int
+    ) -> tuple[Proposal, JoinEvidence]:
+        """A proposal fitted to all that both parts know around its meeting, and what speaks for it.
+
+        Args:
+            rows, inside: frames of the part and of the map.
+            reach: frames to either side of the meeting.
+        """
+        f, g = proposal.frames
+        groups = around(rows, f, reach), around(inside, g, reach)
+        evidence, found = self._weigh(*groups, proposal.move)
+        again = self._known_by_both(found, rows)
+        if again:
+            proposal = replace(proposal, move=refined(again, proposal.move, self.poses))
+            evidence, _ = self._weigh(*groups, proposal.move)
+        return proposal, evidence
 
     def _is_level(self, rows: np.ndarray, inside: np.ndarray, move: Sim3) -> bool:
         """Whether a part would stand upright on the map, as far as its frames do in themselves."""
