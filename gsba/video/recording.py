@@ -22,6 +22,7 @@ from gsba.video.timeline import Timeline, Track, bgr, decode, luma, read_timelin
 LENSES = ("front", "back")
 EXACT_S = 1e-6  # closer times are equal
 
+_RAW_SUFFIX = ".insv"  # of videos that show fisheyes even where no circle is seen
 _STITCH = "stitch it in the camera's app and export an equirectangular (2:1) video"
 _NAMED = ("00", "10")  # between underscores in the names of a front and of a back lens's file
 _NEARLY = 1.1  # longer side over the shorter, up to which a picture is nearly square
@@ -227,6 +228,8 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
     timeline = read_timeline(track)
     num, side = len(timeline.ticks), size[1]
     circles, notes = _shows_circles(track, timeline)
+    if not circles and track.path.suffix.lower() == _RAW_SUFFIX:
+        circles, notes = True, (f"{track.path}: raw, two fisheyes side by side, as its name says",)
     places = ((slice(None), slice(None)),)
     if circles:
         places = (slice(None), slice(side)), (slice(None), slice(side, None))

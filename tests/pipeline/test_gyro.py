@@ -108,7 +108,8 @@ def test_a_raw_video_gives_its_own_readings_or_a_line(
     """Of two files the first lens's holds them."""
     asked, found = [], Readings(np.arange(10) / 100, np.zeros((10, 3)))
 
-    def read(path: Path) -> Readings:
+    def read(path: Path, lasting_s: float | None) -> Readings:
+        assert lasting_s is None  # these are no videos
         asked.append(path.name)
         if "_00_" not in path.name:
             raise GsbaError(f"{path}: no gyro in it")
