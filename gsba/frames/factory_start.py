@@ -163,6 +163,8 @@ def _two_whole(values: Any) -> tuple[int, int]:
 
 def _with_back_turned(pair: Pair, quarters: int) -> Pair:
     """A pair whose back pictures are turned by quarters about the lens's axis."""
+    if not quarters:
+        return pair
     front, back = pair
     turn = Rotation.from_rotvec(back.rotation) * Rotation.from_euler("z", 90 * quarters, True)
     a, b, c = turn.as_rotvec().tolist()

@@ -1,8 +1,8 @@
 """Readings of inertial units from disk: a table, or a maker's recording.
 
-Recordings of Insta360 are read by `gsba.containers`, and where it finds no gyro, or of others, by
-`telemetry_parser`, whose readings of some Insta360 cameras are mirrored and which may end the
-process over fields that are newer than itself.
+Recordings of Insta360 are read by `gsba.containers`: it knows the layouts that `telemetry_parser`
+knows, leaves axes as they are (the library mirrors those of some cameras), and neither ends the
+process nor takes gigabytes over a damaged file. Other recordings are read by the library.
 
 A table has a column of times, three of rates and, if need be, three of forces, separated by commas,
 semicolons or blanks. Without a header these are, in this order, seconds, rad/s and m/s^2. A header
@@ -65,8 +65,11 @@ def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
             installed.
     """
     trailer = read_trailer(path)
-    if trailer is None or trailer.gyro is None:
+    if trailer is None:
         return _by_telemetry_parser(path)
+    if trailer.gyro is None:
+        why = f" ({'; '.join(trailer.notes)})" if trailer.notes else ""
+        raise GsbaError(f"{path}: its Insta360 trailer holds no gyro that can be read{why}")
     gyro = trailer.gyro
     begin, end = float(gyro.times[0]), float(gyro.times[-1])
     outside = lasting_s is not None and (end < 0 or begin > lasting_s)
