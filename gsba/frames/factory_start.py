@@ -18,6 +18,7 @@ from gsba.camera.factory_lenses import (
 from gsba.camera.fisheye import Pair
 from gsba.containers.insta360 import read_trailer
 from gsba.disk import write_json
+from gsba.frames.files import image_size
 from gsba.frames.raw_pairs import decode_pair, rim_likeness
 from gsba.log import GsbaError
 
@@ -87,10 +88,7 @@ def find_factory_lenses(folder: Path, images: Sequence[Path]) -> FactoryLenses |
 
 
 def starting_lenses(
-    folder: Path,
-    pairs: Sequence[tuple[Path, ...]],
-    size: tuple[int, int],
-    factory: FactoryLenses,
+    folder: Path, pairs: Sequence[tuple[Path, ...]], factory: FactoryLenses
 ) -> Pair:
     """Lenses of raw pairs by the maker's calibration, which leaves open what only images tell.
 
@@ -101,9 +99,10 @@ def starting_lenses(
     Args:
         folder: of the pictures, for the log.
         pairs: pictures of the front and of the back lens of each frame, or twice one of both.
-        size: width and height of one lens's picture, pixels.
         factory: the maker's calibration.
     """
+    width, height = image_size(pairs[0][0])
+    size = (width // 2 if pairs[0][0] == pairs[0][1] else width, height)
     rows = np.unique(np.linspace(0, len(pairs) - 1, _LOOKS).astype(int))
     looks = [decode_pair(pairs[f], size, gray=True) for f in rows]
     readings = [

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.factory_lenses import FactoryLenses
 from gsba.camera.fisheye import Pair
 from gsba.frames.dual_fisheye import width_of
 from gsba.frames.factory_start import FACTORY_FILE, find_factory_lenses, starting_lenses
@@ -79,11 +80,8 @@ def scan(
     if layout == "erp" and (
         factory is not None or side_by_side(Path(folder), images, (width, height), calibration)
     ):
-        layout, paths, width = "fisheye", tuple((path, path) for path in images), width // 2
-    if layout == "fisheye" and factory is not None:
-        fisheyes = starting_lenses(Path(folder), paths, (width, height), factory)
-    else:
-        fisheyes = _lenses(Path(folder), layout, paths, calibration)
+        layout, paths = "fisheye", tuple((path, path) for path in images)
+    fisheyes = _lenses(Path(folder), layout, paths, calibration, factory)
     if fisheyes is not None:
         width, height = width_of(fisheyes), width_of(fisheyes) // 2
     erp_size = None if layout == "cube" else (width, height)
@@ -129,9 +127,15 @@ def _in_time_order(
 
 
 def _lenses(
-    folder: Path, layout: str, paths: Sequence[tuple[Path, ...]], calibration: Path | None
+    folder: Path,
+    layout: str,
+    paths: Sequence[tuple[Path, ...]],
+    calibration: Path | None,
+    factory: FactoryLenses | None,
 ) -> Pair | None:
     """What the lenses of raw fisheyes are; None = there are none."""
+    if layout == "fisheye" and factory is not None:
+        return starting_lenses(folder, paths, factory)
     if layout == "fisheye":
         return lenses_of(folder, paths, calibration)
     if calibration is not None:

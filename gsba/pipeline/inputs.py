@@ -93,7 +93,8 @@ def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
         return read_imu(imu)
     if not frames.is_file() or frames.suffix.lower() not in _WITH_GYRO:
         return None
-    names = dict.fromkeys(re.sub("_[01]0_", lens, frames.name) for lens in ("_00_", "_10_"))
+    pair = re.fullmatch(r"(.*_)[01]0(_.*)", frames.name)
+    names = [f"{pair[1]}{n}{pair[2]}" for n in ("00", "10")] if pair else [frames.name]
     errors = []
     for path in filter(Path.is_file, map(frames.with_name, names)):  # of a pair, either may have it
         try:

@@ -52,7 +52,7 @@ MARKER = "extract.json"
 TIMES = "timestamps.csv"
 _JOURNAL = "extract.partial.csv"  # what is there so far; gone when all is
 _JPEG_QUALITY = 95
-_BLACK = 16  # grey value that most pixels of some picture exceed, unless lenses were covered
+_BLACK = 16  # grey value that a hundredth of the pixels exceeds unless lenses were covered
 
 
 @dataclass(frozen=True, slots=True)

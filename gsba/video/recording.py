@@ -2,9 +2,9 @@
 
 Raw recordings of two fisheyes come as one file with a track for each lens, as two files with `_00_`
 and `_10_` in their names, or as one track with both circles side by side. These layouts follow
-public descriptions (OpenSpeleo/insta360-rs, docs/INSV_FORMAT.md; insta.pk360.de on file types): no
-maker's file was at hand. The first track, `_00_` and the left circle are taken for the front lens;
-pictures stay turned as the camera stores them.
+public descriptions (OpenSpeleo/insta360-rs, docs/INSV_FORMAT.md; insta.pk360.de on file types); one
+real file was at hand, side by side and black. The first track, `_00_` and the left circle are taken
+for the front lens; pictures stay turned as the camera stores them.
 """
 
 import re
