@@ -7,7 +7,8 @@ between records and list them in a directory, record 0. All numbers are little-e
 
 Layout, fields and units follow public descriptions: OpenSpeleo/insta360-rs, docs/INSV_FORMAT.md;
 AdrianEddy/telemetry-parser, src/insta360; and Insta360's description of its SDK, which gives rates
-in rad/s and accelerations in g. Tested on one real file, of a ONE R: see tests.
+in rad/s and accelerations in g. Tested on one real file, of a ONE R: rates of the stated range turn
+gravity as the accelerometer does, in the same right-handed axes.
 """
 
 import os
@@ -54,6 +55,8 @@ _STANDARD_GRAVITY = 9.80665
 _MAX_RATE = 70.0  # rad/s: twice what gyros of 2000 deg/s measure
 _MIN_RATE_HZ, _MAX_RATE_HZ = 10.0, 20_000.0  # of gyro readings
 _MIN_USABLE = 0.5  # share of a record's rows without which the record is damaged
+_MAX_TICK = 1 << 53  # of the camera's clock: exact as float64
+_MAX_SPAN = 4.0  # of readings, by how long they would last without a pause
 _MAX_EXPOSURE_S = 100.0
 _YEAR_2100 = 4_102_444_800  # s since 1970: a larger creation time is in milliseconds
 
@@ -239,9 +242,9 @@ def _find_records(
         first = at - _FOOTER.size - size
         if first < start or form > 2:
             break
-        if number == _DIRECTORY and form == _BINARY and size % _ENTRY.size == 0 and size:
-            _read_listed(file, start, first, size, wanted, contents)
-            return
+        is_directory = (form, number) == (_BINARY, _DIRECTORY) and size and not size % _ENTRY.size
+        if is_directory and _read_listed(file, start, first, size, wanted, contents):
+            return  # gaps between records are usual then, so that others are not looked for
         if number in wanted:
             _add(file, first, size, number, contents)
         at = first
@@ -250,8 +253,9 @@ def _find_records(
 
 def _read_listed(
     file: BinaryIO, start: int, at: int, size: int, wanted: set[int], contents: _Contents
-) -> None:
-    """Read records that a directory of `size` bytes at `at` lists."""
+) -> bool:
+    """Read records that a directory of `size` bytes at `at` lists; whether all lie as it says."""
+    before = len(contents.notes)
     listed = _bytes_at(file, at, min(size, _MAX_RECORDS * _ENTRY.size))
     for number, form, count, offset in _ENTRY.iter_unpack(listed):
         first = start + offset
@@ -264,6 +268,7 @@ def _read_listed(
             contents.notes.append(f"damaged: record {number} is not where the directory has it")
             continue
         _add(file, first, count, number, contents)
+    return len(contents.notes) == before
 
 
 def _add(file: BinaryIO, start: int, size: int, number: int, contents: _Contents) -> None:
@@ -286,8 +291,10 @@ def _trailer(version: int, contents: _Contents) -> Insta360Trailer:
     found = _gyro(records.get(_GYRO, b""), raw, values, notes)
     scaled_ms = raw is False if found is None else found.milliseconds
     tick_s = 1e-3 if scaled_ms else 1e-6
-    first_frame, delay_s = values.get(_FIRST_FRAME), 1e-3 * (_real(values, _GYRO_DELAY_MS) or 0.0)
-    start = first_frame if isinstance(first_frame, int) else None
+    start = first_frame = values.get(_FIRST_FRAME)
+    if not isinstance(first_frame, int) or not 0 <= first_frame < _MAX_TICK:
+        start = first_frame = None
+    delay_s = 1e-3 * (_real(values, _GYRO_DELAY_MS) or 0.0)
     if start is None and found is not None:
         start, delay_s = found.ticks[0], 0.0
     readout_ms = _real(values, _READOUT_MS)
@@ -304,7 +311,7 @@ def _trailer(version: int, contents: _Contents) -> Insta360Trailer:
         window=_window(values),
         picture_size=_size(values, _SIZE, 1, 2),
         back_track_first=values.get(_TRACK_ORDER) == _BACK_TRACK_FIRST,
-        first_frame_s=first_frame * tick_s if isinstance(first_frame, int) else None,
+        first_frame_s=None if first_frame is None else first_frame * tick_s,
         created_unix_s=_creation_time(values),
         readout_s=1e-3 * readout_ms if readout_ms is not None and 0 < readout_ms < 1e3 else None,
         gyro=gyro,
@@ -339,7 +346,7 @@ def _gyro(
             forces, turns = _from_raw(forces, turns, ranges)
         with np.errstate(invalid="ignore", over="ignore"):
             fine = np.isfinite(rows["values"]).all(axis=1) & (abs(turns) < _MAX_RATE).all(axis=1)
-        fine &= (ticks >= 0) & (ticks < 1 << 53)
+        fine &= _near_others(ticks)
         later = np.maximum.accumulate(np.where(fine, ticks, -1))
         fine[1:] &= ticks[1:] > later[:-1]
         kept, step_s = int(fine.sum()), 1e-6 if is_raw else 1e-3
@@ -354,6 +361,15 @@ def _gyro(
         return _Ticks(ticks[fine], not is_raw, turns[fine].astype(np.float64), forces)
     notes.append(f"gyro: {len(record):,} bytes of no known layout")
     return None
+
+
+def _near_others(ticks: np.ndarray) -> np.ndarray:
+    """Whether times (N,) int64 lie as near to the middle one as so many steps reach; (N,) bool."""
+    sound = (ticks >= 0) & (ticks < _MAX_TICK)
+    if sound.sum() < 2:
+        return sound
+    step = float(np.median(abs(np.diff(ticks[sound]))))
+    return sound & (abs(ticks - np.median(ticks[sound])) <= _MAX_SPAN * len(ticks) * step)
 
 
 def _row(is_raw: bool) -> int:
@@ -396,7 +412,7 @@ def _exposures(
     rows = np.frombuffer(record, _SHUTTER, len(record) // _SHUTTER.itemsize)
     with np.errstate(invalid="ignore"):
         fine = (rows["duration"] > 0) & (rows["duration"] < _MAX_EXPOSURE_S)
-    fine &= (rows["time"] >= 0) & (rows["time"] < 1 << 53)
+    fine &= (rows["time"] >= 0) & (rows["time"] < _MAX_TICK)
     if not len(rows):
         return None
     if not fine.all():

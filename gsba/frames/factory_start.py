@@ -120,7 +120,7 @@ def starting_lenses(
         folder,
         factory.generation,
         100 * factory.focal_sigma,
-        _other_reading(best),
+        _other_reading(best) if factory.angles_known else "; its angles are of no known form",
         "which both lenses' rims confirm" if scores[best] > _AGREEING else "unconfirmed by images",
     )
     return readings[best]

@@ -6,6 +6,7 @@ from pathlib import Path
 import insta360_files as made
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gsba.containers.insta360 import Insta360Trailer, read_trailer
 from gsba.imu.files import read_imu
@@ -60,6 +61,30 @@ def test_a_real_file_to_the_number() -> None:
     assert "40 of the front lens, 33.20 to 33.24 ms" in text and "GPS: 0 fixes" in text
     readings = read_imu(made.REAL)
     np.testing.assert_array_equal(readings.rates, gyro.rates)
+
+
+@needs_real
+def test_real_rates_turn_as_gravity_does() -> None:
+    """Rates of the right scale and axes keep gravity still, which turns by 21 degrees in the chip's
+    axes; that tells their unit, and that both sensors share right-handed axes."""
+    found = read_trailer(made.REAL)
+    assert found is not None and found.gyro is not None
+    rates, forces = found.gyro.rates, found.gyro.accelerations
+    steps = 0.5 * (rates[1:] + rates[:-1]) * np.diff(found.gyro.times)[:, None]
+
+    def wander(factors: list[float]) -> float:
+        """Standard deviation of accelerations in a frame that turns by rates times factors."""
+        world_R_imu, still = Rotation.identity(), [forces[0]]
+        for step, force in zip(Rotation.from_rotvec(steps * factors), forces[1:], strict=True):
+            world_R_imu = world_R_imu * step
+            still.append(world_R_imu.apply(force))
+        return float(np.linalg.norm(np.std(still, axis=0)))
+
+    best = wander([1, 1, 1])
+    for factor in (0.0, 0.5, 2.0, -1.0):
+        assert wander([factor] * 3) > 1.2 * best
+    for mirrored in ([-1, 1, 1], [1, -1, 1], [1, 1, -1]):
+        assert wander(list(map(float, mirrored))) > 1.2 * best
 
 
 @pytest.mark.parametrize("directory", [False, True])
@@ -133,13 +158,12 @@ def test_the_richest_calibration_comes_first(tmp_path: Path) -> None:
 
 def test_readings_that_do_not_come_in_order_are_left_out(tmp_path: Path) -> None:
     times = 1000 * np.arange(100)
-    times[50] = times[20]
-    times[70] = 1 << 60
+    times[50], times[10], times[70] = times[20], 1 << 40, 1 << 60
     record = made.raw_gyro(times, np.zeros((100, 3)), np.ones((100, 3)))
     found = _read(tmp_path / "v.insv", made.trailer(((0, 3, record), (1, 1, made.metadata()))))
-    assert found.gyro is not None and len(found.gyro.times) == 98
+    assert found.gyro is not None and len(found.gyro.times) == 97
     assert (np.diff(found.gyro.times) > 0).all()
-    assert found.notes == ("gyro: 2 of 100 readings are damaged",)
+    assert found.notes == ("gyro: 3 of 100 readings are damaged",)
 
 
 @pytest.mark.parametrize("content", [b"", b"short", bytes(5000), made.SIGNATURE[1:]])
@@ -169,6 +193,21 @@ def test_damage_leaves_what_can_still_be_read(tmp_path: Path) -> None:
     assert found.notes == (f"damaged: {end_of_gyro:,} bytes of the trailer cannot be read",)
     with pytest.raises(GsbaError, match=r"v\.insv: its Insta360 trailer holds no gyro.*damaged: "):
         read_imu(tmp_path / "v.insv")
+
+
+def test_a_damaged_directory_leaves_the_records_next_to_it(tmp_path: Path) -> None:
+    records = made.usual_records()
+    content = bytearray(made.trailer(records, directory=True).replace(b"\xaa" * 100, b""))
+    found = _read(tmp_path / "v.insv", bytes(content))  # its offsets are too large now
+    assert found.model == "Insta360 OneR" and found.gyro is not None
+    assert sum("would lie outside" in note or "is not where" in note for note in found.notes) == 4
+
+
+@pytest.mark.parametrize("first_frame", [-1, 1 << 60, -(1 << 63)])
+def test_a_first_frame_at_no_time(tmp_path: Path, first_frame: int) -> None:
+    content = made.trailer(made.usual_records(first_frame=first_frame))
+    found = _read(tmp_path / "v.insv", content)
+    assert not found.has_frame_clock and found.gyro is not None and found.gyro.times[0] == 0
 
 
 def test_a_size_beyond_the_file_hides_nothing(tmp_path: Path) -> None:
