@@ -42,7 +42,7 @@ _FITTED_TO = np.deg2rad(100.0)  # largest angle to which radial terms are fitted
 _MAX_TILT_DEG = 5.0  # of a lens's axis, by the first two angles
 _MAX_OFF_AXIS_SUM_DEG = 10.0  # of the third angles of both lenses from 180
 _FOCAL_SIGMA = {1: 0.05, 2: 0.01, 3: 0.005, 6: 0.005}  # relative
-_CENTRE_SIGMA = 0.004  # of the canvas's height
+_DIRECTION_SIGMA = {n: np.deg2rad(deg) for n, deg in ((1, 1.5), (2, 0.7), (3, 0.4), (6, 0.4))}
 _ROTATION_SIGMA = np.deg2rad(1.5)
 _MAX_NUMBER = 1e7
 _BASELINES_M = 0.002, 0.2  # smallest and largest distance of two lenses
@@ -65,10 +65,8 @@ class FactoryCalibration:
 
     text: str  # numbers with underscores between them
     camera: str = ""  # model; "" = not known
-    sensor: tuple[int, int] | None = (
-        None  # width and height of one lens's sensor, pixels; None = as
-    )
-    # the text says
+    sensor: tuple[int, int] | None = None  # width and height, pixels, of one lens; None
+    # = as the text says
     window: tuple[int, int] | None = None  # width and height of its recorded part; None = not known
     shift: tuple[int, int] = (0, 0)  # of that part's middle from the sensor's, pixels right, down
     back_first: bool = False  # whether pictures of the text's second lens come first
@@ -95,12 +93,9 @@ class FactoryLenses:
         return _FOCAL_SIGMA[self.generation]
 
     @property
-    def centre_sigma_px(self) -> float:
-        """Standard deviation of the centres along each axis, pixels of the canvas.
-
-        An X4 Air's own calibration was off by 14 pixels of 7680 (Kjerag's study).
-        """
-        return _CENTRE_SIGMA * self.canvas[1]
+    def direction_sigma(self) -> float:
+        """Standard deviation of directions of pixels in the axes of their own lens, rad."""
+        return float(_DIRECTION_SIGMA[self.generation])
 
     @property
     def rotation_sigma(self) -> float:

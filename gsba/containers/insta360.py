@@ -13,13 +13,14 @@ gravity as the accelerometer does, in the same right-handed axes.
 
 import os
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from gsba.containers.protobuf import read_message
 from gsba.log import GsbaError, brief
 
 _SIGNATURE = b"8db42d694ccc418790edff439fe026bf"
@@ -284,7 +285,7 @@ def _add(file: BinaryIO, start: int, size: int, number: int, contents: _Contents
 def _trailer(version: int, contents: _Contents) -> Insta360Trailer:
     """What records say."""
     records, notes = contents.records, contents.notes
-    values, whole = _message(records.get(_METADATA, b""))
+    values, whole = read_message(records.get(_METADATA, b""))
     if not whole:
         notes.append("damaged: the end of the metadata cannot be read")
     raw = _flag(values, _RAW_GYRO)
@@ -338,7 +339,7 @@ def _gyro(
     """Readings of a record, in the layout that the metadata states, or else in the other one."""
     if not record:
         return None
-    ranges = _message(values.get(_GYRO_RANGES, b""))[0]
+    ranges = read_message(values.get(_GYRO_RANGES, b""))[0]
     for is_raw in (False, True) if raw is False else (True, False):
         rows = np.frombuffer(record, _RAW if is_raw else _SCALED, len(record) // _row(is_raw))
         ticks, (forces, turns) = rows["time"], np.split(rows["values"], 2, axis=1)
@@ -448,57 +449,6 @@ def _gps(record: bytes, notes: list[str]) -> GpsRecord | None:
     )
 
 
-def _message(data: Any) -> tuple[dict[int, Any], bool]:
-    """Fields of a protobuf message, the last of each number, and whether all could be read.
-
-    Numbers are int (varint) or float (8 and 4 bytes), everything else bytes.
-    """
-    values: dict[int, Any] = {}
-    try:
-        for number, value in _fields(data if isinstance(data, bytes) else b""):
-            values[number] = value
-    except (IndexError, ValueError, struct.error):
-        return values, False
-    return values, True
-
-
-def _fields(data: bytes) -> Iterator[tuple[int, Any]]:
-    """Number and value of each field (https://protobuf.dev/programming-guides/encoding).
-
-    Raises:
-        IndexError, ValueError, struct.error: data that end early or are none.
-    """
-    at = 0
-    while at < len(data):
-        key, at = _varint(data, at)
-        number, wire = key >> 3, key & 7
-        if wire == 0:
-            value, at = _varint(data, at)
-        elif wire == 1:
-            value, at = struct.unpack_from("<d", data, at)[0], at + 8
-        elif wire == 5:
-            value, at = struct.unpack_from("<f", data, at)[0], at + 4
-        elif wire == 2:
-            count, at = _varint(data, at)
-            if count > len(data) - at:
-                raise ValueError
-            value, at = data[at : at + count], at + count
-        else:
-            raise ValueError
-        yield number, value
-
-
-def _varint(data: bytes, at: int) -> tuple[int, int]:
-    """A number of 7 bits a byte, two's complement of 64 bits, and the place behind it."""
-    value = 0
-    for shift in range(0, 70, 7):
-        byte, at = data[at], at + 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value - (1 << 64) if value >> 63 == 1 else value & ((1 << 64) - 1), at
-    raise ValueError
-
-
 def _text(values: Mapping[int, Any], key: int, most: int = 200) -> str:
     """A field of text without what no terminal should show; "" = none."""
     found = values.get(key)
@@ -519,7 +469,7 @@ def _flag(values: Mapping[int, Any], key: int) -> bool | None:
 
 def _size(values: Mapping[int, Any], key: int, across: int, down: int) -> tuple[int, int] | None:
     """Width and height from two fields of a nested message."""
-    inner = _message(values.get(key, b""))[0]
+    inner = read_message(values.get(key, b""))[0]
     width, height = inner.get(across), inner.get(down)
     if not isinstance(width, int) or not isinstance(height, int):
         return None
@@ -530,7 +480,7 @@ def _window(values: Mapping[int, Any]) -> SensorWindow | None:
     source, size = _size(values, _WINDOW, 1, 2), _size(values, _WINDOW, 3, 4)
     if source is None or size is None or size[0] > source[0] or size[1] > source[1]:
         return None
-    inner = _message(values[_WINDOW])[0]
+    inner = read_message(values[_WINDOW])[0]
     right, down = (found if isinstance(found := inner.get(key, 0), int) else 0 for key in (5, 6))
     if abs(right) > source[0] or abs(down) > source[1]:
         return None

@@ -115,11 +115,12 @@ def starting_lenses(
     if scores[best] <= scores[0] + _CLEARLY:
         best = 0
     _log.warning(
-        "%s: lenses start from the maker's calibration (generation %d, focal length to %.1f %%%s), "
-        "%s; --calibration FILE says better",
+        "%s: lenses start from the maker's calibration (generation %d, directions to %.1f "
+        "degrees, one lens against the other to %.1f%s), %s; --calibration FILE says better",
         folder,
         factory.generation,
-        100 * factory.focal_sigma,
+        np.rad2deg(factory.direction_sigma),
+        np.rad2deg(factory.rotation_sigma),
         _other_reading(best) if factory.angles_known else "; its angles are of no known form",
         "which both lenses' rims confirm" if scores[best] > _AGREEING else "unconfirmed by images",
     )
@@ -139,6 +140,8 @@ def _read_factory_calibration(folder: Path) -> FactoryCalibration | None:
         texts = {key: tree[key] for key in ("text", "camera")}
         sizes = {key: tree[key] and _two_whole(tree[key]) for key in ("sensor", "window")}
         if not all(isinstance(text, str) for text in texts.values()):
+            raise ValueError
+        if not all(size is None or min(size) > 0 for size in sizes.values()):
             raise ValueError
         rest = {"shift": _two_whole(tree["shift"]), "back_first": bool(tree["back_first"])}
         return FactoryCalibration(**texts, **sizes, **rest)

@@ -84,10 +84,12 @@ def test_generations_agree_on_one_camera() -> None:
         found = _parse(text, **X4_WINDOW)
         assert found.generation == generation
         for lens, other in zip(true, found.pairs((1920, 1920))[0], strict=True):
-            off = _radii(other) / _radii(lens) - 1
-            assert abs(off).max() < 1.5 * max(found.focal_sigma, third.focal_sigma)
-            assert np.hypot(*np.subtract(lens.principal, other.principal)) < (
-                found.centre_sigma_px * 1920 / 5760
+            known = max(found.direction_sigma, third.direction_sigma)
+            off = (_radii(other) - _radii(lens)) / lens.focal
+            assert np.sqrt(np.mean(off**2)) < known and abs(off).max() < 2 * known
+            assert np.hypot(*np.subtract(lens.principal, other.principal)) / lens.focal < known
+            assert abs(other.focal / lens.focal - 1) < 1.3 * max(
+                found.focal_sigma, third.focal_sigma
             )
 
 

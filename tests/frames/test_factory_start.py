@@ -36,7 +36,10 @@ def _start(folder: Path, **more) -> Pair:
 
 @pytest.mark.parametrize(
     ("true", "said"),
-    [(WINDOWED, "to 5.0 %), which both"), (WHOLE, "the whole sensor in the picture")],
+    [
+        (WINDOWED, "directions to 1.5 degrees, one lens against the other to 1.5), which both"),
+        (WHOLE, "the whole sensor in the picture"),
+    ],
 )
 def test_images_tell_which_part_of_the_sensor_they_show(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, true: Pair, said: str
