@@ -30,6 +30,7 @@ _ENTRY = struct.Struct("<BBII")  # of the directory: number, format, size, start
 _VERSION = 3
 _MAX_RECORDS = 256
 _MAX_METADATA_BYTES = 8 << 20
+_MAX_RECORD_BYTES = 1 << 29  # seven hours of a gyro at 1 kHz
 _BINARY, _PROTOBUF = 0, 1  # formats of records
 _DIRECTORY, _METADATA, _GYRO, _EXPOSURES, _GPS, _BACK_EXPOSURES = 0, 1, 3, 4, 7, 12
 
@@ -276,8 +277,8 @@ def _add(file: BinaryIO, start: int, size: int, number: int, contents: _Contents
     """Read a record, unless one of its number was read."""
     if number in contents.records or not size:
         return
-    if number == _METADATA and size > _MAX_METADATA_BYTES:
-        contents.notes.append(f"damaged: metadata of {size:,} bytes")
+    if size > (_MAX_METADATA_BYTES if number == _METADATA else _MAX_RECORD_BYTES):
+        contents.notes.append(f"damaged: record {number} claims {size:,} bytes")
         return
     contents.records[number] = _bytes_at(file, start, size)
 
