@@ -37,6 +37,7 @@ FAMILIES = {  # beside the usual hundred cases
     "tiffs": 8,
     "clusters": 6,
     "numbers": 8,
+    "insta360": 8,
 }
 _SCANS = ("cloud.pcd", "binary.pcd", "cloud.ply", "mesh.obj", "cloud.las", "cloud.laz")
 if importlib.util.find_spec("open3d") and importlib.util.find_spec("laspy"):
@@ -85,6 +86,8 @@ def prepare(out: Path) -> None:
     chain = {"cam0": camera, "cam1": camera | {"T_cn_cnm1": turned}}
     (made / "chain.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(chain))))
     (made / "scheduler.json").write_text(json.dumps({"type": "Scheduler", "address": "tls://"}))
+    trailer = _insta360_trailer()
+    (made / "walk.insv").write_bytes((out / "walk.mp4").read_bytes() + trailer)
     (made / "precious.txt").write_text("precious")
     cv2.imwrite(str(made / "a.tif"), np.full((32, 64, 3), 90, np.uint8))
     for lens in ("front", "back"):
@@ -279,6 +282,37 @@ def _tiffs(draft: Draft) -> Spoiled:
     return draft.done("tiffs", _refined, resumes=True)
 
 
+def _insta360_trailer() -> bytes:
+    """What a camera appends to a video: gyro, exposures, fixes, lenses, and where they are."""
+    lenses = b"2_15.5_16_16_0_0_0_15.5_48_16_0_0_180_64_32_1"
+    metadata = b"\x12\x02X1" + b"\x2a" + bytes([len(lenses)]) + lenses + b"\xf0\x03\x01"
+    gyro = b"".join(struct.pack("<q6H", 10_000 * n, *[33_000 + n] * 6) for n in range(300))
+    exposures = b"".join(struct.pack("<qd", 33_000 * n, 0.01) for n in range(90))
+    fixes = 9 * struct.pack("<qHcdcdc3d", 1_700_000_000, 1, b"A", 5, b"N", 5, b"E", 1, 1, 1)
+    body = entries = b""
+    records = (7, 0, fixes), (4, 0, exposures), (3, 0, gyro), (1, 1, metadata)
+    for number, form, content in records:
+        entries += struct.pack("<BBII", number, form, len(content), len(body))
+        body += content + struct.pack("<BBI", form, number, len(content))
+    body += entries + struct.pack("<BBI", 0, 0, len(entries)) + bytes(32)
+    signature = b"8db42d694ccc418790edff439fe026bf"
+    return body + struct.pack("<II", len(body) + 40, 3) + signature
+
+
+def _insta360(draft: Draft) -> Spoiled:
+    """A camera's own video, the end of which is damaged: what it says of lenses, and its gyro."""
+    draft.copy("flat", "slam.tum")
+    _copy(draft, "walk.insv")
+    count, change = draft.pick([120, 300, 9000]), change_bytes(draft)  # bytes with more that leads
+    draft.edit("walk.insv", lambda data: data[:-count] + change(data[-count:]), f"last {count}")
+    if draft.rng.random() < 0.5:
+        draft.arguments = ["--quiet", "extract", "walk.insv", "--out", "out"]
+        return draft.done("insta360", lambda *_: None, resumes=True)
+    draft.arguments = ["--quiet", "refine", "flat", "slam.tum", "--fps", "2", "--out", "out"]
+    draft.arguments += ["--imu", "walk.insv", *small_settings()]
+    return draft.done("insta360", _refined, resumes=True)
+
+
 def _clusters(draft: Draft) -> Spoiled:
     """Schedulers that are none."""
     draft.copy("flat", "slam.tum")
@@ -377,5 +411,6 @@ _DRAWN: Mapping[str, Callable[[Draft], Spoiled]] = {
     "tiffs": _tiffs,
     "clusters": _clusters,
     "numbers": _numbers,
+    "insta360": _insta360,
     "scans": _scans,
 }

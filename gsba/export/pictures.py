@@ -18,7 +18,7 @@ from gsba.frames.pixels import load_padded
 from gsba.store.shards import even_blocks
 from gsba.types import FrameSet
 
-_INSTEAD = {".webp": ".jpg", ".tif": ".png", ".tiff": ".png"}
+_INSTEAD = {".insp": ".jpg", ".webp": ".jpg", ".tif": ".png", ".tiff": ".png"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import numpy as np
 from gsba.frames.headers import JPEG_END, Header, header_of
 from gsba.log import GsbaError
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".insp")  # the last: JPEG
 
 _MOST_PADDING, _FILLS = 1024, (b"\0", b"\xff")  # bytes before the end, and what they are
 

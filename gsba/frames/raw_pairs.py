@@ -271,6 +271,19 @@ def _continued(looks: np.ndarray, front: Fisheye, behind: list[Fisheye]) -> tupl
     Args:
         looks: (N, 2, h, w) uint8, pictures of both.
     """
+    scores = [rim_likeness(looks, front, lens) for lens in behind]
+    order = np.argsort(scores)[::-1]
+    return behind[int(order[0])], bool(scores[order[0]] > scores[order[1]] + _CLEARLY)
+
+
+def rim_likeness(
+    looks: Sequence[Sequence[np.ndarray]] | np.ndarray, front: Fisheye, back: Fisheye
+) -> float:
+    """Mean correlation of what both lenses show at their rims, about 1 where lenses are right.
+
+    Args:
+        looks: (N, 2, h, w) uint8, pictures of both.
+    """
     longitudes = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
     angles = np.pi / 2 + np.linspace(-_OVERLAP, _OVERLAP, _ACROSS)[:, None]
     ring = np.stack(
@@ -281,13 +294,8 @@ def _continued(looks: np.ndarray, front: Fisheye, behind: list[Fisheye]) -> tupl
         ],
         axis=-1,
     )
-    ahead = [_seen(pictures[0], front, ring) for pictures in looks]
-    scores = [
-        np.mean([_alike(a, _seen(p[1], lens, ring)) for a, p in zip(ahead, looks, strict=True)])
-        for lens in behind
-    ]
-    order = np.argsort(scores)[::-1]
-    return behind[int(order[0])], bool(scores[order[0]] > scores[order[1]] + _CLEARLY)
+    both = [(_seen(one, front, ring), _seen(other, back, ring)) for one, other in looks]
+    return float(np.mean([_alike(one, other) for one, other in both]))
 
 
 def _seen(picture: np.ndarray, lens: Fisheye, directions: np.ndarray) -> np.ndarray:

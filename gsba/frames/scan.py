@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.factory_lenses import FactoryLenses
 from gsba.camera.fisheye import Pair
 from gsba.frames.dual_fisheye import width_of
+from gsba.frames.factory_start import FACTORY_FILE, find_factory_lenses, starting_lenses
 from gsba.frames.files import image_header, image_size, is_image
 from gsba.frames.masks import find_masks
 from gsba.frames.raw_pairs import find_pairs, lenses_of, side_by_side
@@ -32,7 +34,6 @@ _FOREIGN = {  # images that are not read, by suffix
     ".gif": "GIF",
     ".heic": "HEIC",
     ".heif": "HEIF",
-    ".insp": "INSP",
     ".jp2": "JPEG 2000",
     ".jxl": "JPEG XL",
 }
@@ -75,9 +76,12 @@ def scan(
     paths = tuple(found[name] for name in names)
     width, height = _common_size(paths, layout)
     images = [group[0] for group in paths]
-    if layout == "erp" and side_by_side(Path(folder), images, (width, height), calibration):
+    factory = find_factory_lenses(Path(folder), images) if calibration is None else None
+    if layout == "erp" and (
+        factory is not None or side_by_side(Path(folder), images, (width, height), calibration)
+    ):
         layout, paths = "fisheye", tuple((path, path) for path in images)
-    fisheyes = _lenses(Path(folder), layout, paths, calibration)
+    fisheyes = _lenses(Path(folder), layout, paths, calibration, factory)
     if fisheyes is not None:
         width, height = width_of(fisheyes), width_of(fisheyes) // 2
     erp_size = None if layout == "cube" else (width, height)
@@ -123,9 +127,15 @@ def _in_time_order(
 
 
 def _lenses(
-    folder: Path, layout: str, paths: Sequence[tuple[Path, ...]], calibration: Path | None
+    folder: Path,
+    layout: str,
+    paths: Sequence[tuple[Path, ...]],
+    calibration: Path | None,
+    factory: FactoryLenses | None,
 ) -> Pair | None:
     """What the lenses of raw fisheyes are; None = there are none."""
+    if layout == "fisheye" and factory is not None:
+        return starting_lenses(folder, paths, factory)
     if layout == "fisheye":
         return lenses_of(folder, paths, calibration)
     if calibration is not None:
@@ -197,7 +207,7 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
             f"('{next(iter(subfolders.values())).name}'); keep one of them"
         )
     others = [p.name for p in entries if p not in images and p not in subfolders.values()]
-    others = [name for name in others if name != _TIMES_FILE]
+    others = [name for name in others if name not in (_TIMES_FILE, FACTORY_FILE)]
     if others:
         _log.info("%s: ignored %d other entries: %s", folder, len(others), ", ".join(others[:5]))
     places = [folder, *(path for path in entries if path.name.lower() in FACES and path.is_dir())]

@@ -1,4 +1,8 @@
-"""Readings of inertial units from disk: a table, or whatever `telemetry_parser` can read.
+"""Readings of inertial units from disk: a table, or a maker's recording.
+
+Recordings of Insta360 are read by `gsba.containers`: it knows the layouts that `telemetry_parser`
+knows, leaves axes as they are (the library mirrors those of some cameras), and neither ends the
+process nor takes gigabytes over a damaged file. Other recordings are read by the library.
 
 A table has a column of times, three of rates and, if need be, three of forces, separated by commas,
 semicolons or blanks. Without a header these are, in this order, seconds, rad/s and m/s^2. A header
@@ -11,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.containers.insta360 import read_trailer
 from gsba.frames.times import read_lines
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError, brief
@@ -35,10 +40,11 @@ _UNSAID = ["t", *(f"gyro_{axis}" for axis in "xyz"), *(f"acc_{axis}" for axis in
 
 
 def read_imu(path: Path) -> Readings:
-    """Readings of a table, or of a recording that `telemetry_parser` reads.
+    """Readings of a table, or of a maker's recording.
 
     Raises:
-        GsbaError: what cannot be read or used, with the line; or `telemetry_parser` is not there.
+        GsbaError: what cannot be read or used, with the line; or `telemetry_parser` is needed and
+            not installed.
     """
     path = Path(path)
     if path.suffix.lower() in _TABLES or not path.is_file():
@@ -46,11 +52,41 @@ def read_imu(path: Path) -> Readings:
     return read_telemetry(path)
 
 
-def read_telemetry(path: Path) -> Readings:
-    """Readings that a maker's recording holds, by `telemetry_parser`: deg/s and m/s^2.
+def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
+    """Readings that a maker's recording holds.
+
+    Args:
+        path: of the recording.
+        lasting_s: seconds that its pictures last; readings that state their times from the first
+            frame, and none from while these last, are of another recording. None = not known.
 
     Raises:
-        GsbaError: the library is not there, or finds no readings.
+        GsbaError: it holds no readings that can be used, or `telemetry_parser` is needed and not
+            installed.
+    """
+    trailer = read_trailer(path)
+    if trailer is None:
+        return _by_telemetry_parser(path)
+    if trailer.gyro is None:
+        why = f" ({'; '.join(trailer.notes)})" if trailer.notes else ""
+        raise GsbaError(f"{path}: its Insta360 trailer holds no gyro that can be read{why}")
+    gyro = trailer.gyro
+    begin, end = float(gyro.times[0]), float(gyro.times[-1])
+    outside = lasting_s is not None and (end < 0 or begin > lasting_s)
+    if trailer.has_frame_clock and outside:
+        raise GsbaError(
+            f"{path}: its gyro readings are from {begin:.3f} to {end:.3f} s after the first frame, "
+            f"its pictures from 0 to {lasting_s:.3f} s: readings of another recording"
+        )
+    where = [f"reading {n + 1}" for n in range(len(gyro.times))]
+    return _checked(path, gyro.times, gyro.rates, gyro.accelerations, where)
+
+
+def _by_telemetry_parser(path: Path) -> Readings:
+    """Readings of a recording by `telemetry_parser`: deg/s and m/s^2.
+
+    Raises:
+        GsbaError: the library is not installed, or finds no readings.
     """
     try:
         from telemetry_parser import Parser  # type: ignore[import-not-found]

@@ -1,6 +1,7 @@
 """What a run starts from, as its caller names it: files of poses, and frames of a video."""
 
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -92,11 +93,27 @@ def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
         return read_imu(imu)
     if not frames.is_file() or frames.suffix.lower() not in _WITH_GYRO:
         return None
-    front = frames.with_name(frames.name.replace("_10_", "_00_"))  # of two files, the one with it
+    pair = re.fullmatch(r"(.*_)[01]0(_.*)", frames.name)
+    names = [f"{pair[1]}{n}{pair[2]}" for n in ("00", "10")] if pair else [frames.name]
+    errors = []
+    for path in filter(Path.is_file, map(frames.with_name, names)):  # of a pair, either may have it
+        try:
+            found = read_telemetry(path, _duration_s(path))
+        except GsbaError as error:
+            errors.append(error)
+            continue
+        every = float(np.median(np.diff(found.timestamps)))
+        logger.info("%s: gyro, %d readings at %.0f Hz", path, len(found.timestamps), 1 / every)
+        return found
+    logger.info("no gyro: %s", errors[0])
+    return None
+
+
+def _duration_s(path: Path) -> float | None:
+    """Seconds that a video claims to last; None = it cannot be read, which its extraction tells."""
     try:
-        return read_telemetry(front if front.is_file() else frames)
-    except GsbaError as error:
-        logger.info("no gyro: %s", error)
+        return video.claimed_duration_s(path)
+    except GsbaError:
         return None
 
 

@@ -5,6 +5,6 @@ Gives a folder of frames with their times, of raw videos one of each lens.
 """
 
 from gsba.video.extraction import extract
-from gsba.video.timeline import is_video
+from gsba.video.timeline import claimed_duration_s, is_video
 
-__all__ = ["extract", "is_video"]
+__all__ = ["claimed_duration_s", "extract", "is_video"]

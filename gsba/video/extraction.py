@@ -2,7 +2,8 @@
 
 `FRAMES/NNNNNN.jpg` is frame NNNNNN of the video, counted from 0; `timestamps.csv` gives the seconds
 since the first one. Of raw recordings, `FRAMES/front/NNNNNN.jpg` and `FRAMES/back/NNNNNN.jpg` are
-what the two lenses saw at one instant, chosen together, and NNNNNN counts frames of the front one.
+what the two lenses saw at one instant, chosen together, and NNNNNN counts frames of the front one;
+`factory_lenses.json` is their calibration by the maker, where the video holds one.
 `extract.json` says what was asked for, so that the same call resumes and another one does not mix
 its frames in.
 """
@@ -21,6 +22,11 @@ import numpy as np
 
 from gsba.config import VideoSettings
 from gsba.disk import disk_errors, refuse_links, remove_temporaries, write_bytes, write_text
+from gsba.frames.factory_start import (
+    FACTORY_FILE,
+    factory_calibration,
+    write_factory_calibration,
+)
 from gsba.frames.times import read_times
 from gsba.log import GsbaError, track
 from gsba.store.records import RecordError, typed
@@ -46,6 +52,7 @@ MARKER = "extract.json"
 TIMES = "timestamps.csv"
 _JOURNAL = "extract.partial.csv"  # what is there so far; gone when all is
 _JPEG_QUALITY = 95
+_BLACK = 16  # grey value that a hundredth of the pixels exceeds unless lenses were covered
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +101,12 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
         raise GsbaError(f"--width {settings.width}: {video} has only {recording.width} pixels")
     windows, received = _windows(video, recording, settings)
     _check_end(video, recording, settings.to_s)
+    _refuse_darkness(video, recording, windows)
     for note in recording.notes:
         logger.info("%s", note)
     _write_marker(out, video, key, None, recording.lenses)
+    if recording.lenses:
+        _keep_calibration(recording, out)
     before = _read_journal(out, recording.lenses)
     after, standing = _extract(recording, windows, out, settings, before)
     kept = before + after
@@ -109,6 +119,33 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
     why = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
     logger.info("%s: kept %d of %d frames (%s)", out, counts.kept, received, why or "all")
     return counts
+
+
+def _refuse_darkness(video: Path, recording: Recording, windows: list[np.ndarray]) -> None:
+    """Refuse a video of black pictures: the middle one, the first and the last are looked at.
+
+    Raises:
+        GsbaError: all that can be decoded of these are black.
+    """
+    level = -1
+    for row in dict.fromkeys([len(windows) // 2, 0, len(windows) - 1]):
+        for _, pictures in shots(recording, [int(windows[row][0])]):
+            level = max(level, *(int(np.percentile(each.luma(), 99)) for each in pictures))
+        if level > _BLACK:
+            return
+    if level >= 0:
+        raise GsbaError(
+            f"{video}: its pictures are black (99 % of their pixels at or below {level} of 255): "
+            "was a lens covered? Nothing can be matched in them"
+        )
+
+
+def _keep_calibration(recording: Recording, out: Path) -> None:
+    """Write the maker's calibration that a video holds beside its frames."""
+    files = [track.path for track in recording.tracks]
+    found = factory_calibration(files, two_tracks=len(files) == 2 and files[0] == files[1])
+    if found is not None:
+        write_factory_calibration(out, found)
 
 
 def _windows(
@@ -278,7 +315,7 @@ def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
     with disk_errors(out):
         names = [*written, *(kept.name for kept in _read_journal(out, lenses))]
         _remove_images(out, lenses, names)
-        for name in (TIMES, _JOURNAL, MARKER):
+        for name in (TIMES, FACTORY_FILE, _JOURNAL, MARKER):
             (out / name).unlink(missing_ok=True)
     return None
 

@@ -2,9 +2,9 @@
 
 Raw recordings of two fisheyes come as one file with a track for each lens, as two files with `_00_`
 and `_10_` in their names, or as one track with both circles side by side. These layouts follow
-public descriptions (OpenSpeleo/insta360-rs, docs/INSV_FORMAT.md; insta.pk360.de on file types): no
-maker's file was at hand. The first track, `_00_` and the left circle are taken for the front lens;
-pictures stay turned as the camera stores them.
+public descriptions (OpenSpeleo/insta360-rs, docs/INSV_FORMAT.md; insta.pk360.de on file types); one
+real file was at hand, side by side and black. The first track, `_00_` and the left circle are taken
+for the front lens; pictures stay turned as the camera stores them.
 """
 
 import re
@@ -22,6 +22,7 @@ from gsba.video.timeline import Timeline, Track, bgr, decode, luma, read_timelin
 LENSES = ("front", "back")
 EXACT_S = 1e-6  # closer times are equal
 
+_RAW_SUFFIX = ".insv"  # of videos that show fisheyes even where no circle is seen
 _STITCH = "stitch it in the camera's app and export an equirectangular (2:1) video"
 _NAMED = ("00", "10")  # between underscores in the names of a front and of a back lens's file
 _NEARLY = 1.1  # longer side over the shorter, up to which a picture is nearly square
@@ -227,6 +228,8 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
     timeline = read_timeline(track)
     num, side = len(timeline.ticks), size[1]
     circles, notes = _shows_circles(track, timeline)
+    if not circles and track.path.suffix.lower() == _RAW_SUFFIX:
+        circles, notes = True, (f"{track.path}: raw, two fisheyes side by side, as its name says",)
     places = ((slice(None), slice(None)),)
     if circles:
         places = (slice(None), slice(side)), (slice(None), slice(side, None))

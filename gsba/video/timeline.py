@@ -74,6 +74,16 @@ def track_sizes(video: Path) -> list[tuple[int, int]]:
         return [(stream.width, stream.height) for stream in streams]
 
 
+def claimed_duration_s(video: Path) -> float | None:
+    """Seconds that the first track of a video claims to last; None = it does not state them.
+
+    Raises:
+        GsbaError: no video, or no decoder for it.
+    """
+    with _opened(video) as (container, streams):
+        return _claimed_end(container, streams[0])
+
+
 def read_timeline(track: Track) -> Timeline:
     """Presentation times of all frames of a track, from its packets alone.
 

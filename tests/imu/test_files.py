@@ -1,12 +1,14 @@
 """Readings from tables and makers' files."""
 
 import builtins
+import sys
 from pathlib import Path
 
+import insta360_files
 import numpy as np
 import pytest
 
-from gsba.imu.files import read_imu
+from gsba.imu.files import read_imu, read_telemetry
 from gsba.log import GsbaError
 
 VALUES = np.random.default_rng(0).normal(0, 0.5, (20, 6))
@@ -124,6 +126,31 @@ def test_makers_files_are_read_by_telemetry_parser(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.timestamps, 0.01 * np.arange(20), atol=1e-12)
     np.testing.assert_allclose(found.rates, 1e-4 * whole[:, :3], atol=1e-12)
     np.testing.assert_allclose(found.forces, 9.80665e-4 * whole[:, 3:], atol=1e-9)
+
+
+def test_files_of_insta360_are_read_without_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "telemetry_parser", None)
+    path = tmp_path / "walk.insv"
+    path.write_bytes(bytes(2000) + insta360_files.trailer(insta360_files.usual_records()))
+    found = read_imu(path)
+    np.testing.assert_allclose(found.timestamps, 0.001 * np.arange(500) - 0.01, atol=1e-12)
+    np.testing.assert_allclose(found.rates[0], 0.5 * np.sin([0, 1, 2]), atol=6e-4)
+    assert found.forces is not None
+    np.testing.assert_allclose(np.linalg.norm(found.forces, axis=1), 9.80665, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("first_frame", "said"), [(6_000_000, "-1.010 to -0.511"), (0, "4.990")])
+def test_a_gyro_of_another_recording_is_refused(
+    tmp_path: Path, first_frame: int, said: str
+) -> None:
+    path = tmp_path / "walk.insv"
+    records = insta360_files.usual_records(first_frame=first_frame)
+    path.write_bytes(insta360_files.trailer(records))
+    with pytest.raises(GsbaError, match=f"{said}.* from 0 to 1.500 s: readings of another"):
+        read_telemetry(path, lasting_s=1.5)
+    assert len(read_telemetry(path, lasting_s=5.0 if first_frame == 0 else None).timestamps) == 500
 
 
 def test_what_telemetry_parser_cannot_read_is_named(tmp_path: Path) -> None:

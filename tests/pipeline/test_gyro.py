@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import insta360_files as made
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -22,7 +23,13 @@ PLAIN = SETTINGS.model_copy(update={"patches": SETTINGS.patches.model_copy(updat
 
 
 def _write(path: Path, on: Trajectory, seed: int = 0) -> Path:
-    """Readings on a smooth way through poses, and for a while before and after."""
+    """A table of readings on a smooth way through poses, and for a while before and after."""
+    np.savetxt(path, _readings(on, seed), delimiter=",", fmt="%.9g")
+    return path
+
+
+def _readings(on: Trajectory, seed: int = 0) -> np.ndarray:
+    """Times, rates and forces (n, 7), as `_write` writes them."""
     rng, times = np.random.default_rng(seed), on.timestamps
     fine = np.arange(times[0] - 1, times[-1] + 1, 0.01)
     inside = np.clip(fine, times[0], times[-1])
@@ -31,9 +38,7 @@ def _write(path: Path, on: Trajectory, seed: int = 0) -> Path:
     moved = CubicSpline(times, on.world_T_rigs[:, :3, 3])(inside, 2)
     forces = turned(inside).inv().apply(moved - np.array([0, 9.80665, 0]))  # y is down
     rates = rates @ IMU_R_RIG.T + BIAS + rng.normal(0, 1e-3, rates.shape)
-    table = np.column_stack([fine + OFFSET_S, rates, forces @ IMU_R_RIG.T])
-    np.savetxt(path, table, delimiter=",", fmt="%.9g")
-    return path
+    return np.column_stack([fine + OFFSET_S, rates, forces @ IMU_R_RIG.T])
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +72,26 @@ def test_a_gyro_is_aligned_and_frames_turn_as_it_says(
     assert true @ [0, -1, 0] > np.cos(np.deg2rad(3))
     again = case.refine(out, PLAIN, imu=readings)
     assert not computed_stages(again)
+
+
+def test_a_camera_s_own_readings_are_aligned(case: Case, without: Path, tmp_path: Path) -> None:
+    """In the trailer of an Insta360, as whole numbers, on a clock from the first frame."""
+    table = _readings(case.truth)
+    begin_us = 7_000_000
+    ticks = np.rint(1e6 * (table[:, 0] - OFFSET_S - case.truth.timestamps[0])).astype(int)
+    record = made.raw_gyro(begin_us + ticks, table[:, 1:4], table[:, 4:] / 9.80665)
+    path, out = tmp_path / "v.insv", tmp_path / "run"
+    metadata = made.metadata(first_frame=begin_us)
+    path.write_bytes(made.trailer(((0, made.GYRO, record), (1, made.METADATA, metadata))))
+    case.refine(out, PLAIN, imu=path)
+    said = json.loads((out / "report.json").read_text())["gyro"]
+    assert said["taken"]
+    assert said["offset_s"] == pytest.approx(-case.truth.timestamps[0], abs=0.01)
+    np.testing.assert_allclose(np.deg2rad(said["bias_deg_per_s"]), BIAS, atol=2e-3)
+    off = Rotation.from_matrix(np.array(said["rig_R_imu"]) @ IMU_R_RIG).magnitude()
+    assert np.rad2deg(off) < 2
+    turned = [case.errors(run).rpe_rotation_deg.rmse for run in (out, without)]
+    assert turned[0] < 0.9 * turned[1]
 
 
 def test_readings_of_another_walk_change_nothing(
@@ -108,7 +133,8 @@ def test_a_raw_video_gives_its_own_readings_or_a_line(
     """Of two files the first lens's holds them."""
     asked, found = [], Readings(np.arange(10) / 100, np.zeros((10, 3)))
 
-    def read(path: Path) -> Readings:
+    def read(path: Path, lasting_s: float | None) -> Readings:
+        assert lasting_s is None  # these are no videos
         asked.append(path.name)
         if "_00_" not in path.name:
             raise GsbaError(f"{path}: no gyro in it")

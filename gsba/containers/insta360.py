@@ -1,0 +1,496 @@
+"""The trailer that Insta360 cameras append to their videos (`.insv`) and pictures (`.insp`).
+
+It is read from the end of the file: 32 bytes of signature, before them the size of the trailer and
+its version (u32 each), before these 32 bytes of no known meaning. Records lie before that header,
+each followed by its format (u8), its number (u8) and its size (u32); some cameras leave gaps
+between records and list them in a directory, record 0. All numbers are little-endian.
+
+Layout, fields and units follow public descriptions: OpenSpeleo/insta360-rs, docs/INSV_FORMAT.md;
+AdrianEddy/telemetry-parser, src/insta360; and Insta360's description of its SDK, which gives rates
+in rad/s and accelerations in g. Tested on one real file, of a ONE R: rates of the stated range turn
+gravity as the accelerometer does, in the same right-handed axes.
+"""
+
+import os
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from gsba.containers.protobuf import read_message
+from gsba.log import GsbaError, brief
+
+_SIGNATURE = b"8db42d694ccc418790edff439fe026bf"
+_HEADER = struct.Struct("<32xII32s")  # size of the trailer with this header, version, signature
+_FOOTER = struct.Struct("<BBI")  # format, number, size of the record before it
+_ENTRY = struct.Struct("<BBII")  # of the directory: number, format, size, start in the trailer
+_VERSION = 3
+_MAX_RECORDS = 256
+_MAX_METADATA_BYTES = 8 << 20
+_MAX_RECORD_BYTES = 1 << 29  # seven hours of a gyro at 1 kHz
+_BINARY, _PROTOBUF = 0, 1  # formats of records
+_DIRECTORY, _METADATA, _GYRO, _EXPOSURES, _GPS, _BACK_EXPOSURES = 0, 1, 3, 4, 7, 12
+
+_SERIAL, _MODEL, _FIRMWARE, _CREATED = 1, 2, 3, 7  # fields of the metadata
+_SIZE, _FIRST_FRAME, _READOUT_MS, _WINDOW, _GYRO_DELAY_MS = 19, 24, 25, 27, 28
+_RAW_GYRO, _GYRO_RANGES, _TRACK_ORDER = 62, 65, 80
+_LENSES = 111, 54, 53, 5, 112, 56, 55, 17  # best first: present ones, then those of the factory
+_BACK_TRACK_FIRST = 1  # value of _TRACK_ORDER
+
+_RAW = np.dtype([("time", "<i8"), ("values", "<u2", 6)])  # microseconds; 32768 is zero
+_SCALED = np.dtype([("time", "<i8"), ("values", "<f8", 6)])  # milliseconds; g, rad/s
+_SHUTTER = np.dtype([("time", "<i8"), ("duration", "<f8")])  # seconds; time as of the gyro
+_FIX = np.dtype(
+    [
+        *(("seconds", "<i8"), ("milliseconds", "<u2"), ("state", "S1")),
+        *(("latitude", "<f8"), ("north", "S1"), ("longitude", "<f8"), ("east", "S1")),
+        *(("speed", "<f8"), ("course", "<f8"), ("altitude", "<f8")),
+    ]
+)
+_RAW_ZERO, _RAW_FULL = 32768, 32768  # of a raw value; what stands for the end of the range
+_RANGE_DEG_S = 2000.0  # of gyros whose range is not stated
+_RANGES_G = 8, 16, 32  # of accelerometers, one of which shows about 1 g where none is stated
+_STANDARD_GRAVITY = 9.80665
+_MAX_RATE = 70.0  # rad/s: twice what gyros of 2000 deg/s measure
+_MIN_RATE_HZ, _MAX_RATE_HZ = 10.0, 20_000.0  # of gyro readings
+_MIN_USABLE = 0.5  # share of a record's rows without which the record is damaged
+_MAX_TICK = 1 << 53  # of the camera's clock: exact as float64
+_MAX_SPAN = 4.0  # of readings, by how long they would last without a pause
+_MAX_EXPOSURE_S = 100.0
+_YEAR_2100 = 4_102_444_800  # s since 1970: a larger creation time is in milliseconds
+
+
+@dataclass(frozen=True, slots=True)
+class GyroRecord:
+    """Readings of a gyro and an accelerometer in the axes of their chip, as the camera wrote them.
+
+    The bias is not taken out, and how the chip lies in the camera is not known.
+    """
+
+    times: np.ndarray  # (N,) float64, s on the clock of `Insta360Trailer`, strictly increasing
+    rates: np.ndarray  # (N, 3) float64, rad/s
+    accelerations: np.ndarray  # (N, 3) float64, m/s^2, about 9.8 long at rest
+
+    @property
+    def rate_hz(self) -> float:
+        """Readings per second, by the median step; NaN where there is one reading."""
+        return 1 / float(np.median(np.diff(self.times))) if len(self.times) > 1 else float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureRecord:
+    """How long the rows of frames were exposed; of one lens. The sensor's gain is not recorded."""
+
+    times: np.ndarray  # (N,) float64, s on the clock of `Insta360Trailer`
+    durations: np.ndarray  # (N,) float64, s
+
+
+@dataclass(frozen=True, slots=True)
+class GpsRecord:
+    """Fixes of a GPS receiver that are marked as valid."""
+
+    unix_times: np.ndarray  # (N,) float64, s since 1970, UTC
+    latitudes: np.ndarray  # (N,) float64, degrees, north positive
+    longitudes: np.ndarray  # (N,) float64, degrees, east positive
+    altitudes: np.ndarray  # (N,) float64, m; above which surface the file does not state
+    speeds: np.ndarray  # (N,) float64, m/s
+    courses: np.ndarray  # (N,) float64, degrees from north, clockwise
+
+
+@dataclass(frozen=True, slots=True)
+class SensorWindow:
+    """Part of one lens's sensor that is recorded, scaled to the size of the pictures."""
+
+    source: tuple[int, int]  # width and height of the sensor, pixels of the sensor
+    size: tuple[int, int]  # width and height of the part, pixels of the sensor
+    shift: tuple[int, int]  # from the middle of the sensor to that of the part, pixels right, down
+
+
+@dataclass(frozen=True, slots=True)
+class Insta360Trailer:
+    """What an Insta360 camera appended to a file.
+
+    Times are seconds since the first frame where `has_frame_clock`, else since the first reading.
+    """
+
+    version: int  # of the trailer's layout
+    serial: str  # "" = not stated; so are the following two
+    model: str  # e.g. "Insta360 X4"
+    firmware: str
+    lens_strings: tuple[str, ...]  # calibrations by the maker, best first; see gsba.camera
+    window: SensorWindow | None  # None = not stated
+    picture_size: tuple[int, int] | None  # width and height of one lens's picture, pixels
+    back_track_first: bool  # whether the first of two video tracks is the back lens's
+    first_frame_s: float | None  # time of the first frame on the camera's clock, s; None = unknown
+    created_unix_s: float | None  # s since 1970; None = not stated
+    readout_s: float | None  # from the first row of a frame to its last; None = not stated
+    gyro: GyroRecord | None  # None = none, or not asked for; so are the following three
+    exposures: ExposureRecord | None  # of the front lens
+    back_exposures: ExposureRecord | None  # of the back lens
+    gps: GpsRecord | None
+    notes: tuple[str, ...]  # what is damaged or left out, one line each
+
+    @property
+    def has_frame_clock(self) -> bool:
+        """Whether times count from the first frame."""
+        return self.first_frame_s is not None
+
+    def summary(self) -> list[str]:
+        """Lines for people: camera, gyro, exposures, positions, calibration, and notes."""
+        lines = [f"camera: {self.model or 'Insta360'}, firmware {self.firmware or 'not stated'}"]
+        if self.gyro is None:
+            lines.append("gyro: none")
+        else:
+            since = "the first frame" if self.has_frame_clock else "the first reading"
+            lines.append(
+                f"gyro: {len(self.gyro.times):,} readings at {self.gyro.rate_hz:.0f} Hz, "
+                f"{self.gyro.times[0]:.3f} to {self.gyro.times[-1]:.3f} s from {since}"
+            )
+        for name, of_lens in (("front", self.exposures), ("back", self.back_exposures)):
+            if of_lens is not None:
+                low, high = 1e3 * of_lens.durations.min(), 1e3 * of_lens.durations.max()
+                lines.append(
+                    f"exposures: {len(of_lens.times):,} of the {name} lens, {low:.2f} to "
+                    f"{high:.2f} ms"
+                )
+        lines.append(f"GPS: {0 if self.gps is None else len(self.gps.unix_times):,} fixes")
+        if self.readout_s is not None:
+            lines.append(f"readout: {1e3 * self.readout_s:.2f} ms")
+        known = f"by the maker: {brief(self.lens_strings[0])}" if self.lens_strings else "none"
+        return [*lines, f"lens calibration: {known}", *self.notes]
+
+
+def read_trailer(path: Path, telemetry: bool = True) -> Insta360Trailer | None:
+    """What an Insta360 camera appended to a file; None = the file has no such trailer.
+
+    Only the trailer is read. What is damaged is left out, with a note.
+
+    Args:
+        path: video or picture.
+        telemetry: whether gyro, exposures and GPS are read; the metadata is small and always is.
+
+    Raises:
+        GsbaError: the file cannot be read, or nothing of its trailer can.
+    """
+    try:
+        with path.open("rb") as file:
+            return _read(path, file, telemetry)
+    except OSError as error:
+        raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+@dataclass(slots=True)
+class _Contents:
+    """Records of a trailer as they are found; grows while they are read."""
+
+    records: dict[int, bytes] = field(default_factory=dict)  # number -> content
+    notes: list[str] = field(default_factory=list)
+
+
+def _read(path: Path, file: BinaryIO, telemetry: bool) -> Insta360Trailer | None:
+    length = file.seek(0, os.SEEK_END)
+    if length < _HEADER.size:
+        return None
+    size, version, signature = _HEADER.unpack(_bytes_at(file, length - _HEADER.size, _HEADER.size))
+    if signature != _SIGNATURE:
+        return None
+    if version != _VERSION:
+        raise GsbaError(f"{path}: its Insta360 trailer is of version {version}; 3 is read")
+    contents, start = _Contents(), length - size
+    if not _HEADER.size <= size <= length:
+        start = 0
+        contents.notes.append(
+            f"damaged: the trailer claims {size:,} of the file's {length:,} bytes"
+        )
+    wanted = {_METADATA}
+    wanted |= {_GYRO, _EXPOSURES, _GPS, _BACK_EXPOSURES} if telemetry else set()
+    _find_records(file, start, length - _HEADER.size, wanted, contents)
+    if not contents.records:
+        raise GsbaError(f"{path}: its Insta360 trailer is damaged: no record can be read")
+    return _trailer(version, contents)
+
+
+def _bytes_at(file: BinaryIO, start: int, count: int) -> bytes:
+    """Exactly so many bytes of a file, from a place in it."""
+    file.seek(start)
+    found = file.read(count)
+    if len(found) != count:
+        raise OSError(0, "it became shorter while it was read")
+    return found
+
+
+def _find_records(
+    file: BinaryIO, start: int, end: int, wanted: set[int], contents: _Contents
+) -> None:
+    """Read records that are wanted: backwards from the end, or where a directory says they are.
+
+    Args:
+        file: at least `end` bytes long.
+        start: of the trailer in the file.
+        end: of its last record.
+        wanted: numbers of records.
+        contents: is filled.
+    """
+    at = end
+    for _ in range(_MAX_RECORDS):
+        if at <= start:
+            return
+        if at - start < _FOOTER.size:
+            break
+        form, number, size = _FOOTER.unpack(_bytes_at(file, at - _FOOTER.size, _FOOTER.size))
+        first = at - _FOOTER.size - size
+        if first < start or form > 2:
+            break
+        is_directory = (form, number) == (_BINARY, _DIRECTORY) and size and not size % _ENTRY.size
+        if is_directory and _read_listed(file, start, first, size, wanted, contents):
+            return  # gaps between records are usual then, so that others are not looked for
+        if number in wanted:
+            _add(file, first, size, number, contents)
+        at = first
+    contents.notes.append(f"damaged: {at - start:,} bytes of the trailer cannot be read")
+
+
+def _read_listed(
+    file: BinaryIO, start: int, at: int, size: int, wanted: set[int], contents: _Contents
+) -> bool:
+    """Read records that a directory of `size` bytes at `at` lists; whether all lie as it says."""
+    before = len(contents.notes)
+    listed = _bytes_at(file, at, min(size, _MAX_RECORDS * _ENTRY.size))
+    for number, form, count, offset in _ENTRY.iter_unpack(listed):
+        first = start + offset
+        if number not in wanted:
+            continue
+        if first + count + _FOOTER.size > at:
+            contents.notes.append(f"damaged: record {number} would lie outside of the trailer")
+            continue
+        if _FOOTER.unpack(_bytes_at(file, first + count, _FOOTER.size)) != (form, number, count):
+            contents.notes.append(f"damaged: record {number} is not where the directory has it")
+            continue
+        _add(file, first, count, number, contents)
+    return len(contents.notes) == before
+
+
+def _add(file: BinaryIO, start: int, size: int, number: int, contents: _Contents) -> None:
+    """Read a record, unless one of its number was read."""
+    if number in contents.records or not size:
+        return
+    if size > (_MAX_METADATA_BYTES if number == _METADATA else _MAX_RECORD_BYTES):
+        contents.notes.append(f"damaged: record {number} claims {size:,} bytes")
+        return
+    contents.records[number] = _bytes_at(file, start, size)
+
+
+def _trailer(version: int, contents: _Contents) -> Insta360Trailer:
+    """What records say."""
+    records, notes = contents.records, contents.notes
+    values, whole = read_message(records.get(_METADATA, b""))
+    if not whole:
+        notes.append("damaged: the end of the metadata cannot be read")
+    raw = _flag(values, _RAW_GYRO)
+    found = _gyro(records.get(_GYRO, b""), raw, values, notes)
+    scaled_ms = raw is False if found is None else found.milliseconds
+    tick_s = 1e-3 if scaled_ms else 1e-6
+    start = first_frame = values.get(_FIRST_FRAME)
+    if not isinstance(first_frame, int) or not 0 <= first_frame < _MAX_TICK:
+        start = first_frame = None
+    delay_s = 1e-3 * (_real(values, _GYRO_DELAY_MS) or 0.0)
+    if start is None and found is not None:
+        start, delay_s = found.ticks[0], 0.0
+    readout_ms = _real(values, _READOUT_MS)
+    gyro = None
+    if found is not None and start is not None:
+        times = (found.ticks - start) * tick_s - delay_s
+        gyro = GyroRecord(times, found.rates, found.accelerations)
+    return Insta360Trailer(
+        version=version,
+        serial=_text(values, _SERIAL),
+        model=_text(values, _MODEL),
+        firmware=_text(values, _FIRMWARE),
+        lens_strings=tuple(text for key in _LENSES if (text := _text(values, key, 4096))),
+        window=_window(values),
+        picture_size=_size(values, _SIZE, 1, 2),
+        back_track_first=values.get(_TRACK_ORDER) == _BACK_TRACK_FIRST,
+        first_frame_s=None if first_frame is None else first_frame * tick_s,
+        created_unix_s=_creation_time(values),
+        readout_s=1e-3 * readout_ms if readout_ms is not None and 0 < readout_ms < 1e3 else None,
+        gyro=gyro,
+        exposures=_exposures(records.get(_EXPOSURES, b""), start, tick_s, "front", notes),
+        back_exposures=_exposures(records.get(_BACK_EXPOSURES, b""), start, tick_s, "back", notes),
+        gps=_gps(records.get(_GPS, b""), notes),
+        notes=tuple(notes),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Ticks:
+    """Readings of a gyro, on the camera's clock."""
+
+    ticks: np.ndarray  # (N,) int64, strictly increasing
+    milliseconds: bool  # whether ticks are milliseconds, else microseconds
+    rates: np.ndarray  # (N, 3) float64, rad/s
+    accelerations: np.ndarray  # (N, 3) float64, m/s^2
+
+
+def _gyro(
+    record: bytes, raw: bool | None, values: Mapping[int, Any], notes: list[str]
+) -> _Ticks | None:
+    """Readings of a record, in the layout that the metadata states, or else in the other one."""
+    if not record:
+        return None
+    ranges = read_message(values.get(_GYRO_RANGES, b""))[0]
+    for is_raw in (False, True) if raw is False else (True, False):
+        rows = np.frombuffer(record, _RAW if is_raw else _SCALED, len(record) // _row(is_raw))
+        ticks, (forces, turns) = rows["time"], np.split(rows["values"], 2, axis=1)
+        if is_raw:
+            forces, turns = _from_raw(forces, turns, ranges)
+        with np.errstate(invalid="ignore", over="ignore"):
+            fine = np.isfinite(rows["values"]).all(axis=1) & (abs(turns) < _MAX_RATE).all(axis=1)
+        fine &= _near_others(ticks)
+        later = np.maximum.accumulate(np.where(fine, ticks, -1))
+        fine[1:] &= ticks[1:] > later[:-1]
+        kept, step_s = int(fine.sum()), 1e-6 if is_raw else 1e-3
+        if kept < max(2, _MIN_USABLE * len(rows)):
+            continue
+        rate_hz = 1 / (float(np.median(np.diff(ticks[fine]))) * step_s)
+        if not _MIN_RATE_HZ <= rate_hz <= _MAX_RATE_HZ:
+            continue
+        if kept < len(rows):
+            notes.append(f"gyro: {len(rows) - kept:,} of {len(rows):,} readings are damaged")
+        forces = forces[fine] * _force_unit(forces[fine], is_raw)
+        return _Ticks(ticks[fine], not is_raw, turns[fine].astype(np.float64), forces)
+    notes.append(f"gyro: {len(record):,} bytes of no known layout")
+    return None
+
+
+def _near_others(ticks: np.ndarray) -> np.ndarray:
+    """Whether times (N,) int64 lie as near to the middle one as so many steps reach; (N,) bool."""
+    sound = (ticks >= 0) & (ticks < _MAX_TICK)
+    if sound.sum() < 2:
+        return sound
+    step = float(np.median(abs(np.diff(ticks[sound]))))
+    return sound & (abs(ticks - np.median(ticks[sound])) <= _MAX_SPAN * len(ticks) * step)
+
+
+def _row(is_raw: bool) -> int:
+    """Bytes of a reading."""
+    return (_RAW if is_raw else _SCALED).itemsize
+
+
+def _from_raw(
+    forces: np.ndarray, turns: np.ndarray, ranges: Mapping[int, Any]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Accelerations (N, 3) in g and rates (N, 3) in rad/s of raw values.
+
+    Zero is 32768, and 32768 more is the end of the range, which the metadata states: 32 g are 1024
+    a g, 2000 deg/s are 16.384 for each.
+    """
+    stated_g, stated_deg_s = (
+        float(found) if isinstance(found := ranges.get(key), int) and 0 < found < 1e5 else None
+        for key in (1, 2)
+    )
+    of_full = (forces.astype(np.float64) - _RAW_ZERO) / _RAW_FULL
+    if stated_g is None and len(of_full):
+        length = float(np.median(np.linalg.norm(of_full, axis=1)))
+        stated_g = float(min(_RANGES_G, key=lambda g: abs(np.log(max(g * length, 1e-9)))))
+    full_rate = np.deg2rad(stated_deg_s or _RANGE_DEG_S)
+    return of_full * (stated_g or 1.0), (
+        turns.astype(np.float64) - _RAW_ZERO
+    ) / _RAW_FULL * full_rate
+
+
+def _force_unit(forces: np.ndarray, is_raw: bool) -> float:
+    """m/s^2 for each unit of accelerations (N, 3): they are in g, unless they are far longer."""
+    length = float(np.median(np.linalg.norm(forces, axis=1)))
+    return 1.0 if length > np.sqrt(_STANDARD_GRAVITY) and not is_raw else _STANDARD_GRAVITY
+
+
+def _exposures(
+    record: bytes, start: Any, tick_s: float, lens: str, notes: list[str]
+) -> ExposureRecord | None:
+    """Exposures of a record, on the clock that begins at `start` ticks; None = there are none."""
+    rows = np.frombuffer(record, _SHUTTER, len(record) // _SHUTTER.itemsize)
+    with np.errstate(invalid="ignore"):
+        fine = (rows["duration"] > 0) & (rows["duration"] < _MAX_EXPOSURE_S)
+    fine &= (rows["time"] >= 0) & (rows["time"] < _MAX_TICK)
+    if not len(rows):
+        return None
+    if not fine.all():
+        notes.append(f"exposures of the {lens} lens: {(~fine).sum():,} of {len(rows):,} damaged")
+    if not fine.any():
+        return None
+    ticks = rows["time"][fine]
+    start = ticks[0] if start is None else start
+    return ExposureRecord((ticks - start) * tick_s, rows["duration"][fine].astype(np.float64))
+
+
+def _gps(record: bytes, notes: list[str]) -> GpsRecord | None:
+    """Fixes that are marked as valid and lie somewhere; None = there are none."""
+    rows = np.frombuffer(record, _FIX, len(record) // _FIX.itemsize)
+    rows = rows[rows["state"] == b"A"]
+    latitudes, longitudes = abs(rows["latitude"]), abs(rows["longitude"])
+    with np.errstate(invalid="ignore"):
+        fine = (latitudes <= 90) & (longitudes <= 180) & (latitudes + longitudes > 0)
+    others = np.column_stack([rows[key] for key in ("speed", "course", "altitude")])
+    fine &= np.isfinite(others).all(axis=1)
+    if not fine.all():
+        notes.append(f"GPS: {(~fine).sum():,} of {len(rows):,} fixes are damaged or at 0, 0")
+    if not fine.any():
+        return None
+    rows = rows[fine]
+    return GpsRecord(
+        unix_times=rows["seconds"] + 1e-3 * rows["milliseconds"],
+        latitudes=np.where(rows["north"] == b"S", -abs(rows["latitude"]), rows["latitude"]),
+        longitudes=np.where(rows["east"] == b"W", -abs(rows["longitude"]), rows["longitude"]),
+        altitudes=rows["altitude"].astype(np.float64),
+        speeds=rows["speed"].astype(np.float64),
+        courses=rows["course"].astype(np.float64),
+    )
+
+
+def _text(values: Mapping[int, Any], key: int, most: int = 200) -> str:
+    """A field of text without what no terminal should show; "" = none."""
+    found = values.get(key)
+    text = found.decode("utf-8", "replace") if isinstance(found, bytes) else ""
+    return "".join(filter(str.isprintable, text[:most])).strip()
+
+
+def _real(values: Mapping[int, Any], key: int) -> float | None:
+    """A field of a finite floating-point number."""
+    found = values.get(key)
+    return found if isinstance(found, float) and np.isfinite(found) else None
+
+
+def _flag(values: Mapping[int, Any], key: int) -> bool | None:
+    found = values.get(key)
+    return bool(found) if isinstance(found, int) else None
+
+
+def _size(values: Mapping[int, Any], key: int, across: int, down: int) -> tuple[int, int] | None:
+    """Width and height from two fields of a nested message."""
+    inner = read_message(values.get(key, b""))[0]
+    width, height = inner.get(across), inner.get(down)
+    if not isinstance(width, int) or not isinstance(height, int):
+        return None
+    return (width, height) if 0 < width < 1 << 16 and 0 < height < 1 << 16 else None
+
+
+def _window(values: Mapping[int, Any]) -> SensorWindow | None:
+    source, size = _size(values, _WINDOW, 1, 2), _size(values, _WINDOW, 3, 4)
+    if source is None or size is None or size[0] > source[0] or size[1] > source[1]:
+        return None
+    inner = read_message(values[_WINDOW])[0]
+    right, down = (found if isinstance(found := inner.get(key, 0), int) else 0 for key in (5, 6))
+    if abs(right) > source[0] or abs(down) > source[1]:
+        return None
+    return SensorWindow(source, size, (right, down))
+
+
+def _creation_time(values: Mapping[int, Any]) -> float | None:
+    """Seconds since 1970, of a field that holds seconds or milliseconds."""
+    found = values.get(_CREATED)
+    if not isinstance(found, int) or found <= 0 or found > 1000 * _YEAR_2100:
+        return None
+    return float(found) if found < _YEAR_2100 else 1e-3 * found

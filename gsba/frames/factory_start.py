@@ -1,0 +1,181 @@
+"""Lenses of raw pairs to start from, by what their camera's maker wrote into its files."""
+
+import json
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gsba.camera.factory_lenses import (
+    FactoryCalibration,
+    FactoryLenses,
+    parse_factory_lenses,
+)
+from gsba.camera.fisheye import Pair
+from gsba.containers.insta360 import read_trailer
+from gsba.disk import write_json
+from gsba.frames.files import image_size
+from gsba.frames.raw_pairs import decode_pair, rim_likeness
+from gsba.log import GsbaError
+
+_log = logging.getLogger(__name__)
+
+FACTORY_FILE = "factory_lenses.json"  # beside the frames of a video
+INSTA360_PICTURE = ".insp"  # suffix of JPEG images with both lenses side by side
+_LOOKS = 8  # frames in which rims are compared
+_QUARTER_TURNS = 4
+_MAX_BYTES = 1 << 16  # of FACTORY_FILE
+_CLEARLY = 0.1  # by how much more alike rims must become for another reading than the usual one
+_AGREEING = 0.3  # likeness of the rims that says that a reading is right
+
+
+def factory_calibration(
+    files: Iterable[Path], two_tracks: bool = False
+) -> FactoryCalibration | None:
+    """The maker's calibration in the first of some files that holds one that can be read.
+
+    Args:
+        files: videos or pictures of one camera, as it wrote them.
+        two_tracks: whether they show the lenses in two tracks, in an order that the file states.
+    """
+    for path in files:
+        try:
+            trailer = read_trailer(path, telemetry=False)
+        except GsbaError as error:
+            _log.info("no calibration by the maker: %s", error)
+            continue
+        if trailer is None:
+            continue
+        for text in trailer.lens_strings:
+            window = trailer.window
+            found = FactoryCalibration(
+                text,
+                camera=trailer.model,
+                sensor=None if window is None else window.source,
+                window=None if window is None else window.size,
+                shift=(0, 0) if window is None else window.shift,
+                back_first=two_tracks and trailer.back_track_first,
+            )
+            try:
+                parse_factory_lenses(found)
+            except GsbaError as error:
+                _log.info("%s: not used: %s", path, error)
+                continue
+            return found
+    return None
+
+
+def write_factory_calibration(folder: Path, calibration: FactoryCalibration) -> None:
+    """Keep a maker's calibration beside frames, for `find_factory_lenses`."""
+    write_json(folder / FACTORY_FILE, asdict(calibration))
+
+
+def find_factory_lenses(folder: Path, images: Sequence[Path]) -> FactoryLenses | None:
+    """The maker's calibration of frames: beside those of a video, in pictures as the camera wrote
+    them; None = there is none.
+
+    Raises:
+        GsbaError: the file beside the frames is damaged.
+    """
+    found = _read_factory_calibration(folder)
+    if found is None and images and images[0].suffix.lower() == INSTA360_PICTURE:
+        found = factory_calibration(images[:1])
+    return None if found is None else parse_factory_lenses(found)
+
+
+def starting_lenses(
+    folder: Path, pairs: Sequence[tuple[Path, ...]], factory: FactoryLenses
+) -> Pair:
+    """Lenses of raw pairs by the maker's calibration, which leaves open what only images tell.
+
+    That is whether pictures show the stated window of the sensor or all of it, and, if somebody
+    turned pictures, by which quarter the back ones are turned against the front ones. The usual
+    reading is taken unless another one makes the lenses' pictures clearly more alike at the rims.
+
+    Args:
+        folder: of the pictures, for the log.
+        pairs: pictures of the front and of the back lens of each frame, or twice one of both.
+        factory: the maker's calibration.
+    """
+    width, height = image_size(pairs[0][0])
+    size = (width // 2 if pairs[0][0] == pairs[0][1] else width, height)
+    rows = np.unique(np.linspace(0, len(pairs) - 1, _LOOKS).astype(int))
+    looks = [decode_pair(pairs[f], size, gray=True) for f in rows]
+    readings = [
+        _with_back_turned(pair, quarters)
+        for pair in factory.pairs(size)
+        for quarters in range(_QUARTER_TURNS)
+    ]
+    scores = [rim_likeness(looks, *pair) for pair in readings]
+    best = int(np.argmax(scores))
+    if scores[best] <= scores[0] + _CLEARLY:
+        best = 0
+    _log.warning(
+        "%s: lenses start from the maker's calibration (generation %d, directions to %.1f "
+        "degrees, one lens against the other to %.1f%s), %s; --calibration FILE says better",
+        folder,
+        factory.generation,
+        np.rad2deg(factory.direction_sigma),
+        np.rad2deg(factory.rotation_sigma),
+        _other_reading(best) if factory.angles_known else "; its angles are of no known form",
+        "which both lenses' rims confirm" if scores[best] > _AGREEING else "unconfirmed by images",
+    )
+    return readings[best]
+
+
+def _read_factory_calibration(folder: Path) -> FactoryCalibration | None:
+    """The maker's calibration beside frames; None = there is none.
+
+    Raises:
+        GsbaError: a file of that name that is damaged.
+    """
+    path = folder / FACTORY_FILE
+    try:
+        with path.open("rb") as file:
+            tree = json.loads(file.read(_MAX_BYTES))
+        texts = {key: tree[key] for key in ("text", "camera")}
+        sizes = {key: tree[key] and _two_whole(tree[key]) for key in ("sensor", "window")}
+        if not all(isinstance(text, str) for text in texts.values()):
+            raise ValueError
+        if not all(size is None or min(size) > 0 for size in sizes.values()):
+            raise ValueError
+        rest = {"shift": _two_whole(tree["shift"]), "back_first": bool(tree["back_first"])}
+        return FactoryCalibration(**texts, **sizes, **rest)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        raise GsbaError(f"{path}: is damaged: remove it, or extract the frames again") from None
+
+
+def _two_whole(values: Any) -> tuple[int, int]:
+    """Two whole numbers.
+
+    Raises:
+        ValueError, TypeError: others.
+    """
+    first, second = values
+    if not all(isinstance(value, int) and abs(value) < 1 << 20 for value in (first, second)):
+        raise ValueError
+    return first, second
+
+
+def _with_back_turned(pair: Pair, quarters: int) -> Pair:
+    """A pair whose back pictures are turned by quarters about the lens's axis."""
+    if not quarters:
+        return pair
+    front, back = pair
+    turn = Rotation.from_rotvec(back.rotation) * Rotation.from_euler("z", 90 * quarters, True)
+    a, b, c = turn.as_rotvec().tolist()
+    return front, replace(back, rotation=(a, b, c))
+
+
+def _other_reading(reading: int) -> str:
+    """How a reading differs from the usual one, for the log; "" = it is that."""
+    turned = reading % _QUARTER_TURNS
+    parts = [f"the back lens turned by {90 * turned} degrees"] if turned else []
+    parts += ["the whole sensor in the picture"] if reading >= _QUARTER_TURNS else []
+    return f"; as images show, {' and '.join(parts)}" if parts else ""
