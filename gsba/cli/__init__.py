@@ -1,11 +1,12 @@
 """The command line. Commands parse, call and print; heavy imports stay in their bodies."""
 
-from gsba.cli import checking, plotting, preparing, refining, results, splat, viewing
+from gsba.cli import checking, inspecting, plotting, preparing, refining, results, splat, viewing
 from gsba.cli.app import app
 
 __all__ = [
     "app",
     "checking",
+    "inspecting",
     "main",
     "plotting",
     "preparing",

@@ -84,6 +84,17 @@ def claimed_duration_s(video: Path) -> float | None:
         return _claimed_end(container, streams[0])
 
 
+def container_tags(video: Path) -> dict[str, str]:
+    """Tags of a video's container by the last word of their names in small letters: QuickTime's
+    "com.apple.quicktime.model" is "model".
+
+    Raises:
+        GsbaError: no video.
+    """
+    with _opened(video) as (container, _):
+        return {key.lower().rpartition(".")[2]: text for key, text in container.metadata.items()}
+
+
 def read_timeline(track: Track) -> Timeline:
     """Presentation times of all frames of a track, from its packets alone.
 

@@ -1,0 +1,107 @@
+"""What a video is: camera, layout, tracks, times, gyro, positions, lenses."""
+
+from pathlib import Path
+
+import numpy as np
+
+from gsba.config import VideoSettings
+from gsba.containers.insta360 import Insta360Trailer, read_trailer
+from gsba.imu.files import read_telemetry
+from gsba.inspection.facts import Facts, Found, spoken_seconds
+from gsba.log import GsbaError
+from gsba.placement.gps_video import read_video_gps
+from gsba.video.recording import Recording, read_recording
+from gsba.video.timeline import container_tags
+
+_RATE = 2.0  # frames per second that suit somebody who walks
+_STEADY = 1.5  # longest step over the median one, up to which a frame rate is constant
+
+
+def of_video(path: Path) -> Found:
+    """Facts about a video; those that can be found out of one that would be refused."""
+    trailer = read_trailer(path)
+    try:
+        recording = read_recording(path)
+    except GsbaError as error:
+        return Found((*_camera(path, trailer), *_sensors(path, trailer)), str(error))
+    facts = (
+        *_camera(path, trailer),
+        ("layout", _layout(recording)),
+        *(("files", track.path.name) for track in recording.tracks[1:] if track.path != path),
+        ("frames", _frames(recording)),
+        *_sensors(path, trailer),
+    )
+    rate = min(_RATE, 1 / recording.timelines[0].interval_s)
+    options = () if rate == VideoSettings().fps else ("--fps", f"{rate:g}")
+    return Found(facts, options=options)
+
+
+def _camera(path: Path, trailer: Insta360Trailer | None) -> Facts:
+    """Maker, model and firmware, and when the recording was made."""
+    if trailer is not None:
+        firmware = f", firmware {trailer.firmware}" if trailer.firmware else ""
+        return (("camera", f"{trailer.model or 'Insta360'}{firmware}"),)
+    tags = container_tags(path)
+    named = [tags[key] for key in ("make", "model", "firmware") if tags.get(key)]
+    created = tags.get("creation_time")
+    facts = [("camera", " ".join(named))] if named else []
+    return (*facts, *([("created", created)] if created else []))
+
+
+def _layout(recording: Recording) -> str:
+    """How pictures lie in the frames."""
+    line = recording.timelines[0]
+    if recording.cube:
+        return f"equi-angular cube map, two tracks of {line.width}x{line.height}"
+    if not recording.lenses:
+        return f"stitched panoramas, {line.width}x{line.height}"
+    tracks = "two tracks or files" if len(recording.tracks) > 1 else "side by side"
+    return f"raw, two fisheyes, {tracks} of {line.width}x{line.height}"
+
+
+def _frames(recording: Recording) -> str:
+    """Number, rate and duration."""
+    times, num = recording.times, int(np.count_nonzero(recording.shown))
+    steps = np.diff(times)
+    varying = len(steps) and steps.max() > _STEADY * np.median(steps)
+    rate = 1 / recording.timelines[0].interval_s
+    end = float(times[-1]) + recording.timelines[0].interval_s
+    about = "about " if varying else ""
+    return f"{num}, {about}{rate:.5g} a second, {spoken_seconds(end)}"
+
+
+def _sensors(path: Path, trailer: Insta360Trailer | None) -> Facts:
+    """Gyro, positions, and what the maker states of exposures and lenses."""
+    facts = [("gyro", _gyro(path)), ("GPS", _gps(path))]
+    if trailer is None:
+        return tuple(facts)
+    if trailer.exposures is not None:
+        times = 1e3 * trailer.exposures.durations
+        facts.append(("exposures", f"{len(times):,}, {times.min():.3g} to {times.max():.3g} ms"))
+    if trailer.readout_s is not None:
+        facts.append(("readout", f"{1e3 * trailer.readout_s:.4g} ms, by the maker"))
+    known = "by the maker, a start for the images" if trailer.lens_strings else "none in the file"
+    return (*facts, ("calibration", known), *(("note", note) for note in trailer.notes))
+
+
+def _gyro(path: Path) -> str:
+    try:
+        readings = read_telemetry(path)
+    except GsbaError as error:
+        return f"none: {_reason(path, error)}"
+    rate = 1 / float(np.median(np.diff(readings.times)))
+    beside = " with accelerometer" if readings.forces is not None else ""
+    return f"{len(readings.times):,} readings at {rate:.0f} Hz{beside}"
+
+
+def _gps(path: Path) -> str:
+    try:
+        fixes = read_video_gps(path)
+    except GsbaError as error:
+        return f"none: {_reason(path, error)}"
+    return f"{len(fixes.geodetic):,} fixes, {np.median(fixes.sigmas[:, 0]):.2g} m across (1 sigma)"
+
+
+def _reason(path: Path, error: GsbaError) -> str:
+    """What an error says beside the path, which stands above."""
+    return str(error).removeprefix(f"{path}: ")

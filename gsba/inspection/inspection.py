@@ -1,0 +1,53 @@
+"""What a file or folder is, in facts for people and programs, and the `refine` line for it."""
+
+import shlex
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from gsba import video
+from gsba.frames.files import is_image
+from gsba.inspection import footage, pictures
+from gsba.inspection.facts import Facts
+from gsba.log import GsbaError
+
+
+@dataclass(frozen=True, slots=True)
+class Inspection:
+    """What a path holds."""
+
+    path: str  # as it was given
+    facts: Facts  # name and text of each
+    problem: str  # why `refine` would refuse it, one line; "" = it would not
+    command: str  # the line to type; "" where it would be refused
+
+    def table(self) -> dict[str, Any]:
+        """Plain values, as JSON holds them."""
+        return asdict(self) | {"facts": dict(self.facts)}
+
+    def text(self) -> str:
+        """Lines for people."""
+        width = max((len(name) for name, _ in self.facts), default=0)
+        lines = [f"  {name.ljust(width)}  {text}" for name, text in self.facts]
+        end = f"  refused: {self.problem}" if self.problem else f"  {self.command}"
+        return "\n".join([self.path, *lines, end])
+
+
+def inspect(path: Path) -> Inspection:
+    """Find out what a video, a picture or a folder of pictures is.
+
+    Raises:
+        GsbaError: there is no such file or folder, or it is none of these.
+    """
+    if path.is_dir():
+        found = pictures.of_folder(path)
+    elif video.is_video(path):
+        found = footage.of_video(path)
+    elif is_image(path):
+        found = pictures.of_picture(path)
+    elif path.exists():
+        raise GsbaError(f"{path}: is no video, picture or folder of pictures")
+    else:
+        raise GsbaError(f"{path}: no such file or folder")
+    command = "" if found.problem else shlex.join(["gsba", "refine", str(path), *found.options])
+    return Inspection(str(path), found.facts, found.problem, command)

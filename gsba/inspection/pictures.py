@@ -1,0 +1,73 @@
+"""What pictures are: one of them, or a folder of frames."""
+
+from pathlib import Path
+
+import numpy as np
+
+from gsba.frames.exif import ExifTags, read_exif
+from gsba.frames.files import image_size
+from gsba.frames.scan import scan
+from gsba.inspection.facts import Facts, Found, spoken_seconds
+from gsba.log import GsbaError
+from gsba.types import FrameSet
+
+_LAYOUTS = {
+    "erp": "stitched panoramas",
+    "fisheye": "raw, two fisheyes a frame",
+    "cube": "faces of a cube",
+    "eac": "equi-angular cube map, two pictures a frame",
+}
+
+
+def of_folder(folder: Path) -> Found:
+    """Facts about a folder of frames."""
+    try:
+        frames = scan(folder, order_suffices=True)
+    except GsbaError as error:
+        return Found((), str(error))
+    tags = [tag for paths in frames.paths if (tag := _tags(paths[0])) is not None]
+    return Found((*_camera(tags), *_about(frames), *_positions(tags, len(frames))))
+
+
+def of_picture(path: Path) -> Found:
+    """Facts about one picture, which is no capture."""
+    width, height = image_size(path)
+    tags = _tags(path)
+    facts = (*_camera([tags] if tags else []), ("size", f"{width}x{height}"))
+    return Found(facts, f"{path}: one picture; give the folder of all pictures of the place")
+
+
+def _about(frames: FrameSet) -> Facts:
+    """Layout, number, times and lenses."""
+    first = frames.paths[0][0]
+    width, height = image_size(first)
+    facts = [("layout", f"{_LAYOUTS[frames.layout]}, files of {width}x{height}")]
+    count = str(len(frames))
+    if frames.timed:
+        span = float(frames.timestamps[-1] - frames.timestamps[0])
+        step = float(np.median(np.diff(frames.timestamps)))
+        facts.append(("frames", f"{count}, one every {step:.3g} s, {spoken_seconds(span)}"))
+    else:
+        facts.append(("frames", f"{count}, in the order of their names: nothing says when"))
+    for name, lens in zip(("front lens", "back lens"), frames.fisheyes or (), strict=False):
+        x, y = lens.principal
+        at = f"focal length {lens.focal:.1f} px, principal point ({x:.1f}, {y:.1f})"
+        facts.append((name, f"{at} in {lens.width}x{lens.height}"))
+    return tuple(facts)
+
+
+def _tags(path: Path) -> ExifTags | None:
+    try:
+        return read_exif(path)
+    except ValueError:  # damaged tags say nothing
+        return None
+
+
+def _camera(tags: list[ExifTags]) -> Facts:
+    named = [tag.camera for tag in tags if tag.camera]
+    return (("camera", max(set(named), key=named.count)),) if named else ()
+
+
+def _positions(tags: list[ExifTags], num: int) -> Facts:
+    located = sum(tag.gps is not None for tag in tags)
+    return (("GPS", f"{located} of {num} frames have a position (--gps exif)"),) if located else ()
