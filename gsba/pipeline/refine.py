@@ -258,9 +258,12 @@ def _find_camera(
     if run.frames.fisheyes is not None:
         return _find_raw_camera(run, seen, prior, matches, solved)
     looking = seen.through(Lenses())
-    guess = backend.guess_axes(run, looking, prior, "axes", matches, solved)
+    guess = None
+    if not run.frames.lens_axes_known:
+        guess = backend.guess_axes(run, looking, prior, "axes", matches, solved)
+        looking = seen.through(guess.lenses)
     band, better, gates = np.deg2rad(settings.camera.seam_deg), solved, settings.rounds.loops
-    looking = seen.through(replace(guess.lenses, band_rad=float(band)))
+    looking = seen.through(replace(looking.lenses, band_rad=float(band)))
     for n in range(2):  # on trial, then judged by what is matched with them
         found = backend.find_lenses(run, looking, prior, f"lenses{n}", matches, better)
         if not found.lenses:

@@ -1,0 +1,180 @@
+"""Equi-angular cube maps on disk: the two tracks of GoPro's MAX cameras, a picture each a frame.
+
+They are resampled once, straight into what is asked for: a panorama here, faces in `cubemap`.
+"""
+
+import logging
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gsba.camera.equiangular import (
+    Grid,
+    around_squares,
+    is_equiangular,
+    overlap_of,
+    shrunk,
+    square_directions,
+    square_pixels,
+    squares,
+)
+from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.tables import table
+from gsba.frames.files import decode, image_size, is_image
+from gsba.log import GsbaError
+from gsba.types import FACES, FrameSet
+
+_log = logging.getLogger(__name__)
+
+_FOLDER = re.compile(r"track(\d+)", re.IGNORECASE)
+_BAND = 256  # rows of which coordinates are held in double precision
+_LOOKED_AT = 5  # frames in which edges of squares are compared
+_MIN_CORRELATION = 0.5  # of grey values along edges that squares of both tracks share: it is 0.9 and
+# more on real frames, and around 0 on pictures that do not belong together
+_MIN_CONTRAST = 4.0  # grey levels, standard deviation along an edge that tells
+
+
+def find_tracks(folder: Path) -> dict[str, tuple[Path, ...]] | None:
+    """Pictures of both tracks of each frame by name, of folders `track0` and `track5`, or the like.
+
+    Returns:
+        None: no such folder holds images.
+
+    Raises:
+        GsbaError: only one does, or more than two, or their names differ.
+    """
+    if not folder.is_dir():
+        return None
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        match = _FOLDER.fullmatch(path.name)
+        if match and path.is_dir() and any(map(is_image, path.iterdir())):
+            found[int(match[1])] = path
+    if not found:
+        return None
+    names = [found[number].name for number in sorted(found)]
+    if len(names) != 2:
+        several = f"pictures in {len(names)} folders, {', '.join(names)}"
+        held = f"{names[0]}/ but no pictures of the second track" if len(names) == 1 else several
+        raise GsbaError(
+            f"{folder}: holds {held}; of a .360 recording, extract both video tracks, as track0/ "
+            "and track5/ (gsba extract does)"
+        )
+    first, second = (_by_name(folder / name) for name in names)
+    for one, other, (ours, theirs) in ((first, second, names), (second, first, names[::-1])):
+        missing = sorted(one.keys() - other.keys())
+        if missing:
+            raise GsbaError(
+                f"{folder}: '{ours}/{one[missing[0]].name}' has no picture of that name in "
+                f"{theirs}/ ({len(missing)} of {len(one)}); remove it, or extract both alike"
+            )
+    return {name: (path, second[name]) for name, path in first.items()}
+
+
+def track_size(pairs: Sequence[tuple[Path, ...]]) -> tuple[int, int]:
+    """Width and height of the pictures of two tracks, all checked by their headers.
+
+    Raises:
+        GsbaError: sizes that differ, or that tracks of an equi-angular cube map cannot have.
+    """
+    first = pairs[0][0]
+    width, height = image_size(first)
+    if not is_equiangular(width, height):
+        raise GsbaError(
+            f"{first}: is {width}x{height}, no track of a .360 recording: that is three squares "
+            "wide and up to a twelfth more (4096x1344, 2272x736)"
+        )
+    for path in (path for pair in pairs for path in pair):
+        if (size := image_size(path)) != (width, height):
+            raise GsbaError(
+                f"{path}: is {size[0]}x{size[1]}, but '{first.parent.name}/{first.name}' is "
+                f"{width}x{height}: both tracks are of one size; extract them again"
+            )
+    return width, height
+
+
+def check_edges(folder: Path, pairs: Sequence[tuple[Path, ...]], size: tuple[int, int]) -> None:
+    """Refuse tracks whose squares do not continue one another, by some frames.
+
+    Raises:
+        GsbaError: so they are; they are not of one instant, or of another layout.
+    """
+    rows = np.unique(np.linspace(0, len(pairs) - 1, _LOOKED_AT).astype(int))
+    found = [_edge_correlations(_decoded(pairs[row], size, gray=True)) for row in rows]
+    known = np.concatenate(found)
+    _log.info(
+        "%s: GoPro's equi-angular cube map, two tracks of %dx%d, %d columns from both lenses",
+        folder, *size, overlap_of(*size),
+    )  # fmt: skip
+    if len(known) and np.median(known) < _MIN_CORRELATION:
+        raise GsbaError(
+            f"{folder}: squares of {pairs[0][0].parent.name} and {pairs[0][1].parent.name} do not "
+            f"meet at their edges (correlation {np.median(known):.2f}): their pictures are not of "
+            "the same instants, or not of GoPro's equi-angular layout; extract both tracks again"
+        )
+
+
+def load_squares(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
+    """Upright squares (6, S, S[, 3]) uint8 of frame f, FACES order; see `equiangular.squares`."""
+    assert frames.tracks is not None
+    return _decoded(frames.paths[f], frames.tracks, gray)
+
+
+def load_panorama(frames: FrameSet, f: int, gray: bool, width: int) -> np.ndarray:
+    """Panorama (width / 2, width[, 3]) uint8 of frame f, with the frames' correction."""
+    faces = shrunk(load_squares(frames, f, gray), max(round(width / 4), 1))
+    u, v = _maps(Grid(faces.shape[1], frames.correction), width)
+    return cv2.remap(around_squares(faces), u, v, cv2.INTER_LANCZOS4)
+
+
+def _decoded(paths: Sequence[Path], size: tuple[int, int], gray: bool) -> np.ndarray:
+    first, second = (decode(path, size, gray) for path in paths)
+    return squares((first, second))
+
+
+@table(maxsize=2)
+def _maps(grid: Grid, width: int) -> np.ndarray:
+    """Places (2, width / 2, width) float32 of a panorama's pixels in a grid, OpenCV pixels."""
+    height = width // 2
+    maps = np.empty((2, height, width), np.float32)
+    for top in range(0, height, _BAND):
+        rows = np.arange(top, min(top + _BAND, height)) + 0.5
+        pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, rows), axis=-1)
+        found = grid.places(bearings_from_erp(pixels, width, height))
+        maps[:, top : top + len(rows)] = np.moveaxis(found, -1, 0)
+    return maps
+
+
+def _edge_correlations(faces: np.ndarray) -> np.ndarray:
+    """Correlations (n,) of grey values (6, S, S) just beside edges that both tracks have a part in;
+    those without contrast are left out."""
+    size, found = faces.shape[1], []
+    along = np.arange(size) + 0.5
+    for face in ("front", "right", "left"):  # of track 0
+        n = FACES.index(face)
+        for u, v in ((along, -0.5), (along, size + 0.5), (-0.5, along), (size + 0.5, along)):
+            beyond = np.stack(np.broadcast_arrays(u, v), axis=-1)
+            others, pixels = square_pixels(square_directions(beyond, n, size), size)
+            if FACES[others[size // 2]] in ("front", "right", "left"):
+                continue
+            inner = np.clip(beyond, 0, size - 1).astype(int)
+            there = np.clip(pixels, 0, size - 1).astype(int)
+            a = faces[n, inner[:, 1], inner[:, 0]].astype(float)
+            b = faces[others, there[:, 1], there[:, 0]].astype(float)
+            if min(a.std(), b.std()) > _MIN_CONTRAST:
+                found.append(np.corrcoef(a, b)[0, 1])
+    return np.array(found)
+
+
+def _by_name(folder: Path) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for path in filter(is_image, sorted(folder.iterdir())):
+        if path.stem in found:
+            raise GsbaError(
+                f"{folder}: '{found[path.stem].name}' and '{path.name}' are one frame's name twice"
+            )
+        found[path.stem] = path
+    return found
