@@ -32,8 +32,8 @@ _log = logging.getLogger(__name__)
 _FOLDER = re.compile(r"track(\d+)", re.IGNORECASE)
 _BAND = 256  # rows of which coordinates are held in double precision
 _LOOKED_AT = 5  # frames in which edges of squares are compared
-_MIN_CORRELATION = 0.5  # of grey values along edges that squares of both tracks share: it is 0.9 and
-# more on real frames, and around 0 on pictures that do not belong together
+_MIN_CORRELATION = 0.5  # of grey values along edges that squares of both tracks share: 0.9 and more
+# on real frames, around 0 on pictures of several instants
 _MIN_CONTRAST = 4.0  # grey levels, standard deviation along an edge that tells
 
 

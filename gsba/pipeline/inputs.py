@@ -9,6 +9,7 @@ import numpy as np
 from gsba import video
 from gsba.camera.calibration import read_calibration
 from gsba.config import RefineSettings
+from gsba.frames.lens_names import lens_files
 from gsba.frames.times import check_fps
 from gsba.imu.files import read_imu, read_telemetry
 from gsba.imu.readings import Readings
@@ -90,11 +91,12 @@ def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
     """
     if imu is not None:
         return read_imu(imu)
-    if not frames.is_file() or frames.suffix.lower() not in _WITH_GYRO:
+    pair = lens_files(frames)
+    if not frames.is_file() or (frames.suffix.lower() not in _WITH_GYRO and pair is None):
         return None
-    front = frames.with_name(frames.name.replace("_10_", "_00_"))  # of two files, the one with it
+    front = pair[0] if pair and pair[0].is_file() else frames  # of two files, the one with it
     try:
-        return read_telemetry(front if front.is_file() else frames)
+        return read_telemetry(front)
     except GsbaError as error:
         logger.info("no gyro: %s", error)
         return None
