@@ -37,9 +37,9 @@ def _directions(seed: int) -> np.ndarray:
 
 def _sample(track: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Values (N, C) float of a track (H, W, C) at pixels (N, 2), linear between centres."""
-    places = (pixels - 0.5).astype(np.float32)[None]
-    nothing, how, border = np.zeros(0, np.float32), cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
-    return cv2.remap(track.astype(np.float32), places, nothing, how, borderMode=border)[0]
+    u, v = (pixels - 0.5).astype(np.float32).T[:, None]
+    how, border = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
+    return cv2.remap(track.astype(np.float32), u, v, how, borderMode=border)[0]
 
 
 @pytest.mark.parametrize(("size", "overlap"), SIZES)
