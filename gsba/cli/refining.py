@@ -95,7 +95,9 @@ Segment = Annotated[
 def refine(
     frames: Annotated[
         Path,
-        typer.Argument(help="Folder of 2:1 panoramas, raw fisheyes or cube faces, or a video."),
+        typer.Argument(
+            help="Folder of 2:1 panoramas, raw fisheyes, .360 tracks or cube faces, or a video."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder of the run.", metavar="RUN")],
     trajectory: Annotated[
