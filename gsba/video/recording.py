@@ -263,16 +263,8 @@ def _of_two_tracks(
             f"{where}: {len(ours) + len(theirs) - 2 * num} instants left out that one {kind} alone "
             f"shows ({len(ours) - num} {one}, {len(theirs) - num} {other})"
         )
-    if cube:
-        whole = (slice(None), slice(None))
-        places, notes = (whole, whole), tuple(notes)
-        return Recording(tracks, (front, back), places, size[0], shown, nearest, notes, cube=True)
-    side = min(size)
-    top, left = (size[1] - side) // 2, (size[0] - side) // 2
-    if max(size) > side:
-        notes.append(f"{where}: pictures are cut to {side}x{side} around their middle")
-    place = (slice(top, top + side), slice(left, left + side))
-    return Recording(tracks, (front, back), (place, place), side, shown, nearest, tuple(notes))
+    places, lines = ((slice(None), slice(None)),) * 2, (front, back)
+    return Recording(tracks, lines, places, size[0], shown, nearest, tuple(notes), cube=cube)
 
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
