@@ -6,8 +6,8 @@ square is as high as its track, and equal steps in it are equal angles from its 
 half of the front and half of the back lens: their middle columns stand twice, once from each lens,
 so that they are wider than high. As a track is 3 S + 2 overlap wide, any size tells its overlap.
 
-Sources: P. Bourke and D. Greenwood (paulbourke.net/panorama/gopromax2sphere, 2021) for the layout;
-the width of the overlap and the turns were measured on frames and GoPro's own panoramas of them.
+Source of the layout: P. Bourke, paulbourke.net/panorama/gopromax2sphere (2021). The turns, the
+overlap and the angles were checked on frames of a MAX at 3K and panoramas made of them.
 """
 
 from dataclasses import dataclass
@@ -52,11 +52,6 @@ def overlap_of(width: int, height: int) -> int:
     return (width - 3 * height) // 2
 
 
-def band_rad(width: int, height: int) -> float:
-    """Angle from the seam between the lenses, within which tracks of a size show both."""
-    return np.pi / 4 * overlap_of(width, height) / height
-
-
 def square_pixels(directions: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Where upright equi-angular squares of `size` pixels show directions.
 
@@ -85,7 +80,7 @@ def square_directions(pixels: np.ndarray, face: int, size: int) -> np.ndarray:
 
 
 def taps(directions: np.ndarray, width: int, height: int) -> Taps:
-    """Where two tracks of a size show directions (..., 3), rig frame."""
+    """The pixels by which two tracks of a size, pixels, show directions (..., 3), rig frame."""
     faces, pixels = square_pixels(directions, height)
     track, slot, turns = np.moveaxis(np.array(_STORED)[faces], -1, 0)
     u, v = pixels[..., 0], pixels[..., 1]
@@ -127,8 +122,10 @@ def shrunk(faces: np.ndarray, size: int) -> np.ndarray:
 
 
 def around_squares(faces: np.ndarray) -> np.ndarray:
-    """Squares side by side in one picture, three and three, each with PAD pixels of what lies
-    beyond its border on the sphere: what `Grid` has places in."""
+    """Join squares (6, S, S[, C]) in one picture, three beside three, for `Grid` to look up.
+
+    Each square gets PAD pixels of what lies beyond its border on the sphere.
+    """
     size = faces.shape[1]
     cell = size + 2 * PAD
     out = np.empty((2 * cell, 3 * cell, *faces.shape[3:]), faces.dtype)
@@ -158,7 +155,11 @@ class Grid:
 
 
 def _blended(stored: np.ndarray, size: int, overlap: int) -> np.ndarray:
-    """A side square (S, S[, C]) uint8 of columns from its left edge on."""
+    """Blend the doubled columns of a side square; `stored` begins at its left edge.
+
+    Returns:
+        (S, S[, C]) uint8.
+    """
     half = (size + overlap) // 2
     first = half - overlap
     left, right = stored[:, first:half], stored[:, half : half + overlap]
@@ -170,7 +171,7 @@ def _blended(stored: np.ndarray, size: int, overlap: int) -> np.ndarray:
 
 
 def _left_share(columns: np.ndarray, size: int, overlap: int) -> np.ndarray:
-    """Weight of a side square's left half at columns of the square without the doubled ones."""
+    """Weight of the lens in the left half of a side square, at columns of the blended square."""
     return np.clip(0.5 + (size / 2 - columns) / max(overlap, 1e-9), 0, 1)
 
 

@@ -44,8 +44,10 @@ def straightened_inside(
 
 
 def observed(directions: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
-    """Where pictures that stitching bends show directions (h, w, 3), rig frame, as far as the field
-    tells, (h, w, 3)."""
+    """Directions (h, w, 3) in which bent pictures show directions (h, w, 3), rig frame, both unit.
+
+    The field is evaluated on a coarse grid and interpolated.
+    """
     import cv2
 
     padded = _padded_offsets(correction)

@@ -291,8 +291,12 @@ class ViewCutter:
     def cut_squares(
         self, squares: np.ndarray, correction: tuple[float, ...] = ()
     ) -> Iterator[np.ndarray]:
-        """As `cut_padded`, straight from the squares (6, S, S[, C]) uint8 of an equi-angular cube
-        map, FACES order; `correction` of what stitching bends is as in `FrameSet`."""
+        """Images (height, width[, C]) uint8, bicubic, of an equi-angular cube map.
+
+        Args:
+            squares: (6, S, S[, C]) uint8, FACES order.
+            correction: of what stitching bends, see `FrameSet`.
+        """
         width = dense_enough(4 * squares.shape[1], self._views[0].focal)
         squares = shrunk(squares, width // 4)
         places = Grid(squares.shape[1], correction).places
@@ -314,7 +318,7 @@ class ViewCutter:
     def _looked_up(
         self, picture: np.ndarray, places: Callable[[np.ndarray], np.ndarray], how: int
     ) -> Iterator[np.ndarray]:
-        """Each view of a picture that has directions (h, w, 3) at places (h, w, 2)."""
+        """Sample each view; `places` maps directions (h, w, 3) to OpenCV pixels (h, w, 2)."""
         for view, offsets in zip(self._views, self._offsets, strict=True):
             u, v = self._maps(view, offsets, places)
             yield cv2.remap(picture, u, v, how)

@@ -90,12 +90,15 @@ def cut_padded(padded: np.ndarray, rig: CubeRig, out: np.ndarray) -> Iterator[np
 def cut_squares(
     squares: np.ndarray, rig: CubeRig, correction: tuple[float, ...] = ()
 ) -> np.ndarray:
-    """As `cut`, of the squares (6, S, S[, C]) uint8 of an equi-angular cube map, in FACES order.
+    """Sample the faces of an equi-angular cube map, bicubic, continuous over all its edges.
 
     Args:
-        squares: of `gsba.camera.equiangular.squares`.
+        squares: (6, S, S[, C]) uint8 of `gsba.camera.equiangular.squares`, FACES order.
         rig: faces to cut.
         correction: of what stitching bends, see `FrameSet`.
+
+    Returns:
+        (6, size, size[, C]) uint8, in FACES order.
     """
     squares = shrunk(squares, dense_enough(4 * squares.shape[1], rig.focal) // 4)
     faces = np.empty((len(FACES), rig.size, rig.size, *squares.shape[3:]), np.uint8)
@@ -126,7 +129,7 @@ def _face_maps(rig: CubeRig, width: int, height: int) -> np.ndarray:
 
 @table(maxsize=2)
 def _grid_maps(rig: CubeRig, grid: Grid) -> np.ndarray:
-    """As `_face_maps`, in the squares of an equi-angular cube map."""
+    """Sampling positions (6, 2, size, size) float32 in an equi-angular grid, OpenCV pixels."""
     return _maps_by(rig, grid.places)
 
 

@@ -32,26 +32,29 @@ _log = logging.getLogger(__name__)
 _FOLDER = re.compile(r"track(\d+)", re.IGNORECASE)
 _BAND = 256  # rows of which coordinates are held in double precision
 _LOOKED_AT = 5  # frames in which edges of squares are compared
-_MIN_CORRELATION = 0.5  # of grey values along edges that squares of both tracks share: 0.9 and more
-# on real frames, around 0 on pictures of several instants
+_MIN_CORRELATION = (
+    0.5  # of grey values along edges that squares of both tracks share: its median is
+)
+# 0.95 and more on real frames, 0.2 and less on pictures of several instants
+_PARTS = 64  # of an edge, whose mean grey values are compared
 _MIN_CONTRAST = 4.0  # grey levels, standard deviation along an edge that tells
 
 
 def find_tracks(folder: Path) -> dict[str, tuple[Path, ...]] | None:
-    """Pictures of both tracks of each frame by name, of folders `track0` and `track5`, or the like.
+    """Find the pictures of both tracks of each frame in folders `track0` and `track5`.
+
+    Any two numbers do; the lower one is the track of the front lens.
 
     Returns:
-        None: no such folder holds images.
+        Paths of the pictures by the frame's name, or None where no such folder holds images.
 
     Raises:
-        GsbaError: only one does, or more than two, or their names differ.
+        GsbaError: one folder or more than two hold images, or their names differ.
     """
-    if not folder.is_dir():
-        return None
     found: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
+    for path in _entries(folder):
         match = _FOLDER.fullmatch(path.name)
-        if match and path.is_dir() and any(map(is_image, path.iterdir())):
+        if match and path.is_dir() and any(map(is_image, _entries(path))):
             found[int(match[1])] = path
     if not found:
         return None
@@ -75,10 +78,10 @@ def find_tracks(folder: Path) -> dict[str, tuple[Path, ...]] | None:
 
 
 def track_size(pairs: Sequence[tuple[Path, ...]]) -> tuple[int, int]:
-    """Width and height of the pictures of two tracks, all checked by their headers.
+    """Width and height of the pictures of two tracks; the headers of all are checked.
 
     Raises:
-        GsbaError: sizes that differ, or that tracks of an equi-angular cube map cannot have.
+        GsbaError: sizes differ, or tracks of an equi-angular cube map cannot have them.
     """
     first = pairs[0][0]
     width, height = image_size(first)
@@ -97,10 +100,10 @@ def track_size(pairs: Sequence[tuple[Path, ...]]) -> tuple[int, int]:
 
 
 def check_edges(folder: Path, pairs: Sequence[tuple[Path, ...]], size: tuple[int, int]) -> None:
-    """Refuse tracks whose squares do not continue one another, by some frames.
+    """Refuse tracks whose squares do not continue one another in some frames.
 
     Raises:
-        GsbaError: so they are; they are not of one instant, or of another layout.
+        GsbaError: grey values on both sides of common edges are not correlated.
     """
     rows = np.unique(np.linspace(0, len(pairs) - 1, _LOOKED_AT).astype(int))
     found = [_edge_correlations(_decoded(pairs[row], size, gray=True)) for row in rows]
@@ -149,8 +152,11 @@ def _maps(grid: Grid, width: int) -> np.ndarray:
 
 
 def _edge_correlations(faces: np.ndarray) -> np.ndarray:
-    """Correlations (n,) of grey values (6, S, S) just beside edges that both tracks have a part in;
-    those without contrast are left out."""
+    """Correlations (n,) of grey values on both sides of edges that squares of both tracks share.
+
+    Values of squares (6, S, S) are averaged along an edge, so that noise counts as no contrast;
+    edges without contrast are left out.
+    """
     size, found = faces.shape[1], []
     along = np.arange(size) + 0.5
     for face in ("front", "right", "left"):  # of track 0
@@ -162,16 +168,25 @@ def _edge_correlations(faces: np.ndarray) -> np.ndarray:
                 continue
             inner = np.clip(beyond, 0, size - 1).astype(int)
             there = np.clip(pixels, 0, size - 1).astype(int)
-            a = faces[n, inner[:, 1], inner[:, 0]].astype(float)
-            b = faces[others, there[:, 1], there[:, 0]].astype(float)
-            if min(a.std(), b.std()) > _MIN_CONTRAST:
+            both = faces[n, inner[:, 1], inner[:, 0]], faces[others, there[:, 1], there[:, 0]]
+            a, b = (
+                [part.mean() for part in np.array_split(one, min(_PARTS, size))] for one in both
+            )
+            if min(np.std(a), np.std(b)) > _MIN_CONTRAST:
                 found.append(np.corrcoef(a, b)[0, 1])
     return np.array(found)
 
 
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(folder.iterdir())
+    except OSError as error:
+        raise GsbaError(f"{folder}: cannot be read ({error.strerror})") from None
+
+
 def _by_name(folder: Path) -> dict[str, Path]:
     found: dict[str, Path] = {}
-    for path in filter(is_image, sorted(folder.iterdir())):
+    for path in filter(is_image, _entries(folder)):
         if path.stem in found:
             raise GsbaError(
                 f"{folder}: '{found[path.stem].name}' and '{path.name}' are one frame's name twice"

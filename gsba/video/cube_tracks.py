@@ -15,14 +15,14 @@ TRACKS = ("track0", "track5")  # folders of their frames, as GoPro numbers them
 
 
 def cube_tracks(video: Path, sizes: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
-    """Which tracks of a video are those of an equi-angular cube map; None = it is of other kind.
+    """Find the two tracks of an equi-angular cube map in a video; None where it holds none.
 
     Args:
         video: the file.
         sizes: width and height of its tracks.
 
     Raises:
-        GsbaError: a `.360` file that holds no such two, or more.
+        GsbaError: a `.360` file does not hold exactly two such tracks of one size.
     """
     found = [n for n, size in enumerate(sizes) if is_equiangular(*size)]
     if len(found) == 2 and sizes[found[0]] == sizes[found[1]]:

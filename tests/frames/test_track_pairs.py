@@ -12,14 +12,18 @@ from two_fisheyes import colours, write
 
 from factors.sphere_field import num_harmonics
 from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.camera.one_centre import Stitcher
 from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import bearings_from_erp
-from gsba.camera.views import ViewCutter, lens_views, rig_views
+from gsba.camera.views import ViewCutter, cube_views, lens_views, rig_views
+from gsba.export.images import panorama_writer, view_writer, write_pictures
+from gsba.export.pictures import Files
 from gsba.frames import cubemap, lens_faces, load_erp, load_grey, scan
 from gsba.frames.buffers import Buffers
 from gsba.frames.pixels import load_padded
+from gsba.frames.track_pairs import load_squares
 from gsba.log import GsbaError
-from gsba.types import FrameSet
+from gsba.types import FACES, FrameSet
 
 SIZE, OVERLAP, NUM = 96, 4, 3
 REAL = Path(__file__).parents[3] / "shared" / "data" / "real" / "max_eac"
@@ -90,6 +94,29 @@ def test_faces_of_one_lens(frames: FrameSet) -> None:
         centres = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
         true = colours(view.rays(np.stack(centres, axis=-1)))
         assert np.abs(image - true).mean() < 0.7
+
+
+def test_panoramas_of_two_lenses_are_stitched_in_one_step(frames: FrameSet) -> None:
+    lenses = Lenses(centre=np.array([0, 0, 0.015]), band_rad=float(np.deg2rad(4)))
+    scene = 1e6 * np.random.default_rng(0).normal(size=(200, 3))
+    found = Stitcher(lenses, 0, scene).stitched_squares(load_squares(frames, 0))
+    assert np.abs(found - _true(4 * SIZE)).mean() < 0.7
+
+
+def test_exports_write_panoramas_and_faces(tmp_path: Path, frames: FrameSet) -> None:
+    whole = Files(tmp_path, ("",), "erp/{name}{suffix}", "")
+    faces = Files(tmp_path, FACES, "cube/{view}/{name}{suffix}", "")
+    views = cube_views(FACES, 64)
+    writers = [panorama_writer(whole, frames), view_writer(faces, frames, views, ONE_CENTRE)]
+    write_pictures(frames, writers)
+    cut, _ = cubemap.load(frames, 2, CubeRig(64, np.pi / 2))
+    for path, expected in [
+        (tmp_path / "erp" / "2.png", load_erp(frames, 2)),
+        *((tmp_path / "cube" / face / "2.png", cut[n]) for n, face in enumerate(FACES)),
+    ]:
+        shown = cv2.imread(str(path))
+        assert shown is not None
+        np.testing.assert_array_equal(shown[..., ::-1], expected)
 
 
 def test_corrections_are_applied_in_the_same_step(frames: FrameSet) -> None:
