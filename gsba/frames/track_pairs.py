@@ -32,9 +32,7 @@ _log = logging.getLogger(__name__)
 _FOLDER = re.compile(r"track(\d+)", re.IGNORECASE)
 _BAND = 256  # rows of which coordinates are held in double precision
 _LOOKED_AT = 5  # frames in which edges of squares are compared
-_MIN_CORRELATION = (
-    0.5  # of grey values along edges that squares of both tracks share: its median is
-)
+_MIN_CORRELATION = 0.5  # median, of grey values along edges that squares of both tracks share:
 # 0.95 and more on real frames, 0.2 and less on pictures of several instants
 _PARTS = 64  # of an edge, whose mean grey values are compared
 _MIN_CONTRAST = 4.0  # grey levels, standard deviation along an edge that tells
@@ -168,10 +166,9 @@ def _edge_correlations(faces: np.ndarray) -> np.ndarray:
                 continue
             inner = np.clip(beyond, 0, size - 1).astype(int)
             there = np.clip(pixels, 0, size - 1).astype(int)
-            both = faces[n, inner[:, 1], inner[:, 0]], faces[others, there[:, 1], there[:, 0]]
-            a, b = (
-                [part.mean() for part in np.array_split(one, min(_PARTS, size))] for one in both
-            )
+            sides = faces[n, inner[:, 1], inner[:, 0]], faces[others, there[:, 1], there[:, 0]]
+            parts = [np.array_split(values, min(_PARTS, size)) for values in sides]
+            a, b = ([part.mean() for part in side] for side in parts)
             if min(np.std(a), np.std(b)) > _MIN_CONTRAST:
                 found.append(np.corrcoef(a, b)[0, 1])
     return np.array(found)
