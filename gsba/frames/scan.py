@@ -16,7 +16,7 @@ from gsba.frames.files import image_header, image_size, is_image
 from gsba.frames.masks import find_masks
 from gsba.frames.raw_pairs import find_pairs, lenses_of, side_by_side
 from gsba.frames.times import frame_times
-from gsba.frames.track_pairs import check_edges, find_tracks, track_size
+from gsba.frames.track_pairs import find_tracks, track_size
 from gsba.log import GsbaError, track
 from gsba.types import FACES, FrameSet
 
@@ -75,7 +75,7 @@ def scan(
         raise GsbaError(f"{folder}: {len(found)} frames; at least {MIN_FRAMES} are needed")
     names, times, timed = _in_time_order(Path(folder), found, timestamps, fps, order_suffices)
     paths = tuple(found[name] for name in names)
-    tracks = track_size(paths) if layout == "eac" else None
+    tracks = track_size(Path(folder), paths) if layout == "eac" else None
     width, height = tracks or _common_size(paths, layout)
     images = [group[0] for group in paths]
     if layout == "erp" and side_by_side(Path(folder), images, (width, height), calibration):
@@ -84,7 +84,6 @@ def scan(
     if fisheyes is not None:
         width, height = width_of(fisheyes), width_of(fisheyes) // 2
     if tracks is not None:
-        check_edges(Path(folder), paths, tracks)
         width, height = 4 * tracks[1], 2 * tracks[1]
     erp_size = None if layout == "cube" else (width, height)
     return FrameSet(

@@ -75,11 +75,16 @@ def find_tracks(folder: Path) -> dict[str, tuple[Path, ...]] | None:
     return {name: (path, second[name]) for name, path in first.items()}
 
 
-def track_size(pairs: Sequence[tuple[Path, ...]]) -> tuple[int, int]:
-    """Width and height of the pictures of two tracks; the headers of all are checked.
+def track_size(folder: Path, pairs: Sequence[tuple[Path, ...]]) -> tuple[int, int]:
+    """Width and height of the pictures of two tracks, after a look at all headers and some pixels.
+
+    Args:
+        folder: of both tracks.
+        pairs: paths of both pictures of each frame.
 
     Raises:
-        GsbaError: sizes differ, or tracks of an equi-angular cube map cannot have them.
+        GsbaError: sizes differ, tracks of an equi-angular cube map cannot have them, or squares do
+            not continue one another across both tracks.
     """
     first = pairs[0][0]
     width, height = image_size(first)
@@ -94,28 +99,12 @@ def track_size(pairs: Sequence[tuple[Path, ...]]) -> tuple[int, int]:
                 f"{path}: is {size[0]}x{size[1]}, but '{first.parent.name}/{first.name}' is "
                 f"{width}x{height}: both tracks are of one size; extract them again"
             )
-    return width, height
-
-
-def check_edges(folder: Path, pairs: Sequence[tuple[Path, ...]], size: tuple[int, int]) -> None:
-    """Refuse tracks whose squares do not continue one another in some frames.
-
-    Raises:
-        GsbaError: grey values on both sides of common edges are not correlated.
-    """
-    rows = np.unique(np.linspace(0, len(pairs) - 1, _LOOKED_AT).astype(int))
-    found = [_edge_correlations(_decoded(pairs[row], size, gray=True)) for row in rows]
-    known = np.concatenate(found)
     _log.info(
         "%s: GoPro's equi-angular cube map, two tracks of %dx%d, %d columns from both lenses",
-        folder, *size, overlap_of(*size),
+        folder, width, height, overlap_of(width, height),
     )  # fmt: skip
-    if len(known) and np.median(known) < _MIN_CORRELATION:
-        raise GsbaError(
-            f"{folder}: squares of {pairs[0][0].parent.name} and {pairs[0][1].parent.name} do not "
-            f"meet at their edges (correlation {np.median(known):.2f}): their pictures are not of "
-            "the same instants, or not of GoPro's equi-angular layout; extract both tracks again"
-        )
+    _check_edges(folder, pairs, (width, height))
+    return width, height
 
 
 def load_squares(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
@@ -134,6 +123,19 @@ def load_panorama(frames: FrameSet, f: int, gray: bool, width: int) -> np.ndarra
 def _decoded(paths: Sequence[Path], size: tuple[int, int], gray: bool) -> np.ndarray:
     first, second = (decode(path, size, gray) for path in paths)
     return squares((first, second))
+
+
+def _check_edges(folder: Path, pairs: Sequence[tuple[Path, ...]], size: tuple[int, int]) -> None:
+    """Refuse tracks whose grey values on both sides of common edges are not correlated."""
+    rows = np.unique(np.linspace(0, len(pairs) - 1, _LOOKED_AT).astype(int))
+    found = [_edge_correlations(_decoded(pairs[row], size, gray=True)) for row in rows]
+    known = np.concatenate(found)
+    if len(known) and np.median(known) < _MIN_CORRELATION:
+        raise GsbaError(
+            f"{folder}: squares of {pairs[0][0].parent.name} and {pairs[0][1].parent.name} do not "
+            f"meet at their edges (correlation {np.median(known):.2f}): their pictures are not of "
+            "the same instants, or not of GoPro's equi-angular layout; extract both tracks again"
+        )
 
 
 @table(maxsize=2)

@@ -76,8 +76,7 @@ def refine(
     """Refine the pose of every frame, and write poses, cloud, report and datasets to `out`.
 
     Args:
-        frames: folder of 2:1 panoramas, raw fisheyes, both tracks of a cube map, or cube faces; or
-            a video, for `out`/frames.
+        frames: folder of panoramas, raw fisheyes, .360 tracks or cube faces; or a video.
         trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig. Several are pieces of one run
             on one clock, and the first one's world is kept. None = start from the images alone:
             the first step's length is the unit and the first frame the world.
