@@ -64,10 +64,11 @@ class FrameSet:
 
     names: tuple[str, ...]  # (F,) unique, without folder or extension
     paths: tuple[tuple[Path, ...], ...]  # (F,)(1) for "erp", (F,)(2) for "fisheye": front and
-    # back, (F,)(len(faces)) for "cube"
+    # back, (F,)(2) for "eac": track 0 and the second one, (F,)(len(faces)) for "cube"
     timestamps: np.ndarray  # (F,) float64, seconds, strictly increasing
-    layout: str  # "erp" (2:1 equirectangular), "fisheye" (one image per lens, read as a panorama)
-    # or "cube" (one 90-degree image per face)
+    layout: str  # "erp" (2:1 equirectangular), "fisheye" (one image per lens, read as a panorama),
+    # "eac" (two tracks of an equi-angular cube map, read as a panorama or as faces) or "cube" (one
+    # 90-degree image per face)
     faces: tuple[str, ...]  # faces present, in FACES order; () for panoramas
     width: int  # pixels of one image (panorama or face)
     height: int  # pixels
@@ -79,6 +80,8 @@ class FrameSet:
     )
     fisheyes: tuple[Fisheye, Fisheye] | None = None  # front and back, by which panoramas are cut
     # out of "fisheye" frames
+    tracks: tuple[int, int] | None = None  # width and height, pixels, of either image of "eac"
+    # frames; None = of another layout
 
     def __post_init__(self) -> None:
         for name in self.names:
@@ -95,6 +98,11 @@ class FrameSet:
     def panoramic(self) -> bool:
         """Whether a frame is read as one equirectangular image, not as several faces."""
         return self.layout != "cube"
+
+    @property
+    def lens_axes_known(self) -> bool:
+        """Whether lenses look along the rig's z, as no stabiliser has turned the images."""
+        return self.layout in ("fisheye", "eac")
 
     @property
     def panorama_width(self) -> int:

@@ -1,6 +1,6 @@
 """The camera: six faces on one rig, the equirectangular picture, two lenses and their stitching.
 
-Takes pixels of a face or a panorama.
+Takes pixels of a face, a panorama or an equi-angular cube map.
 Gives bearings in the rig frame, rays that start at the lens that saw them, and pixels back.
 """
 

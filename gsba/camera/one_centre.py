@@ -14,6 +14,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from gsba.camera.equiangular import Grid, around_squares
 from gsba.camera.fisheye import project
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings
@@ -58,6 +59,23 @@ class Stitcher:
     def stitched(self, erp: np.ndarray) -> np.ndarray:
         """The panorama (H, 2 H, C) uint8 of one that a stitcher made."""
         return self._joined(erp.shape[1], erp.shape[2], _looking_up(erp, cv2.INTER_LANCZOS4))
+
+    def stitched_squares(
+        self, squares: np.ndarray, correction: tuple[float, ...] = ()
+    ) -> np.ndarray:
+        """The panorama (2 S, 4 S, C) uint8 of an equi-angular cube map.
+
+        Args:
+            squares: (6, S, S, C) uint8, FACES order.
+            correction: of what stitching bends, see `FrameSet`.
+        """
+        picture, grid = around_squares(squares), Grid(squares.shape[1], correction)
+
+        def look(_: int, shown: np.ndarray) -> np.ndarray:
+            maps = grid.places(shown).astype(np.float32)
+            return cv2.remap(picture, maps[..., 0], maps[..., 1], cv2.INTER_LANCZOS4)
+
+        return self._joined(4 * grid.size, squares.shape[3], look)
 
     def stitched_mask(self, mask: np.ndarray) -> np.ndarray:
         """The mask (H, 2 H) bool of one that belongs to a stitcher's panorama, or to that of a raw

@@ -43,12 +43,25 @@ def straightened_inside(
     return cv2.remap(padded, maps[0], maps[1], cv2.INTER_LANCZOS4, dst=out)
 
 
+def observed(directions: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
+    """Directions (h, w, 3) in which bent pictures show directions (h, w, 3), rig frame, both unit.
+
+    The field is evaluated on a coarse grid and interpolated.
+    """
+    import cv2
+
+    padded = _padded_offsets(correction)
+    places = erp_from_bearings(directions, _COARSE, _COARSE // 2) - 0.5 + PAD
+    places = places.astype(np.float32)
+    return directions + cv2.remap(padded, places[..., 0], places[..., 1], cv2.INTER_CUBIC)
+
+
 @table(maxsize=1)
 def _maps(correction: tuple[float, ...], width: int, height: int) -> np.ndarray:
     """Places (2, H, W) float32 in the padded panorama, OpenCV pixels."""
     import cv2
 
-    offsets = around_sphere(_offsets(correction), PAD)
+    offsets = _padded_offsets(correction)
     out = np.empty((2, height, width), np.float32)
     columns, scale = np.arange(width) + 0.5, offsets.shape[1] - 2 * PAD
     for first in range(0, height, _BAND):
@@ -59,6 +72,11 @@ def _maps(correction: tuple[float, ...], width: int, height: int) -> np.ndarray:
         found = erp_from_bearings(bearings_from_erp(pixels, width, height) + moved, width, height)
         out[:, first : first + len(rows)] = np.moveaxis(found - 0.5 + PAD, -1, 0)
     return out
+
+
+@table(maxsize=2)
+def _padded_offsets(correction: tuple[float, ...]) -> np.ndarray:
+    return around_sphere(_offsets(correction), PAD)
 
 
 def _offsets(correction: tuple[float, ...]) -> np.ndarray:

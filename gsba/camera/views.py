@@ -14,10 +14,11 @@ from functools import partial
 import cv2
 import numpy as np
 
+from gsba.camera.equiangular import Grid, around_squares, shrunk
 from gsba.camera.fisheye import project
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import RIG_R_FACE, CubeRig
-from gsba.camera.sphere import around_sphere, erp_from_bearings, low_passed
+from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings, low_passed
 from gsba.camera.straighten import PAD
 from gsba.geometry import pose
 from gsba.types import FACES, Fisheye, FrameSet, Reconstruction
@@ -287,6 +288,20 @@ class ViewCutter:
             u, v = self._maps(view, offsets, partial(_in_picture, lens, scale))
             yield cv2.remap(picture, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
+    def cut_squares(
+        self, squares: np.ndarray, correction: tuple[float, ...] = ()
+    ) -> Iterator[np.ndarray]:
+        """Images (height, width[, C]) uint8, bicubic, of an equi-angular cube map.
+
+        Args:
+            squares: (6, S, S[, C]) uint8, FACES order.
+            correction: of what stitching bends, see `FrameSet`.
+        """
+        width = dense_enough(4 * squares.shape[1], self._views[0].focal)
+        squares = shrunk(squares, width // 4)
+        places = Grid(squares.shape[1], correction).places
+        return self._looked_up(around_squares(squares), places, cv2.INTER_CUBIC)
+
     def cut_mask(self, mask: np.ndarray) -> list[np.ndarray]:
         """Masks (height, width) of one (H, 2 H), bool or float32 weights."""
         whole = around_sphere(mask.astype(np.uint8) if mask.dtype == bool else mask, PAD)
@@ -298,9 +313,15 @@ class ViewCutter:
         def places(shown: np.ndarray) -> np.ndarray:
             return erp_from_bearings(shown, width, height) - 0.5 + PAD
 
+        return self._looked_up(padded, places, how)
+
+    def _looked_up(
+        self, picture: np.ndarray, places: Callable[[np.ndarray], np.ndarray], how: int
+    ) -> Iterator[np.ndarray]:
+        """Sample each view; `places` maps directions (h, w, 3) to OpenCV pixels (h, w, 2)."""
         for view, offsets in zip(self._views, self._offsets, strict=True):
             u, v = self._maps(view, offsets, places)
-            yield cv2.remap(padded, u, v, how)
+            yield cv2.remap(picture, u, v, how)
 
     def _maps(
         self, view: View, offsets: np.ndarray, places: Callable[[np.ndarray], np.ndarray]

@@ -11,7 +11,7 @@ from gsba.log import GsbaError
 
 @command
 def extract(
-    video: Annotated[Path, typer.Argument(help="Video, 2:1 or raw of two fisheyes.")],
+    video: Annotated[Path, typer.Argument(help="Video: 2:1, .360, or raw of two fisheyes.")],
     out: Annotated[Path, typer.Option(help="Folder of the frames.", metavar="FRAMES")],
     fps: Annotated[float | None, typer.Option(help="Frames kept per second; 1 if unsaid.")] = None,
     every: Annotated[int | None, typer.Option(help="Keep one frame of so many.")] = None,
@@ -48,7 +48,9 @@ def extract(
 
 @command
 def mask(
-    frames: Annotated[Path, typer.Argument(help="Folder of 2:1 panoramas or raw fisheyes.")],
+    frames: Annotated[
+        Path, typer.Argument(help="Folder of 2:1 panoramas, tracks or raw fisheyes.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder of the masks.", metavar="DIR")],
     masks: Annotated[
         Path | None, typer.Option(help="Masks of your own, merged with what is found.")

@@ -96,7 +96,9 @@ Segment = Annotated[
 def refine(
     frames: Annotated[
         Path,
-        typer.Argument(help="Folder of 2:1 panoramas, raw fisheyes or cube faces, or a video."),
+        typer.Argument(
+            help="Folder of 2:1 panoramas, raw fisheyes, .360 tracks or cube faces, or a video."
+        ),
     ],
     trajectory: Annotated[
         list[Path] | None,

@@ -28,6 +28,7 @@ from gsba.export.pictures import Files, FrameWriter, Pictures, Shown
 from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.files import goes_out_as_it_is
 from gsba.frames.pixels import load_faces
+from gsba.frames.track_pairs import load_squares
 from gsba.log import GsbaError
 from gsba.memory import give_back_freed_memory
 from gsba.store.shards import Threads, Workers
@@ -97,7 +98,13 @@ class _CubeFaces(FrameWriter):
 
         f, frames, size, paths = shown.f, shown.frames, self.size, self.images(shown)
         rig = CubeRig(size, np.pi / 2)
-        if frames.panoramic:
+        if frames.tracks is not None:
+            shown.write(
+                size,
+                paths,
+                lambda: cubemap.cut_squares(load_squares(frames, f), rig, frames.correction),
+            )
+        elif frames.panoramic:
             room = shown.room("face", (size, size, 3))
             shown.write(size, paths, lambda: cubemap.cut_padded(shown.padded, rig, room))
         elif size == frames.width and all(map(goes_out_as_it_is, frames.paths[f], paths)):
@@ -140,6 +147,8 @@ class _LensFaces(_OfLenses):
         def cut() -> Iterator[np.ndarray]:
             if frames.fisheyes is not None:
                 return cutter().cut_raw(load_raw(frames, f))
+            if frames.tracks is not None:
+                return cutter().cut_squares(load_squares(frames, f), frames.correction)
             return cutter().cut_padded(shown.padded)
 
         def cut_mask() -> Iterator[np.ndarray]:
@@ -180,8 +189,8 @@ def panorama_writer(
 ) -> FrameWriter:
     """Copies the panorama of a frame, and writes its mask where the frames have masks.
 
-    Panoramas that are corrected, those of raw pairs, and images that trainers misread are written
-    anew; those of two lenses are stitched by `gsba.camera.one_centre`.
+    Panoramas that are corrected, those of raw pairs and of cube maps, and images that trainers
+    misread are written anew; those of two lenses are stitched by `gsba.camera.one_centre`.
 
     Args:
         files: where they go.
@@ -200,8 +209,8 @@ class _Panoramas(FrameWriter):
     def __call__(self, shown: Shown) -> None:
         frames, (path,) = shown.frames, self.images(shown)
         source = frames.paths[shown.f][0]
-        as_it_is = not (frames.correction or frames.fisheyes) and goes_out_as_it_is(source, path)
-        if as_it_is:
+        as_it_is = frames.layout == "erp" and not frames.correction
+        if as_it_is and goes_out_as_it_is(source, path):
             pass_on(source, path, self.link)
         else:
             shown.write("panorama", [path], lambda: [shown.erp])
@@ -222,6 +231,9 @@ class _Stitched(_OfLenses):
         def stitched() -> list[np.ndarray]:
             if frames.fisheyes is not None:
                 return [stitcher().stitched_raw(load_raw(frames, f), frames.width)]
+            if frames.tracks is not None:
+                squares = load_squares(frames, f)
+                return [stitcher().stitched_squares(squares, frames.correction)]
             return [stitcher().stitched(shown.erp)]
 
         def mask() -> list[np.ndarray]:

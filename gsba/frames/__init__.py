@@ -1,6 +1,6 @@
 """Captured frames on disk: found, timed, and read as panoramas or faces.
 
-Takes a folder of panoramas or cube faces, times and masks.
+Takes a folder of panoramas, raw fisheyes, tracks of a cube map or cube faces, times and masks.
 Gives a `FrameSet`, and its pixels and masks whenever they are asked for.
 """
 

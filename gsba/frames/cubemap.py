@@ -1,10 +1,11 @@
 """Cut the six pinhole faces of a frame out of its panorama."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
 
+from gsba.camera.equiangular import Grid, around_squares, shrunk
 from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings, low_passed
 from gsba.camera.straighten import PAD
@@ -12,6 +13,7 @@ from gsba.camera.tables import table
 from gsba.config import CubemapSettings
 from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp, load_faces
+from gsba.frames.track_pairs import load_squares
 from gsba.types import FACES, FrameSet
 
 _BAND = 256  # rows of which coordinates are held in double precision
@@ -44,6 +46,8 @@ def load(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.nda
     """Faces (6, size, size, 3) uint8 RGB of a frame and where they may be used, bool or None."""
     mask = load_usable(frames, frame)
     masks = None if mask is None else cut_mask(mask, rig)
+    if frames.tracks is not None:
+        return cut_squares(load_squares(frames, frame), rig, frames.correction), masks
     if frames.panoramic:
         width = dense_enough(frames.width, rig.focal)
         return cut(load_erp(frames, frame, width=width), rig), masks
@@ -83,6 +87,28 @@ def cut_padded(padded: np.ndarray, rig: CubeRig, out: np.ndarray) -> Iterator[np
         yield cv2.remap(padded, u, v, cv2.INTER_CUBIC, dst=out)
 
 
+def cut_squares(
+    squares: np.ndarray, rig: CubeRig, correction: tuple[float, ...] = ()
+) -> np.ndarray:
+    """Sample the faces of an equi-angular cube map, bicubic, continuous over all its edges.
+
+    Args:
+        squares: (6, S, S[, C]) uint8 of `gsba.camera.equiangular.squares`, FACES order.
+        rig: faces to cut.
+        correction: of what stitching bends, see `FrameSet`.
+
+    Returns:
+        (6, size, size[, C]) uint8, in FACES order.
+    """
+    squares = shrunk(squares, dense_enough(4 * squares.shape[1], rig.focal) // 4)
+    faces = np.empty((len(FACES), rig.size, rig.size, *squares.shape[3:]), np.uint8)
+    picture = around_squares(squares)
+    maps = _grid_maps(rig, Grid(squares.shape[1], correction))
+    for face, (u, v) in zip(faces, maps, strict=True):
+        cv2.remap(picture, u, v, cv2.INTER_CUBIC, dst=face)
+    return faces
+
+
 def cut_mask(mask: np.ndarray, rig: CubeRig) -> np.ndarray:
     """Nearest-neighbour faces (6, size, size) of an ERP mask (H, 2H), bool or float32 weights."""
     padded = around_sphere(mask.astype(np.uint8) if mask.dtype == bool else mask, PAD)
@@ -98,11 +124,21 @@ def _maps_into(padded: np.ndarray, rig: CubeRig) -> np.ndarray:
 @table(maxsize=2)
 def _face_maps(rig: CubeRig, width: int, height: int) -> np.ndarray:
     """Sampling positions (6, 2, size, size) float32 in the padded panorama, OpenCV pixels."""
+    return _maps_by(rig, lambda rays: erp_from_bearings(rays, width, height) - 0.5 + PAD)
+
+
+@table(maxsize=2)
+def _grid_maps(rig: CubeRig, grid: Grid) -> np.ndarray:
+    """Sampling positions (6, 2, size, size) float32 in an equi-angular grid, OpenCV pixels."""
+    return _maps_by(rig, grid.places)
+
+
+def _maps_by(rig: CubeRig, places: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     centres = np.arange(rig.size) + 0.5
     maps = np.empty((len(FACES), 2, rig.size, rig.size), np.float32)
     for face in range(len(FACES)):
         for top in range(0, rig.size, _BAND):
             grid = np.stack(np.meshgrid(centres, centres[top : top + _BAND]), axis=-1)
-            erp_pixels = erp_from_bearings(rig.bearings(grid, face), width, height)
-            maps[face, :, top : top + _BAND] = np.moveaxis(erp_pixels - 0.5 + PAD, -1, 0)
+            found = places(rig.bearings(grid, face))
+            maps[face, :, top : top + _BAND] = np.moveaxis(found, -1, 0)
     return maps

@@ -5,6 +5,7 @@ import numpy as np
 from gsba.camera.views import ViewCutter
 from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.pixels import load_erp
+from gsba.frames.track_pairs import load_squares
 from gsba.types import FrameSet
 
 
@@ -12,9 +13,11 @@ def cut(frames: FrameSet, f: int, cutter: ViewCutter) -> list[np.ndarray]:
     """Images (height, width, 3) uint8 RGB of each view of frame f.
 
     Args:
-        frames: panoramas, or raw pairs, which are cut in one step.
+        frames: panoramas; raw pairs and equi-angular cube maps are cut in one step.
         cutter: of that frame.
     """
     if frames.fisheyes is not None:
         return list(cutter.cut_raw(load_raw(frames, f)))
+    if frames.tracks is not None:
+        return list(cutter.cut_squares(load_squares(frames, f), frames.correction))
     return cutter.cut(load_erp(frames, f))

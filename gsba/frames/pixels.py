@@ -7,6 +7,7 @@ from gsba.camera.straighten import PAD, straightened, straightened_inside
 from gsba.frames.buffers import Buffers
 from gsba.frames.dual_fisheye import load_joined
 from gsba.frames.files import decode
+from gsba.frames.track_pairs import load_panorama
 from gsba.types import FrameSet
 
 
@@ -27,6 +28,8 @@ def load_erp(frames: FrameSet, f: int, gray: bool = False, width: int | None = N
         raise ValueError("load_erp needs equirectangular frames")
     if frames.fisheyes is not None:
         return load_joined(frames, f, gray, min(width or frames.width, frames.width))
+    if frames.tracks is not None:
+        return load_panorama(frames, f, gray, min(width or frames.width, frames.width))
     erp = decode(frames.paths[f][0], (frames.width, frames.height), gray, at_least=width)
     if width is not None and width < erp.shape[1]:
         erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
@@ -41,7 +44,7 @@ def load_padded(frames: FrameSet, f: int, buffers: Buffers) -> np.ndarray:
     """
     shape = (frames.height + 2 * PAD, frames.width + 2 * PAD, 3)
     padded = buffers.array("padded", shape)
-    if frames.fisheyes is not None:
+    if frames.layout != "erp":
         return around_sphere(load_erp(frames, f), PAD, padded)
     size = frames.width, frames.height
     room = padded.reshape(-1)[-3 * frames.width * frames.height :]

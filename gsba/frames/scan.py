@@ -18,6 +18,7 @@ from gsba.frames.files import image_header, image_size, is_image
 from gsba.frames.masks import find_masks
 from gsba.frames.raw_pairs import find_pairs, lenses_of, side_by_side
 from gsba.frames.times import frame_times
+from gsba.frames.track_pairs import find_tracks, track_size
 from gsba.log import GsbaError, track
 from gsba.types import FACES, FrameSet
 
@@ -52,7 +53,8 @@ def scan(
     The folder holds equirectangular images, or cube faces: subfolders `front`, `right`, ... with
     equal names, or files `NAME_front.jpg`, ...; up and down may be absent from all frames. Or it
     holds raw fisheyes: subfolders `front` and `back` alone (or `lens0` and `lens1`), files
-    `..._00_...` and `..._10_...`, or both side by side in 2:1 images.
+    `..._00_...` and `..._10_...`, or both side by side in 2:1 images. Or it holds both tracks of an
+    equi-angular cube map, in subfolders `track0` and `track5`.
 
     Args:
         folder: JPEG, PNG, WebP or TIFF images; other files are ignored.
@@ -74,7 +76,8 @@ def scan(
         raise GsbaError(f"{folder}: {len(found)} frames; at least {MIN_FRAMES} are needed")
     names, times, timed = _in_time_order(Path(folder), found, timestamps, fps, order_suffices)
     paths = tuple(found[name] for name in names)
-    width, height = _common_size(paths, layout)
+    tracks = track_size(Path(folder), paths) if layout == "eac" else None
+    width, height = tracks or _common_size(paths, layout)
     images = [group[0] for group in paths]
     factory = find_factory_lenses(Path(folder), images) if calibration is None else None
     if layout == "erp" and (
@@ -84,6 +87,8 @@ def scan(
     fisheyes = _lenses(Path(folder), layout, paths, calibration, factory)
     if fisheyes is not None:
         width, height = width_of(fisheyes), width_of(fisheyes) // 2
+    if tracks is not None:
+        width, height = 4 * tracks[1], 2 * tracks[1]
     erp_size = None if layout == "cube" else (width, height)
     return FrameSet(
         names=names,
@@ -96,6 +101,7 @@ def scan(
         mask_paths=find_masks(masks, names, erp_size),
         timed=timed,
         fisheyes=fisheyes,
+        tracks=tracks,
     )
 
 
@@ -195,6 +201,9 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
     pairs = find_pairs(folder)
     if pairs is not None:
         return "fisheye", (), dict(pairs)
+    tracks = find_tracks(folder)
+    if tracks is not None:
+        return "eac", (), tracks
     images = [path for path in entries if is_image(path) and path.is_file()]
     subfolders = {
         path.name.lower(): path

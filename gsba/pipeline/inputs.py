@@ -1,7 +1,6 @@
 """What a run starts from, as its caller names it: files of poses, and frames of a video."""
 
 import logging
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 from gsba import video
 from gsba.camera.calibration import read_calibration
 from gsba.config import RefineSettings
+from gsba.frames.lens_names import lens_files
 from gsba.frames.times import check_fps
 from gsba.imu.files import read_imu, read_telemetry
 from gsba.imu.readings import Readings
@@ -91,12 +91,11 @@ def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
     """
     if imu is not None:
         return read_imu(imu)
-    if not frames.is_file() or frames.suffix.lower() not in _WITH_GYRO:
+    pair = lens_files(frames)
+    if not frames.is_file() or (frames.suffix.lower() not in _WITH_GYRO and pair is None):
         return None
-    pair = re.fullmatch(r"(.*_)[01]0(_.*)", frames.name)
-    names = [f"{pair[1]}{n}{pair[2]}" for n in ("00", "10")] if pair else [frames.name]
     errors = []
-    for path in filter(Path.is_file, map(frames.with_name, names)):  # of a pair, either may have it
+    for path in filter(Path.is_file, pair or (frames,)):  # of a pair, either may have it
         try:
             found = read_telemetry(path, _duration_s(path))
         except GsbaError as error:

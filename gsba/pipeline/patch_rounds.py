@@ -152,7 +152,7 @@ def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, n
         known = run.stage(f"calibrated_{name}", key, lenses, SelfCalibration)
         world = replace(world, calibrated=known)
         world = world.read(replace(world.seeing(), lenses=known.lenses))
-    if number == 1 and not raw and world.lenses.axes is None:
+    if number == 1 and not run.frames.lens_axes_known and world.lenses.axes is None:
         found = run.stage(f"axes_{name}", key, axes, LensAxes)
         world = replace(world, axes=found).read(replace(world.seeing(), lenses=found.lenses))
     return world.read(run.stage(f"camera_{name}_{number}", key, settle, Readout, noted=False))
@@ -180,7 +180,8 @@ def _straighten(run: Run, prior: Prior, world: Map, sighted: Sighted, number: in
     """The map with what stitching bends taken out, where all frames share it."""
     name, settings = f"stitching{number}", run.settings
     looked_for = number == 1 or world.field
-    if settings.stitching.mode == "off" or run.frames.layout != "erp" or not looked_for:
+    stitched = run.frames.layout in ("erp", "eac")
+    if settings.stitching.mode == "off" or not stitched or not looked_for:
         return world
 
     def compute() -> Stitching:

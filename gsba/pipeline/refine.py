@@ -76,7 +76,7 @@ def refine(
     """Refine the pose of every frame, and write poses, cloud, report and datasets to `out`.
 
     Args:
-        frames: folder of 2:1 panoramas, raw fisheyes or cube faces, or a video, for `out`/frames.
+        frames: folder of panoramas, raw fisheyes, .360 tracks or cube faces; or a video.
         trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig. Several are pieces of one run
             on one clock, and the first one's world is kept. None = start from the images alone:
             the first step's length is the unit and the first frame the world.
@@ -258,9 +258,12 @@ def _find_camera(
     if run.frames.fisheyes is not None:
         return _find_raw_camera(run, seen, prior, matches, solved)
     looking = seen.through(Lenses())
-    guess = backend.guess_axes(run, looking, prior, "axes", matches, solved)
+    guess = None
+    if not run.frames.lens_axes_known:
+        guess = backend.guess_axes(run, looking, prior, "axes", matches, solved)
+        looking = seen.through(guess.lenses)
     band, better, gates = np.deg2rad(settings.camera.seam_deg), solved, settings.rounds.loops
-    looking = seen.through(replace(guess.lenses, band_rad=float(band)))
+    looking = seen.through(replace(looking.lenses, band_rad=float(band)))
     for n in range(2):  # on trial, then judged by what is matched with them
         found = backend.find_lenses(run, looking, prior, f"lenses{n}", matches, better)
         if not found.lenses:

@@ -3,7 +3,8 @@
 `FRAMES/NNNNNN.jpg` is frame NNNNNN of the video, counted from 0; `timestamps.csv` gives the seconds
 since the first one. Of raw recordings, `FRAMES/front/NNNNNN.jpg` and `FRAMES/back/NNNNNN.jpg` are
 what the two lenses saw at one instant, chosen together, and NNNNNN counts frames of the front one;
-`factory_lenses.json` is their calibration by the maker, where the video holds one.
+`factory_lenses.json` is their calibration by the maker, where the video holds one. Of GoPro's
+`.360`, `FRAMES/track0/NNNNNN.jpg` and `FRAMES/track5/NNNNNN.jpg` are both tracks alike.
 `extract.json` says what was asked for, so that the same call resumes and another one does not mix
 its frames in.
 """
@@ -34,6 +35,7 @@ from gsba.store.store import digest, fingerprint
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Counts
 from gsba.version import __version__
+from gsba.video.cube_tracks import TRACKS
 from gsba.video.likeness import apparent_motion_deg, lens_interior, miniature, sharpness
 from gsba.video.recording import (
     EXACT_S,
@@ -72,8 +74,8 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
     the frame rate does. A call that was interrupted goes on where it stopped.
 
     Args:
-        video: H.264, H.265 or whatever else FFmpeg decodes: 2:1, or raw of two lenses (see
-            `gsba.video.recording`), either file of a pair.
+        video: H.264, H.265 or whatever else FFmpeg decodes: 2:1, GoPro's `.360`, or raw of two
+            lenses (see `gsba.video.recording`), either file of a pair.
         out: folder of the frames, made if missing.
         settings: which frames, and at what size (of raw recordings: of one lens's picture).
         replace: put up with another extraction in `out`, and replace it.
@@ -99,22 +101,27 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
     recording = read_recording(video)
     if settings.width is not None and settings.width > recording.width:
         raise GsbaError(f"--width {settings.width}: {video} has only {recording.width} pixels")
+    if settings.width is not None and recording.cube:
+        raise GsbaError(
+            f"--width {settings.width}: tracks of a .360 recording keep their size, as lenses "
+            "overlap in a whole number of columns: leave it out"
+        )
     windows, received = _windows(video, recording, settings)
     _check_end(video, recording, settings.to_s)
     _refuse_darkness(video, recording, windows)
     for note in recording.notes:
         logger.info("%s", note)
-    _write_marker(out, video, key, None, recording.lenses)
+    _write_marker(out, video, key, None, recording.folders)
     if recording.lenses:
         _keep_calibration(recording, out)
-    before = _read_journal(out, recording.lenses)
+    before = _read_journal(out, recording.folders)
     after, standing = _extract(recording, windows, out, settings, before)
     kept = before + after
     if not kept:
         raise GsbaError(f"{video}: none of its pictures could be decoded; copy it again")
     counts = _counts(received, windows, kept, standing)
     _write_times(out, kept)
-    _write_marker(out, video, key, counts, recording.lenses)
+    _write_marker(out, video, key, counts, recording.folders)
     (out / _JOURNAL).unlink(missing_ok=True)
     why = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
     logger.info("%s: kept %d of %d frames (%s)", out, counts.kept, received, why or "all")
@@ -221,17 +228,17 @@ def _extract(
     skip_standing = settings.standing_deg > 0 and settings.at is None
     if before and todo and skip_standing:
         for _, pictures in shots(recording, [before[-1].index]):
-            last = _small(pictures)
+            last = _small(pictures, recording.cube)
     best = _best_of_each(shots(recording, _flat(todo)), todo, settings.sharpest)
     for index, pictures in track(best, "extracting frames", len(todo)):
         if skip_standing:
-            small = _small(pictures)
+            small = _small(pictures, recording.cube)
             if last is not None and _motion_deg(last, small, recording) < settings.standing_deg:
                 standing += 1
                 continue
             last = small
         name, images = f"{index:06d}.jpg", [_encoded(each, settings.width) for each in pictures]
-        for folder, image in zip(_folders(out, recording.lenses), images, strict=True):
+        for folder, image in zip(_folders(out, recording.folders), images, strict=True):
             write_bytes(folder / name, image)
         kept.append(_Kept(name, float(times[index]), index, standing))
         _append(out / _JOURNAL, kept[-1])
@@ -251,9 +258,10 @@ def _sharpness(pictures: tuple[Picture, ...]) -> float:
     return sum(sharpness(picture.luma()) for picture in pictures) / len(pictures)
 
 
-def _small(pictures: tuple[Picture, ...]) -> np.ndarray:
-    """Miniature of a panorama, or of two lenses side by side, which is as wide."""
-    return miniature(np.concatenate([picture.luma() for picture in pictures], axis=1))
+def _small(pictures: tuple[Picture, ...], cube: bool) -> np.ndarray:
+    """Miniature of a panorama, of two lenses side by side, or of two tracks, one below the other:
+    all are about as many degrees across."""
+    return miniature(np.concatenate([p.luma() for p in pictures], axis=0 if cube else 1))
 
 
 def _motion_deg(before: np.ndarray, after: np.ndarray, recording: Recording) -> float:
@@ -299,7 +307,8 @@ def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
     try:
         marker = json.loads((out / MARKER).read_text(encoding="utf-8"))
         counts = typed(marker["counts"], Counts | None)  # type: ignore[arg-type]
-        lenses = LENSES if "lenses" in marker else ()
+        known = (LENSES, TRACKS) if "lenses" in marker else ()
+        lenses = next((names for names in known if list(names) == marker["lenses"]), LENSES[:0])
         same = marker["key"] == key
     except (OSError, ValueError, TypeError, KeyError, RecursionError, RecordError):
         raise GsbaError(f"{out} is not empty and no extraction: choose another --out") from None

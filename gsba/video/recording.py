@@ -1,13 +1,13 @@
-"""What a recording shows at each instant: a stitched panorama, or what each of two lenses saw.
+"""What a recording shows at each instant: a panorama, what each of two lenses saw, or a cube map.
 
 Raw recordings of two fisheyes come as one file with a track for each lens, as two files with `_00_`
 and `_10_` in their names, or as one track with both circles side by side. These layouts follow
 public descriptions (OpenSpeleo/insta360-rs, docs/INSV_FORMAT.md; insta.pk360.de on file types); one
 real file was at hand, side by side and black. The first track, `_00_` and the left circle are taken
-for the front lens; pictures stay turned as the camera stores them.
+for the front lens; pictures stay turned as the camera stores them. GoPro's `.360` holds two tracks
+of a cube map, see `gsba.video.cube_tracks`.
 """
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from gsba.frames.lens_names import lens_files
 from gsba.frames.raw_pairs import two_circles
 from gsba.log import GsbaError
+from gsba.video.cube_tracks import TRACKS, cube_tracks
 from gsba.video.timeline import Timeline, Track, bgr, decode, luma, read_timeline, track_sizes
 
 LENSES = ("front", "back")
@@ -24,7 +26,6 @@ EXACT_S = 1e-6  # closer times are equal
 
 _RAW_SUFFIX = ".insv"  # of videos that show fisheyes even where no circle is seen
 _STITCH = "stitch it in the camera's app and export an equirectangular (2:1) video"
-_NAMED = ("00", "10")  # between underscores in the names of a front and of a back lens's file
 _NEARLY = 1.1  # longer side over the shorter, up to which a picture is nearly square
 _SHORT = 0.1  # part of the longer track's duration that the shorter may lack
 _LOOKED_AT = 5  # frames in which two circles side by side are looked for
@@ -57,6 +58,7 @@ class Recording:
     shown: np.ndarray  # (N,) bool, instants of which every track has a frame
     partners: np.ndarray  # (N,) int64, frame of the last track at instants that are `shown`
     notes: tuple[str, ...] = ()  # what the video was taken for, and what of it is left out
+    cube: bool = False  # whether these are two tracks of an equi-angular cube map, not two lenses
 
     @property
     def times(self) -> np.ndarray:
@@ -65,8 +67,13 @@ class Recording:
 
     @property
     def lenses(self) -> tuple[str, ...]:
-        """Names of the lenses whose pictures these are; () for panoramas."""
-        return LENSES if len(self.places) > 1 else ()
+        """Names of the lenses whose pictures these are; () for panoramas and cube maps."""
+        return LENSES if len(self.places) > 1 and not self.cube else ()
+
+    @property
+    def folders(self) -> tuple[str, ...]:
+        """Names of the pictures of an instant, where there are two."""
+        return TRACKS if self.cube else self.lenses
 
 
 def files_of(video: Path) -> tuple[Path, ...]:
@@ -75,12 +82,7 @@ def files_of(video: Path) -> tuple[Path, ...]:
     Raises:
         GsbaError: no video, or of a layout that is not read.
     """
-    if video.suffix.lower() == ".360":
-        raise GsbaError(
-            f"{video}: is a cube map in GoPro's layout, no fisheyes: export an equirectangular "
-            "(2:1) video from GoPro Player"
-        )
-    pair = _named_pair(video)
+    pair = lens_files(video)
     if pair is None or not all(path.is_file() for path in pair):
         return (video,)
     sizes = track_sizes(video)
@@ -91,10 +93,16 @@ def read_recording(video: Path) -> Recording:
     """Find out what a video shows, and when.
 
     Raises:
-        GsbaError: no video, neither a panorama nor of two lenses, or of lenses that do not match.
+        GsbaError: no video, no panorama, cube map or recording of two lenses, or one of lenses or
+            tracks that do not match.
     """
     files = files_of(video)
     size, *others = track_sizes(files[0])
+    if (cube := cube_tracks(files[0], [size, *others])) is not None:
+        width, height = [size, *others][cube[0]]
+        note = f"{video}: GoPro's equi-angular cube map, two tracks of {width}x{height}"
+        tracks = Track(video, cube[0]), Track(video, cube[1])
+        return _of_two_tracks(tracks, (width, height), note, cube=True)
     if len(files) == 2:
         _check_pair(files, size)
         note = f"{files[0]}: raw, of the front lens; of the back one is {files[1]}"
@@ -133,7 +141,7 @@ def shots(recording: Recording, chosen: Sequence[int]) -> Iterator[tuple[int, tu
 
 
 def check_lengths(recording: Recording) -> None:
-    """Refuse lenses of which one was recorded for a clearly shorter time.
+    """Refuse lenses, or tracks, of which one was recorded for a clearly shorter time.
 
     Raises:
         GsbaError: so it is.
@@ -143,21 +151,15 @@ def check_lengths(recording: Recording) -> None:
         return
     short, long = int(np.argmin(lasting)), int(np.argmax(lasting))
     end = recording.times[recording.shown][-1]
+    if recording.cube:
+        ours, theirs = f"pictures of {TRACKS[short]}", f"those of {TRACKS[long]}"
+    else:
+        ours, theirs = f"the {LENSES[short]} lens's pictures", f"the {LENSES[long]} one's"
     raise GsbaError(
-        f"{recording.tracks[short].path}: the {LENSES[short]} lens's pictures last "
-        f"{lasting[short]:.3f} s, the {LENSES[long]} one's {lasting[long]:.3f} s: one is cut "
-        f"short; copy it again, or pass --to {end:.3f} to use what both show"
+        f"{recording.tracks[short].path}: {ours} last {lasting[short]:.3f} s, {theirs} "
+        f"{lasting[long]:.3f} s: one is cut short; copy it again, or pass --to {end:.3f} to use "
+        "what both show"
     )
-
-
-def _named_pair(video: Path) -> tuple[Path, Path] | None:
-    """Paths of a front and of a back lens's file, of which `video` is named as one; else None."""
-    found = list(re.finditer(rf"(?<=_)({'|'.join(_NAMED)})(?=_)", video.name))
-    if not found:
-        return None
-    start, end = found[-1].span()
-    front, back = (video.with_name(video.name[:start] + n + video.name[end:]) for n in _NAMED)
-    return front, back
 
 
 def _is_nearly_square(size: tuple[int, int]) -> bool:
@@ -205,7 +207,7 @@ def _check_panorama(video: Path, size: tuple[int, int]) -> None:
     width, height = size
     if width == 2 * height and height > 0:
         return
-    pair = _named_pair(video) if _is_nearly_square(size) else None
+    pair = lens_files(video) if _is_nearly_square(size) else None
     if pair is not None:
         other = pair[0] if video.name == pair[1].name else pair[1]
         raise GsbaError(
@@ -238,8 +240,12 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
     return Recording((track,), (timeline,), places, width, *everything, notes)
 
 
-def _of_two_tracks(tracks: tuple[Track, Track], size: tuple[int, int], note: str) -> Recording:
-    """Pair the frames of two lenses by when they are shown."""
+def _of_two_tracks(
+    tracks: tuple[Track, Track], size: tuple[int, int], note: str, cube: bool = False
+) -> Recording:
+    """Pair the frames of two lenses, or of the tracks of a cube map, by when they are shown."""
+    one, other = TRACKS if cube else LENSES
+    kind = "track" if cube else "lens"
     front, back = read_timeline(tracks[0]), read_timeline(tracks[1])
     ahead = int(back.ticks[0]) * back.tick_s - int(front.ticks[0]) * front.tick_s
     ours, theirs = front.times, back.times + float(ahead)
@@ -250,22 +256,18 @@ def _of_two_tracks(tracks: tuple[Track, Track], size: tuple[int, int], note: str
     where = " and ".join(dict.fromkeys(str(track.path) for track in tracks))
     if not shown.any():
         raise GsbaError(
-            f"{where}: the lenses share no times (front 0 to {ours[-1]:.3f} s, back "
-            f"{theirs[0]:.3f} to {theirs[-1]:.3f} s): not one recording; copy it again from the "
-            "camera"
+            f"{where}: the {'tracks' if cube else 'lenses'} share no times ({one} 0 to "
+            f"{ours[-1]:.3f} s, {other} {theirs[0]:.3f} to {theirs[-1]:.3f} s): not one "
+            "recording; copy it again from the camera"
         )
     notes, num = [note], int(shown.sum())
     if num < max(len(ours), len(theirs)):
         notes.append(
-            f"{where}: {len(ours) + len(theirs) - 2 * num} instants left out that one lens alone "
-            f"shows ({len(ours) - num} front, {len(theirs) - num} back)"
+            f"{where}: {len(ours) + len(theirs) - 2 * num} instants left out that one {kind} alone "
+            f"shows ({len(ours) - num} {one}, {len(theirs) - num} {other})"
         )
-    side = min(size)
-    top, left = (size[1] - side) // 2, (size[0] - side) // 2
-    if max(size) > side:
-        notes.append(f"{where}: pictures are cut to {side}x{side} around their middle")
-    place = (slice(top, top + side), slice(left, left + side))
-    return Recording(tracks, (front, back), (place, place), side, shown, nearest, tuple(notes))
+    places, lines = ((slice(None), slice(None)),) * 2, (front, back)
+    return Recording(tracks, lines, places, size[0], shown, nearest, tuple(notes), cube=cube)
 
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -141,7 +141,8 @@ def test_a_raw_video_gives_its_own_readings_or_a_line(
         return found
 
     monkeypatch.setattr("gsba.pipeline.inputs.read_telemetry", read)
-    for name in ("walk_00_1.insv", "walk_10_1.insv", "other.insv", "stitched.mp4"):
+    names = "walk_00_1.insv", "walk_10_1.insv", "other.insv", "stitched.mp4"
+    for name in (*names, "GS010001.360", "GPFR0001.MP4", "GPBK0001.MP4"):
         (tmp_path / name).write_bytes(b"")
     caplog.set_level("INFO")
     assert read_gyro(None, tmp_path / "walk_10_1.insv") is found
@@ -149,4 +150,6 @@ def test_a_raw_video_gives_its_own_readings_or_a_line(
     assert "no gyro: " in caplog.text and "no gyro in it" in caplog.text
     assert read_gyro(None, tmp_path / "stitched.mp4") is None
     assert read_gyro(None, tmp_path) is None
-    assert asked == ["walk_00_1.insv", "other.insv"]
+    assert read_gyro(None, tmp_path / "GS010001.360") is None
+    assert read_gyro(None, tmp_path / "GPBK0001.MP4") is None
+    assert asked == ["walk_00_1.insv", "other.insv", "GS010001.360", "GPFR0001.MP4"]

@@ -1,0 +1,194 @@
+"""Equi-angular cube maps on disk: the two tracks of GoPro's MAX cameras, a picture each a frame.
+
+They are resampled once, straight into what is asked for: a panorama here, faces in `cubemap`.
+"""
+
+import logging
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gsba.camera.equiangular import (
+    Grid,
+    around_squares,
+    is_equiangular,
+    overlap_of,
+    shrunk,
+    square_directions,
+    square_pixels,
+    squares,
+)
+from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.tables import table
+from gsba.frames.files import decode, image_size, is_image
+from gsba.log import GsbaError
+from gsba.types import FACES, FrameSet
+
+_log = logging.getLogger(__name__)
+
+_FOLDER = re.compile(r"track(\d+)", re.IGNORECASE)
+_BAND = 256  # rows of which coordinates are held in double precision
+_LOOKED_AT = 5  # frames in which edges of squares are compared
+_MIN_CORRELATION = 0.5  # median, of grey values along edges that squares of both tracks share:
+# 0.95 and more on real frames, 0.2 and less on pictures of several instants
+_PARTS = 64  # of an edge, whose mean grey values are compared
+_MIN_CONTRAST = 4.0  # grey levels, standard deviation along an edge that tells
+
+
+def find_tracks(folder: Path) -> dict[str, tuple[Path, ...]] | None:
+    """Find the pictures of both tracks of each frame in folders `track0` and `track5`.
+
+    Any two numbers do; the lower one is the track of the front lens.
+
+    Returns:
+        Paths of the pictures by the frame's name, or None where no such folder holds images.
+
+    Raises:
+        GsbaError: one folder or more than two hold images, or their names differ.
+    """
+    found: dict[int, Path] = {}
+    for path in _entries(folder):
+        match = _FOLDER.fullmatch(path.name)
+        if match and path.is_dir() and any(map(is_image, _entries(path))):
+            found[int(match[1])] = path
+    if not found:
+        return None
+    names = [found[number].name for number in sorted(found)]
+    if len(names) != 2:
+        several = f"pictures in {len(names)} folders, {', '.join(names)}"
+        held = f"{names[0]}/ but no pictures of the second track" if len(names) == 1 else several
+        raise GsbaError(
+            f"{folder}: holds {held}; of a .360 recording, extract both video tracks, as track0/ "
+            "and track5/ (gsba extract does)"
+        )
+    first, second = (_by_name(folder / name) for name in names)
+    for one, other, (ours, theirs) in ((first, second, names), (second, first, names[::-1])):
+        missing = sorted(one.keys() - other.keys())
+        if missing:
+            raise GsbaError(
+                f"{folder}: '{ours}/{one[missing[0]].name}' has no picture of that name in "
+                f"{theirs}/ ({len(missing)} of {len(one)}); remove it, or extract both alike"
+            )
+    return {name: (path, second[name]) for name, path in first.items()}
+
+
+def track_size(folder: Path, pairs: Sequence[tuple[Path, ...]]) -> tuple[int, int]:
+    """Width and height of the pictures of two tracks, after a look at all headers and some pixels.
+
+    Args:
+        folder: of both tracks.
+        pairs: paths of both pictures of each frame.
+
+    Raises:
+        GsbaError: sizes differ, tracks of an equi-angular cube map cannot have them, or squares do
+            not continue one another across both tracks.
+    """
+    first = pairs[0][0]
+    width, height = image_size(first)
+    if not is_equiangular(width, height):
+        raise GsbaError(
+            f"{first}: is {width}x{height}, no track of a .360 recording: that is three squares "
+            "wide and up to a twelfth more (4096x1344, 2272x736)"
+        )
+    for path in (path for pair in pairs for path in pair):
+        if (size := image_size(path)) != (width, height):
+            raise GsbaError(
+                f"{path}: is {size[0]}x{size[1]}, but '{first.parent.name}/{first.name}' is "
+                f"{width}x{height}: both tracks are of one size; extract them again"
+            )
+    _log.info(
+        "%s: GoPro's equi-angular cube map, two tracks of %dx%d, %d columns from both lenses",
+        folder, width, height, overlap_of(width, height),
+    )  # fmt: skip
+    _check_edges(folder, pairs, (width, height))
+    return width, height
+
+
+def load_squares(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
+    """Upright squares (6, S, S[, 3]) uint8 of frame f, FACES order; see `equiangular.squares`."""
+    assert frames.tracks is not None
+    return _decoded(frames.paths[f], frames.tracks, gray)
+
+
+def load_panorama(frames: FrameSet, f: int, gray: bool, width: int) -> np.ndarray:
+    """Panorama (width / 2, width[, 3]) uint8 of frame f, with the frames' correction."""
+    faces = shrunk(load_squares(frames, f, gray), max(round(width / 4), 1))
+    u, v = _maps(Grid(faces.shape[1], frames.correction), width)
+    return cv2.remap(around_squares(faces), u, v, cv2.INTER_LANCZOS4)
+
+
+def _decoded(paths: Sequence[Path], size: tuple[int, int], gray: bool) -> np.ndarray:
+    first, second = (decode(path, size, gray) for path in paths)
+    return squares((first, second))
+
+
+def _check_edges(folder: Path, pairs: Sequence[tuple[Path, ...]], size: tuple[int, int]) -> None:
+    """Refuse tracks whose grey values on both sides of common edges are not correlated."""
+    rows = np.unique(np.linspace(0, len(pairs) - 1, _LOOKED_AT).astype(int))
+    found = [_edge_correlations(_decoded(pairs[row], size, gray=True)) for row in rows]
+    known = np.concatenate(found)
+    if len(known) and np.median(known) < _MIN_CORRELATION:
+        raise GsbaError(
+            f"{folder}: squares of {pairs[0][0].parent.name} and {pairs[0][1].parent.name} do not "
+            f"meet at their edges (correlation {np.median(known):.2f}): their pictures are not of "
+            "the same instants, or not of GoPro's equi-angular layout; extract both tracks again"
+        )
+
+
+@table(maxsize=2)
+def _maps(grid: Grid, width: int) -> np.ndarray:
+    """Places (2, width / 2, width) float32 of a panorama's pixels in a grid, OpenCV pixels."""
+    height = width // 2
+    maps = np.empty((2, height, width), np.float32)
+    for top in range(0, height, _BAND):
+        rows = np.arange(top, min(top + _BAND, height)) + 0.5
+        pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, rows), axis=-1)
+        found = grid.places(bearings_from_erp(pixels, width, height))
+        maps[:, top : top + len(rows)] = np.moveaxis(found, -1, 0)
+    return maps
+
+
+def _edge_correlations(faces: np.ndarray) -> np.ndarray:
+    """Correlations (n,) of grey values on both sides of edges that squares of both tracks share.
+
+    Values of squares (6, S, S) are averaged along an edge, so that noise counts as no contrast;
+    edges without contrast are left out.
+    """
+    size, found = faces.shape[1], []
+    along = np.arange(size) + 0.5
+    for face in ("front", "right", "left"):  # of track 0
+        n = FACES.index(face)
+        for u, v in ((along, -0.5), (along, size + 0.5), (-0.5, along), (size + 0.5, along)):
+            beyond = np.stack(np.broadcast_arrays(u, v), axis=-1)
+            others, pixels = square_pixels(square_directions(beyond, n, size), size)
+            if FACES[others[size // 2]] in ("front", "right", "left"):
+                continue
+            inner = np.clip(beyond, 0, size - 1).astype(int)
+            there = np.clip(pixels, 0, size - 1).astype(int)
+            sides = faces[n, inner[:, 1], inner[:, 0]], faces[others, there[:, 1], there[:, 0]]
+            parts = [np.array_split(values, min(_PARTS, size)) for values in sides]
+            a, b = ([part.mean() for part in side] for side in parts)
+            if min(np.std(a), np.std(b)) > _MIN_CONTRAST:
+                found.append(np.corrcoef(a, b)[0, 1])
+    return np.array(found)
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(folder.iterdir())
+    except OSError as error:
+        raise GsbaError(f"{folder}: cannot be read ({error.strerror})") from None
+
+
+def _by_name(folder: Path) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for path in filter(is_image, _entries(folder)):
+        if path.stem in found:
+            raise GsbaError(
+                f"{folder}: '{found[path.stem].name}' and '{path.name}' are one frame's name twice"
+            )
+        found[path.stem] = path
+    return found

@@ -1,0 +1,124 @@
+"""The equi-angular cube map: every direction is found where both tracks show it."""
+
+import cv2
+import numpy as np
+import pytest
+from cube_map_tracks import picture_tracks, track_directions
+from two_fisheyes import colours
+
+from gsba.camera.equiangular import (
+    Grid,
+    around_squares,
+    is_equiangular,
+    overlap_of,
+    square_directions,
+    square_pixels,
+    squares,
+    taps,
+)
+from gsba.types import FACES
+
+SIZES = [(96, 4), (90, 6), (64, 0)]  # pixels of a square, columns that stand twice
+
+
+def _directions(seed: int) -> np.ndarray:
+    """Unit directions (N, 3): all over the sphere, along all edges of the cube, on the seam."""
+    rng = np.random.default_rng(seed)
+    anywhere = rng.normal(size=(4000, 3))
+    edges = rng.uniform(-1, 1, (6000, 3))
+    rows, axes = np.arange(6000), rng.permuted(np.tile([0, 1, 2], (6000, 1)), axis=1)
+    edges[rows[:, None], axes[:, :2]] = rng.choice([-1, 1], (6000, 2))
+    edges[rows, axes[:, 0]] *= 1 + rng.normal(size=6000) * 0.02
+    seam = rng.normal(size=(4000, 3)) * [1, 1, 0.02]
+    found = np.concatenate([anywhere, edges, seam])
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def _sample(track: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Values (N, C) float of a track (H, W, C) at pixels (N, 2), linear between centres."""
+    u, v = (pixels - 0.5).astype(np.float32).T[:, None]
+    how, border = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
+    return cv2.remap(track.astype(np.float32), u, v, how, borderMode=border)[0]
+
+
+@pytest.mark.parametrize(("size", "overlap"), SIZES)
+def test_taps_are_the_pixels_that_show_a_direction(size: int, overlap: int) -> None:
+    """Exactly: each pixel's own direction leads back to it, by one of the taps."""
+    directions, width = track_directions(size, overlap), 3 * size + 2 * overlap
+    v, u = np.mgrid[:size, :width] + 0.5
+    for track in (0, 1):
+        found = taps(directions[track], width, size)
+        off = np.linalg.norm(found.pixels - np.stack([u, v], -1)[:, :, None], axis=-1)
+        assert (found.tracks == track).all()
+        assert off.min(axis=-1).max() < 1e-9
+        np.testing.assert_allclose(found.weights.sum(axis=-1), 1)
+        alone = found.weights.max(axis=-1) == 1
+        doubled = 4 * overlap  # columns of two side squares, twice each
+        assert (~alone).sum() == size * doubled
+
+
+@pytest.mark.parametrize(("size", "overlap"), SIZES)
+def test_taps_reproduce_a_smooth_sphere(size: int, overlap: int) -> None:
+    """Across all edges and in the doubled columns, as well as linear interpolation can."""
+    directions = _directions(0)
+    true = colours(directions)
+    tracks = picture_tracks(size, overlap, colours)
+    found = taps(directions, 3 * size + 2 * overlap, size)
+    shown = np.zeros_like(true)
+    for track in (0, 1):
+        own = found.tracks == track
+        for tap in (0, 1):
+            values = _sample(tracks[track], found.pixels[own, tap])
+            shown[own] += found.weights[own, tap, None] * values
+    # a step of a pixel is pi / (2 size); half of it beyond a border goes unseen by one tap
+    step = np.pi / (2 * size)
+    assert np.abs(shown - true).max() < 95 * (6 * step / 2 + 0.01)
+    assert np.abs(shown - true).mean() < 0.8
+
+
+@pytest.mark.parametrize(("size", "overlap"), SIZES)
+def test_grids_reproduce_a_smooth_sphere(size: int, overlap: int) -> None:
+    """With what lies beyond their borders, squares are continuous everywhere."""
+    directions = _directions(1)
+    grid, faces = Grid(size), squares(picture_tracks(size, overlap, colours))
+    u, v = grid.places(directions).astype(np.float32).T[:, None]
+    shown = cv2.remap(around_squares(faces), u, v, cv2.INTER_CUBIC)[0]
+    off = np.abs(shown - colours(directions))
+    assert off.max() < 3.0 and off.mean() < 0.5  # grey levels: 0.3 is rounding
+
+
+def test_doubled_columns_pass_from_one_lens_to_the_other() -> None:
+    """The front lens sees 200, the back one 100, each as far as its picture goes."""
+    size, overlap = 96, 8
+    width, half = 3 * size + 2 * overlap, (size + overlap) // 2
+    front = np.zeros((2, size, width), bool)
+    front[0, :, half : width - half] = True
+    front[1, :, :half] = front[1, :, width - half :] = True
+    first, second = np.where(front, 200, 100).astype(np.uint8)
+    faces = squares((first, second))
+    pixels = np.stack(np.meshgrid(*2 * (np.arange(size) + 0.5,)), axis=-1)
+    for n in range(len(FACES)):
+        ahead = square_directions(pixels, n, size)
+        largest = np.abs(ahead).max(axis=-1)
+        angle = np.arctan(ahead[..., 2] / largest)  # from the seam, as side squares count it
+        share = np.clip(0.5 + angle / (np.pi / 2 * overlap / size), 0, 1)
+        np.testing.assert_allclose(faces[n], 100 + 100 * share, atol=0.51)
+
+
+def test_squares_and_directions_are_inverse() -> None:
+    directions = _directions(2)
+    faces, pixels = square_pixels(5 * directions, 100)
+    assert pixels.min() > -1e-9 and pixels.max() < 100 + 1e-9
+    for n in range(len(FACES)):
+        back = square_directions(pixels[faces == n], n, 100)
+        back /= np.linalg.norm(back, axis=-1, keepdims=True)
+        np.testing.assert_allclose(back, directions[faces == n], atol=1e-12)
+
+
+def test_the_size_of_a_track_tells_its_overlap() -> None:
+    """Of GoPro MAX at 5.6K and 3K, of MAX 2 with 8 and 10 bits, and of the first firmware."""
+    known = {(4096, 1344): 32, (2272, 736): 32, (5888, 1920): 64, (5952, 1920): 96, (4032, 1344): 0}
+    assert {size: overlap_of(*size) for size in known} == known
+    assert all(is_equiangular(*size) for size in known)
+    for size in [(3840, 1920), (1920, 1080), (1376, 1344), (2273, 736), (2274, 736), (0, 0)]:
+        assert not is_equiangular(*size), size
