@@ -13,7 +13,7 @@ from gsba.frames.times import check_fps
 from gsba.imu.files import read_imu, read_telemetry
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError
-from gsba.placement.placement import EXIF
+from gsba.placement import EXIF
 from gsba.store.store import RunStore
 from gsba.trajectory.association import without_trajectory
 from gsba.trajectory.files import read_trajectory
