@@ -24,7 +24,7 @@ Overrides = Annotated[
 ]
 Factors = Annotated[
     str | None,
-    typer.Option(help="Families, commas between: bearing, reprojection, photometric, splat."),
+    typer.Option(help="Families, commas between: bearing, reprojection, gps, photometric, splat."),
 ]
 Weights = Annotated[
     list[Path] | None,
@@ -67,6 +67,13 @@ Imu = Annotated[
     typer.Option(
         help="Gyro and accelerometer that rode along: t, gyro x y z [rad/s], accelerometer x y z "
         "[m/s^2]; or a maker's recording.",
+        metavar="FILE",
+    ),
+]
+Gps = Annotated[
+    str | None,
+    typer.Option(
+        help="GPS positions as factors against drift: CSV, GPX, a video, or exif (of the frames).",
         metavar="FILE",
     ),
 ]
@@ -117,6 +124,7 @@ def refine(
     camera: Camera = None,
     calibration: Calibration = None,
     imu: Imu = None,
+    gps: Gps = None,
     fps: Annotated[
         float | None,
         typer.Option(help="Frames per second, from time 0; of a video: frames kept per second."),
@@ -139,6 +147,9 @@ def refine(
     overrides = [*_networks(weights, accept_noncommercial, download), *(overrides or ())]
     if camera is not None:
         overrides = [*overrides, f'camera.name="{camera}"']
+    if gps is not None:
+        overrides = [*overrides, f"gps.file={json.dumps(gps)}"]
+        factors = _with_gps(factors)
     settings = _settings(config, overrides, factors)
     with loading():
         from gsba import pipeline
@@ -256,6 +267,13 @@ def show_config(
     from gsba.config_file import to_toml
 
     typer.echo(to_toml(_settings(config, overrides, factors)), nl=False)
+
+
+def _with_gps(factors: str | None) -> str:
+    """Families with that of GPS, which --gps asks for."""
+    families = factors or "bearing"
+    named = [family.strip() for family in families.split(",")]
+    return families if "gps" in named else f"{families},gps"
 
 
 def _networks(weights: list[Path] | None, accept_noncommercial: bool, download: bool) -> list[str]:

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.bundle.fixes import FrameFixes
 from gsba.config import GpsSettings
-from gsba.fixes import FrameFixes
 from gsba.log import GsbaError
 from gsba.placement.exif import read_exif_gps
 from gsba.placement.gps import GpsFixes, local_from_geodetic, read_gps

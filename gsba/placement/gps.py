@@ -64,7 +64,9 @@ def fixes_of(
     geodetic = np.array(geodetic, np.float64).reshape(-1, 3)
     sigmas = sigmas_of(settings or GpsSettings(), np.full(len(geodetic), np.nan), sigmas)
     named = len(keys) > 0 and isinstance(keys[0], str)
-    order = np.arange(len(keys)) if named else np.argsort(np.array(keys, np.float64), kind="stable")
+    order = np.arange(len(keys))
+    if not named:
+        order = np.argsort(np.array(keys, np.float64), kind="stable")
     high = np.isfinite(geodetic[order, 2])
     if high.sum() >= _MIN_ALTITUDES:
         order = order[high]
@@ -73,7 +75,7 @@ def fixes_of(
     geodetic, sigmas = geodetic[order], sigmas[order]
     geodetic[:, 1] = np.unwrap(geodetic[:, 1], period=360)  # the date line is no jump
     if named:
-        return GpsFixes(tuple(str(keys[i]) for i in order), None, geodetic, sigmas)
+        return GpsFixes(tuple(str(keys[int(i)]) for i in order), None, geodetic, sigmas)
     return GpsFixes(None, np.array(keys, np.float64)[order], geodetic, sigmas)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsba.fixes import FrameFixes
+from gsba.bundle.fixes import FrameFixes
 from gsba.similarity import Sim3, level_similarity, robust_similarity, similarity
 
 _MEDIAN_LENGTH = 1.538  # of a 3-vector of independent unit normals
@@ -57,7 +57,7 @@ def fit_fixes(
 ) -> GpsFit:
     """Most probable similarity of a map onto GPS fixes whose errors last, without false fixes.
 
-    Least squares with the inverse covariance of all fixes (see `gsba.fixes`), from a robust start
+    Least squares with the inverse covariance of all fixes (see `gsba.bundle.fixes`), from a robust start
     (`gsba.similarity.robust_similarity`). A fix is false where it is further off than 4.6 of its
     standard deviations, or than as many of what the fixes scatter where that is more.
 
@@ -82,10 +82,8 @@ def fit_fixes(
         before, used = used, distances <= _OUTLIER_SIGMAS * wide
         if np.array_equal(before, used):
             break
-    chosen, off = fixes.taken(used), _residuals(fit, positions, fixes)[used]
-    whitened = chosen.whitened(off)
-    left = max(whitened.size - len(free) + (scale is not None), 1)
-    misfit = max(np.sum(whitened**2) / left, np.mean((off / chosen.sigmas) ** 2))
+    off = _residuals(fit, positions, fixes)[used]
+    misfit = np.mean((off / fixes.sigmas[used]) ** 2)
     covariance = np.zeros((7, 7))
     covariance[np.ix_(free, free)] = np.linalg.pinv(information[np.ix_(free, free)], hermitian=True)
     covariance *= max(1.0, float(misfit))
@@ -122,7 +120,7 @@ def _most_probable(
 ) -> tuple[Sim3, np.ndarray]:
     """Gauss-Newton over the fixes used; the similarity and its information (7, 7)."""
     chosen, some = fixes.taken(used), positions[used]
-    information, free = np.zeros((7, 7)), list(free)
+    information, rows = np.zeros((7, 7)), list(free)
     for _ in range(_STEPS):
         columns = chosen.whitened(_columns(fit, some - centre)).reshape(-1, 7)
         off = chosen.whitened(chosen.positions - fit.points(some)).ravel()
@@ -131,9 +129,9 @@ def _most_probable(
             weight = (scale[0] / max(scale[1], 1e-9 * scale[0])) ** 2
             information[0, 0] += weight
             right[0] += weight * np.log(scale[0] / fit.scale)
-        inverse = np.linalg.pinv(information[np.ix_(free, free)], hermitian=True)
+        inverse = np.linalg.pinv(information[np.ix_(rows, rows)], hermitian=True)
         step = np.zeros(7)
-        step[free] = inverse @ right[free]
+        step[rows] = inverse @ right[rows]
         step[0] = np.clip(step[0], -1, 1)
         turn = Rotation.from_rotvec(step[1:4]).as_matrix()
         grown, rotation = fit.scale * np.exp(step[0]), turn @ fit.rotation

@@ -1,4 +1,5 @@
 """GPS fixes that a camera records into its video, by `telemetry_parser`."""
+
 from pathlib import Path
 
 from gsba.config import GpsSettings

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from gsba.bundle.fixes import FrameFixes
 from gsba.config import GpsSettings, PlacementSettings
-from gsba.fixes import FrameFixes
 from gsba.geometry import pose
 from gsba.log import GsbaError, brief
 from gsba.placement.frame_fixes import fixes_of_frames, read_fixes
@@ -418,17 +418,18 @@ def _claims(found: GpsFit, positions: np.ndarray) -> dict[str, Any]:
 def _require_determined(path: Path, found: GpsFit, fixes: FrameFixes) -> None:
     """GsbaError for fixes that leave scale, heading or tilt open."""
     extent = float(np.linalg.norm(np.ptp(fixes.positions[found.used], axis=0)[:2]))
-    known = f"they spread over {extent:.3g} m and are known to {np.median(fixes.sigmas[:, 0]):.2g} m"
+    noise = float(np.median(fixes.sigmas[:, 0]))
+    known = f"they spread over {extent:.3g} m, and are known to {noise:.2g} m"
     if not found.scale_sigma < _MOST_GPS_SCALE_SIGMA:
         raise GsbaError(
-            f"{path}: its positions tell the scale to {100 * found.scale_sigma:.0f} % only ({known}): "
-            "add --scale lens, or place the run by --scale LENGTH --between A B"
+            f"{path}: its positions tell the scale to {100 * found.scale_sigma:.0f} % only "
+            f"({known}): add --scale lens, or place the run by --scale LENGTH --between A B"
         )
     if not np.degrees(found.heading_sigma) < _MOST_GPS_ANGLE_DEG:
         raise GsbaError(
-            f"{path}: its positions do not tell where north is, to "
-            f"{np.degrees(found.heading_sigma):.0f} degrees only ({known}): leave out --gps, or give "
-            "positions of a longer walk or a better receiver"
+            f"{path}: its positions tell where north is to "
+            f"{np.degrees(found.heading_sigma):.0f} degrees only ({known}): leave out --gps, or "
+            "give positions of a longer walk or of a better receiver"
         )
     if not np.degrees(found.tilt_sigma) < _MOST_GPS_ANGLE_DEG:
         raise GsbaError(

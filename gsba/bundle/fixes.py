@@ -1,5 +1,6 @@
 """Positions of frames by GPS: how noisy they are, and how long an error lasts."""
 
+import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +42,13 @@ class FrameFixes:
             self.origin,
             self.correlation_s,
         )
+
+    def digest(self) -> str:
+        """Fingerprint of all that results rest on."""
+        times = np.zeros(0) if self.times is None else self.times
+        parts = self.frames, self.positions, self.sigmas, times, np.array([self.correlation_s])
+        data = b"".join(np.ascontiguousarray(part, np.float64).tobytes() for part in parts)
+        return hashlib.sha256(data).hexdigest()[:16]
 
     def _correlations(self) -> np.ndarray:
         """Correlation (G - 1,) of the lasting errors of each fix and the next."""
