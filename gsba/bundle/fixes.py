@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_WHITE_SHARE = 0.1  # of the variance of a fix: independent from fix to fix, the rest lasts
+WHITE_SHARE = 0.1  # of the variance of a fix: independent from fix to fix, the rest lasts
 _UNTIMED_STEP = 0.5  # correlation times between fixes whose times are not known
 
 
@@ -50,8 +50,8 @@ class FrameFixes:
         data = b"".join(np.ascontiguousarray(part, np.float64).tobytes() for part in parts)
         return hashlib.sha256(data).hexdigest()[:16]
 
-    def _correlations(self) -> np.ndarray:
-        """Correlation (G - 1,) of the lasting errors of each fix and the next."""
+    def correlations(self) -> np.ndarray:
+        """Correlation (G - 1,) of the lasting part of the errors of each fix and the next."""
         if self.times is None:
             return np.full(max(len(self) - 1, 0), np.exp(-_UNTIMED_STEP))
         return np.exp(-np.diff(self.times) / self.correlation_s)
@@ -66,14 +66,14 @@ class FrameFixes:
             columns: (G, 3, ...) metres, residuals or Jacobians by anything.
         """
         scaled = columns / self.sigmas.reshape(*self.sigmas.shape, *[1] * (columns.ndim - 2))
-        correlations = np.concatenate([[0.0], self._correlations()])
-        lasting = 1 - _WHITE_SHARE
+        correlations = np.concatenate([[0.0], self.correlations()])
+        lasting = 1 - WHITE_SHARE
         mean, variance = np.zeros(scaled.shape[1:]), lasting
         out = np.empty_like(scaled)
         for i, correlation in enumerate(correlations):
             mean = correlation * mean
             variance = correlation**2 * variance + (1 - correlation**2) * lasting
-            total = variance + _WHITE_SHARE
+            total = variance + WHITE_SHARE
             innovation = scaled[i] - mean
             out[i] = innovation / np.sqrt(total)
             mean = mean + variance / total * innovation
@@ -87,9 +87,9 @@ class FrameFixes:
         their mean, is then neither more nor less than their lasting errors allow. Of shorter
         periods, about which images know more, they say less.
         """
-        steps = self._correlations()
+        steps = self.correlations()
         if not len(steps):
             return self.sigmas
         around = np.sqrt(np.append(steps, steps[-1]) * np.insert(steps, 0, steps[0]))
-        lasting = (1 - _WHITE_SHARE) * (1 + around) / np.maximum(1 - around, 1e-9)
-        return self.sigmas * np.sqrt(lasting + _WHITE_SHARE)[:, None]
+        lasting = (1 - WHITE_SHARE) * (1 + around) / np.maximum(1 - around, 1e-9)
+        return self.sigmas * np.sqrt(lasting + WHITE_SHARE)[:, None]

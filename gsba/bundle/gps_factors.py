@@ -8,8 +8,10 @@ say nothing of the gauge; the result is carried back to the trajectory's world i
 the first pose and re-estimating the similarity in turns would approach it slowly, a shared
 variable would tie all frames to one another.
 
-Covariances are of the gauge that holds the first pose: there the similarity is a variable, by
-factors that are linear.
+Errors of fixes last (`gsba.bundle.fixes`). The adjustment has independent ones that say as much of
+drift, so that each fix is a factor of its own, with a robust loss. Covariances have the lasting
+errors as variables; and as they are of the gauge that holds the first pose, the similarity as well,
+all by factors that are linear.
 """
 
 from collections.abc import Callable
@@ -18,7 +20,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from gsba.bundle.fixes import FrameFixes
+from gsba.bundle.fixes import WHITE_SHARE, FrameFixes
 from gsba.bundle.prior_factors import X
 from gsba.config import GpsSettings
 from gsba.similarity import NoSimilarityError, Sim3, robust_similarity, similarity
@@ -28,7 +30,8 @@ _MEDIAN_LENGTH = 1.538  # of a 3-vector of independent unit normals
 _OUTLIER_SIGMAS = 4.6  # 99.99 % of such vectors are shorter
 _ROUNDS = 10  # of choosing fixes
 
-S: Callable[[int], int] = gtsam.symbol_shorthand.S  # what a map's similarity changes by
+S: Callable[[int], int] = gtsam.symbol_shorthand.S  # what a map's similarity changes by (7,)
+E: Callable[[int], int] = gtsam.symbol_shorthand.E  # lasting error of a fix (3,), in its sigmas
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +43,7 @@ class Anchors:
     covariances: np.ndarray  # (A, 3, 3) float64, map units^2, of independent errors
     loss_scales: np.ndarray  # (A,) float64, of the Cauchy loss, in standard deviations of these
     maps: np.ndarray  # (A,) int64, map of each
+    fixes: FrameFixes  # (A) the same in level metres
     used: np.ndarray  # (G,) bool, fixes of the frames that are among them
     level_from_map: dict[int, Sim3]  # of each map that has fixes: metres east, north, up
 
@@ -47,9 +51,11 @@ class Anchors:
         """Whether the map of a frame, of all maps (F,), has fixes; None = there is one map."""
         return (0 if maps is None else int(maps[frame])) in self.level_from_map
 
-    def residuals(self, world_T_rigs: np.ndarray) -> np.ndarray:
-        """Frames (A, 3) less where their fixes are, map units."""
-        return world_T_rigs[self.frames, :3, 3] - self.positions
+    def weights(self, world_T_rigs: np.ndarray) -> np.ndarray:
+        """Weights (A,) of the Cauchy loss under these poses (F, 4, 4)."""
+        off = world_T_rigs[self.frames, :3, 3] - self.positions
+        squares = np.einsum("ai,aij,aj->a", off, np.linalg.inv(self.covariances), off)
+        return 1 / (1 + squares / self.loss_scales**2)
 
 
 def anchor(
@@ -98,7 +104,7 @@ def anchor(
         covariances[a], places[a] = axes @ axes.T, fit.points_back(kept.positions[a])
     loss = scales * kept.sigmas[:, 0] / sigmas[:, 0]
     mask = np.isin(np.arange(len(fixes)), chosen)
-    return Anchors(kept.frames, places, covariances, loss, of_fix, mask, found)
+    return Anchors(kept.frames, places, covariances, loss, of_fix, kept, mask, found)
 
 
 def _level_from_map(positions: np.ndarray, fixes: FrameFixes) -> tuple[Sim3, np.ndarray, float]:
@@ -133,37 +139,64 @@ def factors(anchors: Anchors) -> gtsam.NonlinearFactorGraph:
 
 
 def linear_factors(
-    anchors: Anchors, world_T_rigs: np.ndarray, values: gtsam.Values
+    anchors: Anchors,
+    world_T_rigs: np.ndarray,
+    values: gtsam.Values,
+    *,
+    free_similarity: bool = True,
 ) -> gtsam.NonlinearFactorGraph:
-    """What fixes say of poses in any gauge: similarities are variables beside them.
+    """What fixes say of poses, for covariances: their lasting errors are variables, too.
 
     Args:
         anchors: fixes in the world of the poses.
         world_T_rigs: (F, 4, 4) where factors are linearized.
-        values: of the poses; a change of seven dimensions is added for each map.
+        values: of the poses; the further variables are added.
+        free_similarity: whether the map's similarity is a variable, as it must be where the first
+            pose is held.
 
     Returns:
         Linear factors, weighted as the loss weighs them there.
     """
     graph = gtsam.NonlinearFactorGraph()
-    middles = {}
-    for number in anchors.level_from_map:
-        middles[number] = anchors.positions[anchors.maps == number].mean(axis=0)
-        values.insert(S(number), np.zeros(7))
-    model = gtsam.noiseModel.Unit.Create(3)
-    for a, off in enumerate(anchors.residuals(world_T_rigs)):
-        root = np.linalg.inv(np.linalg.cholesky(anchors.covariances[a]))
-        distance = np.linalg.norm(root @ off) / anchors.loss_scales[a]
-        root /= np.sqrt(1 + distance**2)
-        number, frame = int(anchors.maps[a]), int(anchors.frames[a])
-        arm = anchors.positions[a] - middles[number]
-        by_similarity = -np.column_stack([arm, *np.cross(np.eye(3), arm), np.eye(3)])
-        by_pose = np.hstack([np.zeros((3, 3)), world_T_rigs[frame, :3, :3]])
-        rows = gtsam.JacobianFactor(
-            X(frame), root @ by_pose, S(number), root @ by_similarity, -root @ off, model
-        )
+    added = gtsam.Values()
+    for number in anchors.level_from_map if free_similarity else ():
+        added.insert(S(number), np.zeros(7))
+    for a in range(len(anchors.frames)):
+        added.insert(E(a), np.zeros(3))
+    values.insert(added)
+    unit, weights = gtsam.noiseModel.Unit.Create(3), anchors.weights(world_T_rigs)
+
+    def add(terms: dict[int, np.ndarray], right: np.ndarray) -> None:
         here = gtsam.Values()
-        here.insert(X(frame), gtsam.Pose3(world_T_rigs[frame]))
-        here.insert(S(number), np.zeros(7))
+        for key in terms:
+            if added.exists(key):
+                here.insert(key, added.atVector(key))
+            else:
+                here.insert(key, values.atPose3(key))
+        pairs = [part for term in terms.items() for part in term]
+        rows = gtsam.JacobianFactor(*pairs, right, unit)  # type: ignore[call-overload]
         graph.add(gtsam.LinearContainerFactor(rows, here))
+
+    for number, fit in anchors.level_from_map.items():
+        chosen = np.flatnonzero(anchors.maps == number)
+        fixes, middle = anchors.fixes.taken(chosen), anchors.positions[chosen].mean(axis=0)
+        memories = np.concatenate([[0.0], fixes.correlations()])
+        for i, a in enumerate(chosen.tolist()):
+            fresh = 1 / np.sqrt((1 - WHITE_SHARE) * (1 - memories[i] ** 2))
+            link = {E(a): fresh * np.eye(3)}
+            if i:
+                link |= {E(int(chosen[i - 1])): -fresh * memories[i] * np.eye(3)}
+            add(link, np.zeros(3))
+            frame = int(anchors.frames[a])
+            off = world_T_rigs[frame, :3, 3] - anchors.positions[a]
+            arm = anchors.positions[a] - middle
+            weight = np.sqrt(weights[a] / WHITE_SHARE)
+            whitened = weight * fit.scale * fit.rotation / fixes.sigmas[i][:, None]
+            by_pose = np.hstack([np.zeros((3, 3)), world_T_rigs[frame, :3, :3]])
+            terms = {X(frame): whitened @ by_pose}
+            if free_similarity:
+                by_similarity = np.column_stack([arm, *np.cross(np.eye(3), arm), np.eye(3)])
+                terms[S(number)] = -whitened @ by_similarity
+            terms[E(a)] = -weight * np.eye(3)
+            add(terms, -whitened @ off)
     return graph

@@ -57,8 +57,8 @@ def fit_fixes(
 ) -> GpsFit:
     """Most probable similarity of a map onto GPS fixes whose errors last, without false fixes.
 
-    Least squares with the inverse covariance of all fixes (see `gsba.bundle.fixes`), from a robust start
-    (`gsba.similarity.robust_similarity`). A fix is false where it is further off than 4.6 of its
+    Least squares with the inverse covariance of all fixes (`gsba.bundle.fixes`), from a start
+    by `gsba.similarity.robust_similarity`. A fix is false where it is further off than 4.6 of its
     standard deviations, or than as many of what the fixes scatter where that is more.
 
     Args:
