@@ -204,9 +204,9 @@ def _placement(
     if settings.gps is not None:
         scale = None
         if settings.length == "lens":
-            by_lenses = _by_lenses(reconstruction, baseline, placement)
-            scale = by_lenses.similarity.scale, by_lenses.grounds["lens"]["scale_sigma"]
-            placement = dataclasses.replace(placement, grounds=by_lenses.grounds)
+            scale, grounds = _scale_by_lenses(reconstruction, baseline)
+            grounds = {**placement.grounds, "lens": grounds}
+            placement = dataclasses.replace(placement, grounds=grounds)
         return _on_earth(reconstruction, frames, settings.gps, placement, scale, gps)
     if settings.length == "lens":
         return _by_lenses(reconstruction, baseline, placement)
@@ -293,10 +293,10 @@ def metres_per_unit(
     return scale, scale * float(np.hypot(lenses[1] / lenses[0], baseline[1] / baseline[0]))
 
 
-def _by_lenses(
-    reconstruction: Reconstruction, baseline: tuple[float, float] | None, placement: Placement
-) -> Placement:
-    """Metres, by what the maker says is between the lenses."""
+def _scale_by_lenses(
+    reconstruction: Reconstruction, baseline: tuple[float, float] | None
+) -> tuple[tuple[float, float], dict[str, Any]]:
+    """Metric scale and its standard deviation by the lenses, and the entry of transform.json."""
     if reconstruction.lens_baseline is None:
         raise GsbaError(
             "--scale lens: the run found no two lenses (report.json says why, under camera): "
@@ -304,12 +304,19 @@ def _by_lenses(
         )
     assert baseline is not None  # see check
     scale, sigma = metres_per_unit(reconstruction.lens_baseline, baseline)
+    return (scale, sigma), {"baseline_m": baseline[0], "scale_sigma": sigma}
+
+
+def _by_lenses(
+    reconstruction: Reconstruction, baseline: tuple[float, float] | None, placement: Placement
+) -> Placement:
+    """Metres, by what the maker says is between the lenses."""
+    (scale, sigma), grounds = _scale_by_lenses(reconstruction, baseline)
     if not sigma < _MOST_SIGMA * scale:
         raise GsbaError(
             f"--scale lens: the distance between the lenses tells the scale to "
             f"{100 * sigma / scale:.0f} % only; {100 * _MOST_SIGMA:.0f} % are needed"
         )
-    grounds = {"baseline_m": baseline[0], "scale_sigma": sigma}
     return dataclasses.replace(
         placement,
         similarity=dataclasses.replace(placement.similarity, scale=scale),
