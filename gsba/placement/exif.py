@@ -1,6 +1,7 @@
 """Positions that cameras write into pictures: the GPS directory of EXIF."""
 
 import logging
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -28,20 +29,18 @@ def read_exif_gps(frames: FrameSet, settings: GpsSettings | None = None) -> GpsF
         GsbaError: fewer than three frames have one, or a picture cannot be read.
     """
     found: dict[str, GpsTag] = {}
-    damaged = repeated = 0
+    taken, damaged = set[tuple[float, float, float]](), 0
     for name, paths in zip(frames.names, track(frames.paths, "reading EXIF"), strict=True):
         tag, failed = _first_tag(paths)
         damaged += failed
         if tag is None:
             continue
-        if tag.unix_time == tag.unix_time and tag in found.values():  # NaN: no time stamp
-            repeated += 1
-            continue
-        found[name] = tag
+        known = tag.latitude, tag.longitude, tag.unix_time
+        if math.isnan(tag.unix_time) or known not in taken:
+            found[name] = tag
+        taken.add(known)
     if damaged:
         _log.warning("--gps exif: the EXIF data of %d pictures are damaged", damaged)
-    if repeated:
-        _log.info("--gps exif: %d frames repeat the fix of an earlier one: left out", repeated)
     if len(found) < MIN_FIXES:
         raise GsbaError(
             f"--gps exif: {len(found)} of {len(frames)} frames have GPS tags "

@@ -68,7 +68,7 @@ def fixes_of(
     if not named:
         order = np.argsort(np.array(keys, np.float64), kind="stable")
     high = np.isfinite(geodetic[order, 2])
-    if high.sum() >= _MIN_ALTITUDES:
+    if high.all() or high.sum() >= _MIN_ALTITUDES:
         order = order[high]
     else:
         geodetic[:, 2], sigmas[:, 2] = 0.0, np.maximum(sigmas[:, 2], _LEVEL_M)
