@@ -435,6 +435,18 @@ class SplatSettings(_Settings):
     seed: int = Field(default=0, ge=0, le=_MAX_SEED)
 
 
+class GpsSettings(_Settings):
+    """GPS positions of frames, and how well receivers know them."""
+
+    file: _Text | None = None  # CSV, GPX, a video, or "exif" of the frames: for the gps factors
+    sigma_m: float = Field(
+        default=3.0, gt=0
+    )  # metres across, standard deviation per axis: no fix is better; times its DOP where given
+    sigma_up_m: float = Field(default=5.0, gt=0)  # metres up, the same
+    correlation_s: float = Field(default=60.0, gt=0)  # time constant after which errors differ
+    loss_sigmas: float = Field(default=2.0, gt=0)  # Cauchy scale of the gps factors
+
+
 class PlacementSettings(_Settings):
     """Where the exported world is: upright, to scale, on the earth; the run itself stays put."""
 
@@ -442,7 +454,7 @@ class PlacementSettings(_Settings):
     length: Annotated[float, Field(gt=0)] | Literal["lens"] | None = None  # metres between the two
     # of `between`, or by the distance between the lenses
     between: tuple[str, str] | None = None  # frames by name, or points "x,y,z" of the run's world
-    gps: _Text | None = None  # file of positions, or "exif": metres, east-north-up
+    gps: _Text | None = None  # CSV, GPX, a video, or "exif": metres, east-north-up
     align: _Text | None = None  # TUM file of true poses: its world and unit
     scan: _Text | None = None  # PLY, PCD, LAS, LAZ, OBJ or GLB of the place: its world and unit
     pairs: _Text | None = None  # file of three or more pairs, run and scan, to find it by
@@ -466,9 +478,10 @@ class RefineSettings(_Settings):
     camera: CameraSettings = CameraSettings()
     stitching: StitchingSettings = StitchingSettings()
     solver: SolverSettings = SolverSettings()
-    factors: tuple[Literal["bearing", "reprojection", "photometric", "splat"], ...] = Field(
+    factors: tuple[Literal["bearing", "reprojection", "gps", "photometric", "splat"], ...] = Field(
         default=("bearing",), min_length=1
     )
+    gps: GpsSettings = GpsSettings()
     photometric: PhotometricSettings = PhotometricSettings()
     splat: SplatFactorSettings = SplatFactorSettings()
     export: ExportSettings = ExportSettings()
@@ -500,6 +513,16 @@ class RefineSettings(_Settings):
         if not {"bearing", "reprojection"} & set(self.factors):
             named = " and ".join(self.factors)
             raise ValueError(f"factors: {named} starts from bearing or reprojection; add one")
+        return self
+
+    @model_validator(mode="after")
+    def _gps_has_fixes(self) -> "RefineSettings":
+        if ("gps" in self.factors) != (self.gps.file is not None):
+            raise ValueError(
+                "factors: gps needs positions: pass --gps FILE, or gps.file"
+                if self.gps.file is None
+                else "gps.file is read by the gps factors: add gps to factors"
+            )
         return self
 
     @model_validator(mode="after")

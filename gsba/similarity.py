@@ -203,7 +203,8 @@ def naming(path: Path) -> Iterator[None]:
     except NoSimilarityError:
         raise GsbaError(
             f"{path}: its positions and the frames' have nothing in common: check that they are "
-            "of this recording and on the frames' clock"
+            "of this recording and on the frames' clock, and that the path is longer than they "
+            "are wrong"
         ) from None
 
 

@@ -16,7 +16,8 @@ from factors import (
     RobustLoss,
     tangent_basis,
 )
-from gsba.bundle import prior_factors, triangulation
+from gsba.bundle import gps_factors, prior_factors, triangulation
+from gsba.bundle.gps_factors import Anchors
 from gsba.bundle.optimizer import marginal_covariances, optimize
 from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.config import RefineSettings, SolverSettings
@@ -30,6 +31,7 @@ DRAWS = 500  # errors of all poses, that tell how those of different ones belong
 _AT_ONCE = 1 << 18  # observations whose residuals are found together
 _REDUNDANT = 0.1  # least share of residual dimensions left over by the poses
 _FLAT = 1e-12  # of the information of a point, beside it: one that rays leave open has no inverse
+_GPS_DAMPING, _GPS_TOLERANCE = 1e-9, 1e-7  # of adjustments with GPS: drift is long and soft
 _LEAST_LEFT = 1e-3  # share of a residual that a point leaves over, or it says nothing of noise
 
 
@@ -42,6 +44,34 @@ class Problem:
     settings: RefineSettings  # families, loss, solver, rounds
     num_threads: int  # of the solver
     turning: Turning | None = None  # of the frames, by a gyro; its say on poses is in the priors
+    anchors: Anchors | None = None  # GPS fixes in the world of the poses; None = there are none
+    ungauged: gtsam.NonlinearFactorGraph | None = None  # `priors` without the gauge, which the
+    # anchors give; None = there are none
+
+    @property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """Factors on the poses beside what images say: priors, gauge, GPS."""
+        if self.anchors is None or self.ungauged is None:
+            return self.priors
+        graph = gtsam.NonlinearFactorGraph(self.ungauged)
+        graph.push_back(gps_factors.factors(self.anchors))
+        return graph
+
+    def held(
+        self, world_T_rigs: np.ndarray, values: gtsam.Values, maps: np.ndarray | None
+    ) -> gtsam.NonlinearFactorGraph:
+        """The same for covariances: the first pose and the extent of each map are held fixed.
+
+        Args:
+            world_T_rigs: (F, 4, 4) poses.
+            values: of the poses; further variables that GPS asks for are added.
+            maps: (F,) map of each frame; None = there is one.
+        """
+        graph = gtsam.NonlinearFactorGraph(self.priors)
+        graph.push_back(prior_factors.fixed_scale(world_T_rigs, maps))
+        if self.anchors is not None:
+            graph.push_back(gps_factors.linear_factors(self.anchors, world_T_rigs, values))
+        return graph
 
 
 def adjust_sighted(
@@ -130,7 +160,10 @@ def adjust(
         spread = noise * max(1.0, gate / settings.rounds.gate_scale)
         block = landmark_block(landmarks, keypoints, spread, problem)
         solver = _solver(settings, last=final and number == len(gates))
-        result = optimize(problem.priors, [block], values_of(world_T_rigs), solver)
+        if problem.anchors is not None:
+            finer = {"lambda_initial": _GPS_DAMPING, "relative_tolerance": _GPS_TOLERANCE}
+            solver = solver.model_copy(update=finer)
+        result = optimize(problem.graph, [block], values_of(world_T_rigs), solver)
         poses = poses_of(result.values, len(world_T_rigs))
         new_support = len(place(poses, last_gate).tracks)
         accepted = new_support >= settings.rounds.min_support * support
@@ -202,10 +235,9 @@ def pose_covariances(
 ) -> tuple[np.ndarray, JointErrors]:
     """Marginal covariances (F, 6, 6) with the first pose and the extent of each map held fixed."""
     block = landmark_block(solved.landmarks, keypoints, solved.noise, problem)
-    held = gtsam.NonlinearFactorGraph(problem.priors)
-    held.push_back(prior_factors.fixed_scale(solved.world_T_rigs, components))
     keys = [prior_factors.X(f) for f in range(len(solved.world_T_rigs))]
     values = values_of(solved.world_T_rigs)
+    held = problem.held(solved.world_T_rigs, values, components)
     return marginal_covariances(held, [block], values, keys, DRAWS, problem.settings.seed)
 
 

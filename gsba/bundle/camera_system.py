@@ -80,7 +80,7 @@ class CameraSystem:
         lenses, found = self.seeing.lenses, self.seeing
         variances = None
         for _ in range(1 if lenses.twists is None else _SPREADS):
-            system = camera.system(self.problem.priors)
+            system = camera.system(self.problem.graph)
             steps = system.solve(_DAMPING)
             if steps is None:
                 return self.seeing
@@ -117,7 +117,7 @@ class CameraSystem:
     def _agrees(self, turning: Turning) -> bool:
         """Whether frames turn while they are read as a gyro says, by images alone."""
         camera = _linearized(replace(self, seeing=replace(self.seeing, by_gyro=False)))
-        system, own = camera.system(self.problem.priors), camera.own[0]
+        system, own = camera.system(self.problem.graph), camera.own[0]
         steps, variances = system.solve(_DAMPING), _own_variances(camera, system)
         told = np.isfinite(turning.rates).all(axis=1)
         if steps is None or variances is None or not told.any():
@@ -134,13 +134,13 @@ class CameraSystem:
             components: (F,) map of each frame; None = there is one.
         """
         camera, num = _linearized(self), len(self.solved.world_T_rigs)
-        graph = camera.graph(self.problem.priors)
-        graph.push_back(prior_factors.fixed_scale(self.solved.world_T_rigs, components))
+        poses, values = self.solved.world_T_rigs, camera.values
+        graph = camera.graph(self.problem.held(poses, values, components))
         every = C(0), D(0), N(0), *(key for key, _ in _OF_LENSES)
         beside = [key for key in every if camera.values.exists(key)]
-        seed, poses = self.problem.settings.seed, camera.keys[:num]
+        seed, keys = self.problem.settings.seed, camera.keys[:num]
         found, joint = marginal_covariances(
-            graph, [camera.block()], camera.values, poses, DRAWS, seed, beside
+            graph, [camera.block()], values, keys, DRAWS, seed, beside
         )
         sigmas = {key: np.sqrt(np.diagonal(found[num + i])) for i, key in enumerate(beside)}
         nothing = np.array([np.nan])

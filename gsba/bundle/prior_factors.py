@@ -9,6 +9,7 @@ from gsba.types import StepNoise, Turning
 
 X = gtsam.symbol_shorthand.X
 _ANYWHERE = 1e4  # extents of a map: as good as no say
+_FAINTER = 10.0  # times the noise of absolute priors, where GPS says where frames are
 
 
 def build(
@@ -18,6 +19,7 @@ def build(
     false_frames: np.ndarray | None = None,
     first: np.ndarray | None = None,
     noise: StepNoise | None = None,
+    gauge: bool = True,
 ) -> gtsam.NonlinearFactorGraph:
     """Relative priors between neighbours, a weak absolute one, and a fixed first pose.
 
@@ -28,6 +30,8 @@ def build(
         false_frames: (F,) bool, frames that get no absolute prior; None = all do.
         first: (4, 4) where to fix the first pose; None = where the trajectory has it.
         noise: of the steps that keep their prior, as others showed it; None = as in the settings.
+        gauge: whether to fix the first pose. Else GPS says where frames are: the first pose is as
+            free as the map is large, and absolute priors are fainter.
     """
     graph = gtsam.NonlinearFactorGraph()
     steps = inverse(coarse_world_T_rigs[:-1]) @ coarse_world_T_rigs[1:]
@@ -52,14 +56,19 @@ def build(
             gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
             model = gtsam.noiseModel.Robust.Create(loss, gaussian)
         graph.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), gtsam.Pose3(steps[f]), model))
-    weak = robust(np.deg2rad(settings.absolute_rotation_deg), settings.absolute_position * extent)
+    fainter = 1.0 if gauge else _FAINTER
+    weak = robust(
+        fainter * np.deg2rad(settings.absolute_rotation_deg),
+        fainter * settings.absolute_position * extent,
+    )
     for f, world_T_rig in enumerate(coarse_world_T_rigs):
         if false_frames is not None and false_frames[f]:
             continue
         graph.add(gtsam.PriorFactorPose3(X(f), gtsam.Pose3(world_T_rig), weak))
-    gauge = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-6] * 3 + [1e-6 * extent] * 3))
+    tight = 1e-6 if gauge else 1.0
+    held = gtsam.noiseModel.Diagonal.Sigmas(np.array([tight] * 3 + [tight * extent] * 3))
     fixed = gtsam.Pose3(coarse_world_T_rigs[0] if first is None else first)
-    graph.add(gtsam.PriorFactorPose3(X(0), fixed, gauge))
+    graph.add(gtsam.PriorFactorPose3(X(0), fixed, held))
     return graph
 
 

@@ -25,7 +25,7 @@ Overrides = Annotated[
 ]
 Factors = Annotated[
     str | None,
-    typer.Option(help="Families, commas between: bearing, reprojection, photometric, splat."),
+    typer.Option(help="Families, commas between: bearing, reprojection, gps, photometric, splat."),
 ]
 Weights = Annotated[
     list[Path] | None,
@@ -68,6 +68,13 @@ Imu = Annotated[
     typer.Option(
         help="Gyro and accelerometer that rode along: t, gyro x y z [rad/s], accelerometer x y z "
         "[m/s^2]; or a maker's recording.",
+        metavar="FILE",
+    ),
+]
+Gps = Annotated[
+    str | None,
+    typer.Option(
+        help="GPS positions as factors against drift: CSV, GPX, a video, or exif (of the frames).",
         metavar="FILE",
     ),
 ]
@@ -129,6 +136,7 @@ def refine(
     camera: Camera = None,
     calibration: Calibration = None,
     imu: Imu = None,
+    gps: Gps = None,
     fps: Annotated[
         float | None,
         typer.Option(help="Frames per second, from time 0; of a video: frames kept per second."),
@@ -152,6 +160,9 @@ def refine(
     overrides = [*_networks(weights, accept_noncommercial, download), *(overrides or ())]
     if camera is not None:
         overrides = [*overrides, f'camera.name="{camera}"']
+    if gps is not None:
+        overrides = [*overrides, f"gps.file={json.dumps(gps)}"]
+        factors = _with_gps(factors)
     settings = _settings(config, overrides, factors)
     with loading():
         from gsba import pipeline
@@ -279,6 +290,13 @@ def show_config(
     from gsba.config_file import to_toml
 
     typer.echo(to_toml(_settings(config, overrides, factors)), nl=False)
+
+
+def _with_gps(factors: str | None) -> str:
+    """Families with that of GPS, which --gps asks for."""
+    families = factors or "bearing"
+    named = [family.strip() for family in families.split(",")]
+    return families if "gps" in named else f"{families},gps"
 
 
 def _networks(weights: list[Path] | None, accept_noncommercial: bool, download: bool) -> list[str]:

@@ -22,6 +22,7 @@ from gsba.log import GsbaError
 
 if TYPE_CHECKING:
     from gsba.camera.lens import Lenses
+    from gsba.config import GpsSettings
     from gsba.evaluate.consistency import Consistency
     from gsba.types import FrameSet, Reconstruction, Trajectory
 
@@ -52,7 +53,14 @@ Between = Annotated[
 ]
 Gps = Annotated[
     str | None,
-    typer.Option(help="CSV, GPX, or exif (of the frames): metres east, north, up.", metavar="FILE"),
+    typer.Option(
+        help="CSV, GPX, a GoPro video, or exif (of the frames): metres east, north, up.",
+        metavar="FILE",
+    ),
+]
+GpsSigma = Annotated[
+    float | None,
+    typer.Option(help="With --gps: metres across that no fix is better than (3).", metavar="M"),
 ]
 AlignScan = Annotated[
     str | None,
@@ -94,6 +102,7 @@ def export(
     baseline: Millimetres = None,
     between: Between = None,
     gps: Gps = None,
+    gps_sigma: GpsSigma = None,
     align: Annotated[
         str | None, typer.Option(help="True poses: their world and unit.", metavar="TRUTH.tum")
     ] = None,
@@ -125,7 +134,9 @@ def export(
     lenses = _lenses(run, reconstruction, frames, images, map_number)
     folder = out or run / (to if map_number == 1 else f"{to}-map{map_number}")
     said = _baseline(run, baseline) if scale == "lens" else None
-    placement = replace(place(reconstruction, frames, settings, said), map_number=map_number)
+    noise = _gps_noise(run, gps_sigma) if gps is not None else None
+    placed = place(reconstruction, frames, settings, said, noise)
+    placement = replace(placed, map_number=map_number)
     given = reconstruction, frames, folder, ExportFormat(to), face_size, placement, link, lenses
     with connected(cluster) as client, hired(client, folder, frames) as workers:
         write(*given, images=images, workers=workers)
@@ -158,6 +169,19 @@ def _baseline(run: Path, millimetres: float | None) -> tuple[float, float] | Non
     if millimetres is None:
         return load_config(run / "config.toml").camera.baseline()
     return validated({"camera": {"baseline_mm": millimetres}}).camera.baseline()
+
+
+def _gps_noise(run: Path, sigma: float | None) -> "GpsSettings":
+    """How well GPS knows positions: as given, with as much more up, or as the run was told."""
+    from gsba.config_file import load_config, validated
+
+    known = load_config(run / "config.toml").gps.model_copy(update={"file": None})
+    if sigma is None:
+        return known
+    up = sigma * known.sigma_up_m / known.sigma_m
+    changed = known.model_dump() | {"sigma_m": sigma, "sigma_up_m": up}
+    gps = {"gps": {key: value for key, value in changed.items() if value is not None}}
+    return validated(gps).gps
 
 
 def _length(text: str | None) -> float | str | None:

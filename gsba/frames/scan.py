@@ -59,7 +59,7 @@ def scan(
     Args:
         folder: JPEG, PNG, WebP or TIFF images; other files are ignored.
         timestamps: table of times (see `read_times`); else `timestamps.csv` in the folder, unless
-            `fps` is given; else the file names, if they are times.
+            `fps` is given; else the file names, if they are times; else EXIF tags.
         fps: frames per second of these files in name order.
         masks: one ERP mask for all frames, or a folder with one for each; white = use.
         order_suffices: where nothing gives times, name order stands in for them.
@@ -122,7 +122,8 @@ def _in_time_order(
         table = folder / _TIMES_FILE
     if fps is not None:
         _warn_of_slots(folder, max(path.name for path in found[names[-1]]))
-    times, timed = frame_times(names, table, fps, order_suffices)
+    pictures = [found[name] for name in names]
+    times, timed = frame_times(names, table, fps, order_suffices, pictures)
     order = np.argsort(times, kind="stable")
     names, times = [names[i] for i in order], times[order]
     same = np.flatnonzero(np.diff(times) <= 0)

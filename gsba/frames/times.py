@@ -1,4 +1,4 @@
-"""Times of frames and poses: tables on disk, frame rates, file names."""
+"""Times of frames and poses: tables on disk, frame rates, file names, EXIF tags."""
 
 import logging
 import re
@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.frames.exif import ExifTags, read_exif
 from gsba.frames.files import IMAGE_SUFFIXES
-from gsba.log import GsbaError, brief
+from gsba.log import GsbaError, brief, track
 
 _log = logging.getLogger(__name__)
 
@@ -119,15 +120,20 @@ def _is_seconds(text: str) -> bool:
 
 
 def frame_times(
-    names: Sequence[str], table: Path | None, fps: float | None, order_suffices: bool = False
+    names: Sequence[str],
+    table: Path | None,
+    fps: float | None,
+    order_suffices: bool = False,
+    pictures: Sequence[Sequence[Path]] = (),
 ) -> tuple[np.ndarray, bool]:
-    """Time of each frame from a table, a rate, or the names themselves.
+    """Time of each frame from a table, a rate, the names themselves, or EXIF tags.
 
     Args:
         names: (F,) frame names without extension, in name order.
         table: file that `read_times` understands; a plain list is in name order.
         fps: frames per second of these very frames: frame i is at i / fps.
         order_suffices: where nothing gives times, name order stands in for them.
+        pictures: (F,) files of each frame, whose EXIF tags are read last.
 
     Returns:
         (F,) float64 seconds, not necessarily sorted, and whether they are times.
@@ -141,7 +147,12 @@ def frame_times(
             return _times_from_list(names, table, rows), True
         return _times_by_name(names, table, rows), True
     try:
-        given = _times_from_names(names) if fps is None else _times_at_rate(names, check_fps(fps))
+        if fps is not None:
+            given = _times_at_rate(names, check_fps(fps))
+        else:
+            given = _times_from_names(names)
+            if given is None:
+                given = _times_from_exif(names, pictures)
     except NoTimesError as error:
         if not order_suffices:
             raise
@@ -209,8 +220,11 @@ def _times_at_rate(names: Sequence[str], fps: float) -> np.ndarray:
     return np.arange(len(names)) / fps
 
 
-def _times_from_names(names: Sequence[str]) -> np.ndarray:
-    """Times of names that are decimal seconds, or whole Unix times after a common prefix."""
+def _times_from_names(names: Sequence[str]) -> np.ndarray | None:
+    """Times of names that are decimal seconds, or whole Unix times after a common prefix.
+
+    None where names are none of these.
+    """
     if all(re.fullmatch(r"[0-9]+\.[0-9]+", name) for name in names):
         times = np.array([float(name) for name in names])
         if np.median(np.diff(np.sort(times))) < _MIN_INTERVAL_S:
@@ -224,4 +238,54 @@ def _times_from_names(names: Sequence[str]) -> np.ndarray:
     if len(found) == len(names) and len(prefixes) == 1 and len(units) == 1 and None not in units:
         _log.info("frame times are the file names, Unix time in %s", units.pop())
         return np.array([seconds(digits) for _, digits in found])
-    raise NoTimesError(f"nothing says when the frames ('{names[0]}', ...) were taken; {_HOW}")
+    return None
+
+
+def _times_from_exif(names: Sequence[str], pictures: Sequence[Sequence[Path]]) -> np.ndarray:
+    """Times of DateTimeOriginal and SubSecTimeOriginal, Unix time where the zone is given.
+
+    Raises:
+        NoTimesError: not all frames have one, or they do not ascend with the names.
+    """
+    tags = [_time_tags(files) for files in track(pictures, "reading EXIF")]
+    why, taken = _unusable(names, tags), [tag.taken for tag in tags if tag is not None]
+    if not taken or why:
+        said = f"; EXIF times are not used: {why}" if why else ""
+        first = f"the frames ('{names[0]}', ...)"
+        raise NoTimesError(f"nothing says when {first} were taken{said}; {_HOW}")
+    zoned = all(tag is not None and tag.zoned for tag in tags)
+    what = "Unix time" if zoned else "local time, as no time zone is given"
+    whole = "" if any(tag is not None and tag.subsecond for tag in tags) else ", in whole seconds"
+    _log.info("frame times are those of EXIF, %s%s", what, whole)
+    return np.array(taken, np.float64)
+
+
+def _unusable(names: Sequence[str], tags: Sequence[ExifTags | None]) -> str:
+    """Why EXIF times are no times of the frames; empty = they are, or none is there."""
+    dated = [tag for tag in tags if tag is not None]
+    if dated and len(dated) < len(tags):
+        lacking = next(name for name, tag in zip(names, tags, strict=True) if tag is None)
+        return f"{len(dated)} of {len(names)} frames have one, not '{lacking}'"
+    if len({tag.zoned for tag in dated}) > 1:
+        return "some name a time zone, others do not"
+    taken = np.array([tag.taken for tag in dated], np.float64)
+    late = np.flatnonzero(np.diff(taken) <= 0)
+    if not len(late):
+        return ""
+    pair = f"'{names[late[0]]}' and '{names[late[0] + 1]}'"
+    if taken[late[0]] > taken[late[0] + 1]:
+        return f"{pair} are in another order by them than by name"
+    whole = "" if any(tag.subsecond for tag in dated) else ": they are whole seconds"
+    return f"{pair} have the same one{whole}"
+
+
+def _time_tags(files: Sequence[Path]) -> ExifTags | None:
+    """Tags of the first picture of a frame that says when it was taken; None = none does."""
+    for path in files:
+        try:
+            tags = read_exif(path)
+        except ValueError:  # damaged
+            continue
+        if tags.taken is not None:
+            return tags
+    return None

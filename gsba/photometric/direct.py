@@ -225,7 +225,7 @@ def _solve(
         landmarks = adjustment.landmark_block(solved.landmarks, keypoints, solved.noise, problem)
         landmarks.polish(values)
         before, fits = landmarks.error(values), _geometric_fits(landmarks, values)
-        result = optimize(problem.priors, [landmarks, block], values, solver)
+        result = optimize(problem.graph, [landmarks, block], values, solver)
         growth = _geometric_fits(landmarks, result.values) / fits
         doubts, residuals = _frame_weights(block, result.values, growth, chosen)
         if np.all(doubts >= 1) or np.any(weights < 1):

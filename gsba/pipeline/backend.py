@@ -75,7 +75,8 @@ def adjust(
 
     def compute() -> Solution:
         found = _tracks(seen, prior, matches)
-        return adjustment.adjust(found, seen.keypoints, start, run.problem(prior), gates, final)
+        problem = run.problem(prior, start)
+        return adjustment.adjust(found, seen.keypoints, start, problem, gates, final)
 
     return run.stage(name, [run.solving_key(), gates, final], compute, Solution)
 
@@ -106,7 +107,7 @@ def guess_axes(
     """Which way two lenses would look, from matches as they came."""
 
     def found(wide: Solution) -> LensAxes:
-        problem = run.problem(prior)
+        problem = run.problem(prior, wide)
         return lens_axes.guess(wide.landmarks, seen.keypoints, wide, seen.lenses, problem)
 
     return _of_matches(run, seen, prior, name, matches, solved, found, LensAxes)
@@ -129,7 +130,7 @@ def find_lenses(
     """Where the lenses are, from matches that no solution has chosen among."""
 
     def found(wide: Solution) -> LensCentres:
-        problem = run.problem(prior)
+        problem = run.problem(prior, wide)
         return lens_centres.estimate(wide.landmarks, seen.keypoints, wide, seen.lenses, problem)
 
     return _of_matches(run, seen, prior, name, matches, solved, found, LensCentres, noted=True)
@@ -152,7 +153,8 @@ def find_readout(
     """How long rows are read and which way, from the same."""
 
     def found(wide: Solution) -> Readout:
-        shown, times, problem = seen.shown.bearings_rig, run.frames.timestamps, run.problem(prior)
+        shown, times = seen.shown.bearings_rig, run.frames.timestamps
+        problem = run.problem(prior, wide)
         given = wide.landmarks, seen.keypoints, shown, wide, seen.lenses, times, problem
         return readout.estimate(*given)
 
@@ -171,7 +173,8 @@ def settle_camera(
     """The camera that was found, from the same, and each frame's own motion and axes."""
 
     def found(wide: Solution) -> Readout:
-        shown, times, problem = seen.shown.bearings_rig, run.frames.timestamps, run.problem(prior)
+        shown, times = seen.shown.bearings_rig, run.frames.timestamps
+        problem = run.problem(prior, wide)
         return CameraSystem(wide, seen.keypoints, shown, camera, times, problem).step()
 
     return _of_matches(run, seen, prior, name, matches, solved, found, Readout)
@@ -181,7 +184,7 @@ def _under_lenses(
     run: Run, seen: Seen, prior: Prior, wide: Solution
 ) -> tuple[Landmarks, Keypoints, np.ndarray, Solution, Lenses, Problem]:
     """What is asked of a map for what its lenses do to pictures."""
-    shown, problem = seen.shown.bearings_rig, run.problem(prior)
+    shown, problem = seen.shown.bearings_rig, run.problem(prior, wide)
     return wide.landmarks, seen.keypoints, shown, wide, seen.lenses, problem
 
 
@@ -273,7 +276,7 @@ def measure_strength(run: Run, seen: Seen, prior: Prior, solved: Solution) -> Pr
     closer, settings, trust = run.settings.closer, run.settings.priors, prior.trust
 
     def compute() -> MapStrength:
-        problem = run.problem(prior, settings.faint())
+        problem = run.problem(prior, None, settings.faint())
         covariances, joint = adjustment.pose_covariances(
             solved, seen.keypoints, problem, prior.parts
         )
@@ -326,7 +329,8 @@ def refine_photometric(run: Run, prior: Prior, world: Map) -> Map:
     def compute() -> PhotometricResult:
         frames, keypoints = world.straightened(run.frames), world.keypoints(run.rig)
         lenses = world.lenses.cut_anew()
-        return direct.refine(frames, keypoints, world.solution, run.problem(prior), lenses)
+        problem = run.problem(prior, world.solution)
+        return direct.refine(frames, keypoints, world.solution, problem, lenses)
 
     found = run.stage("photometric", key, compute, PhotometricResult)
     return replace(world, solution=found.adjustment, frame_weights=found.frame_weights)
@@ -346,7 +350,7 @@ def refine_on_splat(run: Run, prior: Prior, world: Map) -> Map:
         places, seen = solved.landmarks.points_world, solved.landmarks.tracks
         around = scenes_around(solved.world_T_rigs, places, seen.points, seen.frames)
         optics = Optics(lenses, around)
-        given = frames, world.keypoints(run.rig), solved, run.problem(prior)
+        given = frames, world.keypoints(run.rig), solved, run.problem(prior, solved)
         return refinement.refine(*given, patches, turns, start, optics)
 
     found = run.stage("splat", key, compute, SplatResult)
@@ -367,7 +371,7 @@ def measure_camera(run: Run, prior: Prior, world: Map) -> Map:
             straight.bearings_rig,
             world.seeing(),
             run.frames.timestamps,
-            run.problem(prior),
+            run.problem(prior, world.solution),
         )
         return system.covariances(prior.parts)
 
@@ -384,7 +388,8 @@ def reconstruct(run: Run, seen: Seen, prior: Prior, world: Map) -> Reconstructio
         return _reconstruct_rotations(run, seen, prior)
 
     def compute() -> Reconstruction:
-        solved, observed, problem = world.solution, world.keypoints(run.rig), run.problem(prior)
+        solved, observed = world.solution, world.keypoints(run.rig)
+        problem = run.problem(prior, solved)
         frames = world.straightened(run.frames)
         if world.covariances is None:
             claimed = adjustment.pose_covariances(solved, observed, problem, prior.parts)

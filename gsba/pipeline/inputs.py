@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from gsba import video
+from gsba.bundle.fixes import FrameFixes
+from gsba.bundle.gps_factors import MIN_FIXES
 from gsba.camera.calibration import read_calibration
 from gsba.config import RefineSettings
 from gsba.frames.lens_names import lens_files
@@ -14,7 +16,7 @@ from gsba.frames.times import check_fps
 from gsba.imu.files import read_imu, read_telemetry
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError
-from gsba.placement.placement import EXIF
+from gsba.placement import EXIF, fixes_of_frames
 from gsba.store.store import RunStore
 from gsba.trajectory.association import without_trajectory
 from gsba.trajectory.files import read_trajectory
@@ -116,6 +118,26 @@ def _duration_s(path: Path) -> float | None:
         return None
 
 
+def positions_of(frames: FrameSet, settings: RefineSettings) -> FrameFixes | None:
+    """GPS fixes of frames for the gps factors; None = they are not asked for.
+
+    Raises:
+        GsbaError: positions that cannot be used, or that too few frames have.
+    """
+    source = settings.gps.file
+    if source is None:
+        return None
+    fixes = fixes_of_frames(source, frames, settings.gps)
+    if len(fixes) < MIN_FIXES:
+        raise GsbaError(
+            f"--gps {source}: {len(fixes)} of {len(frames)} frames have a position, and "
+            f"{MIN_FIXES} are needed: check that they are of this recording and on the frames' "
+            "clock"
+        )
+    logger.info("--gps %s: %d of %d frames have a position", source, len(fixes), len(frames))
+    return fixes
+
+
 def extract_frames(
     out: Path,
     origin: Mapping[str, Path],
@@ -125,7 +147,7 @@ def extract_frames(
 ) -> None:
     """Write the frames of the video that a run is about to `out`/frames."""
     chosen = settings.video
-    if settings.placement.gps == EXIF:
+    if EXIF in (settings.placement.gps, settings.gps.file):
         raise GsbaError("--gps exif: a video's frames have no tags; give positions as a file")
     if fps is not None:
         chosen = chosen.model_copy(update={"fps": check_fps(fps), "every": None, "at": None})

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from gsba.bundle.gps_factors import anchor
 from gsba.bundle.reconstruction import world_scale
 from gsba.camera.calibration import calibration_json
 from gsba.camera.fisheye import Pair
@@ -18,6 +19,7 @@ from gsba.pipeline.run import Run
 from gsba.placement.placement import Placement, metres_per_unit, place
 from gsba.report import findings
 from gsba.report.camera_findings import of_camera, of_lenses
+from gsba.report.gps_findings import of_gps
 from gsba.report.html import residual_sphere, write_html
 from gsba.report.imu_findings import of_gyro
 from gsba.report.maps import MapSummary, is_partial, summarize_maps
@@ -82,7 +84,8 @@ def write(run: Run, prior: Prior, world: Map, result: Reconstruction, lenses: Le
     (out / CALIBRATION).unlink(missing_ok=True)
     if shown.fisheyes is not None:
         write_json(out / CALIBRATION, _calibration(shown.fisheyes, world, result, lenses, settings))
-    placement = place(main, shown, settings.placement, settings.camera.baseline())
+    baseline = settings.camera.baseline()
+    placement = place(main, shown, settings.placement, baseline, settings.gps)
     _export(run, main, shown, placement, lenses.taken(rows))
     report = _report(run, prior, world, result)
     write_json(out / "report.json", report)
@@ -141,6 +144,12 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
     if prior.gyro is not None:
         gyro, more = of_gyro(prior.gyro, prior.turning, world.readout, world.solution.world_T_rigs)
         notes += more
+    gps = None
+    if run.fixes is not None:
+        poses = world.solution.world_T_rigs
+        anchors = anchor(poses, run.fixes, run.settings.gps, prior.parts)
+        gps, more = of_gps(run.fixes, anchors, poses, frames)
+        notes += more
     most = run.settings.closer.max_scale_sigma
     notes += findings.of_frames(frames, coarse, result, undone, world.frame_weights, most)
     report = build_report(
@@ -158,6 +167,7 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
         stitching=world.stitching and findings.of_field(world.stitching),
         camera=camera,
         gyro=gyro,
+        gps=gps,
         reasons=_reasons(prior),
     )
     report["residual_sphere"] = plain(residual_sphere(result), digits=4)

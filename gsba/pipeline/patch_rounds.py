@@ -123,7 +123,7 @@ def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, n
 
     def axes() -> LensAxes:
         solved, keypoints = placed_anew()
-        problem = run.problem(prior)
+        problem = run.problem(prior, solved)
         return lens_axes.loosened(solved.landmarks, keypoints, solved, world.lenses, problem)
 
     shown = stitching.corrected(sighted.keypoints, world.field, run.rig).bearings_rig
@@ -131,17 +131,17 @@ def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, n
 
     def rows() -> Readout:
         solved, keypoints = placed_anew()
-        around, problem = solved.landmarks, run.problem(prior)
+        around, problem = solved.landmarks, run.problem(prior, solved)
         return readout.estimate(around, keypoints, shown, solved, world.lenses, times, problem)
 
     def settle() -> Readout:
         solved, keypoints = placed_anew()
-        problem = run.problem(prior)
+        problem = run.problem(prior, solved)
         return CameraSystem(solved, keypoints, shown, world.seeing(), times, problem).step()
 
     def lenses() -> SelfCalibration:
         solved, keypoints = placed_anew()
-        around, problem = solved.landmarks, run.problem(prior)
+        around, problem = solved.landmarks, run.problem(prior, solved)
         return self_calibration.estimate(around, keypoints, shown, solved, world.lenses, problem)
 
     key = backend.camera_key(run)
@@ -164,7 +164,8 @@ def _adjust_aligned(run: Run, prior: Prior, world: Map, sighted: Sighted, name: 
 
     def compute() -> tuple[Solution, Keypoints]:
         there = replace(sighted, keypoints=world.rays(sighted.keypoints, run.rig))
-        solved, found = adjustment.adjust_sighted(there, world.solution, run.problem(prior), gates)
+        problem = run.problem(prior, world.solution)
+        solved, found = adjustment.adjust_sighted(there, world.solution, problem, gates)
         return solved, stitching.with_noise_of(sighted.keypoints, found)
 
     key = [run.solving_key(), gates]
@@ -190,7 +191,7 @@ def _straighten(run: Run, prior: Prior, world: Map, sighted: Sighted, number: in
             world.observed,
             world.solution,
             world.field,
-            run.problem(prior),
+            run.problem(prior, world.solution),
             world.lenses,
         )
 
@@ -210,7 +211,7 @@ def _is_settled(run: Run, prior: Prior, before: Map, world: Map, number: int) ->
     """Whether the last round of aligning patches moved steps by less than their noise."""
 
     def compute() -> float:
-        solved, problem = world.solution, run.problem(prior)
+        solved, problem = world.solution, run.problem(prior, world.solution)
         known = adjustment.pose_covariances(solved, world.keypoints(run.rig), problem, prior.parts)
         former = before.solution.world_T_rigs
         return settling.step_motion(former, solved.world_T_rigs, *known)

@@ -59,11 +59,15 @@ class Prior:
         """The trajectory, chained past its false steps, as a solution without points."""
         return Solution.without_points(self.trust.world_T_rigs)
 
-    def graph(self, settings: PriorSettings) -> gtsam.NonlinearFactorGraph:
+    def graph(
+        self, settings: PriorSettings, first: np.ndarray | None = None, *, gauge: bool = True
+    ) -> gtsam.NonlinearFactorGraph:
         """What the trajectory says, as far as it is believed, the gauge, and the caller's factors.
 
         Args:
             settings: noise of the trajectory, unless images told it.
+            first: (4, 4) where to fix the first pose; None = where the start has it.
+            gauge: whether to fix it.
         """
         trust, strength = self.trust, self.strength
         whole = trust.false_steps.all()  # then the start is all there is
@@ -71,8 +75,9 @@ class Prior:
         false, noise = trust.false_steps, None
         if strength is not None:
             false, noise = false | strength.held_steps, strength.noise
-        first = trust.world_T_rigs[0]
-        graph = prior_factors.build(believed, settings, false, trust.false_frames, first, noise)
+        first = trust.world_T_rigs[0] if first is None else first
+        given = believed, settings, false, trust.false_frames, first, noise, gauge
+        graph = prior_factors.build(*given)
         if self.turning is not None:
             extent = float(np.linalg.norm(np.ptp(believed[:, :3, 3], axis=0)))
             graph.push_back(prior_factors.turns(self.turning, extent, settings.loss_sigmas))

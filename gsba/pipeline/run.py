@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from gsba import learned
+from gsba.bundle import gps_factors
 from gsba.bundle.adjustment import Problem
+from gsba.bundle.fixes import FrameFixes
 from gsba.camera.rig import CubeRig
 from gsba.config import PriorSettings, RefineSettings
 from gsba.frames import cubemap
@@ -17,7 +19,7 @@ from gsba.log import GsbaError
 from gsba.photometric import direct
 from gsba.pipeline.prior import ExtraFactors, Prior
 from gsba.store.store import Chain, RunStore, fingerprint
-from gsba.types import CoarsePoses, Counts, FrameSet, Round
+from gsba.types import CoarsePoses, Counts, FrameSet, Round, Solution
 
 T = TypeVar("T")
 
@@ -63,6 +65,7 @@ class Run:
     num_threads: int
     lenses_found: bool = False  # whether what raw pairs are cut by was found, so that it is free
     imu: Readings | None = None  # of a gyro that rode along; None = there are none
+    fixes: FrameFixes | None = None  # of frames by GPS, for its factors; None = there are none
 
     @classmethod
     def begin(
@@ -75,6 +78,7 @@ class Run:
         journal: Journal | None = None,
         lenses_found: bool = False,
         imu: Readings | None = None,
+        fixes: FrameFixes | None = None,
     ) -> "Run":
         """Start a run, or take it up, on these frames and poses.
 
@@ -107,6 +111,7 @@ class Run:
             num_threads=settings.solver.threads(),
             lenses_found=lenses_found,
             imu=imu,
+            fixes=fixes,
         )
 
     def stage(
@@ -129,15 +134,28 @@ class Run:
             self.journal.note(name, result)
         return result
 
-    def problem(self, prior: Prior, noise: PriorSettings | None = None) -> Problem:
+    def problem(
+        self, prior: Prior, solved: Solution | None, noise: PriorSettings | None = None
+    ) -> Problem:
         """What adjustments share while this is believed of the trajectory.
 
         Args:
+            solved: poses so far, that GPS fixes are carried to; None = without GPS.
             noise: of the trajectory; None = as in the settings.
         """
-        graph = prior.graph(noise or self.settings.priors)
-        settings = self.settings if self.frames.timed else self.settings.untimed()
-        return Problem(graph, self.rig, settings, self.num_threads, prior.turning)
+        settings, noise = self.settings, noise or self.settings.priors
+        anchors, first, ungauged = None, None, None
+        if self.fixes is not None and solved is not None:
+            poses = solved.world_T_rigs
+            first = poses[0]
+            anchors = gps_factors.anchor(poses, self.fixes, settings.gps, prior.parts)
+            if anchors is not None:
+                gauge = not anchors.holds(0, prior.parts)
+                ungauged = prior.graph(noise, first, gauge=gauge)
+        graph = prior.graph(noise, first)
+        settings = settings if self.frames.timed else settings.untimed()
+        given = graph, self.rig, settings, self.num_threads, prior.turning
+        return Problem(*given, anchors, ungauged)
 
     def matching_key(self) -> list[object]:
         """Settings that matches rest on."""
@@ -151,4 +169,7 @@ class Run:
         settings = self.settings
         relevant = [settings.triangulate, settings.rounds, settings.priors, settings.solver]
         families = [f for f in settings.factors if f not in ("photometric", "splat")]
-        return [*relevant, families, self.custom]
+        known = []
+        if self.fixes is not None:
+            known = [settings.gps.loss_sigmas, self.fixes.digest()]
+        return [*relevant, families, self.custom, *known]

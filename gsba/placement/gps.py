@@ -1,7 +1,8 @@
-"""Positions from satellites: CSV tables and GPX tracks, and their local level frame (WGS 84)."""
+"""GPS fixes with their noise: CSV tables and GPX tracks, and their local level frame (WGS 84)."""
 
 import csv
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,19 +10,27 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from gsba.config import GpsSettings
 from gsba.frames.times import read_lines, seconds, stem_of
 from gsba.log import GsbaError, brief
 
 _A, _F = 6_378_137.0, 1 / 298.257223563  # WGS 84: half axis in metres, flattening
 _E2 = _F * (2 - _F)
 _HIGHEST_M = 1e6  # no receiver works higher up
+_MIN_ALTITUDES = 3  # fixes with an altitude: then fixes without are left out
+_LEVEL_M = 20.0  # standard deviation of heights where no altitudes are known: taken for level
 _COLUMNS = {
     "name": ("name", "frame", "image", "file", "filename"),
     "time": ("time", "timestamp", "t", "seconds"),
     "latitude": ("latitude", "lat"),
     "longitude": ("longitude", "lon", "lng", "long"),
     "altitude": ("altitude", "alt", "ele", "elevation", "height"),
+    "dop": ("hdop", "dop", "pdop"),
+    "dop_up": ("vdop",),
+    "error": ("sigma", "accuracy", "horizontal_accuracy", "sigma_m"),
+    "error_up": ("sigma_up", "vertical_accuracy", "sigma_up_m"),
 }
+_OF_NOISE = ("dop", "dop_up", "error", "error_up")
 _WANT = "want a header such as name,latitude,longitude,altitude or timestamp,lat,lon,alt"
 
 
@@ -32,24 +41,97 @@ class GpsFixes:
     names: tuple[str, ...] | None  # (G,) frames' names, or None: they are of times
     timestamps: np.ndarray | None  # (G,) float64, seconds, ascending; None: they are of frames
     geodetic: np.ndarray  # (G, 3) float64: latitude, longitude (degrees), altitude (metres)
+    sigmas: np.ndarray  # (G, 3) float64, standard deviations east, north and up, metres
 
 
-def read_gps(path: Path) -> GpsFixes:
+def fixes_of(
+    keys: Sequence[float] | Sequence[str] | np.ndarray,
+    geodetic: np.ndarray,
+    sigmas: np.ndarray | None = None,
+    settings: GpsSettings | None = None,
+) -> GpsFixes:
+    """Fixes of any source: in order of time, altitudes known for all or for none.
+
+    Args:
+        keys: (G,) times in seconds on the frames' clock, distinct, in any order; or frames' names.
+        geodetic: (G, 3) latitude, longitude (degrees), altitude (metres, NaN = not known). Fixes
+            without an altitude are left out where at least three have one; else all altitudes are
+            0, and worth 20 m.
+        sigmas: (G, 3) standard deviations east, north and up, metres; None = the least that
+            settings allow, see `sigmas_of`.
+        settings: the least noise of a fix.
+    """
+    geodetic = np.array(geodetic, np.float64).reshape(-1, 3)
+    sigmas = sigmas_of(settings or GpsSettings(), np.full(len(geodetic), np.nan), sigmas)
+    named = len(keys) > 0 and isinstance(keys[0], str)
+    order = np.arange(len(keys))
+    if not named:
+        order = np.argsort(np.array(keys, np.float64), kind="stable")
+    high = np.isfinite(geodetic[order, 2])
+    if high.all() or high.sum() >= _MIN_ALTITUDES:
+        order = order[high]
+    else:
+        geodetic[:, 2], sigmas[:, 2] = 0.0, np.maximum(sigmas[:, 2], _LEVEL_M)
+    geodetic, sigmas = geodetic[order], sigmas[order]
+    geodetic[:, 1] = np.unwrap(geodetic[:, 1], period=360)  # the date line is no jump
+    if named:
+        return GpsFixes(tuple(str(keys[int(i)]) for i in order), None, geodetic, sigmas)
+    return GpsFixes(None, np.array(keys, np.float64)[order], geodetic, sigmas)
+
+
+def sigmas_of(
+    settings: GpsSettings,
+    dop: np.ndarray,
+    given: np.ndarray | None = None,
+    *,
+    dop_up: np.ndarray | None = None,
+    error_m: np.ndarray | None = None,
+    error_up_m: np.ndarray | None = None,
+) -> np.ndarray:
+    """Standard deviations (G, 3) of fixes east, north and up, metres, never below the settings'.
+
+    Across, the receiver's own error estimate, else the dilution of precision times the settings'
+    noise; up, the same of the vertical, else in proportion to that across.
+
+    Args:
+        dop, dop_up: (G,) dilution of precision, across (or of the position), and up.
+        given: (G, 3) known ones, metres, that only the settings bound from below.
+        error_m, error_up_m: (G,) the receiver's own estimates, metres. NaN is unknown in all.
+    """
+    least = np.array([settings.sigma_m, settings.sigma_m, settings.sigma_up_m])
+    if given is not None:
+        return np.fmax(np.broadcast_to(given, (len(dop), 3)), least)
+    nothing = np.full(len(dop), np.nan)
+    error_m, error_up_m, dop_up = (
+        nothing if part is None else part for part in (error_m, error_up_m, dop_up)
+    )
+    across = np.fmax(np.where(np.isfinite(error_m), error_m, dop * settings.sigma_m), least[0])
+    up = np.where(np.isfinite(error_up_m), error_up_m, dop_up * settings.sigma_m)
+    up = np.where(np.isfinite(up), up, across * least[2] / least[0])
+    return np.column_stack([across, across, np.fmax(up, least[2])])
+
+
+def read_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
     """Fixes of a CSV table (decimal degrees, metres) or of a GPX track.
 
-    A table's header names its columns: latitude and longitude, altitude if known (else 0), and
-    either the frame's name or the time in seconds on the frames' clock. A GPX track's times are
-    UTC, as Unix time.
+    A table's header names its columns: latitude and longitude, altitude if known, either the
+    frame's name or the time in seconds on the frames' clock, and how noisy fixes are: `hdop`,
+    `vdop`, `pdop`, or `sigma`, `accuracy` and `sigma_up` in metres. A GPX track's times are UTC, as
+    Unix time; its `hdop`, `vdop` and `pdop` are read.
+
+    Args:
+        path: the file.
+        settings: the least noise of a fix.
 
     Raises:
         GsbaError: with the line that cannot be used.
     """
-    path = Path(path)
+    path, settings = Path(path), settings or GpsSettings()
     lines = read_lines(path)
     if not lines:
         raise GsbaError(f"{path}: holds no positions")
     if lines[0][1].startswith("<"):
-        return _read_gpx(path)
+        return _read_gpx(path, settings)
     header = [cell.lower() for cell in _cells(path, *lines[0])]
     where = {
         key: next(header.index(name) for name in names if name in header)
@@ -60,26 +142,20 @@ def read_gps(path: Path) -> GpsFixes:
         raise GsbaError(f"{path}: names no latitude and longitude; {_WANT}")
     if not {"name", "time"} & where.keys():
         raise GsbaError(f"{path}: says neither frame nor time of its positions; {_WANT}")
-    names, times, fixes = [], [], []
+    keys, rows, noise = [], [], []
     for number, line in lines[1:]:
         cells = _cells(path, number, line)
         if len(cells) != len(header):
             raise GsbaError(f"{path}:{number}: {len(cells)} cells under {len(header)} columns")
+        found = {key: cells[column] for key, column in where.items()}
         place = f"{path}:{number}"
-        values = [
-            _number(cells[where[key]], key, place) if key in where else 0.0
-            for key in ("latitude", "longitude", "altitude")
-        ]
-        fixes.append(_checked(values, place))
-        if "name" in where:
-            names.append(stem_of(cells[where["name"]]))
-        else:
-            times.append(_number(cells[where["time"]], "time", place))
-    if not fixes:
+        rows.append(_position(found["latitude"], found["longitude"], found.get("altitude"), place))
+        noise.append([_noise(found.get(key), key, place) for key in _OF_NOISE])
+        named = "name" in where
+        keys.append(stem_of(found["name"]) if named else _number(found["time"], "time", place))
+    if not rows:
         raise GsbaError(f"{path}: holds no positions")
-    if "name" in where:
-        return GpsFixes(tuple(names), None, np.array(fixes))
-    return _in_order(path, np.array(times), np.array(fixes))
+    return _checked_fixes(path, keys, rows, noise, settings)
 
 
 def _cells(path: Path, number: int, line: str) -> list[str]:
@@ -110,15 +186,15 @@ def _earth_centred(geodetic: np.ndarray) -> np.ndarray:
     return np.stack([x, y, z], axis=-1)
 
 
-def _read_gpx(path: Path) -> GpsFixes:
+def _read_gpx(path: Path, settings: GpsSettings) -> GpsFixes:
     try:
         root = ElementTree.parse(path).getroot()
     except (ElementTree.ParseError, LookupError, ValueError) as error:  # syntax, encoding
         raise GsbaError(f"{path}: neither a CSV table nor a GPX track ({error})") from None
-    times, fixes = [], []
+    times, rows, noise = [], [], []
     for number, point in enumerate(root.iterfind(".//{*}trkpt"), 1):
         place = f"{path}: track point {number}"
-        time, elevation = point.findtext("{*}time"), point.findtext("{*}ele")
+        time = point.findtext("{*}time")
         if time is None:
             raise GsbaError(f"{place} has no time")
         try:
@@ -126,21 +202,48 @@ def _read_gpx(path: Path) -> GpsFixes:
             times.append((stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp())
         except (ValueError, OverflowError):
             raise GsbaError(f"{place}: '{brief(time)}' is not a time") from None
-        values = [_number(point.get(key, ""), key, place) for key in ("lat", "lon")]
-        values.append(0.0 if elevation is None else _number(elevation, "ele", place))
-        fixes.append(_checked(values, place))
-    if not fixes:
+        height = point.findtext("{*}ele")
+        rows.append(_position(point.get("lat", ""), point.get("lon", ""), height, place))
+        dop = point.findtext("{*}hdop") or point.findtext("{*}pdop")
+        up = point.findtext("{*}vdop")
+        noise.append([_noise(dop, "hdop", place), _noise(up, "vdop", place), math.nan, math.nan])
+    if not rows:
         raise GsbaError(f"{path}: the GPX file holds no track points")
-    return _in_order(path, np.array(times), np.array(fixes))
+    return _checked_fixes(path, times, rows, noise, settings)
 
 
-def _in_order(path: Path, times: np.ndarray, fixes: np.ndarray) -> GpsFixes:
-    order = np.argsort(times, kind="stable")
-    if np.any(np.diff(times[order]) <= 0):
+def _checked_fixes(
+    path: Path,
+    keys: list[float] | list[str],
+    rows: list[list[float]],
+    noise: list[list[float]],
+    settings: GpsSettings,
+) -> GpsFixes:
+    """Fixes of a file; `noise` holds a row of `_OF_NOISE` for each."""
+    if not isinstance(keys[0], str) and len(set(keys)) < len(keys):
         raise GsbaError(f"{path}: holds two positions at one time")
-    fixes = fixes[order]
-    fixes[:, 1] = np.unwrap(fixes[:, 1], period=360)  # the date line is no jump
-    return GpsFixes(None, times[order], fixes)
+    dop, dop_up, error, error_up = np.array(noise).T
+    known = {"dop_up": dop_up, "error_m": error, "error_up_m": error_up}
+    return fixes_of(keys, np.array(rows), sigmas_of(settings, dop, **known), settings)
+
+
+def _position(latitude: str, longitude: str, altitude: str | None, place: str) -> list[float]:
+    """Latitude and longitude, degrees, and altitude, metres; NaN where it is absent or empty."""
+    values = [_number(latitude, "latitude", place), _number(longitude, "longitude", place)]
+    if not (abs(values[0]) <= 90 and abs(values[1]) <= 360):
+        raise GsbaError(f"{place}: {values[0]}, {values[1]} is no latitude and longitude")
+    values.append(_number(altitude, "altitude", place) if altitude else math.nan)
+    if abs(values[2]) > _HIGHEST_M:
+        raise GsbaError(f"{place}: {values[2]:g} is no altitude in metres")
+    return values
+
+
+def _noise(text: str | None, what: str, place: str) -> float:
+    """A DOP or a standard deviation; NaN where it is absent, empty, or 0 for "unknown"."""
+    value = _number(text, what, place) if text and text.strip() else math.nan
+    if value < 0:
+        raise GsbaError(f"{place}: {what} {value:g} is negative")
+    return value or math.nan
 
 
 def _number(text: str, what: str, place: str) -> float:
@@ -151,11 +254,3 @@ def _number(text: str, what: str, place: str) -> float:
     if not math.isfinite(value):
         raise GsbaError(f"{place}: {what} '{brief(text)}' is not a number")
     return value
-
-
-def _checked(values: list[float], place: str) -> list[float]:
-    if not (abs(values[0]) <= 90 and abs(values[1]) <= 360):
-        raise GsbaError(f"{place}: {values[0]}, {values[1]} is no latitude and longitude")
-    if not abs(values[2]) <= _HIGHEST_M:
-        raise GsbaError(f"{place}: {values[2]:g} is no altitude in metres")
-    return values

@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from gsba.config import PlacementSettings
+from gsba.bundle.fixes import FrameFixes
+from gsba.config import GpsSettings, PlacementSettings
 from gsba.geometry import pose
 from gsba.log import GsbaError, brief
-from gsba.placement.exif import read_exif_gps
-from gsba.placement.gps import GpsFixes, local_from_geodetic, read_gps
+from gsba.placement.frame_fixes import fixes_of_frames, read_fixes
+from gsba.placement.gps_fit import GpsFit, fit_fixes
 from gsba.scans.files import check_scan, normals_of, read_pairs, read_scan, upwards
 from gsba.scans.registration import in_file, register
 from gsba.scans.search import Guess
@@ -25,7 +26,6 @@ from gsba.scans.types import Scan, cloud_of
 from gsba.similarity import (
     Sim3,
     extents,
-    level_similarity,
     naming,
     pose_similarity,
     residuals_of,
@@ -39,7 +39,6 @@ from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
 
-EXIF = "exif"  # in place of a file of positions: those in the pictures
 _UP_WORLD = np.array([0.0, -1.0, 0.0])  # of an upright world: y down, as cameras have it
 UPS = {"z": np.array([0.0, 0, 1]), "y": np.array([0.0, 1, 0])}  # axes of scans that point up
 _TOLERANCE_S = 0.02  # of true poses around a frame
@@ -48,6 +47,11 @@ _FURTHEST = 1e12  # from the origin, in the placed unit
 _FAR = 1e4  # coordinates beyond lose digits as float32: an offset is kept apart
 _STUCK_M = 1e-3  # extent of positions, metres: a receiver that works scatters by more
 _MOST_SIGMA = 0.1  # of a scale by the lenses, part of it
+_MOST_GPS_SCALE_SIGMA = 0.3  # of a scale by GPS, part of it
+_MOST_GPS_ANGLE_DEG = 25.0  # standard deviation of heading and tilt by GPS
+_SIGMA_BY_EDGES_DEG = 0.2  # of the way up by vertical edges, see docs/gyro.md
+_SIGMA_BY_FORCES_DEG = 0.5  # by an accelerometer, for its bias
+_SIGMA_BY_RIGS_DEG = 3.0  # by how rigs were held
 _LEVEL_SPREAD = 0.02  # of a path's second extent to its first: below, positions leave a roll open
 
 
@@ -150,6 +154,7 @@ def place(
     frames: FrameSet,
     settings: PlacementSettings,
     baseline: tuple[float, float] | None = None,
+    gps: GpsSettings | None = None,
 ) -> Placement:
     """Where the settings want the world of a run.
 
@@ -158,16 +163,18 @@ def place(
         frames: its frames; their pictures are read to find the vertical.
         settings: `up` alone turns as little as it takes to make -y the way up. With `length`
             the unit becomes the metre. `gps` gives metres east, north and up; together with `up` it
-            decides heading, scale and place only; "exif" takes the positions in the pictures.
+            decides heading, scale and place only, with a length of "lens" the scale is weighed with
+            that of the lenses; "exif" takes the positions in the pictures.
             `align` gives the world of the true poses, `scan` that of a scan of the place; with
             it, `up`, `gps` or `pairs` only tell where to look.
         baseline: metres between the lenses and their standard deviation, for a length of "lens".
+        gps: noise of GPS positions.
 
     Raises:
         GsbaError: settings that exclude one another, or data that do not suffice.
     """
     check(settings, baseline=baseline)
-    placement = _placement(reconstruction, frames, settings, baseline)
+    placement = _placement(reconstruction, frames, settings, baseline, gps)
     placed = placement.similarity.points(reconstruction.world_T_rigs[:, :3, 3])
     far = np.abs(placed).max(initial=0)
     scale = placement.similarity.scale
@@ -184,6 +191,7 @@ def _placement(
     frames: FrameSet,
     settings: PlacementSettings,
     baseline: tuple[float, float] | None,
+    gps: GpsSettings | None,
 ) -> Placement:
     """What the settings ask for, however odd."""
     if settings.align is not None:
@@ -194,7 +202,12 @@ def _placement(
     if settings.up == "auto":
         placement = _upright(reconstruction, frames)
     if settings.gps is not None:
-        return _on_earth(reconstruction, frames, Path(settings.gps), placement)
+        scale = None
+        if settings.length == "lens":
+            scale, grounds = _scale_by_lenses(reconstruction, baseline)
+            grounds = {**placement.grounds, "lens": grounds}
+            placement = dataclasses.replace(placement, grounds=grounds)
+        return _on_earth(reconstruction, frames, settings.gps, placement, scale, gps)
     if settings.length == "lens":
         return _by_lenses(reconstruction, baseline, placement)
     if settings.length is not None and settings.between is not None:
@@ -224,20 +237,20 @@ def check(
         )
     if isinstance(settings.length, float) != (settings.between is not None):
         raise GsbaError("--scale LENGTH and --between A B need one another")
-    ways = [settings.length is not None, settings.gps is not None, settings.align is not None]
-    if sum(ways) > 1:
-        raise GsbaError("--scale, --gps and --align each decide the scale: pass one")
+    measured = isinstance(settings.length, float)  # that of the lenses is weighed with the fixes
+    ways = [measured, settings.gps is not None, settings.align is not None]
+    if sum(ways) > 1 or (settings.length is not None and settings.align is not None):
+        raise GsbaError(
+            "--scale, --gps and --align each decide the scale: pass one, or --scale lens with --gps"
+        )
     if settings.scan is not None and (settings.length is not None or settings.align is not None):
         raise GsbaError("--align-scan decides the scale: leave out --scale and --align")
     if settings.pairs is not None and settings.scan is None:
         raise GsbaError("--pairs are of a run and a scan: give --align-scan SCAN as well")
     if settings.align is not None and settings.up != "none":
         raise GsbaError("--align decides which way is up: leave out --up auto")
-    if settings.gps == EXIF:
-        if frames is not None:
-            read_exif_gps(frames)
-    elif settings.gps is not None:
-        read_gps(Path(settings.gps))
+    if settings.gps is not None:
+        read_fixes(settings.gps, frames)
     if settings.align is not None:
         read_trajectory(Path(settings.align))
     if settings.scan is not None:
@@ -280,10 +293,10 @@ def metres_per_unit(
     return scale, scale * float(np.hypot(lenses[1] / lenses[0], baseline[1] / baseline[0]))
 
 
-def _by_lenses(
-    reconstruction: Reconstruction, baseline: tuple[float, float] | None, placement: Placement
-) -> Placement:
-    """Metres, by what the maker says is between the lenses."""
+def _scale_by_lenses(
+    reconstruction: Reconstruction, baseline: tuple[float, float] | None
+) -> tuple[tuple[float, float], dict[str, Any]]:
+    """Metric scale and its standard deviation by the lenses, and the entry of transform.json."""
     if reconstruction.lens_baseline is None:
         raise GsbaError(
             "--scale lens: the run found no two lenses (report.json says why, under camera): "
@@ -291,12 +304,19 @@ def _by_lenses(
         )
     assert baseline is not None  # see check
     scale, sigma = metres_per_unit(reconstruction.lens_baseline, baseline)
+    return (scale, sigma), {"baseline_m": baseline[0], "scale_sigma": sigma}
+
+
+def _by_lenses(
+    reconstruction: Reconstruction, baseline: tuple[float, float] | None, placement: Placement
+) -> Placement:
+    """Metres, by what the maker says is between the lenses."""
+    (scale, sigma), grounds = _scale_by_lenses(reconstruction, baseline)
     if not sigma < _MOST_SIGMA * scale:
         raise GsbaError(
             f"--scale lens: the distance between the lenses tells the scale to "
             f"{100 * sigma / scale:.0f} % only; {100 * _MOST_SIGMA:.0f} % are needed"
         )
-    grounds = {"baseline_m": baseline[0], "scale_sigma": sigma}
     return dataclasses.replace(
         placement,
         similarity=dataclasses.replace(placement.similarity, scale=scale),
@@ -335,66 +355,106 @@ def _point(text: str, reconstruction: Reconstruction, frames: FrameSet) -> np.nd
 
 
 def _on_earth(
-    reconstruction: Reconstruction, frames: FrameSet, path: Path, upright: Placement
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    source: str,
+    upright: Placement,
+    scale: tuple[float, float] | None = None,
+    settings: GpsSettings | None = None,
 ) -> Placement:
-    """East, north and up in metres around the middle of the fixes."""
-    fixes = read_exif_gps(frames) if str(path) == EXIF else read_gps(path)
-    rows, geodetic = _fixes_of_frames(path, fixes, frames)
-    good = reconstruction.pose_statuses[rows] == PoseStatus.REFINED
-    rows, geodetic = rows[good], geodetic[good]
-    if len(rows) < 3:
+    """East, north and up in metres around the middle of the fixes.
+
+    Args:
+        upright: where up is known, the way up; it stays so.
+        scale: metres per map unit, known from elsewhere, and its standard deviation.
+        settings: noise of the fixes.
+    """
+    fixes, path = fixes_of_frames(source, frames, settings), Path(source)
+    fixes = fixes.taken(reconstruction.pose_statuses[fixes.frames] == PoseStatus.REFINED)
+    if len(fixes) < 3:
         raise GsbaError(
-            f"{path}: {len(rows)} of its positions are of refined frames; 3 are needed: check that "
-            "they are of this recording and on the frames' clock"
+            f"{path}: {len(fixes)} of its positions are of refined frames; 3 are needed: check "
+            "that they are of this recording and on the frames' clock"
         )
-    origin = np.median(geodetic, axis=0)
-    target = local_from_geodetic(geodetic, origin)
-    if np.ptp(target, axis=0).max() < _STUCK_M:
-        raise GsbaError(f"{path}: all {len(rows)} positions are the same: the receiver was stuck")
-    positions = reconstruction.world_T_rigs[rows, :3, 3]
+    if np.ptp(fixes.positions, axis=0).max() < _STUCK_M:
+        raise GsbaError(f"{path}: all {len(fixes)} positions are the same: the receiver was stuck")
+    positions, level, up_sigma = reconstruction.world_T_rigs[fixes.frames, :3, 3], np.eye(3), None
+    if upright.up is not None:
+        level = _least_turn(_UP_WORLD, np.array([0.0, 0, 1])) @ upright.similarity.rotation
+        up_sigma = _up_sigma(upright)
+    elif extents(positions)[1] <= _LEVEL_SPREAD:
+        raise GsbaError(f"{path}: the frames lie on a line: add --up auto")
     with naming(path):
-        if upright.up is None:
-            if extents(positions)[1] <= _LEVEL_SPREAD:
-                raise GsbaError(f"{path}: the frames lie on a line: add --up auto")
-            fit, used, sigma = robust_similarity(positions, target, similarity, 3)
-        else:
-            level = _least_turn(_UP_WORLD, np.array([0.0, 0, 1])) @ upright.similarity.rotation
-            fit, used, sigma = robust_similarity(positions @ level.T, target, level_similarity, 2)
-            fit = dataclasses.replace(fit, rotation=fit.rotation @ level)
-    grounds = {
-        **upright.grounds,
-        "gps": {
-            "file": str(path),
-            "fixes": len(rows),
-            "outliers": int(np.sum(~used)),
-            "rmse_m": sigma,
-        },
-    }
-    logger.info("--gps %s: %d of %d positions agree to %.3g m", path, used.sum(), len(used), sigma)
-    where = (float(origin[0]), float(origin[1]), float(origin[2]))
+        found = fit_fixes(positions @ level.T, fixes, up_sigma, scale)
+    _require_determined(path, found, fixes)
+    fit = dataclasses.replace(found.similarity, rotation=found.similarity.rotation @ level)
+    grounds = {**upright.grounds, "gps": {"file": str(path), **_claims(found, positions @ level.T)}}
+    logger.info(
+        "--gps %s: %d of %d positions agree to %.3g m; scale known to %.2g %%, heading to %.2g "
+        "degrees, tilt to %.2g degrees, place to %.2g m",
+        path,
+        found.used.sum(),
+        len(fixes),
+        found.rms_m,
+        100 * found.scale_sigma,
+        np.degrees(found.heading_sigma),
+        np.degrees(found.tilt_sigma),
+        grounds["gps"]["position_sigma_m"][0],
+    )
+    where = (float(fixes.origin[0]), float(fixes.origin[1]), float(fixes.origin[2]))
     return Placement(fit, unit="m", up="z", origin=where, grounds=grounds)
 
 
-def _fixes_of_frames(
-    path: Path, fixes: GpsFixes, frames: FrameSet
-) -> tuple[np.ndarray, np.ndarray]:
-    """Frames (M,) with a fix, and it (M, 3): by name, or between the fixes before and after."""
-    if fixes.names is not None:
-        by_name = dict(zip(fixes.names, fixes.geodetic, strict=True))
-        rows = [f for f, name in enumerate(frames.names) if name in by_name]
-        found = np.array([by_name[frames.names[f]] for f in rows]).reshape(-1, 3)
-        return np.array(rows, np.int64), found
-    times, entries = frames.timestamps, fixes.timestamps
-    assert entries is not None
-    _require_times(path, frames)
-    inside = np.flatnonzero((times >= entries[0]) & (times <= entries[-1]))
-    if not len(inside):
+def _claims(found: GpsFit, positions: np.ndarray) -> dict[str, Any]:
+    """Entries of transform.json on a fit: how many fixes it rests on, and standard deviations.
+
+    Those of the position are east, north and up, the medians over the frames that have a fix.
+    """
+    return {
+        "fixes": len(found.used),
+        "outliers": int(np.sum(~found.used)),
+        "rmse_m": found.rms_m,
+        "misfit": found.misfit,
+        "scale_sigma": found.scale_sigma * found.similarity.scale,
+        "heading_sigma_deg": float(np.degrees(found.heading_sigma)),
+        "tilt_sigma_deg": float(np.degrees(found.tilt_sigma)),
+        "position_sigma_m": np.median(found.position_sigmas(positions), axis=0).tolist(),
+    }
+
+
+def _require_determined(path: Path, found: GpsFit, fixes: FrameFixes) -> None:
+    """GsbaError for fixes that leave scale, heading or tilt open."""
+    extent = float(np.linalg.norm(np.ptp(fixes.positions[found.used], axis=0)[:2]))
+    noise = float(np.median(fixes.sigmas[:, 0]))
+    known = f"they spread over {extent:.3g} m, and are known to {noise:.2g} m"
+    if not found.scale_sigma < _MOST_GPS_SCALE_SIGMA:
         raise GsbaError(
-            f"{path}: no overlap in time: positions span {entries[0]:.3f} to {entries[-1]:.3f} s, "
-            f"frames {times[0]:.3f} to {times[-1]:.3f} s; put both on one clock"
+            f"{path}: its positions tell the scale to {100 * found.scale_sigma:.0f} % only "
+            f"({known}): add --scale lens, or place the run by --scale LENGTH --between A B"
         )
-    geodetic = [np.interp(times[inside], entries, column) for column in fixes.geodetic.T]
-    return inside, np.stack(geodetic, axis=1)
+    if not np.degrees(found.heading_sigma) < _MOST_GPS_ANGLE_DEG:
+        raise GsbaError(
+            f"{path}: its positions tell where north is to "
+            f"{np.degrees(found.heading_sigma):.0f} degrees only ({known}): leave out --gps, or "
+            "give positions of a longer walk or of a better receiver"
+        )
+    if not np.degrees(found.tilt_sigma) < _MOST_GPS_ANGLE_DEG:
+        raise GsbaError(
+            f"{path}: its positions tell the way up to {np.degrees(found.tilt_sigma):.0f} degrees "
+            "only: add --up auto"
+        )
+
+
+def _up_sigma(upright: Placement) -> float:
+    """Standard deviation of a way up, radians, by what it rests on."""
+    gravity = upright.grounds.get("gravity", {})
+    if gravity.get("vertical_edges"):
+        degrees = _SIGMA_BY_EDGES_DEG
+    elif "edges_to_accelerometer_deg" in gravity:
+        degrees = _SIGMA_BY_FORCES_DEG
+    else:
+        degrees = _SIGMA_BY_RIGS_DEG
+    return float(np.radians(degrees))
 
 
 def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Placement:
@@ -466,7 +526,7 @@ def guess_in_scan(
         return guess.without(scan.offset), {"pairs": settings.pairs}
     if settings.gps is not None:
         upright = _upright(reconstruction, frames) if settings.up == "auto" else Placement()
-        earth = _on_earth(reconstruction, frames, Path(settings.gps), upright)
+        earth = _on_earth(reconstruction, frames, settings.gps, upright)
         turn = _least_turn(np.array([0.0, 0, 1]), axis)
         rotation = turn @ earth.similarity.rotation
         return Guess(scale=earth.similarity.scale, rotation=rotation), earth.grounds

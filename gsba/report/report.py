@@ -95,6 +95,7 @@ def build_report(
     stitching: Mapping[str, Any] | None = None,
     camera: Mapping[str, Any] | None = None,
     gyro: Mapping[str, Any] | None = None,
+    gps: Mapping[str, Any] | None = None,
     reasons: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Content of report.json: plain values only.
@@ -111,6 +112,7 @@ def build_report(
         stitching: the field of directions, see `gsba.report.findings.of_field`.
         camera: where its lenses are, see `gsba.report.findings.of_camera`.
         gyro: that rode along, see `gsba.report.imu_findings.of_gyro`.
+        gps: positions that were factors, see `gsba.report.gps_findings.of_gps`.
         reasons: why maps were not joined, see `gsba.report.maps.summarize_maps`.
     """
     quality = frame_quality(reconstruction)
@@ -128,6 +130,7 @@ def build_report(
         "stitching": stitching,
         **({} if camera is None else {"camera": camera}),
         **({} if gyro is None else {"gyro": gyro}),
+        **({} if gps is None else {"gps": gps}),
         "stages": stage_rows,
         "solver": solver,
         "splat": moves,

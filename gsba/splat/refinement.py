@@ -258,7 +258,7 @@ class _Turns:
         near = near_of(world_T_rigs[self.split.training], SplatSettings())
         pixels = splat_block(gaussians, self.captured, near, self.backend)
         solver = settings.solver.model_copy(update={"max_iterations": settings.splat.solver_steps})
-        result = optimize(self.problem.priors, [landmarks, *self.further, pixels], values, solver)
+        result = optimize(self.problem.graph, [landmarks, *self.further, pixels], values, solver)
         return adjustment.poses_of(result.values, len(world_T_rigs)), result
 
     def _block(self) -> LandmarkBlock:

@@ -1,0 +1,202 @@
+"""GPS factors: fixes of frames, carried into the map, hold its poses against drift.
+
+The similarity between the map and level metres is no variable of the adjustment. It is found from
+the poses at the start of each, and defines the coordinates: as the fixes then determine place,
+heading and scale, the first pose is not held, and the map is free to move, turn and grow to where
+fixes and images agree best. That is the joint optimum of poses and similarity, since observations
+say nothing of the gauge; the result is carried back to the trajectory's world in the end. Holding
+the first pose and re-estimating the similarity in turns would approach it slowly, a shared
+variable would tie all frames to one another.
+
+Errors of fixes last (`gsba.bundle.fixes`). The adjustment has independent ones that say as much of
+drift, so that each fix is a factor of its own, with a robust loss. Covariances have the lasting
+errors as variables; and as they are of the gauge that holds the first pose, the similarity as well,
+all by factors that are linear.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from gsba.bundle.fixes import WHITE_SHARE, FrameFixes
+from gsba.bundle.prior_factors import X
+from gsba.config import GpsSettings
+from gsba.similarity import NoSimilarityError, Sim3, robust_similarity, similarity
+
+MIN_FIXES = 5  # in a map: seven unknowns leave little of fewer
+_MEDIAN_LENGTH = 1.538  # of a 3-vector of independent unit normals
+_OUTLIER_SIGMAS = 4.6  # 99.99 % of such vectors are shorter
+_ROUNDS = 10  # of choosing fixes
+
+S: Callable[[int], int] = gtsam.symbol_shorthand.S  # what a map's similarity changes by (7,)
+E: Callable[[int], int] = gtsam.symbol_shorthand.E  # lasting error of a fix (3,), in its sigmas
+
+
+@dataclass(frozen=True, slots=True)
+class Anchors:
+    """Fixes carried into the world of a map, in map units; false ones are left out."""
+
+    frames: np.ndarray  # (A,) int64, frame of each
+    positions: np.ndarray  # (A, 3) float64, world, map units
+    covariances: np.ndarray  # (A, 3, 3) float64, map units^2, of independent errors
+    loss_scales: np.ndarray  # (A,) float64, of the Cauchy loss, in standard deviations of these
+    maps: np.ndarray  # (A,) int64, map of each
+    fixes: FrameFixes  # (A) the same in level metres
+    used: np.ndarray  # (G,) bool, fixes of the frames that are among them
+    level_from_map: dict[int, Sim3]  # of each map that has fixes: metres east, north, up
+
+    def holds(self, frame: int, maps: np.ndarray | None) -> bool:
+        """Whether the map of a frame, of all maps (F,), has fixes; None = there is one map."""
+        return (0 if maps is None else int(maps[frame])) in self.level_from_map
+
+    def weights(self, world_T_rigs: np.ndarray) -> np.ndarray:
+        """Weights (A,) of the Cauchy loss under these poses (F, 4, 4)."""
+        off = world_T_rigs[self.frames, :3, 3] - self.positions
+        squares = np.einsum("ai,aij,aj->a", off, np.linalg.inv(self.covariances), off)
+        return 1 / (1 + squares / self.loss_scales**2)
+
+
+def anchor(
+    world_T_rigs: np.ndarray,
+    fixes: FrameFixes,
+    settings: GpsSettings,
+    maps: np.ndarray | None = None,
+) -> Anchors | None:
+    """Fixes carried into the world of these poses, each map by a similarity of its own.
+
+    Fixes further from the poses than 4.6 standard deviations are left out; where most are further
+    off, as poses drift, so are the limit and the scale of the loss.
+
+    Args:
+        world_T_rigs: (F, 4, 4) poses so far.
+        fixes: of some of the frames.
+        settings: scale of the loss.
+        maps: (F,) map of each frame; None = there is one.
+
+    Returns:
+        None where no map has enough fixes that lie as its frames do.
+    """
+    positions, of_fix = world_T_rigs[fixes.frames, :3, 3], np.zeros(len(fixes), np.int64)
+    if maps is not None:
+        of_fix = np.asarray(maps, np.int64)[fixes.frames]
+    found, rows, wide = dict[int, Sim3](), [np.zeros(0, np.int64)], np.ones(len(fixes))
+    for number in np.unique(of_fix).tolist():
+        inside = np.flatnonzero(of_fix == number)
+        if len(inside) < MIN_FIXES:
+            continue
+        try:
+            fit, used, scatter = _level_from_map(positions[inside], fixes.taken(inside))
+        except NoSimilarityError:
+            continue
+        found[number], wide[inside] = fit, scatter
+        rows.append(inside[used])
+    if not found:
+        return None
+    chosen = np.sort(np.concatenate(rows))
+    of_fix, kept = of_fix[chosen], fixes.taken(chosen)
+    sigmas, scales = kept.independent_sigmas(), settings.loss_sigmas * wide[chosen]
+    places, covariances = np.empty((len(chosen), 3)), np.empty((len(chosen), 3, 3))
+    for a, number in enumerate(of_fix.tolist()):
+        fit = found[number]
+        axes = fit.rotation.T * (sigmas[a] / fit.scale)
+        covariances[a], places[a] = axes @ axes.T, fit.points_back(kept.positions[a])
+    loss = scales * kept.sigmas[:, 0] / sigmas[:, 0]
+    mask = np.isin(np.arange(len(fixes)), chosen)
+    return Anchors(kept.frames, places, covariances, loss, of_fix, kept, mask, found)
+
+
+def _level_from_map(positions: np.ndarray, fixes: FrameFixes) -> tuple[Sim3, np.ndarray, float]:
+    """Similarity of a map, fixes (G,) that agree with it, and how many times their noise they
+    scatter, at least 1.
+
+    Raises:
+        NoSimilarityError: they do not lie as the frames do.
+    """
+    fit, used, _ = robust_similarity(positions, fixes.positions, similarity, 3)
+    wide = 1.0
+    for _ in range(_ROUNDS):
+        off = (fixes.positions - fit.points(positions)) / fixes.sigmas
+        distances = np.linalg.norm(off, axis=1)
+        wide = max(1.0, float(np.median(distances)) / _MEDIAN_LENGTH)
+        before, used = used, distances <= _OUTLIER_SIGMAS * wide
+        if np.array_equal(before, used):
+            break
+        fit = similarity(positions[used], fixes.positions[used])
+    return fit, used, wide
+
+
+def factors(anchors: Anchors) -> gtsam.NonlinearFactorGraph:
+    """GTSAM's GPS factors under a Cauchy loss, one for each fix."""
+    graph = gtsam.NonlinearFactorGraph()
+    for a, frame in enumerate(anchors.frames.tolist()):
+        noise = gtsam.noiseModel.Gaussian.Covariance(anchors.covariances[a])
+        loss = gtsam.noiseModel.mEstimator.Cauchy.Create(float(anchors.loss_scales[a]))
+        model = gtsam.noiseModel.Robust.Create(loss, noise)
+        graph.add(gtsam.GPSFactor(X(frame), anchors.positions[a], model))
+    return graph
+
+
+def linear_factors(
+    anchors: Anchors,
+    world_T_rigs: np.ndarray,
+    values: gtsam.Values,
+    *,
+    free_similarity: bool = True,
+) -> gtsam.NonlinearFactorGraph:
+    """What fixes say of poses, for covariances: their lasting errors are variables, too.
+
+    Args:
+        anchors: fixes in the world of the poses.
+        world_T_rigs: (F, 4, 4) where factors are linearized.
+        values: of the poses; the further variables are added.
+        free_similarity: whether the map's similarity is a variable, as it must be where the first
+            pose is held.
+
+    Returns:
+        Linear factors, weighted as the loss weighs them there.
+    """
+    graph = gtsam.NonlinearFactorGraph()
+    added = gtsam.Values()
+    for number in anchors.level_from_map if free_similarity else ():
+        added.insert(S(number), np.zeros(7))
+    for a in range(len(anchors.frames)):
+        added.insert(E(a), np.zeros(3))
+    values.insert(added)
+    unit, weights = gtsam.noiseModel.Unit.Create(3), anchors.weights(world_T_rigs)
+
+    def add(terms: dict[int, np.ndarray], right: np.ndarray) -> None:
+        here = gtsam.Values()
+        for key in terms:
+            if added.exists(key):
+                here.insert(key, added.atVector(key))
+            else:
+                here.insert(key, values.atPose3(key))
+        pairs = [part for term in terms.items() for part in term]
+        rows = gtsam.JacobianFactor(*pairs, right, unit)  # type: ignore[call-overload]
+        graph.add(gtsam.LinearContainerFactor(rows, here))
+
+    for number, fit in anchors.level_from_map.items():
+        chosen = np.flatnonzero(anchors.maps == number)
+        fixes, middle = anchors.fixes.taken(chosen), anchors.positions[chosen].mean(axis=0)
+        memories = np.concatenate([[0.0], fixes.correlations()])
+        for i, a in enumerate(chosen.tolist()):
+            fresh = 1 / np.sqrt((1 - WHITE_SHARE) * (1 - memories[i] ** 2))
+            link = {E(a): fresh * np.eye(3)}
+            if i:
+                link |= {E(int(chosen[i - 1])): -fresh * memories[i] * np.eye(3)}
+            add(link, np.zeros(3))
+            frame = int(anchors.frames[a])
+            off = world_T_rigs[frame, :3, 3] - anchors.positions[a]
+            arm = anchors.positions[a] - middle
+            weight = np.sqrt(weights[a] / WHITE_SHARE)
+            whitened = weight * fit.scale * fit.rotation / fixes.sigmas[i][:, None]
+            by_pose = np.hstack([np.zeros((3, 3)), world_T_rigs[frame, :3, :3]])
+            terms = {X(frame): whitened @ by_pose}
+            if free_similarity:
+                by_similarity = np.column_stack([arm, *np.cross(np.eye(3), arm), np.eye(3)])
+                terms[S(number)] = -whitened @ by_similarity
+            terms[E(a)] = -weight * np.eye(3)
+            add(terms, -whitened @ off)
+    return graph

@@ -1,0 +1,139 @@
+"""EXIF tags of pictures: when they were taken, and where. Read by Pillow, without pixels."""
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any
+
+from gsba.log import GsbaError
+
+# Tags of Exif 3.0 (CIPA DC-008), sections 4.6.5 and 4.6.6.
+_EXIF_DIRECTORY, _GPS_DIRECTORY = 0x8769, 0x8825
+_TAKEN, _OFFSET, _SUBSECOND = 0x9003, 0x9011, 0x9291
+_LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)
+_GPS_TIME, _STATUS, _DOP, _GPS_DATE, _ERROR = 7, 9, 11, 29, 31
+_LATEST_OFFSET_H = 14  # hours of a time zone from UTC, at most
+
+
+@dataclass(frozen=True, slots=True)
+class GpsTag:
+    """The position in the GPS directory of a picture."""
+
+    latitude: float  # degrees
+    longitude: float  # degrees
+    altitude: float  # metres; NaN = not given
+    dop: float  # dilution of precision; NaN = not given
+    error_m: float  # metres across, the receiver's own estimate; NaN = not given
+    unix_time: float  # seconds, when the fix was taken; NaN = not given
+
+
+@dataclass(frozen=True, slots=True)
+class ExifTags:
+    """When and where a picture was taken, as far as its tags tell."""
+
+    taken: float | None  # seconds since 1970, local time unless `zoned`; None = not given
+    zoned: bool  # whether the tags name the time zone, so that `taken` is Unix time
+    subsecond: bool  # whether `taken` has a fraction of a second
+    gps: GpsTag | None  # None = no valid position
+
+
+def read_exif(path: Path) -> ExifTags:
+    """Tags of a JPEG, PNG, WebP or TIFF picture.
+
+    Raises:
+        ValueError: EXIF data that are damaged.
+        GsbaError: the file cannot be read.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)  # which is how Pillow reports damage
+            with Image.open(path) as picture:  # reads no pixels
+                exif = picture.getexif()
+                shot, gps = exif.get_ifd(_EXIF_DIRECTORY), exif.get_ifd(_GPS_DIRECTORY)
+    except UnidentifiedImageError:
+        raise GsbaError(f"{path}: is no picture that can be read") from None
+    except OSError as error:
+        raise GsbaError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except Exception:  # of the parser, each in its own words
+        raise ValueError(f"{path}: damaged EXIF data") from None
+    try:
+        return ExifTags(*_taken(shot), _gps_tag(gps))
+    except (TypeError, IndexError, AttributeError):
+        raise ValueError(f"{path}: damaged EXIF data") from None
+
+
+def _taken(tags: Mapping[int, Any]) -> tuple[float | None, bool, bool]:
+    """Time of DateTimeOriginal with its fraction, whether its zone is known, and the fraction."""
+    try:
+        moment = datetime.strptime(_text(tags, _TAKEN), "%Y:%m:%d %H:%M:%S")
+    except ValueError:  # absent, or blank as cameras without a clock write it
+        return None, False, False
+    zone = _zone(_text(tags, _OFFSET))
+    digits = _text(tags, _SUBSECOND)
+    fraction = float(f"0.{digits}") if digits.isascii() and digits.isdigit() else None
+    whole = moment.replace(tzinfo=zone or UTC).timestamp()
+    return whole + (fraction or 0.0), zone is not None, fraction is not None
+
+
+def _zone(text: str) -> timezone | None:
+    """Time zone of "+02:00"; None = not given."""
+    try:
+        offset = datetime.strptime(text, "%z").utcoffset()
+    except ValueError:
+        return None
+    if offset is None or abs(offset) > timedelta(hours=_LATEST_OFFSET_H):
+        return None
+    return timezone(offset)
+
+
+def _gps_tag(gps: Mapping[int, Any]) -> GpsTag | None:
+    """The position of a GPS directory, if it is valid."""
+    if not {_LATITUDE, _LONGITUDE} <= gps.keys() or _text(gps, _STATUS).upper() == "V":
+        return None
+    latitude, longitude = _sexagesimal(gps[_LATITUDE]), _sexagesimal(gps[_LONGITUDE])
+    latitude *= -1 if _text(gps, _LATITUDE_REF).upper() == "S" else 1
+    longitude *= -1 if _text(gps, _LONGITUDE_REF).upper() == "W" else 1
+    valid = math.isfinite(latitude + longitude) and abs(latitude) <= 90 and abs(longitude) <= 180
+    if not valid or latitude == longitude == 0:  # what cameras write before the first fix
+        return None
+    altitude = _number(gps, _ALTITUDE, -math.inf)
+    below = gps.get(_ALTITUDE_REF) in (1, b"\x01")
+    unix_time = math.nan
+    try:
+        day = datetime.strptime(_text(gps, _GPS_DATE), "%Y:%m:%d").replace(tzinfo=UTC)
+        unix_time = day.timestamp() + 3600 * _sexagesimal(gps[_GPS_TIME])
+    except (ValueError, KeyError):
+        pass
+    return GpsTag(
+        latitude,
+        longitude,
+        -altitude if below else altitude,
+        _number(gps, _DOP),
+        _number(gps, _ERROR),
+        unix_time,
+    )
+
+
+def _number(tags: Mapping[int, Any], tag: int, low: float = 0.0) -> float:
+    """A finite number above `low`; NaN = not given, or unknown as 0/0 and 0 mean."""
+    value = float(tags.get(tag, math.nan))
+    return value if math.isfinite(value) and value > low else math.nan
+
+
+def _sexagesimal(parts: Sequence[Any]) -> float:
+    """First unit of (degrees or hours, minutes, seconds); a later part may be absent or 0/0."""
+    values = [float(part) for part in parts]
+    values[1:] = [value if math.isfinite(value) else 0.0 for value in values[1:]]
+    return sum(value / 60**k for k, value in enumerate(values[:3]))
+
+
+def _text(tags: Mapping[int, Any], tag: int) -> str:
+    value = tags.get(tag, "")
+    if isinstance(value, bytes):
+        value = value.decode("ascii", "replace")
+    return str(value).strip("\0 ")

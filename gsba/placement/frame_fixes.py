@@ -1,0 +1,99 @@
+"""GPS fixes of a run's frames: from whatever file holds them, at the times of the frames."""
+
+from pathlib import Path
+
+import numpy as np
+
+from gsba.bundle.fixes import FrameFixes
+from gsba.config import GpsSettings
+from gsba.log import GsbaError
+from gsba.placement.exif import read_exif_gps
+from gsba.placement.gps import GpsFixes, local_from_geodetic, read_gps
+from gsba.placement.gps_video import is_recording, read_video_gps
+from gsba.types import FrameSet
+
+EXIF = "exif"  # in place of a file of positions: those in the pictures
+_ACCELERATION = 1.0  # m/s^2, of people on foot: how far a path strays from the line between fixes
+
+
+def read_fixes(
+    source: str, frames: FrameSet | None = None, settings: GpsSettings | None = None
+) -> GpsFixes | None:
+    """Fixes that `--gps` names: a CSV or GPX file, a video, or "exif" of the frames.
+
+    Args:
+        source: path of the file, or "exif".
+        frames: of the run; None = they are not known yet: then "exif" gives None.
+        settings: the least noise of a fix.
+
+    Raises:
+        GsbaError: what cannot be read, with the place.
+    """
+    if source == EXIF:
+        return None if frames is None else read_exif_gps(frames, settings)
+    path = Path(source)
+    return read_video_gps(path, settings) if is_recording(path) else read_gps(path, settings)
+
+
+def fixes_of_frames(
+    source: str, frames: FrameSet, settings: GpsSettings | None = None
+) -> FrameFixes:
+    """Fixes of frames by name, or interpolated between the fixes before and after.
+
+    Between fixes that are `d` seconds apart a walker strays from the straight line by up to
+    `a d^2 / 8`, a = 1 m/s^2: that is added to the noise, and frames where it exceeds the noise of
+    the fixes have none.
+
+    Args:
+        source: see `read_fixes`.
+        frames: of the run; they need times unless fixes name frames.
+        settings: the least noise, and how long an error lasts.
+
+    Raises:
+        GsbaError: what cannot be read, or fixes of another time.
+    """
+    settings = settings or GpsSettings()
+    fixes = read_fixes(source, frames, settings)
+    assert fixes is not None  # frames are known
+    if fixes.names is None:
+        rows, geodetic, sigmas = _between(source, fixes, frames)
+    else:
+        by_name = {name: g for g, name in enumerate(fixes.names)}
+        rows = np.array([f for f, name in enumerate(frames.names) if name in by_name], np.int64)
+        chosen = [by_name[frames.names[f]] for f in rows]
+        geodetic, sigmas = fixes.geodetic[chosen], fixes.sigmas[chosen]
+    origin = np.median(geodetic, axis=0) if len(rows) else np.zeros(3)
+    local = local_from_geodetic(geodetic, origin)
+    times = frames.timestamps[rows] if frames.timed else None
+    origin[1] = (origin[1] + 180) % 360 - 180
+    return FrameFixes(rows, local, sigmas, times, origin, settings.correlation_s)
+
+
+def _between(
+    source: str, fixes: GpsFixes, frames: FrameSet
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frames (G,) between fixes, their positions (G, 3) geodetic, and their noise (G, 3) metres."""
+    times, entries = frames.timestamps, fixes.timestamps
+    assert entries is not None
+    if not frames.timed:
+        raise GsbaError(f"{source}: nothing says when frames were taken: refine with --timestamps")
+    inside = np.flatnonzero((times >= entries[0]) & (times <= entries[-1]))
+    if not len(inside):
+        raise GsbaError(
+            f"{source}: no overlap in time: positions span {entries[0]:.3f} to {entries[-1]:.3f} "
+            f"s, frames {times[0]:.3f} to {times[-1]:.3f} s; put both on one clock"
+        )
+    after = np.clip(np.searchsorted(entries, times[inside]), 1, max(len(entries) - 1, 1))
+    after = np.minimum(after, len(entries) - 1)
+    before = np.maximum(after - 1, 0)
+    gaps = entries[after] - entries[before]
+    part = np.where(gaps > 0, (times[inside] - entries[before]) / np.maximum(gaps, 1e-12), 0.0)
+
+    def mixed(columns: np.ndarray) -> np.ndarray:
+        return columns[before] + part[:, None] * (columns[after] - columns[before])
+
+    noise = mixed(fixes.sigmas)
+    stray = _ACCELERATION * gaps**2 / 2 * part * (1 - part)
+    near = stray <= noise[:, 0]
+    total = np.hypot(noise, stray[:, None])
+    return inside[near], mixed(fixes.geodetic)[near], total[near]

@@ -1,0 +1,122 @@
+"""GPS fixes that GoPro cameras record into their videos, unpacked by `telemetry_parser`.
+
+GPMF packets of about a second hold fixes as GPS5 (up to HERO10 and MAX, with one DOP and one state
+of the receiver) or as GPS9 (later, with one for each fix): see github.com/gopro/gpmf-parser.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsba.config import GpsSettings
+from gsba.log import GsbaError
+from gsba.placement.gps import GpsFixes, fixes_of, sigmas_of
+
+_RECORDINGS = (".360", ".insv", ".lrv", ".mov", ".mp4", ".osv")
+_EXTRA = "gsba[imu]"
+_PANIC = "PanicException"  # of libraries in Rust: no Exception, and nowhere to import it from
+_FIX, _DOP, _UTC = "0x47505346", "0x47505350", "0x47505355"  # GPSF, GPSP (DOP * 100), GPSU (ms)
+_GPS9 = "0x47505339"
+_GPS9_HEADER = 8  # bytes of key, type, size and repeat before its records
+_GPS9_RECORD = np.dtype([("values", ">i4", 7), ("dop", ">u2"), ("fix", ">u2")])
+_FLAT, _FULL = 2, 3  # states of the receiver: position without and with an altitude
+_DAY_S = 86_400.0
+_PACKET_S = 1.0  # that the only packet of a video lasts
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a file is a video, by its name."""
+    return path.suffix.lower() in _RECORDINGS
+
+
+def read_video_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
+    """Fixes of a GoPro video, at seconds after its first packet of GPS: the video's clock.
+
+    Fixes of a packet are evenly spread until the next; packets are timed by the camera's own
+    counter (STMP), else by the receiver's UTC. Where the receiver had no fix, there is none.
+
+    Args:
+        path: the video.
+        settings: the least noise of a fix; its DOP is read.
+
+    Raises:
+        GsbaError: the library is not there, or finds no positions.
+    """
+    packets = [packet for packet in map(_packet, _samples(path)) if packet is not None]
+    if not packets:
+        raise GsbaError(
+            f"{path}: telemetry-parser finds no GPS in it; give positions as CSV or GPX"
+        )
+    starts = np.array([start for start, _ in packets], np.float64)
+    starts -= starts[0]
+    late = np.flatnonzero(~(np.diff(starts) > 0))
+    if len(late):
+        raise GsbaError(f"{path}: the times of its GPS packets {late[0]} and {late[0] + 1} cross")
+    lengths = np.diff(starts)
+    lengths = np.append(lengths, lengths[-1] if len(lengths) else _PACKET_S)
+    times = np.concatenate(
+        [
+            start + length * np.arange(len(rows)) / max(len(rows), 1)
+            for start, length, (_, rows) in zip(starts, lengths, packets, strict=True)
+        ]
+    )
+    rows = np.concatenate([rows for _, rows in packets])
+    locked = rows[:, 4] >= _FLAT
+    locked &= np.isfinite(rows[:, :2]).all(axis=1) & (np.abs(rows[:, :2]) <= [90, 360]).all(axis=1)
+    if not locked.any():
+        raise GsbaError(f"{path}: its GPS receiver had no fix; give positions as CSV or GPX")
+    settings, rows, times = settings or GpsSettings(), rows[locked], times[locked]
+    geodetic = np.where(np.arange(3) < np.where(rows[:, 4:] >= _FULL, 3, 2), rows[:, :3], np.nan)
+    return fixes_of(times, geodetic, sigmas_of(settings, rows[:, 3]), settings)
+
+
+def _samples(path: Path) -> Sequence[Mapping[str, Mapping[str, Any]]]:
+    """Groups of tags of each packet."""
+    try:
+        from telemetry_parser import Parser  # type: ignore[import-not-found]
+    except ImportError:
+        raise GsbaError(
+            f"{path}: its GPS is read by telemetry-parser: pip install '{_EXTRA}', or give a CSV "
+            "or GPX file"
+        ) from None
+    try:
+        return Parser(str(path)).telemetry()
+    except BaseException as error:
+        if not isinstance(error, OSError | ValueError) and type(error).__name__ != _PANIC:
+            raise
+        raise GsbaError(f"{path}: telemetry-parser finds no GPS in it ({error})") from None
+
+
+def _packet(groups: Mapping[str, Mapping[str, Any]]) -> tuple[float, np.ndarray] | None:
+    """Start in seconds and fixes (n, 5) of a packet; None = it has none.
+
+    Columns are latitude, longitude (degrees), altitude (metres), DOP (NaN = unknown), and the state
+    of the receiver.
+    """
+    tags = groups.get("GPS9") or groups.get("GPS")
+    if not isinstance(tags, Mapping) or "Scale" not in tags:
+        return None
+    try:
+        scale = np.array(tags["Scale"], np.float64)
+        if _GPS9 in tags:
+            raw = bytes(tags[_GPS9])[_GPS9_HEADER:]
+            size = _GPS9_RECORD.itemsize
+            found = np.frombuffer(raw[: len(raw) // size * size], _GPS9_RECORD)
+            rows = found["values"] / scale[:7]
+            dop, fix = found["dop"] / scale[7], found["fix"].astype(np.float64)
+        else:
+            rows = np.array(tags["Data"], np.float64).reshape(-1, 5) / scale
+            dop = np.full(len(rows), float(tags.get(_DOP, np.nan)) / 100)
+            fix = np.full(len(rows), float(tags.get(_FIX, _FULL)))
+        start = tags.get("TimestampUs")
+        if start is not None:
+            seconds = 1e-6 * float(start)
+        elif _GPS9 in tags:
+            seconds = float(rows[0, 5] * _DAY_S + rows[0, 6])
+        else:
+            seconds = 1e-3 * float(tags[_UTC])
+    except (KeyError, TypeError, ValueError, IndexError):
+        return None
+    return seconds, np.column_stack([rows[:, :3], np.where(dop > 0, dop, np.nan), fix])

@@ -1,0 +1,113 @@
+"""Runs with GPS fixes as factors: on the command line, from a table or from tags, and refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_run import SETTINGS, Case, computed_stages
+from typer.testing import CliRunner
+from walk_on_earth import geodetic_of
+
+from gsba.cli import app
+from gsba.config import RefineSettings
+from gsba.evaluate.trajectory import evaluate
+from gsba.log import GsbaError
+from gsba.trajectory.files import read_trajectory
+
+PLAIN = SETTINGS.model_copy(update={"patches": SETTINGS.patches.model_copy(update={"rounds": 0})})
+
+
+def _with_gps(file: Path, **options: float) -> RefineSettings:
+    tree = PLAIN.model_dump() | {"factors": ("bearing", "gps")}
+    return RefineSettings.model_validate(tree | {"gps": {"file": str(file), **options}})
+
+
+def _table(path: Path, case: Case, metres: float, seed: int = 0, shift_s: float = 0.0) -> Path:
+    """Fixes of the true positions, blown up to metres, with .3 m of noise."""
+    times, upright = case.truth.timestamps, np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    level = metres * case.truth.world_T_rigs[:, :3, 3] @ upright
+    level += np.random.default_rng(seed).normal(0, 0.3, level.shape)
+    rows = [
+        f"{t + shift_s!r},{lat:.10f},{lon:.10f},{alt:.4f}"
+        for t, (lat, lon, alt) in zip(times.tolist(), geodetic_of(level), strict=True)
+    ]
+    path.write_text("\n".join(["timestamp,lat,lon,alt", *rows]) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def without(case: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run without fixes."""
+    out = tmp_path_factory.mktemp("without") / "run"
+    case.refine(out, PLAIN)
+    return out
+
+
+def _apart(one: Path, other: Path) -> float:
+    """RMS of the positions of two runs, once aligned, over the extent of the walk."""
+    first, second = (read_trajectory(out / "trajectory.tum") for out in (one, other))
+    extent = float(np.linalg.norm(np.ptp(second.world_T_rigs[:, :3, 3], axis=0)))
+    return evaluate(first, second).ate.rmse / extent
+
+
+def test_fixes_hold_a_run_and_are_reported(case: Case, without: Path, tmp_path: Path) -> None:
+    table, out = _table(tmp_path / "gps.csv", case, 30.0), tmp_path / "run"
+    result = case.refine(out, _with_gps(table))
+    said = json.loads((out / "report.json").read_text())["gps"]
+    assert said["taken"] and said["used"] == said["fixes"] == len(case.truth.timestamps)
+    assert said["false_fixes"] == [] and said["residual_m"]["most"] < 10
+    assert any(note.startswith("GPS held 8 of 8 frames") for note in result.report["notes"])
+    # Images know this walk far better: fixes leave it as it is, in the trajectory's world.
+    assert _apart(out, without) < 1e-4
+    assert case.errors(out).scale == pytest.approx(case.errors(without).scale, rel=1e-3)
+    again = case.refine(out, _with_gps(table))
+    assert computed_stages(again) == []
+    other = case.refine(out, _with_gps(_table(tmp_path / "other.csv", case, 30.0, seed=1)))
+    assert "chain" in computed_stages(other) and "features" not in computed_stages(other)
+
+
+def test_the_command_takes_gps_as_a_family(case: Case, tmp_path: Path) -> None:
+    late = _table(tmp_path / "gps.csv", case, 30.0, shift_s=1000.0)
+    for source, message in (
+        (late, "no overlap in time"),
+        (tmp_path / "none.csv", "none.csv: cannot be read"),
+        ("exif", "--gps exif: 0 of 8 frames have GPS tags"),
+    ):
+        command = ["refine", case.frames, case.slam, "--out", tmp_path / "run", "--gps", source]
+        done = CliRunner().invoke(app, [str(part) for part in command])
+        assert done.exit_code == 1 and message in done.stderr, done.stderr
+        assert len(done.stderr.splitlines()) == 1
+
+
+def test_positions_elsewhere_have_no_say(case: Case, without: Path, tmp_path: Path) -> None:
+    table = tmp_path / "gps.csv"
+    rng = np.random.default_rng(3)
+    rows = [
+        f"{t!r},{lat:.10f},{lon:.10f},{alt:.4f}"
+        for t, (lat, lon, alt) in zip(
+            case.truth.timestamps.tolist(),
+            geodetic_of(rng.normal(0, 2, (len(case.truth.timestamps), 3))),
+            strict=True,
+        )
+    ]
+    table.write_text("\n".join(["timestamp,lat,lon,alt", *rows]) + "\n")
+    out = tmp_path / "run"
+    report = case.refine(out, _with_gps(table)).report
+    assert not report["gps"]["taken"]
+    assert any(note.startswith("GPS had no say") for note in report["notes"])
+    assert _apart(out, without) < 1e-4
+
+
+def test_settings_name_both_or_none() -> None:
+    with pytest.raises(ValueError, match="factors: gps needs positions: pass --gps FILE"):
+        RefineSettings.model_validate({"factors": ("bearing", "gps")})
+    with pytest.raises(ValueError, match=r"gps\.file is read by the gps factors"):
+        RefineSettings.model_validate({"gps": {"file": "walk.gpx"}})
+
+
+def test_too_few_positions_are_one_line(case: Case, tmp_path: Path) -> None:
+    table = _table(tmp_path / "gps.csv", case, 30.0)
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:4]))
+    with pytest.raises(GsbaError, match=r"gps.csv: 3 of 8 frames have a position, and 5 are"):
+        case.refine(tmp_path / "run", _with_gps(table))

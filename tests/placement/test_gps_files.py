@@ -1,0 +1,217 @@
+"""GPS fixes of tables, tracks, tags and GoPro videos, with the noise that these state."""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from walk_on_earth import frame_set
+
+from gsba.config import GpsSettings
+from gsba.log import GsbaError
+from gsba.placement import fixes_of, fixes_of_frames, read_fixes, read_gps
+from gsba.placement.exif import read_exif_gps
+from gsba.types import FrameSet
+
+LEAST = [3.0, 3.0, 5.0]
+
+
+def _read(path: Path, text: str, **settings: float) -> np.ndarray:
+    path.write_text(text)
+    return read_gps(path, GpsSettings.model_validate(settings)).sigmas
+
+
+def test_tables_state_their_noise(tmp_path: Path) -> None:
+    path = tmp_path / "gps.csv"
+    plain = _read(path, "t,lat,lon,alt\n1,48,11,500\n2,48,11,500\n")
+    np.testing.assert_array_equal(plain, [LEAST, LEAST])
+    dop = _read(path, "t,lat,lon,alt,hdop,vdop\n1,48,11,500,2,4\n2,48,11,500,.5,\n3,48,11,5,,0\n")
+    np.testing.assert_allclose(dop, [[6, 6, 12], LEAST, LEAST])
+    own = _read(path, "t,lat,lon,alt,accuracy,vertical_accuracy\n1,48,11,500,8,20\n2,48,11,5,.1,\n")
+    np.testing.assert_allclose(own, [[8, 8, 20], LEAST])
+    exact = _read(path, "t,lat,lon,alt,sigma\n1,48,11,500,.02\n", sigma_m=0.01, sigma_up_m=0.02)
+    np.testing.assert_allclose(exact, [[0.02, 0.02, 0.04]])
+    for cells, message in (("x", "error 'x' is not a number"), ("-1", "error -1 is negative")):
+        with pytest.raises(GsbaError, match=rf"gps.csv:2: {message}"):
+            _read(path, f"t,lat,lon,alt,sigma\n1,48,11,500,{cells}\n")
+
+
+def test_tracks_state_their_noise(tmp_path: Path) -> None:
+    points = "".join(
+        f'<trkpt lat="48" lon="11"><ele>5</ele><time>2024-05-01T10:00:0{k}Z</time>{dop}</trkpt>'
+        for k, dop in enumerate(
+            ["", "<hdop>2</hdop><vdop>3</vdop><pdop>9</pdop>", "<pdop>2.5</pdop>"]
+        )
+    )
+    text = f"<?xml version='1.0'?><gpx><trk><trkseg>{points}</trkseg></trk></gpx>"
+    found = _read(tmp_path / "walk.gpx", text)
+    np.testing.assert_allclose(found, [LEAST, [6, 6, 9], [7.5, 7.5, 12.5]])
+
+
+def test_altitudes_are_all_or_none() -> None:
+    geodetic = np.array([[48, 11, np.nan], [48, 11, 500.0], [48, 11, 501], [48, 11, 502]])
+    some = fixes_of([3.0, 1, 2, 0], geodetic)
+    assert some.timestamps is not None
+    np.testing.assert_array_equal(some.timestamps, [0, 1, 2])
+    np.testing.assert_array_equal(some.geodetic[:, 2], [502, 500, 501])
+    none = fixes_of(["a", "b"], geodetic[:2])
+    assert none.names == ("a", "b")
+    np.testing.assert_array_equal(none.geodetic[:, 2], [0, 0])
+    np.testing.assert_array_equal(none.sigmas[:, 2], [20, 20])
+
+
+def test_frames_between_fixes_know_less(tmp_path: Path) -> None:
+    """Half a second from fixes 1 s apart: an eighth of a metre more; 6 s apart 4.5; 20 s: none."""
+    path = tmp_path / "gps.csv"
+    rows = [f"{t},48,{11 + 1e-5 * t:.6f},500" for t in (0, 1, 7, 27)]
+    path.write_text("\n".join(["t,lat,lon,alt", *rows]))
+    frames = replace(frame_set(4), timestamps=np.array([0.5, 1.0, 4.0, 17.0]))
+    settings = GpsSettings(sigma_m=5.0, sigma_up_m=8.0)
+    found = fixes_of_frames(str(path), frames, settings)
+    np.testing.assert_array_equal(found.frames, [0, 1, 2])
+    np.testing.assert_allclose(found.sigmas[:, 0], np.hypot(5, [0.125, 0, 4.5]))
+    np.testing.assert_allclose(found.sigmas[:, 2], np.hypot(8, [0.125, 0, 4.5]))
+    east = found.positions[:, 0]
+    np.testing.assert_allclose(np.diff(east) / np.diff(frames.timestamps[:3]), 0.746, atol=1e-3)
+
+
+def _tagged(folder: Path, stamps: Sequence[float]) -> FrameSet:
+    """Pictures whose fixes are of these seconds of a minute."""
+    base = frame_set(len(stamps))
+    paths = []
+    for k, (name, second) in enumerate(zip(base.names, stamps, strict=True)):
+        exif = Image.Exif()
+        place = (48.0, 8.0, 0.1 * second)
+        exif[0x8825] = {1: "N", 2: place, 3: "E", 4: (11.0, 30.0, 0.0), 6: 520.0}
+        exif[0x8825] |= {7: (10.0, 0.0, second), 29: "2024:05:01", 11: 2.0 if k % 2 else 0.5}
+        path = folder / f"{name}.jpg"
+        Image.fromarray(np.full((8, 16, 3), 90, np.uint8)).save(path, exif=exif)
+        paths.append((path,))
+    return replace(base, paths=tuple(paths))
+
+
+def test_a_fix_that_pictures_repeat_counts_once(tmp_path: Path) -> None:
+    found = read_exif_gps(_tagged(tmp_path, [0.0, 1.0, 1.0, 1.0, 2.0]))
+    assert found.names == ("frame_0000", "frame_0001", "frame_0004")
+    np.testing.assert_allclose(found.sigmas, [LEAST, [6, 6, 10], LEAST])
+
+
+def _item(key: str, kind: str, size: int, data: bytes) -> bytes:
+    """One item of GPMF: key, type, size of an element, number of them, and the elements."""
+    head = struct.pack(">4scBH", key.encode(), kind.encode(), size, len(data) // size)
+    return head + data + bytes(-len(data) % 4)
+
+
+def _device(tags: bytes, first_us: int | None) -> bytes:
+    stamp = b"" if first_us is None else _item("STMP", "J", 8, struct.pack(">Q", first_us))
+    stream = _item("STRM", "\0", 1, stamp + tags)
+    name = _item("DVNM", "c", 1, b"MAX ")
+    return _item("DEVC", "\0", 1, _item("DVID", "L", 4, struct.pack(">I", 1)) + name + stream)
+
+
+def _gps5(start: float, count: int, state: int = 3, stamped: bool = True) -> bytes:
+    """A packet of fixes `count` a second: latitude 48 + t / 1e5, DOP 2.5."""
+    times = start + np.arange(count) / count
+    rows = np.column_stack(
+        [480_000_000 + 100 * times, *np.tile([[115_000_000], [520_000], [1], [1]], count)]
+    )
+    utc = f"2405011000{int(start):02d}.{round(1000 * (start % 1)):03d}".encode()
+    tags = _item("GPSF", "L", 4, struct.pack(">I", state)) + _item("GPSU", "U", 16, utc)
+    tags += _item("GPSP", "S", 2, struct.pack(">H", 250))
+    tags += _item("SCAL", "l", 4, struct.pack(">5i", 10**7, 10**7, 1000, 1000, 100))
+    tags += _item("GPS5", "l", 20, rows.round().astype(">i4").tobytes())
+    return _device(tags, round(1e6 * (start + 0.3)) if stamped else None)
+
+
+def _gps9(start: float, count: int) -> bytes:
+    """The same as later cameras write it; the first fix is flat."""
+    data = b""
+    for k in range(count):
+        t = start + k / count
+        place = round(480_000_000 + 100 * t), 115_000_000, 520_000, 1, 1
+        state = 2 if start == 0 and k == 0 else 3
+        data += struct.pack(">7i2H", *place, 8887, round(1000 * (36000 + t)), 400, state)
+    tags = _item("TYPE", "c", 1, b"lllllllSS")
+    tags += _item(
+        "SCAL", "l", 4, struct.pack(">9i", 10**7, 10**7, 1000, 1000, 100, 1, 1000, 100, 1)
+    )
+    return _device(tags + _item("GPS9", "?", 32, data), None)
+
+
+def _box(kind: str, *parts: bytes) -> bytes:
+    body = b"".join(parts)
+    return struct.pack(">I4s", 8 + len(body), kind.encode()) + body
+
+
+def _full(kind: str, *parts: bytes, flags: int = 0) -> bytes:
+    return _box(kind, struct.pack(">I", flags), *parts)
+
+
+def _video(path: Path, packets: Sequence[bytes]) -> Path:
+    """An MP4 file (ISO/IEC 14496-12) with a track of metadata alone, a packet a second."""
+    matrix = struct.pack(">9i", 65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)
+    ends, num = np.cumsum([len(packet) for packet in packets]), len(packets)
+    brand = _box("ftyp", b"mp41", bytes(4), b"mp41")
+    places = len(brand) + 8 + ends - [len(packet) for packet in packets]
+    table = _box(
+        "stbl",
+        _full("stsd", struct.pack(">I", 1), _box("gpmd", bytes(6), b"\0\1", bytes(4))),
+        _full("stts", struct.pack(">III", 1, num, 1000)),
+        _full("stsc", struct.pack(">IIII", 1, 1, 1, 1)),
+        _full("stsz", struct.pack(">II", 0, num), *(struct.pack(">I", len(p)) for p in packets)),
+        _full("stco", struct.pack(">I", num), *(struct.pack(">I", int(at)) for at in places)),
+    )
+    times = struct.pack(">IIII", 0, 0, 1000, 1000 * num)
+    handler = _full("hdlr", bytes(4), b"meta", bytes(12), b"\x0bGoPro MET  \0")
+    data = _box("dinf", _full("dref", struct.pack(">I", 1), _full("url ", flags=1)))
+    media = _box("mdia", _full("mdhd", times, bytes(4)), handler, _box("minf", data, table))
+    head = _full("tkhd", struct.pack(">IIIII", 0, 0, 1, 0, 1000 * num), bytes(16), matrix, bytes(8))
+    whole = _full("mvhd", times, struct.pack(">IH", 65536, 256), bytes(10), matrix, bytes(28))
+    path.write_bytes(
+        brand + _box("mdat", *packets) + _box("moov", whole, _box("trak", head, media))
+    )
+    return path
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_gopro_videos_hold_fixes_on_their_clock(tmp_path: Path, stamped: bool) -> None:
+    pytest.importorskip("telemetry_parser", reason="telemetry-parser (gsba[imu]) is not there")
+    states = [0, 3, 3, 2]
+    packets = [_gps5(float(k), 18, state, stamped) for k, state in enumerate(states)]
+    found = read_fixes(str(_video(tmp_path / "GS01.360", packets)))
+    assert found is not None and found.timestamps is not None
+    times = np.arange(18, 54) / 18  # no fix yet in the first second, none with height in the last
+    np.testing.assert_allclose(found.timestamps, times, atol=1e-6)
+    np.testing.assert_allclose(found.geodetic[:, 0], 48 + 1e-5 * times, atol=1.1e-7)
+    np.testing.assert_allclose(found.geodetic[:, 1:], np.tile([11.5, 520], (36, 1)))
+    np.testing.assert_allclose(found.sigmas, np.tile([7.5, 7.5, 12.5], (36, 1)))
+
+
+def test_later_gopros_rate_each_fix(tmp_path: Path) -> None:
+    pytest.importorskip("telemetry_parser", reason="telemetry-parser (gsba[imu]) is not there")
+    found = read_fixes(str(_video(tmp_path / "a.mp4", [_gps9(0.0, 10), _gps9(1.0, 10)])))
+    assert found is not None and found.timestamps is not None
+    np.testing.assert_allclose(found.timestamps, np.arange(1, 20) / 10, atol=1e-6)
+    np.testing.assert_allclose(found.sigmas[:, 0], 12)
+
+
+def test_videos_without_fixes_are_one_line(tmp_path: Path) -> None:
+    pytest.importorskip("telemetry_parser", reason="telemetry-parser (gsba[imu]) is not there")
+    lost = _video(tmp_path / "lost.mp4", [_gps5(float(k), 18, 0) for k in range(3)])
+    with pytest.raises(GsbaError, match=r"lost\.mp4: its GPS receiver had no fix"):
+        read_fixes(str(lost))
+    crossed = _video(tmp_path / "crossed.mp4", [_gps5(1.0, 18), _gps5(0.0, 18)])
+    with pytest.raises(GsbaError, match="packets 0 and 1 cross"):
+        read_fixes(str(crossed))
+    none = _video(tmp_path / "none.mp4", [_device(_item("GYRO", "s", 6, bytes(60)), 0)] * 2)
+    with pytest.raises(GsbaError, match="finds no GPS in it"):
+        read_fixes(str(none))
+    whole = lost.read_bytes()
+    for cut in range(0, len(whole), 37):
+        (tmp_path / "cut.mp4").write_bytes(whole[:cut])
+        with pytest.raises(GsbaError, match=r"cut\.mp4: ") as failure:
+            read_fixes(str(tmp_path / "cut.mp4"))
+        assert "\n" not in str(failure.value)
