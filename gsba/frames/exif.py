@@ -1,4 +1,5 @@
-"""EXIF tags of pictures: when they were taken, and where. Read by Pillow, without pixels."""
+"""EXIF tags of pictures: when, where and by which camera they were taken. Read by Pillow, without
+pixels."""
 
 import math
 import warnings
@@ -11,6 +12,7 @@ from typing import Any
 from gsba.log import GsbaError
 
 # Tags of Exif 3.0 (CIPA DC-008), sections 4.6.5 and 4.6.6.
+_MAKE, _MODEL = 0x010F, 0x0110
 _EXIF_DIRECTORY, _GPS_DIRECTORY = 0x8769, 0x8825
 _TAKEN, _OFFSET, _SUBSECOND = 0x9003, 0x9011, 0x9291
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)
@@ -38,6 +40,7 @@ class ExifTags:
     zoned: bool  # whether the tags name the time zone, so that `taken` is Unix time
     subsecond: bool  # whether `taken` has a fraction of a second
     gps: GpsTag | None  # None = no valid position
+    camera: str = ""  # maker and model; "" = not given
 
 
 def read_exif(path: Path) -> ExifTags:
@@ -62,7 +65,8 @@ def read_exif(path: Path) -> ExifTags:
     except Exception:  # of the parser, each in its own words
         raise ValueError(f"{path}: damaged EXIF data") from None
     try:
-        return ExifTags(*_taken(shot), _gps_tag(gps))
+        named = [text for text in (_text(exif, _MAKE), _text(exif, _MODEL)) if text]
+        return ExifTags(*_taken(shot), _gps_tag(gps), " ".join(named))
     except (TypeError, IndexError, AttributeError):
         raise ValueError(f"{path}: damaged EXIF data") from None
 

@@ -10,6 +10,7 @@ from gsba.imu.files import read_telemetry
 from gsba.inspection.facts import Facts, Found, spoken_seconds
 from gsba.log import GsbaError
 from gsba.placement.gps_video import read_video_gps
+from gsba.video.extraction import refuse_darkness
 from gsba.video.recording import Recording, read_recording
 from gsba.video.timeline import container_tags
 
@@ -31,6 +32,10 @@ def of_video(path: Path) -> Found:
         ("frames", _frames(recording)),
         *_sensors(path, trailer),
     )
+    try:
+        refuse_darkness(path, recording, np.flatnonzero(recording.shown).tolist())
+    except GsbaError as error:
+        return Found(facts, str(error))
     rate = min(_RATE, 1 / recording.timelines[0].interval_s)
     options = () if rate == VideoSettings().fps else ("--fps", f"{rate:g}")
     return Found(facts, options=options)
@@ -89,9 +94,9 @@ def _gyro(path: Path) -> str:
         readings = read_telemetry(path)
     except GsbaError as error:
         return f"none: {_reason(path, error)}"
-    rate = 1 / float(np.median(np.diff(readings.times)))
+    rate = 1 / float(np.median(np.diff(readings.timestamps)))
     beside = " with accelerometer" if readings.forces is not None else ""
-    return f"{len(readings.times):,} readings at {rate:.0f} Hz{beside}"
+    return f"{len(readings.timestamps):,} readings at {rate:.0f} Hz{beside}"
 
 
 def _gps(path: Path) -> str:

@@ -1,5 +1,6 @@
-"""GPS fixes that GoPro cameras record into their videos, unpacked by `telemetry_parser`.
+"""GPS fixes that cameras record into their videos.
 
+Those of Insta360 are in the trailer of the file. Those of GoPro are unpacked by `telemetry_parser`:
 GPMF packets of about a second hold fixes as GPS5 (up to HERO10 and MAX, with one DOP and one state
 of the receiver) or as GPS9 (later, with one for each fix): see github.com/gopro/gpmf-parser.
 """
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsba.config import GpsSettings
+from gsba.containers.insta360 import GpsRecord, read_trailer
 from gsba.log import GsbaError
 from gsba.placement.gps import GpsFixes, fixes_of, sigmas_of
 
@@ -24,6 +26,7 @@ _GPS9_RECORD = np.dtype([("values", ">i4", 7), ("dop", ">u2"), ("fix", ">u2")])
 _FLAT, _FULL = 2, 3  # states of the receiver: position without and with an altitude
 _DAY_S = 86_400.0
 _PACKET_S = 1.0  # that the only packet of a video lasts
+_FIRST_FIX_S = -5.0, 3600.0  # after a recording began, between which its first fix comes
 
 
 def is_recording(path: Path) -> bool:
@@ -32,17 +35,44 @@ def is_recording(path: Path) -> bool:
 
 
 def read_video_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
-    """Fixes of a GoPro video, at seconds after its first packet of GPS: the video's clock.
+    """Fixes of a video of Insta360 or GoPro, at seconds on the video's clock.
+
+    Args:
+        path: the video.
+        settings: the least noise of a fix; where the file gives its DOP, that is read.
+
+    Raises:
+        GsbaError: it holds no positions, or `telemetry_parser` is needed and not installed.
+    """
+    trailer = read_trailer(path)
+    if trailer is None:
+        return _of_gopro(path, settings)
+    if trailer.gps is None:
+        raise GsbaError(f"{path}: its Insta360 trailer holds no GPS; give positions as CSV or GPX")
+    return _of_insta360(trailer.gps, trailer.created_unix_s, settings)
+
+
+def _of_insta360(
+    record: GpsRecord, created_unix_s: float | None, settings: GpsSettings | None
+) -> GpsFixes:
+    """Fixes since the recording was created, to a second; since the first fix where that does not
+    fit."""
+    begin = float(record.unix_times[0])
+    if created_unix_s is not None:
+        low, high = _FIRST_FIX_S
+        begin = created_unix_s if low <= begin - created_unix_s <= high else begin
+    geodetic = np.column_stack([record.latitudes, record.longitudes, record.altitudes])
+    return fixes_of(record.unix_times - begin, geodetic, settings=settings)
+
+
+def _of_gopro(path: Path, settings: GpsSettings | None) -> GpsFixes:
+    """Fixes at seconds after the first packet of GPS.
 
     Fixes of a packet are evenly spread until the next; packets are timed by the camera's own
     counter (STMP), else by the receiver's UTC. Where the receiver had no fix, there is none.
 
-    Args:
-        path: the video.
-        settings: the least noise of a fix; its DOP is read.
-
     Raises:
-        GsbaError: the library is not there, or finds no positions.
+        GsbaError: the library is not installed, or finds no positions.
     """
     packets = [packet for packet in map(_packet, _samples(path)) if packet is not None]
     if not packets:

@@ -108,7 +108,7 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
         )
     windows, received = _windows(video, recording, settings)
     _check_end(video, recording, settings.to_s)
-    _refuse_darkness(video, recording, windows)
+    refuse_darkness(video, recording, [int(window[0]) for window in windows])
     for note in recording.notes:
         logger.info("%s", note)
     _write_marker(out, video, key, None, recording.folders)
@@ -128,15 +128,20 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
     return counts
 
 
-def _refuse_darkness(video: Path, recording: Recording, windows: list[np.ndarray]) -> None:
+def refuse_darkness(video: Path, recording: Recording, instants: Sequence[int]) -> None:
     """Refuse a video of black pictures: the middle one, the first and the last are looked at.
+
+    Args:
+        video: the file, for the message.
+        recording: what it shows.
+        instants: ascending, those that are `shown`.
 
     Raises:
         GsbaError: all that can be decoded of these are black.
     """
     level = -1
-    for row in dict.fromkeys([len(windows) // 2, 0, len(windows) - 1]):
-        for _, pictures in shots(recording, [int(windows[row][0])]):
+    for row in dict.fromkeys([len(instants) // 2, 0, len(instants) - 1]):
+        for _, pictures in shots(recording, [instants[row]]):
             level = max(level, *(int(np.percentile(each.luma(), 99)) for each in pictures))
         if level > _BLACK:
             return
