@@ -15,7 +15,7 @@ from gsba.frames.times import check_fps
 from gsba.imu.files import read_imu, read_telemetry
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError
-from gsba.placement import EXIF, fixes_of_frames
+from gsba.placement import EXIF, fixes_of_frames, read_fixes
 from gsba.store.store import RunStore
 from gsba.trajectory.association import without_trajectory
 from gsba.trajectory.files import read_trajectory
@@ -133,6 +133,8 @@ def extract_frames(
     chosen = settings.video
     if EXIF in (settings.placement.gps, settings.gps.file):
         raise GsbaError("--gps exif: a video's frames have no tags; give positions as a file")
+    if settings.gps.file is not None:
+        read_fixes(settings.gps.file)  # fails before hours of decoding
     if fps is not None:
         chosen = chosen.model_copy(update={"fps": check_fps(fps), "every": None, "at": None})
     with RunStore(out, dict(origin), fresh) as store:
