@@ -15,7 +15,7 @@ from gsba.frames.times import check_fps
 from gsba.imu.files import read_imu, read_telemetry
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError
-from gsba.placement import EXIF, fixes_of_frames, read_fixes
+from gsba.placement import EXIF, check, fixes_of_frames, read_fixes
 from gsba.store.store import RunStore
 from gsba.trajectory.association import without_trajectory
 from gsba.trajectory.files import read_trajectory
@@ -105,9 +105,12 @@ def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
 def positions_of(frames: FrameSet, settings: RefineSettings) -> FrameFixes | None:
     """GPS fixes of frames for the gps factors; None = they are not asked for.
 
+    Positions that the run's exports are to be placed by are read, too, to refuse them early.
+
     Raises:
         GsbaError: positions that cannot be used, or that too few frames have.
     """
+    check(settings.placement, frames, settings.camera.baseline())
     source = settings.gps.file
     if source is None:
         return None

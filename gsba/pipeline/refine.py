@@ -108,7 +108,6 @@ def refine(
         inputs.extract_frames(out, origin, settings, fps, fresh)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, calibration)
-    check(settings.placement, frame_set, settings.camera.baseline())
     sensors = readings, inputs.positions_of(frame_set, settings)
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
