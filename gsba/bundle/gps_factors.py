@@ -157,27 +157,12 @@ def linear_factors(
     Returns:
         Linear factors, weighted as the loss weighs them there.
     """
-    graph = gtsam.NonlinearFactorGraph()
-    added = gtsam.Values()
-    for number in anchors.level_from_map if free_similarity else ():
-        added.insert(S(number), np.zeros(7))
+    graph, weights = gtsam.NonlinearFactorGraph(), anchors.weights(world_T_rigs)
     for a in range(len(anchors.frames)):
-        added.insert(E(a), np.zeros(3))
-    values.insert(added)
-    unit, weights = gtsam.noiseModel.Unit.Create(3), anchors.weights(world_T_rigs)
-
-    def add(terms: dict[int, np.ndarray], right: np.ndarray) -> None:
-        here = gtsam.Values()
-        for key in terms:
-            if added.exists(key):
-                here.insert(key, added.atVector(key))
-            else:
-                here.insert(key, values.atPose3(key))
-        pairs = [part for term in terms.items() for part in term]
-        rows = gtsam.JacobianFactor(*pairs, right, unit)  # type: ignore[call-overload]
-        graph.add(gtsam.LinearContainerFactor(rows, here))
-
+        values.insert(E(a), np.zeros(3))
     for number, fit in anchors.level_from_map.items():
+        if free_similarity:
+            values.insert(S(number), np.zeros(7))
         chosen = np.flatnonzero(anchors.maps == number)
         fixes, middle = anchors.fixes.taken(chosen), anchors.positions[chosen].mean(axis=0)
         memories = np.concatenate([[0.0], fixes.correlations()])
@@ -186,17 +171,32 @@ def linear_factors(
             link = {E(a): fresh * np.eye(3)}
             if i:
                 link |= {E(int(chosen[i - 1])): -fresh * memories[i] * np.eye(3)}
-            add(link, np.zeros(3))
+            graph.add(_linear(link, np.zeros(3), values))
             frame = int(anchors.frames[a])
             off = world_T_rigs[frame, :3, 3] - anchors.positions[a]
             arm = anchors.positions[a] - middle
             weight = np.sqrt(weights[a] / WHITE_SHARE)
             whitened = weight * fit.scale * fit.rotation / fixes.sigmas[i][:, None]
             by_pose = np.hstack([np.zeros((3, 3)), world_T_rigs[frame, :3, :3]])
-            terms = {X(frame): whitened @ by_pose}
+            terms = {X(frame): whitened @ by_pose, E(a): -weight * np.eye(3)}
             if free_similarity:
                 by_similarity = np.column_stack([arm, *np.cross(np.eye(3), arm), np.eye(3)])
                 terms[S(number)] = -whitened @ by_similarity
-            terms[E(a)] = -weight * np.eye(3)
-            add(terms, -whitened @ off)
+            graph.add(_linear(terms, -whitened @ off, values))
     return graph
+
+
+def _linear(
+    terms: dict[int, np.ndarray], right: np.ndarray, values: gtsam.Values
+) -> gtsam.LinearContainerFactor:
+    """A linear factor of up to three variables, linearized at these values."""
+    here = gtsam.Values()
+    for key, matrix in terms.items():
+        if matrix.shape[1] == 6:
+            here.insert(key, values.atPose3(key))
+        else:
+            here.insert(key, values.atVector(key))
+    parts = [part for term in terms.items() for part in term]
+    unit = gtsam.noiseModel.Unit.Create(3)
+    rows = gtsam.JacobianFactor(*parts, right, unit)  # type: ignore[call-overload]
+    return gtsam.LinearContainerFactor(rows, here)

@@ -16,7 +16,7 @@ from gsba.frames.times import check_fps
 from gsba.imu.files import read_imu, read_telemetry
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError
-from gsba.placement import EXIF, fixes_of_frames
+from gsba.placement import EXIF, check, fixes_of_frames, read_fixes
 from gsba.store.store import RunStore
 from gsba.trajectory.association import without_trajectory
 from gsba.trajectory.files import read_trajectory
@@ -121,9 +121,12 @@ def _duration_s(path: Path) -> float | None:
 def positions_of(frames: FrameSet, settings: RefineSettings) -> FrameFixes | None:
     """GPS fixes of frames for the gps factors; None = they are not asked for.
 
+    Positions that the run's exports are to be placed by are read, too, to refuse them early.
+
     Raises:
         GsbaError: positions that cannot be used, or that too few frames have.
     """
+    check(settings.placement, frames, settings.camera.baseline())
     source = settings.gps.file
     if source is None:
         return None
@@ -149,6 +152,8 @@ def extract_frames(
     chosen = settings.video
     if EXIF in (settings.placement.gps, settings.gps.file):
         raise GsbaError("--gps exif: a video's frames have no tags; give positions as a file")
+    if settings.gps.file is not None:
+        read_fixes(settings.gps.file)  # fails before hours of decoding
     if fps is not None:
         chosen = chosen.model_copy(update={"fps": check_fps(fps), "every": None, "at": None})
     with RunStore(out, dict(origin), fresh) as store:

@@ -26,7 +26,7 @@ from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import ExtraFactors, Prior
 from gsba.pipeline.run import Journal, Run
-from gsba.placement import check, read_fixes
+from gsba.placement import check
 from gsba.store import cluster
 from gsba.store.store import RunStore
 from gsba.trajectory.axes import quarter_turn
@@ -104,21 +104,17 @@ def refine(
     origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
     readings = inputs.read_gyro(imu, frames)
-    if settings.gps.file is not None:
-        read_fixes(settings.gps.file)
     if video.is_video(frames):
         inputs.extract_frames(out, origin, settings, fps, fresh)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, calibration)
-    check(settings.placement, frame_set, settings.camera.baseline())
-    fixes = inputs.positions_of(frame_set, settings)
+    sensors = readings, inputs.positions_of(frame_set, settings)
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
         frame_set, journal = merging.before(store, frame_set, chosen), Journal()
         if chosen.distractors:
             frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
-        start = store, frame_set, coarse, settings, extra_factors, journal
-        run = Run.begin(*start, imu=readings, fixes=fixes)
+        run = Run.begin(store, frame_set, coarse, settings, extra_factors, journal, False, *sensors)
         return _refine(run, Prior.of(coarse, extra_factors), given)
 
 
@@ -155,17 +151,8 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
         frames, again = replace(frames, fisheyes=fisheyes), Journal(dict(counts))
         frames = merging.recut(run.store, frames, n)
         settings, extra = run.settings, run.extra_factors
-        run = Run.begin(
-            run.store,
-            frames,
-            prior.coarse,
-            settings,
-            extra,
-            again,
-            found,
-            run.imu,
-            run.fixes,
-        )
+        sensors = run.imu, run.fixes
+        run = Run.begin(run.store, frames, prior.coarse, settings, extra, again, found, *sensors)
 
 
 def _cut_better(coarse: CoarsePoses, world: Map) -> _Cut | None:

@@ -111,8 +111,7 @@ def build_report(
         moves: of the poses against a splat, see `gsba.splat.refinement.Move`.
         stitching: the field of directions, see `gsba.report.findings.of_field`.
         camera: where its lenses are, see `gsba.report.findings.of_camera`.
-        gyro: that rode along, see `gsba.report.imu_findings.of_gyro`.
-        gps: positions that were factors, see `gsba.report.gps_findings.of_gps`.
+        gyro, gps: see `gsba.report.imu_findings.of_gyro` and `gsba.report.gps_findings.of_gps`.
         reasons: why maps were not joined, see `gsba.report.maps.summarize_maps`.
     """
     quality = frame_quality(reconstruction)
@@ -129,8 +128,7 @@ def build_report(
         "trajectory": trajectory,
         "stitching": stitching,
         **({} if camera is None else {"camera": camera}),
-        **({} if gyro is None else {"gyro": gyro}),
-        **({} if gps is None else {"gps": gps}),
+        **{name: said for name, said in (("gyro", gyro), ("gps", gps)) if said is not None},
         "stages": stage_rows,
         "solver": solver,
         "splat": moves,

@@ -61,6 +61,16 @@ def test_fixes_hold_a_run_and_are_reported(case: Case, without: Path, tmp_path: 
     # Images know this walk far better: fixes leave it as it is, in the trajectory's world.
     assert _apart(out, without) < 1e-4
     assert case.errors(out).scale == pytest.approx(case.errors(without).scale, rel=1e-3)
+    claims = []
+    for more in ((), ("--gps-sigma", "0.3")):
+        folder = tmp_path / f"export{len(more)}"
+        command = ["export", out, "--to", "tum", "--out", folder, "--gps", table, *more]
+        done = CliRunner().invoke(app, [str(part) for part in command])
+        assert done.exit_code == 0, done.stderr
+        said = json.loads((folder / "transform.json").read_text())
+        assert (said["unit"], said["up"]) == ("m", "z")
+        claims.append(said["grounds"]["gps"]["scale_sigma"])
+    assert claims[1] < 0.2 * claims[0]
     again = case.refine(out, _with_gps(table))
     assert computed_stages(again) == []
     other = case.refine(out, _with_gps(_table(tmp_path / "other.csv", case, 30.0, seed=1)))
