@@ -16,13 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from gsba.containers.insta360 import read_trailer
+from gsba.containers.telemetry import ask_telemetry_parser
 from gsba.frames.times import read_lines
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError, brief
 
 _TABLES = (".csv", ".txt", ".tsv", ".dat")
-_EXTRA = "gsba[imu]"
-_PANIC = "PanicException"  # of libraries in Rust: no Exception, and nowhere to import it from
 _FASTEST = 40.0  # rad/s: gyros end at 35, which are 2000 deg/s
 _SLOWEST = 25.0  # readings per second: less say nothing of the 10 to 30 ms of a readout
 _LEAST = 10  # readings
@@ -88,19 +87,8 @@ def _by_telemetry_parser(path: Path) -> Readings:
     Raises:
         GsbaError: the library is not installed, or finds no readings.
     """
-    try:
-        from telemetry_parser import Parser  # type: ignore[import-not-found]
-    except ImportError:
-        raise GsbaError(
-            f"{path}: its gyro is read by telemetry-parser: pip install '{_EXTRA}', or give a "
-            "table (t, gyro x y z, accelerometer x y z)"
-        ) from None
-    try:
-        rows = Parser(str(path)).normalized_imu()
-    except BaseException as error:
-        if not isinstance(error, OSError | ValueError) and type(error).__name__ != _PANIC:
-            raise
-        raise GsbaError(f"{path}: telemetry-parser finds no gyro in it ({error})") from None
+    table = "a table (t, gyro x y z, accelerometer x y z)"
+    rows = ask_telemetry_parser(path, "normalized_imu", "gyro", table)
     rows = [row for row in rows if row.get("gyro") is not None]
     times = np.array([1e-3 * row["timestamp_ms"] for row in rows], np.float64)
     rates = np.array([row["gyro"] for row in rows], np.float64).reshape(-1, 3) * _DEGREE

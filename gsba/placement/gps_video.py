@@ -5,7 +5,7 @@ GPMF packets of about a second hold fixes as GPS5 (up to HERO10 and MAX, with on
 of the receiver) or as GPS9 (later, with one for each fix): see github.com/gopro/gpmf-parser.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,11 @@ import numpy as np
 
 from gsba.config import GpsSettings
 from gsba.containers.insta360 import GpsRecord, read_trailer
+from gsba.containers.telemetry import ask_telemetry_parser
 from gsba.log import GsbaError
 from gsba.placement.gps import GpsFixes, fixes_of, sigmas_of
 
 _RECORDINGS = (".360", ".insv", ".lrv", ".mov", ".mp4", ".osv")
-_EXTRA = "gsba[imu]"
-_PANIC = "PanicException"  # of libraries in Rust: no Exception, and nowhere to import it from
 _FIX, _DOP, _UTC = "0x47505346", "0x47505350", "0x47505355"  # GPSF, GPSP (DOP * 100), GPSU (ms)
 _GPS9 = "0x47505339"
 _GPS9_HEADER = 8  # bytes of key, type, size and repeat before its records
@@ -74,7 +73,8 @@ def _of_gopro(path: Path, settings: GpsSettings | None) -> GpsFixes:
     Raises:
         GsbaError: the library is not installed, or finds no positions.
     """
-    packets = [packet for packet in map(_packet, _samples(path)) if packet is not None]
+    groups = ask_telemetry_parser(path, "telemetry", "GPS", "a CSV or GPX file")
+    packets = [packet for packet in map(_packet, groups) if packet is not None]
     if not packets:
         raise GsbaError(
             f"{path}: telemetry-parser finds no GPS in it; give positions as CSV or GPX"
@@ -100,23 +100,6 @@ def _of_gopro(path: Path, settings: GpsSettings | None) -> GpsFixes:
     settings, rows, times = settings or GpsSettings(), rows[locked], times[locked]
     geodetic = np.where(np.arange(3) < np.where(rows[:, 4:] >= _FULL, 3, 2), rows[:, :3], np.nan)
     return fixes_of(times, geodetic, sigmas_of(settings, rows[:, 3]), settings)
-
-
-def _samples(path: Path) -> Sequence[Mapping[str, Mapping[str, Any]]]:
-    """Groups of tags of each packet."""
-    try:
-        from telemetry_parser import Parser  # type: ignore[import-not-found]
-    except ImportError:
-        raise GsbaError(
-            f"{path}: its GPS is read by telemetry-parser: pip install '{_EXTRA}', or give a CSV "
-            "or GPX file"
-        ) from None
-    try:
-        return Parser(str(path)).telemetry()
-    except BaseException as error:
-        if not isinstance(error, OSError | ValueError) and type(error).__name__ != _PANIC:
-            raise
-        raise GsbaError(f"{path}: telemetry-parser finds no GPS in it ({error})") from None
 
 
 def _packet(groups: Mapping[str, Mapping[str, Any]]) -> tuple[float, np.ndarray] | None:
