@@ -1,10 +1,11 @@
-"""GPS fixes of tables, tracks, tags and GoPro videos, with the noise that these state."""
+"""GPS fixes of tables, tracks, tags and videos, with the noise that these state."""
 
 import struct
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import insta360_files
 import numpy as np
 import pytest
 from PIL import Image
@@ -14,6 +15,7 @@ from gsba.config import GpsSettings
 from gsba.log import GsbaError
 from gsba.placement import fixes_of, fixes_of_frames, read_fixes, read_gps
 from gsba.placement.exif import read_exif_gps
+from gsba.placement.gps_video import read_video_gps
 from gsba.types import FrameSet
 
 LEAST = [3.0, 3.0, 5.0]
@@ -215,3 +217,20 @@ def test_videos_without_fixes_are_one_line(tmp_path: Path) -> None:
         with pytest.raises(GsbaError, match=r"cut\.mp4: ") as failure:
             read_fixes(str(tmp_path / "cut.mp4"))
         assert "\n" not in str(failure.value)
+
+
+def test_fixes_of_insta360_are_on_the_clock_of_the_video(tmp_path: Path) -> None:
+    """Since the recording was created; since the first fix where the camera's date is wrong."""
+    path = tmp_path / "VID_20240101_120000_00_001.insv"
+    fixes = b"".join(insta360_files.fix(1_700_000_004 + n, -10.5, 20.25) for n in range(3))
+    for created, begins in ((1_700_000_000, 4.25), (1_400_000_000, 0.0)):
+        metadata = insta360_files.metadata(f7=created)
+        records = ((0, insta360_files.GPS, fixes), (1, insta360_files.METADATA, metadata))
+        path.write_bytes(b"pictures" + insta360_files.trailer(records))
+        found = read_video_gps(path)
+        assert found.timestamps is not None
+        np.testing.assert_allclose(found.timestamps, begins + np.arange(3))
+        np.testing.assert_allclose(found.geodetic, [[-10.5, 20.25, 12.0]] * 3)
+    path.write_bytes(b"pictures" + insta360_files.trailer(records[1:]))
+    with pytest.raises(GsbaError, match="holds no GPS"):
+        read_video_gps(path)
