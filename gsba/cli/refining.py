@@ -62,6 +62,14 @@ Camera = Annotated[
 Calibration = Annotated[
     Path | None, typer.Option(help="Of the lenses of raw fisheyes.", metavar="FILE")
 ]
+Circle = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Image circle of raw fisheyes where none is found: centre and radius, pixels of one "
+        "lens's picture. Repeatable: front, then back; one value is for both.",
+        metavar="X,Y,R",
+    ),
+]
 Imu = Annotated[
     Path | None,
     typer.Option(
@@ -116,6 +124,7 @@ def refine(
     ] = None,
     camera: Camera = None,
     calibration: Calibration = None,
+    circle: Circle = None,
     imu: Imu = None,
     fps: Annotated[
         float | None,
@@ -145,6 +154,7 @@ def refine(
         from gsba.store.cluster import connected
     given = {"keyframes": keyframes, "segment": segment, "timestamps": timestamps, "fps": fps}
     given |= {"masks": masks or "auto", "calibration": calibration, "imu": imu, "fresh": fresh}
+    given["circles"] = [_circle(text) for text in circle or ()]
     with connected(cluster) as client:
         result = pipeline.refine(frames, trajectory, out, settings, client=client, **given)
     _conclude([result], allow_partial)
@@ -256,6 +266,17 @@ def show_config(
     from gsba.config_file import to_toml
 
     typer.echo(to_toml(_settings(config, overrides, factors)), nl=False)
+
+
+def _circle(text: str) -> tuple[float, float, float]:
+    """Centre and radius of `--circle X,Y,R`."""
+    try:
+        x, y, radius = (float(part) for part in text.split(","))
+    except ValueError:
+        raise GsbaError(
+            f"--circle {text}: give X,Y,R: a centre and a radius, three numbers with commas between"
+        ) from None
+    return x, y, radius
 
 
 def _networks(weights: list[Path] | None, accept_noncommercial: bool, download: bool) -> list[str]:

@@ -68,6 +68,7 @@ def refine(
     timestamps: Path | None = None,
     fps: float | None = None,
     calibration: Path | None = None,
+    circles: Sequence[tuple[float, float, float]] = (),
     imu: Path | None = None,
     fresh: bool = False,
     extra_factors: ExtraFactors | None = None,
@@ -89,6 +90,8 @@ def refine(
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
+        circles: image circles of raw fisheyes where none are found: x and y of the centre and
+            radius, pixels of one lens's picture; of the front and the back lens, or one of both.
         imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
         fresh: forget an earlier run in `out`.
         extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
@@ -98,6 +101,7 @@ def refine(
         GsbaError: an input or setting that cannot be used.
     """
     frames, out = Path(frames), Path(out)
+    given_circles = inputs.given_circles(circles, calibration)
     settings = inputs.with_baseline(settings or RefineSettings(), calibration)
     check(settings.placement, baseline=settings.camera.baseline())
     chosen = merging.choose(masks, segment)
@@ -107,7 +111,8 @@ def refine(
     if video.is_video(frames):
         inputs.extract_frames(out, origin, settings, fps, fresh)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
-    frame_set = scan(frames, timestamps, fps, chosen.given, not given, calibration)
+    untimed = not given
+    frame_set = scan(frames, timestamps, fps, chosen.given, untimed, calibration, given_circles)
     check(settings.placement, frame_set, settings.camera.baseline())
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:

@@ -13,7 +13,7 @@ from two_fisheyes import BEHIND, HALF_FOV, colours, made_pair, picture, turned, 
 from gsba.camera.calibration import calibration_json
 from gsba.camera.fisheye import Pair, rotation_of
 from gsba.frames.pixels import load_erp
-from gsba.frames.raw_pairs import two_circles
+from gsba.frames.side_by_side import two_circles
 from gsba.frames.scan import find_panoramas, scan
 from gsba.log import GsbaError
 from gsba.types import FACES, Fisheye
