@@ -79,6 +79,7 @@ class FrameSet:
     )
     fisheyes: tuple[Fisheye, Fisheye] | None = None  # front and back, by which panoramas are cut
     # out of "fisheye" frames
+    lenses_nominal: bool = False  # whether no calibration says so: plain lenses in image circles
 
     def __post_init__(self) -> None:
         for name in self.names:

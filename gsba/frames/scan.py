@@ -104,6 +104,7 @@ def scan(
         mask_paths=find_masks(masks, names, erp_size),
         timed=timed,
         fisheyes=fisheyes,
+        lenses_nominal=fisheyes is not None and calibration is None,
     )
 
 

@@ -152,7 +152,8 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
                 return run, seen, believed, world
             run.store.stage(name, known, lambda found=better: found, _Cut, after)
         n, (fisheyes, found) = n + 1, better
-        frames, again = replace(frames, fisheyes=fisheyes), Journal(dict(counts))
+        again = Journal(dict(counts))
+        frames = replace(frames, fisheyes=fisheyes, lenses_nominal=False)
         frames = merging.recut(run.store, frames, n)
         settings, extra = run.settings, run.extra_factors
         run = Run.begin(run.store, frames, prior.coarse, settings, extra, again, found, run.imu)

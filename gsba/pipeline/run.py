@@ -91,7 +91,7 @@ class Run:
         start = coarse.world_T_rigs.tolist(), settings.read
         inputs = [fingerprint(paths), frames.timestamps.tolist(), frames.timed, *start]
         if frames.fisheyes is not None:
-            inputs += [*map(asdict, frames.fisheyes), lenses_found]
+            inputs += [*map(asdict, frames.fisheyes), lenses_found, frames.lenses_nominal]
         chain.stage("frames", inputs, lambda: frames, FrameSet)
         return cls(
             store=store,
