@@ -79,7 +79,8 @@ class FrameSet:
     )
     fisheyes: tuple[Fisheye, Fisheye] | None = None  # front and back, by which panoramas are cut
     # out of "fisheye" frames
-    lenses_nominal: bool = False  # whether no calibration says so: plain lenses in image circles
+    lenses_nominal: bool = False  # whether these are but a start: plain lenses in image circles, or
+    # a calibration that pictures contradict
 
     def __post_init__(self) -> None:
         for name in self.names:

@@ -6,14 +6,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.calibration import fitted, read_calibration
-from gsba.camera.fisheye import Pair, project
+from gsba.camera.fisheye import Pair
 from gsba.frames.files import decode, image_size, is_image
 from gsba.frames.image_circles import CircleSearch, ImageCircle, find_circle
+from gsba.frames.lens_overlap import measure_overlap, scaled
 from gsba.frames.side_by_side import cut
 from gsba.log import GsbaError
 from gsba.types import FACES, Fisheye
@@ -25,9 +25,10 @@ _HALF_FOV = np.deg2rad(100.0)  # of the circle that a fisheye of unknown make fi
 _LOOKS = 8  # frames that show the image circles
 _BEHIND = np.diag([-1.0, 1.0, -1.0])  # rig_R_lens of an upright back lens
 _TURNS = [Rotation.from_euler("z", turn).as_matrix() for turn in np.deg2rad([0, 90, 180, 270])]
-_OVERLAP = np.deg2rad(4.0)  # either way of the rim, which both lenses show
-_AROUND, _ACROSS = 720, 9  # places at which they are compared
-_CLEARLY = 0.1  # by how much more alike the right turn makes them than any other
+_CONTRADICTED = (
+    0.025  # of focal lengths: a calibration that is this far off is not of the pictures;
+)
+# near things may tell one or two percent where there is none
 
 Found = dict[str, tuple[Path, Path]]  # frame -> picture of the front lens, of the back lens
 
@@ -162,8 +163,8 @@ def lenses_of(
     size: tuple[int, int],
     calibration: Path | None,
     circles: Sequence[ImageCircle] = (),
-) -> Pair:
-    """What the lenses of raw pairs are: by a calibration file, or of the circles that they show.
+) -> tuple[Pair, bool]:
+    """What the lenses of raw pairs are at first: by a calibration, or of the circles they show.
 
     Args:
         folder: that the pictures are in.
@@ -172,33 +173,75 @@ def lenses_of(
         calibration: file; None = there is none.
         circles: image circles of the front and the back lens, or one of both; none = found.
 
+    Returns:
+        the lenses, and whether they are to be estimated: plain ones of unknown make, or of a
+        calibration that the pictures contradict.
+
     Raises:
         GsbaError: a calibration of other pictures, circles outside of the pictures, or pictures
             that show no circle.
     """
-    if calibration is not None:
-        return fitted(read_calibration(calibration), size, calibration)
     rows = np.unique(np.linspace(0, len(pairs) - 1, _LOOKS).astype(int))
+    if calibration is not None:
+        known = fitted(read_calibration(calibration), size, calibration)
+        return _checked(folder, known, [pairs[f] for f in rows], size, calibration)
     looks = [decode_pair(pairs[f], size, gray=True) for f in rows]
     front_circle, back_circle = _given(circles, size) or _found(folder, pairs[0], looks)
     front = _nominal(size, front_circle, np.eye(3))
     behind = [_nominal(size, back_circle, _BEHIND @ turn) for turn in _TURNS]
-    back, clearly = _continued(looks, front, behind)
-    if not clearly:
+    radii = front_circle.radius, back_circle.radius
+    overlap = measure_overlap(looks, front, behind, radii)
+    if not overlap.turn_is_clear:
         raise GsbaError(
             f"{folder}: raw fisheyes of unknown lenses, and what both show at their rims does not "
             "tell how one is turned against the other: give --calibration FILE"
         )
+    scale = overlap.scale or 1.0
+    off = max(front_circle.sigma, back_circle.sigma)
     _log.warning(
         "%s: raw fisheyes of unknown lenses, taken for %.0f degrees in circles of %.0f and %.0f "
-        "pixels (%s): --calibration FILE says better",
+        "pixels (circles %s%s): --calibration FILE says better",
         folder,
-        np.rad2deg(2 * _HALF_FOV),
-        2 * front_circle.radius,
-        2 * back_circle.radius,
-        "given" if circles else f"found to {max(front_circle.sigma, back_circle.sigma):.1f} pixels",
+        np.rad2deg(2 * _HALF_FOV) / scale,
+        *(2 * radius for radius in radii),
+        "given" if circles else f"found to {off:.1f} pixels",
+        "" if overlap.scale is None else "; degrees by what both lenses show at the seam",
     )
-    return front, back
+    return scaled((front, behind[overlap.turn]), scale), True
+
+
+def _checked(
+    folder: Path,
+    pair: Pair,
+    chosen: Sequence[Sequence[Path]],
+    size: tuple[int, int],
+    calibration: Path,
+) -> tuple[Pair, bool]:
+    """Calibrated lenses, and whether pictures contradict them: then with focal lengths that fit.
+
+    Args:
+        chosen: files of some frames, as for `decode_pair`.
+    """
+    try:
+        looks = [decode_pair(paths, size, gray=True) for paths in chosen]
+    except GsbaError:  # said when the picture is used
+        return pair, False
+    circles = [find_circle(pictures).circle for pictures in zip(*looks, strict=True)]
+    if circles[0] is None or circles[1] is None:
+        return pair, False
+    overlap = measure_overlap(looks, pair[0], [pair[1]], (circles[0].radius, circles[1].radius))
+    scale = overlap.scale or 1.0
+    if abs(scale - 1) < _CONTRADICTED:
+        return pair, False
+    _log.warning(
+        "%s: %s does not fit these pictures: both lenses show the same at the seam with focal "
+        "lengths %.1f %% %s, so they are taken for that and estimated",
+        folder,
+        calibration.name,
+        100 * abs(scale - 1),
+        "longer" if scale > 1 else "shorter",
+    )
+    return scaled(pair, scale), True
 
 
 def _given(
@@ -292,43 +335,3 @@ def _nominal(size: tuple[int, int], circle: ImageCircle, rig_R_lens: np.ndarray)
     a, b, c = (float(v) for v in Rotation.from_matrix(rig_R_lens).as_rotvec())
     focal, none = circle.radius / float(_HALF_FOV), (0.0, 0.0, 0.0, 0.0)
     return Fisheye(*size, focal, (circle.x, circle.y), none, (a, b, c))
-
-
-def _continued(
-    looks: Sequence[Sequence[np.ndarray]], front: Fisheye, behind: list[Fisheye]
-) -> tuple[Fisheye, bool]:
-    """The one of several back lenses whose pictures go on where the front one's end, and whether it
-    is clearly that one.
-
-    Args:
-        looks: (h, w) uint8 pictures of both, of each of several frames.
-    """
-    longitudes = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
-    angles = np.pi / 2 + np.linspace(-_OVERLAP, _OVERLAP, _ACROSS)[:, None]
-    ring = np.stack(
-        [
-            np.sin(angles) * np.cos(longitudes),
-            np.sin(angles) * np.sin(longitudes),
-            np.cos(angles) * np.ones_like(longitudes),
-        ],
-        axis=-1,
-    )
-    ahead = [_seen(pictures[0], front, ring) for pictures in looks]
-    scores = [
-        np.mean([_alike(a, _seen(p[1], lens, ring)) for a, p in zip(ahead, looks, strict=True)])
-        for lens in behind
-    ]
-    order = np.argsort(scores)[::-1]
-    return behind[int(order[0])], bool(scores[order[0]] > scores[order[1]] + _CLEARLY)
-
-
-def _seen(picture: np.ndarray, lens: Fisheye, directions: np.ndarray) -> np.ndarray:
-    places = (project(lens, directions) - 0.5).astype(np.float32)
-    blurred = cv2.GaussianBlur(picture, (0, 0), lens.focal / _AROUND * np.pi)
-    return cv2.remap(blurred, places[..., 0], places[..., 1], cv2.INTER_LINEAR).astype(np.float64)
-
-
-def _alike(one: np.ndarray, other: np.ndarray) -> float:
-    """Correlation of two pictures."""
-    a, b = one - one.mean(), other - other.mean()
-    return float(np.sum(a * b) / np.sqrt(max(np.sum(a * a) * np.sum(b * b), 1e-12)))

@@ -89,7 +89,7 @@ def scan(
         if found_size is not None:
             layout, lens_size = "fisheye", found_size
             paths = tuple((path, path) for path in images)
-    fisheyes = _lenses(Path(folder), layout, paths, lens_size, calibration, circles)
+    fisheyes, nominal = _lenses(Path(folder), layout, paths, lens_size, calibration, circles)
     if fisheyes is not None:
         width, height = width_of(fisheyes), width_of(fisheyes) // 2
     erp_size = None if layout == "cube" else (width, height)
@@ -104,7 +104,7 @@ def scan(
         mask_paths=find_masks(masks, names, erp_size),
         timed=timed,
         fisheyes=fisheyes,
-        lenses_nominal=fisheyes is not None and calibration is None,
+        lenses_nominal=nominal,
     )
 
 
@@ -170,8 +170,8 @@ def _lenses(
     size: tuple[int, int],
     calibration: Path | None,
     circles: Sequence[ImageCircle],
-) -> Pair | None:
-    """What the lenses of raw fisheyes are; None = there are none."""
+) -> tuple[Pair | None, bool]:
+    """What the lenses of raw fisheyes are, None = there are none, and whether to estimate them."""
     if layout == "fisheye":
         return lenses_of(folder, paths, size, calibration, circles)
     held = "cube faces" if layout == "cube" else "panoramas"
@@ -182,7 +182,7 @@ def _lenses(
         )
     if circles:
         raise GsbaError(f"{folder}: holds {held}, but --circle is for raw fisheyes: leave it out")
-    return None
+    return None, False
 
 
 def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:

@@ -139,17 +139,24 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
     known = [run.settings.model_dump(exclude={"export", "placement"}), run.custom]
     known += [] if run.imu is None else [run.imu.digest]
     counts, frames = dict(run.journal.counts), run.frames
-    n = 0
+    n, best = 0, None  # the pass before: what it rests on, steps without matches, its result
     while True:
         name, after, better = f"recalibrated{n}", run.chain.latest, None
-        if frames.fisheyes is not None:
+        kept = run.store.stored(f"{name}_undone", known, bool, after)
+        if frames.fisheyes is not None and not kept:
             better = run.store.stored(name, known, _Cut, after)
         if better is None:
             seen = frontend.extract(run)
             believed, world = solve(run, seen, prior, given)
-            better = None if n == _PASSES - 1 else _cut_better(prior.coarse, world)
+            unseen = int(believed.trust.unseen_steps.sum())
+            if best is not None and unseen > best[1]:
+                logger.info("frames cut anew match at fewer steps: the pass before is kept")
+                run.store.stage(f"recalibrated{n - 1}_undone", known, lambda: True, bool, best[0])
+                return best[2]
+            best = after, unseen, (run, seen, believed, world)
+            better = None if kept or n == _PASSES - 1 else _cut_better(prior.coarse, world)
             if better is None:
-                return run, seen, believed, world
+                return best[2]
             run.store.stage(name, known, lambda found=better: found, _Cut, after)
         n, (fisheyes, found) = n + 1, better
         again = Journal(dict(counts))
