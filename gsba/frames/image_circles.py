@@ -33,9 +33,10 @@ _BORDER = 1.5  # pixels at the picture's border that show no edge
 _MIN_SUPPORT = 0.5  # share of the visible rim on which an edge must lie
 _MIN_RAYS = 54  # that must agree
 _INNER = 0.75, 0.97  # radii of a circle within a housing's, parts of the outer one
-_CONCENTRIC = 0.08  # distance of their centres, part of the radius
+_CONCENTRIC = 0.03  # distance of their centres, part of the radius
 _INNER_SCORE = 0.4  # of a circle within a housing's, part of the outer one's
 _PLAIN = 0.6  # contrast of a housing, part of that of the scene within
+_TEXTURE_BLUR, _TEXTURE_PARTS = 1.5, 12  # pixels; of a circle, whose mean is taken off
 _RAYS_PER_WITNESS = 8  # neighbouring rays have the same error
 
 
@@ -94,7 +95,7 @@ def find_circle(pictures: Sequence[np.ndarray]) -> CircleSearch:
     small = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in pictures]
     median = np.median(small, axis=0).astype(np.float32)
     smooth = cv2.GaussianBlur(median, (0, 0), _BLUR)
-    best, num_rays = _best_circle(_edges(smooth), np.log(smooth + _DARK_OFFSET))
+    best, num_rays = _best_circle(_edges(smooth), small)
     if best is not None:
         best = best.scaled(width / size[0])
     found = best is not None and best.support >= _MIN_SUPPORT and num_rays >= _MIN_RAYS
@@ -155,9 +156,9 @@ def _half_level(profile: np.ndarray) -> float:
     return before + float((profile[before] - level) / step) if step > 0 else len(profile) / 2
 
 
-def _best_circle(edges: _Edges, logs: np.ndarray) -> tuple[ImageCircle | None, int]:
+def _best_circle(edges: _Edges, pictures: Sequence[np.ndarray]) -> tuple[ImageCircle | None, int]:
     """The circle that most rays agree with, and how many do; of a scene within a housing, its."""
-    height, width = logs.shape
+    height, width = pictures[0].shape
     circles = _trials(edges.places, width, height)
     if not len(circles):
         return None, 0
@@ -177,7 +178,7 @@ def _best_circle(edges: _Edges, logs: np.ndarray) -> tuple[ImageCircle | None, i
         inner = circles[int(np.argmax(np.where(within, scores, -1.0)))]
         between = outer - 0.5 * (outer - inner)
         scene = inner * np.array([1.0, 1.0, 0.93])
-        if _contrast(logs, between) < _PLAIN * _contrast(logs, scene):
+        if _contrast(pictures, between) < _PLAIN * _contrast(pictures, scene):
             outer = inner
     return _refined(edges, outer, width, height)
 
@@ -244,17 +245,25 @@ def _sigma(away: np.ndarray, residuals: np.ndarray) -> float:
     return float(np.sqrt(np.diag(covariance).max()))
 
 
-def _contrast(logs: np.ndarray, circle: np.ndarray) -> float:
-    """Mean difference of neighbouring pixels along a circle (3,), where the picture shows it."""
+def _contrast(pictures: Sequence[np.ndarray], circle: np.ndarray) -> float:
+    """Relative contrast of fine structure along a circle (3,), where pictures show it.
+
+    Single pictures tell: their median has lost most of a scene that moves.
+    """
     x, y, radius = circle
     angles = np.arange(0, 2 * np.pi, 1.0 / radius)
     across, down = x + radius * np.cos(angles), y + radius * np.sin(angles)
-    height, width = logs.shape
+    height, width = pictures[0].shape
     inside = (across > _BORDER) & (across < width - _BORDER)
     inside &= (down > _BORDER) & (down < height - _BORDER)
-    values = _sampled(logs, across[None], down[None])[0]
-    steps = np.abs(np.diff(values))[inside[1:] & inside[:-1]]
-    return float(np.mean(steps)) if len(steps) else 0.0
+    if not inside.any():
+        return 0.0
+    smooth = [cv2.GaussianBlur(picture, (0, 0), _TEXTURE_BLUR) for picture in pictures]
+    values = np.stack([_sampled(one, across[None], down[None])[0] for one in smooth])
+    length = max(len(angles) // _TEXTURE_PARTS, 3)
+    fine = values - cv2.blur(values, (length, 1), borderType=cv2.BORDER_REFLECT)
+    relative = np.abs(fine) / (values + _DARK_OFFSET)
+    return float(np.median(relative[:, inside]))  # flare is no scene
 
 
 def _sampled(picture: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ _OVERLAP = np.deg2rad(np.arange(-4.0, 4.5, 1.0))  # from the seam
 _SCALES = 100.0 / np.arange(90.0, 112.25, 0.5)[::-1]  # of focal lengths: circles of 90 to 112
 # degrees from the axis, where they are taken for 100
 _INSIDE = 0.985  # part of a circle's radius: what lies further out is its dark rim
-_MIN_ROWS = 3  # of _OVERLAP
+_MIN_ROWS = 5  # of _OVERLAP
 _LOW = 3  # harmonics around the seam below this one are sky and ground at any focal length
 _TURN_MARGIN = 0.1  # by which the right turn must correlate better than any other
 _MIN_PEAK = 0.25  # correlation at the right focal length
