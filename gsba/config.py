@@ -497,6 +497,21 @@ class RefineSettings(_Settings):
         camera = self.camera.model_copy(update={"name": None, "readout_ms": None})
         return self.model_copy(update={"camera": camera})
 
+    def with_gates(self, scale: float) -> "RefineSettings":
+        """The same with gates of matching a number of times as wide, for lenses that are not known
+        as well as these gates ask for."""
+        verify = {"max_error_deg": scale * self.verify.max_error_deg}
+        refined = {"rotation_deg": scale * self.pairs.refined.rotation_deg}
+        pairs = {
+            "point_deg": scale * self.pairs.point_deg,
+            "refined": self.pairs.refined.model_copy(update=refined),
+        }
+        sections = {
+            "verify": self.verify.model_copy(update=verify),
+            "pairs": self.pairs.model_copy(update=pairs),
+        }
+        return self.model_copy(update=sections)
+
     def plainer(self) -> "RefineSettings":
         """For a first solution: features alone, without patches, pixels or splats."""
         unaligned = self.patches.model_copy(update={"rounds": 0})

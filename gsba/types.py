@@ -82,6 +82,10 @@ class FrameSet:
     # out of "fisheye" frames
     tracks: tuple[int, int] | None = None  # width and height, pixels, of either image of "eac"
     # frames; None = of another layout
+    lenses_nominal: bool = (
+        False  # whether these are but a start: plain lenses in image circles, the
+    )
+    # maker's calibration of another day, or a calibration that pictures contradict
 
     def __post_init__(self) -> None:
         for name in self.names:

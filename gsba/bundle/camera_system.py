@@ -279,7 +279,8 @@ def _linearized(given: CameraSystem) -> _Camera:
     off = None
     if lenses.fisheyes is not None:
         off = self_calibration.from_calibrated(lenses)
-        shared += _of_lenses(self_calibration.by_lenses(bearings, directions, lenses))
+        by_lenses = self_calibration.by_lenses(bearings, directions, lenses, seen.residuals)
+        shared += _of_lenses(by_lenses)
     if lenses.twists is not None:
         velocities = _velocities(given)
         times = lenses.fractions(directions, frames)[:, None, None]

@@ -59,7 +59,7 @@ def guess(
     frames = keypoints.frames()
     tried = [replace(so_far, axes=axes) for axes in _candidates(solved.world_T_rigs)]
 
-    def by_centres(rows: np.ndarray, by_start: np.ndarray) -> np.ndarray:
+    def by_centres(rows: np.ndarray, by_start: np.ndarray, _: np.ndarray) -> np.ndarray:
         columns = []
         for under in tried:
             of = keypoints.bearings_rig[rows], frames[rows]

@@ -12,7 +12,14 @@ import numpy as np
 
 from factors.bearing import tangent_basis
 from gsba.bundle.adjustment import Problem
-from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of, predicts, summed
+from gsba.bundle.shared_parameters import (
+    PARTS,
+    SharedModel,
+    models_of,
+    predicts,
+    summed,
+    whole_model_of,
+)
 from gsba.camera.lens import Lenses
 from gsba.types import Counts, Keypoints, Landmarks, Solution
 
@@ -69,18 +76,21 @@ def estimate(
     chosen = problem.settings.camera
     frames = keypoints.frames()
 
-    def by_centre(rows: np.ndarray, by_origin: np.ndarray) -> np.ndarray:
+    def by_centre(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
         return so_far.by_centre(by_origin, keypoints.bearings_rig[rows], frames[rows])
 
     systems, counts = models_of(landmarks, _MOST, keypoints, solved, problem, by_centre)
-    if not systems:
+    whole = None
+    if not systems and so_far.cut_by is not None:  # raw pairs are of two, also where frames are few
+        whole = whole_model_of(landmarks, _MOST, keypoints, solved, problem, by_centre)
+    if not systems and whole is None:
         unknown, nothing = np.full((3, 3), np.nan), np.full(PARTS, np.nan)
         why = "too few points to tell one lens from the other"
         return LensCentres(so_far, so_far.centre, unknown, nothing, why, counts)
-    total = summed(systems)
+    total = whole or summed(systems)
     damping = 1e-9 * np.trace(total.hessian) * np.eye(3)
     covariance = np.linalg.inv(total.hessian + damping) / total.curvature
-    found = so_far.centre + _step(systems)
+    found = so_far.centre + _step([total])
     around = [part.around(so_far.centre) for part in systems]  # as if there were one centre
     gains = np.array(
         [
@@ -88,7 +98,7 @@ def estimate(
             for p, part in enumerate(around)
         ]
     )
-    shares = gains / np.array([part.cost for part in around])
+    shares = gains / np.array([part.cost for part in around]) if systems else np.full(PARTS, np.nan)
     strength = float(np.sqrt(found @ np.linalg.solve(covariance, found)))
     reason = ""
     if chosen.model == "auto" and so_far.cut_by is None:  # raw pairs are of two
@@ -98,8 +108,10 @@ def estimate(
         elif strength < (_SIGNIFICANT if so_far else _ON_TRIAL):
             reason = f"one centre is as likely: {strength:.1f} standard deviations"
     where, untaken = np.array2string(found, precision=5), reason and f"; not taken: {reason}"
-    gained = 100 * float(shares.mean())
-    logger.info("lens centres: %s, %.1f %% of unseen parts' cost%s", where, gained, untaken)
+    gained = (
+        f"{100 * float(shares.mean()):.1f} % of unseen parts' cost" if systems else "few frames"
+    )
+    logger.info("lens centres: %s, %s%s", where, gained, untaken)
     taken = replace(so_far, centre=np.zeros(3) if reason else found)
     return LensCentres(taken, found, covariance, shares, reason, counts)
 
@@ -138,7 +150,7 @@ def stitched_for(
         return StitchRadius(replace(so_far, nearness=said), said, 0.0, unknown, reason)
     frames = keypoints.frames()
 
-    def by_both(rows: np.ndarray, by_origin: np.ndarray) -> np.ndarray:
+    def by_both(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
         directions, there = shown[rows], frames[rows]
         starts = so_far.origins(directions, there)
         by_near = by_nearness(keypoints.bearings_rig[rows], starts)

@@ -70,7 +70,7 @@ def estimate(
     ways, frames = _ways(problem.settings.camera, lenses), keypoints.frames()
     times = np.stack([lenses.fractions(shown, frames, way) for way in ways], axis=1)
 
-    def by_duration(rows: np.ndarray, by_origin: np.ndarray) -> np.ndarray:
+    def by_duration(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
         moving = motion[frames[rows], 3:]
         if offsets is not None:  # a turning ray's point moves as if it were carried along
             moving = moving + np.cross(motion[frames[rows], :3], offsets[rows])

@@ -1,8 +1,10 @@
 """What the lenses of raw pairs are: focal lengths, distortion, and how the back one is turned.
 
-Found from a map as other parameters that all frames share, beside the lenses' centre, and believed
-where every part of the sequence gains by what the others give. The front lens's axes are the rig's,
-as it was calibrated: a turn of both is one of the poses.
+Found from a map as other parameters that all frames share, beside the lenses' centre. What differs
+from a calibration is believed where every part of the sequence gains by what the others give. Plain
+lenses of unknown make are only a start, with priors as wide as such lenses differ: what is found is
+taken where observations determine the focal lengths, in short sequences too. The front lens's axes
+are the rig's, as it was calibrated: a turn of both is one of the poses.
 """
 
 import logging
@@ -18,6 +20,7 @@ from gsba.bundle.shared_parameters import (
     models_of,
     predicts,
     summed,
+    whole_model_of,
 )
 from gsba.camera.fisheye import PARAMETERS, Pair, by_parameters, changed, difference, recalibrated
 from gsba.camera.lens import Lenses, facing
@@ -33,6 +36,13 @@ FREE = OF_FRONT + OF_BACK
 _SIGMAS = np.array([0.05, 0.02, 0.02, 0.05, 0.02, 0.005, 0.001, 0.03, 0.03, 0.03])  # of a lens
 SPREAD = np.concatenate([_SIGMAS[:OF_FRONT], _SIGMAS])  # (FREE,) standard deviations: how far
 # lenses may be from what they were calibrated as, or from plain ones
+_DETERMINED = 0.5  # of such a standard deviation, at most, that remains of what is determined
+_GROUPS = {
+    "focal lengths": [0, OF_FRONT],
+    "principal points": [1, 2, OF_FRONT + 1, OF_FRONT + 2],
+    "radial terms": [*range(3, OF_FRONT), *range(OF_FRONT + 3, FREE - _TURN)],
+    "the back lens's turn": [*range(FREE - _TURN, FREE)],
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +54,7 @@ class SelfCalibration:
     # sequence that what other parts give takes off, beside centres alone
     reason: str  # why none was taken; empty if one was
     counts: Counts  # of observations
+    undetermined: tuple[str, ...] = ()  # what observations hardly tell more of than priors
 
 
 def estimate(
@@ -53,6 +64,7 @@ def estimate(
     solved: Solution,
     so_far: Lenses,
     problem: Problem,
+    nominal: bool = False,
 ) -> SelfCalibration:
     """Find what lenses are from a map, poses, points and their centre adjusted with them.
 
@@ -63,18 +75,24 @@ def estimate(
         solved: the map's poses, solved under these, and the noise of its observations.
         so_far: lenses of raw pairs.
         problem: priors, loss, settings.
+        nominal: whether the lenses so far are plain ones of unknown make, not calibrated.
     """
     frames = keypoints.frames()
 
-    def by_both(rows: np.ndarray, by_origin: np.ndarray) -> np.ndarray:
-        own = by_lenses(keypoints.bearings_rig[rows], shown[rows], so_far)
+    def by_both(rows: np.ndarray, by_origin: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+        own = by_lenses(keypoints.bearings_rig[rows], shown[rows], so_far, residuals)
         return np.concatenate([own, so_far.by_centre(by_origin, shown[rows], frames[rows])], axis=2)
 
     systems, counts = models_of(landmarks, _MOST, keypoints, solved, problem, by_both)
+    off = from_calibrated(so_far)
+    if nominal:
+        whole = summed(systems) if systems else None
+        whole = whole or whole_model_of(landmarks, _MOST, keypoints, solved, problem, by_both)
+        if whole is not None:
+            return _of_nominal(whole, so_far, off, counts)
     if not systems:
         why = "too few points to tell what lenses are"
         return SelfCalibration(so_far, np.full(PARTS, np.nan), why, counts)
-    off = from_calibrated(so_far)
     gains = []
     for p, part in enumerate(systems):
         others = systems[:p] + systems[p + 1 :]
@@ -97,16 +115,67 @@ def estimate(
     return SelfCalibration(lenses, shares, reason, counts)
 
 
-def by_lenses(bearings_rig: np.ndarray, shown: np.ndarray, lenses: Lenses) -> np.ndarray:
+def _of_nominal(
+    system: SharedModel, so_far: Lenses, off: np.ndarray, counts: Counts
+) -> SelfCalibration:
+    """What plain lenses of unknown make turn out to be, where focal lengths are determined.
+
+    Args:
+        system: of all observations.
+        off: (FREE,) how far lenses are from the plain ones.
+    """
+    found, sigmas = _step([system], off), _sigmas(system)
+    loose = undetermined(sigmas)
+    focal = 100 * sigmas[[0, OF_FRONT]]
+    reason = ""
+    if "focal lengths" in loose:
+        reason = (
+            f"these frames tell focal lengths to {focal[0]:.1f} and {focal[1]:.1f} % only: lenses "
+            "stay plain ones"
+        )
+    logger.info(
+        "lenses: focal lengths %+.3f and %+.3f %% (sigmas %.3f and %.3f)%s%s",
+        *(100 * (off + found[:FREE])[[0, OF_FRONT]]),
+        *focal,
+        f"; hardly determined: {', '.join(loose)}" if loose else "",
+        reason and f"; not taken: {reason}",
+    )
+    lenses = so_far
+    if not reason:
+        lenses = moved(so_far, found[:FREE])
+        lenses = replace(lenses, centre=so_far.centre + found[FREE:])
+    return SelfCalibration(lenses, np.full(PARTS, np.nan), reason, counts, loose)
+
+
+def undetermined(sigmas: np.ndarray) -> tuple[str, ...]:
+    """What standard deviations (FREE,) after an adjustment are hardly smaller of than before."""
+    loose = np.asarray(sigmas) > _DETERMINED * SPREAD
+    return tuple(name for name, rows in _GROUPS.items() if loose[rows].mean() > 0.5)
+
+
+def by_lenses(
+    bearings_rig: np.ndarray,
+    shown: np.ndarray,
+    lenses: Lenses,
+    residuals: np.ndarray | None = None,
+) -> np.ndarray:
     """Jacobian (O, 2, FREE) of residuals of bearings by what lenses are.
+
+    Noise is of pixels: it is an angle that shrinks where a focal length grows, and least squares of
+    angles would prefer long ones. Taken where points are predicted, not where they were observed,
+    the Jacobian is free of that noise, and so is what it finds.
 
     Args:
         bearings_rig: (O, 3) of the rays.
         shown: (O, 3) directions in the panoramas.
         lenses: of raw pairs.
+        residuals: (O, 2) of the bearings, from observed to predicted; None = taken as 0.
     """
     out = np.zeros((len(shown), 2, FREE))
     basis, there = -tangent_basis(bearings_rig), lenses.calibrated(shown)
+    if residuals is not None:
+        there = there - np.einsum("oij,oi->oj", basis, residuals)
+        there /= np.linalg.norm(there, axis=1, keepdims=True)
     front = facing(shown) > 0
     for part, lens, columns in zip(
         (front, ~front), now(lenses), (slice(OF_FRONT), slice(OF_FRONT, FREE)), strict=True
@@ -158,6 +227,13 @@ def _step(systems: list[SharedModel], off: np.ndarray) -> np.ndarray:
     total, pull = summed(systems), _pull()
     gradient = total.gradient + pull * np.concatenate([off, np.zeros(3)])
     return -np.linalg.solve(total.curvature * total.hessian + np.diag(pull), gradient)
+
+
+def _sigmas(system: SharedModel) -> np.ndarray:
+    """Standard deviations (FREE,) of lenses, adjusted with centre, poses and points."""
+    information = system.curvature * system.hessian + np.diag(_pull())
+    information += 1e-12 * np.trace(information) * np.eye(len(information))
+    return np.sqrt(np.diagonal(np.linalg.inv(information))[:FREE])
 
 
 def _centre_step(systems: list[SharedModel]) -> np.ndarray:

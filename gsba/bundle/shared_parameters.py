@@ -19,6 +19,8 @@ from factors.robust import RobustLoss
 from gsba.bundle.adjustment import Problem, landmark_block, values_of
 from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
 
+BySharedParameters = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
 PARTS = 4  # of the sequence: each is predicted by what the others give
 _LEAST_FRAMES = 2 * PARTS
 _LEAST_POINTS = 50  # of a part
@@ -158,7 +160,7 @@ def models_of(
     keypoints: Keypoints,
     solved: Solution,
     problem: Problem,
-    by_shared: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    by_shared: BySharedParameters,
 ) -> tuple[list[SharedModel], Counts]:
     """Models of the cost of each part of the sequence, by at most so many observations.
 
@@ -178,12 +180,30 @@ def models_of(
     return models, Counts(len(landmarks.tracks), len(used.tracks), "observations")
 
 
+def whole_model_of(
+    landmarks: Landmarks,
+    most: int,
+    keypoints: Keypoints,
+    solved: Solution,
+    problem: Problem,
+    by_shared: BySharedParameters,
+) -> SharedModel | None:
+    """Model of the cost of a sequence that is too short for parts; None = it has no points.
+
+    Args: see `models_of`.
+    """
+    used = drawn(landmarks, most, problem.settings.seed)
+    if not used.tracks.num_points:
+        return None
+    return model_of(used, keypoints, solved, problem, by_shared)
+
+
 def model_of(
     landmarks: Landmarks,
     keypoints: Keypoints,
     solved: Solution,
     problem: Problem,
-    by_shared: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    by_shared: BySharedParameters,
 ) -> SharedModel:
     """Model of the robust cost of some points and their bearings, at a solution's poses.
 
@@ -192,14 +212,14 @@ def model_of(
         keypoints: where these really point.
         solved: poses, and the noise of observations.
         problem: families, loss.
-        by_shared: Jacobian (O, 2, K) of bearings' residuals, from the rows (O,) of keypoints and
-            the Jacobian (O, 2, 3) by where each ray starts.
+        by_shared: Jacobian (O, 2, K) of bearings' residuals, from the rows (O,) of keypoints, the
+            Jacobian (O, 2, 3) by where each ray starts, and the residuals (O, 2).
     """
     seen = weighted(landmarks, keypoints, solved, problem)
     by_origin = -seen.by_point @ solved.world_T_rigs[landmarks.tracks.frames, :3, :3]
     num = len(solved.world_T_rigs)
     system = without_points(
-        seen, landmarks.tracks, num, seen.by_pose, by_shared(seen.rows, by_origin)
+        seen, landmarks.tracks, num, seen.by_pose, by_shared(seen.rows, by_origin, seen.residuals)
     )
     return _without_poses(system, num, seen.curvature)
 

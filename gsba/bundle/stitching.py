@@ -1,7 +1,6 @@
 """What the camera's calibration and stitching bend: a field fixed to the rig, found by the map."""
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +9,7 @@ from factors.bearing import tangent_basis
 from factors.sphere_field import SphereField, degrees_of, harmonics, num_harmonics
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import Problem
-from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of
+from gsba.bundle.shared_parameters import PARTS, BySharedParameters, SharedModel, models_of
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.types import Counts, Keypoints, Round, Sighted, Solution
@@ -125,12 +124,10 @@ def _systems(
     return [model.around(now.field.coefficients) for model in models], counts
 
 
-def _by_field(
-    keypoints: Keypoints, there: Keypoints, max_degree: int
-) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+def _by_field(keypoints: Keypoints, there: Keypoints, max_degree: int) -> BySharedParameters:
     """Jacobian of residuals by a field, as in `model_of`, where it takes keypoints to `there`."""
 
-    def by_field(rows: np.ndarray, _: np.ndarray) -> np.ndarray:
+    def by_field(rows: np.ndarray, _origin: np.ndarray, _residuals: np.ndarray) -> np.ndarray:
         basis = harmonics(keypoints.bearings_rig[rows], max_degree)
         return -tangent_basis(there.bearings_rig[rows]) @ basis
 

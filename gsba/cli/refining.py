@@ -63,6 +63,14 @@ Camera = Annotated[
 Calibration = Annotated[
     Path | None, typer.Option(help="Of the lenses of raw fisheyes.", metavar="FILE")
 ]
+Circle = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Image circle of raw fisheyes where none is found: centre and radius, pixels of one "
+        "lens's picture. Repeatable: front, then back; one value is for both.",
+        metavar="X,Y,R",
+    ),
+]
 Imu = Annotated[
     Path | None,
     typer.Option(
@@ -135,6 +143,7 @@ def refine(
     ] = None,
     camera: Camera = None,
     calibration: Calibration = None,
+    circle: Circle = None,
     imu: Imu = None,
     gps: Gps = None,
     fps: Annotated[
@@ -169,6 +178,7 @@ def refine(
         from gsba.store.cluster import connected
     given = {"keyframes": keyframes, "segment": segment, "timestamps": timestamps, "fps": fps}
     given |= {"masks": masks or "auto", "calibration": calibration, "imu": imu, "fresh": fresh}
+    given["circles"] = [_circle(text) for text in circle or ()]
     with connected(cluster) as client:
         result = pipeline.refine(frames, trajectory, out, settings, client=client, **given)
     _conclude([result], allow_partial)
@@ -297,6 +307,17 @@ def _with_gps(factors: str | None) -> str:
     families = factors or "bearing"
     named = [family.strip() for family in families.split(",")]
     return families if "gps" in named else f"{families},gps"
+
+
+def _circle(text: str) -> tuple[float, float, float]:
+    """Centre and radius of `--circle X,Y,R`."""
+    try:
+        x, y, radius = (float(part) for part in text.split(","))
+    except ValueError:
+        raise GsbaError(
+            f"--circle {text}: give X,Y,R: a centre and a radius, three numbers with commas between"
+        ) from None
+    return x, y, radius
 
 
 def _networks(weights: list[Path] | None, accept_noncommercial: bool, download: bool) -> list[str]:

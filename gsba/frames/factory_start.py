@@ -18,8 +18,8 @@ from gsba.camera.factory_lenses import (
 from gsba.camera.fisheye import Pair
 from gsba.containers.insta360 import read_trailer
 from gsba.disk import write_json
-from gsba.frames.files import image_size
-from gsba.frames.raw_pairs import decode_pair, rim_likeness
+from gsba.frames.lens_overlap import rim_likeness
+from gsba.frames.raw_pairs import decode_pair
 from gsba.log import GsbaError
 
 _log = logging.getLogger(__name__)
@@ -88,7 +88,10 @@ def find_factory_lenses(folder: Path, images: Sequence[Path]) -> FactoryLenses |
 
 
 def starting_lenses(
-    folder: Path, pairs: Sequence[tuple[Path, ...]], factory: FactoryLenses
+    folder: Path,
+    pairs: Sequence[tuple[Path, ...]],
+    size: tuple[int, int],
+    factory: FactoryLenses,
 ) -> Pair:
     """Lenses of raw pairs by the maker's calibration, which leaves open what only images tell.
 
@@ -99,10 +102,9 @@ def starting_lenses(
     Args:
         folder: of the pictures, for the log.
         pairs: pictures of the front and of the back lens of each frame, or twice one of both.
+        size: width and height of one lens's picture.
         factory: the maker's calibration.
     """
-    width, height = image_size(pairs[0][0])
-    size = (width // 2 if pairs[0][0] == pairs[0][1] else width, height)
     rows = np.unique(np.linspace(0, len(pairs) - 1, _LOOKS).astype(int))
     looks = [decode_pair(pairs[f], size, gray=True) for f in rows]
     readings = [
@@ -110,7 +112,7 @@ def starting_lenses(
         for pair in factory.pairs(size)
         for quarters in range(_QUARTER_TURNS)
     ]
-    scores = [rim_likeness(looks, *pair) for pair in readings]
+    scores = [rim_likeness(looks, pair) for pair in readings]
     best = int(np.argmax(scores))
     if scores[best] <= scores[0] + _CLEARLY:
         best = 0

@@ -1,26 +1,64 @@
-"""How cameras name the two files of one recording, one of each lens."""
+"""How cameras name the two files of one recording or picture, one of each lens."""
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
-# What tells both names apart: front, back.
-_MARKS = (
-    (re.compile(r"(?<=_)(00|10)(?=_)"), ("00", "10")),  # Insta360: VID_..._00_001.insv
-    (re.compile(r"^(GPFR|GPBK)(?=\d)", re.IGNORECASE), ("GPFR", "GPBK")),  # GoPro Fusion
-    (re.compile(r"^(GF|GB)(?=\d)", re.IGNORECASE), ("GF", "GB")),  # the same, further chapters
+
+@dataclass(frozen=True, slots=True)
+class LensNames:
+    """How the names of files say which lens took them."""
+
+    pattern: re.Pattern[str]  # of a name: groups before, lens, after
+    lenses: tuple[str, str]  # what the front and the back lens are called, in upper case
+    shown: tuple[str, str]  # how messages call the files
+    maker: str = ""  # camera that names files so; empty = several do
+
+    def read(self, stem: str) -> tuple[int, str] | None:
+        """Lens, 0 front or 1 back, and the frame's name; None = the stem says no lens."""
+        found = self.pattern.fullmatch(stem)
+        if found is None:
+            return None
+        name = found["before"] + found["after"].removeprefix("_")
+        return self.lenses.index(found["lens"].upper()), name
+
+    def both(self, name: str) -> tuple[str, str] | None:
+        """Names of the front and of the back lens's file; None = the name says no lens."""
+        found = self.pattern.fullmatch(name)
+        if found is None:
+            return None
+        lower = found["lens"].islower()
+        front, back = (
+            f"{found['before']}{lens.lower() if lower else lens}{found['after']}"
+            for lens in self.lenses
+        )
+        return front, back
+
+
+_CLOCK = LensNames(  # Insta360: VID_..._00_001.insv
+    re.compile(r"(?P<before>.*_)(?P<lens>00|10)(?P<after>_.*)"), ("00", "10"), ("_00_", "_10_")
 )
+FUSION_NAMES = (
+    LensNames(
+        re.compile(r"(?P<before>GP)(?P<lens>FR|BK)(?P<after>\d.*)", re.IGNORECASE),
+        ("FR", "BK"),
+        ("GPFR...", "GPBK..."),
+        "GoPro Fusion",
+    ),
+    LensNames(  # the same, further chapters and bursts
+        re.compile(r"(?P<before>G)(?P<lens>F|B)(?P<after>\d.*)", re.IGNORECASE),
+        ("F", "B"),
+        ("GF...", "GB..."),
+        "GoPro Fusion",
+    ),
+)
+LENS_NAMES = (_CLOCK, *FUSION_NAMES)
 
 
 def lens_files(path: Path) -> tuple[Path, Path] | None:
     """Paths of the front and of the back lens's file, if the path is named as one of them."""
-    for pattern, marks in _MARKS:
-        found = list(pattern.finditer(path.name))
-        if found:
-            start, end = found[-1].span()
-            lower = found[-1][0].islower()
-            front, back = (
-                path.with_name(path.name[:start] + (m.lower() if lower else m) + path.name[end:])
-                for m in marks
-            )
-            return front, back
+    for names in LENS_NAMES:
+        both = names.both(path.name)
+        if both is not None:
+            return path.with_name(both[0]), path.with_name(both[1])
     return None

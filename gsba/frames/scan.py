@@ -10,13 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.calibration import read_calibration
 from gsba.camera.factory_lenses import FactoryLenses
 from gsba.camera.fisheye import Pair
 from gsba.frames.dual_fisheye import width_of
 from gsba.frames.factory_start import FACTORY_FILE, find_factory_lenses, starting_lenses
 from gsba.frames.files import image_header, image_size, is_image
+from gsba.frames.headers import Header
+from gsba.frames.image_circles import ImageCircle
 from gsba.frames.masks import find_masks
-from gsba.frames.raw_pairs import find_pairs, lenses_of, side_by_side
+from gsba.frames.raw_pairs import find_pairs, lenses_of
+from gsba.frames.side_by_side import in_folder, lens_sizes, may_hold_two
 from gsba.frames.times import frame_times
 from gsba.frames.track_pairs import find_tracks, track_size
 from gsba.log import GsbaError, track
@@ -47,14 +51,16 @@ def scan(
     masks: Path | None = None,
     order_suffices: bool = False,
     calibration: Path | None = None,
+    circles: Sequence[ImageCircle] = (),
 ) -> FrameSet:
     """Frames of a folder, in time order, checked by their headers.
 
     The folder holds equirectangular images, or cube faces: subfolders `front`, `right`, ... with
     equal names, or files `NAME_front.jpg`, ...; up and down may be absent from all frames. Or it
-    holds raw fisheyes: subfolders `front` and `back` alone (or `lens0` and `lens1`), files
-    `..._00_...` and `..._10_...`, or both side by side in 2:1 images. Or it holds both tracks of an
-    equi-angular cube map, in subfolders `track0` and `track5`.
+    holds raw fisheyes: subfolders `front` and `back` alone (or `lens0` and `lens1`, `FR` and
+    `BK`), files `..._00_...` and `..._10_...` (or `GPFR...` and `GPBK...`, `GF...` and `GB...`),
+    or both side by side in 2:1 or 16:9 images. Or it holds both tracks of an equi-angular cube map,
+    in subfolders `track0` and `track5`.
 
     Args:
         folder: JPEG, PNG, WebP or TIFF images; other files are ignored.
@@ -65,6 +71,8 @@ def scan(
         order_suffices: where nothing gives times, name order stands in for them.
         calibration: of the lenses of raw fisheyes, see `gsba.camera.calibration`; 2:1 images are
             such then.
+        circles: image circles of raw fisheyes, of the front and the back lens, or one of both;
+            2:1 images are such then. Without, they are found.
 
     Raises:
         GsbaError: naming the first file or frame that cannot be used.
@@ -77,14 +85,17 @@ def scan(
     names, times, timed = _in_time_order(Path(folder), found, timestamps, fps, order_suffices)
     paths = tuple(found[name] for name in names)
     tracks = track_size(Path(folder), paths) if layout == "eac" else None
-    width, height = tracks or _common_size(paths, layout)
+    width, height = lens_size = tracks or _common_size(paths, layout)
     images = [group[0] for group in paths]
     factory = find_factory_lenses(Path(folder), images) if calibration is None else None
-    if layout == "erp" and (
-        factory is not None or side_by_side(Path(folder), images, (width, height), calibration)
-    ):
-        layout, paths = "fisheye", tuple((path, path) for path in images)
-    fisheyes = _lenses(Path(folder), layout, paths, calibration, factory)
+    if layout == "erp":
+        raw = lens_sizes(lens_size)[0] if factory is not None else None
+        raw = raw or _beside(Path(folder), images, lens_size, calibration, circles)
+        if raw is not None:
+            layout, lens_size = "fisheye", raw
+            paths = tuple((path, path) for path in images)
+    known = calibration, circles, factory
+    fisheyes, nominal = _lenses(Path(folder), layout, paths, lens_size, *known)
     if fisheyes is not None:
         width, height = width_of(fisheyes), width_of(fisheyes) // 2
     if tracks is not None:
@@ -102,6 +113,7 @@ def scan(
         timed=timed,
         fisheyes=fisheyes,
         tracks=tracks,
+        lenses_nominal=nominal,
     )
 
 
@@ -133,24 +145,57 @@ def _in_time_order(
     return tuple(names), times, timed
 
 
+def _beside(
+    folder: Path,
+    images: Sequence[Path],
+    size: tuple[int, int],
+    calibration: Path | None = None,
+    circles: Sequence[ImageCircle] = (),
+) -> tuple[int, int] | None:
+    """Width and height of one lens's picture where images hold two side by side; None = they are
+    panoramas.
+
+    Raises:
+        GsbaError: they are neither.
+    """
+    shape, source = None, ""
+    if calibration is not None:
+        front, source = read_calibration(calibration)[0], calibration.name
+        shape = front.width, front.height
+    found = in_folder(folder, images, size, shape, source)
+    for note in found.notes:
+        _log.info(note)
+    if found.lens_size is None and circles and may_hold_two(size):
+        _log.info("%s: taken for two fisheyes side by side, as --circle says", folder)
+        return lens_sizes(size)[-1]
+    if found.lens_size is None and size[0] != 2 * size[1]:
+        raise _no_panorama(images[0], image_header(images[0]), "; nor are there two image circles")
+    return found.lens_size
+
+
 def _lenses(
     folder: Path,
     layout: str,
     paths: Sequence[tuple[Path, ...]],
+    size: tuple[int, int],
     calibration: Path | None,
+    circles: Sequence[ImageCircle],
     factory: FactoryLenses | None,
-) -> Pair | None:
-    """What the lenses of raw fisheyes are; None = there are none."""
-    if layout == "fisheye" and factory is not None:
-        return starting_lenses(folder, paths, factory)
+) -> tuple[Pair | None, bool]:
+    """What the lenses of raw fisheyes are, None = there are none, and whether to estimate them."""
+    if layout == "fisheye" and factory is not None and not circles:
+        return starting_lenses(folder, paths, size, factory), True
     if layout == "fisheye":
-        return lenses_of(folder, paths, calibration)
+        return lenses_of(folder, paths, size, calibration, circles)
+    held = "cube faces" if layout == "cube" else "panoramas"
     if calibration is not None:
         raise GsbaError(
-            f"{calibration}: a calibration is for raw fisheyes, but {folder} holds cube faces: "
+            f"{calibration}: a calibration is for raw fisheyes, but {folder} holds {held}: "
             "leave --calibration out"
         )
-    return None
+    if circles:
+        raise GsbaError(f"{folder}: holds {held}, but --circle is for raw fisheyes: leave it out")
+    return None, False
 
 
 def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
@@ -166,7 +211,7 @@ def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
     _check_names(Path(folder), names)
     paths = tuple(found[name] for name in names)
     width, height = _common_size(paths, layout)
-    if side_by_side(Path(folder), [path for (path,) in paths], (width, height)):
+    if _beside(Path(folder), [path for (path,) in paths], (width, height)) is not None:
         raise GsbaError(f"{folder}: holds raw fisheyes side by side; panoramas are wanted here")
     return FrameSet(
         names=tuple(names),
@@ -316,11 +361,8 @@ def _common_size(paths: Sequence[tuple[Path, ...]], layout: str) -> tuple[int, i
         for path in group:
             header = image_header(path)
             w, h = header.size
-            if layout == "erp" and (w != 2 * h or h == 0):
-                turned = header.swapped and h == 2 * w
-                why = f" as its EXIF orientation {header.orientation} shows it" if turned else ""
-                what = ": remove that tag" if turned else ""
-                raise GsbaError(f"{path}: is {w}x{h}{why}; an equirectangular frame is 2:1{what}")
+            if layout == "erp" and not may_hold_two((w, h)):
+                raise _no_panorama(path, header)
             if layout == "cube" and (w != h or h == 0):
                 raise GsbaError(f"{path}: is {w}x{h}; a cube face is square")
             if (w, h) != (width, height) and layout == "fisheye":
@@ -331,6 +373,15 @@ def _common_size(paths: Sequence[tuple[Path, ...]], layout: str) -> tuple[int, i
             if (w, h) != (width, height):
                 raise GsbaError(f"{path}: is {w}x{h}, but '{first.name}' is {width}x{height}")
     return width, height
+
+
+def _no_panorama(path: Path, header: Header, more: str = "") -> GsbaError:
+    """The refusal of an image that is not 2:1."""
+    (w, h) = header.size
+    turned = header.swapped and h == 2 * w
+    why = f" as its EXIF orientation {header.orientation} shows it" if turned else ""
+    what = ": remove that tag" if turned else more
+    return GsbaError(f"{path}: is {w}x{h}{why}; an equirectangular frame is 2:1{what}")
 
 
 def _warn_of_slots(folder: Path, last: str) -> None:

@@ -119,7 +119,8 @@ def calibrate(
     """What the lenses of raw pairs are, from matches that no solution has chosen among."""
 
     def found(wide: Solution) -> SelfCalibration:
-        return self_calibration.estimate(*_under_lenses(run, seen, prior, wide))
+        nominal = run.frames.lenses_nominal
+        return self_calibration.estimate(*_under_lenses(run, seen, prior, wide), nominal)
 
     return _of_matches(run, seen, prior, name, matches, solved, found, SelfCalibration)
 

@@ -77,7 +77,7 @@ def _extract(
 
 def _see(run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str) -> Seen:
     """Features of each frame (F,), ready to be matched; `stage`: the last one they are of."""
-    frames, settings = run.frames, run.settings
+    frames, settings = run.frames, run.matching_settings
 
     load = FrameFeatures(found, frames.names)
 

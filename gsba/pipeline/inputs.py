@@ -11,6 +11,7 @@ from gsba.bundle.fixes import FrameFixes
 from gsba.bundle.gps_factors import MIN_FIXES
 from gsba.camera.calibration import read_calibration
 from gsba.config import RefineSettings
+from gsba.frames.image_circles import ImageCircle
 from gsba.frames.lens_names import lens_files
 from gsba.frames.times import check_fps
 from gsba.imu.files import read_imu, read_telemetry
@@ -81,6 +82,29 @@ def with_baseline(settings: RefineSettings, calibration: Path | None) -> RefineS
         )
     camera = settings.camera.model_copy(update={"baseline_mm": millimetres})
     return settings.model_copy(update={"camera": camera})
+
+
+def given_circles(
+    circles: Sequence[tuple[float, float, float]], calibration: Path | None
+) -> tuple[ImageCircle, ...]:
+    """Image circles of the front and the back lens as a caller gives them, or one of both.
+
+    Raises:
+        GsbaError: more than two of them, no circles, or a calibration as well.
+    """
+    if not circles:
+        return ()
+    if calibration is not None:
+        raise GsbaError(
+            f"--circle and --calibration {calibration} both say where image circles are: pass one"
+        )
+    if len(circles) > 2:
+        raise GsbaError(f"--circle: {len(circles)} are given; a camera of two lenses has two")
+    for circle in circles:
+        if len(circle) != 3 or not np.isfinite(circle).all() or circle[2] <= 0:
+            said = ",".join(f"{value:g}" for value in circle)
+            raise GsbaError(f"--circle {said}: give X,Y,R: a centre and a positive radius, pixels")
+    return tuple(ImageCircle(*map(float, circle)) for circle in circles)
 
 
 def read_gyro(imu: Path | None, frames: Path) -> Readings | None:

@@ -142,7 +142,8 @@ def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, n
     def lenses() -> SelfCalibration:
         solved, keypoints = placed_anew()
         around, problem = solved.landmarks, run.problem(prior, solved)
-        return self_calibration.estimate(around, keypoints, shown, solved, world.lenses, problem)
+        given = around, keypoints, shown, solved, world.lenses, problem
+        return self_calibration.estimate(*given, run.frames.lenses_nominal)
 
     key = backend.camera_key(run)
     if number == 0 and world.lenses.twists is None:

@@ -68,6 +68,7 @@ def refine(
     timestamps: Path | None = None,
     fps: float | None = None,
     calibration: Path | None = None,
+    circles: Sequence[tuple[float, float, float]] = (),
     imu: Path | None = None,
     fresh: bool = False,
     extra_factors: ExtraFactors | None = None,
@@ -89,6 +90,8 @@ def refine(
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
+        circles: image circles of raw fisheyes where none are found: x and y of the centre and
+            radius, pixels of one lens's picture; of the front and the back lens, or one of both.
         imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
         fresh: forget an earlier run in `out`.
         extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
@@ -98,6 +101,7 @@ def refine(
         GsbaError: an input or setting that cannot be used.
     """
     frames, out = Path(frames), Path(out)
+    given_circles = inputs.given_circles(circles, calibration)
     settings = inputs.with_baseline(settings or RefineSettings(), calibration)
     check(settings.placement, baseline=settings.camera.baseline())
     chosen = merging.choose(masks, segment)
@@ -107,7 +111,8 @@ def refine(
     if video.is_video(frames):
         inputs.extract_frames(out, origin, settings, fps, fresh)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
-    frame_set = scan(frames, timestamps, fps, chosen.given, not given, calibration)
+    untimed = not given
+    frame_set = scan(frames, timestamps, fps, chosen.given, untimed, calibration, given_circles)
     sensors = readings, inputs.positions_of(frame_set, settings)
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
@@ -135,20 +140,28 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
     known += [] if run.imu is None else [run.imu.digest]
     known += [] if run.fixes is None else [run.fixes.digest()]
     counts, frames = dict(run.journal.counts), run.frames
-    n = 0
+    n, best = 0, None  # the pass before: what it rests on, steps without matches, its result
     while True:
         name, after, better = f"recalibrated{n}", run.chain.latest, None
-        if frames.fisheyes is not None:
+        kept = run.store.stored(f"{name}_undone", known, bool, after)
+        if frames.fisheyes is not None and not kept:
             better = run.store.stored(name, known, _Cut, after)
         if better is None:
             seen = frontend.extract(run)
             believed, world = solve(run, seen, prior, given)
-            better = None if n == _PASSES - 1 else _cut_better(prior.coarse, world)
+            unseen = int(believed.trust.unseen_steps.sum())
+            if best is not None and unseen > best[1]:
+                logger.info("frames cut anew match at fewer steps: the pass before is kept")
+                run.store.stage(f"recalibrated{n - 1}_undone", known, lambda: True, bool, best[0])
+                return best[2]
+            best = after, unseen, (run, seen, believed, world)
+            better = None if kept or n == _PASSES - 1 else _cut_better(prior.coarse, world)
             if better is None:
-                return run, seen, believed, world
+                return best[2]
             run.store.stage(name, known, lambda found=better: found, _Cut, after)
         n, (fisheyes, found) = n + 1, better
-        frames, again = replace(frames, fisheyes=fisheyes), Journal(dict(counts))
+        again = Journal(dict(counts))
+        frames = replace(frames, fisheyes=fisheyes, lenses_nominal=False)
         frames = merging.recut(run.store, frames, n)
         settings, extra = run.settings, run.extra_factors
         sensors = run.imu, run.fixes

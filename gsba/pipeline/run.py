@@ -6,6 +6,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+
 from gsba import learned
 from gsba.bundle import gps_factors
 from gsba.bundle.adjustment import Problem
@@ -22,6 +24,10 @@ from gsba.store.store import Chain, RunStore, fingerprint
 from gsba.types import CoarsePoses, Counts, FrameSet, Round, Solution
 
 T = TypeVar("T")
+
+_NOMINAL_DEG = 0.5  # that epipolar planes of neighbours are off, at least, while lenses of unknown
+# make are taken for plain ones: 5 % of what pictures move by between them
+_NOMINAL_PIXELS = 2.0  # the same, pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +101,7 @@ class Run:
         start = coarse.world_T_rigs.tolist(), settings.read
         inputs = [fingerprint(paths), frames.timestamps.tolist(), frames.timed, *start]
         if frames.fisheyes is not None:
-            inputs += [*map(asdict, frames.fisheyes), lenses_found]
+            inputs += [*map(asdict, frames.fisheyes), lenses_found, frames.lenses_nominal]
         chain.stage("frames", inputs, lambda: frames, FrameSet)
         return cls(
             store=store,
@@ -157,9 +163,20 @@ class Run:
         given = graph, self.rig, settings, self.num_threads, prior.turning
         return Problem(*given, anchors, ungauged)
 
+    @property
+    def matching_settings(self) -> RefineSettings:
+        """Settings whose gates are as wide as directions of raw pairs are uncertain."""
+        frames, own = self.frames, self.settings.verify.max_error_deg
+        if frames.fisheyes is None:
+            return self.settings
+        focal = min(lens.focal for lens in frames.fisheyes)
+        pixels = _NOMINAL_PIXELS if frames.lenses_nominal else 1.0
+        least = max(float(np.rad2deg(pixels / focal)), _NOMINAL_DEG * frames.lenses_nominal)
+        return self.settings.with_gates(max(1.0, least / own))
+
     def matching_key(self) -> list[object]:
         """Settings that matches rest on."""
-        settings = self.settings
+        settings = self.matching_settings
         files = fingerprint(path for stage, path in self.weights.items() if stage == "matching")
         how = settings.matching.model_dump(exclude={"weights"}), files
         return [settings.pairs, how, settings.verify, settings.seed]

@@ -1,11 +1,11 @@
 """What a recording shows at each instant: a panorama, what each of two lenses saw, or a cube map.
 
 Raw recordings of two fisheyes come as one file with a track for each lens, as two files with `_00_`
-and `_10_` in their names, or as one track with both circles side by side. These layouts follow
-public descriptions (OpenSpeleo/insta360-rs, docs/INSV_FORMAT.md; insta.pk360.de on file types); one
-real file was at hand, side by side and black. The first track, `_00_` and the left circle are taken
-for the front lens; pictures stay turned as the camera stores them. GoPro's `.360` holds two tracks
-of a cube map, see `gsba.video.cube_tracks`.
+and `_10_` (GoPro Fusion: `GPFR` and `GPBK`) in their names, or as one track with both circles side
+by side, perhaps squeezed to 16:9. These layouts follow public descriptions (OpenSpeleo/insta360-rs,
+docs/INSV_FORMAT.md; insta.pk360.de on file types); two real files were at hand, one of them black.
+The first track, `_00_` and the left circle are taken for the front lens; pictures stay turned as
+the camera stores them. GoPro's `.360` holds two tracks of a cube map, see `gsba.video.cube_tracks`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gsba.frames.lens_names import lens_files
-from gsba.frames.raw_pairs import two_circles
+from gsba.frames.side_by_side import LOOKED_AT, SideBySide, lens_sizes, may_hold_two, recognise
 from gsba.log import GsbaError
 from gsba.video.cube_tracks import TRACKS, cube_tracks
 from gsba.video.timeline import Timeline, Track, bgr, decode, luma, read_timeline, track_sizes
@@ -28,7 +28,6 @@ _RAW_SUFFIX = ".insv"  # of videos that show fisheyes even where no circle is se
 _STITCH = "stitch it in the camera's app and export an equirectangular (2:1) video"
 _NEARLY = 1.1  # longer side over the shorter, up to which a picture is nearly square
 _SHORT = 0.1  # part of the longer track's duration that the shorter may lack
-_LOOKED_AT = 5  # frames in which two circles side by side are looked for
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,14 +36,22 @@ class Picture:
 
     frame: Any  # av.VideoFrame
     place: tuple[slice, slice]  # rows and columns of it in the frame
+    height: int | None = None  # pixels, to which squeezed rows are unsqueezed; None = as they are
 
     def luma(self) -> np.ndarray:
         """Brightness (H, W) uint8."""
-        return np.ascontiguousarray(luma(self.frame)[self.place])
+        return self._unsqueezed(luma(self.frame)[self.place])
 
     def bgr(self) -> np.ndarray:
         """Colours (H, W, 3) uint8 BGR."""
-        return np.ascontiguousarray(bgr(self.frame)[self.place])
+        return self._unsqueezed(bgr(self.frame)[self.place])
+
+    def _unsqueezed(self, pixels: np.ndarray) -> np.ndarray:
+        if self.height is None:
+            return np.ascontiguousarray(pixels)
+        import cv2
+
+        return cv2.resize(pixels, (pixels.shape[1], self.height), interpolation=cv2.INTER_AREA)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +66,7 @@ class Recording:
     partners: np.ndarray  # (N,) int64, frame of the last track at instants that are `shown`
     notes: tuple[str, ...] = ()  # what the video was taken for, and what of it is left out
     cube: bool = False  # whether these are two tracks of an equi-angular cube map, not two lenses
+    height: int | None = None  # pixels, to which squeezed pictures are unsqueezed; None = none are
 
     @property
     def times(self) -> np.ndarray:
@@ -111,7 +119,8 @@ def read_recording(video: Path) -> Recording:
         _check_tracks(video, [size, *others])
         note = f"{video}: raw, two tracks of {size[0]}x{size[1]}: front lens, back lens"
         return _of_two_tracks((Track(video), Track(video, 1)), size, note)
-    _check_panorama(video, size)
+    if not may_hold_two(size):
+        _check_panorama(video, size)
     return _of_one_track(Track(video), size)
 
 
@@ -124,7 +133,8 @@ def shots(recording: Recording, chosen: Sequence[int]) -> Iterator[tuple[int, tu
     frames = decode(recording.tracks[0], recording.timelines[0], chosen)
     if len(recording.tracks) == 1:
         for index, frame in frames:
-            yield index, tuple(Picture(frame, place) for place in recording.places)
+            places = recording.places
+            yield index, tuple(Picture(frame, place, recording.height) for place in places)
         return
     partners = recording.partners[list(chosen)].tolist()
     instants = dict(zip(partners, chosen, strict=True))
@@ -226,18 +236,30 @@ def _check_panorama(video: Path, size: tuple[int, int]) -> None:
 
 
 def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
-    """Panoramas, or two lenses side by side."""
+    """Panoramas, or two lenses side by side.
+
+    Raises:
+        GsbaError: neither.
+    """
     timeline = read_timeline(track)
-    num, side = len(timeline.ticks), size[1]
-    circles, notes = _shows_circles(track, timeline)
-    if not circles and track.path.suffix.lower() == _RAW_SUFFIX:
-        circles, notes = True, (f"{track.path}: raw, two fisheyes side by side, as its name says",)
-    places = ((slice(None), slice(None)),)
-    if circles:
-        places = (slice(None), slice(side)), (slice(None), slice(side, None))
-    width = side if circles else size[0]
+    num, (width, height) = len(timeline.ticks), size
+    found = _find_circles(track, timeline, size)
+    if found.lens_size is None and track.path.suffix.lower() == _RAW_SUFFIX and may_hold_two(size):
+        note = f"{track.path}: raw, two fisheyes side by side, as its name says"
+        found = SideBySide(lens_sizes(size)[0], (note,))
     everything = np.ones(num, bool), np.arange(num)
-    return Recording((track,), (timeline,), places, width, *everything, notes)
+    if found.lens_size is None:
+        _check_panorama(track.path, size)
+        places = ((slice(None), slice(None)),)
+        return Recording((track,), (timeline,), places, width, *everything, found.notes)
+    side, unsqueezed = width // 2, None
+    rows = slice(found.top, found.top + side)
+    if found.lens_size[1] < height:
+        rows, unsqueezed = slice(None), side
+    places = (rows, slice(side)), (rows, slice(side, None))
+    return Recording(
+        (track,), (timeline,), places, side, *everything, found.notes, height=unsqueezed
+    )
 
 
 def _of_two_tracks(
@@ -277,11 +299,11 @@ def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.where(np.abs(wanted - times[before]) <= np.abs(times[after] - wanted), before, after)
 
 
-def _shows_circles(track: Track, timeline: Timeline) -> tuple[bool, tuple[str, ...]]:
-    """Whether 2:1 frames are two image circles side by side; notes on it."""
+def _find_circles(track: Track, timeline: Timeline, size: tuple[int, int]) -> SideBySide:
+    """Whether frames are two image circles side by side."""
     num = len(timeline.ticks)
     middle = num // 2
-    others = {(2 * i + 1) * num // (2 * _LOOKED_AT) for i in range(_LOOKED_AT)} - {middle}
+    others = {(2 * i + 1) * num // (2 * LOOKED_AT) for i in range(LOOKED_AT)} - {middle}
     parts = [middle], sorted(others)  # the middle one settles it for most panoramas
     greys = (luma(frame) for part in parts for _, frame in decode(track, timeline, part))
-    return two_circles(greys, track.path)
+    return recognise(greys, size, track.path)

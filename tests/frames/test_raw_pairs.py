@@ -2,6 +2,7 @@
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,9 +13,10 @@ from two_fisheyes import BEHIND, HALF_FOV, colours, made_pair, picture, turned, 
 
 from gsba.camera.calibration import calibration_json
 from gsba.camera.fisheye import Pair, rotation_of
+from gsba.frames.image_circles import ImageCircle
 from gsba.frames.pixels import load_erp
-from gsba.frames.raw_pairs import two_circles
 from gsba.frames.scan import find_panoramas, scan
+from gsba.frames.side_by_side import two_circles
 from gsba.log import GsbaError
 from gsba.types import FACES, Fisheye
 
@@ -26,6 +28,10 @@ LAYOUTS = {
     "lens0": ("lens0/{}.png", "lens1/{}.png"),
     "files": ("VID_2024_00_007_{}.png", "VID_2024_10_007_{}.png"),
     "beside": ("{}.png", "{}.png"),
+    "FR": ("FR/GPFR7_{}.png", "BK/GPBK7_{}.png"),
+    "fr": ("fr/{}.png", "Bk/{}.png"),
+    "fusion": ("GPFR0042_{}.png", "GPBK0042_{}.png"),
+    "fusion photos": ("GF0100{}.png", "GB0100{}.png"),
 }
 
 
@@ -152,6 +158,102 @@ def test_what_does_not_tell_a_turn_is_refused(tmp_path: Path, seen) -> None:
     assert scan(root, fps=1, calibration=_calibration(tmp_path / "c.json")).fisheyes is not None
 
 
+def test_a_fusion_folder_is_said_to_be_one(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO):
+        scan(_write_pairs(tmp_path, "FR", _nominal()), fps=1)
+    assert "raw pairs of a GoPro Fusion, front lens in FR/, back in BK/" in caplog.text
+
+
+@pytest.mark.parametrize("gone", ["FR", "BK"])
+def test_a_fusion_folder_without_a_side(tmp_path: Path, gone: str) -> None:
+    root = _write_pairs(tmp_path, "FR")
+    for path in (root / gone).iterdir():
+        path.unlink()
+    left = {"FR": "BK", "BK": "FR"}[gone]
+    with pytest.raises(GsbaError, match=rf"holds {left}/ but no pictures in {gone}/: of raw pairs"):
+        scan(root, fps=1)
+
+
+def test_squeezed_pairs_are_read_unsqueezed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    pair = _nominal()
+    plain = _write_pairs(tmp_path / "plain", "beside", pair)
+    for path in sorted(plain.iterdir()):
+        image = cv2.resize(cv2.imread(str(path)), (2 * SIDE, 9 * SIDE // 8))
+        write(tmp_path / "squeezed" / f"360_{path.name}", image[..., ::-1])
+    with caplog.at_level(logging.INFO):
+        frames = scan(tmp_path / "squeezed", fps=1)
+    assert "they are ellipses: 480x270 is read as 480x240" in caplog.text
+    assert "Samsung Gear 360" in caplog.text
+    assert frames.fisheyes is not None and frames.lenses_nominal
+    for lens, true in zip(frames.fisheyes, pair, strict=True):
+        assert (lens.width, lens.height) == (SIDE, SIDE)
+        np.testing.assert_allclose(lens.principal, true.principal, atol=1)
+        assert lens.focal == pytest.approx(true.focal, rel=0.01)
+    assert np.abs(load_erp(frames, 1) - load_erp(scan(plain, fps=1), 1).astype(float)).mean() < 3
+
+
+def test_circles_that_are_given(tmp_path: Path) -> None:
+    pair = _nominal()
+    root = _write_pairs(tmp_path, "front", pair)
+    circles = [ImageCircle(*lens.principal, lens.focal * HALF_FOV) for lens in pair]
+    found = scan(root, fps=1, circles=circles).fisheyes
+    assert found is not None
+    for lens, true in zip(found, pair, strict=True):
+        assert lens.principal == true.principal
+        assert lens.focal == pytest.approx(true.focal, rel=0.005)
+    both = scan(root, fps=1, circles=circles[:1]).fisheyes
+    assert both is not None and both[0].principal == both[1].principal
+    for wrong in (ImageCircle(-5, 100, 90), ImageCircle(100, 300, 90), ImageCircle(100, 100, 400)):
+        with pytest.raises(GsbaError, match=r"--circle .*: lies outside of the pictures.* 240x240"):
+            scan(root, fps=1, circles=[wrong])
+
+
+@pytest.mark.parametrize("degrees", [95.0, 104.0])
+def test_the_seam_tells_how_wide_circles_are(tmp_path: Path, degrees: float) -> None:
+    """Fine colours: smooth ones look alike under any focal length."""
+    focal = 0.46 * SIDE / np.deg2rad(degrees)
+    pair = tuple(replace(lens, focal=focal) for lens in _nominal())
+
+    def fine(shift: float):
+        directions = np.random.default_rng(5).normal(size=(40, 3)) * 9 + shift
+        return lambda seen: np.stack([150 + 12 * np.sin(seen @ directions.T).sum(-1)] * 3, axis=-1)
+
+    for frame in range(3):
+        for lens, name in zip(pair, ("front", "back"), strict=True):
+            drawn = picture(
+                lens, lambda d, f=frame: np.clip(fine(f)(d), 40, 255), np.deg2rad(degrees)
+            )
+            write(tmp_path / name / f"{frame}.png", drawn)
+    found = scan(tmp_path, fps=1).fisheyes
+    assert found is not None
+    assert found[0].focal == pytest.approx(focal, rel=0.01)
+
+
+@pytest.mark.parametrize("off", [0.95, 1.05, 1.0])
+def test_a_calibration_that_the_seam_contradicts(
+    tmp_path: Path, off: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    pair = _nominal()
+
+    def fine(shift: float):
+        waves = np.random.default_rng(5).normal(size=(40, 3)) * 9 + shift
+        return lambda seen: np.clip(
+            np.stack([150 + 12 * np.sin(seen @ waves.T).sum(-1)] * 3, axis=-1), 40, 255
+        )
+
+    root = _write_pairs(tmp_path / "raw", "front", pair, seen=fine)
+    given = tuple(replace(lens, focal=off * lens.focal) for lens in pair)
+    frames = scan(root, fps=1, calibration=_calibration(tmp_path / "c.json", given))  # type: ignore
+    assert frames.fisheyes is not None
+    assert frames.lenses_nominal == (off != 1)
+    assert frames.fisheyes[0].focal == pytest.approx(pair[0].focal, rel=0.01)
+    assert ("c.json does not fit these pictures" in caplog.text) == (off != 1)
+
+
 @pytest.mark.parametrize("shown", ["lit", "dark", "lamp"])
 @pytest.mark.parametrize("name", ["front", "back"])
 def test_pictures_without_a_circle(tmp_path: Path, shown: str, name: str) -> None:
@@ -163,7 +265,8 @@ def test_pictures_without_a_circle(tmp_path: Path, shown: str, name: str) -> Non
         cv2.circle(pixels, (80, 150), 9, (255, 255, 255), -1)
     for f in range(3):
         write(root / name / f"{f:03d}.png", pixels)
-    message = rf"its {name} pictures show no bright circle .* --calibration FILE; of a cube, its"
+    message = rf"its {name} pictures show no bright circle .*median grey .* --circle X,Y,R .*"
+    message += r"--calibration FILE; of a cube, its"
     with pytest.raises(GsbaError, match=message):
         scan(root, fps=1)
 
