@@ -182,7 +182,9 @@ def test_squeezed_pairs_are_read_unsqueezed(
     pair = _nominal()
     plain = _write_pairs(tmp_path / "plain", "beside", pair)
     for path in sorted(plain.iterdir()):
-        image = cv2.resize(cv2.imread(str(path)), (2 * SIDE, 9 * SIDE // 8))
+        image = cv2.imread(str(path))
+        assert image is not None
+        image = cv2.resize(image, (2 * SIDE, 9 * SIDE // 8))
         write(tmp_path / "squeezed" / f"360_{path.name}", image[..., ::-1])
     with caplog.at_level(logging.INFO):
         frames = scan(tmp_path / "squeezed", fps=1)
