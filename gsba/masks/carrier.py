@@ -31,6 +31,7 @@ _MIN_FRAMES = 6  # fewer agree by chance
 _STAYS, _MOVES = 0.75, 0.5  # correlation of structure that stays; of structure that moves, at most
 _MIN_MOVING = 1 / 3  # of the textured directions: fewer do not tell a carrier from what is far away
 _STANDING = 0.9  # of the textured directions that stay: the camera stands
+_LARGE_SHARE = 1 / 3  # of the picture: a carrier that is worth a warning
 _MIN_TEXTURED = 0.02  # of all directions
 _STRUCTURE, _STRUCTURE_TURNED = 256, 128  # pixels across the pictures that are compared: the
 # camera's tilt, which turns leave, moves the carrier by a pixel of these
@@ -87,10 +88,10 @@ def find_carrier(frames: FrameSet) -> Carrier:
     turns = turns if found.any() else np.zeros(len(frames))
     turning = ", turning below it" if turns.any() else ""
     logger.info("carrier: %s", reason or f"{100 * share:.1f}% of the picture{turning}")
-    if share > 0.5:
+    if share > _LARGE_SHARE:
         logger.warning(
-            "%.0f%% of the picture turn with the camera and are masked: poses rest on the rest; "
-            "look at carrier_check.jpg",
+            "%.0f%% of the picture turn with the camera, as a vehicle does, and are masked: poses "
+            "rest on the rest; look at carrier_check.jpg",
             100 * share,
         )
     return Carrier(~found, turns, median, share, reason)

@@ -8,7 +8,7 @@ from gsba.bundle.camera_system import CameraCovariances
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of
 from gsba.bundle.readout import Readout
-from gsba.bundle.self_calibration import FREE, OF_FRONT, SelfCalibration
+from gsba.bundle.self_calibration import FREE, OF_FRONT, SelfCalibration, undetermined
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
 from gsba.placement.placement import metres_per_unit
@@ -104,6 +104,13 @@ def of_lenses(
             "radial_sigmas": own[3:7],
         }
     said["back"]["turn_sigmas_deg"] = np.rad2deg(of_lens[1][7:])
+    loose = undetermined(sigmas)
+    said["hardly_determined"] = loose
+    if loose:
+        notes.append(
+            f"these frames hardly determine of the lenses: {', '.join(loose)} (they stay near what "
+            "lenses were taken for)"
+        )
     front, back = (said[name] for name in ("front", "back"))
     notes.append(
         f"the lenses were calibrated as found: focal lengths {front['focal']:.2f} and "

@@ -89,7 +89,7 @@ def test_drawn_circles_are_found_within_a_hundredth(seed: int) -> None:
     assert found is not None, drawn
     off = np.hypot(found.x - drawn.x, found.y - drawn.y), found.radius - drawn.radius
     assert np.abs(off).max() < 0.01 * drawn.radius, (off, drawn)
-    assert found.support > 0.5 and 0 < found.sigma < 0.01 * drawn.radius
+    assert found.support >= 0.5 and 0 < found.sigma < 0.01 * drawn.radius
 
 
 def test_the_same_circle_every_time() -> None:
@@ -153,7 +153,8 @@ def test_ordinary_pictures_are_no_pairs(size: tuple[int, int]) -> None:
 def test_fusion_circles(name: str, x: float, y: float, radius: float) -> None:
     """Centre and radius as measured by eye on the pictures, to 5 pixels."""
     paths = sorted((REAL / "fusion_wood" / name).iterdir())
-    found = find_circle([cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in paths]).circle
+    pictures = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths]
+    found = find_circle([picture for picture in pictures if picture is not None]).circle
     assert found is not None and found.support > 0.9
     assert max(abs(found.x - x), abs(found.y - y), abs(found.radius - radius)) < 0.01 * radius
 

@@ -182,7 +182,9 @@ def test_squeezed_pairs_are_read_unsqueezed(
     pair = _nominal()
     plain = _write_pairs(tmp_path / "plain", "beside", pair)
     for path in sorted(plain.iterdir()):
-        image = cv2.resize(cv2.imread(str(path)), (2 * SIDE, 9 * SIDE // 8))
+        image = cv2.imread(str(path))
+        assert image is not None
+        image = cv2.resize(image, (2 * SIDE, 9 * SIDE // 8))
         write(tmp_path / "squeezed" / f"360_{path.name}", image[..., ::-1])
     with caplog.at_level(logging.INFO):
         frames = scan(tmp_path / "squeezed", fps=1)
@@ -212,25 +214,27 @@ def test_circles_that_are_given(tmp_path: Path) -> None:
             scan(root, fps=1, circles=[wrong])
 
 
+def _fine(shift: float):
+    """Fine structure: what is smooth looks alike under any focal length."""
+    waves = np.random.default_rng(5).normal(size=(40, 3)) * 9 + shift
+
+    def seen(directions: np.ndarray) -> np.ndarray:
+        grey = 150 + 12 * np.sin(directions @ waves.T).sum(axis=-1)
+        return np.clip(np.stack([grey] * 3, axis=-1), 40, 255)
+
+    return seen
+
+
 @pytest.mark.parametrize("degrees", [95.0, 104.0])
 def test_the_seam_tells_how_wide_circles_are(tmp_path: Path, degrees: float) -> None:
-    """Fine colours: smooth ones look alike under any focal length."""
-    focal = 0.46 * SIDE / np.deg2rad(degrees)
-    pair = tuple(replace(lens, focal=focal) for lens in _nominal())
-
-    def fine(shift: float):
-        directions = np.random.default_rng(5).normal(size=(40, 3)) * 9 + shift
-        return lambda seen: np.stack([150 + 12 * np.sin(seen @ directions.T).sum(-1)] * 3, axis=-1)
-
+    half_fov = np.deg2rad(degrees)
+    pair = [replace(lens, focal=0.46 * SIDE / half_fov) for lens in _nominal()]
     for frame in range(3):
         for lens, name in zip(pair, ("front", "back"), strict=True):
-            drawn = picture(
-                lens, lambda d, f=frame: np.clip(fine(f)(d), 40, 255), np.deg2rad(degrees)
-            )
-            write(tmp_path / name / f"{frame}.png", drawn)
+            write(tmp_path / name / f"{frame}.png", picture(lens, _fine(frame), half_fov))
     found = scan(tmp_path, fps=1).fisheyes
     assert found is not None
-    assert found[0].focal == pytest.approx(focal, rel=0.01)
+    assert found[0].focal == pytest.approx(pair[0].focal, rel=0.01)
 
 
 @pytest.mark.parametrize("off", [0.95, 1.05, 1.0])
@@ -238,14 +242,7 @@ def test_a_calibration_that_the_seam_contradicts(
     tmp_path: Path, off: float, caplog: pytest.LogCaptureFixture
 ) -> None:
     pair = _nominal()
-
-    def fine(shift: float):
-        waves = np.random.default_rng(5).normal(size=(40, 3)) * 9 + shift
-        return lambda seen: np.clip(
-            np.stack([150 + 12 * np.sin(seen @ waves.T).sum(-1)] * 3, axis=-1), 40, 255
-        )
-
-    root = _write_pairs(tmp_path / "raw", "front", pair, seen=fine)
+    root = _write_pairs(tmp_path / "raw", "front", pair, seen=_fine)
     given = tuple(replace(lens, focal=off * lens.focal) for lens in pair)
     frames = scan(root, fps=1, calibration=_calibration(tmp_path / "c.json", given))  # type: ignore
     assert frames.fisheyes is not None

@@ -209,3 +209,31 @@ def test_a_calibration_is_not_for_panoramas(walk: Path, tmp_path: Path) -> None:
             calibration=walk / "true.json",
         )  # fmt: skip
     assert not (tmp_path / "run").exists()
+
+
+REAL = Path(__file__).parents[3] / "shared/data/real"
+
+
+def test_a_circle_goes_without_a_calibration(walk: Path, tmp_path: Path) -> None:
+    given = {"calibration": walk / "true.json", "circles": [(224.0, 224.0, 220.0)]}
+    with pytest.raises(GsbaError, match=r"--circle and --calibration .*true\.json both say"):
+        refine(walk / "frames", walk / "slam.tum", tmp_path / "run", **given)
+    arguments = [str(walk / "frames"), str(walk / "slam.tum"), "--out", str(tmp_path / "run")]
+    for text, message in (("1,2", "three numbers"), ("9,9,-3", "positive radius")):
+        result = CliRunner().invoke(app, ["-q", "refine", *arguments, "--circle", text])
+        assert result.exit_code == 1 and message in result.output
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (REAL / "fusion_wood").is_dir(), reason="real captures are not here")
+def test_a_fusion_capture_runs_from_its_own_files(tmp_path: Path) -> None:
+    result = refine(REAL / "fusion_wood", None, tmp_path / "run", fps=1.0)
+    summary, camera = result.report["summary"], result.report["camera"]
+    assert summary["refined"] == 6
+    assert summary["median_residual_deg"] < 0.06
+    assert camera["lenses"]["taken"]
+    # The walker makes about a metre a second: 20 to 45 mm between the lenses.
+    poses = read_trajectory(tmp_path / "run/trajectory.tum").world_T_rigs
+    step = np.median(np.linalg.norm(np.diff(poses[1:, :3, 3], axis=0), axis=1))
+    assert 0.015 < camera["baseline"] / step < 0.05
