@@ -20,7 +20,7 @@ from gsba.loop_closure import connectivity
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
 from gsba.photometric import direct
-from gsba.pipeline import backend, frontend, inputs, outputs, patch_rounds
+from gsba.pipeline import acceptance, backend, frontend, inputs, outputs, patch_rounds
 from gsba.pipeline.frontend import Seen
 from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
@@ -127,6 +127,7 @@ def _refine(run: Run, prior: Prior, given: Sequence[Trajectory]) -> RunResult:
     """A run from its frames to what it leaves behind."""
     run, seen, prior, world = _solve_raw(run, prior, given)
     result = backend.reconstruct(run, seen, prior, world)
+    acceptance.require_motion(run.frames, result, prior.coarse.sources)
     return outputs.write(run, prior, world, result, backend.keep_lenses(run, world, result))
 
 

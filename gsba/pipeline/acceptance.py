@@ -1,0 +1,75 @@
+"""What a finished run must show before anything of it is written: else it is refused in a line."""
+
+import numpy as np
+
+from gsba.frames.masks import load_mask
+from gsba.geometry import inverse, step_covariances
+from gsba.log import GsbaError
+from gsba.types import FrameSet, PoseSource, Reconstruction
+
+MIN_STEP_SIGMAS = 3.0  # median length of a map's steps, in standard deviations; maps of real and
+# rendered walks have 40 and more
+_VEHICLE_SHARE = 1 / 3  # of the picture that turns with the camera: more than people or sticks fill
+
+
+def require_motion(frames: FrameSet, result: Reconstruction, sources: np.ndarray) -> None:
+    """Refuse positions that images alone do not determine, and turns seen from a vehicle.
+
+    A camera on a vehicle whose surroundings are blurred or far sees the vehicle stand still. Its
+    turns look like those of a camera on a tripod, and its positions come from false matches: these
+    are no better known than steps are long.
+
+    Args:
+        frames: of the run, with their masks.
+        result: what was solved.
+        sources: (F,) `PoseSource` of the coarse poses.
+
+    Raises:
+        GsbaError: the images determine no positions, and no trajectory gives them.
+    """
+    if (sources != PoseSource.NONE).any():
+        return
+    main = result.of_map(1)
+    share = _masked_share(frames)
+    where = (
+        f"{100 * share:.0f} % of the picture turn with the camera, as a vehicle does (see "
+        "carrier_check.jpg)"
+    )
+    if not len(main.points_world):
+        if share < _VEHICLE_SHARE:
+            return
+        raise GsbaError(
+            f"nothing but turns can be told from these pictures: {where}, and what passes by "
+            "shows no parallax: it is blurred or far away, or the vehicle stands; give more "
+            "frames per second, --masks of the vehicle, or a trajectory"
+        )
+    sigmas = step_sigmas(main)
+    if not len(sigmas) or np.median(sigmas) >= MIN_STEP_SIGMAS:
+        return
+    cause = where if share >= _VEHICLE_SHARE else "the camera hardly moves, or little matches"
+    raise GsbaError(
+        f"the images determine no positions: the median step is {np.median(sigmas):.1f} standard "
+        f"deviations long, and {MIN_STEP_SIGMAS:g} are needed: {cause}; nothing is written: give "
+        "sharper frames, other frames per second, or a trajectory"
+    )
+
+
+def step_sigmas(result: Reconstruction) -> np.ndarray:
+    """Length of each step of a map over the standard deviation of its end, (F - 1,) float64.
+
+    Steps of unknown covariance are left out.
+    """
+    poses, joint = result.world_T_rigs, result.joint_errors
+    if joint is None or len(poses) < 2:
+        return np.zeros(0)
+    steps = inverse(poses[:-1]) @ poses[1:]
+    spread = step_covariances(poses, result.pose_covariances, joint.neighbours)[:, 3:, 3:]
+    variances = np.trace(spread, axis1=1, axis2=2)
+    known = np.isfinite(variances) & (variances > 0)
+    return np.linalg.norm(steps[known, :3, 3], axis=1) / np.sqrt(variances[known])
+
+
+def _masked_share(frames: FrameSet) -> float:
+    """Part of the sphere's panorama that the mask of the first frame leaves out."""
+    mask = load_mask(frames, 0)
+    return 0.0 if mask is None else 1 - float(np.mean(mask))
