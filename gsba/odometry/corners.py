@@ -3,11 +3,11 @@
 import cv2
 import numpy as np
 
-from gsba.camera.rig import cells_of
+from gsba.camera.rig import cells_of, owner_faces
 from gsba.odometry.atlas import Atlas, AtlasLayout
 
-_PER_SIDE = 9  # cells along a side of a cube face: 10 degrees each
-_PER_CELL = 2  # features in a cell, followed ones among them
+_PER_SIDE = 11  # cells along a side of a cube face: 8 degrees each
+_PER_CELL = 1  # features in a cell, followed ones among them
 _BLOCK = 5  # pixels across the patch of which gradients are summed
 _APART_PX = 5  # between features
 _MIN_EIGENVALUE = 3e-5  # of a patch's gradients, as OpenCV normalises them: less is noise
@@ -53,8 +53,6 @@ def _flat(response: np.ndarray, allowed: np.ndarray) -> float:
 
 def _block(peaks: np.ndarray, layout: AtlasLayout, along: np.ndarray) -> None:
     """Clear `peaks` around features that are known, bearings (M, 3) along the axes of the cut."""
-    from gsba.camera.rig import owner_faces
-
     faces = owner_faces(along).astype(np.int64)
     for u, v in np.rint(layout.pixels(along, faces)).astype(int):
         top, left = max(v - _APART_PX, 0), max(u - _APART_PX, 0)

@@ -5,7 +5,7 @@ import numpy as np
 
 from gsba.odometry.atlas import Atlas, AtlasLayout, shared_faces
 
-_WINDOW = 13  # pixels across the patch that is followed
+_WINDOW = 15  # pixels across the patch that is followed
 _LEVELS = 3  # halvings of the atlas
 _STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)  # iterations, pixels
 _MIN_EIGENVALUE = 1e-4  # of a patch's gradients, as OpenCV normalises them

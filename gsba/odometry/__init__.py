@@ -1,0 +1,17 @@
+"""Visual odometry: where a 360-degree camera was during a video, from the video alone.
+
+Takes small panoramas, in time order. Gives a pose for every frame, and frames worth refining.
+"""
+
+from gsba.odometry.frame_choice import choose_frames
+from gsba.odometry.panoramas import of_frames, of_video, without_carrier
+from gsba.odometry.walk import Odometry, track_panoramas
+
+__all__ = [
+    "Odometry",
+    "choose_frames",
+    "of_frames",
+    "of_video",
+    "track_panoramas",
+    "without_carrier",
+]
