@@ -1,6 +1,6 @@
 """The command line. Commands parse, call and print; heavy imports stay in their bodies."""
 
-from gsba.cli import checking, plotting, preparing, refining, results, splat, viewing
+from gsba.cli import checking, plotting, preparing, refining, results, splat, tracking, viewing
 from gsba.cli.app import app
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "refining",
     "results",
     "splat",
+    "tracking",
     "viewing",
 ]
 

@@ -4,12 +4,13 @@ Takes small panoramas, in time order. Gives a pose for every frame, and frames w
 """
 
 from gsba.odometry.frame_choice import choose_frames
-from gsba.odometry.panoramas import of_frames, of_video, without_carrier
+from gsba.odometry.panoramas import masked, of_frames, of_video, without_carrier
 from gsba.odometry.walk import Odometry, track_panoramas
 
 __all__ = [
     "Odometry",
     "choose_frames",
+    "masked",
     "of_frames",
     "of_video",
     "track_panoramas",

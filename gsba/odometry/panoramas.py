@@ -64,6 +64,7 @@ def of_frames(frames: FrameSet, source: Path, width: int) -> SmallPanoramas:
             yield row, cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
     raw = frames.fisheyes is not None
+    found = SmallPanoramas(source, frames.timestamps, width, read)
     usable = clear_of_seam(width // 2).copy() if raw else np.ones(size[::-1], bool)
     masked = any(path is not None for path in frames.mask_paths)
     looks = np.unique(np.linspace(0, len(frames) - 1, _CARRIER_LOOKS).astype(int))
@@ -72,8 +73,7 @@ def of_frames(frames: FrameSet, source: Path, width: int) -> SmallPanoramas:
         if mask is not None:
             share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
             usable &= share > 0.9
-    everything = None if usable.all() else usable
-    return SmallPanoramas(source, frames.timestamps, width, read, everything)
+    return found if usable.all() else replace(found, usable=usable)
 
 
 def of_video(video: Path, width: int, calibration: Path | None = None) -> SmallPanoramas:
@@ -123,11 +123,29 @@ def without_carrier(panoramas: SmallPanoramas) -> SmallPanoramas:
         logger.info("nothing is masked: %s", error)
         return panoramas
     logger.info("carrier: %.1f%% of the picture", 100 * (1 - found.mean()))
-    fitted = (panoramas.width, panoramas.width // 2)
-    usable = cv2.resize(found.astype(np.float32), fitted) > 0.9
-    return replace(
-        panoramas, usable=usable if panoramas.usable is None else usable & panoramas.usable
-    )
+    return _narrowed(panoramas, found)
+
+
+def masked(panoramas: SmallPanoramas, mask: Path) -> SmallPanoramas:
+    """The same panoramas, used where a 2:1 picture, the mask of all frames, is white.
+
+    Raises:
+        GsbaError: the mask cannot be read, or is not 2:1.
+    """
+    levels = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE)
+    if levels is None:
+        raise GsbaError(f"{mask}: cannot be read as a picture; give a 2:1 mask, white = use")
+    if levels.shape[1] != 2 * levels.shape[0]:
+        raise GsbaError(f"{mask}: is {levels.shape[1]}x{levels.shape[0]}; a mask is 2:1")
+    return _narrowed(panoramas, levels > 127)
+
+
+def _narrowed(panoramas: SmallPanoramas, usable: np.ndarray) -> SmallPanoramas:
+    """Used only where a mask (h, 2h) bool of any size is True besides."""
+    size = (panoramas.width, panoramas.width // 2)
+    fitted = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.9
+    before = panoramas.usable
+    return replace(panoramas, usable=fitted if before is None else fitted & before)
 
 
 def _pixels(picture: Picture, colour: bool) -> np.ndarray:

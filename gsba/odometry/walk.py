@@ -93,6 +93,16 @@ class Odometry:
             "cpu_ms_per_frame": 1e3 * self.cpu_s / max(len(self), 1),
         }
 
+    def summary(self) -> str:
+        """One line for the terminal."""
+        told = self.report()
+        line = f"{told['posed']} of {told['frames']} frames posed, {told['keyframes']} keyframes"
+        if not (self.statuses == FrameStatus.TRACKED).any():
+            line += ", rotations only: the camera did not move enough to tell where it went"
+        elif len(self.pieces()) > 1:
+            line += f", {len(self.pieces())} maps that nothing ties together"
+        return f"{line}, {told['cpu_ms_per_frame']:.0f} ms of processor time a frame"
+
     def _stretches(self, chosen: np.ndarray) -> list[Stretch]:
         edges = np.flatnonzero(np.diff(chosen.astype(int), prepend=0, append=0))
         times = self.timestamps
@@ -138,15 +148,7 @@ def track_panoramas(panoramas: SmallPanoramas, seed: int = 0) -> Odometry:
 
 
 def _log(found: Odometry) -> None:
-    told = found.report()
-    logger.info(
-        "%d of %d frames posed, %d keyframes, %d map(s), %.0f ms of processor time a frame",
-        told["posed"],
-        told["frames"],
-        told["keyframes"],
-        told["maps"],
-        told["cpu_ms_per_frame"],
-    )
+    logger.info("%s", found.summary())
     for stretch in found.lost():
         logger.warning(
             "no pose from %.3f to %.3f s (%d frames): too dark, covered, or nothing in common "

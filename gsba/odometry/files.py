@@ -1,0 +1,25 @@
+"""Odometry on disk: the trajectory, its keyframes, and what happened."""
+
+from pathlib import Path
+
+import numpy as np
+
+from gsba.disk import write_json
+from gsba.odometry.walk import Odometry
+from gsba.trajectory.files import write_tum
+from gsba.types import Trajectory
+
+
+def write_odometry(found: Odometry, walk: Path, keyframes: Path, report: Path) -> None:
+    """Write the poses of all frames and of the keyframes as TUM files, and the report as JSON."""
+    for path in (walk, keyframes, report):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_tum(keyframes, found.trajectory(keyframes=True))
+    write_json(report, found.report())
+    write_tum(walk, found.trajectory())
+
+
+def write_chosen(found: Odometry, rows: np.ndarray, path: Path) -> None:
+    """Write the poses of chosen frames (N,) as a TUM file, by whose times they are extracted."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_tum(path, Trajectory(found.timestamps[rows], found.world_T_rigs[rows]))
