@@ -26,6 +26,7 @@ class Miniature:
 
     detail: np.ndarray  # (64, 128) float32
     weights: np.ndarray  # (64, 128) float32, solid angle, 0 = not the scene
+    contrast: float  # grey values, spread of the detail before it was scaled
 
 
 def miniature(grey: np.ndarray, usable: np.ndarray | None = None) -> Miniature:
@@ -41,7 +42,7 @@ def miniature(grey: np.ndarray, usable: np.ndarray | None = None) -> Miniature:
         share = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         weights = weights * (share > 0.9)
     spread = float(np.sqrt(np.average(detail**2, weights=weights))) if weights.any() else 0.0
-    return Miniature(detail / max(spread, 1e-3), weights)
+    return Miniature(detail / max(spread, 1e-3), weights, spread)
 
 
 def turned(one: Miniature, other: Miniature, guesses: list[np.ndarray]) -> np.ndarray:

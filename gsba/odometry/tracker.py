@@ -18,6 +18,7 @@ from gsba.odometry.atlas import Atlas, AtlasLayout, Cutter
 from gsba.odometry.corners import new_corners
 from gsba.odometry.derotation import Miniature, miniature, turned
 from gsba.odometry.flow import follow
+from gsba.odometry.relocalisation import Described, describe, placed
 from gsba.odometry.resection import Resection, resect
 from gsba.odometry.two_view_start import median_turn, start_map
 from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window
@@ -25,7 +26,9 @@ from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_wind
 logger = logging.getLogger(__name__)
 
 FREE, HELD = 8, 5  # keyframes of the window that are adjusted, and before them that are held
-_REMEMBERED = 6  # keyframes that a lost frame is compared with
+_REMEMBERED = 10  # keyframes that a lost frame is compared with
+_DESCRIBED = 4  # of these, the last ones, that it is compared with by descriptors
+_MIN_CONTRAST = 1.5  # grey values: less is darkness, or a hand over the lenses
 _KEYFRAME_PARALLAX = np.deg2rad(3.0)  # median of the features, since the last keyframe
 _KEYFRAME_SHARE = 0.7  # of the last keyframe's features that could be followed, still found
 _START_SHARE = 0.45  # of the first keyframe's features, below which a start is begun anew
@@ -57,6 +60,7 @@ class _Keyframe:
     bearings: np.ndarray  # (N, 3) unit, rig frame
     atlas: Atlas | None  # None = forgotten
     small: Miniature | None
+    described: Described | None = None  # when a lost frame was first compared with it
     most_found: int = 0  # of its features in one of the frames after it
 
 
@@ -157,8 +161,8 @@ class Tracker:
         """Make a frame the first keyframe of a map, if it shows anything."""
         atlas = self._cutter.cut(grey, self._pose[:3, :3])
         corners = self._corners(atlas, np.zeros((0, 3)))
-        if len(corners) < _MIN_FEATURES:
-            self._record(FrameStatus.LOST, np.eye(4), frame=frame)
+        if len(corners) < _MIN_FEATURES or small.contrast < _MIN_CONTRAST:
+            self._record(FrameStatus.LOST, np.eye(4))
             return
         self._window = []
         self._add_keyframe(frame, self._pose, atlas, small, None, corners)
@@ -250,10 +254,10 @@ class Tracker:
         assert self._features is not None
         key = self._window[-1]
         tried = self._attempt(grey, key, self._features, self._pose @ self._motion)
-        if not self._holds(tried):
+        if not tried.fit.significant:
             turned_pose = pose(self._turned(small, tried.fit.world_T_rig[:3, :3]), self._pose[:3, 3])
             again = self._attempt(grey, key, self._features, turned_pose)
-            tried = again if self._holds(again) else None
+            tried = again if again.fit.significant else None
         if tried is None:
             tried = self._relocalised(grey, small)
         if tried is None:
@@ -276,10 +280,6 @@ class Tracker:
         rows = known & found
         fit = resect(points[rows], bearings[rows], predicted, self._sigma)
         return _Attempt(atlas, bearings, found, fit)
-
-    @staticmethod
-    def _holds(tried: _Attempt) -> bool:
-        return tried.fit.significant
 
     def _accept(self, frame: int, tried: _Attempt, small: Miniature) -> None:
         """Take the pose of a frame; make it a keyframe if it is time."""
@@ -406,23 +406,51 @@ class Tracker:
 
     def _relocalised(self, grey: np.ndarray, small: Miniature) -> _Attempt | None:
         """A lost frame posed by one of the last keyframes, which takes the lead then; or None."""
+        if small.contrast < _MIN_CONTRAST:
+            return None
         for key in reversed(self._window):
             if key.atlas is None or key.small is None:
                 break
             world_R_rig = key.world_T_rig[:3, :3] @ turned(key.small, small, [np.eye(3)])
-            world = key.bearings @ key.world_T_rig[:3, :3].T
-            features = _Features(key.ids, key.bearings, world, np.zeros(len(key.ids), int))
-            tried = self._attempt(grey, key, features, pose(world_R_rig, key.world_T_rig[:3, 3]))
-            if tried.fit.significant:
-                tried = self._attempt(grey, key, features, tried.fit.world_T_rig)
-            if self._holds(tried):
-                if key is not self._window[-1]:
-                    self._window = self._window[: self._window.index(key) + 1]
-                self._features = features
-                self._motion = np.eye(4)
-                logger.debug("frame %d: found again by keyframe %d", len(self.records), key.number)
-                return tried
+            found = self._by_keyframe(grey, key, pose(world_R_rig, key.world_T_rig[:3, 3]))
+            if found is not None:
+                return found
+        frame = self._described(self._cutter.cut(grey, self._pose[:3, :3]))
+        for key in reversed(self._window[-_DESCRIBED:]):
+            if key.atlas is None:
+                break
+            if key.described is None:
+                key.described = self._described(key.atlas)
+            points = self._points[key.ids]
+            known = np.isfinite(points[:, 0])
+            distances = np.linalg.norm(points[known] - key.world_T_rig[:3, 3], axis=1)
+            seed = self.seed + len(self.records)
+            key_T_rig = placed(key.described, frame, key.bearings[known], distances, seed)
+            if key_T_rig is None:
+                continue
+            found = self._by_keyframe(grey, key, key.world_T_rig @ key_T_rig)
+            if found is not None:
+                return found
         return None
+
+    def _by_keyframe(
+        self, grey: np.ndarray, key: _Keyframe, predicted: np.ndarray
+    ) -> _Attempt | None:
+        """A frame followed from a keyframe near a predicted pose; the keyframe leads if it holds."""
+        world = key.bearings @ key.world_T_rig[:3, :3].T
+        features = _Features(key.ids, key.bearings, world, np.zeros(len(key.ids), int))
+        tried = self._attempt(grey, key, features, predicted)
+        if tried.fit.significant:
+            tried = self._attempt(grey, key, features, tried.fit.world_T_rig)
+        if not tried.fit.significant:
+            return None
+        self._window = self._window[: self._window.index(key) + 1]
+        self._features = features
+        logger.debug("frame %d: found again by keyframe %d", len(self.records), key.number)
+        return tried
+
+    def _described(self, atlas: Atlas) -> Described:
+        return describe(self._layout, atlas, self._usable_in(atlas))
 
     def _lose(self, grey: np.ndarray, small: Miniature, frame: int) -> None:
         """Leave a frame without a pose; begin a new map after several."""
@@ -430,8 +458,7 @@ class Tracker:
         self._small = self._small if self._small is not None else small
         key = self._window[-1]
         self._record(FrameStatus.LOST, inverse(key.world_T_rig) @ self._pose)
-        atlas = self._cutter.cut(grey, self._pose[:3, :3])
-        if len(self._corners(atlas, np.zeros((0, 3)))) < _MIN_FEATURES:
+        if small.contrast < _MIN_CONTRAST:
             return
         self._failures += 1
         if self._failures < _PATIENCE:
@@ -486,7 +513,6 @@ class Tracker:
         key_T_rig: np.ndarray,
         distance: float = float("nan"),
         inliers: int = 0,
-        frame: int | None = None,
     ) -> None:
         """Note the frame after the last one."""
         if not self.keyframe_poses:
