@@ -32,9 +32,7 @@ def load_joined(frames: FrameSet, f: int, gray: bool, width: int) -> np.ndarray:
     return join_pictures(pictures, frames.fisheyes, width, width / frames.width)
 
 
-def join_pictures(
-    pictures: list[np.ndarray], pair: Pair, width: int, share: float
-) -> np.ndarray:
+def join_pictures(pictures: list[np.ndarray], pair: Pair, width: int, share: float) -> np.ndarray:
     """Panorama (width / 2, width[, 3]) uint8 of what the front and the back lens saw.
 
     Args:

@@ -44,7 +44,9 @@ class AtlasLayout:
     def corners(self) -> np.ndarray:
         """(6, 2) float64, pixel of the top left corner of each face."""
         number = np.arange(len(RIG_R_FACE))
-        return self.rig.size * np.stack([number % _COLUMNS, number // _COLUMNS], axis=1).astype(float)
+        return self.rig.size * np.stack([number % _COLUMNS, number // _COLUMNS], axis=1).astype(
+            float
+        )
 
     @cached_property
     def directions(self) -> np.ndarray:

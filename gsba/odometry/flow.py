@@ -38,9 +38,7 @@ def follow(
     faces = shared_faces(before, guess)
     starts, ends = layout.pixels(before, faces), layout.pixels(guess, faces)
     margin = _WINDOW / 2
-    rows = np.flatnonzero(
-        layout.inside(starts, faces, margin) & layout.inside(ends, faces, margin)
-    )
+    rows = np.flatnonzero(layout.inside(starts, faces, margin) & layout.inside(ends, faces, margin))
     found, bearings = np.zeros(len(predicted), bool), predicted.copy()
     if not len(rows):
         return bearings, found

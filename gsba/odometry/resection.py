@@ -5,15 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors import tangent_basis
-from gsba.significance import least_agreeing
 from gsba.camera.rig import witnesses
+from gsba.significance import least_agreeing
 
 _STEPS = 12  # Gauss-Newton
 _CONVERGED = 1e-6  # radians, and parts of the median distance
 _ANNEALED = (8.0, 4.0, 2.0, 1.0)  # scale of the loss in the first steps, times the last
 _GATE = 3.5  # standard deviations of an inlier
 _SAMPLE = 3  # bearings that determine a pose
-_CELLS = 8  # along a cube face's side: all features within one cell, 11 degrees, are one witness
+_CELLS = 16  # along a cube face's side: all features within one cell, 6 degrees, are one witness
+_MIN_WITNESSES = 20  # that agree: fewer may be of one thing that moves on its own
 _MAX_FALSE_ALARMS = 1e-6  # poses that chance explains as well as the one believed
 _CHANCE_SPAN = np.deg2rad(6.0)  # false matches lie anywhere within this of where they were expected
 _MAX_POSITION_SIGMA = 0.05  # of the position, in median distances of the points
@@ -116,4 +117,5 @@ def _significant(bearings: np.ndarray, inliers: np.ndarray, sigma: float) -> boo
     agreeing = witnesses(bearings[inliers], _CELLS) if inliers.any() else 0
     chance = min((_GATE * sigma / _CHANCE_SPAN) ** 2, 0.5)
     per_witness = 1 - (1 - chance) ** (len(bearings) / max(num, 1))
-    return agreeing >= least_agreeing(num, per_witness, _SAMPLE, _MAX_FALSE_ALARMS)
+    needed = least_agreeing(num, per_witness, _SAMPLE, _MAX_FALSE_ALARMS)
+    return agreeing >= max(needed, _MIN_WITNESSES)

@@ -7,7 +7,6 @@ Frames hang on their keyframes, and move with them.
 """
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -31,13 +30,13 @@ _DESCRIBED = 4  # of these, the last ones, that it is compared with by descripto
 _MIN_CONTRAST = 1.5  # grey values: less is darkness, or a hand over the lenses
 _KEYFRAME_PARALLAX = np.deg2rad(3.0)  # median of the features, since the last keyframe
 _KEYFRAME_SHARE = 0.7  # of the last keyframe's features that could be followed, still found
+_FADING_SHARE = 0.7  # of the first keyframe's features, below which less parallax has to do
 _START_SHARE = 0.45  # of the first keyframe's features, below which a start is begun anew
-_SIGMA, _MIN_SIGMA, _MAX_SIGMA = np.deg2rad([0.12, 0.05, 0.35])  # of bearings, per axis
+_SIGMA, _MIN_SIGMA, _MAX_SIGMA = np.deg2rad([0.25, 0.05, 0.35])  # of bearings, per axis
 _ADAPTING = 0.1  # weight of one frame in the noise of bearings
 _GATE = 4.0  # standard deviations of a feature that fits
 _MIN_FEATURES = 40  # of a picture that shows anything
 _MAX_MISSES = 4  # frames in a row in which a feature without a point was not found
-_PATIENCE = 8  # frames that show something and fit no keyframe, before a new map is begun
 _MAX_PENDING = 300  # frames before the start of a map that are posed again once it has points
 
 
@@ -115,6 +114,7 @@ class Tracker:
     width: int  # pixels across the panoramas
     usable: np.ndarray | None = None  # (h, 2h) bool, what shows the scene in every frame
     seed: int = 0  # of the sampling at the start of a map
+    patience: int = 8  # frames that show something and fit no keyframe before a new map is begun
     records: list[FrameRecord] = field(default_factory=list)
     keyframe_poses: list[np.ndarray] = field(default_factory=list)
     keyframe_frames: list[int] = field(default_factory=list)
@@ -173,15 +173,12 @@ class Tracker:
         """Follow the first keyframe's features until they show that the camera moved."""
         key, features = self._window[-1], self._features
         assert key.atlas is not None and features is not None
-        attempts = [self._pose[:3, :3] @ self._motion[:3, :3]]
-        for attempt in range(2):
-            rotation = attempts[-1]
-            atlas = self._cutter.cut(grey, rotation)
-            predicted = unit(features.latest_world @ rotation)
-            bearings, found = follow(self._layout, key.atlas, atlas, features.bearings, predicted)
-            if attempt or np.count_nonzero(found) >= _START_SHARE * key.most_found:
-                break
-            attempts.append(self._turned(small, rotation))
+        predicted_R = self._pose[:3, :3] @ self._motion[:3, :3]
+        atlas, bearings, found = self._followed(grey, key, features, predicted_R)
+        if np.count_nonzero(found) < _START_SHARE * (key.most_found or len(features.ids)):
+            again = self._followed(grey, key, features, self._turned(small, predicted_R))
+            if np.count_nonzero(again[2]) > np.count_nonzero(found):
+                atlas, bearings, found = again
         ids, one, other = features.ids[found], features.bearings[found], bearings[found]
         if len(ids) < _MIN_FEATURES:
             self._lose(grey, small, frame)
@@ -189,7 +186,9 @@ class Tracker:
         key.most_found = max(key.most_found, len(ids))
         turn = median_turn(one, other)
         world_R_rig = key.world_T_rig[:3, :3] @ turn.one_R_other
-        solved = start_map(ids, one, other, turn, self._sigma, self._seed_of(frame))
+        fading = len(ids) < _FADING_SHARE * key.most_found
+        seed = self.seed + frame
+        solved = start_map(ids, one, other, turn, self._sigma, seed, fading)
         self._failures = 0
         if solved is not None:
             self._start(frame, solved, atlas, small, ids, other)
@@ -209,6 +208,15 @@ class Tracker:
         del self._pending[:-_MAX_PENDING]
         self._record(FrameStatus.TURNING, inverse(key.world_T_rig) @ self._pose)
 
+    def _followed(
+        self, grey: np.ndarray, key: _Keyframe, features: _Features, world_R_rig: np.ndarray
+    ) -> tuple[Atlas, np.ndarray, np.ndarray]:
+        """A frame's atlas, bearings (N, 3) of features in it, and which were found, by rotation."""
+        assert key.atlas is not None
+        atlas = self._cutter.cut(grey, world_R_rig)
+        expected = unit(features.latest_world @ world_R_rig)
+        return atlas, *follow(self._layout, key.atlas, atlas, features.bearings, expected)
+
     def _start(
         self,
         frame: int,
@@ -224,10 +232,11 @@ class Tracker:
         points = solved.points_world @ world_T_key[:3, :3].T + world_T_key[:3, 3]
         self._set_points(solved.ids, points)
         self._has_points = True
-        self._step(world_T_key @ solved.world_T_rigs[1], small)
-        self._motion = np.eye(4)
         for before, seen, where in self._pending:
             self._pose_again(before, seen, where, key)
+        last = self.records[-1]
+        self._pose = self.keyframe_poses[last.keyframe] @ last.key_T_rig
+        self._step(world_T_key @ solved.world_T_rigs[1], small)
         self._pending.clear()
         false = np.isin(ids, solved.outliers[:, 1])
         self._become_keyframe(frame, atlas, small, ids[~false], bearings[~false])
@@ -255,7 +264,9 @@ class Tracker:
         key = self._window[-1]
         tried = self._attempt(grey, key, self._features, self._pose @ self._motion)
         if not tried.fit.significant:
-            turned_pose = pose(self._turned(small, tried.fit.world_T_rig[:3, :3]), self._pose[:3, 3])
+            turned_pose = pose(
+                self._turned(small, tried.fit.world_T_rig[:3, :3]), self._pose[:3, 3]
+            )
             again = self._attempt(grey, key, self._features, turned_pose)
             tried = again if again.fit.significant else None
         if tried is None:
@@ -461,7 +472,7 @@ class Tracker:
         if small.contrast < _MIN_CONTRAST:
             return
         self._failures += 1
-        if self._failures < _PATIENCE:
+        if self._failures < self.patience:
             return
         self._failures = 0
         logger.warning("frame %d: nothing ties it to the map: a new one begins", frame)
@@ -520,6 +531,3 @@ class Tracker:
             self.keyframe_frames.append(len(self.records))
         key = self._window[-1].number if self._window else len(self.keyframe_poses) - 1
         self.records.append(FrameRecord(status, self._map, key, key_T_rig, distance, inliers))
-
-    def _seed_of(self, frame: int) -> int:
-        return self.seed + frame

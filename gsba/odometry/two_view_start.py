@@ -11,7 +11,8 @@ from gsba.matching.verification import relative_pose
 from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window
 
 _REFITS = 6  # of a rotation, without the features that are furthest off
-_MOVED = np.deg2rad(1.2)  # parallax of the upper quarter of the features: a start is tried
+_MOVED, _MOVED_LITTLE = np.deg2rad([4.0, 1.2])  # parallax of the upper quarter of the features,
+# from which on a start is tried; where features are being lost
 _MAX_DIRECTION_SIGMA = np.deg2rad(6.0)  # of the translation
 _MIN_POINTS = 40  # that are independent, cells of 6 degrees
 _CELLS = 16
@@ -39,7 +40,13 @@ def median_turn(one: np.ndarray, other: np.ndarray) -> Turn:
 
 
 def start_map(
-    ids: np.ndarray, one: np.ndarray, other: np.ndarray, turn: Turn, sigma: float, seed: int
+    ids: np.ndarray,
+    one: np.ndarray,
+    other: np.ndarray,
+    turn: Turn,
+    sigma: float,
+    seed: int,
+    fading: bool,
 ) -> AdjustedWindow | None:
     """Poses of two frames and the points they see; None where the camera may have turned only.
 
@@ -51,8 +58,10 @@ def start_map(
         turn: of the bearings.
         sigma: radians, of bearings per axis.
         seed: of the sampling.
+        fading: whether features are being lost, so that little parallax has to do.
     """
-    if len(ids) < _MIN_POINTS or np.quantile(turn.parallaxes, 0.75) < _MOVED:
+    moved = _MOVED_LITTLE if fading else _MOVED
+    if len(ids) < _MIN_POINTS or np.quantile(turn.parallaxes, 0.75) < moved:
         return None
     found = relative_pose(one, other, _VERIFY, seed)
     if found is None or found.direction_sigma > _MAX_DIRECTION_SIGMA:

@@ -15,6 +15,7 @@ from gsba.video.likeness import sharpness
 logger = logging.getLogger(__name__)
 
 _MIN_FRAMES_OF_MAP = 5  # fewer say nothing
+_PATIENCE_S, _MIN_PATIENCE = 1.5, 8  # seconds, and frames, before a lost camera begins a new map
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +121,9 @@ def track_panoramas(panoramas: SmallPanoramas, seed: int = 0) -> Odometry:
         seed: of the sampling at the start of a map.
     """
     num = len(panoramas)
-    tracker = Tracker(panoramas.width, panoramas.usable, seed)
+    interval = float(np.median(np.diff(panoramas.timestamps)))
+    patience = max(_MIN_PATIENCE, round(_PATIENCE_S / interval))
+    tracker = Tracker(panoramas.width, panoramas.usable, seed, patience)
     rows, sharp, cpu_s = [], np.zeros(num), 0.0
     pictures = panoramas.read(range(num), False)
     for row, grey in track(pictures, "tracking", num):
