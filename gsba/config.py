@@ -63,6 +63,17 @@ class VideoSettings(_Settings):
     )  # less apparent motion since the last frame: the camera stands, leave out; 0 = keep all
 
 
+class OdometrySettings(_Settings):
+    """A video's own odometry, and the frames that are chosen by what it shows."""
+
+    width: int = Field(default=800, ge=256, le=4096, multiple_of=2)  # pixels across the panoramas
+    step: float = Field(
+        default=0.2, gt=0, le=1
+    )  # from one chosen frame to the next, part of the distance of things
+    max_turn_deg: float = Field(default=40.0, gt=0)  # from one chosen frame to the next
+    max_frames: int | None = Field(default=None, ge=3)  # chosen, by longer steps; None = no limit
+
+
 class CubemapSettings(_Settings):
     """Faces cut from a panorama for detection."""
 
@@ -452,6 +463,7 @@ class RefineSettings(_Settings):
     """Everything a run depends on."""
 
     video: VideoSettings = VideoSettings()
+    odometry: OdometrySettings = OdometrySettings()
     read: ReadSettings = ReadSettings()
     cubemap: CubemapSettings = CubemapSettings()
     features: FeatureSettings = FeatureSettings()
@@ -483,6 +495,10 @@ class RefineSettings(_Settings):
         """Without what is said in seconds, for frames whose times are no more than an order."""
         camera = self.camera.model_copy(update={"name": None, "readout_ms": None})
         return self.model_copy(update={"camera": camera})
+
+    def with_faint_priors(self) -> "RefineSettings":
+        """For a trajectory that is no more than a start."""
+        return self.model_copy(update={"priors": self.priors.faint()})
 
     def plainer(self) -> "RefineSettings":
         """For a first solution: features alone, without patches, pixels or splats."""

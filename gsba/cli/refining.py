@@ -116,6 +116,14 @@ def refine(
         bool,
         typer.Option("--no-trajectory", help="Start from the images alone, as without TRAJECTORY."),
     ] = False,
+    odometry: Annotated[
+        bool,
+        typer.Option(
+            "--odometry",
+            help="Of a video: follow the camera through all of it, refine frames chosen by what "
+            "they show, and start from there.",
+        ),
+    ] = False,
     config: Config = None,
     overrides: Overrides = None,
     masks: Masks = None,
@@ -144,6 +152,11 @@ def refine(
     """
     if trajectory and no_trajectory:
         raise GsbaError("a TRAJECTORY and --no-trajectory exclude each other: leave one out")
+    if odometry and (trajectory or no_trajectory or fps is not None or frames.is_dir()):
+        raise GsbaError(
+            "--odometry is for a VIDEO, and finds trajectory and frames itself: leave out "
+            "TRAJECTORY, --no-trajectory and --fps"
+        )
     if keyframes is not None and not trajectory:
         raise GsbaError("--keyframes go with the TRAJECTORY of the same run")
     out = out or _run_folder(frames)
@@ -156,6 +169,7 @@ def refine(
         from gsba.store.cluster import connected
     given = {"keyframes": keyframes, "segment": segment, "timestamps": timestamps, "fps": fps}
     given |= {"masks": masks or "auto", "calibration": calibration, "imu": imu, "fresh": fresh}
+    given |= {"odometry": odometry}
     with connected(cluster) as client:
         result = pipeline.refine(frames, trajectory, out, settings, client=client, **given)
     _conclude([result], allow_partial)

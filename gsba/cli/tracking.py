@@ -8,9 +8,6 @@ import typer
 from gsba.cli.app import command
 from gsba.log import GsbaError
 
-WIDTH = 800  # pixels across the panoramas that are followed
-
-
 @command
 def track(
     frames: Annotated[
@@ -37,8 +34,9 @@ def track(
         typer.Option(help="auto: find what carries the camera; none; or a mask, white = use."),
     ] = "auto",
     width: Annotated[
-        int, typer.Option(help="Pixels across the panoramas that are followed.", min=256, max=4096)
-    ] = WIDTH,
+        int | None,
+        typer.Option(help="Pixels across the panoramas that are followed; 800 if unsaid."),
+    ] = None,
     fps: Annotated[
         float | None, typer.Option(help="Frames per second of a folder without times.")
     ] = None,
@@ -51,13 +49,13 @@ def track(
 ) -> None:
     """Follow the camera through a video without any other program: a pose for every frame."""
     from gsba import odometry
+    from gsba.config_file import validated
     from gsba.odometry.files import write_odometry
     from gsba.video import is_video
 
     if out.is_dir():
         raise GsbaError(f"{out}: is a folder; --out names the trajectory file to write")
-    if width % 2:
-        raise GsbaError(f"--width {width}: an even number is needed")
+    width = validated({"odometry": {} if width is None else {"width": width}}).odometry.width
     mask = None if masks in ("auto", "none") else Path(masks)
     if is_video(frames):
         if fps is not None or timestamps is not None:

@@ -67,7 +67,7 @@ class AtlasLayout:
         return owners == faces
 
     def pixels(self, bearings_cut: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """OpenCV pixels (N, 2) of bearings (N, 3) along the axes of the cut; NaN behind the face."""
+        """OpenCV pixels (N, 2) of bearings (N, 3), axes of the cut; NaN behind the face."""
         return self.rig.project(bearings_cut, faces) + self.corners[faces] - 0.5
 
     def bearings(self, pixels: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -79,7 +79,7 @@ class AtlasLayout:
         local = pixels - self.corners[faces]
         with np.errstate(invalid="ignore"):
             within = (local > margin) & (local < self.rig.size - 1 - margin)
-        return within.all(axis=1)
+        return np.asarray(within.all(axis=1))
 
 
 class Cutter:
@@ -91,13 +91,12 @@ class Cutter:
         self._height = 0
         self._maps: tuple[np.ndarray, np.ndarray] | None = None
 
-    def cut(self, grey: np.ndarray, world_R_rig: np.ndarray, interpolation: int = 1) -> Atlas:
+    def cut(self, grey: np.ndarray, world_R_rig: np.ndarray) -> Atlas:
         """The atlas of a panorama (h, 2h) uint8 whose orientation is roughly known.
 
         Args:
             grey: the panorama.
             world_R_rig: (3, 3) predicted orientation.
-            interpolation: OpenCV's flag; bilinear by default.
         """
         off = np.inf
         if self._cut_R_rig is not None and self._height == len(grey):
@@ -107,9 +106,10 @@ class Cutter:
             rays = self._layout.directions.reshape(-1, 3)
             maps = np.empty((*self._layout.directions.shape[:2], 2), np.float32)
             _erp_pixels(rays, world_R_rig, len(grey), maps.reshape(-1, 2))
-            self._maps = cv2.convertMaps(maps, None, cv2.CV_16SC2)
+            self._maps = cv2.convertMaps(maps, np.zeros(0, np.float32), cv2.CV_16SC2)
         assert self._cut_R_rig is not None and self._maps is not None
-        image = cv2.remap(grey, *self._maps, interpolation, borderMode=cv2.BORDER_WRAP)
+        first, second = self._maps
+        image = cv2.remap(grey, first, second, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
         return Atlas(image, self._cut_R_rig)
 
 

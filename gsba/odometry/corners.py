@@ -60,7 +60,7 @@ def _block(peaks: np.ndarray, layout: AtlasLayout, along: np.ndarray) -> None:
 
 
 def _strongest(cells: np.ndarray, room: np.ndarray) -> np.ndarray:
-    """Rows (N',) of the first `room[cell]` entries of each cell (N,), which are in falling order."""
+    """Rows (N',) of the first `room[cell]` entries of each cell (N,), given in falling order."""
     order = np.argsort(cells, kind="stable")
     starts = np.searchsorted(cells[order], np.arange(len(room)))
     rank = np.empty(len(cells), int)
@@ -70,11 +70,11 @@ def _strongest(cells: np.ndarray, room: np.ndarray) -> np.ndarray:
 
 def _apart(pixels: np.ndarray) -> np.ndarray:
     """Rows of pixels (N, 2), in falling order, that are `_APART_PX` from all that go before."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     if len(pixels) < 2:
         return np.arange(len(pixels))
-    pairs = cKDTree(pixels).query_pairs(_APART_PX, output_type="ndarray")
+    pairs = KDTree(pixels).query_pairs(_APART_PX, output_type="ndarray")
     out = np.zeros(len(pixels), bool)
     out[pairs.max(axis=1)] = True
     return np.flatnonzero(~out)

@@ -81,8 +81,7 @@ def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.nd
         # The other picture, turned by the estimate, is compared at the rays of the first.
         places = erp_from_bearings(rays @ rotation, _WIDTH, _WIDTH // 2).astype(np.float32) - 0.5
         maps = places.reshape(-1, _WIDTH, 2)
-        sampled = cv2.remap(other.detail, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-        seen = cv2.remap(other.weights, maps, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_WRAP)
+        sampled, seen = _sampled(other.detail, maps), _sampled(other.weights, maps)
         residuals = (sampled - one.detail).ravel()
         both = weights * (seen.ravel() > 0)
         robust = both / (1 + residuals**2)
@@ -95,6 +94,12 @@ def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.nd
         if np.linalg.norm(step) < _CONVERGED:
             break
     return rotation, cost
+
+
+def _sampled(image: np.ndarray, maps: np.ndarray) -> np.ndarray:
+    """A panorama at OpenCV pixels (h, w, 2)."""
+    nothing = np.zeros(0, np.float32)
+    return cv2.remap(image, maps, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
 
 
 @table(maxsize=1)

@@ -4,22 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsba.config import OdometrySettings
 from gsba.geometry import rotation_angle
 from gsba.odometry.walk import Odometry
 
-STEP = 0.2  # of the distance of things, from one chosen frame to the next
-MAX_TURN_DEG = 40.0  # from one chosen frame to the next
 _EARLIEST = 0.6  # part of a step after which the sharpest frame is looked for
 _MOST_LONGER = 1e6  # times the step, where few frames are wanted
 _HALVINGS = 20  # of the interval in which that factor is looked for
 
 
-def choose_frames(
-    found: Odometry,
-    step: float = STEP,
-    max_turn_deg: float = MAX_TURN_DEG,
-    count: int | None = None,
-) -> np.ndarray:
+def choose_frames(found: Odometry, settings: OdometrySettings) -> np.ndarray:
     """Rows (N,) of frames that are worth refining.
 
     From one frame to the next the camera moves by at most `step` times the median distance of
@@ -28,11 +22,10 @@ def choose_frames(
 
     Args:
         found: of all frames.
-        step: part of the median distance.
-        max_turn_deg: degrees.
-        count: frames at most, by longer steps; None = as many as it takes.
+        settings: lengths of the steps, and how many frames at most.
     """
-    steps = _Steps.of(found, step, np.deg2rad(max_turn_deg))
+    count = settings.max_frames
+    steps = _Steps.of(found, settings.step, np.deg2rad(settings.max_turn_deg))
     rows = _chosen(found, steps, 1.0)
     if count is None or len(rows) <= count:
         return rows

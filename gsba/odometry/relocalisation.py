@@ -107,16 +107,16 @@ def _length(
         direction: (3,) unit, of the step.
         bearings, distances: of the points.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     if not len(bearings):
         return None
     parallax = np.linalg.norm(np.cross(one, other), axis=1)
-    apart, nearest = cKDTree(bearings).query(one)
+    apart, nearest = KDTree(bearings).query(one)
     use = (parallax > _MIN_PARALLAX) & (apart < _NEAR)
     if np.count_nonzero(use) < _MIN_SCALES:
         return None
     # |step x other| / |one x other| is the distance along `one` at a step of length 1.
     at_one = np.linalg.norm(np.cross(direction, other[use]), axis=1) / parallax[use]
-    lengths = distances[nearest[use]] / np.maximum(at_one, 1e-9)
+    lengths = distances[np.asarray(nearest)[use]] / np.maximum(at_one, 1e-9)
     return float(np.median(lengths))

@@ -1,8 +1,8 @@
 """Visual odometry on the sphere: one small grey panorama after another, one pose for each.
 
 Features of the last keyframe are followed into each frame; the frame's pose comes from those whose
-points are known (resection). A frame that shows enough parallax, or too few of the features, becomes
-a keyframe: new features are added, all of the window are triangulated anew and adjusted together.
+points are known (resection). A frame that shows enough parallax, or too few features, becomes a
+keyframe: new features are added, all of the window are triangulated anew and adjusted together.
 Frames hang on their keyframes, and move with them.
 """
 
@@ -305,7 +305,7 @@ class Tracker:
         known = np.isfinite(self._points[features.ids, 0])
         distance = self._distance(features.ids[fits & known], self._pose)
         parallax = self._parallax(features, tried, fits, key)
-        key.most_found = max(key.most_found, np.count_nonzero(fits))
+        key.most_found = max(key.most_found, int(np.count_nonzero(fits)))
         share = np.count_nonzero(fits) / max(key.most_found, 1)
         if parallax > _KEYFRAME_PARALLAX or share < _KEYFRAME_SHARE:
             ids, bearings = features.ids[fits], tried.bearings[fits]
@@ -447,7 +447,7 @@ class Tracker:
     def _by_keyframe(
         self, grey: np.ndarray, key: _Keyframe, predicted: np.ndarray
     ) -> _Attempt | None:
-        """A frame followed from a keyframe near a predicted pose; the keyframe leads if it holds."""
+        """A frame followed from a keyframe, which leads then; None where no pose comes of it."""
         world = key.bearings @ key.world_T_rig[:3, :3].T
         features = _Features(key.ids, key.bearings, world, np.zeros(len(key.ids), int))
         tried = self._attempt(grey, key, features, predicted)

@@ -57,6 +57,11 @@ class Odometry:
         large = with_points[counts[with_points] >= _MIN_FRAMES_OF_MAP]
         return found & np.isin(self.maps, large)
 
+    def usable(self) -> bool:
+        """Whether most frames are posed, and the camera moved enough to tell where it went."""
+        found = self.posed() & np.isfinite(self.distances)
+        return bool(np.count_nonzero(found) > 0.5 * len(self))
+
     def pieces(self) -> list[Trajectory]:
         """Posed frames of each map; no two maps are related."""
         posed = self.posed()

@@ -69,6 +69,7 @@ def refine(
     fps: float | None = None,
     calibration: Path | None = None,
     imu: Path | None = None,
+    odometry: bool = False,
     fresh: bool = False,
     extra_factors: ExtraFactors | None = None,
     client: "Client | None" = None,
@@ -90,6 +91,8 @@ def refine(
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
         imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
+        odometry: of a video without a trajectory: follow the camera through all of it, take the
+            frames that `settings.odometry` chooses by what they show, and start from these poses.
         fresh: forget an earlier run in `out`.
         extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
         client: of a Dask scheduler whose workers take what can be shared out; None = threads here.
@@ -105,7 +108,10 @@ def refine(
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
     readings = inputs.read_gyro(imu, frames)
     if video.is_video(frames):
-        inputs.extract_frames(out, origin, settings, fps, fresh)
+        odometry &= not given
+        found = inputs.extract_frames(out, origin, settings, fps, fresh, odometry, calibration)
+        if found:  # by these very images: they have no say of their own
+            given, settings = found, settings.with_faint_priors()
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, calibration)
     check(settings.placement, frame_set, settings.camera.baseline())
