@@ -12,11 +12,13 @@ import numpy as np
 
 from factors.compiled import kernel_and_part
 from gsba.camera.rig import RIG_R_FACE, CubeRig, owner_faces
+from gsba.camera.sphere import around_sphere
 from gsba.geometry import rotation_angle, unit
 
 _kernel, _part = kernel_and_part()
 HFOV = np.deg2rad(106.0)  # of a face: a feature may move 8 degrees beyond the face that owns it
 _COLUMNS = 3  # faces side by side
+_PAD = 2  # pixels beyond seam and poles that interpolation reads
 _MAX_CUT_ERROR = np.deg2rad(6.0)  # of the axes of a cut: maps are computed anew beyond it
 
 
@@ -106,10 +108,11 @@ class Cutter:
             rays = self._layout.directions.reshape(-1, 3)
             maps = np.empty((*self._layout.directions.shape[:2], 2), np.float32)
             _erp_pixels(rays, world_R_rig, len(grey), maps.reshape(-1, 2))
+            maps += _PAD
             self._maps = cv2.convertMaps(maps, np.zeros(0, np.float32), cv2.CV_16SC2)
         assert self._cut_R_rig is not None and self._maps is not None
         first, second = self._maps
-        image = cv2.remap(grey, first, second, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        image = cv2.remap(around_sphere(grey, _PAD), first, second, cv2.INTER_LINEAR)
         return Atlas(image, self._cut_R_rig)
 
 

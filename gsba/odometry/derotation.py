@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings
 from gsba.camera.tables import table
 
 _WIDTH = 128  # pixels across the panoramas that are compared
 _BLUR = 1.2, 8.0  # pixels: band of detail that is compared
 _STEPS = 15
+_PAD = 2  # pixels beyond seam and poles that interpolation reads
 _CONVERGED = np.deg2rad(0.05)
 _MAX_STEP = np.deg2rad(15.0)
 _ROWS = (0.25, 0.75)  # part of the height whose rows are correlated
@@ -79,8 +80,8 @@ def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.nd
     jacobian = _jacobian(one.detail)
     for _ in range(_STEPS):
         # The other picture, turned by the estimate, is compared at the rays of the first.
-        places = erp_from_bearings(rays @ rotation, _WIDTH, _WIDTH // 2).astype(np.float32) - 0.5
-        maps = places.reshape(-1, _WIDTH, 2)
+        places = erp_from_bearings(rays @ rotation, _WIDTH, _WIDTH // 2) - 0.5
+        maps = places.astype(np.float32).reshape(-1, _WIDTH, 2)
         sampled, seen = _sampled(other.detail, maps), _sampled(other.weights, maps)
         residuals = (sampled - one.detail).ravel()
         both = weights * (seen.ravel() > 0)
@@ -98,8 +99,8 @@ def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.nd
 
 def _sampled(image: np.ndarray, maps: np.ndarray) -> np.ndarray:
     """A panorama at OpenCV pixels (h, w, 2)."""
-    nothing = np.zeros(0, np.float32)
-    return cv2.remap(image, maps, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    padded = around_sphere(image, _PAD)
+    return cv2.remap(padded, maps + _PAD, np.zeros(0, np.float32), cv2.INTER_LINEAR)
 
 
 @table(maxsize=1)
