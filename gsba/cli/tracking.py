@@ -8,6 +8,7 @@ import typer
 from gsba.cli.app import command
 from gsba.log import GsbaError
 
+
 @command
 def track(
     frames: Annotated[

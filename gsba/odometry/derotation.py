@@ -81,7 +81,7 @@ def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.nd
     for _ in range(_STEPS):
         # The other picture, turned by the estimate, is compared at the rays of the first.
         places = erp_from_bearings(rays @ rotation, _WIDTH, _WIDTH // 2) - 0.5
-        maps = places.astype(np.float32).reshape(-1, _WIDTH, 2)
+        maps = np.ascontiguousarray(places, np.float32).reshape(-1, _WIDTH, 2)
         sampled, seen = _sampled(other.detail, maps), _sampled(other.weights, maps)
         residuals = (sampled - one.detail).ravel()
         both = weights * (seen.ravel() > 0)
@@ -100,7 +100,8 @@ def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.nd
 def _sampled(image: np.ndarray, maps: np.ndarray) -> np.ndarray:
     """A panorama at OpenCV pixels (h, w, 2)."""
     padded = around_sphere(image, _PAD)
-    return cv2.remap(padded, maps + _PAD, np.zeros(0, np.float32), cv2.INTER_LINEAR)
+    u, v = maps[..., 0] + _PAD, maps[..., 1] + _PAD
+    return cv2.remap(padded, u, v, cv2.INTER_LINEAR)
 
 
 @table(maxsize=1)

@@ -152,7 +152,11 @@ def _follow(
         panoramas = odometry.of_video(video_file, settings.odometry.width, calibration)
         return odometry.track_panoramas(odometry.without_carrier(panoramas), settings.seed)
 
-    key = [settings.odometry.width, settings.seed, fingerprint([*files_of(video_file), calibration])]
+    key = [
+        settings.odometry.width,
+        settings.seed,
+        fingerprint([*files_of(video_file), calibration]),
+    ]
     found = store.stage("odometry", key, compute, Odometry)
     if not found.usable():
         logger.warning("the odometry lost the camera in most of the video: frames at a fixed rate")
