@@ -50,7 +50,7 @@ def extract(
     if frames is not None and every != "auto":
         raise GsbaError("--frames limits what --every auto chooses: pass that too")
     if every == "auto":
-        every, at = None, _chosen_by_odometry(video, out, frames, fresh)
+        every, at = None, _chosen_by_odometry(video, out, frames, fresh, (from_s, to_s))
     asked = {"fps": fps, "every": every, "at": None if at is None else str(at)}
     asked |= {"from_s": from_s, "to_s": to_s, "width": width}
     chosen = {key: value for key, value in asked.items() if value is not None}
@@ -60,7 +60,13 @@ def extract(
     typer.echo(f"{counts.kept} of {counts.received} frames kept{f' ({why})' if why else ''}: {out}")
 
 
-def _chosen_by_odometry(video: Path, out: Path, frames: int | None, fresh: bool) -> Path:
+def _chosen_by_odometry(
+    video: Path,
+    out: Path,
+    frames: int | None,
+    fresh: bool,
+    part: tuple[float | None, float | None],
+) -> Path:
     """The file, beside the folder of frames, of the poses of frames that odometry chooses."""
     from gsba import odometry
     from gsba.config_file import validated
@@ -70,7 +76,7 @@ def _chosen_by_odometry(video: Path, out: Path, frames: int | None, fresh: bool)
     if path.is_file() and (out / "extract.json").is_file() and not fresh:
         return path  # chosen before
     settings = validated({"odometry": {} if frames is None else {"max_frames": frames}}).odometry
-    panoramas = odometry.without_carrier(odometry.of_video(video, settings.width))
+    panoramas = odometry.without_carrier(odometry.of_video(video, settings.width, None, *part))
     found = odometry.track_panoramas(panoramas)
     if not found.usable():
         raise GsbaError(

@@ -102,7 +102,7 @@ def refine(
         list[Path] | None,
         typer.Argument(
             help="TUM, KITTI or stella_vslam map.msg; several are pieces of one run; without one "
-            "the start is found from the images."
+            "a video is followed by our own odometry, and stills start from pairs of images."
         ),
     ] = None,
     out: Annotated[
@@ -114,14 +114,9 @@ def refine(
     keyframes: Keyframes = None,
     no_trajectory: Annotated[
         bool,
-        typer.Option("--no-trajectory", help="Start from the images alone, as without TRAJECTORY."),
-    ] = False,
-    odometry: Annotated[
-        bool,
         typer.Option(
-            "--odometry",
-            help="Of a video: follow the camera through all of it, refine frames chosen by what "
-            "they show, and start from there.",
+            "--no-trajectory",
+            help="Start from pairs of images; of a video, without its own odometry.",
         ),
     ] = False,
     config: Config = None,
@@ -137,7 +132,10 @@ def refine(
     imu: Imu = None,
     fps: Annotated[
         float | None,
-        typer.Option(help="Frames per second, from time 0; of a video: frames kept per second."),
+        typer.Option(
+            help="Frames per second, from time 0; of a video: frames kept per second, in place of "
+            "frames chosen by what they show."
+        ),
     ] = None,
     weights: Weights = None,
     accept_noncommercial: Consent = False,
@@ -152,11 +150,6 @@ def refine(
     """
     if trajectory and no_trajectory:
         raise GsbaError("a TRAJECTORY and --no-trajectory exclude each other: leave one out")
-    if odometry and (trajectory or no_trajectory or fps is not None or frames.is_dir()):
-        raise GsbaError(
-            "--odometry is for a VIDEO, and finds trajectory and frames itself: leave out "
-            "TRAJECTORY, --no-trajectory and --fps"
-        )
     if keyframes is not None and not trajectory:
         raise GsbaError("--keyframes go with the TRAJECTORY of the same run")
     out = out or _run_folder(frames)
@@ -169,7 +162,7 @@ def refine(
         from gsba.store.cluster import connected
     given = {"keyframes": keyframes, "segment": segment, "timestamps": timestamps, "fps": fps}
     given |= {"masks": masks or "auto", "calibration": calibration, "imu": imu, "fresh": fresh}
-    given |= {"odometry": odometry}
+    given |= {"odometry": False if no_trajectory else None}
     with connected(cluster) as client:
         result = pipeline.refine(frames, trajectory, out, settings, client=client, **given)
     _conclude([result], allow_partial)

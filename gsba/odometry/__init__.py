@@ -1,6 +1,7 @@
 """Visual odometry: where a 360-degree camera was during a video, from the video alone.
 
-Takes small panoramas, in time order. Gives a pose for every frame, and frames worth refining.
+Takes small panoramas in time order.
+Gives a pose for every frame, and the frames that are worth refining.
 """
 
 from gsba.odometry.frame_choice import choose_frames

@@ -18,7 +18,7 @@ from gsba.frames.raw_pairs import lenses_of
 from gsba.log import GsbaError
 from gsba.masks.carrier import PICTURE_WIDTH, find_fixed_carrier
 from gsba.types import FrameSet
-from gsba.video.recording import Picture, Recording, read_recording, shots
+from gsba.video.recording import EXACT_S, Picture, Recording, read_recording, shots
 
 logger = logging.getLogger(__name__)
 
@@ -76,13 +76,20 @@ def of_frames(frames: FrameSet, source: Path, width: int) -> SmallPanoramas:
     return found if usable.all() else replace(found, usable=usable)
 
 
-def of_video(video: Path, width: int, calibration: Path | None = None) -> SmallPanoramas:
+def of_video(
+    video: Path,
+    width: int,
+    calibration: Path | None = None,
+    from_s: float | None = None,
+    to_s: float | None = None,
+) -> SmallPanoramas:
     """Panoramas of a video: stitched, or raw and joined by what its lenses are taken for.
 
     Args:
         video: see `gsba.video.recording`.
         width: pixels across; less where the video is smaller.
         calibration: of the lenses of a raw recording; None = guessed from its image circles.
+        from_s, to_s: seconds since its first frame, the part that is read; None = all.
 
     Raises:
         GsbaError: no such video, fewer than three frames, or a raw one that shows no circles.
@@ -90,9 +97,14 @@ def of_video(video: Path, width: int, calibration: Path | None = None) -> SmallP
     if not video.is_file():
         raise GsbaError(f"{video}: no such file")
     recording = read_recording(video)
-    rows = np.flatnonzero(recording.shown)
+    low, high = from_s or 0.0, np.inf if to_s is None else to_s
+    within = (recording.times >= low - EXACT_S) & (recording.times <= high + EXACT_S)
+    rows = np.flatnonzero(recording.shown & within)
     if len(rows) < _LEAST:
-        raise GsbaError(f"{video}: {len(rows)} frames; at least {_LEAST} are needed")
+        raise GsbaError(
+            f"{video}: {len(rows)} frames between {low:g} and {high:g} s; at least {_LEAST} are "
+            "needed"
+        )
     width = min(width, recording.width * (2 if recording.lenses else 1))
     size = (width, width // 2)
     pair = _lenses(recording, rows, calibration) if recording.lenses else None

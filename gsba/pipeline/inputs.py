@@ -8,11 +8,12 @@ import numpy as np
 
 from gsba import odometry, video
 from gsba.camera.calibration import read_calibration
-from gsba.config import RefineSettings
+from gsba.config import RefineSettings, VideoSettings
 from gsba.frames.times import check_fps
 from gsba.imu.files import read_imu, read_telemetry
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError
+from gsba.masks.merging import Choice
 from gsba.odometry.files import write_chosen, write_odometry
 from gsba.odometry.walk import Odometry
 from gsba.placement.placement import EXIF
@@ -104,13 +105,19 @@ def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
         return None
 
 
+def leaves_frames_open(settings: VideoSettings) -> bool:
+    """Whether settings leave it open which frames of a video to take."""
+    asked = (settings.fps, settings.every, settings.at)
+    return asked == (VideoSettings().fps, None, None) and not settings.sharpest
+
+
 def extract_frames(
     out: Path,
     origin: Mapping[str, Path],
     settings: RefineSettings,
     fps: float | None,
     fresh: bool,
-    by_odometry: bool = False,
+    by_odometry: Choice | None = None,
     calibration: Path | None = None,
 ) -> list[Trajectory]:
     """Write the frames of the video that a run is about to `out`/frames.
@@ -121,7 +128,8 @@ def extract_frames(
         settings: see `gsba.config`.
         fps: frames kept per second; None = as the settings say.
         fresh: forget an earlier run in `out`.
-        by_odometry: choose the frames by what the video's own odometry shows.
+        by_odometry: choose the frames by what the video's own odometry shows under these masks;
+            None = by the settings.
         calibration: of the lenses of a raw video, for the odometry.
 
     Returns:
@@ -134,8 +142,8 @@ def extract_frames(
         chosen = chosen.model_copy(update={"fps": check_fps(fps), "every": None, "at": None})
     pieces: list[Trajectory] = []
     with RunStore(out, dict(origin), fresh) as store:
-        if by_odometry:
-            pieces = _follow(store, origin["frames"], settings, calibration)
+        if by_odometry is not None:
+            pieces = _follow(store, origin["frames"], settings, by_odometry, calibration)
         if pieces:
             chosen = chosen.model_copy(update={"at": str(out / CHOSEN), "sharpest": False})
         video.extract(origin["frames"], out / "frames", chosen, replace=True)
@@ -144,19 +152,27 @@ def extract_frames(
 
 
 def _follow(
-    store: RunStore, video_file: Path, settings: RefineSettings, calibration: Path | None
+    store: RunStore,
+    video_file: Path,
+    settings: RefineSettings,
+    masks: Choice,
+    calibration: Path | None,
 ) -> list[Trajectory]:
     """Odometry of a video, its trajectory and chosen frames written to the run's folder."""
 
-    def compute() -> Odometry:
-        panoramas = odometry.of_video(video_file, settings.odometry.width, calibration)
-        return odometry.track_panoramas(odometry.without_carrier(panoramas), settings.seed)
+    part = (settings.video.from_s, settings.video.to_s)
+    width, seed = settings.odometry.width, settings.seed
 
-    key = [
-        settings.odometry.width,
-        settings.seed,
-        fingerprint([*files_of(video_file), calibration]),
-    ]
+    def compute() -> Odometry:
+        panoramas = odometry.of_video(video_file, width, calibration, *part)
+        if masks.given is not None and masks.given.is_file():
+            panoramas = odometry.masked(panoramas, masks.given)
+        if masks.carrier:
+            panoramas = odometry.without_carrier(panoramas)
+        return odometry.track_panoramas(panoramas, seed)
+
+    files = fingerprint([*files_of(video_file), calibration, masks.given])
+    key = [width, seed, part, masks.carrier, files]
     found = store.stage("odometry", key, compute, Odometry)
     if not found.usable():
         logger.warning("the odometry lost the camera in most of the video: frames at a fixed rate")

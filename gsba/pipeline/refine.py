@@ -69,7 +69,7 @@ def refine(
     fps: float | None = None,
     calibration: Path | None = None,
     imu: Path | None = None,
-    odometry: bool = False,
+    odometry: bool | None = None,
     fresh: bool = False,
     extra_factors: ExtraFactors | None = None,
     client: "Client | None" = None,
@@ -93,6 +93,7 @@ def refine(
         imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
         odometry: of a video without a trajectory: follow the camera through all of it, take the
             frames that `settings.odometry` chooses by what they show, and start from these poses.
+            None = where neither `fps` nor `settings.video` says which frames to take.
         fresh: forget an earlier run in `out`.
         extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
         client: of a Dask scheduler whose workers take what can be shared out; None = threads here.
@@ -108,8 +109,10 @@ def refine(
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
     readings = inputs.read_gyro(imu, frames)
     if video.is_video(frames):
-        odometry &= not given
-        found = inputs.extract_frames(out, origin, settings, fps, fresh, odometry, calibration)
+        if odometry is None:
+            odometry = fps is None and inputs.leaves_frames_open(settings.video)
+        followed = chosen if odometry and not given else None
+        found = inputs.extract_frames(out, origin, settings, fps, fresh, followed, calibration)
         if found:  # by these very images: they have no say of their own
             given, settings = found, settings.with_faint_priors()
         frames, timestamps, fps, fresh = out / "frames", None, None, False
