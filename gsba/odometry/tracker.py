@@ -198,7 +198,6 @@ class Tracker:
         if len(ids) < _START_SHARE * key.most_found:
             # Turned away from what it saw, without a step: the rotation goes on from here.
             self._pending.clear()
-            self._num_ids += 1
             corners = self._corners(atlas, np.zeros((0, 3)))
             self._window = []
             self._add_keyframe(frame, self._pose, atlas, small, None, corners)
@@ -230,7 +229,7 @@ class Tracker:
         key = self._window[-1]
         world_T_key = key.world_T_rig
         points = solved.points_world @ world_T_key[:3, :3].T + world_T_key[:3, 3]
-        self._set_points(solved.ids, points)
+        self._points[solved.ids] = points
         self._has_points = True
         for before, seen, where in self._pending:
             self._pose_again(before, seen, where, key)
@@ -274,8 +273,11 @@ class Tracker:
         if tried is None:
             self._lose(grey, small, frame)
             return
+        found_again = self.records[-1].status == FrameStatus.LOST
         self._failures = 0
         self._accept(frame, tried, small)
+        if found_again:  # the step from where the camera was lost is no velocity
+            self._motion = np.eye(4)
 
     def _attempt(
         self, grey: np.ndarray, key: _Keyframe, features: _Features, predicted: np.ndarray
@@ -383,7 +385,7 @@ class Tracker:
         self.keyframe_frames.append(frame)
         del self._window[: -(FREE + HELD)]
         for old in self._window[:-_REMEMBERED]:
-            old.atlas = old.small = None
+            old.atlas = old.small = old.described = None
         self._features = _Features(
             ids, bearings, bearings @ world_T_rig[:3, :3].T, np.zeros(len(ids), int)
         )
@@ -401,7 +403,7 @@ class Tracker:
             self.keyframe_poses[key.number] = world_T_rig
         everything = np.unique(seen.ids)
         self._points[everything] = np.nan
-        self._set_points(solved.ids, solved.points_world)
+        self._points[solved.ids] = solved.points_world
         for n, key in enumerate(window):
             false = solved.outliers[solved.outliers[:, 0] == n, 1]
             if len(false):
@@ -498,9 +500,6 @@ class Tracker:
             return None
         grey = self.usable.astype(np.uint8) * 255
         return self._mask_cutter.cut(grey, atlas.cut_R_rig).image > 250
-
-    def _set_points(self, ids: np.ndarray, points: np.ndarray) -> None:
-        self._points[ids] = points
 
     def _distance(self, ids: np.ndarray, world_T_rig: np.ndarray) -> float:
         """Median distance of features' points from a pose; NaN without points."""

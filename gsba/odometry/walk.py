@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from gsba.log import track
+from gsba.log import GsbaError, track
 from gsba.odometry.panoramas import SmallPanoramas
 from gsba.odometry.tracker import FrameStatus, Tracker
 from gsba.types import Trajectory
@@ -124,6 +124,9 @@ def track_panoramas(panoramas: SmallPanoramas, seed: int = 0) -> Odometry:
     Args:
         panoramas: all frames, in time order; damaged ones count as lost.
         seed: of the sampling at the start of a map.
+
+    Raises:
+        GsbaError: no picture can be decoded.
     """
     num = len(panoramas)
     interval = float(np.median(np.diff(panoramas.timestamps)))
@@ -137,6 +140,8 @@ def track_panoramas(panoramas: SmallPanoramas, seed: int = 0) -> Odometry:
         sharp[row] = sharpness(grey)
         rows.append(row)
         cpu_s += time.thread_time() - began
+    if not rows:
+        raise GsbaError(f"{panoramas.source}: none of its pictures could be decoded; copy it again")
     records = tracker.records
     poses = np.tile(np.eye(4), (num, 1, 1))
     poses[rows] = tracker.world_T_rigs()
