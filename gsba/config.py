@@ -63,6 +63,17 @@ class VideoSettings(_Settings):
     )  # less apparent motion since the last frame: the camera stands, leave out; 0 = keep all
 
 
+class OdometrySettings(_Settings):
+    """A video's own odometry, and the frames that are chosen by what it shows."""
+
+    width: int = Field(default=800, ge=256, le=4096, multiple_of=2)  # pixels across the panoramas
+    step: float = Field(
+        default=0.2, gt=0, le=1
+    )  # from one chosen frame to the next, part of the distance of things
+    max_turn_deg: float = Field(default=40.0, gt=0)  # from one chosen frame to the next
+    max_frames: int | None = Field(default=None, ge=3)  # chosen, by longer steps; None = no limit
+
+
 class CubemapSettings(_Settings):
     """Faces cut from a panorama for detection."""
 
@@ -313,7 +324,9 @@ class SolverSettings(_Settings):
 
     max_iterations: int = Field(default=50, ge=1)
     relative_tolerance: float = Field(default=1e-5, gt=0, lt=1)  # least decrease of the cost
-    absolute_tolerance: float = Field(default=0.05, gt=0)  # the same, squared standard deviations
+    absolute_tolerance: float | None = Field(
+        default=0.05, gt=0
+    )  # the same, squared standard deviations; None = any
     loss: Literal["none", "huber", "cauchy", "geman_mcclure"] = "cauchy"
     loss_sigmas: float = Field(default=1.0, gt=0)  # scale of the loss, standard deviations
     lambda_initial: float = Field(default=1e-4, gt=0)  # damping, part of the diagonal
@@ -464,6 +477,7 @@ class RefineSettings(_Settings):
     """Everything a run depends on."""
 
     video: VideoSettings = VideoSettings()
+    odometry: OdometrySettings = OdometrySettings()
     read: ReadSettings = ReadSettings()
     cubemap: CubemapSettings = CubemapSettings()
     features: FeatureSettings = FeatureSettings()
@@ -511,6 +525,10 @@ class RefineSettings(_Settings):
             "pairs": self.pairs.model_copy(update=pairs),
         }
         return self.model_copy(update=sections)
+
+    def with_faint_priors(self) -> "RefineSettings":
+        """For a trajectory that is no more than a start."""
+        return self.model_copy(update={"priors": self.priors.faint()})
 
     def plainer(self) -> "RefineSettings":
         """For a first solution: features alone, without patches, pixels or splats."""

@@ -183,7 +183,7 @@ def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
     """Settings of a round: only the last of a run is solved to the end."""
     if last or settings.rounds.tolerance < settings.solver.relative_tolerance:
         return settings.solver
-    looser = {"relative_tolerance": settings.rounds.tolerance, "absolute_tolerance": np.inf}
+    looser = {"relative_tolerance": settings.rounds.tolerance, "absolute_tolerance": None}
     return settings.solver.model_copy(update=looser)
 
 

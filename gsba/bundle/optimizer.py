@@ -119,7 +119,9 @@ def optimize(
     damping = _Damping(settings.lambda_initial)
     history.add(values, cost, costs, damping.value, True)
     for _ in range(settings.max_iterations):
-        negligible = min(settings.relative_tolerance * cost, settings.absolute_tolerance)
+        negligible = settings.relative_tolerance * cost
+        if settings.absolute_tolerance is not None:
+            negligible = min(negligible, settings.absolute_tolerance)
         used = damping.value
         trial, trial_cost, predicted = _attempt(system, values, used)
         if not trial_cost <= cost:  # also where it is not a number

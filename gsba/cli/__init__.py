@@ -1,6 +1,16 @@
 """The command line. Commands parse, call and print; heavy imports stay in their bodies."""
 
-from gsba.cli import checking, inspecting, plotting, preparing, refining, results, splat, viewing
+from gsba.cli import (
+    checking,
+    inspecting,
+    plotting,
+    preparing,
+    refining,
+    results,
+    splat,
+    tracking,
+    viewing,
+)
 from gsba.cli.app import app
 
 __all__ = [
@@ -13,6 +23,7 @@ __all__ = [
     "refining",
     "results",
     "splat",
+    "tracking",
     "viewing",
 ]
 

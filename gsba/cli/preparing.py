@@ -14,7 +14,17 @@ def extract(
     video: Annotated[Path, typer.Argument(help="Video: 2:1, .360, or raw of two fisheyes.")],
     out: Annotated[Path, typer.Option(help="Folder of the frames.", metavar="FRAMES")],
     fps: Annotated[float | None, typer.Option(help="Frames kept per second; 1 if unsaid.")] = None,
-    every: Annotated[int | None, typer.Option(help="Keep one frame of so many.")] = None,
+    every: Annotated[
+        str | None,
+        typer.Option(
+            help="Keep one frame of so many; auto: sharp frames at steps that suit what they show, "
+            "by the video's own odometry.",
+            metavar="N|auto",
+        ),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="With --every auto: frames to keep at most.")
+    ] = None,
     at: Annotated[
         Path | None, typer.Option(help="Keep the frames at its times.", metavar="TRAJECTORY")
     ] = None,
@@ -37,6 +47,10 @@ def extract(
         raise GsbaError("--fps, --every and --at each say which frames to keep: pass one")
     if from_s is not None and to_s is not None and to_s <= from_s:
         raise GsbaError(f"--to {to_s:g} must be later than --from {from_s:g}")
+    if frames is not None and every != "auto":
+        raise GsbaError("--frames limits what --every auto chooses: pass that too")
+    if every == "auto":
+        every, at = None, _chosen_by_odometry(video, out, frames, fresh, (from_s, to_s))
     asked = {"fps": fps, "every": every, "at": None if at is None else str(at)}
     asked |= {"from_s": from_s, "to_s": to_s, "width": width}
     chosen = {key: value for key, value in asked.items() if value is not None}
@@ -44,6 +58,33 @@ def extract(
     counts = write(video, out, validated({"video": chosen}).video, fresh)
     why = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
     typer.echo(f"{counts.kept} of {counts.received} frames kept{f' ({why})' if why else ''}: {out}")
+
+
+def _chosen_by_odometry(
+    video: Path,
+    out: Path,
+    frames: int | None,
+    fresh: bool,
+    part: tuple[float | None, float | None],
+) -> Path:
+    """The file, beside the folder of frames, of the poses of frames that odometry chooses."""
+    from gsba import odometry
+    from gsba.config_file import validated
+    from gsba.odometry.files import write_chosen
+
+    path = out.with_name(f"{out.name}.tum")
+    if path.is_file() and (out / "extract.json").is_file() and not fresh:
+        return path  # chosen before
+    settings = validated({"odometry": {} if frames is None else {"max_frames": frames}}).odometry
+    panoramas = odometry.without_carrier(odometry.of_video(video, settings.width, None, *part))
+    found = odometry.track_panoramas(panoramas)
+    if not found.usable():
+        raise GsbaError(
+            f"{video}: its odometry does not tell where the camera went ({found.summary()}): "
+            "choose frames by --fps or --every N"
+        )
+    write_chosen(found, odometry.choose_frames(found, settings), path)
+    return path
 
 
 @command

@@ -45,6 +45,39 @@ Download = Annotated[
     bool, typer.Option("--download", help="Fetch missing weights from their authors.")
 ]
 
+Frames = Annotated[
+    Path,
+    typer.Argument(
+        help="Folder of 2:1 panoramas, raw fisheyes, .360 tracks or cube faces, or a video."
+    ),
+]
+Trajectories = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="TUM, KITTI or stella_vslam map.msg; several are pieces of one run; without one "
+        "a video is followed by our own odometry, and stills start from pairs of images."
+    ),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        help="Folder of the run; default: the name of the video, or FRAMES-run.", metavar="RUN"
+    ),
+]
+NoTrajectory = Annotated[
+    bool,
+    typer.Option(
+        "--no-trajectory",
+        help="Start from pairs of images; of a video, without its own odometry.",
+    ),
+]
+Fps = Annotated[
+    float | None,
+    typer.Option(
+        help="Frames per second, from time 0; of a video: frames kept per second, in place of "
+        "frames chosen by what they show."
+    ),
+]
 Keyframes = Annotated[
     Path | None, typer.Option(help="Keyframe trajectory of the same run.", metavar="FILE")
 ]
@@ -109,30 +142,11 @@ Segment = Annotated[
 
 @command
 def refine(
-    frames: Annotated[
-        Path,
-        typer.Argument(
-            help="Folder of 2:1 panoramas, raw fisheyes, .360 tracks or cube faces, or a video."
-        ),
-    ],
-    trajectory: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            help="TUM, KITTI or stella_vslam map.msg; several are pieces of one run; without one "
-            "the start is found from the images."
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of the run; default: the name of the video, or FRAMES-run.", metavar="RUN"
-        ),
-    ] = None,
+    frames: Frames,
+    trajectory: Trajectories = None,
+    out: Out = None,
     keyframes: Keyframes = None,
-    no_trajectory: Annotated[
-        bool,
-        typer.Option("--no-trajectory", help="Start from the images alone, as without TRAJECTORY."),
-    ] = False,
+    no_trajectory: NoTrajectory = False,
     config: Config = None,
     overrides: Overrides = None,
     masks: Masks = None,
@@ -146,10 +160,7 @@ def refine(
     circle: Circle = None,
     imu: Imu = None,
     gps: Gps = None,
-    fps: Annotated[
-        float | None,
-        typer.Option(help="Frames per second, from time 0; of a video: frames kept per second."),
-    ] = None,
+    fps: Fps = None,
     weights: Weights = None,
     accept_noncommercial: Consent = False,
     download: Download = False,
@@ -179,6 +190,7 @@ def refine(
     given = {"keyframes": keyframes, "segment": segment, "timestamps": timestamps, "fps": fps}
     given |= {"masks": masks or "auto", "calibration": calibration, "imu": imu, "fresh": fresh}
     given["circles"] = [_circle(text) for text in circle or ()]
+    given["odometry"] = False if no_trajectory else None
     with connected(cluster) as client:
         result = pipeline.refine(frames, trajectory, out, settings, client=client, **given)
     _conclude([result], allow_partial)

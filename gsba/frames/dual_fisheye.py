@@ -28,9 +28,21 @@ def load_raw(frames: FrameSet, f: int, gray: bool = False) -> list[np.ndarray]:
 def load_joined(frames: FrameSet, f: int, gray: bool, width: int) -> np.ndarray:
     """Panorama (width / 2, width[, 3]) uint8 of frame f, by what its lenses are taken for."""
     assert frames.fisheyes is not None
-    share, maps = width / frames.width, _maps(frames.fisheyes, width)
-    halves = []
-    for picture, places in zip(load_raw(frames, f, gray), maps, strict=True):
+    pictures = load_raw(frames, f, gray)
+    return join_pictures(pictures, frames.fisheyes, width, width / frames.width)
+
+
+def join_pictures(pictures: list[np.ndarray], pair: Pair, width: int, share: float) -> np.ndarray:
+    """Panorama (width / 2, width[, 3]) uint8 of what the front and the back lens saw.
+
+    Args:
+        pictures: (h, w[, 3]) uint8 of either.
+        pair: their lenses.
+        width: pixels across the panorama.
+        share: its width over that of a panorama as dense as the pictures.
+    """
+    halves, maps = [], _maps(pair, width)
+    for picture, places in zip(pictures, maps, strict=True):
         if share < 1:
             size = picture.shape[1::-1]
             picture = _shrunk(picture, share)

@@ -65,7 +65,7 @@ def scan(
     Args:
         folder: JPEG, PNG, WebP or TIFF images; other files are ignored.
         timestamps: table of times (see `read_times`); else `timestamps.csv` in the folder, unless
-            `fps` is given; else the file names, if they are times; else EXIF tags.
+            `fps` is given; else file names that are times; else EXIF tags.
         fps: frames per second of these files in name order.
         masks: one ERP mask for all frames, or a folder with one for each; white = use.
         order_suffices: where nothing gives times, name order stands in for them.
@@ -85,16 +85,13 @@ def scan(
     names, times, timed = _in_time_order(Path(folder), found, timestamps, fps, order_suffices)
     paths = tuple(found[name] for name in names)
     tracks = track_size(Path(folder), paths) if layout == "eac" else None
-    width, height = lens_size = tracks or _common_size(paths, layout)
+    width, height = tracks or _common_size(paths, layout)
     images = [group[0] for group in paths]
     factory = find_factory_lenses(Path(folder), images) if calibration is None else None
-    if layout == "erp":
-        raw = lens_sizes(lens_size)[0] if factory is not None else None
-        raw = raw or _beside(Path(folder), images, lens_size, calibration, circles)
-        if raw is not None:
-            layout, lens_size = "fisheye", raw
-            paths = tuple((path, path) for path in images)
-    known = calibration, circles, factory
+    known, lens_size = (calibration, circles, factory), (width, height)
+    if layout == "erp" and (raw := _beside(Path(folder), images, lens_size, *known)) is not None:
+        layout, lens_size = "fisheye", raw
+        paths = tuple((path, path) for path in images)
     fisheyes, nominal = _lenses(Path(folder), layout, paths, lens_size, *known)
     if fisheyes is not None:
         width, height = width_of(fisheyes), width_of(fisheyes) // 2
@@ -151,6 +148,7 @@ def _beside(
     size: tuple[int, int],
     calibration: Path | None = None,
     circles: Sequence[ImageCircle] = (),
+    factory: FactoryLenses | None = None,
 ) -> tuple[int, int] | None:
     """Width and height of one lens's picture where images hold two side by side; None = they are
     panoramas.
@@ -158,6 +156,8 @@ def _beside(
     Raises:
         GsbaError: they are neither.
     """
+    if factory is not None:
+        return lens_sizes(size)[0]
     shape, source = None, ""
     if calibration is not None:
         front, source = read_calibration(calibration)[0], calibration.name

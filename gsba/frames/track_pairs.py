@@ -115,8 +115,13 @@ def load_squares(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
 
 def load_panorama(frames: FrameSet, f: int, gray: bool, width: int) -> np.ndarray:
     """Panorama (width / 2, width[, 3]) uint8 of frame f, with the frames' correction."""
-    faces = shrunk(load_squares(frames, f, gray), max(round(width / 4), 1))
-    u, v = _maps(Grid(faces.shape[1], frames.correction), width)
+    return panorama_of(load_squares(frames, f, gray), width, frames.correction)
+
+
+def panorama_of(faces: np.ndarray, width: int, correction: tuple[float, ...] = ()) -> np.ndarray:
+    """Panorama (width / 2, width[, 3]) uint8 of upright squares (6, S, S[, 3]) uint8."""
+    faces = shrunk(faces, max(round(width / 4), 1))
+    u, v = _maps(Grid(faces.shape[1], correction), width)
     return cv2.remap(around_squares(faces), u, v, cv2.INTER_LANCZOS4)
 
 

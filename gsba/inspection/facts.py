@@ -11,7 +11,6 @@ class Found:
 
     facts: Facts
     problem: str = ""  # why it cannot be refined; "" = it can
-    options: tuple[str, ...] = ()  # of the `refine` line
 
 
 def spoken_seconds(duration_s: float) -> str:

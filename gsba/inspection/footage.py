@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.config import VideoSettings
 from gsba.containers.insta360 import Insta360Trailer, read_trailer
 from gsba.imu.files import read_telemetry
 from gsba.inspection.facts import Facts, Found, spoken_seconds
@@ -14,7 +13,6 @@ from gsba.video.extraction import refuse_darkness
 from gsba.video.recording import Recording, read_recording
 from gsba.video.timeline import container_tags
 
-_RATE = 2.0  # frames per second that suit somebody who walks
 _STEADY = 1.5  # longest step over the median one, up to which a frame rate is constant
 
 
@@ -36,9 +34,7 @@ def of_video(path: Path) -> Found:
         refuse_darkness(path, recording, np.flatnonzero(recording.shown).tolist())
     except GsbaError as error:
         return Found(facts, str(error))
-    rate = min(_RATE, 1 / recording.timelines[0].interval_s)
-    options = () if rate == VideoSettings().fps else ("--fps", f"{rate:g}")
-    return Found(facts, options=options)
+    return Found(facts)
 
 
 def _camera(path: Path, trailer: Insta360Trailer | None) -> Facts:

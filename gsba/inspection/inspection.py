@@ -49,5 +49,5 @@ def inspect(path: Path) -> Inspection:
         raise GsbaError(f"{path}: is no video, picture or folder of pictures")
     else:
         raise GsbaError(f"{path}: no such file or folder")
-    command = "" if found.problem else shlex.join(["gsba", "refine", str(path), *found.options])
+    command = "" if found.problem else shlex.join(["gsba", "refine", str(path)])
     return Inspection(str(path), found.facts, found.problem, command)

@@ -25,7 +25,7 @@ from gsba.types import FrameSet
 
 logger = logging.getLogger(__name__)
 
-_WIDTH = 512  # pixels across the pictures in which the outline is found
+PICTURE_WIDTH = _WIDTH = 512  # pixels across the pictures in which the outline is found
 _MAX_FRAMES = 20
 _MIN_FRAMES = 6  # fewer agree by chance
 _STAYS, _MOVES = 0.75, 0.5  # correlation of structure that stays; of structure that moves, at most
@@ -95,6 +95,28 @@ def find_carrier(frames: FrameSet) -> Carrier:
             100 * share,
         )
     return Carrier(~found, turns, median, share, reason)
+
+
+def find_fixed_carrier(pictures: np.ndarray) -> np.ndarray:
+    """Where pictures show the world and not what carries the camera, if it keeps its direction.
+
+    Args:
+        pictures: (N, h, 2h, 3) uint8 RGB, `PICTURE_WIDTH` across, of a moving camera.
+
+    Returns:
+        (h, 2h) bool, True = use; all of it where nothing stays in place.
+
+    Raises:
+        GsbaError: too few pictures, no texture, or too little that moves.
+    """
+    if len(pictures) < _MIN_FRAMES:
+        raise GsbaError(
+            f"{len(pictures)} frames do not tell what is fixed to the camera: give {_MIN_FRAMES}"
+        )
+    structure = _measure(pictures, _STRUCTURE)
+    _check_moving(structure)
+    median = np.median(pictures, axis=0).astype(np.uint8)
+    return ~outline_carrier(pictures, median, structure)
 
 
 def carrier_mask(carrier: Carrier, frames: FrameSet, frame: int) -> np.ndarray:

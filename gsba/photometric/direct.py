@@ -214,7 +214,7 @@ def _solve(
     """
     settings, num_threads = problem.settings, problem.num_threads
     chosen, values = settings.photometric, adjustment.values_of(solved.world_T_rigs)
-    looser = {"relative_tolerance": chosen.tolerance, "absolute_tolerance": np.inf}
+    looser = {"relative_tolerance": chosen.tolerance, "absolute_tolerance": None}
     solver = settings.solver.model_copy(update=looser)
     start = make_block(pixels, trust, settings, num_threads)
     noise = _noise(start, values) * chosen.inflation

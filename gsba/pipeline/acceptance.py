@@ -5,14 +5,14 @@ import numpy as np
 from gsba.frames.masks import load_mask
 from gsba.geometry import inverse, step_covariances
 from gsba.log import GsbaError
-from gsba.types import FrameSet, PoseSource, Reconstruction
+from gsba.types import FrameSet, Reconstruction
 
 MIN_STEP_SIGMAS = 3.0  # median length of a map's steps, in standard deviations; maps of real and
 # rendered walks have 40 and more
 _VEHICLE_SHARE = 1 / 3  # of the picture that turns with the camera: more than people or sticks fill
 
 
-def require_motion(frames: FrameSet, result: Reconstruction, sources: np.ndarray) -> None:
+def require_motion(frames: FrameSet, result: Reconstruction) -> None:
     """Refuse positions that images alone do not determine, and turns seen from a vehicle.
 
     A camera on a vehicle whose surroundings are blurred or far sees the vehicle stand still. Its
@@ -21,14 +21,11 @@ def require_motion(frames: FrameSet, result: Reconstruction, sources: np.ndarray
 
     Args:
         frames: of the run, with their masks.
-        result: what was solved.
-        sources: (F,) `PoseSource` of the coarse poses.
+        result: what was solved from the images alone.
 
     Raises:
-        GsbaError: the images determine no positions, and no trajectory gives them.
+        GsbaError: the images determine no positions.
     """
-    if (sources != PoseSource.NONE).any():
-        return
     main = result.of_map(1)
     share = _masked_share(frames)
     where = (

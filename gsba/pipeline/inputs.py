@@ -6,29 +6,34 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba import video
+from gsba import odometry, video
 from gsba.bundle.fixes import FrameFixes
 from gsba.bundle.gps_factors import MIN_FIXES
 from gsba.camera.calibration import read_calibration
-from gsba.config import RefineSettings
+from gsba.config import RefineSettings, VideoSettings
 from gsba.frames.image_circles import ImageCircle
 from gsba.frames.lens_names import lens_files
 from gsba.frames.times import check_fps
 from gsba.imu.files import read_imu, read_telemetry
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError
+from gsba.masks.merging import Choice
+from gsba.odometry.files import write_chosen, write_odometry
+from gsba.odometry.walk import Odometry
 from gsba.placement import EXIF, check, fixes_of_frames, read_fixes
-from gsba.store.store import RunStore
+from gsba.store.store import RunStore, fingerprint
 from gsba.trajectory.association import without_trajectory
 from gsba.trajectory.files import read_trajectory
 from gsba.trajectory.keyframes import follow_keyframes
 from gsba.trajectory.misread import refuse_useless
 from gsba.trajectory.restarts import associate_pieces, split_restarts
 from gsba.types import CoarsePoses, FrameSet, Trajectory
+from gsba.video.recording import files_of
 
 logger = logging.getLogger(__name__)
 
 _WITH_GYRO = (".insv", ".osv", ".360")  # raw videos that may hold readings
+CHOSEN = Path("odometry/chosen.tum")  # in a run's folder: frames that the odometry has chosen
 _NO_MOTION = 1e-9  # extent in map units that is rounding alone
 
 
@@ -165,14 +170,39 @@ def positions_of(frames: FrameSet, settings: RefineSettings) -> FrameFixes | Non
     return fixes
 
 
+def follows(settings: VideoSettings, fps: float | None, odometry: bool | None) -> bool:
+    """Whether a video is followed by odometry: as asked, else where nothing says which frames of it
+    to take."""
+    if odometry is not None:
+        return odometry
+    asked = (settings.fps, settings.every, settings.at)
+    return fps is None and asked == (VideoSettings().fps, None, None) and not settings.sharpest
+
+
 def extract_frames(
     out: Path,
     origin: Mapping[str, Path],
     settings: RefineSettings,
     fps: float | None,
     fresh: bool,
-) -> None:
-    """Write the frames of the video that a run is about to `out`/frames."""
+    by_odometry: Choice | None = None,
+    calibration: Path | None = None,
+) -> list[Trajectory]:
+    """Write the frames of the video that a run is about to `out`/frames.
+
+    Args:
+        out: folder of the run.
+        origin: the files that the run is about.
+        settings: see `gsba.config`.
+        fps: frames kept per second; None = as the settings say.
+        fresh: forget an earlier run in `out`.
+        by_odometry: choose the frames by what the video's own odometry shows under these masks;
+            None = by the settings.
+        calibration: of the lenses of a raw video, for the odometry.
+
+    Returns:
+        The odometry's trajectory, in pieces; none where it was not asked for, or found too little.
+    """
     chosen = settings.video
     if EXIF in (settings.placement.gps, settings.gps.file):
         raise GsbaError("--gps exif: a video's frames have no tags; give positions as a file")
@@ -180,6 +210,47 @@ def extract_frames(
         read_fixes(settings.gps.file)  # fails before hours of decoding
     if fps is not None:
         chosen = chosen.model_copy(update={"fps": check_fps(fps), "every": None, "at": None})
+    pieces: list[Trajectory] = []
     with RunStore(out, dict(origin), fresh) as store:
+        if by_odometry is not None:
+            pieces = _follow(store, origin["frames"], settings, by_odometry, calibration)
+        if pieces:
+            chosen = chosen.model_copy(update={"at": str(out / CHOSEN), "sharpest": False})
         video.extract(origin["frames"], out / "frames", chosen, replace=True)
         store.claim(out / "frames")
+    return pieces
+
+
+def _follow(
+    store: RunStore,
+    video_file: Path,
+    settings: RefineSettings,
+    masks: Choice,
+    calibration: Path | None,
+) -> list[Trajectory]:
+    """Odometry of a video, its trajectory and chosen frames written to the run's folder."""
+
+    part = (settings.video.from_s, settings.video.to_s)
+    width, seed = settings.odometry.width, settings.seed
+
+    def compute() -> Odometry:
+        panoramas = odometry.of_video(video_file, width, calibration, *part)
+        if masks.given is not None and masks.given.is_file():
+            panoramas = odometry.masked(panoramas, masks.given)
+        if masks.carrier:
+            panoramas = odometry.without_carrier(panoramas)
+        return odometry.track_panoramas(panoramas, seed)
+
+    files = fingerprint([*files_of(video_file), calibration, masks.given])
+    key = [width, seed, part, masks.carrier, files]
+    found = store.stage("odometry", key, compute, Odometry)
+    if not found.usable():
+        logger.warning("the odometry lost the camera in most of the video: frames at a fixed rate")
+        return []
+    rows = odometry.choose_frames(found, settings.odometry)
+    logger.info("%d of %d frames chosen by what they show", len(rows), len(found))
+    folder = store.root / CHOSEN.parent
+    write_odometry(found, folder / "walk.tum", folder / "keyframes.tum", folder / "odometry.json")
+    write_chosen(found, rows, store.root / CHOSEN)
+    store.claim(folder)
+    return found.pieces()

@@ -70,6 +70,7 @@ def refine(
     calibration: Path | None = None,
     circles: Sequence[tuple[float, float, float]] = (),
     imu: Path | None = None,
+    odometry: bool | None = None,
     fresh: bool = False,
     extra_factors: ExtraFactors | None = None,
     client: "Client | None" = None,
@@ -90,9 +91,12 @@ def refine(
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
-        circles: image circles of raw fisheyes where none are found: x and y of the centre and
-            radius, pixels of one lens's picture; of the front and the back lens, or one of both.
+        circles: image circles of raw fisheyes where none are found: x, y and radius, pixels of one
+            lens's picture; of the front and the back lens, or one of both.
         imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
+        odometry: of a video without a trajectory: follow it, take the frames that
+            `settings.odometry` chooses, and start from its poses. None = where neither `fps` nor
+            `settings.video` says which frames to take.
         fresh: forget an earlier run in `out`.
         extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
         client: of a Dask scheduler whose workers take what can be shared out; None = threads here.
@@ -101,7 +105,6 @@ def refine(
         GsbaError: an input or setting that cannot be used.
     """
     frames, out = Path(frames), Path(out)
-    given_circles = inputs.given_circles(circles, calibration)
     settings = inputs.with_baseline(settings or RefineSettings(), calibration)
     check(settings.placement, baseline=settings.camera.baseline())
     chosen = merging.choose(masks, segment)
@@ -109,10 +112,13 @@ def refine(
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
     readings = inputs.read_gyro(imu, frames)
     if video.is_video(frames):
-        inputs.extract_frames(out, origin, settings, fps, fresh)
+        follow = inputs.follows(settings.video, fps, odometry) and not given
+        asked = origin, settings, fps, fresh, chosen if follow else None, calibration
+        if found := inputs.extract_frames(out, *asked):
+            given, settings = found, settings.with_faint_priors()  # by these very images
         frames, timestamps, fps, fresh = out / "frames", None, None, False
-    untimed = not given
-    frame_set = scan(frames, timestamps, fps, chosen.given, untimed, calibration, given_circles)
+    lenses = calibration, inputs.given_circles(circles, calibration)
+    frame_set = scan(frames, timestamps, fps, chosen.given, not given, *lenses)
     sensors = readings, inputs.positions_of(frame_set, settings)
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
@@ -120,14 +126,15 @@ def refine(
         if chosen.distractors:
             frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
         run = Run.begin(store, frame_set, coarse, settings, extra_factors, journal, False, *sensors)
-        return _refine(run, Prior.of(coarse, extra_factors), given)
+        return _refine(run, Prior.of(coarse, extra_factors), given, len(origin) == 1)
 
 
-def _refine(run: Run, prior: Prior, given: Sequence[Trajectory]) -> RunResult:
+def _refine(run: Run, prior: Prior, given: Sequence[Trajectory], images_alone: bool) -> RunResult:
     """A run from its frames to what it leaves behind."""
     run, seen, prior, world = _solve_raw(run, prior, given)
     result = backend.reconstruct(run, seen, prior, world)
-    acceptance.require_motion(run.frames, result, prior.coarse.sources)
+    if images_alone or (prior.coarse.sources == PoseSource.NONE).all():
+        acceptance.require_motion(run.frames, result)
     return outputs.write(run, prior, world, result, backend.keep_lenses(run, world, result))
 
 

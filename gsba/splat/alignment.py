@@ -74,7 +74,7 @@ def align(
     """
     which = np.arange(len(frames))
     settings = SolverSettings(
-        max_iterations=MAX_STEPS, relative_tolerance=1e-5, absolute_tolerance=np.inf
+        max_iterations=MAX_STEPS, relative_tolerance=1e-5, absolute_tolerance=None
     )
     poses = world_T_rigs
     for level, size in enumerate(sizes):

@@ -101,7 +101,7 @@ def test_a_video_with_all_that_its_maker_appends(tmp_path: Path) -> None:
     assert facts["GPS"].startswith("1 fix")
     assert facts["exposures"] == "15, 10 to 20 ms"
     assert facts["calibration"].startswith("by the maker")
-    assert found.command.endswith("--fps 2")
+    assert found.command == f"gsba refine {path}"
 
 
 def test_the_command_prints_text_or_json(tmp_path: Path) -> None:

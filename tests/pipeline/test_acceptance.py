@@ -8,10 +8,9 @@ import pytest
 
 from gsba.log import GsbaError
 from gsba.pipeline.acceptance import MIN_STEP_SIGMAS, require_motion, step_sigmas
-from gsba.types import FrameSet, JointErrors, PoseSource, Reconstruction
+from gsba.types import FrameSet, JointErrors, Reconstruction
 
 NUM, SIGMA = 8, 0.02
-NOWHERE = np.full(NUM, PoseSource.NONE)
 
 
 def _result(step: float, num_points: int = 5) -> Reconstruction:
@@ -61,16 +60,15 @@ def test_steps_are_measured_by_their_own_noise() -> None:
 def test_positions_that_images_do_not_determine_are_refused(tmp_path: Path) -> None:
     noise = np.sqrt(6) * SIGMA
     hand = _frames(tmp_path, 4)
-    require_motion(hand, _result(1.1 * MIN_STEP_SIGMAS * noise), NOWHERE)
+    require_motion(hand, _result(1.1 * MIN_STEP_SIGMAS * noise))
     with pytest.raises(GsbaError, match=r"the images determine no positions.*hardly moves"):
-        require_motion(hand, _result(0.9 * MIN_STEP_SIGMAS * noise), NOWHERE)
-    require_motion(hand, _result(0.0), np.append(NOWHERE[1:], PoseSource.SLAM))
+        require_motion(hand, _result(0.9 * MIN_STEP_SIGMAS * noise))
     vehicle = _frames(tmp_path, 16)
     with pytest.raises(GsbaError, match="50 % of the picture turn with the camera, as a vehicle"):
-        require_motion(vehicle, _result(0.0), NOWHERE)
+        require_motion(vehicle, _result(0.0))
 
 
 def test_turns_alone_are_a_result_but_not_on_a_vehicle(tmp_path: Path) -> None:
-    require_motion(_frames(tmp_path, 8), _result(0.0, num_points=0), NOWHERE)
+    require_motion(_frames(tmp_path, 8), _result(0.0, num_points=0))
     with pytest.raises(GsbaError, match=r"nothing but turns.*as a vehicle does"):
-        require_motion(_frames(tmp_path, 16), _result(0.0, num_points=0), NOWHERE)
+        require_motion(_frames(tmp_path, 16), _result(0.0, num_points=0))

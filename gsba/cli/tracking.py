@@ -1,0 +1,81 @@
+"""The command `track`: odometry on a video or a folder of frames."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gsba.cli.app import command
+from gsba.log import GsbaError
+
+
+@command
+def track(
+    frames: Annotated[
+        Path,
+        typer.Argument(help="Video, or folder of 2:1 panoramas or raw fisheyes, in time order."),
+    ],
+    out: Annotated[
+        Path, typer.Option(help="Trajectory to write: TUM, poses of all frames.", metavar="FILE")
+    ],
+    keyframes: Annotated[
+        Path | None,
+        typer.Option(
+            help="Keyframes to write, TUM; default: beside --out, named -keyframes.", metavar="FILE"
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            help="Report to write, JSON; default: beside --out, named -report.", metavar="FILE"
+        ),
+    ] = None,
+    masks: Annotated[
+        str,
+        typer.Option(help="auto: find what carries the camera; none; or a mask, white = use."),
+    ] = "auto",
+    width: Annotated[
+        int | None,
+        typer.Option(help="Pixels across the panoramas that are followed; 800 if unsaid."),
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option(help="Frames per second of a folder without times.")
+    ] = None,
+    timestamps: Annotated[
+        Path | None, typer.Option(help="Times of a folder's frames.", metavar="FILE")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Of the lenses of raw fisheyes.", metavar="FILE")
+    ] = None,
+) -> None:
+    """Follow the camera through a video without any other program: a pose for every frame."""
+    from gsba import odometry
+    from gsba.config_file import validated
+    from gsba.odometry.files import write_odometry
+    from gsba.video import is_video
+
+    if out.is_dir():
+        raise GsbaError(f"{out}: is a folder; --out names the trajectory file to write")
+    width = validated({"odometry": {} if width is None else {"width": width}}).odometry.width
+    mask = None if masks in ("auto", "none") else Path(masks)
+    if is_video(frames):
+        if fps is not None or timestamps is not None:
+            raise GsbaError("a video has times of its own: leave --fps and --timestamps out")
+        panoramas = odometry.of_video(frames, width, calibration)
+    else:
+        from gsba.frames.scan import scan
+
+        found = scan(frames, timestamps, fps, None, order_suffices=True, calibration=calibration)
+        panoramas = odometry.of_frames(found, frames, width)
+    if mask is not None:
+        panoramas = odometry.masked(panoramas, mask)
+    elif masks == "auto":
+        panoramas = odometry.without_carrier(panoramas)
+    walk = odometry.track_panoramas(panoramas)
+    write_odometry(
+        walk,
+        out,
+        keyframes or out.with_name(f"{out.stem}-keyframes{out.suffix}"),
+        report or out.with_name(f"{out.stem}-report.json"),
+    )
+    typer.echo(f"{walk.summary()}: {out}")

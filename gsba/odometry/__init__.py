@@ -1,0 +1,19 @@
+"""Visual odometry: where a 360-degree camera was during a video, from the video alone.
+
+Takes small panoramas in time order.
+Gives a pose for every frame, and the frames that are worth refining.
+"""
+
+from gsba.odometry.frame_choice import choose_frames
+from gsba.odometry.panoramas import masked, of_frames, of_video, without_carrier
+from gsba.odometry.walk import Odometry, track_panoramas
+
+__all__ = [
+    "Odometry",
+    "choose_frames",
+    "masked",
+    "of_frames",
+    "of_video",
+    "track_panoramas",
+    "without_carrier",
+]

@@ -1,0 +1,129 @@
+"""How a camera turned between two frames, from their panoramas alone, whatever the angle.
+
+Used where no prediction holds: after fast turns, gaps and blackouts. Rows are correlated for the
+yaw, then the whole sphere is aligned over SO(3) (Gauss-Newton, inverse compositional).
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings
+from gsba.camera.tables import table
+
+_WIDTH = 128  # pixels across the panoramas that are compared
+_BLUR = 1.2, 8.0  # pixels: band of detail that is compared
+_STEPS = 15
+_PAD = 2  # pixels beyond seam and poles that interpolation reads
+_CONVERGED = np.deg2rad(0.05)
+_MAX_STEP = np.deg2rad(15.0)
+_ROWS = (0.25, 0.75)  # part of the height whose rows are correlated
+
+
+@dataclass(frozen=True, slots=True)
+class Miniature:
+    """Detail of a panorama between two scales, of unit spread."""
+
+    detail: np.ndarray  # (64, 128) float32
+    weights: np.ndarray  # (64, 128) float32, solid angle, 0 = not the scene
+    contrast: float  # grey values, spread of the detail before it was scaled
+
+
+def miniature(grey: np.ndarray, usable: np.ndarray | None = None) -> Miniature:
+    """A panorama (h, 2h) uint8 made small; `usable` (h, 2h) bool says what shows the scene."""
+    size = (_WIDTH, _WIDTH // 2)
+    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    wide = np.concatenate([small[:, -32:], small, small[:, :32]], axis=1)
+    fine, coarse = (cv2.GaussianBlur(wide, (0, 0), sigma)[:, 32:-32] for sigma in _BLUR)
+    detail = fine - coarse
+    heights = (np.arange(len(small)) + 0.5) / len(small)
+    weights = np.repeat(np.sin(np.pi * heights)[:, None], _WIDTH, axis=1).astype(np.float32)
+    if usable is not None:
+        share = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        weights = weights * (share > 0.9)
+    spread = float(np.sqrt(np.average(detail**2, weights=weights))) if weights.any() else 0.0
+    return Miniature(detail / max(spread, 1e-3), weights, spread)
+
+
+def turned(one: Miniature, other: Miniature, guesses: list[np.ndarray]) -> np.ndarray:
+    """one_R_other (3, 3) that lays the two panoramas best upon one another.
+
+    Args:
+        one, other: of frames of one place, or near one another.
+        guesses: rotations to begin at, besides the best turn about the vertical axis.
+    """
+    best, least = np.eye(3), np.inf
+    for start in [*guesses, _yaw(one, other)]:
+        rotation, cost = _aligned(one, other, start)
+        if cost < least:
+            best, least = rotation, cost
+    return best
+
+
+def _yaw(one: Miniature, other: Miniature) -> np.ndarray:
+    """Turn about the vertical axis by which rows correlate best."""
+    rows = slice(*(round(part * len(one.detail)) for part in _ROWS))
+    spectra = [np.fft.rfft(m.detail[rows] * (m.weights[rows] > 0), axis=1) for m in (one, other)]
+    correlation = np.fft.irfft(spectra[0] * np.conj(spectra[1]), axis=1).sum(axis=0)
+    angle = 2 * np.pi * int(np.argmax(correlation)) / _WIDTH
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.ndarray, float]:
+    """one_R_other near `start`, and the mean robust cost of what is left."""
+    from scipy.spatial.transform import Rotation
+
+    rays, rotation, cost = _rays(), start, np.inf
+    weights = one.weights.ravel()
+    jacobian = _jacobian(one.detail)
+    for _ in range(_STEPS):
+        # The other picture, turned by the estimate, is compared at the rays of the first.
+        places = erp_from_bearings(rays @ rotation, _WIDTH, _WIDTH // 2) - 0.5
+        maps = np.ascontiguousarray(places, np.float32).reshape(-1, _WIDTH, 2)
+        sampled, seen = _sampled(other.detail, maps), _sampled(other.weights, maps)
+        residuals = (sampled - one.detail).ravel()
+        both = weights * (seen.ravel() > 0)
+        robust = both / (1 + residuals**2)
+        cost = float(np.sum(both * np.log1p(residuals**2)) / max(both.sum(), 1e-6))
+        weighted = jacobian * robust[:, None]
+        normal = weighted.T @ jacobian + 1e-6 * np.eye(3)
+        step = np.linalg.solve(normal, weighted.T @ residuals)
+        step *= min(1.0, _MAX_STEP / max(float(np.linalg.norm(step)), 1e-12))
+        rotation = Rotation.from_rotvec(step).as_matrix() @ rotation
+        if np.linalg.norm(step) < _CONVERGED:
+            break
+    return rotation, cost
+
+
+def _sampled(image: np.ndarray, maps: np.ndarray) -> np.ndarray:
+    """A panorama at OpenCV pixels (h, w, 2)."""
+    padded = around_sphere(image, _PAD)
+    u, v = maps[..., 0] + _PAD, maps[..., 1] + _PAD
+    return cv2.remap(padded, u, v, cv2.INTER_LINEAR)
+
+
+@table(maxsize=1)
+def _rays() -> np.ndarray:
+    """Bearings (64 * 128, 3) of the pixels."""
+    v, u = np.mgrid[: _WIDTH // 2, :_WIDTH] + 0.5
+    rays = bearings_from_erp(np.stack([u, v], axis=-1), _WIDTH, _WIDTH // 2).reshape(-1, 3)
+    rays.setflags(write=False)
+    return rays
+
+
+def _jacobian(detail: np.ndarray) -> np.ndarray:
+    """Derivative (64 * 128, 3) of the detail at each ray by a turn of the ray about the axes."""
+    per_radian = _WIDTH / (2 * np.pi)
+    by_u = 0.5 * (np.roll(detail, -1, axis=1) - np.roll(detail, 1, axis=1)) * per_radian
+    by_v = np.gradient(detail, axis=0) * per_radian
+    x, y, z = _rays().T
+    level = np.maximum(np.hypot(x, z), 0.05)
+    # Turning a ray r about w moves it by w x r: longitude and elevation angles follow.
+    by_longitude, by_height = by_u.ravel(), by_v.ravel()
+    east = np.stack([z, np.zeros_like(x), -x], axis=1) / level[:, None]
+    down = np.stack([-x * y, level**2, -z * y], axis=1) / level[:, None]
+    rays = _rays()
+    gradient = by_longitude[:, None] / level[:, None] * east + by_height[:, None] * down
+    return np.cross(rays, gradient)

@@ -1,0 +1,106 @@
+"""Frames of a video chosen by what they show: sharp, and near enough to one another."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsba.config import OdometrySettings
+from gsba.geometry import rotation_angle
+from gsba.odometry.walk import Odometry
+
+_EARLIEST = 0.6  # part of a step after which the sharpest frame is looked for
+_MOST_LONGER = 1e6  # times the step, where few frames are wanted
+_HALVINGS = 20  # of the interval in which that factor is looked for
+
+
+def choose_frames(found: Odometry, settings: OdometrySettings) -> np.ndarray:
+    """Rows (N,) of frames that are worth refining.
+
+    From one frame to the next the camera moves by at most `step` times the median distance of
+    what it sees, and turns by at most `max_turn_deg`, wherever the video has frames as close; the
+    sharpest of the last part of each such stretch is taken. Frames without a pose are left out.
+
+    Args:
+        found: of all frames.
+        settings: lengths of the steps, and how many frames at most.
+    """
+    count = settings.max_frames
+    steps = _Steps.of(found, settings.step, np.deg2rad(settings.max_turn_deg))
+    rows = _chosen(found, steps, 1.0)
+    if count is None or len(rows) <= count:
+        return rows
+    low, high = 1.0, 2.0
+    while len(_chosen(found, steps, high)) > count:
+        low, high = high, 2 * high
+        if high > _MOST_LONGER:  # more maps than frames are wanted
+            return rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        if len(_chosen(found, steps, middle)) > count:
+            low = middle
+        else:
+            high = middle
+    return _chosen(found, steps, high)
+
+
+@dataclass(frozen=True, slots=True)
+class _Steps:
+    """How far frames are from one another, in steps of the length that is allowed."""
+
+    positions: np.ndarray  # (F, 3) float64, map units
+    rotations: np.ndarray  # (F, 3, 3) float64
+    allowed: np.ndarray  # (F,) float64, length of a step near each frame, map units
+    max_turn: float  # radians
+
+    @classmethod
+    def of(cls, found: Odometry, step: float, max_turn: float) -> "_Steps":
+        """Steps between frames; the distance of things is interpolated where it is not known."""
+        known = np.flatnonzero(np.isfinite(found.distances) & found.posed())
+        distances = np.full(len(found), np.inf)
+        if len(known):
+            distances = np.interp(np.arange(len(found)), known, found.distances[known])
+        poses = found.world_T_rigs
+        return cls(poses[:, :3, 3], poses[:, :3, :3], step * distances, max_turn)
+
+    def between(self, one: int, others: np.ndarray) -> np.ndarray:
+        """From one frame to others (N,)."""
+        moved = np.linalg.norm(self.positions[others] - self.positions[one], axis=1)
+        turned = rotation_angle(self.rotations[one].T @ self.rotations[others])
+        shorter = np.minimum(self.allowed[others], self.allowed[one])
+        return np.maximum(moved / shorter, turned / self.max_turn)
+
+
+def _chosen(found: Odometry, steps: _Steps, longer: float) -> np.ndarray:
+    """Rows of frames at most `longer` steps apart, the first of each map among them."""
+    out: list[int] = []
+    posed = found.posed()
+    for number in np.unique(found.maps[posed]):
+        rows = np.flatnonzero(posed & (found.maps == number))
+        here = 0
+        while here is not None:
+            out.append(int(rows[here]))
+            here = _next(rows, here, steps, longer, found.sharpness)
+    return np.array(out, np.int64)
+
+
+def _next(
+    rows: np.ndarray, here: int, steps: _Steps, longer: float, sharpness: np.ndarray
+) -> int | None:
+    """The frame to take after `rows[here]`, as an index into `rows`; None = nothing new follows."""
+    reach, end = 32, len(rows)
+    while True:
+        ahead = np.arange(here + 1, min(here + 1 + reach, end))
+        away = steps.between(int(rows[here]), rows[ahead]) / longer
+        beyond = np.flatnonzero(away > 1)
+        if len(beyond) or ahead[-1:].tolist() in ([], [end - 1]):
+            break
+        reach *= 2
+    if not len(ahead):
+        return None
+    stop = int(beyond[0]) if len(beyond) else len(ahead)
+    fit = np.flatnonzero(away[:stop] >= _EARLIEST)
+    if len(fit):
+        return int(ahead[fit[np.argmax(sharpness[rows[ahead[fit]]])]])
+    if not len(beyond):
+        return None
+    return int(ahead[max(stop - 1, 0)])

@@ -1,0 +1,122 @@
+"""A lost frame placed relative to a keyframe by descriptors, with the scale of the map's points."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from gsba.config import VerifySettings
+from gsba.geometry import pose
+from gsba.matching.verification import relative_pose
+from gsba.odometry.atlas import Atlas, AtlasLayout
+
+_MAX_KEYPOINTS = 1500
+_CONTRAST = 0.02  # least of a keypoint, as OpenCV's SIFT takes it
+_RATIO = 0.85  # of the distances of the best and the second best match, at most
+_MIN_MATCHES = 20
+_VERIFY = VerifySettings(max_error_deg=0.4)
+_NEAR = np.deg2rad(4.0)  # between a match and the point whose distance it is given
+_MIN_SCALES = 8  # matches near a point
+_MIN_PARALLAX = np.deg2rad(1.0)  # of a match whose distance is compared
+
+
+@dataclass(frozen=True, slots=True)
+class Described:
+    """Keypoints of an atlas."""
+
+    bearings_rig: np.ndarray  # (K, 3) unit
+    descriptors: np.ndarray  # (K, 128) float32, root SIFT
+
+
+def describe(layout: AtlasLayout, atlas: Atlas, usable: np.ndarray | None) -> Described:
+    """SIFT of an atlas, each keypoint in the face that owns it.
+
+    Args:
+        usable: (2 s, 3 s) bool, what of the atlas shows the scene; None = all.
+    """
+    allowed = layout.owned if usable is None else layout.owned & usable
+    sift = cv2.SIFT.create(_MAX_KEYPOINTS, 3, _CONTRAST)
+    found, descriptors = sift.detectAndCompute(atlas.image, allowed.astype(np.uint8) * 255)
+    if descriptors is None:
+        return Described(np.zeros((0, 3)), np.zeros((0, 128), np.float32))
+    pixels = np.array([keypoint.pt for keypoint in found], np.float64)
+    column, row = (np.clip(pixels // layout.rig.size, 0, [2, 1])).astype(int).T
+    bearings = layout.bearings(pixels, row * 3 + column) @ atlas.cut_R_rig
+    total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)
+    return Described(bearings, np.sqrt(descriptors / total).astype(np.float32))
+
+
+def placed(
+    key: Described,
+    frame: Described,
+    bearings: np.ndarray,
+    distances: np.ndarray,
+    seed: int,
+) -> np.ndarray | None:
+    """key_T_rig (4, 4) of a frame, in the unit of the map; None where nothing is certain.
+
+    Args:
+        key, frame: keypoints of both.
+        bearings: (P, 3) unit, the keyframe's rig frame, to its points.
+        distances: (P,) of these points, map units.
+        seed: of the sampling.
+    """
+    if min(len(key.bearings_rig), len(frame.bearings_rig)) < _MIN_MATCHES:
+        return None
+    rows = _matched(key.descriptors, frame.descriptors)
+    if len(rows) < _MIN_MATCHES:
+        return None
+    one, other = key.bearings_rig[rows[:, 0]], frame.bearings_rig[rows[:, 1]]
+    found = relative_pose(one, other, _VERIFY, seed)
+    if found is None:
+        return None
+    rotation, direction = found.f0_T_f1[:3, :3], found.f0_T_f1[:3, 3]
+    if np.isinf(found.direction_sigma):
+        return pose(rotation, np.zeros(3))
+    one, other = one[found.inliers], other[found.inliers] @ rotation.T
+    length = _length(one, other, direction, bearings, distances)
+    return None if length is None else pose(rotation, length * direction)
+
+
+def _matched(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Rows (m, 2) of descriptors that are each other's nearest, by far."""
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    forth = matcher.knnMatch(one, other, k=2)
+    back = {m[0].queryIdx: m[0].trainIdx for m in matcher.knnMatch(other, one, k=1) if m}
+    rows = [
+        (m[0].queryIdx, m[0].trainIdx)
+        for m in forth
+        if len(m) == 2
+        and m[0].distance < _RATIO * m[1].distance
+        and back.get(m[0].trainIdx) == m[0].queryIdx
+    ]
+    return np.array(rows, np.int64).reshape(-1, 2)
+
+
+def _length(
+    one: np.ndarray,
+    other: np.ndarray,
+    direction: np.ndarray,
+    bearings: np.ndarray,
+    distances: np.ndarray,
+) -> float | None:
+    """Length of the step at which matches are as far away as the points beside them; or None.
+
+    Args:
+        one, other: (m, 3) rays of the matches in the keyframe's axes.
+        direction: (3,) unit, of the step.
+        bearings, distances: of the points.
+    """
+    from scipy.spatial import KDTree
+
+    if not len(bearings):
+        return None
+    parallax = np.linalg.norm(np.cross(one, other), axis=1)
+    apart, nearest = KDTree(bearings).query(one)
+    use = (parallax > _MIN_PARALLAX) & (apart < _NEAR)
+    if np.count_nonzero(use) < _MIN_SCALES:
+        return None
+    # |step x other| / |one x other| is the distance along `one` at a step of length 1.
+    at_one = np.linalg.norm(np.cross(direction, other[use]), axis=1) / parallax[use]
+    lengths = distances[np.asarray(nearest)[use]] / np.maximum(at_one, 1e-9)
+    return float(np.median(lengths))

@@ -1,0 +1,532 @@
+"""Visual odometry on the sphere: one small grey panorama after another, one pose for each.
+
+Features of the last keyframe are followed into each frame; the frame's pose comes from those whose
+points are known (resection). A frame that shows enough parallax, or too few features, becomes a
+keyframe: new features are added, all of the window are triangulated anew and adjusted together.
+Frames hang on their keyframes, and move with them.
+"""
+
+import logging
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+
+from gsba.geometry import angles_between, inverse, nearest_rotation, pose, unit
+from gsba.odometry.atlas import Atlas, AtlasLayout, Cutter
+from gsba.odometry.corners import new_corners
+from gsba.odometry.derotation import Miniature, miniature, turned
+from gsba.odometry.flow import follow
+from gsba.odometry.relocalisation import Described, describe, placed
+from gsba.odometry.resection import Resection, resect
+from gsba.odometry.two_view_start import median_turn, start_map
+from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window
+
+logger = logging.getLogger(__name__)
+
+FREE, HELD = 8, 5  # keyframes of the window that are adjusted, and before them that are held
+_REMEMBERED = 10  # keyframes that a lost frame is compared with
+_DESCRIBED = 4  # of these, the last ones, that it is compared with by descriptors
+_MIN_CONTRAST = 1.5  # grey values: less is darkness, or a hand over the lenses
+_KEYFRAME_PARALLAX = np.deg2rad(3.0)  # median of the features, since the last keyframe
+_KEYFRAME_SHARE = 0.7  # of the last keyframe's features that could be followed, still found
+_FADING_SHARE = 0.7  # of the first keyframe's features, below which less parallax has to do
+_START_SHARE = 0.45  # of the first keyframe's features, below which a start is begun anew
+_SIGMA, _MIN_SIGMA, _MAX_SIGMA = np.deg2rad([0.25, 0.05, 0.35])  # of bearings, per axis
+_ADAPTING = 0.1  # weight of one frame in the noise of bearings
+_GATE = 4.0  # standard deviations of a feature that fits
+_MIN_FEATURES = 40  # of a picture that shows anything
+_MAX_MISSES = 4  # frames in a row in which a feature without a point was not found
+_MAX_PENDING = 300  # frames before the start of a map that are posed again once it has points
+
+
+class FrameStatus(IntEnum):
+    """How the pose of a frame was found."""
+
+    TRACKED = 0  # from known points
+    TURNING = 1  # before the map had points: the rotation alone, the position is kept
+    LOST = 2  # not at all: the pose of the frame before stands in for it
+
+
+@dataclass(slots=True)
+class _Keyframe:
+    """A keyframe of the map that is being made."""
+
+    number: int  # of the keyframe in the whole recording
+    frame: int  # index of its frame
+    world_T_rig: np.ndarray  # (4, 4)
+    ids: np.ndarray  # (N,) int64, features seen
+    bearings: np.ndarray  # (N, 3) unit, rig frame
+    atlas: Atlas | None  # None = forgotten
+    small: Miniature | None
+    described: Described | None = None  # when a lost frame was first compared with it
+    most_found: int = 0  # of its features in one of the frames after it
+
+
+@dataclass(slots=True)
+class _Features:
+    """Features of the last keyframe that are followed."""
+
+    ids: np.ndarray  # (N,) int64
+    bearings: np.ndarray  # (N, 3) unit, rig frame of the keyframe
+    latest_world: np.ndarray  # (N, 3) unit, world: direction when last found
+    misses: np.ndarray  # (N,) int, frames since
+
+    def taken(self, rows: np.ndarray) -> "_Features":
+        """Some rows."""
+        return _Features(
+            self.ids[rows], self.bearings[rows], self.latest_world[rows], self.misses[rows]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    """Where the features are in a frame, and the pose they give."""
+
+    atlas: Atlas
+    bearings: np.ndarray  # (N, 3)
+    found: np.ndarray  # (N,) bool
+    fit: Resection
+
+
+@dataclass(slots=True)
+class FrameRecord:
+    """What is known of one frame."""
+
+    status: FrameStatus
+    map_number: int  # 0 = the first map
+    keyframe: int  # number of the keyframe it hangs on
+    key_T_rig: np.ndarray  # (4, 4) float64, pose in that keyframe
+    distance: float  # median distance of the points, map units; NaN = not known
+    inliers: int  # features that fit
+
+
+@dataclass(slots=True)
+class Tracker:
+    """State of the odometry between frames.
+
+    Attributes:
+        records: of all frames so far.
+        keyframe_poses: (4, 4) each, of all keyframes so far, in the world of their map.
+        keyframe_frames: index of each keyframe's frame.
+    """
+
+    width: int  # pixels across the panoramas
+    usable: np.ndarray | None = None  # (h, 2h) bool, what shows the scene in every frame
+    seed: int = 0  # of the sampling at the start of a map
+    patience: int = 8  # frames that show something and fit no keyframe before a new map is begun
+    records: list[FrameRecord] = field(default_factory=list)
+    keyframe_poses: list[np.ndarray] = field(default_factory=list)
+    keyframe_frames: list[int] = field(default_factory=list)
+
+    _layout: AtlasLayout = field(init=False)
+    _cutter: Cutter = field(init=False)
+    _mask_cutter: Cutter = field(init=False)
+    _window: list[_Keyframe] = field(default_factory=list)
+    _features: _Features | None = None
+    _points: np.ndarray = field(default_factory=lambda: np.full((4096, 3), np.nan))
+    _num_ids: int = 0
+    _map: int = 0
+    _has_points: bool = False
+    _pose: np.ndarray = field(default_factory=lambda: np.eye(4))
+    _motion: np.ndarray = field(default_factory=lambda: np.eye(4))
+    _small: Miniature | None = None
+    _sigma: float = float(_SIGMA)
+    _pending: list[tuple[int, np.ndarray, np.ndarray]] = field(default_factory=list)
+    _failures: int = 0
+
+    def __post_init__(self) -> None:
+        self._layout = AtlasLayout.of(self.width)
+        self._cutter, self._mask_cutter = Cutter(self._layout), Cutter(self._layout)
+
+    def world_T_rigs(self) -> np.ndarray:
+        """Poses (F, 4, 4) of all frames so far, each in the world of its map."""
+        return np.array([self.keyframe_poses[r.keyframe] @ r.key_T_rig for r in self.records])
+
+    def add(self, grey: np.ndarray) -> FrameRecord:
+        """Pose the next frame, a panorama (width / 2, width) uint8."""
+        frame = len(self.records)
+        small = miniature(grey, self.usable)
+        if self._features is None:
+            self._begin_map(grey, small, frame)
+        elif not self._has_points:
+            self._add_before_start(grey, small, frame)
+        else:
+            self._add_to_map(grey, small, frame)
+        return self.records[-1]
+
+    # A frame before the map has points.
+
+    def _begin_map(self, grey: np.ndarray, small: Miniature, frame: int) -> None:
+        """Make a frame the first keyframe of a map, if it shows anything."""
+        atlas = self._cutter.cut(grey, self._pose[:3, :3])
+        corners = self._corners(atlas, np.zeros((0, 3)))
+        if len(corners) < _MIN_FEATURES or small.contrast < _MIN_CONTRAST:
+            self._record(FrameStatus.LOST, np.eye(4))
+            return
+        self._window = []
+        self._add_keyframe(frame, self._pose, atlas, small, None, corners)
+        self._record(FrameStatus.TURNING, np.eye(4))
+        self._small = small
+
+    def _add_before_start(self, grey: np.ndarray, small: Miniature, frame: int) -> None:
+        """Follow the first keyframe's features until they show that the camera moved."""
+        key, features = self._window[-1], self._features
+        assert key.atlas is not None and features is not None
+        predicted_R = self._pose[:3, :3] @ self._motion[:3, :3]
+        atlas, bearings, found = self._followed(grey, key, features, predicted_R)
+        if np.count_nonzero(found) < _START_SHARE * (key.most_found or len(features.ids)):
+            again = self._followed(grey, key, features, self._turned(small, predicted_R))
+            if np.count_nonzero(again[2]) > np.count_nonzero(found):
+                atlas, bearings, found = again
+        ids, one, other = features.ids[found], features.bearings[found], bearings[found]
+        if len(ids) < _MIN_FEATURES:
+            self._lose(grey, small, frame)
+            return
+        key.most_found = max(key.most_found, len(ids))
+        turn = median_turn(one, other)
+        world_R_rig = key.world_T_rig[:3, :3] @ turn.one_R_other
+        fading = len(ids) < _FADING_SHARE * key.most_found
+        seed = self.seed + frame
+        solved = start_map(ids, one, other, turn, self._sigma, seed, fading)
+        self._failures = 0
+        if solved is not None:
+            self._start(frame, solved, atlas, small, ids, other)
+            return
+        features.latest_world[found] = bearings[found] @ world_R_rig.T
+        self._step(pose(world_R_rig, self._pose[:3, 3]), small)
+        if len(ids) < _START_SHARE * key.most_found:
+            # Turned away from what it saw, without a step: the rotation goes on from here.
+            self._pending.clear()
+            corners = self._corners(atlas, np.zeros((0, 3)))
+            self._window = []
+            self._add_keyframe(frame, self._pose, atlas, small, None, corners)
+            self._record(FrameStatus.TURNING, np.eye(4))
+            return
+        self._pending.append((frame, ids, other))
+        del self._pending[:-_MAX_PENDING]
+        self._record(FrameStatus.TURNING, inverse(key.world_T_rig) @ self._pose)
+
+    def _followed(
+        self, grey: np.ndarray, key: _Keyframe, features: _Features, world_R_rig: np.ndarray
+    ) -> tuple[Atlas, np.ndarray, np.ndarray]:
+        """A frame's atlas, bearings (N, 3) of features in it, and which were found, by rotation."""
+        assert key.atlas is not None
+        atlas = self._cutter.cut(grey, world_R_rig)
+        expected = unit(features.latest_world @ world_R_rig)
+        return atlas, *follow(self._layout, key.atlas, atlas, features.bearings, expected)
+
+    def _start(
+        self,
+        frame: int,
+        solved: AdjustedWindow,
+        atlas: Atlas,
+        small: Miniature,
+        ids: np.ndarray,
+        bearings: np.ndarray,
+    ) -> None:
+        """Give the map its first points, in the world that the first keyframe has."""
+        key = self._window[-1]
+        world_T_key = key.world_T_rig
+        points = solved.points_world @ world_T_key[:3, :3].T + world_T_key[:3, 3]
+        self._points[solved.ids] = points
+        self._has_points = True
+        for before, seen, where in self._pending:
+            self._pose_again(before, seen, where, key)
+        last = self.records[-1]
+        self._pose = self.keyframe_poses[last.keyframe] @ last.key_T_rig
+        self._step(world_T_key @ solved.world_T_rigs[1], small)
+        self._pending.clear()
+        false = np.isin(ids, solved.outliers[:, 1])
+        self._become_keyframe(frame, atlas, small, ids[~false], bearings[~false])
+
+    def _pose_again(
+        self, frame: int, ids: np.ndarray, bearings: np.ndarray, key: _Keyframe
+    ) -> None:
+        """Pose a frame before the start of the map from the points it has now."""
+        points = self._points[ids]
+        known = np.isfinite(points[:, 0])
+        record = self.records[frame]
+        start = key.world_T_rig @ record.key_T_rig
+        fit = resect(points[known], bearings[known], start, self._sigma)
+        if fit.significant:
+            record.key_T_rig = inverse(key.world_T_rig) @ fit.world_T_rig
+            record.status = FrameStatus.TRACKED
+            record.inliers = int(np.count_nonzero(fit.inliers))
+            record.distance = self._distance(ids, fit.world_T_rig)
+
+    # A frame of a map that has points.
+
+    def _add_to_map(self, grey: np.ndarray, small: Miniature, frame: int) -> None:
+        """Pose a frame by known points; look for it among keyframes where that fails."""
+        assert self._features is not None
+        key = self._window[-1]
+        tried = self._attempt(grey, key, self._features, self._pose @ self._motion)
+        if not tried.fit.significant:
+            turned_pose = pose(
+                self._turned(small, tried.fit.world_T_rig[:3, :3]), self._pose[:3, 3]
+            )
+            again = self._attempt(grey, key, self._features, turned_pose)
+            tried = again if again.fit.significant else None
+        if tried is None:
+            tried = self._relocalised(grey, small)
+        if tried is None:
+            self._lose(grey, small, frame)
+            return
+        found_again = self.records[-1].status == FrameStatus.LOST
+        self._failures = 0
+        self._accept(frame, tried, small)
+        if found_again:  # the step from where the camera was lost is no velocity
+            self._motion = np.eye(4)
+
+    def _attempt(
+        self, grey: np.ndarray, key: _Keyframe, features: _Features, predicted: np.ndarray
+    ) -> _Attempt:
+        """Follow a keyframe's features into a frame whose pose (4, 4) is predicted, and pose it."""
+        assert key.atlas is not None
+        atlas = self._cutter.cut(grey, predicted[:3, :3])
+        points = self._points[features.ids]
+        known = np.isfinite(points[:, 0])
+        rays = np.where(known[:, None], points - predicted[:3, 3], features.latest_world)
+        expected = unit(rays @ predicted[:3, :3])
+        bearings, found = follow(self._layout, key.atlas, atlas, features.bearings, expected)
+        rows = known & found
+        fit = resect(points[rows], bearings[rows], predicted, self._sigma)
+        return _Attempt(atlas, bearings, found, fit)
+
+    def _accept(self, frame: int, tried: _Attempt, small: Miniature) -> None:
+        """Take the pose of a frame; make it a keyframe if it is time."""
+        features, key, fit = self._features, self._window[-1], tried.fit
+        assert features is not None
+        self._step(fit.world_T_rig, small)
+        noise = float(np.clip(fit.noise, _MIN_SIGMA, _MAX_SIGMA))
+        self._sigma += _ADAPTING * (noise - self._sigma)
+        fits = self._fitting(features, tried, key)
+        features.latest_world[fits] = tried.bearings[fits] @ self._pose[:3, :3].T
+        features.misses = np.where(fits, 0, features.misses + 1)
+        known = np.isfinite(self._points[features.ids, 0])
+        distance = self._distance(features.ids[fits & known], self._pose)
+        parallax = self._parallax(features, tried, fits, key)
+        key.most_found = max(key.most_found, int(np.count_nonzero(fits)))
+        share = np.count_nonzero(fits) / max(key.most_found, 1)
+        if parallax > _KEYFRAME_PARALLAX or share < _KEYFRAME_SHARE:
+            ids, bearings = features.ids[fits], tried.bearings[fits]
+            self._become_keyframe(frame, tried.atlas, small, ids, bearings)
+            return
+        kept = known | (features.misses <= _MAX_MISSES)
+        self._features = features.taken(kept)
+        number = int(np.count_nonzero(fit.inliers))
+        key_T_rig = inverse(key.world_T_rig) @ self._pose
+        self._record(FrameStatus.TRACKED, key_T_rig, distance, number)
+
+    def _fitting(self, features: _Features, tried: _Attempt, key: _Keyframe) -> np.ndarray:
+        """Features (N,) bool that were found where the pose allows them."""
+        points = self._points[features.ids]
+        known = np.isfinite(points[:, 0])
+        fits = tried.found.copy()
+        rows = np.flatnonzero(known & tried.found)
+        fits[rows] = tried.fit.inliers
+        rows = np.flatnonzero(~known & tried.found)
+        key_T_rig = inverse(key.world_T_rig) @ self._pose
+        rays = tried.bearings[rows] @ key_T_rig[:3, :3].T
+        normals = np.cross(key_T_rig[:3, 3], features.bearings[rows])
+        lengths = np.linalg.norm(normals, axis=1)
+        across = np.abs(np.sum(normals * rays, axis=1)) / np.maximum(lengths, 1e-12)
+        # Near the epipole, and without a step, what is left is compared with the bearing itself.
+        off = angles_between(features.bearings[rows], rays)
+        fits[rows] = np.minimum(across, off) < _GATE * self._sigma
+        return fits
+
+    def _parallax(
+        self, features: _Features, tried: _Attempt, fits: np.ndarray, key: _Keyframe
+    ) -> float:
+        """Median angle between where features lie from the keyframe and from the frame."""
+        if not fits.any():
+            return 0.0
+        key_R_rig = key.world_T_rig[:3, :3].T @ self._pose[:3, :3]
+        rays = tried.bearings[fits] @ key_R_rig.T
+        return float(np.median(angles_between(features.bearings[fits], rays)))
+
+    # Keyframes.
+
+    def _become_keyframe(
+        self, frame: int, atlas: Atlas, small: Miniature, ids: np.ndarray, bearings: np.ndarray
+    ) -> None:
+        """Make the frame posed last a keyframe: add features, adjust the window."""
+        corners = self._corners(atlas, bearings)
+        self._add_keyframe(frame, self._pose, atlas, small, (ids, bearings), corners)
+        self._adjust()
+        known = np.isfinite(self._points[ids, 0])
+        distance = self._distance(ids[known], self._pose)
+        self._record(FrameStatus.TRACKED, np.eye(4), distance, len(ids))
+
+    def _add_keyframe(
+        self,
+        frame: int,
+        world_T_rig: np.ndarray,
+        atlas: Atlas,
+        small: Miniature,
+        followed: tuple[np.ndarray, np.ndarray] | None,
+        corners: np.ndarray,
+    ) -> None:
+        """Add a keyframe with features that were followed to it (ids, bearings), and new ones."""
+        ids = self._num_ids + np.arange(len(corners))
+        self._num_ids += len(corners)
+        while self._num_ids > len(self._points):
+            self._points = np.concatenate([self._points, np.full_like(self._points, np.nan)])
+        bearings = corners
+        if followed is not None:
+            ids = np.concatenate([followed[0], ids])
+            bearings = np.concatenate([followed[1], corners])
+        number = len(self.keyframe_poses)
+        key = _Keyframe(number, frame, world_T_rig.copy(), ids, bearings, atlas, small)
+        self._window.append(key)
+        self.keyframe_poses.append(key.world_T_rig)
+        self.keyframe_frames.append(frame)
+        del self._window[: -(FREE + HELD)]
+        for old in self._window[:-_REMEMBERED]:
+            old.atlas = old.small = old.described = None
+        self._features = _Features(
+            ids, bearings, bearings @ world_T_rig[:3, :3].T, np.zeros(len(ids), int)
+        )
+
+    def _adjust(self) -> None:
+        """Adjust the window, and drop features that do not fit it."""
+        window, features = self._window, self._features
+        assert features is not None
+        held = max(len(window) - FREE, min(2, len(window) - 1))
+        seen = WindowObservations.of([(key.ids, key.bearings) for key in window])
+        poses = np.array([key.world_T_rig for key in window])
+        solved = adjust_window(poses, held, seen, self._sigma, _GATE)
+        for key, world_T_rig in zip(window[held:], solved.world_T_rigs[held:], strict=True):
+            key.world_T_rig = world_T_rig
+            self.keyframe_poses[key.number] = world_T_rig
+        everything = np.unique(seen.ids)
+        self._points[everything] = np.nan
+        self._points[solved.ids] = solved.points_world
+        for n, key in enumerate(window):
+            false = solved.outliers[solved.outliers[:, 0] == n, 1]
+            if len(false):
+                kept = ~np.isin(key.ids, false)
+                key.ids, key.bearings = key.ids[kept], key.bearings[kept]
+                if n == len(window) - 1:
+                    self._features = features = features.taken(kept)
+        last = window[-1]
+        features.latest_world = features.bearings @ last.world_T_rig[:3, :3].T
+        self._pose = last.world_T_rig.copy()
+
+    # Frames that nothing is known of.
+
+    def _relocalised(self, grey: np.ndarray, small: Miniature) -> _Attempt | None:
+        """A lost frame posed by one of the last keyframes, which takes the lead then; or None."""
+        if small.contrast < _MIN_CONTRAST:
+            return None
+        for key in reversed(self._window):
+            if key.atlas is None or key.small is None:
+                break
+            world_R_rig = key.world_T_rig[:3, :3] @ turned(key.small, small, [np.eye(3)])
+            found = self._by_keyframe(grey, key, pose(world_R_rig, key.world_T_rig[:3, 3]))
+            if found is not None:
+                return found
+        frame = self._described(self._cutter.cut(grey, self._pose[:3, :3]))
+        for key in reversed(self._window[-_DESCRIBED:]):
+            if key.atlas is None:
+                break
+            if key.described is None:
+                key.described = self._described(key.atlas)
+            points = self._points[key.ids]
+            known = np.isfinite(points[:, 0])
+            distances = np.linalg.norm(points[known] - key.world_T_rig[:3, 3], axis=1)
+            seed = self.seed + len(self.records)
+            key_T_rig = placed(key.described, frame, key.bearings[known], distances, seed)
+            if key_T_rig is None:
+                continue
+            found = self._by_keyframe(grey, key, key.world_T_rig @ key_T_rig)
+            if found is not None:
+                return found
+        return None
+
+    def _by_keyframe(
+        self, grey: np.ndarray, key: _Keyframe, predicted: np.ndarray
+    ) -> _Attempt | None:
+        """A frame followed from a keyframe, which leads then; None where no pose comes of it."""
+        world = key.bearings @ key.world_T_rig[:3, :3].T
+        features = _Features(key.ids, key.bearings, world, np.zeros(len(key.ids), int))
+        tried = self._attempt(grey, key, features, predicted)
+        if tried.fit.significant:
+            tried = self._attempt(grey, key, features, tried.fit.world_T_rig)
+        if not tried.fit.significant:
+            return None
+        self._window = self._window[: self._window.index(key) + 1]
+        self._features = features
+        logger.debug("frame %d: found again by keyframe %d", len(self.records), key.number)
+        return tried
+
+    def _described(self, atlas: Atlas) -> Described:
+        return describe(self._layout, atlas, self._usable_in(atlas))
+
+    def _lose(self, grey: np.ndarray, small: Miniature, frame: int) -> None:
+        """Leave a frame without a pose; begin a new map after several."""
+        self._motion = np.eye(4)
+        self._small = self._small if self._small is not None else small
+        key = self._window[-1]
+        self._record(FrameStatus.LOST, inverse(key.world_T_rig) @ self._pose)
+        if small.contrast < _MIN_CONTRAST:
+            return
+        self._failures += 1
+        if self._failures < self.patience:
+            return
+        self._failures = 0
+        logger.warning("frame %d: nothing ties it to the map: a new one begins", frame)
+        self.records.pop()
+        self._map += 1
+        self._has_points, self._features, self._pose = False, None, np.eye(4)
+        self._pending.clear()
+        self._begin_map(grey, small, frame)
+
+    # Small things.
+
+    def _turned(self, small: Miniature, guess: np.ndarray) -> np.ndarray:
+        """Orientation (3, 3) by the panorama as a whole, from that of the frame posed last."""
+        assert self._small is not None
+        before = self._pose[:3, :3]
+        return before @ turned(self._small, small, [before.T @ guess, np.eye(3)])
+
+    def _corners(self, atlas: Atlas, known: np.ndarray) -> np.ndarray:
+        return new_corners(self._layout, atlas, self._usable_in(atlas), known)
+
+    def _usable_in(self, atlas: Atlas) -> np.ndarray | None:
+        if self.usable is None:
+            return None
+        grey = self.usable.astype(np.uint8) * 255
+        return self._mask_cutter.cut(grey, atlas.cut_R_rig).image > 250
+
+    def _distance(self, ids: np.ndarray, world_T_rig: np.ndarray) -> float:
+        """Median distance of features' points from a pose; NaN without points."""
+        points = self._points[ids]
+        points = points[np.isfinite(points[:, 0])]
+        if not len(points):
+            return float("nan")
+        return float(np.median(np.linalg.norm(points - world_T_rig[:3, 3], axis=1)))
+
+    def _step(self, world_T_rig: np.ndarray, small: Miniature) -> None:
+        """Go on to the pose of the next frame."""
+        # A product of products would double what rounding leaves of R^T R - I with every frame.
+        motion = inverse(self._pose) @ world_T_rig
+        self._motion = pose(nearest_rotation(motion[:3, :3]), motion[:3, 3])
+        self._pose = pose(nearest_rotation(world_T_rig[:3, :3]), world_T_rig[:3, 3])
+        self._small = small
+
+    def _record(
+        self,
+        status: FrameStatus,
+        key_T_rig: np.ndarray,
+        distance: float = float("nan"),
+        inliers: int = 0,
+    ) -> None:
+        """Note the frame after the last one."""
+        if not self.keyframe_poses:
+            self.keyframe_poses.append(np.eye(4))
+            self.keyframe_frames.append(len(self.records))
+        key = self._window[-1].number if self._window else len(self.keyframe_poses) - 1
+        self.records.append(FrameRecord(status, self._map, key, key_T_rig, distance, inliers))

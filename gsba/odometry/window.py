@@ -1,0 +1,103 @@
+"""Bundle adjustment of the last keyframes, those before them held."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors import BearingTerm, LandmarkBlock, RobustLoss
+from gsba.bundle import optimize, prior_factors, triangulate
+from gsba.bundle.adjustment import poses_of, values_of
+from gsba.config import SolverSettings, TriangulateSettings
+from gsba.types import Tracks
+
+_SOLVER = SolverSettings(
+    max_iterations=8, relative_tolerance=1e-3, absolute_tolerance=1.0, lambda_initial=1e-6
+)
+_MIN_PARALLAX_DEG = 1.0  # of a point's rays
+_HELD = 1e-6  # standard deviation of poses that are held: radians, and parts of their extent
+
+
+@dataclass(frozen=True, slots=True)
+class WindowObservations:
+    """Which features keyframes of a window see, and where."""
+
+    frames: np.ndarray  # (O,) int32, rows of the window's keyframes
+    ids: np.ndarray  # (O,) int64, features
+    bearings_rig: np.ndarray  # (O, 3) float64, unit, rig frame
+
+    @classmethod
+    def of(cls, keyframes: Sequence[tuple[np.ndarray, np.ndarray]]) -> "WindowObservations":
+        """From ids (n,) and bearings (n, 3) of each keyframe."""
+        frames = np.repeat(np.arange(len(keyframes)), [len(ids) for ids, _ in keyframes])
+        ids = np.concatenate([ids for ids, _ in keyframes])
+        bearings = np.concatenate([bearings for _, bearings in keyframes])
+        order = np.lexsort((frames, ids))
+        return cls(frames[order].astype(np.int32), ids[order], bearings[order])
+
+
+@dataclass(frozen=True, slots=True)
+class AdjustedWindow:
+    """Poses and points after adjustment."""
+
+    world_T_rigs: np.ndarray  # (K, 4, 4) float64
+    ids: np.ndarray  # (J,) int64, features that are points
+    points_world: np.ndarray  # (J, 3) float64
+    outliers: np.ndarray  # (N, 2) int64, keyframe and feature of observations off their point
+
+
+def adjust_window(
+    world_T_rigs: np.ndarray, num_held: int, seen: WindowObservations, sigma: float, gate: float
+) -> AdjustedWindow:
+    """Triangulate all features of a window anew, and adjust poses and points.
+
+    Args:
+        world_T_rigs: (K, 4, 4) poses at the start.
+        num_held: keyframes at the beginning that are held. With one, the distance from it to the
+            furthest keyframe is held besides: the scale is free otherwise.
+        seen: observations.
+        sigma: radians, of bearings per axis.
+        gate: observations further off their point are outliers, standard deviations.
+    """
+    _, points = np.unique(seen.ids, return_inverse=True)
+    num = int(points[-1]) + 1 if len(points) else 0
+    rows = np.arange(len(seen.ids), dtype=np.int32)
+    tracks = Tracks(points.astype(np.int32), seen.frames, rows, num)
+    sigmas = np.full(len(rows), sigma)
+    settings = TriangulateSettings(min_parallax_deg=_MIN_PARALLAX_DEG)
+
+    def place(poses: np.ndarray, limit: float):
+        return triangulate(tracks, seen.bearings_rig, sigmas, poses, limit, settings)
+
+    marks = place(world_T_rigs, 2 * gate)
+    used = marks.tracks.keypoints
+    term = BearingTerm(
+        marks.tracks.frames, marks.tracks.points, seen.bearings_rig[used], sigmas[used], None
+    )
+    keys = [prior_factors.X(k) for k in range(len(world_T_rigs))]
+    block = LandmarkBlock(keys, marks.points_world, [term], RobustLoss("cauchy", 2.0), 1)
+    graph = _held(world_T_rigs, num_held)
+    poses = poses_of(optimize(graph, [block], values_of(world_T_rigs), _SOLVER).values, len(keys))
+    marks = place(poses, gate)
+    kept = np.zeros(len(rows), bool)
+    kept[marks.tracks.keypoints] = True
+    first = np.unique(marks.tracks.points, return_index=True)[1]
+    ids = seen.ids[marks.tracks.keypoints[first]]
+    false = ~kept & np.isin(seen.ids, ids)
+    outliers = np.stack([seen.frames[false], seen.ids[false]], axis=1)
+    return AdjustedWindow(poses, ids, marks.points_world, outliers)
+
+
+def _held(world_T_rigs: np.ndarray, num_held: int) -> gtsam.NonlinearFactorGraph:
+    """Priors that hold the gauge."""
+    extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), 1e-9)
+    sigmas = np.array([_HELD] * 3 + [_HELD * extent] * 3)
+    noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    graph = gtsam.NonlinearFactorGraph()
+    for k in range(num_held):
+        pose = gtsam.Pose3(world_T_rigs[k])
+        graph.add(gtsam.PriorFactorPose3(prior_factors.X(k), pose, noise))
+    if num_held == 1:
+        graph.push_back(prior_factors.fixed_scale(world_T_rigs))
+    return graph
