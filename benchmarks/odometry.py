@@ -115,7 +115,7 @@ def faults(name: str, panoramas: SmallPanoramas, truth: np.ndarray) -> list[Row]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("walks", nargs="+", type=Path)
     parser.add_argument("--markdown", type=Path)
     arguments = parser.parse_args()

@@ -8,6 +8,19 @@ import typer
 from gsba.cli.app import command
 from gsba.log import GsbaError
 
+Keyframes = Annotated[
+    Path | None,
+    typer.Option(
+        help="Keyframes to write, TUM; default: beside --out, named -keyframes.", metavar="FILE"
+    ),
+]
+Report = Annotated[
+    Path | None,
+    typer.Option(
+        help="Report to write, JSON; default: beside --out, named -report.", metavar="FILE"
+    ),
+]
+
 
 @command
 def track(
@@ -18,18 +31,8 @@ def track(
     out: Annotated[
         Path, typer.Option(help="Trajectory to write: TUM, poses of all frames.", metavar="FILE")
     ],
-    keyframes: Annotated[
-        Path | None,
-        typer.Option(
-            help="Keyframes to write, TUM; default: beside --out, named -keyframes.", metavar="FILE"
-        ),
-    ] = None,
-    report: Annotated[
-        Path | None,
-        typer.Option(
-            help="Report to write, JSON; default: beside --out, named -report.", metavar="FILE"
-        ),
-    ] = None,
+    keyframes: Keyframes = None,
+    report: Report = None,
     masks: Annotated[
         str,
         typer.Option(help="auto: find what carries the camera; none; or a mask, white = use."),

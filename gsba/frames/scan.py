@@ -57,10 +57,8 @@ def scan(
 
     The folder holds equirectangular images, or cube faces: subfolders `front`, `right`, ... with
     equal names, or files `NAME_front.jpg`, ...; up and down may be absent from all frames. Or it
-    holds raw fisheyes: subfolders `front` and `back` alone (or `lens0` and `lens1`, `FR` and
-    `BK`), files `..._00_...` and `..._10_...` (or `GPFR...` and `GPBK...`, `GF...` and `GB...`),
-    or both side by side in 2:1 or 16:9 images. Or it holds both tracks of an equi-angular cube map,
-    in subfolders `track0` and `track5`.
+    holds raw fisheyes, one file for each lens (see `find_pairs`) or both side by side in 2:1 or
+    16:9 images; or both tracks of an equi-angular cube map, in subfolders `track0` and `track5`.
 
     Args:
         folder: JPEG, PNG, WebP or TIFF images; other files are ignored.
@@ -69,10 +67,9 @@ def scan(
         fps: frames per second of these files in name order.
         masks: one ERP mask for all frames, or a folder with one for each; white = use.
         order_suffices: where nothing gives times, name order stands in for them.
-        calibration: of the lenses of raw fisheyes, see `gsba.camera.calibration`; 2:1 images are
-            such then.
+        calibration: of the lenses of raw fisheyes, see `gsba.camera.calibration`.
         circles: image circles of raw fisheyes, of the front and the back lens, or one of both;
-            2:1 images are such then. Without, they are found.
+            none = found. With one of these, 2:1 images are raw fisheyes.
 
     Raises:
         GsbaError: naming the first file or frame that cannot be used.
@@ -93,10 +90,9 @@ def scan(
         layout, lens_size = "fisheye", raw
         paths = tuple((path, path) for path in images)
     fisheyes, nominal = _lenses(Path(folder), layout, paths, lens_size, *known)
-    if fisheyes is not None:
-        width, height = width_of(fisheyes), width_of(fisheyes) // 2
-    if tracks is not None:
-        width, height = 4 * tracks[1], 2 * tracks[1]
+    if fisheyes is not None or tracks is not None:
+        width = 4 * tracks[1] if tracks else width_of(fisheyes)  # type: ignore[arg-type]
+        height = width // 2
     erp_size = None if layout == "cube" else (width, height)
     return FrameSet(
         names=names,

@@ -179,6 +179,32 @@ def follows(settings: VideoSettings, fps: float | None, odometry: bool | None) -
     return fps is None and asked == (VideoSettings().fps, None, None) and not settings.sharpest
 
 
+def take_frames(
+    out: Path,
+    origin: Mapping[str, Path],
+    given: list[Trajectory],
+    settings: RefineSettings,
+    fps: float | None,
+    fresh: bool,
+    odometry: bool | None,
+    masks: Choice,
+    calibration: Path | None,
+) -> tuple[list[Trajectory], RefineSettings]:
+    """Frames of the video that a run is about, in `out`/frames; its start, and settings for that.
+
+    Args:
+        given: trajectories; where there is none, the video may be followed by odometry.
+        odometry: whether it is; None = where nothing says which frames to take.
+        out, origin, settings, fps, fresh, masks, calibration: as for `extract_frames`.
+    """
+    follow = follows(settings.video, fps, odometry) and not given
+    asked = settings, fps, fresh, masks if follow else None, calibration
+    found = extract_frames(out, origin, *asked)
+    if not found:
+        return given, settings
+    return found, settings.with_faint_priors()  # made of these very images: no evidence beside them
+
+
 def extract_frames(
     out: Path,
     origin: Mapping[str, Path],

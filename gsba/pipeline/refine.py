@@ -80,8 +80,7 @@ def refine(
     Args:
         frames: folder of panoramas, raw fisheyes, .360 tracks or cube faces; or a video.
         trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig. Several are pieces of one run
-            on one clock, and the first one's world is kept. None = start from the images alone:
-            the first step's length is the unit and the first frame the world.
+            on one clock, and the first one's world is kept. None = start from the images alone.
         out: folder of the run; a second call re-runs what depends on settings that changed.
         settings: see `gsba.config`.
         keyframes: second trajectory file of the same run, with its keyframes: they lead.
@@ -91,12 +90,10 @@ def refine(
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
-        circles: image circles of raw fisheyes where none are found: x, y and radius, pixels of one
-            lens's picture; of the front and the back lens, or one of both.
+        circles: image circles of raw fisheyes, x, y and radius in pixels; see `frames.scan`.
         imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
-        odometry: of a video without a trajectory: follow it, take the frames that
-            `settings.odometry` chooses, and start from its poses. None = where neither `fps` nor
-            `settings.video` says which frames to take.
+        odometry: of a video without a trajectory: start from its own odometry, from the frames that
+            this chooses. None = where neither `fps` nor `settings.video` says which to take.
         fresh: forget an earlier run in `out`.
         extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
         client: of a Dask scheduler whose workers take what can be shared out; None = threads here.
@@ -112,10 +109,8 @@ def refine(
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
     readings = inputs.read_gyro(imu, frames)
     if video.is_video(frames):
-        follow = inputs.follows(settings.video, fps, odometry) and not given
-        asked = origin, settings, fps, fresh, chosen if follow else None, calibration
-        if found := inputs.extract_frames(out, *asked):
-            given, settings = found, settings.with_faint_priors()  # by these very images
+        asked = fps, fresh, odometry, chosen, calibration
+        given, settings = inputs.take_frames(out, origin, given, settings, *asked)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     lenses = calibration, inputs.given_circles(circles, calibration)
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, *lenses)
