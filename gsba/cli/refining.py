@@ -45,6 +45,21 @@ Download = Annotated[
     bool, typer.Option("--download", help="Fetch missing weights from their authors.")
 ]
 
+NoTrajectory = Annotated[
+    bool,
+    typer.Option(
+        "--no-trajectory",
+        help="Start from pairs of images; of a video, without its own odometry.",
+    ),
+]
+Times = Annotated[Path | None, typer.Option(help="Times of the frames.", metavar="FILE")]
+Rate = Annotated[
+    float | None,
+    typer.Option(
+        help="Frames per second, from time 0; of a video: frames kept per second, in place of "
+        "frames chosen by what they show."
+    ),
+]
 Keyframes = Annotated[
     Path | None, typer.Option(help="Keyframe trajectory of the same run.", metavar="FILE")
 ]
@@ -112,31 +127,17 @@ def refine(
         ),
     ] = None,
     keyframes: Keyframes = None,
-    no_trajectory: Annotated[
-        bool,
-        typer.Option(
-            "--no-trajectory",
-            help="Start from pairs of images; of a video, without its own odometry.",
-        ),
-    ] = False,
+    no_trajectory: NoTrajectory = False,
     config: Config = None,
     overrides: Overrides = None,
     masks: Masks = None,
     segment: Segment = None,
     factors: Factors = None,
-    timestamps: Annotated[
-        Path | None, typer.Option(help="Times of the frames.", metavar="FILE")
-    ] = None,
+    timestamps: Times = None,
     camera: Camera = None,
     calibration: Calibration = None,
     imu: Imu = None,
-    fps: Annotated[
-        float | None,
-        typer.Option(
-            help="Frames per second, from time 0; of a video: frames kept per second, in place of "
-            "frames chosen by what they show."
-        ),
-    ] = None,
+    fps: Rate = None,
     weights: Weights = None,
     accept_noncommercial: Consent = False,
     download: Download = False,
@@ -160,9 +161,9 @@ def refine(
     with loading():
         from gsba import pipeline
         from gsba.store.cluster import connected
-    given = {"keyframes": keyframes, "segment": segment, "timestamps": timestamps, "fps": fps}
+    given = {"odometry": False if no_trajectory else None}
+    given |= {"keyframes": keyframes, "segment": segment, "timestamps": timestamps, "fps": fps}
     given |= {"masks": masks or "auto", "calibration": calibration, "imu": imu, "fresh": fresh}
-    given |= {"odometry": False if no_trajectory else None}
     with connected(cluster) as client:
         result = pipeline.refine(frames, trajectory, out, settings, client=client, **given)
     _conclude([result], allow_partial)

@@ -8,6 +8,22 @@ import typer
 from gsba.cli.app import command
 from gsba.log import GsbaError
 
+Keyframes = Annotated[
+    Path | None,
+    typer.Option(
+        help="Keyframes to write, TUM; default: beside --out, named -keyframes.", metavar="FILE"
+    ),
+]
+Report = Annotated[
+    Path | None,
+    typer.Option(
+        help="Report to write, JSON; default: beside --out, named -report.", metavar="FILE"
+    ),
+]
+Width = Annotated[
+    int | None, typer.Option(help="Pixels across the panoramas that are followed; 800 if unsaid.")
+]
+
 
 @command
 def track(
@@ -18,26 +34,13 @@ def track(
     out: Annotated[
         Path, typer.Option(help="Trajectory to write: TUM, poses of all frames.", metavar="FILE")
     ],
-    keyframes: Annotated[
-        Path | None,
-        typer.Option(
-            help="Keyframes to write, TUM; default: beside --out, named -keyframes.", metavar="FILE"
-        ),
-    ] = None,
-    report: Annotated[
-        Path | None,
-        typer.Option(
-            help="Report to write, JSON; default: beside --out, named -report.", metavar="FILE"
-        ),
-    ] = None,
+    keyframes: Keyframes = None,
+    report: Report = None,
     masks: Annotated[
         str,
         typer.Option(help="auto: find what carries the camera; none; or a mask, white = use."),
     ] = "auto",
-    width: Annotated[
-        int | None,
-        typer.Option(help="Pixels across the panoramas that are followed; 800 if unsaid."),
-    ] = None,
+    width: Width = None,
     fps: Annotated[
         float | None, typer.Option(help="Frames per second of a folder without times.")
     ] = None,

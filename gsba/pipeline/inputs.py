@@ -105,10 +105,16 @@ def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
         return None
 
 
-def leaves_frames_open(settings: VideoSettings) -> bool:
-    """Whether settings leave it open which frames of a video to take."""
-    asked = (settings.fps, settings.every, settings.at)
-    return asked == (VideoSettings().fps, None, None) and not settings.sharpest
+def follows(settings: VideoSettings, fps: float | None, asked: bool | None) -> bool:
+    """Whether a video without a trajectory is followed by odometry.
+
+    Args:
+        settings, fps: what they say of the frames to take.
+        asked: None = if they leave that open.
+    """
+    said = (settings.fps, settings.every, settings.at)
+    is_open = said == (VideoSettings().fps, None, None) and not settings.sharpest
+    return (fps is None and is_open) if asked is None else asked
 
 
 def extract_frames(

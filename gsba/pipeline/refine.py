@@ -16,6 +16,7 @@ from gsba.camera.lens import Lenses
 from gsba.config import RefineSettings
 from gsba.frames.dual_fisheye import SEAM
 from gsba.frames.scan import scan
+from gsba.imu.readings import Readings
 from gsba.loop_closure import connectivity
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
@@ -77,7 +78,7 @@ def refine(
     """Refine the pose of every frame, and write poses, cloud, report and datasets to `out`.
 
     Args:
-        frames: folder of 2:1 panoramas, raw fisheyes or cube faces, or a video, for `out`/frames.
+        frames: folder of 2:1 panoramas, raw fisheyes or cube faces; or a video, for `out`/frames.
         trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig. Several are pieces of one run
             on one clock, and the first one's world is kept. None = start from the images alone:
             the first step's length is the unit and the first frame the world.
@@ -91,9 +92,7 @@ def refine(
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
         imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
-        odometry: of a video without a trajectory: follow the camera through all of it, take the
-            frames that `settings.odometry` chooses by what they show, and start from these poses.
-            None = where neither `fps` nor `settings.video` says which frames to take.
+        odometry: follow a video that has no trajectory; None = if it is open which frames to take.
         fresh: forget an earlier run in `out`.
         extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
         client: of a Dask scheduler whose workers take what can be shared out; None = threads here.
@@ -104,27 +103,37 @@ def refine(
     frames, out = Path(frames), Path(out)
     settings = inputs.with_baseline(settings or RefineSettings(), calibration)
     check(settings.placement, baseline=settings.camera.baseline())
-    chosen = merging.choose(masks, segment)
+    chosen, readings = merging.choose(masks, segment), inputs.read_gyro(imu, frames)
     origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
-    readings = inputs.read_gyro(imu, frames)
     if video.is_video(frames):
-        if odometry is None:
-            odometry = fps is None and inputs.leaves_frames_open(settings.video)
-        followed = chosen if odometry and not given else None
-        found = inputs.extract_frames(out, origin, settings, fps, fresh, followed, calibration)
-        if found:  # by these very images: they have no say of their own
-            given, settings = found, settings.with_faint_priors()
+        masked = None if given or not inputs.follows(settings.video, fps, odometry) else chosen
+        found = inputs.extract_frames(out, origin, settings, fps, fresh, masked, calibration)
+        given, settings = found or given, settings.with_faint_priors() if found else settings
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, calibration)
     check(settings.placement, frame_set, settings.camera.baseline())
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
-        frame_set, journal = merging.before(store, frame_set, chosen), Journal()
-        if chosen.distractors:
-            frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
-        run = Run.begin(store, frame_set, coarse, settings, extra_factors, journal, imu=readings)
+        run = _begin(store, frame_set, coarse, given, settings, chosen, extra_factors, readings)
         return _refine(run, Prior.of(coarse, extra_factors), given)
+
+
+def _begin(
+    store: RunStore,
+    frame_set: FrameSet,
+    coarse: CoarsePoses,
+    given: Sequence[Trajectory],
+    settings: RefineSettings,
+    chosen: merging.Choice,
+    extra_factors: ExtraFactors | None,
+    readings: Readings | None,
+) -> Run:
+    """A run on frames that are masked as asked."""
+    frame_set, journal = merging.before(store, frame_set, chosen), Journal()
+    if chosen.distractors:
+        frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
+    return Run.begin(store, frame_set, coarse, settings, extra_factors, journal, imu=readings)
 
 
 def _refine(run: Run, prior: Prior, given: Sequence[Trajectory]) -> RunResult:
