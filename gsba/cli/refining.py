@@ -161,7 +161,7 @@ def refine(
     with loading():
         from gsba import pipeline
         from gsba.store.cluster import connected
-    given = {"odometry": False if no_trajectory else None}
+    given: dict[str, Any] = {"odometry": False if no_trajectory else None}
     given |= {"keyframes": keyframes, "segment": segment, "timestamps": timestamps, "fps": fps}
     given |= {"masks": masks or "auto", "calibration": calibration, "imu": imu, "fresh": fresh}
     with connected(cluster) as client:
