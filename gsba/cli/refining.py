@@ -71,6 +71,7 @@ NoTrajectory = Annotated[
         help="Start from pairs of images; of a video, without its own odometry.",
     ),
 ]
+Times = Annotated[Path | None, typer.Option(help="Times of the frames.", metavar="FILE")]
 Fps = Annotated[
     float | None,
     typer.Option(
@@ -152,9 +153,7 @@ def refine(
     masks: Masks = None,
     segment: Segment = None,
     factors: Factors = None,
-    timestamps: Annotated[
-        Path | None, typer.Option(help="Times of the frames.", metavar="FILE")
-    ] = None,
+    timestamps: Times = None,
     camera: Camera = None,
     calibration: Calibration = None,
     circle: Circle = None,
@@ -187,10 +186,10 @@ def refine(
     with loading():
         from gsba import pipeline
         from gsba.store.cluster import connected
-    given = {"keyframes": keyframes, "segment": segment, "timestamps": timestamps, "fps": fps}
+    given: dict[str, Any] = {"odometry": False if no_trajectory else None}
+    given |= {"keyframes": keyframes, "segment": segment, "timestamps": timestamps, "fps": fps}
     given |= {"masks": masks or "auto", "calibration": calibration, "imu": imu, "fresh": fresh}
     given["circles"] = [_circle(text) for text in circle or ()]
-    given["odometry"] = False if no_trajectory else None
     with connected(cluster) as client:
         result = pipeline.refine(frames, trajectory, out, settings, client=client, **given)
     _conclude([result], allow_partial)

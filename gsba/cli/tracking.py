@@ -20,6 +20,9 @@ Report = Annotated[
         help="Report to write, JSON; default: beside --out, named -report.", metavar="FILE"
     ),
 ]
+Width = Annotated[
+    int | None, typer.Option(help="Pixels across the panoramas that are followed; 800 if unsaid.")
+]
 
 
 @command
@@ -37,10 +40,7 @@ def track(
         str,
         typer.Option(help="auto: find what carries the camera; none; or a mask, white = use."),
     ] = "auto",
-    width: Annotated[
-        int | None,
-        typer.Option(help="Pixels across the panoramas that are followed; 800 if unsaid."),
-    ] = None,
+    width: Width = None,
     fps: Annotated[
         float | None, typer.Option(help="Frames per second of a folder without times.")
     ] = None,

@@ -55,10 +55,9 @@ def scan(
 ) -> FrameSet:
     """Frames of a folder, in time order, checked by their headers.
 
-    The folder holds equirectangular images, or cube faces: subfolders `front`, `right`, ... with
-    equal names, or files `NAME_front.jpg`, ...; up and down may be absent from all frames. Or it
-    holds raw fisheyes, one file for each lens (see `find_pairs`) or both side by side in 2:1 or
-    16:9 images; or both tracks of an equi-angular cube map, in subfolders `track0` and `track5`.
+    It holds equirectangular images; or cube faces in subfolders `front`, `right`, ... or files
+    `NAME_front.jpg`, ...; or raw fisheyes, a file for each lens (see `find_pairs`) or side by side
+    in 2:1 or 16:9 images; or both tracks of an equi-angular cube map in `track0` and `track5`.
 
     Args:
         folder: JPEG, PNG, WebP or TIFF images; other files are ignored.
@@ -68,14 +67,12 @@ def scan(
         masks: one ERP mask for all frames, or a folder with one for each; white = use.
         order_suffices: where nothing gives times, name order stands in for them.
         calibration: of the lenses of raw fisheyes, see `gsba.camera.calibration`.
-        circles: image circles of raw fisheyes, of the front and the back lens, or one of both;
-            none = found. With one of these, 2:1 images are raw fisheyes.
+        circles: of raw fisheyes, front and back, or one of both; none = found.
 
     Raises:
         GsbaError: naming the first file or frame that cannot be used.
     """
-    if timestamps is not None and fps is not None:
-        raise GsbaError("--timestamps and --fps both say when frames were taken; pass one")
+    _check_times(timestamps, fps)
     layout, faces, found = _find_frames(Path(folder))
     if len(found) < MIN_FRAMES:
         raise GsbaError(f"{folder}: {len(found)} frames; at least {MIN_FRAMES} are needed")
@@ -83,9 +80,9 @@ def scan(
     paths = tuple(found[name] for name in names)
     tracks = track_size(Path(folder), paths) if layout == "eac" else None
     width, height = tracks or _common_size(paths, layout)
-    images = [group[0] for group in paths]
+    images, lens_size = [group[0] for group in paths], (width, height)
     factory = find_factory_lenses(Path(folder), images) if calibration is None else None
-    known, lens_size = (calibration, circles, factory), (width, height)
+    known = calibration, circles, factory
     if layout == "erp" and (raw := _beside(Path(folder), images, lens_size, *known)) is not None:
         layout, lens_size = "fisheye", raw
         paths = tuple((path, path) for path in images)
@@ -93,7 +90,6 @@ def scan(
     if fisheyes is not None or tracks is not None:
         width = 4 * tracks[1] if tracks else width_of(fisheyes)  # type: ignore[arg-type]
         height = width // 2
-    erp_size = None if layout == "cube" else (width, height)
     return FrameSet(
         names=names,
         paths=_absolute(paths),
@@ -102,12 +98,18 @@ def scan(
         faces=faces,
         width=width,
         height=height,
-        mask_paths=find_masks(masks, names, erp_size),
+        mask_paths=find_masks(masks, names, None if layout == "cube" else (width, height)),
         timed=timed,
         fisheyes=fisheyes,
         tracks=tracks,
         lenses_nominal=nominal,
     )
+
+
+def _check_times(timestamps: Path | None, fps: float | None) -> None:
+    """Refuse two sources of times."""
+    if timestamps is not None and fps is not None:
+        raise GsbaError("--timestamps and --fps both say when frames were taken; pass one")
 
 
 def _in_time_order(

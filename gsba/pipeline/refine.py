@@ -11,11 +11,13 @@ from threadpoolctl import threadpool_limits
 
 from gsba import video
 from gsba.bundle import self_calibration
+from gsba.bundle.fixes import FrameFixes
 from gsba.camera.fisheye import Pair, turned
 from gsba.camera.lens import Lenses
 from gsba.config import RefineSettings
 from gsba.frames.dual_fisheye import SEAM
 from gsba.frames.scan import scan
+from gsba.imu.readings import Readings
 from gsba.loop_closure import connectivity
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
@@ -84,16 +86,14 @@ def refine(
         out: folder of the run; a second call re-runs what depends on settings that changed.
         settings: see `gsba.config`.
         keyframes: second trajectory file of the same run, with its keyframes: they lead.
-        masks: one ERP mask for all frames, or a folder of one for each, white = use; "auto" finds
-            what carries the camera, "distractors" what moves; or several of these; or "none".
+        masks: a file or a folder, "auto", "distractors", "none", or several: see `merging.choose`.
         segment: a command or a callable that masks faces; see `gsba.masks.segmentation.segmented`.
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
         calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
         circles: image circles of raw fisheyes, x, y and radius in pixels; see `frames.scan`.
         imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
-        odometry: of a video without a trajectory: start from its own odometry, from the frames that
-            this chooses. None = where neither `fps` nor `settings.video` says which to take.
+        odometry: follow a video that has no trajectory; None = if it is open which frames to take.
         fresh: forget an earlier run in `out`.
         extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
         client: of a Dask scheduler whose workers take what can be shared out; None = threads here.
@@ -104,10 +104,9 @@ def refine(
     frames, out = Path(frames), Path(out)
     settings = inputs.with_baseline(settings or RefineSettings(), calibration)
     check(settings.placement, baseline=settings.camera.baseline())
-    chosen = merging.choose(masks, segment)
+    chosen, readings = merging.choose(masks, segment), inputs.read_gyro(imu, frames)
     origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
-    readings = inputs.read_gyro(imu, frames)
     if video.is_video(frames):
         asked = fps, fresh, odometry, chosen, calibration
         given, settings = inputs.take_frames(out, origin, given, settings, *asked)
@@ -117,11 +116,27 @@ def refine(
     sensors = readings, inputs.positions_of(frame_set, settings)
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
-        frame_set, journal = merging.before(store, frame_set, chosen), Journal()
-        if chosen.distractors:
-            frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
-        run = Run.begin(store, frame_set, coarse, settings, extra_factors, journal, False, *sensors)
+        run = _begin(store, frame_set, coarse, given, settings, chosen, extra_factors, *sensors)
         return _refine(run, Prior.of(coarse, extra_factors), given, len(origin) == 1)
+
+
+def _begin(
+    store: RunStore,
+    frame_set: FrameSet,
+    coarse: CoarsePoses,
+    given: Sequence[Trajectory],
+    settings: RefineSettings,
+    chosen: merging.Choice,
+    extra_factors: ExtraFactors | None,
+    readings: Readings | None,
+    fixes: FrameFixes | None,
+) -> Run:
+    """A run on frames that are masked as asked."""
+    frame_set, journal = merging.before(store, frame_set, chosen), Journal()
+    if chosen.distractors:
+        frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
+    sensors = readings, fixes
+    return Run.begin(store, frame_set, coarse, settings, extra_factors, journal, False, *sensors)
 
 
 def _refine(run: Run, prior: Prior, given: Sequence[Trajectory], images_alone: bool) -> RunResult:
