@@ -34,6 +34,10 @@ _BEST = 2  # meetings whose surroundings are compared too
 _MIN_MAP = 3  # frames of a part that is a map
 _BEHIND = 3.0  # times the pace: a frame alone is no further off than that
 _APART = 4.0  # extents between maps that nothing ties together
+_SAME_PLACE = (
+    2.0  # times the differences of two estimates of one join: no other place yet, as parts
+)
+# that drift meet a little differently at either end
 _LEVEL = np.deg2rad(5.0)  # between the verticals of two parts, besides how frames tilt in each
 
 
@@ -207,7 +211,7 @@ class _Joining:
             other
             for other, against in weighed
             if against.confirmed and not why.beats(against)
-            if not alike(best, other, self.poses, self.depth)
+            if not alike(best, other, self.poses, self.depth, _SAME_PLACE)
         )
         if why.confirmed and not any(rivals):
             return best.move

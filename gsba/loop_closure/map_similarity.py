@@ -70,14 +70,24 @@ def _agreeing(meetings: list[Meeting], move: Sim3, poses: np.ndarray) -> list[Me
     return found
 
 
-def alike(one: Proposal, other: Proposal, poses: np.ndarray, depth: float) -> bool:
-    """Whether two proposals carry the frames of both to the same poses."""
+def alike(
+    one: Proposal, other: Proposal, poses: np.ndarray, depth: float, slack: float = 1.0
+) -> bool:
+    """Whether two proposals carry the frames of both to the same poses.
+
+    Args:
+        one, other: the proposals.
+        poses: (F, 4, 4), each frame's in its own map.
+        depth: median distance of points, map units.
+        slack: times the differences that two estimates of one similarity have.
+    """
     frames = poses[[one.frames[0], other.frames[0]]]
     first, second = one.move.poses(frames), other.move.poses(frames)
     turned = rotation_angle(first[0, :3, :3].T @ second[0, :3, :3])
     off = np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1).max()
     stretched = abs(np.log(one.move.scale / other.move.scale))
-    near = off < AGREE * max(depth, 1e-12) and turned < np.deg2rad(AGREE_DEG)
+    near = off < slack * AGREE * max(depth, 1e-12)
+    near &= turned < slack * np.deg2rad(AGREE_DEG)
     return bool(near and stretched < _AGREE_LOG)
 
 
