@@ -12,7 +12,7 @@ MIN_STEP_SIGMAS = 3.0  # median length of a map's steps, in standard deviations;
 _VEHICLE_SHARE = 1 / 3  # of the picture that turns with the camera: more than people or sticks fill
 
 
-def require_motion(frames: FrameSet, result: Reconstruction) -> None:
+def require_motion(frames: FrameSet, result: Reconstruction, in_pieces: bool) -> None:
     """Refuse positions that images alone do not determine, and turns seen from a vehicle.
 
     A camera on a vehicle whose surroundings are blurred or far sees the vehicle stand still. Its
@@ -22,6 +22,8 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
     Args:
         frames: of the run, with their masks.
         result: what was solved from the images alone.
+        in_pieces: whether odometry lost the camera in between. On a vehicle, matches across such a
+            gap are of what rides along or is far away, so that lengths on both sides do not agree.
 
     Raises:
         GsbaError: the images determine no positions.
@@ -39,6 +41,12 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
             f"nothing but turns can be told from these pictures: {where}, and what passes by "
             "shows no parallax: it is blurred or far away, or the vehicle stands; give more "
             "frames per second, --masks of the vehicle, or a trajectory"
+        )
+    if in_pieces and share >= _VEHICLE_SHARE:
+        raise GsbaError(
+            f"{where}, and the camera was lost on the way: how its parts lie to one another cannot "
+            "be told; nothing is written: give a part that holds together (--set video.from_s=..., "
+            "video.to_s=...), --masks of the vehicle, or a trajectory"
         )
     sigmas = step_sigmas(main)
     if not len(sigmas) or np.median(sigmas) >= MIN_STEP_SIGMAS:

@@ -141,10 +141,11 @@ def _begin(
 
 def _refine(run: Run, prior: Prior, given: Sequence[Trajectory], images_alone: bool) -> RunResult:
     """A run from its frames to what it leaves behind."""
+    in_pieces = prior.coarse.segments is not None
     run, seen, prior, world = _solve_raw(run, prior, given)
     result = backend.reconstruct(run, seen, prior, world)
     if images_alone or (prior.coarse.sources == PoseSource.NONE).all():
-        acceptance.require_motion(run.frames, result)
+        acceptance.require_motion(run.frames, result, in_pieces)
     return outputs.write(run, prior, world, result, backend.keep_lenses(run, world, result))
 
 
