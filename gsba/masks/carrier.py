@@ -25,13 +25,13 @@ from gsba.types import FrameSet
 
 logger = logging.getLogger(__name__)
 
-PICTURE_WIDTH = _WIDTH = 512  # pixels across the pictures in which the outline is found
+PICTURE_WIDTH = 512  # pixels across the pictures in which the outline is found
 _MAX_FRAMES = 20
 _MIN_FRAMES = 6  # fewer agree by chance
 _STAYS, _MOVES = 0.75, 0.5  # correlation of structure that stays; of structure that moves, at most
 _MIN_MOVING = 1 / 3  # of the textured directions: fewer do not tell a carrier from what is far away
 _STANDING = 0.9  # of the textured directions that stay: the camera stands
-_LARGE_SHARE = 1 / 3  # of the picture: a carrier that is worth a warning
+VEHICLE_SHARE = 1 / 3  # of the picture: more than people or sticks fill
 _MIN_TEXTURED = 0.02  # of all directions
 _STRUCTURE, _STRUCTURE_TURNED = 256, 128  # pixels across the pictures that are compared: the
 # camera's tilt, which turns leave, moves the carrier by a pixel of these
@@ -52,7 +52,7 @@ class Carrier:
 
 def no_carrier(frames: FrameSet, reason: str) -> Carrier:
     """A carrier that covers nothing, for this reason."""
-    size = _WIDTH // 2, _WIDTH
+    size = PICTURE_WIDTH // 2, PICTURE_WIDTH
     grey = np.full((*size, 3), 128, np.uint8)
     return Carrier(np.ones(size, bool), np.zeros(len(frames)), grey, 0.0, reason)
 
@@ -68,10 +68,7 @@ def find_carrier(frames: FrameSet) -> Carrier:
     """
     if not frames.panoramic:
         raise GsbaError("the carrier is looked for in panoramas; these frames are cube faces")
-    if len(frames) < _MIN_FRAMES:
-        raise GsbaError(
-            f"{len(frames)} frames do not tell what is fixed to the camera: give {_MIN_FRAMES}"
-        )
+    _require_enough(len(frames))
     chosen = np.unique(np.linspace(0, len(frames) - 1, _MAX_FRAMES).astype(int))
     pictures = np.stack([_load(frames, f) for f in track(chosen, "looking for the carrier")])
     structure, turns = _measure(pictures, _STRUCTURE), np.zeros(len(frames))
@@ -80,15 +77,13 @@ def find_carrier(frames: FrameSet) -> Carrier:
         if below is not None:
             bands = [band_of(_load(frames, f)) for f in track(range(len(frames)), "its turns")]
             turns, (pictures, structure) = find_turns(np.stack(bands)), below
-    _check_moving(structure)
-    median = np.median(pictures, axis=0).astype(np.uint8)
-    found = outline_carrier(pictures, median, structure)
+    median, found = _outlined(pictures, structure)
     share = float(found.mean())
     reason = "" if found.any() else "nothing turns with the camera"
     turns = turns if found.any() else np.zeros(len(frames))
     turning = ", turning below it" if turns.any() else ""
     logger.info("carrier: %s", reason or f"{100 * share:.1f}% of the picture{turning}")
-    if share > _LARGE_SHARE:
+    if share > VEHICLE_SHARE:
         logger.warning(
             "%.0f%% of the picture turn with the camera, as a vehicle does, and are masked: poses "
             "rest on the rest; look at carrier_check.jpg",
@@ -109,14 +104,24 @@ def find_fixed_carrier(pictures: np.ndarray) -> np.ndarray:
     Raises:
         GsbaError: too few pictures, no texture, or too little that moves.
     """
-    if len(pictures) < _MIN_FRAMES:
-        raise GsbaError(
-            f"{len(pictures)} frames do not tell what is fixed to the camera: give {_MIN_FRAMES}"
-        )
-    structure = _measure(pictures, _STRUCTURE)
+    _require_enough(len(pictures))
+    return ~_outlined(pictures, _measure(pictures, _STRUCTURE))[1]
+
+
+def _require_enough(num: int) -> None:
+    if num < _MIN_FRAMES:
+        raise GsbaError(f"{num} frames do not tell what is fixed to the camera: give {_MIN_FRAMES}")
+
+
+def _outlined(pictures: np.ndarray, structure: FixedStructure) -> tuple[np.ndarray, np.ndarray]:
+    """The median (h, 2h, 3) uint8 of pictures, and where it shows the carrier (h, 2h) bool.
+
+    Raises:
+        GsbaError: too little moves to tell.
+    """
     _check_moving(structure)
     median = np.median(pictures, axis=0).astype(np.uint8)
-    return ~outline_carrier(pictures, median, structure)
+    return median, outline_carrier(pictures, median, structure)
 
 
 def carrier_mask(carrier: Carrier, frames: FrameSet, frame: int) -> np.ndarray:
@@ -156,10 +161,10 @@ def write_carrier(
 
 
 def _load(frames: FrameSet, f: int) -> np.ndarray:
-    """Frame f, (_WIDTH / 2, _WIDTH, 3) uint8 RGB."""
-    picture = load_erp(frames, f, width=_WIDTH)
-    if picture.shape[1] != _WIDTH:
-        picture = cv2.resize(picture, (_WIDTH, _WIDTH // 2))
+    """Frame f, (PICTURE_WIDTH / 2, PICTURE_WIDTH, 3) uint8 RGB."""
+    picture = load_erp(frames, f, width=PICTURE_WIDTH)
+    if picture.shape[1] != PICTURE_WIDTH:
+        picture = cv2.resize(picture, (PICTURE_WIDTH, PICTURE_WIDTH // 2))
     return picture
 
 

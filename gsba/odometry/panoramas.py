@@ -14,7 +14,7 @@ from gsba.camera.factory_lenses import parse_factory_lenses
 from gsba.camera.fisheye import Pair
 from gsba.disk import write_image
 from gsba.frames.dual_fisheye import clear_of_seam, join_pictures, width_of
-from gsba.frames.factory_start import factory_calibration, starting_lenses
+from gsba.frames.factory_start import starting_lenses
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp
 from gsba.frames.raw_pairs import lenses_of
@@ -22,7 +22,14 @@ from gsba.frames.track_pairs import panorama_of
 from gsba.log import GsbaError
 from gsba.masks.carrier import PICTURE_WIDTH, find_fixed_carrier
 from gsba.types import FrameSet
-from gsba.video.recording import EXACT_S, Picture, Recording, read_recording, shots
+from gsba.video.recording import (
+    EXACT_S,
+    Picture,
+    Recording,
+    factory_calibration_of,
+    read_recording,
+    shots,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -185,11 +192,7 @@ def _lenses(recording: Recording, rows: np.ndarray, calibration: Path | None) ->
                 write_image(path, picture.luma())
             pairs.append(pair)
             size = pictures[0].luma().shape[::-1]
-        files = [track.path for track in recording.tracks]
-        factory = None
-        if calibration is None:
-            two_tracks = len(files) == 2 and files[0] == files[1]
-            factory = factory_calibration(files, two_tracks)
+        factory = factory_calibration_of(recording) if calibration is None else None
         try:
             if factory is not None:
                 return starting_lenses(Path(name), pairs, size, parse_factory_lenses(factory))

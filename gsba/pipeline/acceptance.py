@@ -5,11 +5,11 @@ import numpy as np
 from gsba.frames.masks import load_mask
 from gsba.geometry import inverse, step_covariances
 from gsba.log import GsbaError
+from gsba.masks.carrier import VEHICLE_SHARE
 from gsba.types import FrameSet, Reconstruction
 
 MIN_STEP_SIGMAS = 3.0  # median length of a map's steps, in standard deviations; maps of real and
 # rendered walks have 40 and more
-_VEHICLE_SHARE = 1 / 3  # of the picture that turns with the camera: more than people or sticks fill
 
 
 def require_motion(frames: FrameSet, result: Reconstruction, in_pieces: bool) -> None:
@@ -35,14 +35,14 @@ def require_motion(frames: FrameSet, result: Reconstruction, in_pieces: bool) ->
         "carrier_check.jpg)"
     )
     if not len(main.points_world):
-        if share < _VEHICLE_SHARE:
+        if share < VEHICLE_SHARE:
             return
         raise GsbaError(
             f"nothing but turns can be told from these pictures: {where}, and what passes by "
             "shows no parallax: it is blurred or far away, or the vehicle stands; give more "
             "frames per second, --masks of the vehicle, or a trajectory"
         )
-    if in_pieces and share >= _VEHICLE_SHARE:
+    if in_pieces and share >= VEHICLE_SHARE:
         raise GsbaError(
             f"{where}, and the camera was lost on the way: how its parts lie to one another cannot "
             "be told; nothing is written: give a part that holds together (--set video.from_s=..., "
@@ -51,7 +51,7 @@ def require_motion(frames: FrameSet, result: Reconstruction, in_pieces: bool) ->
     sigmas = step_sigmas(main)
     if not len(sigmas) or np.median(sigmas) >= MIN_STEP_SIGMAS:
         return
-    cause = where if share >= _VEHICLE_SHARE else "the camera hardly moves, or little matches"
+    cause = where if share >= VEHICLE_SHARE else "the camera hardly moves, or little matches"
     raise GsbaError(
         f"the images determine no positions: the median step is {np.median(sigmas):.1f} standard "
         f"deviations long, and {MIN_STEP_SIGMAS:g} are needed: {cause}; nothing is written: give "

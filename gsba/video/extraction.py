@@ -25,7 +25,6 @@ from gsba.config import VideoSettings
 from gsba.disk import disk_errors, refuse_links, remove_temporaries, write_bytes, write_text
 from gsba.frames.factory_start import (
     FACTORY_FILE,
-    factory_calibration,
     write_factory_calibration,
 )
 from gsba.frames.times import read_times
@@ -43,6 +42,7 @@ from gsba.video.recording import (
     Picture,
     Recording,
     check_lengths,
+    factory_calibration_of,
     files_of,
     read_recording,
     shots,
@@ -154,8 +154,7 @@ def refuse_darkness(video: Path, recording: Recording, instants: Sequence[int]) 
 
 def _keep_calibration(recording: Recording, out: Path) -> None:
     """Write the maker's calibration that a video holds beside its frames."""
-    files = [track.path for track in recording.tracks]
-    found = factory_calibration(files, two_tracks=len(files) == 2 and files[0] == files[1])
+    found = factory_calibration_of(recording)
     if found is not None:
         write_factory_calibration(out, found)
 

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from gsba.camera.factory_lenses import FactoryCalibration
+from gsba.frames.factory_start import factory_calibration
 from gsba.frames.lens_names import lens_files
 from gsba.frames.side_by_side import LOOKED_AT, SideBySide, lens_sizes, may_hold_two, recognise
 from gsba.log import GsbaError
@@ -122,6 +124,12 @@ def read_recording(video: Path) -> Recording:
     if not may_hold_two(size):
         _check_panorama(video, size)
     return _of_one_track(Track(video), size)
+
+
+def factory_calibration_of(recording: Recording) -> FactoryCalibration | None:
+    """The maker's calibration that the files of a raw recording hold; None = there is none."""
+    files = [track.path for track in recording.tracks]
+    return factory_calibration(files, two_tracks=len(files) == 2 and files[0] == files[1])
 
 
 def shots(recording: Recording, chosen: Sequence[int]) -> Iterator[tuple[int, tuple[Picture, ...]]]:
