@@ -14,6 +14,7 @@ from two_fisheyes import colours
 from gsba.config import VideoSettings
 from gsba.frames import load_erp, scan
 from gsba.log import GsbaError
+from gsba.odometry.panoramas import of_video
 from gsba.video import extract, is_video
 from gsba.video.recording import read_recording
 
@@ -101,6 +102,18 @@ def test_tracks_are_extracted_in_lockstep(tmp_path: Path) -> None:
             off = np.abs(shown[..., ::-1].astype(int) - true).mean()
             assert off < 8  # grey levels: compression; 40 and more between instants
     assert load_erp(frames, 0).shape == (2 * SIZE, 4 * SIZE, 3)
+
+
+def test_odometry_reads_panoramas_of_both_tracks(tmp_path: Path) -> None:
+    video, width = _recording(tmp_path / "GS010001.360", 4), 2 * SIZE
+    extract(video, tmp_path / "frames", EVERY)
+    frames, panoramas = scan(tmp_path / "frames"), of_video(video, width)
+    read = dict(panoramas.read(range(4), True))
+    assert len(panoramas) == len(frames) == len(read) == 4 and panoramas.usable is None
+    for f, picture in read.items():
+        expected = load_erp(frames, f, width=width).astype(float)
+        assert picture.shape == expected.shape
+        assert np.abs(picture - expected).mean() < 3  # decoded once, not encoded again
 
 
 def test_an_interrupted_extraction_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
