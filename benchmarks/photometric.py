@@ -60,7 +60,7 @@ def make_block(num_patches: int, num_targets: int, size: int, width: int) -> tup
 
 def measure(block: PhotometricBlock, values: gtsam.Values) -> dict[str, float]:
     """CPU seconds of the three things that a step of the solver asks for."""
-    steps = np.full((len(block.pose_keys), 6), 1e-4)
+    steps = np.full((len(block.keys), 6), 1e-4)
     seconds = {}
     for name, call in (
         ("linearize", lambda: block.linearize(values)),

@@ -109,7 +109,7 @@ def solve_ours(problem: Problem, num_threads: int) -> tuple[Result, np.ndarray, 
     graph.add(gtsam.RangeFactorPose3(X(0), X(len(problem.world_T_rigs) // 2), distance, noise))
     done = optimize(graph, [block], values, SolverSettings())
     cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
-    poses = np.array([done.values.atPose3(key).matrix() for key in block.pose_keys])
+    poses = np.array([done.values.atPose3(key).matrix() for key in block.keys])
     steps = len(done.history) - 1
     return Result(OURS, cpu, wall, peak_mb(), steps, done.converged), poses, block.points_world
 
@@ -243,7 +243,7 @@ def _warm_up(problem: Problem) -> None:
     block, values = _block(part, part.world_T_rigs, part.points_world, 1)
     graph = gtsam.NonlinearFactorGraph()
     noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
-    for key in block.pose_keys:
+    for key in block.keys:
         graph.add(gtsam.PriorFactorPose3(key, values.atPose3(key), noise))
     optimize(graph, [block], values)
 

@@ -10,9 +10,10 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class PoseSystem:
-    """Second-order model of a block's cost over its poses: c + g^T x + x^T H x / 2.
+    """Second-order model of a block's cost over its variables: c + g^T x + x^T H x / 2.
 
-    x stacks [rotation, translation] of each pose, right perturbation.
+    x stacks six coordinates of each variable: [rotation, translation] of a pose, right
+    perturbation. A smaller variable has the first ones; the others' entries are zero.
     """
 
     diagonal: np.ndarray  # (F, 6, 6) float64, blocks H[f, f]
@@ -22,20 +23,20 @@ class PoseSystem:
 
 
 class Block(Protocol):
-    """Like factors held as arrays, on Pose3 variables; inner variables are its own business.
+    """Like factors held as arrays, on variables of at most six dimensions; it may have inner ones.
 
     The optimizer calls, in this order: `refresh` and `linearize` at accepted values, then any
     number of `propose`, of which the last is followed by `accept` if its values were taken.
     """
 
     @property
-    def pose_keys(self) -> Sequence[int]:
-        """(F,) keys of its Pose3 variables."""
+    def keys(self) -> Sequence[int]:
+        """(F,) keys of its variables: Pose3, or of any type with at most six dimensions."""
         ...
 
     @property
     def pairs(self) -> np.ndarray:
-        """(P, 2) int, rows f < g of pose_keys that share a residual; fixed for a run."""
+        """(P, 2) int, rows f < g of keys that share a residual; fixed for a run."""
         ...
 
     def refresh(self, values: gtsam.Values) -> None:

@@ -44,14 +44,14 @@ class LandmarkBlock:
     share the work when `num_threads` is above one.
 
     Attributes:
-        pose_keys: (F,) keys of the Pose3 variables `world_T_rig`.
+        keys: (F,) keys of the Pose3 variables `world_T_rig`.
         shared: (P,) float32, how many landmarks each two of `pairs` have in common.
         points_world: (J, 3) float64, current landmarks in the order given.
     """
 
     def __init__(
         self,
-        pose_keys: Sequence[int],
+        keys: Sequence[int],
         points_world: np.ndarray,
         terms: Sequence[Term],
         loss: RobustLoss | None = None,
@@ -61,9 +61,9 @@ class LandmarkBlock:
         """Sort the observations by landmark and frame.
 
         Args:
-            pose_keys: (F,) keys of Pose3 variables.
+            keys: (F,) keys of Pose3 variables.
             points_world: (J, 3) start values, world.
-            terms: observations; frames index pose_keys, points index points_world.
+            terms: observations; frames index keys, points index points_world.
             loss: robust loss on each whitened residual norm; None is plain least squares.
             num_threads: None takes the cores there are, at most 16.
             polish_steps: Gauss-Newton steps on the landmarks after each proposed pose step.
@@ -71,7 +71,7 @@ class LandmarkBlock:
         Raises:
             ValueError: indices out of range, values not finite, arrays of unequal length.
         """
-        self.pose_keys = [int(key) for key in pose_keys]
+        self.keys = [int(key) for key in keys]
         self.loss = loss or RobustLoss()
         self.num_threads = max(1, num_threads or min(16, os.cpu_count() or 1))
         self.polish_steps = polish_steps
@@ -79,16 +79,16 @@ class LandmarkBlock:
         self.families = tuple(dict.fromkeys(term.name for term in terms))
         points = np.array(points_world, dtype=np.float64).reshape(-1, 3)
         for term in terms:
-            check_term(term, len(self.pose_keys), len(points))
+            check_term(term, len(self.keys), len(points))
         if not np.all(np.isfinite(points)):
             raise ValueError("points_world must be finite")
         self._obs, self._order, self._point_order = sort_observations(
-            self.terms, len(self.pose_keys), len(points), self.loss
+            self.terms, len(self.keys), len(points), self.loss
         )
         self._points = points[self._point_order]
-        self._visits = visits_of(self._obs.offsets, self._obs.frames, len(self.pose_keys), _VISITS)
+        self._visits = visits_of(self._obs.offsets, self._obs.frames, len(self.keys), _VISITS)
         self._row_starts, self._columns, self.shared = covisible_pairs(
-            self._obs.offsets, self._obs.frames, len(self.pose_keys)
+            self._obs.offsets, self._obs.frames, len(self.keys)
         )
         self._trial: tuple[np.ndarray, np.ndarray] | None = None
         self._poses: np.ndarray | None = None
@@ -96,8 +96,8 @@ class LandmarkBlock:
 
     @property
     def pairs(self) -> np.ndarray:
-        """(P, 2) int64, rows f < g of pose_keys that see a landmark in common."""
-        rows = np.repeat(np.arange(len(self.pose_keys)), np.diff(self._row_starts))
+        """(P, 2) int64, rows f < g of keys that see a landmark in common."""
+        rows = np.repeat(np.arange(len(self.keys)), np.diff(self._row_starts))
         return np.column_stack([rows, self._columns])
 
     @property
@@ -117,7 +117,7 @@ class LandmarkBlock:
 
     def linearize(self, values: gtsam.Values) -> PoseSystem:
         """Reduced pose system at `values`: robust weights, landmarks eliminated."""
-        self._poses = pose_rows(values, self.pose_keys)
+        self._poses = pose_rows(values, self.keys)
         system, costs, self._point_costs = eliminate_points(
             self._obs, self._visits, self._points, self._poses, self._row_starts, self._columns,
             len(self.families), self.num_threads,
@@ -128,7 +128,7 @@ class LandmarkBlock:
         self, values: gtsam.Values
     ) -> tuple[SchurComplement, np.ndarray, dict[str, float]]:
         """As `linearize`, the Hessian not written out: it, the gradient (F, 6), and costs."""
-        self._poses = pose_rows(values, self.pose_keys)
+        self._poses = pose_rows(values, self.keys)
         complement, gradient, costs, self._point_costs = complement_of(
             self._obs, self._visits, self._points, self._poses, len(self.families),
             self.num_threads,
@@ -139,7 +139,7 @@ class LandmarkBlock:
         """Robust cost at `values`, `steps (F, 6)` from the linearization, landmarks moved along."""
         if self._poses is None:
             raise RuntimeError("propose() needs linearize() before it")
-        poses, steps = pose_rows(values, self.pose_keys), np.ascontiguousarray(steps)
+        poses, steps = pose_rows(values, self.keys), np.ascontiguousarray(steps)
         return self._move(poses, self._poses, steps, self.polish_steps, _PROPOSAL_TOLERANCE)
 
     def accept(self) -> None:
@@ -150,7 +150,7 @@ class LandmarkBlock:
 
     def polish(self, values: gtsam.Values, num_steps: int = 50) -> float:
         """Move the landmarks to their optimum at fixed poses; returns the robust cost."""
-        poses = pose_rows(values, self.pose_keys)
+        poses = pose_rows(values, self.keys)
         cost = self._move(poses, None, None, num_steps, _POLISH_TOLERANCE)
         self.accept()
         return cost
@@ -209,7 +209,7 @@ class LandmarkBlock:
             whiteners=obs.whiteners[rows],
             origins=obs.origins[rows],
         )
-        keys = [self.pose_keys[f] for f in global_frames]
+        keys = [self.keys[f] for f in global_frames]
         num = len(keys)
         pairs = np.stack(np.triu_indices(num, 1), axis=1)
         row_starts = np.concatenate([[0], np.cumsum(np.arange(num - 1, -1, -1))]).astype(np.int64)
@@ -236,7 +236,7 @@ class LandmarkBlock:
 
     def _residuals(self, values: gtsam.Values) -> tuple[np.ndarray, np.ndarray]:
         """Whitened residuals (O, 2) and validity (O,), in the order of the sorted observations."""
-        poses = pose_rows(values, self.pose_keys)
+        poses = pose_rows(values, self.keys)
         residuals = np.empty((len(self._order), 2))
         valid = np.empty(len(self._order), dtype=np.bool_)
         ranges = balanced_ranges(self._obs.offsets)

@@ -32,15 +32,15 @@ class PhotometricBlock:
     never leaves the front of its host: no step takes more than 80% of an inverse depth.
 
     Attributes:
-        pose_keys: (F,) keys of the Pose3 variables `world_T_rig`.
-        pairs: (Q, 2) int64, rows f < g of pose_keys that share a patch.
+        keys: (F,) keys of the Pose3 variables `world_T_rig`.
+        pairs: (Q, 2) int64, rows f < g of keys that share a patch.
         planes: (P, 3) float64, current inverse-depth planes.
         dropped: reason -> observations left out by the last `refresh`.
     """
 
     def __init__(
         self,
-        pose_keys: Sequence[int],
+        keys: Sequence[int],
         pixels: PatchPixels,
         sigmas: np.ndarray | float,
         loss: RobustLoss | None = None,
@@ -52,7 +52,7 @@ class PhotometricBlock:
         """Normalise the templates.
 
         Args:
-            pose_keys: (F,) keys of Pose3 variables.
+            keys: (F,) keys of Pose3 variables.
             pixels: templates and windows, of all frames that the table names.
             sigmas: (P,) or one, grey values of a pixel in the host: noise of a residual.
             loss: robust loss on the root mean square of a patch's whitened residuals, times the
@@ -66,8 +66,8 @@ class PhotometricBlock:
             ValueError: frames that are no poses, sigmas or weights that are none.
         """
         table = pixels.table
-        self.pose_keys = [int(key) for key in pose_keys]
-        table.check(len(self.pose_keys))
+        self.keys = [int(key) for key in keys]
+        table.check(len(self.keys))
         self.table, self.planes = table, table.planes.copy()
         self.loss, self.polish_steps = loss or RobustLoss(), polish_steps
         self.num_threads = max(1, num_threads or min(16, os.cpu_count() or 1))
@@ -107,7 +107,7 @@ class PhotometricBlock:
     def refresh(self, values: gtsam.Values) -> None:
         """Settle which observations count."""
         self._data.weights[:] = self._weights
-        _, errors = self._observe(pose_rows(values, self.pose_keys), self.planes, 0)
+        _, errors = self._observe(pose_rows(values, self.keys), self.planes, 0)
         flags = self._blemishes(values, errors)
         left = self._weights > 0
         self.dropped = {}
@@ -118,10 +118,10 @@ class PhotometricBlock:
 
     def linearize(self, values: gtsam.Values) -> PoseSystem:
         """Reduced pose system at `values`: robust weights, planes eliminated."""
-        poses, data = pose_rows(values, self.pose_keys), self._data
+        poses, data = pose_rows(values, self.keys), self._data
         (hessians, gradients), errors = self._observe(poses, self.planes, DIMS)
         self._costs = self._patch_costs(self.planes, errors)
-        num_f, num_p = len(self.pose_keys), len(self.table)
+        num_f, num_p = len(self.keys), len(self.table)
         off = self.planes - self.table.planes
         priors = np.hstack([self._prior_weights, self._prior_weights * off])
         couplings = np.empty((num_p + len(self.table.targets), 3, 6))
@@ -146,7 +146,7 @@ class PhotometricBlock:
         pulls = np.einsum("oki,oi->ok", couplings, steps[frames])
         downs = downs + (np.add.reduceat(pulls, rows) if len(rows) else np.zeros((0, 3)))
         moved = self._stepped(self.planes, -np.einsum("pij,pj->pi", inverses, downs))
-        poses = pose_rows(values, self.pose_keys)
+        poses = pose_rows(values, self.keys)
         self._trial = self._better(poses, moved, self.planes, self._costs)
         if self.polish_steps:
             self._trial = self._descend(poses, *self._trial, self.polish_steps)
@@ -160,7 +160,7 @@ class PhotometricBlock:
 
     def polish(self, values: gtsam.Values, num_steps: int = 30) -> float:
         """Move the planes to their optimum at fixed poses; returns the robust cost."""
-        poses = pose_rows(values, self.pose_keys)
+        poses = pose_rows(values, self.keys)
         _, errors = self._observe(poses, self.planes, 0)
         costs = self._patch_costs(self.planes, errors)
         self.planes, self._costs = self._descend(poses, self.planes, costs, num_steps)
@@ -173,7 +173,7 @@ class PhotometricBlock:
 
     def errors(self, values: gtsam.Values) -> np.ndarray:
         """Mean square (O,) of each observation's whitened residuals; large where left out."""
-        return self._observe(pose_rows(values, self.pose_keys), self.planes, 0)[1]
+        return self._observe(pose_rows(values, self.keys), self.planes, 0)[1]
 
     def correlations(self, values: gtsam.Values) -> np.ndarray:
         """Normalised correlation (O,) of each observation with its template, 0 where left out."""
@@ -206,7 +206,7 @@ class PhotometricBlock:
             hosts=np.searchsorted(frames, table.hosts),
             targets=np.searchsorted(frames, table.targets),
         )
-        part.pose_keys = [self.pose_keys[f] for f in frames]
+        part.keys = [self.keys[f] for f in frames]
         part.planes, part._prior_weights = self.planes[rows], self._prior_weights[rows]
         part._flat = self._flat[rows]
         part._weights, part.num_threads = self._weights[observations], 1
@@ -249,11 +249,11 @@ class PhotometricBlock:
             self.planes[rows] = part.planes
             return cost, part.linearize(values)
 
-        return reduced_factor(part.pose_keys, part.pairs, evaluate)
+        return reduced_factor(part.keys, part.pairs, evaluate)
 
     def _blemishes(self, values: gtsam.Values, errors: np.ndarray) -> dict[str, np.ndarray]:
         """Reason -> observations (O,) bool that cannot count, at the current planes."""
-        world_T_rigs = np.array([values.atPose3(key).matrix() for key in self.pose_keys])
+        world_T_rigs = np.array([values.atPose3(key).matrix() for key in self.keys])
         owners = self.table.owners
         lost = 2 * self._data.scales[owners] ** 2 / len(self.table.grid)
         return {
@@ -353,8 +353,8 @@ class PhotometricBlock:
 
     def _set_pairs(self) -> None:
         """Frame pairs that share a patch, and a state without a linearization."""
-        self._row_starts, self._columns = covisible_frames(self.table, len(self.pose_keys))
-        rows = np.repeat(np.arange(len(self.pose_keys)), np.diff(self._row_starts))
+        self._row_starts, self._columns = covisible_frames(self.table, len(self.keys))
+        rows = np.repeat(np.arange(len(self.keys)), np.diff(self._row_starts))
         self.pairs = np.column_stack([rows, self._columns]).astype(np.int64)
         self._costs = np.full(len(self.table), np.inf)
         self._trial: tuple[np.ndarray, np.ndarray] | None = None

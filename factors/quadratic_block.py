@@ -21,8 +21,8 @@ class QuadraticBlock:
         self, keys: Sequence[int], hessian: csr_matrix, gradient: np.ndarray, cost: float
     ) -> None:
         """H (6 V, 6 V) and g (6 V,) of variables `keys (V,)`, and c."""
-        self.pose_keys = list(keys)
-        num = len(self.pose_keys)
+        self.keys = list(keys)
+        num = len(self.keys)
         blocks = hessian.tobsr((DIM, DIM))
         rows = np.repeat(np.arange(num), np.diff(blocks.indptr))
         upper, same = rows < blocks.indices, rows == blocks.indices

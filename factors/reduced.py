@@ -65,7 +65,7 @@ class ReducedSystem:
         self._graph, self._blocks = graph, tuple(blocks)
         factor_keys = [graph.at(i).keys() for i in range(graph.size()) if graph.exists(i)]
         self._graph_keys = sorted({key for keys in factor_keys for key in keys})
-        block_keys = [key for block in self._blocks for key in block.pose_keys]
+        block_keys = [key for block in self._blocks for key in block.keys]
         paired = [key for pair in pairs for key in pair]
         self.keys = list(dict.fromkeys([*block_keys, *self._graph_keys, *paired]))
         all_dims = values.dims()
@@ -78,7 +78,7 @@ class ReducedSystem:
         self.first_block = dict(zip(self.keys, starts[:-1].tolist(), strict=True))
         self._num = int(starts[-1])
         self._block_rows = [
-            np.array([self.first_block[key] for key in block.pose_keys], dtype=np.int64)
+            np.array([self.first_block[key] for key in block.keys], dtype=np.int64)
             for block in self._blocks
         ]
         self._padding = self._padded_entries(counts)
@@ -167,7 +167,7 @@ class ReducedSystem:
                 self._diagonal[rows] += complement.diagonal
             poses = np.zeros((self._num, 12))
             for i in self._held:
-                poses[self._block_rows[i]] = pose_rows(values, self._blocks[i].pose_keys)
+                poses[self._block_rows[i]] = pose_rows(values, self._blocks[i].keys)
             self._bases = self._groups.bases(poses)
         return costs
 

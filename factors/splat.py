@@ -43,7 +43,7 @@ class _Frame:
     sigma: float  # of a residual, grey values
 
 
-Render = Callable[[int, np.ndarray], RenderedView]  # row of pose_keys, world_T_rig (4, 4)
+Render = Callable[[int, np.ndarray], RenderedView]  # row of keys, world_T_rig (4, 4)
 
 
 class SplatBlock:
@@ -53,13 +53,13 @@ class SplatBlock:
     is in the graph.
 
     Attributes:
-        pose_keys: (F,) keys of the Pose3 variables `world_T_rig`.
+        keys: (F,) keys of the Pose3 variables `world_T_rig`.
         pairs: (0, 2).
     """
 
     def __init__(
         self,
-        pose_keys: Sequence[int],
+        keys: Sequence[int],
         images: Sequence[np.ndarray],
         weights: Sequence[np.ndarray | None],
         cameras: FaceCameras,
@@ -72,7 +72,7 @@ class SplatBlock:
         """Prepare the captured frames for sampling.
 
         Args:
-            pose_keys: (F,) keys of Pose3 variables.
+            keys: (F,) keys of Pose3 variables.
             images: (F,) of (C, H, W) float32 grey values 0..1 of a frame's faces, which should
                 overlap by a few pixels for sampling near their edges.
             weights: (F,) of (C, H, W) float or bool, how far pixels count, 0..1: 0 is never
@@ -88,9 +88,9 @@ class SplatBlock:
         Raises:
             ValueError: as many images and masks as keys are needed.
         """
-        if not len(pose_keys) == len(images) == len(weights):
-            raise ValueError("pose_keys, images and weights must be equally long")
-        self.pose_keys = [int(key) for key in pose_keys]
+        if not len(keys) == len(images) == len(weights):
+            raise ValueError("keys, images and weights must be equally long")
+        self.keys = [int(key) for key in keys]
         self.pairs = np.zeros((0, 2), np.int64)
         self.loss = loss or RobustLoss("cauchy", 1.0)
         self.correlation = correlation
@@ -104,7 +104,7 @@ class SplatBlock:
     def refresh(self, values: gtsam.Values) -> None:
         """Render at accepted poses; fit gain, offset and noise of every frame there."""
         self._frames = []
-        for f, key in enumerate(self.pose_keys):
+        for f, key in enumerate(self.keys):
             view = self._render(f, values.atPose3(key).matrix())
             found, _, trust = self._sample(f, view, pose_rows(values, [key])[0], False)
             seen = trust > 0
@@ -115,9 +115,9 @@ class SplatBlock:
 
     def linearize(self, values: gtsam.Values) -> PoseSystem:
         """Gauss-Newton model with robust weights at `values`."""
-        num = len(self.pose_keys)
+        num = len(self.keys)
         diagonal, gradient, cost = np.zeros((num, 6, 6)), np.zeros((num, 6)), 0.0
-        for f, pose in enumerate(pose_rows(values, self.pose_keys)):
+        for f, pose in enumerate(pose_rows(values, self.keys)):
             diagonal[f], gradient[f], part = self._frame_system(f, pose)
             cost += part
         return PoseSystem(diagonal, np.zeros((0, 6, 6)), gradient, {NAME: cost})
@@ -131,17 +131,17 @@ class SplatBlock:
 
     def costs(self, values: gtsam.Values) -> dict[str, float]:
         """Robust cost under the last renderings."""
-        poses = pose_rows(values, self.pose_keys)
+        poses = pose_rows(values, self.keys)
         return {NAME: sum(self._frame_cost(f, pose) for f, pose in enumerate(poses))}
 
     def residuals(self, values: gtsam.Values) -> list[np.ndarray]:
         """Whitened residuals (N,) of each frame's samples, 0 where a sample is not seen."""
-        poses = pose_rows(values, self.pose_keys)
+        poses = pose_rows(values, self.keys)
         return [self._residuals(f, pose, False)[0] for f, pose in enumerate(poses)]
 
     def factors(self) -> list[gtsam.CustomFactor]:
         """The same cost under the last renderings as ordinary GTSAM factors, one per frame."""
-        return [self._factor(f, key) for f, key in enumerate(self.pose_keys)]
+        return [self._factor(f, key) for f, key in enumerate(self.keys)]
 
     def _factor(self, f: int, key: int) -> gtsam.CustomFactor:
         def evaluate(values: gtsam.Values, with_system: bool) -> tuple[float, PoseSystem | None]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from gsba.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from gsba.bundle.families import Family, MapSnapshot
     from gsba.bundle.prior_factors import X
     from gsba.config import RefineSettings
     from gsba.config_file import load_config
@@ -21,10 +22,22 @@ if TYPE_CHECKING:
     from gsba.pipeline.refine import refine
     from gsba.store.finished import load_run
 
-__all__ = ["GsbaError", "RefineSettings", "RunResult", "X", "load_config", "load_run", "refine"]
+__all__ = [
+    "Family",
+    "GsbaError",
+    "MapSnapshot",
+    "RefineSettings",
+    "RunResult",
+    "X",
+    "load_config",
+    "load_run",
+    "refine",
+]
 
 _HOMES = {
+    "Family": "gsba.bundle.families",
     "GsbaError": "gsba.log",
+    "MapSnapshot": "gsba.bundle.families",
     "RefineSettings": "gsba.config",
     "RunResult": "gsba.pipeline.outputs",
     "X": "gsba.bundle.prior_factors",

@@ -3,7 +3,8 @@
 import logging
 import os
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from importlib.metadata import EntryPoint, entry_points
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -473,6 +474,14 @@ class PlacementSettings(_Settings):
     pairs: _Text | None = None  # file of three or more pairs, run and scan, to find it by
 
 
+BuiltIn = Literal["bearing", "reprojection", "gps", "photometric", "splat"]  # families of gsba
+
+
+def installed_families() -> dict[str, EntryPoint]:
+    """Entry points of families that packages provide, by name: see `gsba.Family`."""
+    return {point.name: point for point in entry_points(group="gsba.families")}
+
+
 class RefineSettings(_Settings):
     """Everything a run depends on."""
 
@@ -492,9 +501,8 @@ class RefineSettings(_Settings):
     camera: CameraSettings = CameraSettings()
     stitching: StitchingSettings = StitchingSettings()
     solver: SolverSettings = SolverSettings()
-    factors: tuple[Literal["bearing", "reprojection", "gps", "photometric", "splat"], ...] = Field(
-        default=("bearing",), min_length=1
-    )
+    factors: tuple[BuiltIn | str, ...] = Field(default=("bearing",), min_length=1)  # a package's
+    # families by the name of their entry point, with what they are to read: NAME or NAME:ARGUMENT
     gps: GpsSettings = GpsSettings()
     photometric: PhotometricSettings = PhotometricSettings()
     splat: SplatFactorSettings = SplatFactorSettings()
@@ -505,6 +513,10 @@ class RefineSettings(_Settings):
     def direct_families(self) -> tuple[str, ...]:
         """Those that compare pixels of whole frames."""
         return tuple(name for name in self.factors if name in ("photometric", "splat"))
+
+    def package_families(self) -> tuple[str, ...]:
+        """Those that packages provide."""
+        return tuple(name for name in self.factors if name not in get_args(BuiltIn))
 
     def untimed(self) -> "RefineSettings":
         """Without what is said in seconds, for frames whose times are no more than an order."""
@@ -543,6 +555,11 @@ class RefineSettings(_Settings):
 
     @model_validator(mode="after")
     def _geometry_first(self) -> "RefineSettings":
+        for name in self.factors:
+            known = (*get_args(BuiltIn), *installed_families())
+            if name.partition(":")[0] not in known:
+                listed = ", ".join(f'"{one}"' for one in known)
+                raise ValueError(f'factors: "{name}" is none of those installed: {listed}')
         if not {"bearing", "reprojection"} & set(self.factors):
             named = " and ".join(self.factors)
             raise ValueError(f"factors: {named} starts from bearing or reprojection; add one")

@@ -372,6 +372,16 @@ class Round:
 
 
 @dataclass(frozen=True, slots=True)
+class FamilyVariables:
+    """Own variables of families of residuals, see `gsba.bundle.family_variables`."""
+
+    keys: np.ndarray  # (V,) int64, GTSAM keys
+    kinds: tuple[str, ...]  # (V) GTSAM type of each
+    counts: np.ndarray  # (V,) int64, numbers that each takes
+    data: np.ndarray  # (sum of counts,) float64, these numbers
+
+
+@dataclass(frozen=True, slots=True)
 class Solution:
     """Poses and points after the last good round."""
 
@@ -379,6 +389,7 @@ class Solution:
     landmarks: Landmarks
     noise: float  # of observations, in units of the features' own sigmas
     rounds: tuple[Round, ...]
+    variables: FamilyVariables | None = None  # of families; None = they have none
 
     @property
     def counts(self) -> Counts:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import gtsam
@@ -10,6 +10,7 @@ import numpy as np
 
 from factors import (
     BearingTerm,
+    Block,
     FaceCameras,
     LandmarkBlock,
     ReprojectionTerm,
@@ -17,8 +18,10 @@ from factors import (
     tangent_basis,
 )
 from gsba.bundle import gps_factors, prior_factors, triangulation
+from gsba.bundle.families import Families, FamilyTerms
 from gsba.bundle.gps_factors import Anchors
 from gsba.bundle.optimizer import marginal_covariances, optimize
+from gsba.bundle.prior_factors import poses_of, values_of
 from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.config import RefineSettings, SolverSettings
 from gsba.types import JointErrors, Keypoints, Landmarks, Round, Sighted, Solution, Tracks, Turning
@@ -36,6 +39,16 @@ _LEAST_LEFT = 1e-3  # share of a residual that a point leaves over, or it says n
 
 
 @dataclass(frozen=True, slots=True)
+class Terms:
+    """What an adjustment minimises beside the blocks of images, and where it starts."""
+
+    graph: gtsam.NonlinearFactorGraph
+    blocks: tuple[Block, ...]
+    values: gtsam.Values  # poses and families' own variables
+    own: FamilyTerms  # those of families among them
+
+
+@dataclass(frozen=True, slots=True)
 class Problem:
     """What all adjustments at one time of a run share."""
 
@@ -45,16 +58,35 @@ class Problem:
     num_threads: int  # of the solver
     turning: Turning | None = None  # of the frames, by a gyro; its say on poses is in the priors
     anchors: Anchors | None = None  # GPS fixes in the world of the poses; None = there are none
-    ungauged: gtsam.NonlinearFactorGraph | None = None  # `priors` without the gauge, which the
-    # anchors give; None = there are none
+    ungauged: gtsam.NonlinearFactorGraph | None = None  # `priors` without the gauge, which anchors
+    # or families give; None = neither does
+    families: Families = field(
+        default_factory=Families
+    )  # of residuals that the caller or a package added
+    maps: np.ndarray | None = None  # (F,) map of each frame, for the families; None = there is one
+
+    def terms(self, solved: Solution) -> Terms:
+        """Priors, gauge, GPS and families of an adjustment that starts from a solution.
+
+        Raises:
+            GsbaError: a family whose factors are about variables without a value.
+        """
+        own, graph = self.families.terms(solved, self.maps), self.graph
+        values = values_of(solved.world_T_rigs)
+        if self.families.members:
+            graph = gtsam.NonlinearFactorGraph(graph)
+            graph.push_back(own.graph)
+            values.insert(own.values)
+        return Terms(graph, own.blocks, values, own)
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Factors on the poses beside what images say: priors, gauge, GPS."""
-        if self.anchors is None or self.ungauged is None:
+        """Factors on the poses beside what images and families say: priors, gauge, GPS."""
+        if self.ungauged is None:
             return self.priors
         graph = gtsam.NonlinearFactorGraph(self.ungauged)
-        graph.push_back(gps_factors.factors(self.anchors))
+        if self.anchors is not None:
+            graph.push_back(gps_factors.factors(self.anchors))
         return graph
 
     def held(
@@ -144,7 +176,7 @@ def adjust(
         final: whether the last round is solved to the end; others lose observations anyway.
     """
     world_T_rigs, noise, rounds = start.world_T_rigs, start.noise, []
-    settings = problem.settings
+    settings, variables = problem.settings, start.variables
     rows = keypoints.rows(tracks)
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
     shared = {
@@ -163,12 +195,15 @@ def adjust(
         if problem.anchors is not None:
             finer = {"lambda_initial": _GPS_DAMPING, "relative_tolerance": _GPS_TOLERANCE}
             solver = solver.model_copy(update=finer)
-        result = optimize(problem.graph, [block], values_of(world_T_rigs), solver)
+        so_far = replace(start, world_T_rigs=world_T_rigs, landmarks=landmarks, variables=variables)
+        terms = problem.terms(so_far)
+        result = optimize(terms.graph, [block, *terms.blocks], terms.values, solver)
         poses = poses_of(result.values, len(world_T_rigs))
         new_support = len(place(poses, last_gate).tracks)
         accepted = new_support >= settings.rounds.min_support * support
         if accepted:
             world_T_rigs, support = poses, new_support
+            variables = terms.own.variables(result.values)
             placed = place(poses, gate * noise)
             if len(placed.tracks):
                 noise = max(_noise(placed, keypoints, poses), settings.rounds.min_noise)
@@ -176,7 +211,8 @@ def adjust(
         outcome = accepted, result.history, result.reason
         rounds.append(Round(gate, noise, *used, new_support, *outcome))
         logger.debug("round: %s", rounds[-1])
-    return Solution(world_T_rigs, place(world_T_rigs, gates[-1] * noise), noise, tuple(rounds))
+    placed = place(world_T_rigs, gates[-1] * noise)
+    return Solution(world_T_rigs, placed, noise, tuple(rounds), variables)
 
 
 def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
@@ -236,9 +272,11 @@ def pose_covariances(
     """Marginal covariances (F, 6, 6) with the first pose and the extent of each map held fixed."""
     block = landmark_block(solved.landmarks, keypoints, solved.noise, problem)
     keys = [prior_factors.X(f) for f in range(len(solved.world_T_rigs))]
-    values = values_of(solved.world_T_rigs)
-    held = problem.held(solved.world_T_rigs, values, components)
-    return marginal_covariances(held, [block], values, keys, DRAWS, problem.settings.seed)
+    terms = problem.terms(solved)
+    held = problem.held(solved.world_T_rigs, terms.values, components)
+    held.push_back(terms.own.graph)
+    blocks, seed = [block, *terms.blocks], problem.settings.seed
+    return marginal_covariances(held, blocks, terms.values, keys, DRAWS, seed)
 
 
 def _noise(
@@ -299,16 +337,3 @@ def _by_point(
     axes = whitening @ tangent_basis(bearings)  # the angles are small
     axes /= np.linalg.norm(offsets, axis=1)[:, None, None]
     return np.einsum("oij,oj->oi", axes, offsets), axes @ np.swapaxes(poses[:, :3, :3], 1, 2)
-
-
-def values_of(world_T_rigs: np.ndarray) -> gtsam.Values:
-    """Poses (F, 4, 4) under their keys."""
-    values = gtsam.Values()
-    for f, world_T_rig in enumerate(world_T_rigs):
-        values.insert(prior_factors.X(f), gtsam.Pose3(world_T_rig))
-    return values
-
-
-def poses_of(values: gtsam.Values, num_frames: int) -> np.ndarray:
-    """Poses (F, 4, 4) of the first keys."""
-    return np.array([values.atPose3(prior_factors.X(f)).matrix() for f in range(num_frames)])

@@ -12,11 +12,13 @@ import gtsam
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from factors import Block
 from factors.cholesky import DIM
 from factors.quadratic_block import QuadraticBlock
 from factors.reduced import ReducedSystem
 from gsba.bundle import lens_axes, prior_factors, readout, self_calibration
 from gsba.bundle.adjustment import DRAWS, Problem, values_of
+from gsba.bundle.families import FamilyTerms
 from gsba.bundle.lens_centres import by_nearness
 from gsba.bundle.optimizer import marginal_covariances
 from gsba.bundle.readout import Readout
@@ -140,7 +142,7 @@ class CameraSystem:
         beside = [key for key in every if camera.values.exists(key)]
         seed, keys = self.problem.settings.seed, camera.keys[:num]
         found, joint = marginal_covariances(
-            graph, [camera.block()], values, keys, DRAWS, seed, beside
+            graph, camera.blocks(), values, keys, DRAWS, seed, beside
         )
         sigmas = {key: np.sqrt(np.diagonal(found[num + i])) for i, key in enumerate(beside)}
         nothing = np.array([np.nan])
@@ -182,10 +184,12 @@ class _Camera:
     own: tuple[_Own, ...]
     longer: tuple[float, float] | None  # s, what is said of the readout's change, and its sigma
     off: np.ndarray | None  # (FREE,) what lenses of raw pairs are from what they were calibrated as
+    families: FamilyTerms  # of the caller, on poses and on variables of their own
 
     def graph(self, priors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
         """What is believed of them beside the bearings."""
         graph = gtsam.NonlinearFactorGraph(priors)
+        graph.push_back(self.families.graph)
         if self.longer is not None:
             model = gtsam.noiseModel.Diagonal.Sigmas(np.array([self.longer[1]]))
             graph.add(gtsam.PriorFactorVector(D(0), np.array([self.longer[0]]), model))
@@ -200,14 +204,14 @@ class _Camera:
                 graph.add(gtsam.PriorFactorVector(own.symbol(f), -off, model))
         return graph
 
-    def block(self, stretch: float = 1.0) -> QuadraticBlock:
-        """What bearings say of them, its curvature stretched."""
-        return QuadraticBlock(self.keys, stretch * self.hessian, self.gradient, self.cost)
+    def blocks(self, stretch: float = 1.0) -> list[Block]:
+        """What bearings say of them, its curvature stretched; and the families' blocks."""
+        bearings = QuadraticBlock(self.keys, stretch * self.hessian, self.gradient, self.cost)
+        return [bearings, *self.families.blocks]
 
     def system(self, priors: gtsam.NonlinearFactorGraph) -> ReducedSystem:
         """Both, linearized."""
-        blocks = [self.block(self.curvature)]
-        system = ReducedSystem(self.graph(priors), blocks, self.values)
+        system = ReducedSystem(self.graph(priors), self.blocks(self.curvature), self.values)
         system.linearize(self.values)
         return system
 
@@ -313,8 +317,11 @@ def _linearized(given: CameraSystem) -> _Camera:
     said, longer = given.problem.settings.camera.readout(), None
     if said is not None and values.exists(D(0)):
         longer = said[0] - seeing.readout_s, said[1]
-    curvature, own = seen.curvature, tuple(own)
-    return _Camera(values, keys, hessian, gradient, system.cost, curvature, own, longer, off)
+    terms = given.problem.families.terms(solved, given.problem.maps)
+    values.insert(terms.values)
+    return _Camera(
+        values, keys, hessian, gradient, system.cost, seen.curvature, tuple(own), longer, off, terms
+    )
 
 
 def _of_lenses(columns: np.ndarray) -> list[tuple[int, np.ndarray]]:

@@ -12,6 +12,19 @@ _ANYWHERE = 1e4  # extents of a map: as good as no say
 _FAINTER = 10.0  # times the noise of absolute priors, where GPS says where frames are
 
 
+def values_of(world_T_rigs: np.ndarray) -> gtsam.Values:
+    """Poses (F, 4, 4) under their keys."""
+    values = gtsam.Values()
+    for f, world_T_rig in enumerate(world_T_rigs):
+        values.insert(X(f), gtsam.Pose3(world_T_rig))
+    return values
+
+
+def poses_of(values: gtsam.Values, num_frames: int) -> np.ndarray:
+    """Poses (F, 4, 4) of the first keys."""
+    return np.array([values.atPose3(X(f)).matrix() for f in range(num_frames)])
+
+
 def build(
     coarse_world_T_rigs: np.ndarray,
     settings: PriorSettings,

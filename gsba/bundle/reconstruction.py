@@ -29,6 +29,7 @@ def assemble(
     correction: tuple[float, ...] = (),
     components: np.ndarray | None = None,
     joint_errors: JointErrors | None = None,
+    stays: bool = False,
 ) -> Reconstruction:
     """Carry the solution back to the trajectory's world and gather what exports need.
 
@@ -42,6 +43,7 @@ def assemble(
         correction: of the frames, which the keypoints have.
         components: (F,) map of each frame, each carried to its own coarse poses; None = one map.
         joint_errors: of the poses; None = not known.
+        stays: whether world and scale are already those of the result.
 
     Raises:
         GsbaError: not where the trajectory has its frames, or residuals that no solution leaves.
@@ -51,7 +53,10 @@ def assemble(
     known = refined & (coarse.sources == PoseSource.SLAM)
     known &= True if false_frames is None else ~false_frames
     groups = np.zeros(len(seen), np.int32) if components is None else components
-    placed, points_world, stretch = _placed(adjustment, coarse.world_T_rigs, known, groups)
+    placed, points_world = adjustment.world_T_rigs, landmarks.points_world
+    stretch = np.ones((len(seen), 6))
+    if not stays:
+        placed, points_world, stretch = _placed(adjustment, coarse.world_T_rigs, known, groups)
     rows = keypoints.rows(landmarks.tracks)
     points = landmarks.tracks.points
     lengths = np.maximum(np.bincount(points, minlength=len(landmarks.points_world)), 1)

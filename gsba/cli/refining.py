@@ -25,7 +25,10 @@ Overrides = Annotated[
 ]
 Factors = Annotated[
     str | None,
-    typer.Option(help="Families, commas between: bearing, reprojection, gps, photometric, splat."),
+    typer.Option(
+        help="Families, commas between: bearing, reprojection, gps, photometric, splat, and those "
+        "that packages provide, as NAME or NAME:ARGUMENT; list names all that are installed."
+    ),
 ]
 Weights = Annotated[
     list[Path] | None,

@@ -213,7 +213,8 @@ def _solve(
     It is undone where it explains the map's own observations worse than before.
     """
     settings, num_threads = problem.settings, problem.num_threads
-    chosen, values = settings.photometric, adjustment.values_of(solved.world_T_rigs)
+    chosen, terms = settings.photometric, problem.terms(solved)
+    values = terms.values
     looser = {"relative_tolerance": chosen.tolerance, "absolute_tolerance": None}
     solver = settings.solver.model_copy(update=looser)
     start = make_block(pixels, trust, settings, num_threads)
@@ -225,13 +226,14 @@ def _solve(
         landmarks = adjustment.landmark_block(solved.landmarks, keypoints, solved.noise, problem)
         landmarks.polish(values)
         before, fits = landmarks.error(values), _geometric_fits(landmarks, values)
-        result = optimize(problem.graph, [landmarks, block], values, solver)
+        result = optimize(terms.graph, [landmarks, block, *terms.blocks], values, solver)
         growth = _geometric_fits(landmarks, result.values) / fits
         doubts, residuals = _frame_weights(block, result.values, growth, chosen)
         if np.all(doubts >= 1) or np.any(weights < 1):
             break
         weights = doubts
     accepted = landmarks.error(result.values) <= chosen.max_growth * before
+    solved = replace(solved, variables=terms.own.variables(result.values)) if accepted else solved
     adjusted = _adjusted(solved, keypoints, result, accepted, settings, num_threads)
     return adjusted, weights, residuals
 
@@ -299,7 +301,7 @@ def _geometric_fits(landmarks: LandmarkBlock, values: gtsam.Values) -> np.ndarra
     residuals, _ = landmarks.residuals(values)
     norms = np.linalg.norm(np.concatenate(residuals), axis=1)
     frames = np.concatenate([term.frames for term in landmarks.terms])
-    fits = np.ones(len(landmarks.pose_keys))
+    fits = np.ones(len(landmarks.keys))
     for f in range(len(fits)):
         rows = frames == f
         if np.count_nonzero(rows) >= _LEAST_JUDGED:
@@ -322,7 +324,7 @@ def _frame_weights(
     kept = block.counted
     errors = np.sqrt(block.errors(values)[kept])
     targets, hosts = block.table.targets[kept], block.table.hosts[block.table.owners][kept]
-    residuals = np.full(len(block.pose_keys), np.nan)
+    residuals = np.full(len(block.keys), np.nan)
     for f in range(len(residuals)):
         rows = (targets == f) | (hosts == f)
         if np.count_nonzero(rows) >= _LEAST_JUDGED:

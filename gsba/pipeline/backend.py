@@ -9,6 +9,7 @@ import numpy as np
 from gsba.bundle import (
     adjustment,
     common_errors,
+    gauge,
     lens_axes,
     lens_centres,
     map_strength,
@@ -21,6 +22,7 @@ from gsba.bundle import (
 )
 from gsba.bundle.adjustment import Problem
 from gsba.bundle.camera_system import CameraCovariances, CameraSystem
+from gsba.bundle.gauge import Gauge
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of
 from gsba.bundle.map_strength import MapStrength
@@ -79,6 +81,21 @@ def adjust(
         return adjustment.adjust(found, seen.keypoints, start, problem, gates, final)
 
     return run.stage(name, [run.solving_key(), gates, final], compute, Solution)
+
+
+def align_gauge(run: Run, prior: Prior, solved: Solution, name: str) -> tuple[Prior, Solution]:
+    """Trajectory and solution carried to the scale and world that families know; else as they are.
+
+    Points of the solution are left out then.
+    """
+    if not run.families.fixing_gauge.members:
+        return prior, solved
+
+    def compute() -> Gauge:
+        return gauge.align(run.families, solved, prior.parts)
+
+    found = run.stage(name, run.families.digests(), compute, Gauge, noted=False)
+    return prior.moved(found.moves), found.moved(solved, prior.parts)
 
 
 def place(
@@ -407,6 +424,7 @@ def reconstruct(run: Run, seen: Seen, prior: Prior, world: Map) -> Reconstructio
             frames.correction,
             prior.parts,
             joint,
+            stays=bool(run.families.fixing_gauge.members),
         )
         result = replace(result, fisheyes=frames.fisheyes, vertical=_vertical(run, prior, result))
         if not world.lenses or world.centres is None:

@@ -124,7 +124,7 @@ def match_neighbours(
     settled = run.settings.read.model_copy(update={"clock_offset_s": 0.0})
     settings = run.settings.model_copy(update={"read": settled})
     coarse = inputs.coarse_poses(run.frames, [estimate.clock.on_frames(trajectory)], settings)
-    prior = replace(Prior.of(coarse, run.extra_factors), clock=estimate)
+    prior = replace(Prior.of(coarse), clock=estimate)
     return prior, _match_neighbours(run, seen, prior, "neighbours_on_time")
 
 

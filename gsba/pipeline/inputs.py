@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from gsba import odometry, video
+from gsba.bundle.families import Family
 from gsba.bundle.fixes import FrameFixes
 from gsba.bundle.gps_factors import MIN_FIXES
 from gsba.camera.calibration import read_calibration
-from gsba.config import RefineSettings, VideoSettings
+from gsba.config import RefineSettings, VideoSettings, installed_families
 from gsba.frames.image_circles import ImageCircle
 from gsba.frames.lens_names import lens_files
 from gsba.frames.times import check_fps
@@ -145,6 +146,23 @@ def _duration_s(path: Path) -> float | None:
         return video.claimed_duration_s(path)
     except GsbaError:
         return None
+
+
+def families_of(frames: FrameSet, settings: RefineSettings) -> list[Family]:
+    """Families that packages provide, as settings.factors name them.
+
+    Raises:
+        GsbaError: a package whose family cannot be made.
+    """
+    made = list[Family]()
+    for named in settings.package_families():
+        name, _, argument = named.partition(":")
+        try:
+            make = installed_families()[name].load()
+        except (ImportError, AttributeError) as error:
+            raise GsbaError(f"family {name}: its package cannot be loaded: {error}") from error
+        made.append(make(frames, argument or None))
+    return made
 
 
 def positions_of(frames: FrameSet, settings: RefineSettings) -> FrameFixes | None:

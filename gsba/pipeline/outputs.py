@@ -35,6 +35,10 @@ _OWN_GAUGE = (
     "no trajectory: the first frame's axes, and the median step of the start as the unit; "
     "covariances hold the first pose and the distance to the frame furthest from it"
 )
+_FAMILIES_GAUGE = (
+    "families {names} fix the world or the scale; covariances hold the first pose and the distance "
+    "to the frame furthest from it"
+)
 CALIBRATION = "calibration.json"
 _OUTPUTS = (
     "trajectory.tum",
@@ -160,7 +164,7 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
         stages=run.store.records.values(),
         counts=journal.counts,
         solver=[{"stage": name, "rounds": rounds} for name, rounds in journal.rounds.items()],
-        gauge=_OWN_GAUGE if prior.absent else _GAUGE,
+        gauge=_gauge(run, prior),
         notes=notes,
         trajectory=trajectory,
         moves=world.moves,
@@ -170,8 +174,20 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
         gps=gps,
         reasons=_reasons(prior),
     )
+    if run.families.members:
+        snapshot = run.families.snapshot(world.solution, prior.parts)
+        of_families = {family.name: family.report(snapshot) for family in run.families.members}
+        report["families"] = plain(of_families)
     report["residual_sphere"] = plain(residual_sphere(result), digits=4)
     return report
+
+
+def _gauge(run: Run, prior: Prior) -> str:
+    """What defines world and scale of the poses, and what their covariances hold."""
+    fixing = run.families.fixing_gauge.members
+    if fixing:
+        return _FAMILIES_GAUGE.format(names=", ".join(family.name for family in fixing))
+    return _OWN_GAUGE if prior.absent else _GAUGE
 
 
 def _export(

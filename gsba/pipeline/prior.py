@@ -1,7 +1,7 @@
 """What is believed of the trajectory: what it says itself, and what images add and take away."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -11,12 +11,11 @@ from gsba.bundle.map_strength import MapStrength
 from gsba.config import PriorSettings
 from gsba.imu.alignment import Alignment
 from gsba.loop_closure.merged_map import Registered, side_by_side
+from gsba.similarity import Sim3
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import Joint
 from gsba.trajectory.judgement import Trust
 from gsba.types import CoarsePoses, PoseSource, Solution, Turning
-
-ExtraFactors = Callable[[CoarsePoses], Iterable[gtsam.NonlinearFactor]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +24,6 @@ class Prior:
 
     coarse: CoarsePoses  # the trajectory at the frames' times
     trust: Trust  # which of its steps hold, and where to start instead
-    extra: tuple[gtsam.NonlinearFactor, ...] = ()  # the caller's own factors
     clock: ClockEstimate | None = None  # None = not checked
     joints: tuple[Joint, ...] = ()  # of pieces of the trajectory
     parts: np.ndarray | None = None  # (F,) int64, parts that nothing ties together; None = one
@@ -35,10 +33,9 @@ class Prior:
     turning: Turning | None = None  # what it says of the frames; None = it is not believed
 
     @classmethod
-    def of(cls, coarse: CoarsePoses, extra_factors: ExtraFactors | None = None) -> "Prior":
+    def of(cls, coarse: CoarsePoses) -> "Prior":
         """The trajectory, believed as it is."""
-        extra = () if extra_factors is None else tuple(extra_factors(coarse))
-        return cls(coarse, Trust.of_all(coarse.world_T_rigs), extra)
+        return cls(coarse, Trust.of_all(coarse.world_T_rigs))
 
     @property
     def absent(self) -> bool:
@@ -62,7 +59,7 @@ class Prior:
     def graph(
         self, settings: PriorSettings, first: np.ndarray | None = None, *, gauge: bool = True
     ) -> gtsam.NonlinearFactorGraph:
-        """What the trajectory says, as far as it is believed, the gauge, and the caller's factors.
+        """What the trajectory says, as far as it is believed, and the gauge.
 
         Args:
             settings: noise of the trajectory, unless images told it.
@@ -81,9 +78,20 @@ class Prior:
         if self.turning is not None:
             extent = float(np.linalg.norm(np.ptp(believed[:, :3, 3], axis=0)))
             graph.push_back(prior_factors.turns(self.turning, extent, settings.loss_sigmas))
-        for factor in self.extra:
-            graph.add(factor)
         return graph
+
+    def moved(self, moves: Mapping[int, Sim3]) -> "Prior":
+        """The trajectory carried to another world, part by part as numbered in `parts`."""
+        parts = np.zeros(len(self.coarse.sources), np.int64) if self.parts is None else self.parts
+        coarse, start = self.coarse.world_T_rigs.copy(), self.trust.world_T_rigs.copy()
+        scales = np.ones(len(parts))
+        for number, move in moves.items():
+            inside = parts == number
+            coarse[inside], start[inside] = move.poses(coarse[inside]), move.poses(start[inside])
+            scales[inside] = move.scale
+        lengths = self.trust.lengths * scales[:-1]
+        trust = replace(self.trust, world_T_rigs=start, lengths=lengths)
+        return replace(self, coarse=replace(self.coarse, world_T_rigs=coarse), trust=trust)
 
     def _side_by_side(self) -> np.ndarray:
         return side_by_side(self.coarse.world_T_rigs, self.merged)

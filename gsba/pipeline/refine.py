@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from gsba import video
 from gsba.bundle import self_calibration
+from gsba.bundle.families import Family
 from gsba.bundle.fixes import FrameFixes
 from gsba.camera.fisheye import Pair, turned
 from gsba.camera.lens import Lenses
@@ -26,7 +27,7 @@ from gsba.pipeline import acceptance, backend, frontend, inputs, outputs, patch_
 from gsba.pipeline.frontend import Seen
 from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
-from gsba.pipeline.prior import ExtraFactors, Prior
+from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Journal, Run
 from gsba.placement import check
 from gsba.store import cluster
@@ -74,7 +75,7 @@ def refine(
     imu: Path | None = None,
     odometry: bool | None = None,
     fresh: bool = False,
-    extra_factors: ExtraFactors | None = None,
+    families: Sequence[Family] = (),
     client: "Client | None" = None,
 ) -> RunResult:
     """Refine the pose of every frame, and write poses, cloud, report and datasets to `out`.
@@ -95,7 +96,8 @@ def refine(
         imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
         odometry: follow a video that has no trajectory; None = if it is open which frames to take.
         fresh: forget an earlier run in `out`.
-        extra_factors: makes your own, on keys gsba.X(frame); adjustments then never resume.
+        families: residuals of your own, see `gsba.Family`; they join all adjustments, beside
+            those that settings.factors names and packages provide.
         client: of a Dask scheduler whose workers take what can be shared out; None = threads here.
 
     Raises:
@@ -113,11 +115,12 @@ def refine(
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     lenses = calibration, inputs.given_circles(circles, calibration)
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, *lenses)
+    families = [*families, *inputs.families_of(frame_set, settings)]
     sensors = readings, inputs.positions_of(frame_set, settings)
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
-        run = _begin(store, frame_set, coarse, given, settings, chosen, extra_factors, *sensors)
-        return _refine(run, Prior.of(coarse, extra_factors), given, len(origin) == 1)
+        run = _begin(store, frame_set, coarse, given, settings, chosen, families, *sensors)
+        return _refine(run, Prior.of(coarse), given, len(origin) == 1)
 
 
 def _begin(
@@ -127,16 +130,17 @@ def _begin(
     given: Sequence[Trajectory],
     settings: RefineSettings,
     chosen: merging.Choice,
-    extra_factors: ExtraFactors | None,
+    families: Sequence[Family],
     readings: Readings | None,
     fixes: FrameFixes | None,
 ) -> Run:
     """A run on frames that are masked as asked."""
     frame_set, journal = merging.before(store, frame_set, chosen), Journal()
     if chosen.distractors:
-        frame_set = _without_distractors(store, frame_set, coarse, given, settings, journal)
-    sensors = readings, fixes
-    return Run.begin(store, frame_set, coarse, settings, extra_factors, journal, False, *sensors)
+        how = settings, journal, families
+        frame_set = _without_distractors(store, frame_set, coarse, given, *how)
+    sensors = readings, fixes, families
+    return Run.begin(store, frame_set, coarse, settings, journal, False, *sensors)
 
 
 def _refine(run: Run, prior: Prior, given: Sequence[Trajectory], images_alone: bool) -> RunResult:
@@ -155,7 +159,7 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
     Returns:
         The run that it was in the end, its keypoints, and what `solve` gives.
     """
-    known = [run.settings.model_dump(exclude={"export", "placement"}), run.custom]
+    known = [run.settings.model_dump(exclude={"export", "placement"}), run.families.digests()]
     known += [] if run.imu is None else [run.imu.digest]
     known += [] if run.fixes is None else [run.fixes.digest()]
     counts, frames = dict(run.journal.counts), run.frames
@@ -182,9 +186,8 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
         again = Journal(dict(counts))
         frames = replace(frames, fisheyes=fisheyes, lenses_nominal=False)
         frames = merging.recut(run.store, frames, n)
-        settings, extra = run.settings, run.extra_factors
-        sensors = run.imu, run.fixes
-        run = Run.begin(run.store, frames, prior.coarse, settings, extra, again, found, *sensors)
+        beside = run.imu, run.fixes, run.families.members
+        run = Run.begin(run.store, frames, prior.coarse, run.settings, again, found, *beside)
 
 
 def _cut_better(coarse: CoarsePoses, world: Map) -> _Cut | None:
@@ -228,7 +231,7 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     if prior.turning_only:
         return prior, Map.of(prior.start(), seen.shown)
     # A chain of relative poses, then all that neighbours have in common.
-    start = prior.start()
+    prior, start = backend.align_gauge(run, prior, prior.start(), "gauge")
     solved = backend.adjust(run, seen, prior, "chain", [near.matches], start, rounds.chain)
     along = frontend.match_along_epipolars(run, seen, solved)
     known = frontend.match_known_points(run, seen, solved, "near", loops_closed=False)
@@ -237,6 +240,7 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     prior, solved, matches = _merge_maps(run, seen, prior, near, solved, [along, known])
     prior, solved, loops = frontend.close_loops(run, seen, prior, solved)
     along, matches = matches[0], [*matches, loops]
+    prior, solved = backend.align_gauge(run, prior, solved, "gauge_closed")
     solved = backend.adjust(run, seen, prior, "closed", matches, solved, rounds.loops)
     prior = backend.align_imu(run, prior, solved, "imu_closed")
     seen, world = _find_camera(run, seen, prior, matches, solved)
@@ -389,11 +393,12 @@ def _without_distractors(
     given: Sequence[Trajectory],
     settings: RefineSettings,
     journal: Journal,
+    families: Sequence[Family],
 ) -> FrameSet:
     """Frames without what a first solution, plainer than the last, does not explain."""
     direct.check(frames, settings)  # before the first solution, not after
     with store.named("first"):
-        run = Run.begin(store, frames, coarse, settings.plainer())
+        run = Run.begin(store, frames, coarse, settings.plainer(), families=families)
         prior, world = solve(run, frontend.extract(run), Prior.of(coarse), given)
     if prior.turning_only:
         return frames

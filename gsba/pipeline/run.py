@@ -1,7 +1,6 @@
 """A run: what no stage changes, how a stage is kept, and the journal that the report reads."""
 
-import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -11,6 +10,7 @@ import numpy as np
 from gsba import learned
 from gsba.bundle import gps_factors
 from gsba.bundle.adjustment import Problem
+from gsba.bundle.families import Families, Family
 from gsba.bundle.fixes import FrameFixes
 from gsba.camera.rig import CubeRig
 from gsba.config import PriorSettings, RefineSettings
@@ -19,7 +19,7 @@ from gsba.frames.panorama import Greys
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError
 from gsba.photometric import direct
-from gsba.pipeline.prior import ExtraFactors, Prior
+from gsba.pipeline.prior import Prior
 from gsba.store.store import Chain, RunStore, fingerprint
 from gsba.types import CoarsePoses, Counts, FrameSet, Round, Solution
 
@@ -66,12 +66,11 @@ class Run:
     rig: CubeRig  # faces that keypoints are found on
     greys: Greys  # pictures for patches
     weights: Mapping[str, Path]  # stage -> file of a learned network
-    extra_factors: ExtraFactors | None  # the caller's
-    custom: str | None  # of results that rest on those: never resumed
     num_threads: int
     lenses_found: bool = False  # whether what raw pairs are cut by was found, so that it is free
     imu: Readings | None = None  # of a gyro that rode along; None = there are none
     fixes: FrameFixes | None = None  # of frames by GPS, for its factors; None = there are none
+    families: Families = field(default_factory=Families)  # of the caller, or of packages
 
     @classmethod
     def begin(
@@ -80,11 +79,11 @@ class Run:
         frames: FrameSet,
         coarse: CoarsePoses,
         settings: RefineSettings,
-        extra_factors: ExtraFactors | None = None,
         journal: Journal | None = None,
         lenses_found: bool = False,
         imu: Readings | None = None,
         fixes: FrameFixes | None = None,
+        families: Sequence[Family] = (),
     ) -> "Run":
         """Start a run, or take it up, on these frames and poses.
 
@@ -112,12 +111,11 @@ class Run:
             rig=cubemap.rig_for(frames, settings.cubemap),
             greys=Greys(frames, settings.patches.max_width),
             weights=learned.find_weights(settings),
-            extra_factors=extra_factors,
-            custom=None if extra_factors is None else uuid.uuid4().hex,
             num_threads=settings.solver.threads(),
             lenses_found=lenses_found,
             imu=imu,
             fixes=fixes,
+            families=Families(tuple(families), frames.names, frames.timestamps),
         )
 
     def stage(
@@ -146,22 +144,24 @@ class Run:
         """What adjustments share while this is believed of the trajectory.
 
         Args:
-            solved: poses so far, that GPS fixes are carried to; None = without GPS.
+            solved: poses so far, that GPS fixes are carried to; None = without GPS and families.
             noise: of the trajectory; None = as in the settings.
         """
         settings, noise = self.settings, noise or self.settings.priors
         anchors, first, ungauged = None, None, None
+        families = Families() if solved is None else self.families
+        freed = bool(families.fixing_gauge.members)
         if self.fixes is not None and solved is not None:
             poses = solved.world_T_rigs
             first = poses[0]
             anchors = gps_factors.anchor(poses, self.fixes, settings.gps, prior.parts)
-            if anchors is not None:
-                gauge = not anchors.holds(0, prior.parts)
-                ungauged = prior.graph(noise, first, gauge=gauge)
+            freed |= anchors is not None and anchors.holds(0, prior.parts)
+        if solved is not None and (freed or anchors is not None):
+            ungauged = prior.graph(noise, solved.world_T_rigs[0], gauge=not freed)
         graph = prior.graph(noise, first)
         settings = settings if self.frames.timed else settings.untimed()
         given = graph, self.rig, settings, self.num_threads, prior.turning
-        return Problem(*given, anchors, ungauged)
+        return Problem(*given, anchors, ungauged, families, prior.parts)
 
     @property
     def matching_settings(self) -> RefineSettings:
@@ -189,4 +189,4 @@ class Run:
         known = []
         if self.fixes is not None:
             known = [settings.gps.loss_sigmas, self.fixes.digest()]
-        return [*relevant, families, self.custom, *known]
+        return [*relevant, families, self.families.digests(), *known]

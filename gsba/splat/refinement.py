@@ -252,13 +252,15 @@ class _Turns:
         self, gaussians: Gaussians, world_T_rigs: np.ndarray
     ) -> tuple[np.ndarray, OptimizeResult]:
         """Poses after a few joint steps, and the solver's way."""
-        settings, values = self.settings, adjustment.values_of(world_T_rigs)
-        landmarks = self._block()
+        settings = self.settings
+        terms = self.problem.terms(replace(self.solved, world_T_rigs=world_T_rigs))
+        values, landmarks = terms.values, self._block()
         landmarks.polish(values)
         near = near_of(world_T_rigs[self.split.training], SplatSettings())
         pixels = splat_block(gaussians, self.captured, near, self.backend)
         solver = settings.solver.model_copy(update={"max_iterations": settings.splat.solver_steps})
-        result = optimize(self.problem.graph, [landmarks, *self.further, pixels], values, solver)
+        blocks = [landmarks, *self.further, pixels, *terms.blocks]
+        result = optimize(terms.graph, blocks, values, solver)
         return adjustment.poses_of(result.values, len(world_T_rigs)), result
 
     def _block(self) -> LandmarkBlock:

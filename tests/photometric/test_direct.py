@@ -238,7 +238,7 @@ def test_a_doubted_frame_loses_weight() -> None:
     class Block:
         """What the rule looks at."""
 
-        pose_keys = range(3)
+        keys = range(3)
         counted = np.ones(60, bool)
 
         class table:

@@ -14,7 +14,7 @@ import pycolmap
 import pytest
 from tiny_run import NUM_FRAMES, SETTINGS, WIDTH, Case, computed_stages
 
-from gsba import load_run, refine
+from gsba import Family, MapSnapshot, load_run, refine
 from gsba.bundle.prior_factors import X
 from gsba.camera.rig import CubeRig
 from gsba.config_file import load_config
@@ -24,7 +24,7 @@ from gsba.frames import cubemap
 from gsba.log import GsbaError
 from gsba.store.store import load_stage
 from gsba.trajectory.files import read_trajectory
-from gsba.types import FACES, CoarsePoses, Keypoints, PoseStatus, Trajectory
+from gsba.types import FACES, Keypoints, PoseStatus, Trajectory
 
 
 def _greyed(case: Case, to: Path, frames: list[int]) -> Path:
@@ -226,29 +226,37 @@ def test_masks_reach_features_and_exports(case: Case, tmp_path: Path) -> None:
     assert shares["down"] == 0 and shares["up"] == 1
 
 
-def test_a_factor_of_ones_own_takes_part(blank: Case, tmp_path: Path) -> None:
+class _Height(Family):
     """A height for the blank frame, of which images say nothing."""
-    lift = 0.1
 
-    def height_factors(coarse: CoarsePoses) -> list[gtsam.CustomFactor]:
-        wanted = coarse.world_T_rigs[3, 1, 3] + lift
+    name = "height"
 
+    def __init__(self, height: float) -> None:
+        self.height, self.digest = height, str(height)
+
+    def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
         def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list | None):
-            world_T_rig = values.atPose3(factor.keys()[0])
+            world_T_rig = values.atPose3(X(3))
             if jacobians is not None:
                 jacobians[0] = np.append(np.zeros(3), world_T_rig.rotation().matrix()[1])[None]
-            return np.array([world_T_rig.y() - wanted])
+            return np.array([world_T_rig.y() - self.height])
 
+        graph = gtsam.NonlinearFactorGraph()
         noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-4)
-        return [gtsam.CustomFactor(noise, [X(3)], error)]
+        graph.add(gtsam.CustomFactor(noise, [X(3)], error))
+        return graph
 
-    out = blank.copy(tmp_path / "run")
-    result = blank.refine(out, extra_factors=height_factors)
+
+def test_a_family_of_ones_own_takes_part(blank: Case, tmp_path: Path) -> None:
+    lift, out = 0.1, blank.copy(tmp_path / "run")
+    height = blank.result.coarse.world_T_rigs[3, 1, 3] + lift
+    result = blank.refine(out, families=[_Height(height)])
     assert "chain" in computed_stages(result) and "features" not in computed_stages(result)
     heights = result.reconstruction.world_T_rigs[:, 1, 3]
     # Moving the solution back into the trajectory's world shifts heights by the drift it removed.
-    assert heights[3] == pytest.approx(result.coarse.world_T_rigs[3, 1, 3] + lift, abs=0.02)
+    assert heights[3] == pytest.approx(height, abs=0.02)
     plain = blank.result.reconstruction.world_T_rigs[:, 1, 3]
     assert np.abs(np.delete(heights - plain, 3)).max() < 1e-3 < heights[3] - plain[3]
-    again = blank.refine(out, extra_factors=height_factors)
-    assert "chain" in computed_stages(again)  # what a callable does cannot be compared
+    assert not computed_stages(blank.refine(out, families=[_Height(height)]))
+    other = blank.refine(out, families=[_Height(height + lift)])
+    assert "chain" in computed_stages(other)

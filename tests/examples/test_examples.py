@@ -1,0 +1,169 @@
+"""The examples of families, run as their docstrings say on small rendered walks."""
+
+import ast
+import sys
+from pathlib import Path
+
+import cv2
+import gtsam
+import numpy as np
+import pytest
+
+from factors.check import jacobian_errors
+from gsba import RefineSettings
+from gsba.camera.sphere import bearings_from_erp
+from gsba.demo import make_walk
+from gsba.demo.gallery import build_gallery
+from gsba.demo.raycast import ranges
+from gsba.similarity import pose_similarity
+from gsba.trajectory.files import read_trajectory
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+NUM_FRAMES, WIDTH, TAG = 14, 1024, 0.5
+LIGHTER = {"cubemap": {"face_size": 256}, "features": {"max_per_face": 400}}
+
+
+@pytest.fixture(autouse=True)
+def _examples_are_modules(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    settings = RefineSettings.model_validate(LIGHTER)
+    refine = sys.modules["gsba.pipeline.refine"].refine
+    monkeypatch.setattr(
+        "gsba.refine", lambda *given, **more: refine(*given, settings, **more), raising=False
+    )
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo's gallery, with tags on the walls beside the way."""
+    folder = tmp_path_factory.mktemp("examples") / "walk"
+    make_walk(folder, "open", "locked", NUM_FRAMES, WIDTH)
+    truth = read_trajectory(folder / "groundtruth.tum").world_T_rigs
+    tags = _hung(truth[2::4])
+    for world_T_rig, path in zip(truth, sorted((folder / "images").glob("*.jpg")), strict=True):
+        image = cv2.imread(str(path))
+        cv2.imwrite(str(path), _with_tags(image, world_T_rig, tags), [cv2.IMWRITE_JPEG_QUALITY, 95])
+    return folder
+
+
+def _hung(world_T_rigs: np.ndarray) -> list[np.ndarray]:
+    """Poses of tags before what frames see to their left and right, turned towards them."""
+    scene, tags = build_gallery(), []
+    for world_T_rig in world_T_rigs:
+        for side in (-1.0, 1.0):
+            toward = world_T_rig[:3, :3] @ np.array([side, 0.0, 0.0])
+            toward[1] = 0.0
+            toward /= np.linalg.norm(toward)
+            away = float(ranges(scene, world_T_rig[:3, 3], toward[None])[0])
+            y = np.array([0.0, -1.0, 0.0])
+            pose = np.eye(4)
+            pose[:3, :3] = np.stack([np.cross(y, -toward), y, -toward], axis=1)
+            pose[:3, 3] = world_T_rig[:3, 3] + min(0.9 * away, 2.0) * toward
+            tags.append(pose)
+    return tags
+
+
+def _with_tags(image: np.ndarray, world_T_rig: np.ndarray, tags: list[np.ndarray]) -> np.ndarray:
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    v, u = np.mgrid[: 2 * image.shape[0], : 2 * image.shape[1]] / 2 + 0.25
+    rays = bearings_from_erp(np.stack([u, v], -1), image.shape[1], image.shape[0])
+    rays = rays @ world_T_rig[:3, :3].T
+    fine = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    for number, tag in enumerate(tags):
+        picture = cv2.aruco.generateImageMarker(dictionary, number, 800)
+        picture = cv2.copyMakeBorder(picture, 100, 100, 100, 100, cv2.BORDER_CONSTANT, value=255)
+        offset = (tag[:3, 3] - world_T_rig[:3, 3]) @ tag[:3, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            far = offset / (rays @ tag[:3, 2])
+        inside = (far > 0) & (offset < 0)
+        far = np.where(inside, far, 0)
+        hits = world_T_rig[:3, 3] + far[..., None] * rays - tag[:3, 3]
+        x, y = hits @ tag[:3, 0] / TAG, hits @ tag[:3, 1] / TAG
+        inside &= (np.abs(x) < 0.625) & (np.abs(y) < 0.625)
+        s = np.clip((x[inside] + 0.5) * 800 + 100, 0, 999).astype(int)
+        t = np.clip((0.5 - y[inside]) * 800 + 100, 0, 999).astype(int)
+        fine[inside] = picture[t, s][:, None]
+    return cv2.resize(fine, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_AREA)
+
+
+def _scale_and_error(walk: Path, world_T_rigs: np.ndarray) -> tuple[float, float]:
+    """Units of the truth per unit of the result, and the ATE in them after alignment."""
+    truth = read_trajectory(walk / "groundtruth.tum").world_T_rigs
+    fit = pose_similarity(world_T_rigs, truth)
+    off = fit.points(world_T_rigs[:, :3, 3]) - truth[:, :3, 3]
+    return fit.scale, float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+
+
+def test_a_barometer_finds_its_bias(walk: Path, tmp_path: Path) -> None:
+    import barometer
+
+    result = barometer.main(walk, tmp_path / "run")
+    assert result.report["families"]["barometer"]["bias_m"] == pytest.approx(100.0, abs=0.02)
+    assert _scale_and_error(walk, result.reconstruction.world_T_rigs)[1] < 5e-3
+    resumed = barometer.main(walk, tmp_path / "run")
+    assert all(stage["resumed"] for stage in resumed.report["stages"])
+
+
+def test_wheels_set_the_scale(walk: Path, tmp_path: Path) -> None:
+    import wheel_odometry
+
+    result = wheel_odometry.main(walk, tmp_path / "run")
+    scale, error = _scale_and_error(walk, result.reconstruction.world_T_rigs)
+    assert 2.5 * scale == pytest.approx(1.0, rel=0.01)  # thirteen steps, each to 1 %
+    assert error < 5e-3
+    assert "wheels" in result.report["gauge"]
+
+
+def test_a_floor_finds_its_plane(walk: Path, tmp_path: Path) -> None:
+    import floor_plane
+
+    result = floor_plane.main(walk, tmp_path / "run")
+    normal = np.array(result.report["families"]["floor"]["normal"])
+    assert abs(normal[1]) > 0.99
+    assert _scale_and_error(walk, result.reconstruction.world_T_rigs)[1] < 1e-2
+
+
+def test_tags_set_the_scale(walk: Path, tmp_path: Path) -> None:
+    import april_tags
+
+    result = april_tags.main(walk / "images", walk / "slam.tum", tmp_path / "run", TAG)
+    assert len(result.report["families"]["tags"]) >= 4
+    scale, error = _scale_and_error(walk, result.reconstruction.world_T_rigs)
+    assert scale == pytest.approx(1.0, rel=0.01)
+    assert error < 5e-3
+
+
+def test_jacobians_of_the_examples() -> None:
+    import april_tags
+    import barometer
+    import floor_plane
+
+    rng, values = np.random.default_rng(0), gtsam.Values()
+    x = gtsam.symbol("x", 0)
+    values.insert(x, gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(size=3)), rng.normal(size=3)))
+    values.insert(barometer.B, rng.normal(size=2))
+    values.insert(floor_plane.N, gtsam.Unit3(rng.normal(size=3)))
+    values.insert(floor_plane.D, 0.3)
+    tag = gtsam.symbol("T", 0)
+    values.insert(tag, gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(size=3)), rng.normal(size=3)))
+    one, eight = (gtsam.noiseModel.Isotropic.Sigma(n, 0.1) for n in (1, 8))
+    bearings = rng.normal(size=(4, 3))
+    bearings /= np.linalg.norm(bearings, axis=1)[:, None]
+    corners = april_tags.AprilTags([], 0.2)._error_of([x, tag], bearings)
+    for factor in (
+        gtsam.CustomFactor(one, [x, barometer.B], barometer._error_of(0.4)),
+        gtsam.CustomFactor(one, [x, floor_plane.N, floor_plane.D], floor_plane._error),
+        gtsam.CustomFactor(eight, [x, tag], corners),
+    ):
+        assert max(jacobian_errors(factor, values).values()) < 1e-5
+
+
+def test_examples_are_short() -> None:
+    """At most 80 lines of code each: docstrings, comments and blank lines aside."""
+    for path in EXAMPLES.glob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+            if documented and ast.get_docstring(node):
+                node.body = node.body[1:] or [ast.Pass()]
+        assert len(ast.unparse(tree).split("\n")) <= 80, path
