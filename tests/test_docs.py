@@ -62,7 +62,7 @@ def test_library_and_readme_run(
         names: dict = {"__name__": page.stem}
         exec(compile("\n".join(_blocks(page, "python")), str(page), "exec"), names)
     assert names["settings"].solver.num_threads == 2
-    assert len(names["frames"].names) == len(names["level"](names["result"].coarse)) == NUM_FRAMES
+    assert len(names["frames"].names) == NUM_FRAMES
 
 
 def test_the_readme_is_short() -> None:

@@ -310,18 +310,17 @@ def _linearized(given: CameraSystem) -> _Camera:
     )  # fmt: skip
     places = _places(num, [part.shape[2] for part in by_frame], [p.shape[2] for _, p in shared])
     found, size = system.hessian.tocoo(), DIM * len(keys)
-    rows, columns = found.coords
-    hessian = csr_matrix((found.data, (places[rows], places[columns])), shape=(size, size))
+    at = tuple(places[coordinates] for coordinates in found.coords)
+    hessian = csr_matrix((found.data, at), shape=(size, size))
     gradient = np.zeros(size)
     gradient[places] = system.gradient
     said, longer = given.problem.settings.camera.readout(), None
     if said is not None and values.exists(D(0)):
         longer = said[0] - seeing.readout_s, said[1]
-    terms = given.problem.families.terms(solved, given.problem.maps)
-    values.insert(terms.values)
-    return _Camera(
-        values, keys, hessian, gradient, system.cost, seen.curvature, tuple(own), longer, off, terms
-    )
+    families = given.problem.families.terms(solved, given.problem.maps)
+    values.insert(families.values)
+    known = seen.curvature, tuple(own), longer, off, families
+    return _Camera(values, keys, hessian, gradient, system.cost, *known)
 
 
 def _of_lenses(columns: np.ndarray) -> list[tuple[int, np.ndarray]]:

@@ -53,20 +53,16 @@ def assemble(
     known = refined & (coarse.sources == PoseSource.SLAM)
     known &= True if false_frames is None else ~false_frames
     groups = np.zeros(len(seen), np.int32) if components is None else components
-    placed, points_world = adjustment.world_T_rigs, landmarks.points_world
-    stretch = np.ones((len(seen), 6))
-    if not stays:
-        placed, points_world, stretch = _placed(adjustment, coarse.world_T_rigs, known, groups)
-    rows = keypoints.rows(landmarks.tracks)
-    points = landmarks.tracks.points
+    targets = None if stays else coarse.world_T_rigs
+    placed, points_world, stretch = _placed(adjustment, targets, known, groups)
+    rows, points = keypoints.rows(landmarks.tracks), landmarks.tracks.points
     lengths = np.maximum(np.bincount(points, minlength=len(landmarks.points_world)), 1)
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
     origins = keypoints.origins_of(rows)
     poses = moved_to(adjustment.world_T_rigs[landmarks.tracks.frames], origins)
     errors = angular_errors(poses, landmarks.points_world[points], bearings)
     _require_small(errors)
-    channels = keypoints.colors[rows].T
-    colors = [np.bincount(points, channel, len(lengths)) / lengths for channel in channels]
+    colors = [np.bincount(points, c, len(lengths)) / lengths for c in keypoints.colors[rows].T]
     return Reconstruction(
         placed,
         covariances * stretch[:, :, None] * stretch[:, None, :],
@@ -111,13 +107,13 @@ def _require_small(errors: np.ndarray) -> None:
 
 
 def _placed(
-    adjustment: Solution, target_T_rigs: np.ndarray, known: np.ndarray, groups: np.ndarray
+    adjustment: Solution, target_T_rigs: np.ndarray | None, known: np.ndarray, groups: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses, points, and factors (F, 6) of the standard deviations, each map in its own world.
 
     Args:
         adjustment: the last solution.
-        target_T_rigs: (F, 4, 4) poses that define the worlds.
+        target_T_rigs: (F, 4, 4) poses that define the worlds; None = all stay as they are.
         known: (F,) bool, frames that say where their map goes; all, where fewer than two do.
         groups: (F,) map of each frame, 0 = the largest; a smaller one that does not lie as its
             coarse poses, at no scale, stays as it was solved.
@@ -128,6 +124,8 @@ def _placed(
     poses, landmarks = adjustment.world_T_rigs, adjustment.landmarks
     placed, stretch = np.empty_like(poses), np.ones((len(poses), 6))
     points, hosts = np.empty_like(landmarks.points_world), landmarks.tracks.hosts()
+    if target_T_rigs is None:
+        return poses, landmarks.points_world, stretch
     for group in np.unique(groups):
         inside = groups == group
         chosen = known & inside if np.count_nonzero(known & inside) > 1 else inside

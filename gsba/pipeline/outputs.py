@@ -174,12 +174,15 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
         gps=gps,
         reasons=_reasons(prior),
     )
-    if run.families.members:
-        snapshot = run.families.snapshot(world.solution, prior.parts)
-        of_families = {family.name: family.report(snapshot) for family in run.families.members}
-        report["families"] = plain(of_families)
+    report["families"] = _of_families(run, prior, world)
     report["residual_sphere"] = plain(residual_sphere(result), digits=4)
     return report
+
+
+def _of_families(run: Run, prior: Prior, world: Map) -> dict[str, Any]:
+    """What families of the caller and of packages say of the map, by their names."""
+    snapshot = run.families.snapshot(world.solution, prior.parts)
+    return {family.name: plain(family.report(snapshot)) for family in run.families.members}
 
 
 def _gauge(run: Run, prior: Prior) -> str:

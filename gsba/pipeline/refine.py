@@ -96,8 +96,7 @@ def refine(
         imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
         odometry: follow a video that has no trajectory; None = if it is open which frames to take.
         fresh: forget an earlier run in `out`.
-        families: residuals of your own, see `gsba.Family`; they join all adjustments, beside
-            those that settings.factors names and packages provide.
+        families: residuals of your own, see `gsba.Family`, beside those of settings.factors.
         client: of a Dask scheduler whose workers take what can be shared out; None = threads here.
 
     Raises:
@@ -115,7 +114,6 @@ def refine(
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     lenses = calibration, inputs.given_circles(circles, calibration)
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, *lenses)
-    families = [*families, *inputs.families_of(frame_set, settings)]
     sensors = readings, inputs.positions_of(frame_set, settings)
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
@@ -135,6 +133,7 @@ def _begin(
     fixes: FrameFixes | None,
 ) -> Run:
     """A run on frames that are masked as asked."""
+    families = [*families, *inputs.families_of(frame_set, settings)]
     frame_set, journal = merging.before(store, frame_set, chosen), Journal()
     if chosen.distractors:
         how = settings, journal, families
