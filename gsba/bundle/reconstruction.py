@@ -57,8 +57,7 @@ def assemble(
     placed, points_world, stretch = _placed(adjustment, targets, known, groups)
     rows, points = keypoints.rows(landmarks.tracks), landmarks.tracks.points
     lengths = np.maximum(np.bincount(points, minlength=len(landmarks.points_world)), 1)
-    bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
-    origins = keypoints.origins_of(rows)
+    bearings, origins = keypoints.bearings_rig[rows], keypoints.origins_of(rows)
     poses = moved_to(adjustment.world_T_rigs[landmarks.tracks.frames], origins)
     errors = angular_errors(poses, landmarks.points_world[points], bearings)
     _require_small(errors)
@@ -73,7 +72,7 @@ def assemble(
         points,
         landmarks.tracks.frames,
         bearings,
-        adjustment.noise * sigmas,
+        adjustment.noise * keypoints.sigmas_rad[rows],
         correction,
         components,
         joint_errors and joint_errors.scaled(stretch),
