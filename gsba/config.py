@@ -1,37 +1,14 @@
 """Settings: one frozen model per stage, defaults that run a sensible job with no file."""
 
-import logging
 import os
-from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-logger = logging.getLogger(__name__)
-
-RENAMED = {"align": "patches"}  # sections under names of version 0.1, read until 0.3
 _MAX_FACE, _MAX_SEED = 16_384, 2**31 - 1  # pixels: remapping ends at 32,767
 _CutSize = Annotated[int, Field(ge=64, le=_MAX_FACE)]
 _Text = Annotated[str, Field(min_length=1, pattern=r"^[^\x00]*$")]
-
-
-def renamed(tree: Mapping[str, Any], source: str = "settings") -> dict[str, Any]:
-    """A tree of settings with sections under their names of today; says which were not.
-
-    Raises:
-        ValueError: a section under both.
-    """
-    out = dict(tree)
-    for old, new in RENAMED.items():
-        if old in out:
-            if new in out:
-                raise ValueError(f"{old} is the former name of {new}: keep {new} alone")
-            logger.warning(
-                "%s: %s is now called %s; the old name is read for a while", source, old, new
-            )
-            out[new] = out.pop(old)
-    return out
 
 
 class _Settings(BaseModel):
@@ -547,11 +524,6 @@ class RefineSettings(_Settings):
         unaligned = self.patches.model_copy(update={"rounds": 0})
         families = tuple(name for name in self.factors if name not in self.direct_families())
         return self.model_copy(update={"patches": unaligned, "factors": families})
-
-    @model_validator(mode="before")
-    @classmethod
-    def _old_names(cls, tree: Any) -> Any:
-        return renamed(tree) if isinstance(tree, Mapping) else tree
 
     @model_validator(mode="after")
     def _geometry_first(self) -> "RefineSettings":

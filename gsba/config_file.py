@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from gsba.config import RefineSettings, renamed
+from gsba.config import RefineSettings
 from gsba.log import GsbaError, brief
 
 _NONE = "none"
@@ -28,11 +28,10 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Refi
     Raises:
         GsbaError: unreadable file, unknown key, or a value out of range; says what is allowed.
     """
-    tree = _renamed(_read_toml(path), str(path)) if path else {}
+    tree = _read_toml(path) if path else {}
     _check_keys(tree, RefineSettings, (), str(path))
     for override in overrides:
         keys, value = _parse_override(override)
-        keys = (*_renamed({keys[0]: None}, "--set"), *keys[1:])
         branch: dict[str, Any] = {}
         _put(branch, keys, value)
         _check_keys(branch, RefineSettings, (), "--set")
@@ -52,14 +51,6 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise GsbaError(f"cannot read settings {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:  # of syntax, encoding, digits, nesting
         raise GsbaError(f"{path} is not valid TOML: {error}") from error
-
-
-def _renamed(tree: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """See `gsba.config.renamed`; GsbaError for a section under both names."""
-    try:
-        return renamed(tree, source)
-    except ValueError as error:
-        raise GsbaError(f"{source}: {error}") from None
 
 
 def _parse_override(text: str) -> tuple[tuple[str, ...], Any]:

@@ -159,23 +159,6 @@ def test_images_that_a_format_has_no_place_for_are_refused_early() -> None:
     assert load_config(None, ("export.images=panorama", fitting)).export.images == "panorama"
 
 
-def test_sections_under_their_former_names_are_read(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = tmp_path / "old.toml"
-    path.write_text("[align]\nrounds = 1\npatch_size = 9\n")
-    with caplog.at_level("WARNING"):
-        found = load_config(path, ["align.max_views=3"])
-        library = RefineSettings.model_validate({"align": {"rounds": 0}})
-    assert (found.patches.rounds, found.patches.patch_size, found.patches.max_views) == (1, 9, 3)
-    assert library.patches.rounds == 0
-    said = [record.getMessage() for record in caplog.records]
-    assert len(said) == 3 and all("align is now called patches" in line for line in said)
-    path.write_text("[align]\nrounds = 1\n[patches]\nrounds = 2\n")
-    with pytest.raises(GsbaError, match="align is the former name of patches"):
-        load_config(path)
-
-
 @pytest.mark.parametrize("iterations", ["0", "10000001", "1" + 20 * "0"])
 def test_no_training_takes_for_ever(iterations: str) -> None:
     with pytest.raises(GsbaError, match=r"--iterations \d+: Input should be (less|greater)"):

@@ -164,7 +164,7 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
     counts, frames = dict(run.journal.counts), run.frames
     n, best = 0, None  # the pass before: what it rests on, steps without matches, its result
     while True:
-        name, after, better = f"recalibrated{n}", run.chain.latest, None
+        name, after, better = f"recut{n}", run.chain.latest, None
         kept = run.store.stored(f"{name}_undone", known, bool, after)
         if frames.fisheyes is not None and not kept:
             better = run.store.stored(name, known, _Cut, after)
@@ -174,7 +174,7 @@ def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run
             unseen = int(believed.trust.unseen_steps.sum())
             if best is not None and unseen > best[1]:
                 logger.info("frames cut anew match at fewer steps: the pass before is kept")
-                run.store.stage(f"recalibrated{n - 1}_undone", known, lambda: True, bool, best[0])
+                run.store.stage(f"recut{n - 1}_undone", known, lambda: True, bool, best[0])
                 return best[2]
             best = after, unseen, (run, seen, believed, world)
             better = None if kept or n == _PASSES - 1 else _cut_better(prior.coarse, world)

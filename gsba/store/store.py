@@ -79,6 +79,7 @@ class RunStore:
     ) -> None:
         self.root = root
         self.records: dict[str, StageRecord] = {}  # stages of this call, in order
+        self._types: dict[str, object] = {}  # of results, by the stage's name
         self._prefix = ""
         self._lock = open_run_folder(root, origin, fresh)
         try:
@@ -121,9 +122,14 @@ class RunStore:
             compute: makes the result; called without arguments.
             returns: type of the result, a record of gsba.types or a tuple of such.
             after: names of earlier stages of this call whose results `compute` uses.
+
+        Raises:
+            ValueError: a stage of this call has this name and another type of result.
         """
         key = self._key(name, settings, after)
         name = self._prefix + name
+        if self._types.setdefault(name, returns) is not returns:
+            raise ValueError(f"stage {name} has results of two types: name one of them otherwise")
         path = _stage_path(self.root, name)
         stored = _load_if_current(path, key, returns)
         if stored is not None:

@@ -319,6 +319,13 @@ def test_fresh_stays_inside_the_run(tmp_path: Path) -> None:
     assert (tmp_path / "mine.txt").exists()
 
 
+def test_a_name_for_results_of_two_types_is_refused(tmp_path: Path) -> None:
+    with RunStore(tmp_path / "run", {}) as store:
+        store.stage("a", 1, _tracks, Tracks)
+        with pytest.raises(ValueError, match="stage a has results of two types"):
+            store.stage("a", 2, lambda: Counts(1, 1, "frames"), Counts)
+
+
 def test_load_stage_reads_a_finished_run(tmp_path: Path) -> None:
     _run(tmp_path / "run", _Calls())
     assert load_stage(tmp_path / "run", "b", Tracks).num_points == 4
