@@ -158,7 +158,7 @@ class SplatBlock:
         residuals, jacobian, trust = self._residuals(f, pose, True)
         squared = residuals**2
         shares = trust / self.correlation
-        weights = shares * _weights(self.loss, squared)
+        weights = shares * self.loss.weights(squared)
         weighted = jacobian * weights[:, None]
         cost = float(shares @ self.loss.rho(squared))
         return weighted.T @ jacobian, weighted.T @ residuals, cost
@@ -227,18 +227,6 @@ def _exposure(rendered: np.ndarray, captured: np.ndarray) -> tuple[float, float]
         weighted = columns / (1 + (residuals / scale) ** 2)[:, None]
         solution = np.linalg.lstsq(weighted.T @ columns, weighted.T @ captured, rcond=None)[0]
     return float(solution[0]), float(solution[1])
-
-
-def _weights(loss: RobustLoss, squared: np.ndarray) -> np.ndarray:
-    """Weights 2 rho' (N,) of squared whitened residuals (N,)."""
-    c2 = loss.scale**2
-    if loss.kind == "huber":
-        return np.where(squared > c2, loss.scale / np.sqrt(np.maximum(squared, c2)), 1.0)
-    if loss.kind == "cauchy":
-        return c2 / (c2 + squared)
-    if loss.kind == "geman_mcclure":
-        return (c2 / (c2 + squared)) ** 2
-    return np.ones_like(squared)
 
 
 @_part
