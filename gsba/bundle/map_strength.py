@@ -74,7 +74,7 @@ def measure(
     weak = np.convolve(poor, reach)[closer.reach : closer.reach + num] > 0
     held = seen & _held(world_T_rigs, covariances, joint, priors)
     noise = _noise(world_T_rigs, coarse_world_T_rigs, held & believed, priors)
-    counts = Counts(num, int(weak.sum()), "frames", {"held well": int((~weak).sum())})
+    counts = Counts(num, int((~weak).sum()), "frames", {"held loosely": int(weak.sum())})
     return MapStrength(sigmas, drift, weak, held, noise, counts)
 
 

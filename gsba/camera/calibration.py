@@ -45,9 +45,10 @@ def read_calibration(path: Path) -> Pair:
         pair = from_colmap_model(path) if path.is_dir() else _of_tree(_tree(path), path)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-        raise GsbaError(
-            f"{path}: not a calibration of two lenses ({kind}{_one_line(error)}); {_WANTED}"
-        ) from None
+        why = kind + _one_line(error)
+        if isinstance(error, KeyError):
+            why = f"it has no {error}"
+        raise GsbaError(f"{path}: not a calibration of two lenses ({why}); {_WANTED}") from None
     try:
         return _centred(pair)
     except ValueError as error:

@@ -122,8 +122,6 @@ def _calibration(
 def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[str, Any]:
     """The content of report.json."""
     frames, coarse, journal = run.frames, prior.coarse, run.journal
-    undone = [n for n, rounds in journal.rounds.items() if not all(r.accepted for r in rounds)]
-    undone += [name for name in journal.undone if name not in undone]
     trajectory, notes = findings.of_trajectory(
         prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.absent
     )
@@ -155,7 +153,7 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
         gps, more = of_gps(run.fixes, anchors, poses, frames)
         notes += more
     most = run.settings.closer.max_scale_sigma
-    notes += findings.of_frames(frames, coarse, result, undone, world.frame_weights, most)
+    notes += findings.of_frames(frames, coarse, result, world.frame_weights, most)
     report = build_report(
         settings=run.settings,
         frames=frames,

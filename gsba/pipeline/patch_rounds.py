@@ -172,7 +172,6 @@ def _adjust_aligned(run: Run, prior: Prior, world: Map, sighted: Sighted, name: 
     key = [run.solving_key(), gates]
     solved, keypoints = run.stage(name, key, compute, tuple[Solution, Keypoints])
     if not solved.carries(world.solution, run.settings.rounds.min_observations):
-        run.journal.undo(name)
         return None
     shown = {"aligned": sighted.aligned, "normals_rig": sighted.normals_rig}
     return replace(world, solution=solved, observed=keypoints, **shown)
@@ -201,7 +200,6 @@ def _straighten(run: Run, prior: Prior, world: Map, sighted: Sighted, number: in
     if not found.field:
         return replace(world, stitching=found)
     if not found.adjustment.carries(world.solution, settings.rounds.min_observations):
-        run.journal.undo(name)
         return world
     if world.stitching is not None:  # what it gained is known best from where none was
         found = replace(found, part_gains=world.stitching.part_gains)

@@ -36,7 +36,6 @@ class Journal:
 
     counts: dict[str, list[Counts]] = field(default_factory=dict)  # by stage
     rounds: dict[str, tuple[Round, ...]] = field(default_factory=dict)  # of adjustment, by stage
-    undone: list[str] = field(default_factory=list)  # stages whose result was not taken
 
     def note(self, name: str, result: object) -> None:
         """Write down what a stage's result says of itself."""
@@ -48,10 +47,6 @@ class Journal:
             self.counts[name] = [counts] if isinstance(counts, Counts) else list(counts)
         if rounds:
             self.rounds[name] = rounds
-
-    def undo(self, name: str) -> None:
-        """Write down that a stage's result was not taken."""
-        self.undone.append(name)
 
 
 @dataclass(frozen=True, slots=True)

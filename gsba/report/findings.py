@@ -16,6 +16,7 @@ from gsba.types import CoarsePoses, FrameSet, PoseSource, PoseStatus, Reconstruc
 
 logger = logging.getLogger(__name__)
 
+_NAMED = 5  # frames in a line of the log
 _MANY = 0.1  # part of a trajectory's steps: contradicted, the rest of it is in doubt, too
 
 
@@ -161,14 +162,12 @@ def of_frames(
     frames: FrameSet,
     coarse: CoarsePoses,
     reconstruction: Reconstruction,
-    undone: Sequence[str],
     frame_weights: np.ndarray,
     max_scale_sigma: float,
 ) -> list[str]:
-    """What the user should know about a run, also logged as warnings.
+    """What the user should know about a run; warnings of the log name few frames of many.
 
     Args:
-        undone: stages in which a round of bundle adjustment was undone.
         frame_weights: (F,) of each frame's pixels, below 1 where they contradict the others.
         max_scale_sigma: of a step's length over the one before it; above, a place is named.
     """
@@ -176,26 +175,29 @@ def of_frames(
     filled = np.flatnonzero((coarse.sources != PoseSource.SLAM) & ~absent)
     unrefined = reconstruction.pose_statuses == PoseStatus.UNREFINED
     lost = np.flatnonzero(unrefined & (reconstruction.map_numbers() > 0))
+    doubted = np.flatnonzero(frame_weights < 1)
+    weak = _weak_places(reconstruction, max_scale_sigma)
+    uncertain = (
+        f"the scale is uncertain by more than {max_scale_sigma:.2%} where few points are seen from "
+        "three frames"
+    )
     notes = []
     if absent.all():
         notes.append("no trajectory: started from the images alone, in units of their own")
     if coarse.time_offset:
         notes.append(f"frame times were shifted by {coarse.time_offset:.6f} s")
-    if len(filled):
-        notes.append(f"no SLAM pose, started from neighbours: {_names(frames, filled)}")
-    if len(lost):
-        notes.append(f"matched nothing, held by the trajectory alone: {_names(frames, lost)}")
-    if undone:
-        notes.append(f"rounds were undone in {', '.join(undone)}: they explained less")
-    if len(doubted := np.flatnonzero(frame_weights < 1)):
-        notes.append(f"pixels fit badly and were weighted down: {_names(frames, doubted)}")
-    if len(weak := _weak_places(reconstruction, max_scale_sigma)):
-        notes.append(
-            f"the scale may change here by more than {max_scale_sigma:.2%}, as images hold it "
-            f"loosely: {_names(frames, weak)}"
-        )
     for note in notes:
         logger.warning(note)
+    for what, rows in (
+        ("no SLAM pose, started between neighbours", filled),
+        ("no matches, the pose comes from the trajectory", lost),
+        ("pixels fit badly and were weighted down", doubted),
+        (uncertain, weak),
+    ):
+        if len(rows):
+            names = [frames.names[f] for f in rows]
+            notes.append(f"{what}: {', '.join(names)}")
+            logger.warning("%s: %s", what, _brief(names, len(frames)))
     return notes
 
 
@@ -207,7 +209,8 @@ def _weak_places(reconstruction: Reconstruction, max_scale_sigma: float) -> np.n
     return 1 + np.flatnonzero(scale_sigmas(poses, joint.draws) > max_scale_sigma)
 
 
-def _names(frames: FrameSet, chosen: np.ndarray) -> str:
-    """The first twenty names, and how many more."""
-    names = ", ".join(frames.names[f] for f in chosen[:20])
-    return names if len(chosen) <= 20 else f"{names} and {len(chosen) - 20} more"
+def _brief(names: Sequence[str], num_frames: int) -> str:
+    """The names of a few frames; of more, how many they are and where all are listed."""
+    if len(names) <= _NAMED:
+        return ", ".join(names)
+    return f"{len(names)} of {num_frames} frames, listed in report.json"

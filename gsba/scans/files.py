@@ -229,7 +229,8 @@ def _of_laser(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         seen = ("red", "green", "blue") if {"red", "green", "blue"} <= names else ("intensity",) * 3
         colors = np.stack([np.asarray(file[name], np.float64) for name in seen], axis=1)
     except Exception as error:  # of the parser, each in its own words
-        raise GsbaError(f"{path}: cannot be read ({error})") from None
+        why = " ".join(str(error).split()) or "damaged, or cut short"
+        raise GsbaError(f"{path}: cannot be read ({why})") from None
     return points, colors / max(colors.max(initial=0), 1.0)
 
 

@@ -263,8 +263,8 @@ def test_kalibr_omni_is_refused_where_it_is_not(tmp_path: Path, distortion: list
 
 
 BAD_OURS = {
-    "no lens": (lambda t: t["lenses"].pop("back"), "KeyError: 'back'"),
-    "no focal length": (lambda t: t["lenses"]["back"].pop("f"), "KeyError: 'f'"),
+    "no lens": (lambda t: t["lenses"].pop("back"), "it has no 'back'"),
+    "no focal length": (lambda t: t["lenses"]["back"].pop("f"), "it has no 'f'"),
     "of text": (lambda t: t["lenses"]["back"].update(f="wide"), "could not convert"),
     "no number": (lambda t: t["lenses"]["back"].update(f=float("nan")), "are to be numbers"),
     "endless": (lambda t: t["lenses"]["back"].update(width=1e999), "OverflowError"),
@@ -292,7 +292,7 @@ BAD_OURS = {
         lambda t: t["lenses"]["back"].update(rig_T_lens=np.eye(4).tolist()),
         "the front lens is to look along z of the rig and the back one the other way",
     ),
-    "something else": (lambda t: t.pop("lenses"), "KeyError: 'lenses'.*Kalibr camchain"),
+    "something else": (lambda t: t.pop("lenses"), "it has no 'lenses'.*Kalibr camchain"),
 }
 
 
@@ -326,7 +326,7 @@ BAD_KALIBR = {
     "no focal length": (lambda t: t["cam1"].update(intrinsics=[0, 66, 120, 120]), "above 0"),
     "few intrinsics": (lambda t: t["cam1"].update(intrinsics=[70, 120, 120]), "4 intrinsics"),
     "few terms": (lambda t: t["cam0"].update(distortion_coeffs=[0, 0]), "4 distortion_coeffs"),
-    "no motion": (lambda t: t["cam1"].pop("T_cn_cnm1"), "KeyError: 'T_cn_cnm1'"),
+    "no motion": (lambda t: t["cam1"].pop("T_cn_cnm1"), "it has no 'T_cn_cnm1'"),
     "no camera": (lambda t: t.update(cam1=None), "TypeError"),
     "scaled": (
         lambda t: t["cam1"].update(T_cn_cnm1=(2 * np.eye(4)).tolist()),

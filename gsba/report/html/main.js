@@ -151,7 +151,7 @@ function stages() {
         make("td", {}, i ? "" : stage.name + (stage.workers ? `, ${stage.workers} workers` : "")), make("td", { class: "n" }, i ? "" : stage.seconds.toFixed(1)),
         make("td", {}, i ? "" : make("div", { class: "bar" }, make("i", { style: `width:${100 * stage.seconds / longest}%` }))),
         make("td", { class: "n" }, c ? `${num(c.received)} ${c.unit}` : ""), make("td", { class: "n" }, c ? num(c.kept) : ""),
-        make("td", {}, dropped || (c && c.received > c.kept ? `${num(c.received - c.kept)}, no reason given` : ""))));
+        make("td", {}, dropped)));
     });
   }
 }
