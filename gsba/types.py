@@ -285,6 +285,13 @@ class VerifiedPairs:
         """The frames of each pair."""
         return {(int(f0), int(f1)) for f0, f1 in self.matches.pairs}
 
+    def within(self, pieces: np.ndarray | None) -> "VerifiedPairs":
+        """Pairs whose frames are of one piece (F,) int; None = there is one."""
+        if pieces is None:
+            return self
+        f0, f1 = self.matches.pairs.T
+        return self.taken(np.flatnonzero(pieces[f0] == pieces[f1]).tolist())
+
     def missing(self, chosen: np.ndarray) -> np.ndarray:
         """Those of some pairs (P, 2) that are not among these."""
         present = self.frames()

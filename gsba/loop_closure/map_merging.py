@@ -379,7 +379,11 @@ class _Joining:
         return True
 
     def result(self) -> Registered:
-        """The map as it is now; a frame in no part of it is apart, beside the one before it."""
+        """The map as it is now, each map in the world of its earliest part.
+
+        A frame in no part of it is apart, beside the one before it.
+        """
+        self._keep_earliest_worlds()
         lost, maps = self.components < 0, int(self.components.max()) + 1
         for n, f in enumerate(np.flatnonzero(lost).tolist()):
             placed = np.flatnonzero(~lost)
@@ -406,6 +410,16 @@ class _Joining:
             Counts(num - 1, kept, "parts", dropped),
             reasons,
         )
+
+    def _keep_earliest_worlds(self) -> None:
+        """Carry each map to where its earliest part was before parts were joined."""
+        for component in range(int(self.components.max()) + 1):
+            rows = np.flatnonzero(self.components == component)
+            parts = rows[self.met[rows] & ~self.alone[rows]]
+            back = self.moves[int(parts[0])].inverse()
+            self.poses[rows] = back.poses(self.poses[rows])
+            for f in rows:
+                self.moves[f] = back.after(self.moves[f])
 
     def _reasons(self, order: np.ndarray) -> tuple[str, ...]:
         """Why each map (order: (F,) number of each frame's) was not joined to a larger one."""

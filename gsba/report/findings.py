@@ -10,7 +10,7 @@ from gsba.bundle.map_strength import scale_sigmas
 from gsba.bundle.stitching import Stitching
 from gsba.loop_closure.merged_map import Registered
 from gsba.trajectory.clock import ClockEstimate
-from gsba.trajectory.joining import Joint
+from gsba.trajectory.joining import GUESS, Joint
 from gsba.trajectory.judgement import Trust
 from gsba.types import CoarsePoses, FrameSet, PoseSource, PoseStatus, Reconstruction
 
@@ -96,10 +96,10 @@ def _maps(
         for joint in joints
     ]
     for joint in joints:
-        notes.append(
-            f"the trajectory begins anew at {names[joint.first]}: joined by {joint.how}, "
-            f"scale {joint.scale:.4g}"
-        )
+        told = f"joined by {joint.how}, scale {joint.scale:.4g}"
+        if joint.how == GUESS:
+            told = "no images tell how this piece lies to the others"
+        notes.append(f"the trajectory begins anew at {names[joint.first]}: {told}")
     judgement: dict[str, Any] = {"joints": pieces} if pieces else {}
     if registered is None:
         return judgement, notes
