@@ -16,7 +16,7 @@ from gsba.trajectory.judgement import Trust
 from gsba.trajectory.steps import Steps, image_steps, length_ratios, off_steps
 from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
 
-_PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
+PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
 _WIDER = 2, 4, 8  # frames
 _MANY_LOST = 0.2  # part of the neighbours
 
@@ -62,7 +62,7 @@ def recover(
     chosen = _of_one_piece(pairs.adjacent(len(coarse.sources)), coarse)
     guided = guided.within(coarse.segments)
     intervals = np.diff(timestamps)
-    close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
+    close = np.flatnonzero(intervals <= PAUSE * np.median(intervals))
     lost = guided.missing(_of_one_piece(np.column_stack([close, close + 1]), coarse))
     alone = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
     alone = _with_wider(context, alone)
@@ -147,7 +147,7 @@ def check_clock(
         GsbaError: it is reversed, mirrored, inverted or in other axes.
     """
     settings, intervals = context.settings, np.diff(timestamps)
-    close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
+    close = np.flatnonzero(intervals <= PAUSE * np.median(intervals))
     chosen = np.column_stack([close, close + 1])
     lost = guided.missing(chosen)
     if len(lost) > _MANY_LOST * len(chosen):
