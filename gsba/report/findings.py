@@ -177,6 +177,11 @@ def of_frames(
     unrefined = reconstruction.pose_statuses == PoseStatus.UNREFINED
     lost = np.flatnonzero(unrefined & (reconstruction.map_numbers() > 0))
     notes = []
+    if len(fetched := np.flatnonzero(frames.fetched)):
+        notes.append(
+            f"{len(fetched)} more frames of the video were fetched where the map was weak, and are "
+            f"left out of datasets unless export.fetched = true: {_names(frames, fetched)}"
+        )
     if absent.all():
         notes.append("no trajectory: started from the images alone, in units of their own")
     if coarse.time_offset:
