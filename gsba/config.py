@@ -74,9 +74,9 @@ class OdometrySettings(_Settings):
     max_frames: int | None = Field(default=None, ge=3)  # chosen, by longer steps; None = no limit
     fetch_rounds: int = Field(default=3, ge=0)  # in which more frames are fetched, where the map of
     # those that were chosen is weak; 0 = none are
-    max_scale_sigma: float = Field(
-        default=0.02, gt=0
-    )  # of a step's length over the one before, relative; above, frames are fetched there
+    max_drift: float = Field(
+        default=3e-4, gt=0
+    )  # predicted error of positions, part of the path; in maps above it, frames are fetched
 
 
 class CubemapSettings(_Settings):

@@ -23,7 +23,7 @@ from gsba.types import FrameSet
 logger = logging.getLogger(__name__)
 
 FOLDER = Path("fetched")  # in a run's folder: frames fetched in each round
-_MAX_SHARE = 1.0  # fetched frames, part of those that were chosen
+_MAX_SHARE = 3.0  # fetched frames, part of those that were chosen
 
 
 def fetch_where_weak(
@@ -67,15 +67,23 @@ def fetch_where_weak(
 
 
 def weak_steps(prior: Prior, settings: OdometrySettings) -> np.ndarray:
-    """Steps (F - 1,) bool from frame to frame that images hold poorly, or do not show."""
+    """Steps (F - 1,) bool between frames that images hold poorly, or do not show.
+
+    These are steps that no image shows or that nothing ties together; and of maps that drift, those
+    that hand on the scale less well than half of them do.
+    """
     weak = prior.trust.unseen_steps.copy()
     if prior.merged is not None:
         weak |= np.diff(prior.merged.components) != 0
         weak |= prior.merged.lost[:-1] | prior.merged.lost[1:]
     if prior.strength is not None:
-        poor = np.nan_to_num(prior.strength.scale_sigmas) > settings.max_scale_sigma
-        weak[:-1] |= poor
-        weak[1:] |= poor
+        maps = np.zeros(len(weak) + 1, np.int64) if prior.parts is None else prior.parts
+        sigmas = np.pad(prior.strength.scale_sigmas, 1, constant_values=np.nan)
+        for number in np.flatnonzero(prior.strength.drift > settings.max_drift).tolist():
+            known = (maps == number) & np.isfinite(sigmas)
+            if known.any():
+                poor = known & (sigmas >= np.median(sigmas[known]))
+                weak |= poor[:-1] | poor[1:]
     return weak
 
 
@@ -121,6 +129,9 @@ def _with_rows(
     """Frames, and rows (N,) of the odometry besides, extracted to a folder of their own."""
     folder, before = store.root / FOLDER / f"{number}", store.root / "frames"
     at = store.root / FOLDER / f"{number}.tum"
+    if len(rows) == 1:  # a file of poses has two at least: one that is there already goes with it
+        known = int(np.argmin(np.abs(walk.timestamps - frames.timestamps[0])))
+        rows = np.unique([known, *rows])
     write_chosen(walk, rows, at)
     asked = settings.video.model_copy(
         update={"at": str(at), "sharpest": False, "every": None, "standing_deg": 0.0}
@@ -128,12 +139,11 @@ def _with_rows(
     video.extract(video_file, folder, asked, replace=True)
     store.claim(store.root / FOLDER)
     like = [path.relative_to(before.absolute()).parent for path in frames.paths[0]]
-    table = {
+    found = {
         Path(row.name or "").stem: row.timestamp for row in read_times(folder / "timestamps.csv")
     }
-    new = {
-        name: tuple((folder / part / f"{name}.jpg").absolute() for part in like) for name in table
-    }
+    table = {name: time for name, time in found.items() if name not in frames.names}
+    new = {n: tuple((folder / part / f"{n}.jpg").absolute() for part in like) for n in table}
     names, times = (*frames.names, *table), [*frames.timestamps.tolist(), *table.values()]
     order = np.argsort(times, kind="stable")
     paths = (*frames.paths, *new.values())
