@@ -50,6 +50,11 @@ class OdometrySettings(_Settings):
     )  # from one chosen frame to the next, part of the distance of things
     max_turn_deg: float = Field(default=40.0, gt=0)  # from one chosen frame to the next
     max_frames: int | None = Field(default=None, ge=3)  # chosen, by longer steps; None = no limit
+    fetch_rounds: int = Field(default=3, ge=0)  # in which more frames are fetched, where the map of
+    # those that were chosen is weak; 0 = none are
+    max_drift: float = Field(
+        default=3e-4, gt=0
+    )  # predicted error of positions, part of the path; in maps above it, frames are fetched
 
 
 class CubemapSettings(_Settings):
@@ -388,6 +393,7 @@ class ExportSettings(_Settings):
     images: Literal["auto", "cube", "lenses", "fisheye", "panorama"] = "auto"  # six faces as seen
     # from one centre, ten of one lens each where two are known, raw fisheyes as they are, panoramas
     # at the map's depth; auto: cube, of raw fisheyes lenses
+    fetched: bool = False  # datasets hold the frames, too, that were fetched where the map was weak
 
     @model_validator(mode="after")
     def _images_fit(self) -> "ExportSettings":

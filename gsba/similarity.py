@@ -38,6 +38,15 @@ class Sim3:
         """Rotation and translation, without the scale, as a pose (4, 4)."""
         return pose(self.rotation, self.translation)
 
+    def inverse(self) -> "Sim3":
+        """From the new world to the old one."""
+        rotation = self.rotation.T
+        return Sim3(1 / self.scale, rotation, -rotation @ self.translation / self.scale)
+
+    def after(self, first: "Sim3") -> "Sim3":
+        """The change of world `first`, and then this one."""
+        return Sim3.of(self.scale * first.scale, self.poses(first.new_T_old))
+
     def points(self, old: np.ndarray) -> np.ndarray:
         """Points (N, 3) of the old world in the new one."""
         return self.scale * old @ self.rotation.T + self.translation

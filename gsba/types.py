@@ -86,6 +86,10 @@ class FrameSet:
         False  # whether these are but a start: plain lenses in image circles, the
     )
     # maker's calibration of another day, or a calibration that pictures contradict
+    fetched: tuple[
+        bool, ...
+    ] = ()  # (F,) frames of a video that strengthen the map where those that
+    # were chosen left it weak: datasets go without them; () = none
 
     def __post_init__(self) -> None:
         for name in self.names:
@@ -97,6 +101,10 @@ class FrameSet:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def chosen(self) -> np.ndarray:
+        """Frames (F',) int64 that datasets are made of: those that were not fetched."""
+        return np.flatnonzero(~np.array(self.fetched or (False,) * len(self), bool))
 
     @property
     def panoramic(self) -> bool:
@@ -131,6 +139,7 @@ class FrameSet:
             paths=paths,
             timestamps=self.timestamps[rows],
             mask_paths=mask_paths,
+            fetched=tuple(self.fetched[f] for f in rows) if self.fetched else (),
         )
 
 
@@ -284,6 +293,13 @@ class VerifiedPairs:
     def frames(self) -> set[tuple[int, int]]:
         """The frames of each pair."""
         return {(int(f0), int(f1)) for f0, f1 in self.matches.pairs}
+
+    def within(self, pieces: np.ndarray | None) -> "VerifiedPairs":
+        """Pairs whose frames are of one piece (F,) int; None = there is one."""
+        if pieces is None:
+            return self
+        f0, f1 = self.matches.pairs.T
+        return self.taken(np.flatnonzero(pieces[f0] == pieces[f1]).tolist())
 
     def missing(self, chosen: np.ndarray) -> np.ndarray:
         """Those of some pairs (P, 2) that are not among these."""

@@ -47,6 +47,7 @@ def export(
     images: str = "auto",
     workers: Workers | None = None,
     map_number: int = 1,
+    fetched: bool = False,
 ) -> None:
     """Write a reconstruction in another program's format, all frames of one of its maps.
 
@@ -66,6 +67,7 @@ def export(
             alone, else faces.
         workers: who write pictures; None = threads here.
         map_number: which map of a reconstruction that holds several, 1 = the largest.
+        fetched: write the frames, too, that were fetched where the map was weak (see `FrameSet`).
 
     Raises:
         GsbaError: `out` is in use or not seen by a worker, the format does not fit the frames,
@@ -73,7 +75,7 @@ def export(
             export goes on where it was when it is called again in the same way.
     """
     given = reconstruction, frames, {to: out}, face_size, placement, link, lenses, images
-    export_all(*given, workers, map_number)
+    export_all(*given, workers, map_number, fetched)
 
 
 def export_all(
@@ -87,13 +89,14 @@ def export_all(
     images: str = "auto",
     workers: Workers | None = None,
     map_number: int = 1,
+    fetched: bool = False,
 ) -> None:
     """As `export`, in several formats at once: every picture is read, cut and encoded once.
 
     Args:
         outs: folder of each format.
-        reconstruction, frames, face_size, placement, link, lenses, images, workers, map_number: as
-            of `export`.
+        reconstruction, frames, face_size, placement, link, lenses, images, workers, map_number,
+            fetched: as of `export`.
 
     Raises:
         GsbaError: as of `export`; none of the folders is written then.
@@ -104,6 +107,10 @@ def export_all(
     reconstruction, frames = one_map(whole, frames, map_number, "the reconstruction")
     if lenses:
         lenses = lenses_of_map(lenses, whole, map_number)
+    if not fetched and any(frames.fetched):
+        rows = frames.chosen()
+        reconstruction, frames = reconstruction.taken(rows), frames.taken(rows)
+        lenses = lenses.taken(rows)
     unrefined = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
     if len(unrefined):
         names = ", ".join(frames.names[f] for f in unrefined[:5])

@@ -14,6 +14,7 @@ import numpy as np
 
 from gsba.geometry import angles_between, inverse, unit
 from gsba.loop_closure import join_evidence, loops
+from gsba.loop_closure.break_crossing import agreed, crossing
 from gsba.loop_closure.connectivity import by_size
 from gsba.loop_closure.join_evidence import JoinEvidence, Places, Rates, around
 from gsba.loop_closure.map_similarity import Meeting, Proposal, alike, propose, refined
@@ -182,7 +183,7 @@ class _Joining:
         if meetings and found is None:  # too few of them, perhaps: look around the best
             meetings += self._meetings(self.context, self._around(meetings, rows, inside, chosen))
             found = self._best(part, meetings, rows, inside)
-        return found
+        return found or self._over_break(rows, inside)
 
     def _best(
         self, part: int, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray
@@ -216,6 +217,31 @@ class _Joining:
         if why.confirmed and not any(rivals):
             return best.move
         self.reasons[part] = "it fits two places alike" if why.confirmed else f"doubtful: {why}"
+        return None
+
+    def _over_break(self, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
+        """The similarity that several pairs of frames over a short break in time agree on, unless
+        what is around refutes it; None if the part is not next to the map in time.
+
+        The camera cannot have gone far in between, so that a look-alike is no danger here.
+        """
+        intervals = np.diff(self.times)
+        for f in np.flatnonzero(intervals <= recovery.PAUSE * np.median(intervals)).tolist():
+            if not ((f in rows and f + 1 in inside) or (f in inside and f + 1 in rows)):
+                continue
+            before, after = (rows, inside) if f in rows else (inside, rows)
+            ends = before[before <= f][-_BESIDE:], after[after > f][:_BESIDE]
+            chosen = np.array([(a, b) for a in ends[0] for b in ends[1] if b - a <= _BESIDE])
+            pairs = recovery.match_anywhere(self.context, chosen)
+            given = pairs, self.context.keypoints, self.poses, self.known, rows
+            best = agreed(crossing(*given), self.poses, self.depth)
+            if best is None or (self._held(rows) and not self._plausible(best)):
+                continue
+            own, theirs = ends if f in rows else ends[::-1]
+            evidence = self._weigh(own, theirs, best.move)[0]
+            logger.info("a part of %d frames goes on at a break: %s", len(rows), evidence)
+            if not evidence.refuted:
+                return best.move
         return None
 
     def _judged(
@@ -379,7 +405,11 @@ class _Joining:
         return True
 
     def result(self) -> Registered:
-        """The map as it is now; a frame in no part of it is apart, beside the one before it."""
+        """The map as it is now, each map in the world of its earliest part.
+
+        A frame in no part of it is apart, beside the one before it.
+        """
+        self._keep_earliest_worlds()
         lost, maps = self.components < 0, int(self.components.max()) + 1
         for n, f in enumerate(np.flatnonzero(lost).tolist()):
             placed = np.flatnonzero(~lost)
@@ -406,6 +436,16 @@ class _Joining:
             Counts(num - 1, kept, "parts", dropped),
             reasons,
         )
+
+    def _keep_earliest_worlds(self) -> None:
+        """Carry each map to where its earliest part was before parts were joined."""
+        for component in range(int(self.components.max()) + 1):
+            rows = np.flatnonzero(self.components == component)
+            parts = rows[self.met[rows] & ~self.alone[rows]]
+            back = self.moves[int(parts[0])].inverse()
+            self.poses[rows] = back.poses(self.poses[rows])
+            for f in rows:
+                self.moves[f] = back.after(self.moves[f])
 
     def _reasons(self, order: np.ndarray) -> tuple[str, ...]:
         """Why each map (order: (F,) number of each frame's) was not joined to a larger one."""

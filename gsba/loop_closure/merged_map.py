@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.similarity import Sim3
-from gsba.trajectory.joining import GUESS, PLACES, Joint
+from gsba.trajectory.joining import PLACES, Joint
 from gsba.trajectory.judgement import Trust
 from gsba.types import CoarsePoses, Counts, PoseSource, Solution
 
@@ -14,7 +14,7 @@ from gsba.types import CoarsePoses, Counts, PoseSource, Solution
 class Registered:
     """A map whose parts were joined as far as they meet."""
 
-    solved: Solution
+    solved: Solution  # each map in the world of its earliest part
     components: np.ndarray  # (F,) int32, map of each frame, 0 = the largest
     scales: np.ndarray  # (F,) float64: each frame was carried by scale * R @ x + t
     moves: np.ndarray  # (F, 4, 4) float64, R and t
@@ -56,13 +56,14 @@ def follow(
     if (coarse.sources == PoseSource.NONE).all():
         return replace(coarse, world_T_rigs=placed), trust, joints
     poses, followed = coarse.world_T_rigs.copy(), []
+    in_main = registered.met & ~registered.alone & (registered.components == 0)
     for joint in joints:
         rows = np.arange(joint.first, joint.last + 1)
-        known = rows[registered.met[rows] & ~registered.alone[rows]]
-        if joint.how == GUESS and len(known) and registered.components[known[0]] == 0:
+        known = rows[in_main[rows]]
+        if len(known) and np.count_nonzero(in_main) > len(known):
             move = registered.move(int(known[0]))
-            poses[rows], world_T_own = move.poses(poses[rows]), move.poses(joint.world_T_own)
-            scale = move.scale * joint.scale
-            joint = replace(joint, scale=scale, world_T_own=world_T_own, how=PLACES)
+            poses[rows] = move.poses(poses[rows])
+            own = move.after(Sim3.of(joint.scale, joint.world_T_own))
+            joint = replace(joint, scale=own.scale, world_T_own=own.new_T_old, how=PLACES)
         followed.append(joint)
     return replace(coarse, world_T_rigs=poses), trust, tuple(followed)

@@ -16,7 +16,7 @@ from gsba.trajectory.judgement import Trust
 from gsba.trajectory.steps import Steps, image_steps, length_ratios, off_steps
 from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
 
-_PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
+PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
 _WIDER = 2, 4, 8  # frames
 _MANY_LOST = 0.2  # part of the neighbours
 
@@ -45,6 +45,10 @@ def recover(
     does not mislead. Frames two apart, or with a pause between them, where it does, are only
     matched along the steps found or the trajectory.
 
+    Frames of two pieces of the trajectory are not compared here. Two views have no scale of their
+    own, and what both show may ride along with the camera or be far away: how two pieces lie to
+    one another is for `gsba.loop_closure.map_merging` to decide, from points that both know.
+
     Args:
         context: of the run.
         guided: neighbours verified under the trajectory's guidance; all of them where it is right.
@@ -55,15 +59,16 @@ def recover(
         GsbaError: the images contradict most of the trajectory.
     """
     settings, keypoints = context.settings, context.keypoints
-    chosen = pairs.adjacent(len(coarse.sources))
+    chosen = _of_one_piece(pairs.adjacent(len(coarse.sources)), coarse)
+    guided = guided.within(coarse.segments)
     intervals = np.diff(timestamps)
-    close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
-    lost = guided.missing(np.column_stack([close, close + 1]))
+    close = np.flatnonzero(intervals <= PAUSE * np.median(intervals))
+    lost = guided.missing(_of_one_piece(np.column_stack([close, close + 1]), coarse))
     alone = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
     alone = _with_wider(context, alone)
     steps = image_steps(alone, keypoints)
     alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
-    coarse, joints = _joined(coarse, alone, steps, keypoints)
+    coarse, joints = joining.join(coarse)
     misread.refuse_misfit(coarse, steps, settings.verify)
     trust = _judge(alone, keypoints, coarse, settings)
     if trust.sound and not joints:
@@ -111,13 +116,12 @@ def _with_wider(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
     return found
 
 
-def _joined(
-    coarse: CoarsePoses, found: VerifiedPairs, steps: Steps, keypoints: Keypoints
-) -> tuple[CoarsePoses, tuple[Joint, ...]]:
-    """The trajectory with its pieces in one world, if there are several."""
+def _of_one_piece(chosen: np.ndarray, coarse: CoarsePoses) -> np.ndarray:
+    """Those pairs (P, 2) whose frames belong to one piece of the trajectory."""
     if coarse.segments is None:
-        return coarse, ()
-    return joining.join(coarse, steps, *length_ratios(found, steps, keypoints))
+        return chosen
+    pieces = coarse.segments[chosen]
+    return chosen[pieces[:, 0] == pieces[:, 1]]
 
 
 def check_clock(
@@ -143,7 +147,7 @@ def check_clock(
         GsbaError: it is reversed, mirrored, inverted or in other axes.
     """
     settings, intervals = context.settings, np.diff(timestamps)
-    close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
+    close = np.flatnonzero(intervals <= PAUSE * np.median(intervals))
     chosen = np.column_stack([close, close + 1])
     lost = guided.missing(chosen)
     if len(lost) > _MANY_LOST * len(chosen):

@@ -196,8 +196,10 @@ def _export(
 ) -> None:
     """Datasets in all formats; the first that is not there yet has the others written with it."""
     store, size, images = run.store, run.settings.export.face_size, run.settings.export.images
+    fetched = run.settings.export.fetched
     seen_by = lenses if of_one_lens(images, shown) else ONE_CENTRE
     key = [size, placement.to_json(), *(["of one lens"] if seen_by else [])]
+    key += ["fetched"] if fetched else []
     key += {"fisheye": ["raw"], "panorama": ["panorama"]}.get(images, [])
     folders = {ExportFormat(name): store.root / name for name in run.settings.export.formats}
     waiting = {}
@@ -210,11 +212,13 @@ def _export(
     def compute() -> Counts:
         if waiting:
             how = {"lenses": seen_by, "images": images, "workers": store.workers}
-            export_all(main, shown, waiting, size, placement, **how)
+            export_all(main, shown, waiting, size, placement, fetched=fetched, **how)
             waiting.clear()
         apart = len(run.frames) - len(shown)
         dropped = {"in another map or in none": apart} if apart else {}
-        return Counts(len(run.frames), len(shown), "frames", dropped)
+        left_out = 0 if fetched else len(shown) - len(shown.chosen())
+        dropped |= {"fetched for the map alone": left_out} if left_out else {}
+        return Counts(len(run.frames), len(shown) - left_out, "frames", dropped)
 
     for to, folder in folders.items():
         store.stage(f"export-{to.value}", key, compute, Counts, run.chain.latest)

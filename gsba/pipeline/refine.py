@@ -2,7 +2,8 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,8 +23,9 @@ from gsba.imu.readings import Readings
 from gsba.loop_closure import connectivity
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
+from gsba.odometry.walk import Odometry
 from gsba.photometric import direct
-from gsba.pipeline import acceptance, backend, frontend, inputs, outputs, patch_rounds
+from gsba.pipeline import acceptance, backend, densify, frontend, inputs, outputs, patch_rounds
 from gsba.pipeline.frontend import Seen
 from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
@@ -31,7 +33,7 @@ from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Journal, Run
 from gsba.placement import check
 from gsba.store import cluster
-from gsba.store.store import RunStore
+from gsba.store.store import RunStore, load_stage
 from gsba.trajectory.axes import quarter_turn
 from gsba.types import (
     CoarsePoses,
@@ -114,32 +116,57 @@ def refine(
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     lenses = calibration, inputs.given_circles(circles, calibration)
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, *lenses)
-    sensors = readings, inputs.positions_of(frame_set, settings)
-    coarse = inputs.coarse_poses(frame_set, given, settings)
+    start = _start_of(frame_set, given, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
-        run = _begin(store, frame_set, coarse, given, settings, chosen, families, *sensors)
-        return _refine(run, Prior.of(coarse), given, len(origin) == 1)
+        begin = partial(_begin, store, given, settings, chosen, families, readings)
+        if given and len(origin) == 1:  # of the video's own odometry
+            walk = load_stage(out, "odometry", Odometry)
+
+            def measure(some: FrameSet) -> Prior:
+                run, prior = begin(_start_of(some, given, settings))
+                return _map_features(run, frontend.extract(run), prior, given)[0]
+
+            whole = densify.fetch_where_weak(
+                store, origin["frames"], walk, frame_set, settings, measure
+            )
+            start = start if whole is frame_set else _start_of(whole, given, settings)
+        run, prior = begin(start)
+        return _refine(run, prior, given, len(origin) == 1)
+
+
+@dataclass(frozen=True, slots=True)
+class _Start:
+    """Frames and what is known of where they are."""
+
+    frames: FrameSet
+    coarse: CoarsePoses
+    fixes: FrameFixes | None  # by GPS; None = there are none
+
+
+def _start_of(frames: FrameSet, given: Sequence[Trajectory], settings: RefineSettings) -> _Start:
+    fixes = inputs.positions_of(frames, settings)
+    return _Start(frames, inputs.coarse_poses(frames, given, settings), fixes)
 
 
 def _begin(
     store: RunStore,
-    frame_set: FrameSet,
-    coarse: CoarsePoses,
     given: Sequence[Trajectory],
     settings: RefineSettings,
     chosen: merging.Choice,
     families: Sequence[Family],
     readings: Readings | None,
-    fixes: FrameFixes | None,
-) -> Run:
-    """A run on frames that are masked as asked."""
-    families = [*families, *inputs.families_of(frame_set, settings)]
-    frame_set, journal = merging.before(store, frame_set, chosen), Journal()
+    start: _Start,
+) -> tuple[Run, Prior]:
+    """A run on frames that are masked as asked, and what is believed of the trajectory at first."""
+    families = [*families, *inputs.families_of(start.frames, settings)]
+    coarse, journal = start.coarse, Journal()
+    frames = merging.before(store, start.frames, chosen)
     if chosen.distractors:
         how = settings, journal, families
-        frame_set = _without_distractors(store, frame_set, coarse, given, *how)
-    sensors = readings, fixes, families
-    return Run.begin(store, frame_set, coarse, settings, journal, False, *sensors)
+        frames = _without_distractors(store, frames, coarse, given, *how)
+    sensors = readings, start.fixes, families
+    run = Run.begin(store, frames, coarse, settings, journal, False, *sensors)
+    return run, Prior.of(coarse)
 
 
 def _refine(run: Run, prior: Prior, given: Sequence[Trajectory], images_alone: bool) -> RunResult:
@@ -223,30 +250,10 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
         GsbaError: images that do not match, or that contradict the trajectory.
     """
     rounds, families = run.settings.rounds, run.settings.direct_families()
-    # Neighbours in time, and what they say of the trajectory and its clock.
-    prior, near = frontend.match_neighbours(run, seen, prior, given)
-    prior, near = frontend.judge_trajectory(run, seen, prior, near)
-    prior = frontend.align_imu(run, seen, prior, near)
+    prior, seen, world, along = _map_features(run, seen, prior, given)
     if prior.turning_only:
-        return prior, Map.of(prior.start(), seen.shown)
-    # A chain of relative poses, then all that neighbours have in common.
-    prior, start = backend.align_gauge(run, prior, prior.start(), "gauge")
-    solved = backend.adjust(run, seen, prior, "chain", [near.matches], start, rounds.chain)
-    along = frontend.match_along_epipolars(run, seen, solved)
-    known = frontend.match_known_points(run, seen, solved, "near", loops_closed=False)
-    solved = backend.adjust(run, seen, prior, "dense", [along, known], solved, rounds.dense)
-    # One map, its loops closed; closer looks where images hold it poorly.
-    prior, solved, matches = _merge_maps(run, seen, prior, near, solved, [along, known])
-    prior, solved, loops = frontend.close_loops(run, seen, prior, solved)
-    along, matches = matches[0], [*matches, loops]
-    prior, solved = backend.align_gauge(run, prior, solved, "gauge_closed")
-    solved = backend.adjust(run, seen, prior, "closed", matches, solved, rounds.loops)
-    prior = backend.align_imu(run, prior, solved, "imu_closed")
-    seen, world = _find_camera(run, seen, prior, matches, solved)
-    solved = world.solution
-    prior = backend.align_imu(run, prior, solved, "imu_camera", with_noise=bool(world.lenses))
-    prior = backend.measure_strength(run, seen, prior, solved)
-    seen, solved, along = _look_closer(run, seen, prior, solved, along)
+        return prior, world
+    seen, solved, along = _look_closer(run, seen, prior, world.solution, along)
     # The map matched anew from itself.
     for n in range(1, rounds.map_passes + 1):
         wide = frontend.match_known_points(run, seen, solved, f"everywhere{n}")
@@ -262,6 +269,42 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
         world = backend.refine_on_splat(run, prior, world)
     prior = backend.align_imu(run, prior, world.solution, "imu_final", with_noise=False)
     return prior, backend.measure_camera(run, prior, world)
+
+
+def _map_features(
+    run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]
+) -> tuple[Prior, Seen, Map, Matches]:
+    """One map of all frames' features, the camera that sees them, and how well images hold it.
+
+    Returns:
+        What is believed by then, the keypoints through that camera, the map, and the matches of
+        neighbours.
+    """
+    rounds = run.settings.rounds
+    # Neighbours in time, and what they say of the trajectory and its clock.
+    prior, near = frontend.match_neighbours(run, seen, prior, given)
+    prior, near = frontend.judge_trajectory(run, seen, prior, near)
+    prior = frontend.align_imu(run, seen, prior, near)
+    if prior.turning_only:
+        return prior, seen, Map.of(prior.start(), seen.shown), near.matches
+    # A chain of relative poses, then all that neighbours have in common.
+    prior, start = backend.align_gauge(run, prior, prior.start(), "gauge")
+    solved = backend.adjust(run, seen, prior, "chain", [near.matches], start, rounds.chain)
+    along = frontend.match_along_epipolars(run, seen, solved)
+    known = frontend.match_known_points(run, seen, solved, "near", loops_closed=False)
+    solved = backend.adjust(run, seen, prior, "dense", [along, known], solved, rounds.dense)
+    # One map, its loops closed, and the camera.
+    prior, solved, matches = _merge_maps(run, seen, prior, near, solved, [along, known])
+    prior, solved, loops = frontend.close_loops(run, seen, prior, solved)
+    along, matches = matches[0], [*matches, loops]
+    prior, solved = backend.align_gauge(run, prior, solved, "gauge_closed")
+    solved = backend.adjust(run, seen, prior, "closed", matches, solved, rounds.loops)
+    prior = backend.align_imu(run, prior, solved, "imu_closed")
+    seen, world = _find_camera(run, seen, prior, matches, solved)
+    solved = world.solution
+    prior = backend.align_imu(run, prior, solved, "imu_camera", with_noise=bool(world.lenses))
+    prior = backend.measure_strength(run, seen, prior, solved)
+    return prior, seen, world, along
 
 
 def _merge_maps(

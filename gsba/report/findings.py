@@ -10,7 +10,7 @@ from gsba.bundle.map_strength import scale_sigmas
 from gsba.bundle.stitching import Stitching
 from gsba.loop_closure.merged_map import Registered
 from gsba.trajectory.clock import ClockEstimate
-from gsba.trajectory.joining import Joint
+from gsba.trajectory.joining import GUESS, Joint
 from gsba.trajectory.judgement import Trust
 from gsba.types import CoarsePoses, FrameSet, PoseSource, PoseStatus, Reconstruction
 
@@ -97,10 +97,10 @@ def _maps(
         for joint in joints
     ]
     for joint in joints:
-        notes.append(
-            f"the trajectory begins anew at {names[joint.first]}: joined by {joint.how}, "
-            f"scale {joint.scale:.4g}"
-        )
+        told = f"joined by {joint.how}, scale {joint.scale:.4g}"
+        if joint.how == GUESS:
+            told = "no images tell how this piece lies to the others"
+        notes.append(f"the trajectory begins anew at {names[joint.first]}: {told}")
     judgement: dict[str, Any] = {"joints": pieces} if pieces else {}
     if registered is None:
         return judgement, notes
@@ -188,7 +188,12 @@ def of_frames(
         notes.append(f"frame times were shifted by {coarse.time_offset:.6f} s")
     for note in notes:
         logger.warning(note)
+    fetched = (
+        "frames of the video that were fetched where the map was weak, left out of datasets unless "
+        "export.fetched = true"
+    )
     for what, rows in (
+        (fetched, np.flatnonzero(frames.fetched)),
         ("no SLAM pose, started between neighbours", filled),
         ("no matches, the pose comes from the trajectory", lost),
         ("pixels fit badly and were weighted down", doubted),

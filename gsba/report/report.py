@@ -170,7 +170,8 @@ def write_poses(
 
     Covariances are of the tangent [rotation (radians), translation (map units)] in the rig frame;
     the upper triangle is written row by row. Cells of unknown values are empty. Frames of the same
-    `map` share a world; 1 is the largest, and frames that are in none have an empty cell.
+    `map` share a world; 1 is the largest, and frames that are in none have an empty cell. `fetched`
+    is 1 for frames that strengthen the map and are in no dataset, see `FrameSet`.
     """
     quality = frame_quality(reconstruction)
     rows, columns = np.triu_indices(6)
@@ -190,7 +191,7 @@ def write_poses(
     header += ["tx", "ty", "tz", "qw", "qx", "qy", "qz"]
     header += [f"std_{axis}_deg" for axis in _AXES[:3]] + [f"std_{axis}" for axis in _AXES[3:]]
     header += [f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in zip(rows, columns, strict=True)]
-    header += ["map"]
+    header += ["map", "fetched"]
 
     def write(temporary: Path) -> None:
         with temporary.open("w", newline="", encoding="utf-8") as file:
@@ -203,7 +204,7 @@ def write_poses(
                     [name, repr(float(frames.timestamps[f])), status, source]
                     + [int(quality.num_observations[f]), _cell(quality.median_residuals_deg[f])]
                     + [_cell(value) for value in numbers[f]]
-                    + [int(maps[f]) or ""]
+                    + [int(maps[f]) or "", int(frames.fetched[f]) if frames.fetched else 0]
                 )
 
     atomic_write(path, write)

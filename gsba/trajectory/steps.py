@@ -145,12 +145,12 @@ def length_ratios(
         _, in_before, in_after = np.intersect1d(before[:, 1], after[:, 0], return_indices=True)
         before, after = before[in_before], after[in_after]
         here = keypoints.bearings_of(f)
-        back = _depths(
+        back = ray_depths(
             here[before[:, 1]],
             keypoints.bearings_of(f - 1)[before[:, 0]],
             inverse(found.f_T_nexts[f - 1]),
         )
-        ahead = _depths(
+        ahead = ray_depths(
             here[after[:, 0]], keypoints.bearings_of(f + 1)[after[:, 1]], found.f_T_nexts[f]
         )
         ratios = np.log(back / ahead)
@@ -163,7 +163,7 @@ def length_ratios(
     return logs, sigmas
 
 
-def _depths(rays0: np.ndarray, rays1: np.ndarray, f0_T_f1: np.ndarray) -> np.ndarray:
+def ray_depths(rays0: np.ndarray, rays1: np.ndarray, f0_T_f1: np.ndarray) -> np.ndarray:
     """Distances (m,) from frame 0 along its rays to where both rays meet; NaN where unclear."""
     across = rays1 @ f0_T_f1[:3, :3].T
     cosine = np.einsum("mi,mi->m", rays0, across)

@@ -51,6 +51,20 @@ def _errors(found: Registered, true: np.ndarray = TRUTH) -> tuple[float, float]:
     return float(off.max()), float(np.degrees(turned).max())
 
 
+def test_a_map_keeps_the_world_of_its_earliest_part() -> None:
+    """Even where a later part is the one that the others are carried to."""
+    context, whole, late = scene()
+    parts = torn(whole, late, SCALE, MOVE)
+    later_first = 1 - _halves()
+    found = map_merging.merge(context, parts, later_first, NOBODY, ~BREAK, TIMES)
+    assert not found.components.any()
+    np.testing.assert_allclose(found.scales[:HALF], 1.0, rtol=1e-9)
+    np.testing.assert_allclose(found.solved.world_T_rigs[:HALF], TRUTH[:HALF], atol=1e-9)
+    np.testing.assert_allclose(found.scales[HALF:], 1 / SCALE, rtol=0.005)
+    off, turned = _errors(found)
+    assert off < 0.05 and turned < 0.5
+
+
 @pytest.mark.parametrize("scale", [1.0, SCALE, 0.3])
 def test_two_maps_of_any_scale_are_joined_where_they_meet(scale: float) -> None:
     context, whole, late = scene()

@@ -12,6 +12,7 @@ from gsba.geometry import inverse, pose, rotation_angle
 from gsba.matching import correspondences, recovery
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
+from gsba.similarity import Sim3
 from gsba.store.shards import Threads
 from gsba.types import CoarsePoses, Keypoints, PoseSource, Solution
 
@@ -98,3 +99,22 @@ def test_a_lone_look_alike_without_a_third_view_is_not_believed() -> None:
     alone = recovery.match_anywhere(context, pair)
     assert len(empty.matches.pairs) == 0
     assert not recovery._supported((1, 2), alone, context.keypoints, SETTINGS)
+
+
+def test_frames_of_two_pieces_are_never_tied_by_two_views() -> None:
+    """Each piece has a world and a scale of its own, and two views have none to hand on."""
+    slam, half = TRUTH.copy(), NUM_FRAMES // 2
+    slam[half:] = Sim3.of(0.4, np.eye(4)).poses(TRUTH[half:])
+    segments = (np.arange(NUM_FRAMES) >= half).astype(np.int32)
+    context = _context()
+    guided = correspondences.match_neighbours(context, Solution.without_points(TRUTH))
+    assert {(half - 1, half), (half - 2, half)} <= guided.frames()
+    slam_only = np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8)
+    coarse = CoarsePoses(slam, slam_only, 0.0, segments)
+    found = recovery.recover(context, guided, coarse, TIMES)
+    pieces = segments[found.neighbours.matches.pairs]
+    assert len(pieces) == 2 * (2 * half - 3) and (pieces[:, 0] == pieces[:, 1]).all()
+    assert np.flatnonzero(found.trust.unseen_steps).tolist() == [half - 1]
+    assert not found.trust.held_steps.any()  # where the second piece lies is a guess
+    steps = np.linalg.norm(np.diff(found.trust.world_T_rigs[:, :3, 3], axis=0), axis=1)
+    np.testing.assert_allclose(steps, steps[0], rtol=0.05)

@@ -22,7 +22,7 @@ from gsba.log import GsbaError
 from gsba.similarity import Sim3
 from gsba.store.store import load_stage
 from gsba.trajectory.files import read_trajectory, write_tum
-from gsba.trajectory.joining import IMAGES
+from gsba.trajectory.joining import PLACES
 from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
 from gsba.view import load_scene
 
@@ -66,7 +66,7 @@ def test_two_files_with_worlds_of_their_own_are_joined(case: Case, tmp_path: Pat
     result = _refine(out, case.frames, *files)
     assert result.exit_code == 0, result.output
     (joint,) = _report(out)["trajectory"]["joints"]
-    assert (joint["first"], joint["last"], joint["how"]) == ("000004", "000007", IMAGES)
+    assert (joint["first"], joint["last"], joint["how"]) == ("000004", "000007", PLACES)
     assert joint["scale"] == pytest.approx(1 / SCALE, rel=0.05)  # the walk itself drifts
     assert any("begins anew at 000004" in note for note in _report(out)["notes"])
     case.assert_as_good(out)

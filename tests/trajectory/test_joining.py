@@ -1,19 +1,18 @@
-"""Pieces of a trajectory: found where a map was begun anew, and joined by what the images show."""
+"""Pieces of a trajectory: found where a map was begun anew, and laid into one world."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import drifted, loop_walk, unit
+from synthetic import drifted, loop_walk
 
 from gsba.config import ReadSettings
-from gsba.geometry import inverse, pose, rotation_angle
+from gsba.geometry import inverse, pose
 from gsba.similarity import Sim3
 from gsba.trajectory import joining
-from gsba.trajectory.joining import GUESS, IMAGES
+from gsba.trajectory.joining import GUESS
 from gsba.trajectory.restarts import associate_pieces, split_restarts
-from gsba.trajectory.steps import Steps
 from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
 
 NUM, BREAK = 40, 17
@@ -34,16 +33,6 @@ def _begun_anew(scale: float = SCALE) -> np.ndarray:
     poses = inverse(TRUTH[:1]) @ TRUTH
     poses[BREAK:] = Sim3.of(scale, np.eye(4)).poses(inverse(TRUTH[BREAK])[None] @ TRUTH[BREAK:])
     return poses
-
-
-def _steps(verified: np.ndarray) -> tuple[Steps, np.ndarray, np.ndarray]:
-    """True steps of unit length, and the ratios of their lengths."""
-    steps = inverse(TRUTH[:-1]) @ TRUTH[1:]
-    lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
-    steps[:, :3, 3] = unit(steps[:, :3, 3])
-    both = verified[:-1] & verified[1:]
-    sigmas = np.where(both, 0.02, np.inf)
-    return Steps(steps, verified, verified), np.log(lengths[1:] / lengths[:-1]), sigmas
 
 
 def _coarse(poses: np.ndarray) -> CoarsePoses:
@@ -108,38 +97,10 @@ def test_where_pieces_overlap_the_earlier_leads() -> None:
     assert alone.segments is None
 
 
-def test_the_images_over_the_break_join_both_pieces() -> None:
+def test_a_piece_is_placed_as_if_the_pace_went_on() -> None:
     poses = TRUTH.copy()
     poses[BREAK:] = Sim3.of(SCALE, MOVE).poses(TRUTH[BREAK:])
-    coarse, joints = joining.join(_coarse(poses), *_steps(np.ones(NUM - 1, bool)))
-    np.testing.assert_allclose(coarse.world_T_rigs, TRUTH, atol=1e-6)
-    (joint,) = joints
-    assert (joint.first, joint.last, joint.how) == (BREAK, NUM - 1, IMAGES)
-    assert joint.scale == pytest.approx(1 / SCALE)
-    moved = Sim3.of(joint.scale, joint.world_T_own).poses(poses[BREAK:])
-    np.testing.assert_allclose(moved, TRUTH[BREAK:], atol=1e-6)
-
-
-def test_false_poses_near_the_break_do_not_bend_the_joint() -> None:
-    poses = TRUTH.copy()
-    poses[BREAK:] = Sim3.of(SCALE, MOVE).poses(TRUTH[BREAK:])
-    turn = Rotation.from_rotvec([0, 0.5, 0]).as_matrix()
-    for f in (BREAK - 3, BREAK + 2):
-        poses[f] = poses[f] @ pose(turn, np.array([0.5, 0.3, 0]))
-    coarse, (joint,) = joining.join(_coarse(poses), *_steps(np.ones(NUM - 1, bool)))
-    good = ~np.isin(np.arange(NUM), (BREAK - 3, BREAK + 2))
-    off = np.linalg.norm(coarse.world_T_rigs[good, :3, 3] - TRUTH[good, :3, 3], axis=1)
-    turned = np.swapaxes(coarse.world_T_rigs[good, :3, :3], 1, 2) @ TRUTH[good, :3, :3]
-    assert joint.scale == pytest.approx(1 / SCALE, rel=0.02)
-    assert off.max() < 0.15 and np.degrees(rotation_angle(turned)).max() < 0.5
-
-
-def test_without_images_over_the_break_the_pace_goes_on() -> None:
-    poses = TRUTH.copy()
-    poses[BREAK:] = Sim3.of(SCALE, MOVE).poses(TRUTH[BREAK:])
-    seen = np.ones(NUM - 1, bool)
-    seen[BREAK - 1] = False
-    coarse, joints = joining.join(_coarse(poses), *_steps(seen))
+    coarse, joints = joining.join(_coarse(poses))
     assert joints[0].how == GUESS and joints[0].scale == pytest.approx(1 / SCALE, rel=0.1)
     np.testing.assert_array_equal(np.flatnonzero(joining.guessed(joints, NUM)), [BREAK - 1])
     steps = np.linalg.norm(np.diff(coarse.world_T_rigs[:, :3, 3], axis=0), axis=1)

@@ -1,0 +1,83 @@
+"""Similarities of two maps from single pairs of frames over a short break between both.
+
+Two frames that see the same things give their relative rotation and the direction from one to the
+other, and distances of points in units of that step. Points that one of the maps knows say how long
+the step is in its unit; so both maps together say what the one's unit is in the other's.
+"""
+
+import numpy as np
+
+from gsba.geometry import inverse
+from gsba.loop_closure.map_similarity import Proposal, alike
+from gsba.similarity import Sim3
+from gsba.trajectory.steps import ray_depths
+from gsba.types import Keypoints, VerifiedPairs
+
+_MIN_POINTS = 8  # that either map must know of a pair
+_MAX_SIGMA = 0.1  # of the logarithm of a length, relative: points that are too far tell no scale
+MIN_AGREEING = 3  # pairs
+
+
+def crossing(
+    pairs: VerifiedPairs,
+    keypoints: Keypoints,
+    poses: np.ndarray,
+    known: list[np.ndarray],
+    outside: np.ndarray,
+) -> list[Proposal]:
+    """What each pair over a break says of how a part lies in the map.
+
+    Args:
+        pairs: of one frame outside the map and one inside.
+        keypoints: of all frames.
+        poses: (F, 4, 4), each frame's in its own map.
+        known: (F) of (K_f, 3), points of each frame's keypoints in its rig frame, NaN = unknown.
+        outside: frames of the part.
+    """
+    found = []
+    for p, (f0, f1) in enumerate(pairs.matches.pairs.tolist()):
+        if not np.isfinite(pairs.direction_sigmas[p]):
+            continue
+        f, g = (f0, f1) if f0 in outside else (f1, f0)
+        rows, f0_T_f1 = pairs.matches.of(p), pairs.f0_T_f1s[p]
+        rays0, rays1 = keypoints.matched(pairs.matches.pairs[p], rows)
+        lengths = {
+            f0: _step_length(known[f0][rows[:, 0]], ray_depths(rays0, rays1, f0_T_f1)),
+            f1: _step_length(known[f1][rows[:, 1]], ray_depths(rays1, rays0, inverse(f0_T_f1))),
+        }
+        in_own, in_map = lengths[f], lengths[g]
+        if in_own is None or in_map is None:
+            continue
+        g_T_f = inverse(f0_T_f1) if f0 == f else f0_T_f1.copy()
+        g_T_f[:3, 3] *= in_map
+        world_T_f, scale = poses[g] @ g_T_f, in_map / in_own
+        rotation = world_T_f[:3, :3] @ poses[f, :3, :3].T
+        move = Sim3(scale, rotation, world_T_f[:3, 3] - scale * rotation @ poses[f, :3, 3])
+        found.append(Proposal(move, (f, g), len(rows)))
+    return found
+
+
+def agreed(proposals: list[Proposal], poses: np.ndarray, depth: float) -> Proposal | None:
+    """The proposal that most others agree with; None if these are too few, or no majority.
+
+    Args:
+        proposals: of single pairs.
+        poses: (F, 4, 4), each frame's in its own map.
+        depth: median distance of points, map units.
+    """
+    counts = [sum(alike(one, other, poses, depth) for other in proposals) for one in proposals]
+    if max(counts, default=0) < max(MIN_AGREEING, len(proposals) // 2 + 1):
+        return None
+    return proposals[int(np.argmax(counts))]
+
+
+def _step_length(known: np.ndarray, depths: np.ndarray) -> float | None:
+    """Length of a step in the unit of a map that knows points (m, 3), from their distances (m,) in
+    steps; None where it is not sure."""
+    logs = np.log(np.linalg.norm(known, axis=1) / depths)
+    logs = logs[np.isfinite(logs)]
+    if len(logs) < _MIN_POINTS:
+        return None
+    middle = float(np.median(logs))
+    sigma = 1.25 * 1.4826 * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))
+    return float(np.exp(middle)) if sigma < _MAX_SIGMA else None
