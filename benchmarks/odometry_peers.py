@@ -30,8 +30,8 @@ from gsba.types import Trajectory
 PEERS = ("spherical-incremental", "spherical-global")
 TIMEOUT_S = 3600.0
 HEAD = [
-    "| walk | frames of the video | chosen | method | posed | ATE 1e-3 | worst frame, of the extent "
-    "| CPU s | wall s |",
+    "| walk | frames of the video | chosen | method | posed | ATE 1e-3 "
+    "| worst frame, of the extent | CPU s | wall s |",
     "|---|---:|---:|---|---:|---:|---:|---:|---:|",
 ]
 ODOMETRY_HEAD = ["| walk | method | posed | ATE, % of the path |", "|---|---|---:|---:|"]
@@ -87,8 +87,7 @@ def encode(walk: Walk, video: Path) -> None:
         stream: Any = container.add_stream("libx264", rate=rate, options=options)
         stream.pix_fmt = "yuv420p"
         for path in walk.images:
-            picture = cv2.imread(str(path))
-            assert picture is not None
+            picture: Any = cv2.imread(str(path))
             stream.height, stream.width = picture.shape[:2]
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
         container.mux(stream.encode())
@@ -185,8 +184,8 @@ def main() -> None:
             errors = walk.errors(read_trajectory(Path(path)))
             alone.append(odometry_line(walk, Path(path).name, errors))
     foot = (
-        "ATE: rmse of positions after Sim(3) alignment, metres in flats, of the exported map or the "
-        f"largest model. Wrong: a frame off by more than {MAX_ERROR:.0%} of the map's extent. Our "
+        "ATE: rmse of positions after Sim(3) alignment, metres in flats, of the exported map or "
+        f"the largest model. Wrong: a frame off by more than {MAX_ERROR:.0%} of the map's extent. Our "
         "CPU seconds include decoding, odometry and the choice of frames; COLMAP gets the frames."
     )
     table = ["# Videos without a trajectory, beside peers", "", *HEAD, *lines, "", foot, ""]
