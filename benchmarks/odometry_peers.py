@@ -85,10 +85,11 @@ def encode(walk: Walk, video: Path) -> None:
     options = {"crf": "16", "preset": "veryfast"}
     with av.open(str(partial), "w") as container:
         stream: Any = container.add_stream("libx264", rate=rate, options=options)
-        stream.pix_fmt = "yuv420p"
-        for path in walk.images:
-            picture: Any = cv2.imread(str(path))
-            stream.height, stream.width = picture.shape[:2]
+        pictures: Any = map(cv2.imread, map(str, walk.images))
+        for n, picture in enumerate(pictures):
+            if n == 0:
+                stream.height, stream.width = picture.shape[:2]
+                stream.pix_fmt = "yuv420p"
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
         container.mux(stream.encode())
     partial.rename(video)
@@ -185,8 +186,8 @@ def main() -> None:
             alone.append(odometry_line(walk, Path(path).name, errors))
     foot = (
         "ATE: rmse of positions after Sim(3) alignment, metres in flats, of the exported map or "
-        f"the largest model. Wrong: a frame off by more than {MAX_ERROR:.0%} of the map's extent. Our "
-        "CPU seconds include decoding, odometry and the choice of frames; COLMAP gets the frames."
+        f"the largest model. Wrong: a frame off by more than {MAX_ERROR:.0%} of the map's extent. "
+        "Our CPU seconds include decoding, odometry and the choice of frames; COLMAP gets the frames."
     )
     table = ["# Videos without a trajectory, beside peers", "", *HEAD, *lines, "", foot, ""]
     table += ["Before any refinement:", "", *ODOMETRY_HEAD, *alone]
