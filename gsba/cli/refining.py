@@ -231,8 +231,12 @@ def demo(
     ] = "rectangle",
     heading: Annotated[str, typer.Option(help="locked or forward.")] = "locked",
     out: Annotated[Path, typer.Option(help="Folder for the walk and its run.")] = Path("gsba-demo"),
-    frames: Annotated[int, typer.Option(help="Frames of the walk.")] = 40,
-    width: Annotated[int, typer.Option(help="Pixels across a panorama.")] = 1024,
+    frames: Annotated[
+        int | None, typer.Option(help="Frames of the walk; 40 if unsaid, of a video 240.")
+    ] = None,
+    width: Annotated[
+        int | None, typer.Option(help="Pixels across a panorama; 1024 if unsaid, of a video 720.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of the walk's wobble, noise and drift.")] = 0,
     camera: Annotated[
         str, typer.Option(help="ideal, or two-lens: as those on sale, rows read one after another.")
@@ -241,9 +245,77 @@ def demo(
         Path | None,
         typer.Option(help="Walk through this instead: OBJ, GLB or PLY with colours."),
     ] = None,
+    video: Annotated[
+        bool,
+        typer.Option(
+            "--video",
+            help="Film the walk, and refine the video without any trajectory; eight frames a "
+            "second, fewer --frames end on the way.",
+        ),
+    ] = False,
     allow_partial: AllowPartial = False,
 ) -> None:
     """Render a walk with exact truth, spoil its trajectory as SLAM would, refine and compare."""
+    if video:
+        if mesh is not None:
+            raise GsbaError("--video films the gallery: leave out --mesh")
+        asked = {"num_frames": frames, "width": width}
+        asked = {name: value for name, value in asked.items() if value is not None}
+        _demo_of_video(
+            out, allow_partial, path=path, heading=heading, seed=seed, camera=camera, **asked
+        )
+    else:
+        frames, width = 40 if frames is None else frames, 1024 if width is None else width
+        _demo_of_frames(out, allow_partial, path, heading, frames, width, seed, camera, mesh)
+
+
+def _demo_of_video(out: Path, allow_partial: bool, **asked: Any) -> None:
+    """Film a walk, refine the video without a trajectory, and print the errors of both poses.
+
+    Args:
+        out: folder for the walk and its run.
+        asked: arguments of `gsba.demo.make_film`.
+    """
+    from gsba.demo import make_film
+    from gsba.evaluate.trajectory import evaluate as compare
+    from gsba.evaluate.trajectory import format_table
+    from gsba.trajectory.association import nearest
+    from gsba.trajectory.files import read_trajectory
+    from gsba.types import Trajectory
+
+    film, run = make_film(out / "walk", **asked), out / "run"
+    from gsba import pipeline
+
+    result = pipeline.refine(film.video_path, None, run, fresh=True)
+    truth = read_trajectory(film.truth_path)
+    rows, followed = {}, run / "odometry/walk.tum"
+    if followed.is_file():
+        rows["odometry"] = compare(read_trajectory(followed), truth)
+    at = nearest(truth.timestamps, result.frames.timestamps)
+    chosen = Trajectory(truth.timestamps[at], truth.world_T_rigs[at])
+    rows["refined"] = compare(read_trajectory(run / "trajectory.tum"), chosen)
+    typer.echo(format_table(rows))
+    if film.lenses is not None:
+        typer.echo(_found_lenses(result.report["camera"], rows["refined"].scale, film.lenses))
+    typer.echo(
+        f"{len(result.frames)} of {len(truth.timestamps)} frames of the video were refined, "
+        f"without a trajectory. Video and truth in {out / 'walk'}, the run in {run}."
+    )
+    _conclude([result] if len(result.maps) > 1 or result.partial else [], allow_partial)
+
+
+def _demo_of_frames(
+    out: Path,
+    allow_partial: bool,
+    path: str,
+    heading: str,
+    frames: int,
+    width: int,
+    seed: int,
+    camera: str,
+    mesh: Path | None,
+) -> None:
+    """Render a walk, refine it from a spoiled trajectory, and print errors before and after."""
     from gsba.config import CameraSettings, RefineSettings
     from gsba.demo import make_mesh_walk, make_walk
     from gsba.evaluate.trajectory import evaluate as compare

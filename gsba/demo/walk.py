@@ -76,17 +76,14 @@ def make_walk(
     """
     from gsba.demo.gallery import build_gallery
 
-    choices = ((path, WalkPath, "path"), (heading, Heading, "heading"), (camera, Camera, "camera"))
-    for value, allowed, what in choices:
-        if value not in get_args(allowed):
-            raise GsbaError(f"{what} {value!r} is none of {', '.join(get_args(allowed))}")
+    check_choices(path, heading, camera)
     check_walk(out, num_frames, width, seed)
     lenses = TwoLenses() if camera == "two-lens" else None
     truth = walk_poses(path, heading, num_frames, seed)
     scene = build_gallery()
     logger.info("gallery of %d faces, %d frames of %d px", len(scene.corners), num_frames, width)
     with walk_folder(out, truth, seed) as partial:
-        write_frames(partial, truth, _pictures(scene, truth, width, seed, lenses), seed)
+        write_frames(partial, truth, render_walk(scene, truth, width, seed, lenses), seed)
         if lenses is not None:
             lenses.write(partial / "calibration.json")
         if depth:
@@ -97,18 +94,28 @@ def make_walk(
 @contextmanager
 def walk_folder(out: Path, truth: Trajectory, seed: int) -> Iterator[Path]:
     """Folder to write a walk's images into; with its trajectories it takes the place of `out`."""
+    with replaced_folder(out) as partial:
+        (partial / "images").mkdir()
+        yield partial
+        write_tum(partial / "groundtruth.tum", truth)
+        write_tum(partial / "slam.tum", degrade(truth, seed))
+
+
+@contextmanager
+def replaced_folder(out: Path) -> Iterator[Path]:
+    """An empty folder to write into; once written without failure it takes the place of `out`."""
     partial = out.with_name(f".{out.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
-    (partial / "images").mkdir(parents=True)
+    partial.mkdir(parents=True)
     yield partial
-    write_tum(partial / "groundtruth.tum", truth)
-    write_tum(partial / "slam.tum", degrade(truth, seed))
     if out.exists():
         shutil.rmtree(out)
     partial.rename(out)
 
 
-def walk_poses(path: WalkPath, heading: Heading, num_frames: int, seed: int) -> Trajectory:
+def walk_poses(
+    path: WalkPath, heading: Heading, num_frames: int, seed: int, fps: float = FRAMES_PER_SECOND
+) -> Trajectory:
     """Exact poses of a walk, evenly spaced along its path, held by hand.
 
     World: x right, y down, z forward, floor at y = 0, in the gallery's units.
@@ -117,22 +124,28 @@ def walk_poses(path: WalkPath, heading: Heading, num_frames: int, seed: int) -> 
     at, tangent = _sample(path, num_frames)
     yaw = np.arctan2(tangent[:, 0], tangent[:, 1]) if heading == "forward" else 0.0
     positions = np.stack([at[:, 0], np.full(num_frames, -EYE_HEIGHT), at[:, 1]], axis=1)
-    return held_by_hand(positions, yaw, rng)
+    return held_by_hand(positions, yaw, rng, fps=fps)
 
 
 def held_by_hand(
-    positions: np.ndarray, yaw: np.ndarray | float, rng: np.random.Generator, unit: float = 1.0
+    positions: np.ndarray,
+    yaw: np.ndarray | float,
+    rng: np.random.Generator,
+    unit: float = 1.0,
+    fps: float = FRAMES_PER_SECOND,
 ) -> Trajectory:
     """Poses around positions (N, 3) of a walk, headings in radians, swaying as a hand does.
 
     Args:
         unit: of the positions, in those of the gallery.
+        fps: poses per second; the hand sways as fast whatever it is.
     """
-    wobble = [_wobble(rng, len(positions)) for _ in range(6)]
+    times = np.arange(len(positions)) / fps
+    wobble = [_wobble(rng, times) for _ in range(6)]
     pitch, turn, roll = (np.radians(w) * x for w, x in zip(WOBBLE_DEG, wobble, strict=False))
     rotations = _rotations(1, yaw + turn) @ _rotations(0, pitch) @ _rotations(2, roll)
     swaying = positions + unit * WOBBLE_UNITS * np.stack(wobble[3:], axis=1)
-    return Trajectory(np.arange(len(positions)) / FRAMES_PER_SECOND, pose(rotations, swaying))
+    return Trajectory(times, pose(rotations, swaying))
 
 
 def _sample(path: WalkPath, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
@@ -186,11 +199,12 @@ def _arc_length(points: np.ndarray) -> np.ndarray:
     return np.r_[0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
 
 
-def _wobble(rng: np.random.Generator, num_frames: int) -> np.ndarray:
-    """Irregular swing (num_frames,) of unit variance, periods of 4 to 14 frames."""
+def _wobble(rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
+    """Irregular swing (N,) of unit variance at times (N,) in seconds, periods of 2 to 7 s."""
     phase = rng.uniform(0, 2 * np.pi, (3, 1))
     frequency = 2 * np.pi / rng.uniform(4, 14, (3, 1))
-    return np.sin(frequency * np.arange(num_frames) + phase).sum(axis=0) * np.sqrt(2 / 3)
+    steps = FRAMES_PER_SECOND * times
+    return np.sin(frequency * steps + phase).sum(axis=0) * np.sqrt(2 / 3)
 
 
 def _rotations(axis: int, angles: np.ndarray | float) -> np.ndarray:
@@ -204,14 +218,8 @@ def write_frames(out: Path, truth: Trajectory, pictures: Iterator[np.ndarray], s
     """Panoramas (H, W, 3), 0..255, as JPEGs with exposure and noise, and their times."""
     import cv2
 
-    rng = np.random.default_rng([seed, 1])
-    exposures = 1 + EXPOSURE_SWING * np.tanh(_wobble(rng, len(truth.timestamps)))
-    names = [f"{f:06d}.jpg" for f in range(len(exposures))]
-    frames = zip(names, pictures, exposures, strict=True)
-    for name, picture, exposure in track(frames, "rendering the walk", total=len(names)):
-        image = exposure * picture
-        image += NOISE * rng.standard_normal(image.shape, dtype=np.float32)
-        bgr = np.clip(image[..., ::-1] + 0.5, 0, 255).astype(np.uint8)
+    names = [f"{f:06d}.jpg" for f in range(len(truth.timestamps))]
+    for name, bgr in zip(names, exposed(truth, pictures, seed), strict=True):
         quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
         if not cv2.imwrite(str(out / "images" / name), bgr, quality):
             raise GsbaError(f"{out / 'images' / name}: cannot be written; is the disk full?")
@@ -221,7 +229,18 @@ def write_frames(out: Path, truth: Trajectory, pictures: Iterator[np.ndarray], s
         rows.writerows((name, f"{t:.6f}") for name, t in zip(names, truth.timestamps, strict=True))
 
 
-def _pictures(
+def exposed(truth: Trajectory, pictures: Iterator[np.ndarray], seed: int) -> Iterator[np.ndarray]:
+    """Pictures (H, W, 3) uint8 BGR as a sensor gives them: exposure and noise on RGB, 0..255."""
+    rng = np.random.default_rng([seed, 1])
+    exposures = 1 + EXPOSURE_SWING * np.tanh(_wobble(rng, truth.timestamps - truth.timestamps[0]))
+    frames = zip(pictures, exposures, strict=True)
+    for picture, exposure in track(frames, "rendering the walk", total=len(exposures)):
+        image = exposure * picture
+        image += NOISE * rng.standard_normal(image.shape, dtype=np.float32)
+        yield np.clip(image[..., ::-1] + 0.5, 0, 255).astype(np.uint8)
+
+
+def render_walk(
     scene, truth: Trajectory, width: int, seed: int, lenses: TwoLenses | None
 ) -> Iterator[np.ndarray]:
     """Panoramas (width / 2, width, 3) float32 of the frames, one after another."""
@@ -247,6 +266,14 @@ def _write_depth(folder: Path, scene, truth: Trajectory, width: int) -> None:
         hit = ranges(scene, world_T_rig[:3, 3], bearings @ world_T_rig[:3, :3].T)
         depth = hit.reshape(u.shape).astype(np.float32)
         np.savez_compressed(folder / f"{f:06d}.npz", range=depth)
+
+
+def check_choices(path: str, heading: str, camera: str) -> None:
+    """Raise GsbaError for a path, heading or camera that no walk has."""
+    choices = ((path, WalkPath, "path"), (heading, Heading, "heading"), (camera, Camera, "camera"))
+    for value, allowed, what in choices:
+        if value not in get_args(allowed):
+            raise GsbaError(f"{what} {value!r} is none of {', '.join(get_args(allowed))}")
 
 
 def check_walk(out: Path, num_frames: int, width: int, seed: int) -> None:
