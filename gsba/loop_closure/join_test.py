@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsba.geometry import inverse
 from gsba.loop_closure import join_evidence
 from gsba.loop_closure.join_evidence import JoinEvidence, Places, Rates, around
 from gsba.loop_closure.map_similarity import Meeting, Proposal, alike, refined
@@ -71,8 +72,16 @@ class JoinTest:
         places = Places(poses, known)
         return join_evidence.weigh(self.context, places, (rows, inside), self._usual, self.depth)
 
-    def meetings(self, matches: Matches, outside: np.ndarray) -> list[Meeting]:
-        """Matched points that both frames of pairs know, one of them among those outside."""
+    def meetings(
+        self, matches: Matches, outside: np.ndarray, f0_T_f1s: np.ndarray | None = None
+    ) -> list[Meeting]:
+        """Matched points that both frames of pairs know, one of them among those outside.
+
+        Args:
+            matches: of P pairs.
+            outside: frames (N,).
+            f0_T_f1s: (P, 4, 4) relative poses by bearings, their translations of any length.
+        """
         found = []
         for p, (f0, f1) in enumerate(matches.pairs.tolist()):
             matched = matches.of(p)
@@ -81,7 +90,9 @@ class JoinTest:
             theirs = self.known[g][matched[:, columns[1]]]
             both = np.isfinite(own).all(axis=1) & np.isfinite(theirs).all(axis=1)
             if both.any():
-                found.append(Meeting(f, g, own[both], theirs[both]))
+                step = None if f0_T_f1s is None else f0_T_f1s[p]
+                g_T_f = inverse(step) if step is not None and f == f0 else step
+                found.append(Meeting(f, g, own[both], theirs[both], g_T_f))
         return found
 
     def _judged(
