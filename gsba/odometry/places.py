@@ -10,11 +10,12 @@ from gsba.bundle.tracks import build
 from gsba.bundle.triangulation import place
 from gsba.config import FeatureSettings, PairSettings, RefineSettings
 from gsba.features.detection import SiftExtractor, extract, gather
+from gsba.log import track
 from gsba.matching.correspondences import match_along_epipolars
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.odometry.atlas import AtlasLayout, Cutter
 from gsba.store.shards import Workers
-from gsba.types import Features, Matches, Solution
+from gsba.types import Features, Solution
 
 _JPEG_QUALITY = 90
 _STEP = 0.12  # from one place to the next, at least; part of the median distance of points
@@ -31,17 +32,23 @@ class Places:
     """Chosen keyframes of maps that have points; a place is a frame to whatever compares them."""
 
     keyframes: np.ndarray  # (P,) int64, numbers of the keyframes
-    maps: np.ndarray  # (P,) int32, map of each
+    maps: np.ndarray  # (P,) int32, map that each was tracked in
+    features: Sequence[Features]  # (P), keypoints and their descriptors
     solved: Solution  # poses, each in the world of its map, and points of the keypoints
-    context: MatchContext  # of their keypoints
+    context: MatchContext  # of the keypoints
 
     def taken(self, rows: np.ndarray, world_T_rigs: np.ndarray) -> "Places":
-        """Some places (P',), ascending, with other poses (P', 4, 4) and their points anew."""
+        """Some places (P',), ascending, with other poses (P', 4, 4) and points that fit these."""
+        features = [self.features[row] for row in rows]
+        seed, workers = self.context.settings.seed, self.context.workers
+        return make_places(
+            self.keyframes[rows], self.maps[rows], world_T_rigs, features, seed, workers
+        )
 
 
 def compressed(grey: np.ndarray) -> np.ndarray:
     """A panorama (h, 2h) uint8 as JPEG, (n,) uint8: some tens of kilobytes."""
-    return cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
+    return np.asarray(cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])
 
 
 def chosen_keyframes(
@@ -75,21 +82,20 @@ def described(
         usable: (h, 2h) bool, what shows the scene; None = all.
     """
     layout = AtlasLayout.of(width)
-    rig, s = layout.rig, layout.rig.size
-    cutter = Cutter(layout)
-    settings = FeatureSettings(max_per_face=_MAX_PER_FACE)
-    extractor = SiftExtractor(settings)
+    rig, size = layout.rig, layout.rig.size
+    cutter, extractor = Cutter(layout), SiftExtractor(FeatureSettings(max_per_face=_MAX_PER_FACE))
 
     def faces(grey: np.ndarray) -> np.ndarray:
-        image = cutter.cut(grey, np.eye(3)).image
-        return image.reshape(2, s, 3, s).swapaxes(1, 2).reshape(6, s, s)
+        atlas = cutter.cut(grey, np.eye(3)).image.reshape(2, size, 3, size)
+        return atlas.swapaxes(1, 2).reshape(6, size, size)
 
     masks = None if usable is None else faces(usable.astype(np.uint8) * 255) > 250
-    found = []
-    for picture in pictures:
-        grey = faces(cv2.imdecode(picture, cv2.IMREAD_GRAYSCALE))
-        found.append(extract(np.repeat(grey[..., None], 3, axis=-1), masks, rig, extractor))
-    return found
+
+    def describe(picture: np.ndarray) -> Features:
+        grey = faces(np.asarray(cv2.imdecode(picture, cv2.IMREAD_GRAYSCALE)))
+        return extract(np.repeat(grey[..., None], 3, axis=-1), masks, rig, extractor)
+
+    return [describe(picture) for picture in track(pictures, "describing places", len(pictures))]
 
 
 def make_places(
@@ -109,28 +115,18 @@ def make_places(
         seed: of later sampling.
         workers: who match.
     """
-    settings = replace_seed(seed)
     context = MatchContext(
         SearchableFrames(features.__getitem__),
         SearchableFrames(features.__getitem__, _STRONGEST_PER_FACE),
         gather(features),
-        settings,
+        _SETTINGS.model_copy(update={"seed": seed}),
         workers,
     )
     start = Solution.without_points(world_T_rigs)
     found = match_along_epipolars(context, start)
     same = maps[found.pairs[:, 0]] == maps[found.pairs[:, 1]]
-    solved = _with_points(context, start, found.taken(np.flatnonzero(same)))
-    return Places(keyframes, maps, solved, context)
-
-
-def replace_seed(seed):
-    return _SETTINGS.model_copy(update={"seed": seed})
-
-
-def _with_points(context: MatchContext, start: Solution, matches: Matches) -> Solution:
-    keypoints, settings = context.keypoints, context.settings
-    tracks = build([matches], np.diff(keypoints.starts))
-    poses = start.world_T_rigs
-    points = place(tracks, keypoints, poses, _MAX_ERROR_SIGMAS, settings.triangulate)
-    return replace(start, landmarks=points)
+    found, keypoints = found.taken(np.flatnonzero(same)), context.keypoints
+    tracks = build([found], np.diff(keypoints.starts))
+    settings = context.settings.triangulate
+    landmarks = place(tracks, keypoints, world_T_rigs, _MAX_ERROR_SIGMAS, settings)
+    return Places(keyframes, maps, features, replace(start, landmarks=landmarks), context)

@@ -146,10 +146,6 @@ class Tracker:
         """Poses (F, 4, 4) of all frames so far, each in the world of its map."""
         return np.array([self.keyframe_poses[r.keyframe] @ r.key_T_rig for r in self.records])
 
-    def points(self, ids: np.ndarray) -> np.ndarray:
-        """Points (N, 3) of features in the world of their map as last adjusted; NaN = unknown."""
-        return self._points[ids]
-
     def add(self, grey: np.ndarray) -> FrameRecord:
         """Pose the next frame, a panorama (width / 2, width) uint8."""
         frame = len(self.records)
