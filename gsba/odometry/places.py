@@ -8,6 +8,7 @@ import numpy as np
 
 from gsba.bundle.tracks import build
 from gsba.bundle.triangulation import place
+from gsba.camera.rig import CubeRig
 from gsba.config import FeatureSettings, PairSettings, RefineSettings
 from gsba.features.detection import SiftExtractor, extract, gather
 from gsba.log import track
@@ -18,8 +19,9 @@ from gsba.store.shards import Workers
 from gsba.types import Features, Solution
 
 _JPEG_QUALITY = 90
+_HFOV = np.deg2rad(94.0)  # of faces: keypoints near a border are described by what is beyond it
 _STEP = 0.12  # from one place to the next, at least; part of the median distance of points
-_MAX_PER_FACE = 200  # keypoints
+_MAX_PER_FACE = 150  # keypoints
 _STRONGEST_PER_FACE = 100  # of these, that are compared where nothing is predicted
 _SETTINGS = RefineSettings(
     pairs=PairSettings(strongest_per_face=_STRONGEST_PER_FACE, far_drift=0.03)
@@ -81,8 +83,9 @@ def described(
         width: pixels across them.
         usable: (h, 2h) bool, what shows the scene; None = all.
     """
-    layout = AtlasLayout.of(width)
-    rig, size = layout.rig, layout.rig.size
+    size = round(width / np.pi * np.tan(_HFOV / 2))
+    rig = CubeRig(size, _HFOV)
+    layout = AtlasLayout(rig)
     cutter, extractor = Cutter(layout), SiftExtractor(FeatureSettings(max_per_face=_MAX_PER_FACE))
 
     def faces(grey: np.ndarray) -> np.ndarray:

@@ -100,6 +100,12 @@ class Odometry:
         cuts = np.flatnonzero(np.diff(self.maps[rows])) + 1
         return [run for run in np.split(rows, cuts) if len(run)]
 
+    def maps_in_turn(self) -> np.ndarray:
+        """Number (F,) of the map that each frame is in, 1 = the first; 0 = in none."""
+        numbers, posed = np.zeros(len(self), int), self.posed()
+        numbers[posed] = 1 + np.unique(self.maps[posed], return_inverse=True)[1]
+        return numbers
+
     def lost(self) -> list[Stretch]:
         """Stretches of frames without a pose."""
         return self._stretches(~self.posed())

@@ -276,7 +276,8 @@ def _follow(
     rows = odometry.choose_frames(found, settings.odometry)
     logger.info("%d of %d frames chosen by what they show", len(rows), len(found))
     folder = store.root / CHOSEN.parent
-    write_odometry(found, folder / "walk.tum", folder / "keyframes.tum", folder / "odometry.json")
+    names = "walk.tum", "keyframes.tum", "poses.csv", "odometry.json"
+    write_odometry(found, *(folder / name for name in names))
     write_chosen(found, rows, store.root / CHOSEN)
     store.claim(folder)
     return found.pieces()
