@@ -20,7 +20,8 @@ _HELD_LOG_DISTANCE = 1e-5  # of the distance to the furthest keyframe, in the ga
 _FREE_LOG_SCALE = 1.0  # of the first keyframe's scale in that gauge
 _POSE_ROTATION = 0.007  # standard deviations of what is each frame's own: radians, and parts of
 _POSE_TRANSLATION = 0.005  # the median distance
-_PROBABILITY = 0.99  # that a true loop is within what its covariance and the path's allow
+_ERROR_RATE = 1e-9  # of leaving out a true loop: covariances are of random errors, and drift is
+# partly steady
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,43 +49,45 @@ def close_loops(
 ) -> ClosedGraph:
     """Bend the path so that its loops close, without those that its steps cannot pay for.
 
-    Loops are switched by graduated non-convexity (Yang, Antonante, Tzoumas and Carlone, RA-L 5(2),
-    2020): a false one bends steps further than their covariances allow.
+    Loops join one after another, those of the shortest time first: drift is least there. One that
+    costs more than a true one can, as steps have to bend further than they can be off, stays out.
 
     Args:
         world_T_keys: (K, 4, 4) of one map; the first is held.
         steps: that lead to all keyframes but the first, and are certain.
         loops: to be closed.
     """
+    from scipy.stats import chi2
+
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k, world_T_key in enumerate(world_T_keys):
-        values.insert(X(k), _similarity3(Sim3.of(1.0, world_T_key)))
+        values.insert(X(k), similarity3(Sim3.of(1.0, world_T_key)))
     held = gtsam.noiseModel.Isotropic.Sigma(7, _HELD)
     graph.add(gtsam.PriorFactorSimilarity3(X(0), values.atSimilarity3(X(0)), held))
-    for one in (*steps, *loops):
-        graph.add(_between(one))
-    certain = 1 + len(steps)
-    parameters = gtsam.GncLMParams()
-    parameters.setLossType(gtsam.GncLossType.TLS)
-    parameters.setKnownInliers(list(range(certain)))
-    solver = gtsam.GncLMOptimizer(graph, values, parameters)
-    solver.setInlierCostThresholdsAtProbability(_PROBABILITY)
-    result = solver.optimize()
-    kept = np.asarray(solver.getWeights())[certain:] > 0.5
-    found = [result.atSimilarity3(X(k)) for k in range(len(world_T_keys))]
+    for one in steps:
+        graph.add(factor_of(one))
+    kept, cost, most = np.zeros(len(loops), bool), graph.error(values), chi2.isf(_ERROR_RATE, 7)
+    for n in np.argsort([one.second - one.first for one in loops], kind="stable"):
+        tried = gtsam.NonlinearFactorGraph(graph)
+        tried.add(factor_of(loops[n]))
+        bent = gtsam.LevenbergMarquardtOptimizer(tried, values).optimize()
+        if 2 * (tried.error(bent) - cost) < most:
+            graph, values, cost, kept[n] = tried, bent, tried.error(bent), True
+    found = [values.atSimilarity3(X(k)) for k in range(len(world_T_keys))]
     scales = np.array([one.scale() for one in found])
     positions = scales[:, None] * np.array([one.translation() for one in found])
     rotations = np.array([one.rotation().matrix() for one in found])
     return ClosedGraph(pose(rotations, positions), scales, kept)
 
 
-def _between(one: Constraint) -> gtsam.BetweenFactorSimilarity3:
+def factor_of(one: Constraint) -> gtsam.BetweenFactorSimilarity3:
+    """GTSAM's factor of a constraint, on the keys X(first) and X(second)."""
     noise = gtsam.noiseModel.Gaussian.Covariance(one.covariance)
-    between = _similarity3(one.first_T_second)
+    between = similarity3(one.first_T_second)
     return gtsam.BetweenFactorSimilarity3(X(one.first), X(one.second), between, noise)
 
 
-def _similarity3(similarity: Sim3) -> gtsam.Similarity3:
+def similarity3(similarity: Sim3) -> gtsam.Similarity3:
     """GTSAM's similarity s (R x + t)."""
     rotation = gtsam.Rot3(similarity.rotation)
     return gtsam.Similarity3(rotation, similarity.translation / similarity.scale, similarity.scale)
@@ -104,7 +107,7 @@ def covariances_of(
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k, (world_T_key, scale) in enumerate(zip(world_T_keys, scales, strict=True)):
-        values.insert(X(k), _similarity3(Sim3.of(float(scale), world_T_key)))
+        values.insert(X(k), similarity3(Sim3.of(float(scale), world_T_key)))
     away = np.linalg.norm(world_T_keys[:, :3, 3] - world_T_keys[0, :3, 3], axis=1)
     far = int(np.argmax(away))
     moving = away[far] > 0
@@ -114,7 +117,7 @@ def covariances_of(
     if moving:
         graph.add(_fixed_distance(far, world_T_keys[[0, far]], float(scales[far])))
     for one in constraints:
-        graph.add(_between(one))
+        graph.add(factor_of(one))
     marginals = gtsam.Marginals(graph, values)
     found = np.empty((len(world_T_keys), 6, 6))
     for k, scale in enumerate(scales):

@@ -21,6 +21,7 @@ from gsba.imu.readings import Readings
 from gsba.loop_closure import connectivity
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
+from gsba.odometry import Odometry
 from gsba.photometric import direct
 from gsba.pipeline import acceptance, backend, frontend, inputs, outputs, patch_rounds
 from gsba.pipeline.frontend import Seen
@@ -29,6 +30,7 @@ from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import ExtraFactors, Prior
 from gsba.pipeline.run import Journal, Run
 from gsba.placement import check
+from gsba.report.html import add_odometry
 from gsba.store import cluster
 from gsba.store.store import RunStore
 from gsba.trajectory.axes import quarter_turn
@@ -107,9 +109,10 @@ def refine(
     chosen, readings = merging.choose(masks, segment), inputs.read_gyro(imu, frames)
     origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
+    walk: Odometry | None = None
     if video.is_video(frames):
         asked = fps, fresh, odometry, chosen, calibration
-        given, settings = inputs.take_frames(out, origin, given, settings, *asked)
+        given, settings, walk = inputs.take_frames(out, origin, given, settings, *asked)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     lenses = calibration, inputs.given_circles(circles, calibration)
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, *lenses)
@@ -117,7 +120,10 @@ def refine(
     coarse = inputs.coarse_poses(frame_set, given, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
         run = _begin(store, frame_set, coarse, given, settings, chosen, extra_factors, *sensors)
-        return _refine(run, Prior.of(coarse, extra_factors), given, len(origin) == 1)
+        result = _refine(run, Prior.of(coarse, extra_factors), given, len(origin) == 1)
+        if walk is not None:
+            add_odometry(out / "report.html", walk)
+        return result
 
 
 def _begin(
