@@ -223,7 +223,7 @@ class _Joining:
     def _meetings(self, context: MatchContext, chosen: np.ndarray) -> list[Meeting]:
         """Points that both frames of pairs (P, 2), one outside and one inside the map, know."""
         verified = recovery.match_anywhere(context, np.sort(chosen, axis=1), rivals=False)
-        return self.test.meetings(verified.matches, chosen[:, 0], verified.f0_T_f1s)
+        return self.test.meetings(verified.matches, chosen[:, 0])
 
     def _around(
         self, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray, chosen: np.ndarray

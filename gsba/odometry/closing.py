@@ -51,6 +51,13 @@ class ClosedKeyframes:
     loops: np.ndarray  # (L, 2) int64, keyframes at which one map was found to meet itself
     joins: np.ndarray  # (M, 2) int64, keyframes at which two maps were joined
 
+    @classmethod
+    def unchanged(cls, tracked: TrackedKeyframes) -> "ClosedKeyframes":
+        """Keyframes as they were tracked."""
+        num, none = len(tracked.maps), np.zeros((0, 2), np.int64)
+        poses, maps = tracked.world_T_keys.copy(), tracked.maps.copy()
+        return cls(poses, np.ones(num), maps, np.full((num, 6, 6), np.nan), none, none)
+
 
 def close(tracked: TrackedKeyframes, seed: int, workers: Workers) -> ClosedKeyframes:
     """Join the maps of a walk where they meet, close loops, and say how well poses are known.
@@ -60,15 +67,12 @@ def close(tracked: TrackedKeyframes, seed: int, workers: Workers) -> ClosedKeyfr
         seed: of the sampling.
         workers: who compare places.
     """
-    none = np.zeros((0, 2), np.int64)
-    unknown = np.full((len(tracked.maps), 6, 6), np.nan)
-    scales = np.ones(len(tracked.maps))
-    poses, maps = tracked.world_T_keys.copy(), tracked.maps.copy()
-    found = ClosedKeyframes(poses, scales, maps, unknown, none, none)
+    found = ClosedKeyframes.unchanged(tracked)
     places = _places(tracked, seed, workers)
     if places is None:
         return found
-    steps = measure_steps(tracked.features, poses, tracked.maps, tracked.distances)
+    given = tracked.features, tracked.world_T_keys, tracked.maps, tracked.distances
+    steps = measure_steps(*given)
     found = _joined(found, places, tracked)
     for number in np.unique(found.maps[tracked.solved]):
         keys = np.flatnonzero(tracked.solved & (found.maps == number))
@@ -144,26 +148,32 @@ def _closed(
     joins = [of_keys(one) for one in find_joins(some)]
     loops = [of_keys(one) for one in find_loops(some, np.diff(some.maps) != 0)]
     path = [*_steps(keys, poses, scales, row_of, steps), *joins]
+    since = np.ones(len(keys))  # scales after joining
     if loops:
         closed = close_loops(poses, path, loops)
+        if not closed.kept.all():
+            left = np.count_nonzero(~closed.kept)
+            logger.info("%d loops left out: the path cannot have drifted as far", left)
         loops = [one for one, kept in zip(loops, closed.kept, strict=True) if kept]
-        poses, scales = closed.world_T_keys, scales * closed.scales
-        local = closed.scales
-    else:
-        local = np.ones(len(keys))
-    covariances = covariances_of(poses, local, [*path, *loops])
-    ends = [[(keys[o.first], keys[o.second]) for o in some] for some in (loops, joins)]
-    new_loops, new_joins = (np.array(some, np.int64).reshape(-1, 2) for some in ends)
-    world_T_keys, all_scales = found.world_T_keys.copy(), found.scales.copy()
-    all_covariances = found.covariances.copy()
-    world_T_keys[keys], all_scales[keys], all_covariances[keys] = poses, scales, covariances
+        poses, since = closed.world_T_keys, closed.scales
+    covariances, scales = covariances_of(poses, since, [*path, *loops]), scales * since
+
+    def with_values(before: np.ndarray, values: np.ndarray) -> np.ndarray:
+        after = before.copy()
+        after[keys] = values
+        return after
+
+    def with_ends(before: np.ndarray, new: list[Constraint]) -> np.ndarray:
+        ends = [keys[[one.first, one.second]] for one in new]
+        return np.concatenate([before, *(end[None] for end in ends)])
+
     return replace(
         found,
-        world_T_keys=world_T_keys,
-        scales=all_scales,
-        covariances=all_covariances,
-        loops=np.concatenate([found.loops, new_loops]),
-        joins=np.concatenate([found.joins, new_joins]),
+        world_T_keys=with_values(found.world_T_keys, poses),
+        scales=with_values(found.scales, scales),
+        covariances=with_values(found.covariances, covariances),
+        loops=with_ends(found.loops, loops),
+        joins=with_ends(found.joins, joins),
     )
 
 

@@ -137,7 +137,7 @@ def carried_covariances(
     Args:
         covariances: (F, 6, 6) of each frame's keyframe, see `covariances_of`.
         key_T_rigs: (F, 4, 4) poses of frames in their keyframes, map units.
-        distances: (F,) median distance of points, map units; NaN = not known.
+        distances: (F,) median distance of points, map units.
     """
     rotations = np.swapaxes(key_T_rigs[:, :3, :3], 1, 2)
     x, y, z = key_T_rigs[:, :3, 3].T

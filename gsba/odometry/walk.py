@@ -157,7 +157,10 @@ class Odometry:
 
 
 def track_panoramas(
-    panoramas: SmallPanoramas, seed: int = 0, workers: Workers | None = None
+    panoramas: SmallPanoramas,
+    seed: int = 0,
+    workers: Workers | None = None,
+    with_loops: bool = True,
 ) -> Odometry:
     """Follow a camera through a sequence, then join its maps and close its loops.
 
@@ -165,6 +168,7 @@ def track_panoramas(
         panoramas: all frames, in time order; damaged ones count as lost.
         seed: of the sampling.
         workers: who compare places; None = threads of this process.
+        with_loops: False = leave maps and drift as they are, and covariances unknown.
 
     Raises:
         GsbaError: no picture can be decoded.
@@ -180,16 +184,19 @@ def track_panoramas(
         tracker.add(grey)
         sharp[row] = sharpness(grey)
         rows.append(row)
-        if len(tracker.keyframe_frames) > len(kept):
+        while len(tracker.keyframe_frames) > len(kept):
             kept.append(compressed(grey))
         cpu_s += time.thread_time() - began
     if not rows:
         raise GsbaError(f"{panoramas.source}: none of its pictures could be decoded; copy it again")
     began = time.process_time()
     keyframes = _tracked_keyframes(tracker, panoramas, np.array(rows), kept)
-    closed = close(keyframes, seed, workers or Threads(os.cpu_count() or 1))
+    closed = ClosedKeyframes.unchanged(keyframes)
+    if with_loops:
+        closed = close(keyframes, seed, workers or Threads(os.cpu_count() or 1))
     spent = cpu_s, time.process_time() - began
-    found = _odometry(tracker, closed, panoramas.timestamps, np.array(rows), sharp, spent)
+    ends = keyframes, closed, panoramas.timestamps, np.array(rows)
+    found = _odometry(tracker, *ends, sharp, spent)
     _log(found)
     return found
 
@@ -222,6 +229,7 @@ def _tracked_keyframes(
 
 def _odometry(
     tracker: Tracker,
+    tracked: TrackedKeyframes,
     closed: ClosedKeyframes,
     timestamps: np.ndarray,
     rows: np.ndarray,
@@ -232,7 +240,7 @@ def _odometry(
 
     Args:
         tracker: after the last frame.
-        closed: its keyframes after loops were closed.
+        tracked, closed: its keyframes before and after loops were closed.
         timestamps, sharp: (F,) of all panoramas.
         rows: (R,) of these, those that could be read.
         spent: seconds of processor time, of tracking and of closing loops.
@@ -253,8 +261,8 @@ def _odometry(
     keyframes[of_keys] = True
     distances[rows] = [record.distance for record in records]
     distances[rows] *= closed.scales[keys]
-    of_rows = closed.covariances[keys], key_T_rigs, distances[rows]
-    covariances[rows] = carried_covariances(*of_rows)
+    near = tracked.distances[keys] * closed.scales[keys]
+    covariances[rows] = carried_covariances(closed.covariances[keys], key_T_rigs, near)
     inliers[rows] = [record.inliers for record in records]
     known = statuses, maps, keyframes, distances, inliers, sharp
     ends = of_keys[closed.loops], of_keys[closed.joins]
