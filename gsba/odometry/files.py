@@ -33,12 +33,14 @@ def _write_poses(path: Path, found: Odometry) -> None:
     Covariances are of the tangent [rotation (radians), translation (map units)] in the rig frame.
     Cells of unknown values are empty.
     """
-    upper = np.triu_indices(6)
+    upper, covariances = np.triu_indices(6), found.covariances
+    if covariances is None:
+        covariances = np.full((len(found), 6, 6), np.nan)
     numbers = np.hstack(
         [
             found.world_T_rigs[:, :3, 3],
             quaternion_from_rotation(found.world_T_rigs[:, :3, :3]),
-            found.covariances[:, *upper],
+            covariances[:, *upper],
         ]
     )
     names = [f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in zip(*upper, strict=True)]

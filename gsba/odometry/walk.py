@@ -3,7 +3,7 @@
 import logging
 import os
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
@@ -22,6 +22,10 @@ logger = logging.getLogger(__name__)
 
 _MIN_FRAMES_OF_MAP = 5  # fewer say nothing
 _PATIENCE_S, _MIN_PATIENCE = 1.5, 8  # seconds, and frames, before a lost camera begins a new map
+
+
+def _no_pairs() -> np.ndarray:
+    return np.zeros((0, 2), np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +50,14 @@ class Odometry:
     inliers: np.ndarray  # (F,) int32, features that fit the pose
     sharpness: np.ndarray  # (F,) float64, of the small picture; see gsba.video.likeness
     cpu_s: float  # processor time of tracking, decoding apart
-    covariances: np.ndarray  # (F, 6, 6) float64, of poses: tangent [rotation rad, translation],
-    # map units; the first pose of each map and its distance to the furthest are held; NaN = unknown
-    loops: np.ndarray  # (L, 2) int64, frames at which a map was found to meet itself
-    joins: np.ndarray  # (M, 2) int64, frames at which a map was joined to the one begun before
-    closing_cpu_s: float  # processor time of that
+    covariances: np.ndarray | None = None  # (F, 6, 6) float64, of poses: tangent [rotation rad,
+    # translation], map units; the first pose of each map and its distance to the furthest are held;
+    # NaN and None = not known
+    loops: np.ndarray = field(default_factory=_no_pairs)  # (L, 2) int64, frames at which a map was
+    # found to meet itself
+    joins: np.ndarray = field(default_factory=_no_pairs)  # (M, 2) int64, frames at which a map was
+    # joined to one begun before
+    closing_cpu_s: float = 0.0  # processor time of joining maps and closing loops
 
     def __len__(self) -> int:
         return len(self.timestamps)
