@@ -27,6 +27,8 @@ _MAX_TRIED = 4  # proposals of one meeting that are weighed
 _FITTED = 3  # places to either side of a meeting, by which the loop is measured
 _DIRECTION_SIGMA = np.deg2rad(0.25)  # of points that both sides know, as seen from a place
 _DISTANCE_SIGMA = 0.1  # of the logarithm of the ratio of their distances
+_FITTING = 4.0  # of these, from where a point should be seen from either side, at most: it fits
+_MIN_FITTING = 0.35  # share of points that fit a loop that is measured; true ones have 0.4 to 0.6
 _MIN_ROTATION = np.deg2rad(0.1)  # standard deviations of a loop however many points it rests on:
 _MIN_TRANSLATION = 0.003  # lenses have two centres, and each side has drifted; in median distances
 _MIN_LOG_SCALE = 0.01
@@ -59,7 +61,8 @@ def find_loops(places: Places, unseen: np.ndarray) -> list[Constraint]:
     for one in judged:
         logger.debug("a loop of places %s: %s", one.proposal.frames, one.evidence)
     sides = [_sides(*one.proposal.frames, num) for one in kept]
-    return [_measured(one.proposal, *two, test) for one, two in zip(kept, sides, strict=True)]
+    measured = [_measured(one.proposal, *two, test) for one, two in zip(kept, sides, strict=True)]
+    return [one for one in measured if one is not None]
 
 
 def find_joins(places: Places) -> list[Constraint]:
@@ -77,7 +80,14 @@ def find_joins(places: Places) -> list[Constraint]:
         f, g = np.unravel_index(np.argmin(distances), distances.shape)
         proposal = Proposal(Sim3(), (int(rows[f]), int(others[g])), 0)
         part = np.flatnonzero(maps == maps[rows[f]])
-        found.append(_measured(proposal, part, others, test))
+        measured = _measured(proposal, part, others, test)
+        if measured is None:
+            # Frames that tell lie further off; the join itself is believed all the same.
+            end, start = others[g], rows[f]
+            poses, wide = places.solved.world_T_rigs, _UNMEASURED * _floor(test.depth)
+            step = Sim3.of(1.0, inverse(poses[end]) @ poses[start])
+            measured = Constraint(int(end), int(start), step, np.diag(np.square(wide)))
+        found.append(measured)
         inside[part] = True
     return found
 
@@ -144,9 +154,9 @@ def _rivals(one: Judged, judged: list[Judged], test: JoinTest) -> list[Judged]:
 
 def _measured(
     proposal: Proposal, rows: np.ndarray, inside: np.ndarray, test: JoinTest
-) -> Constraint:
+) -> Constraint | None:
     """A proposal that is believed, fitted to what the places next to the meeting know: drift is
-    least there.
+    least there. None where few of their points fit it.
 
     Args:
         proposal: carries places `rows` (N,) to places `inside` (M,), ascending.
@@ -156,10 +166,9 @@ def _measured(
     found = test.meetings(test.weigh(rows, inside, move)[1], rows)
     start = Sim3.of(move.scale, inverse(poses[g]) @ move.poses(poses[f]))
     if sum(len(m.own) for m in found) < _MIN_POINTS:
-        # The frames that told lie further off; the similarity itself is believed all the same.
-        return Constraint(g, f, start, np.diag(np.square(_UNMEASURED * _floor(test.depth))))
-    fitted, covariance = fit_loop(found, poses, (f, g), start)
-    return Constraint(g, f, fitted, covariance)
+        return None
+    fitted = fit_loop(found, poses, (f, g), start)
+    return None if fitted is None else Constraint(g, f, *fitted)
 
 
 def _sides(f: int, g: int, num: int) -> tuple[np.ndarray, np.ndarray]:
@@ -170,7 +179,7 @@ def _sides(f: int, g: int, num: int) -> tuple[np.ndarray, np.ndarray]:
 
 def fit_loop(
     meetings: list[Meeting], poses: np.ndarray, at: tuple[int, int], start: Sim3
-) -> tuple[Sim3, np.ndarray]:
+) -> tuple[Sim3, np.ndarray] | None:
     """The similarity of two places by directions and distances of points that both sides know.
 
     Directions fix the pose; distances fix the scale where the places are close to one another.
@@ -182,7 +191,7 @@ def fit_loop(
         start: g_T_f, similarity of their rigs.
 
     Returns:
-        g_T_f and its covariance (7, 7), see `Constraint`.
+        g_T_f and its covariance (7, 7), see `Constraint`; None where few points fit it.
     """
     from scipy.optimize import least_squares
 
@@ -207,7 +216,11 @@ def fit_loop(
         return np.concatenate([part.ravel() for part in parts])
 
     solved = least_squares(residuals, np.zeros(7), loss="soft_l1", x_scale="jac")
-    noise = max(float(np.median(np.abs(residuals(solved.x)))) / 0.6745, 0.5)
+    left = residuals(solved.x)
+    off = np.linalg.norm(left[: 6 * len(p)].reshape(2, len(p), 3), axis=2)
+    if np.mean((off < _FITTING).all(axis=0)) < _MIN_FITTING:
+        return None
+    noise = max(float(np.median(np.abs(left))) / 0.6745, 0.5)
     information = solved.jac.T @ solved.jac
     covariance = _CORRELATED * noise**2 * np.linalg.inv(information)
     distance = float(np.median(np.linalg.norm(p, axis=1)))

@@ -75,7 +75,9 @@ def test_a_loop_is_as_far_off_as_its_covariance_says() -> None:
             for points in (own, theirs)
         ]
         start = moved(truth, 0.02 * rng.normal(size=7))
-        fit, covariance = fit_loop([Meeting(0, 1, *noisy)], poses, (0, 1), start)
+        fitted = fit_loop([Meeting(0, 1, *noisy)], poses, (0, 1), start)
+        assert fitted is not None
+        fit, covariance = fitted
         between = fit.rotation.T @ truth.rotation
         error = np.concatenate(
             [
@@ -85,6 +87,8 @@ def test_a_loop_is_as_far_off_as_its_covariance_says() -> None:
             ]
         )
         off.append(error @ np.linalg.solve(covariance, error) / 7)
+    strange = Meeting(0, 1, rng.normal(size=(80, 3)), rng.normal(size=(80, 3)))
+    assert fit_loop([strange], poses, (0, 1), truth) is None
     assert 0.02 < np.mean(off) < 1.0  # never too sure; that errors are independent is not believed
 
 
