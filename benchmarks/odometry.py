@@ -23,6 +23,7 @@ from gsba import odometry
 from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings
 from gsba.evaluate.trajectory import evaluate
 from gsba.frames.scan import scan
+from gsba.geometry import inverse
 from gsba.odometry.panoramas import SmallPanoramas
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory
@@ -63,6 +64,55 @@ def follow(name: str, panoramas: SmallPanoramas, truth: np.ndarray) -> Row:
     keyframes = int((found.keyframes & found.posed()).sum())
     ms = float(1e3 * found.cpu_s / len(found))
     return Row(name, len(found), lost or "none", len(errors), keyframes, ", ".join(errors), ms)
+
+
+class LoopRow(NamedTuple):
+    """What closing loops made of one sequence."""
+
+    name: str
+    loops: int
+    joins: int
+    before: str  # ATE of each map, per cent of its path
+    after: str
+    over_sigma: str  # RMS errors of positions over their standard deviations, of each map
+    seconds: float  # processor time of closing
+
+
+def close_loops(name: str, panoramas: SmallPanoramas, truth: np.ndarray) -> LoopRow:
+    """Odometry of a sequence without and with loops closed, beside the truth (F, 4, 4)."""
+    before = odometry.track_panoramas(panoramas, with_loops=False)
+    after = odometry.track_panoramas(panoramas)
+    ates = []
+    for found in (before, after):
+        each = []
+        for number in range(1, found.maps_in_turn().max() + 1):
+            rows = np.flatnonzero(found.maps_in_turn() == number)
+            times, true = found.timestamps[rows], truth[rows]
+            path = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum()
+            poses = Trajectory(times, found.world_T_rigs[rows])
+            each.append(f"{100 * evaluate(poses, Trajectory(times, true)).ate.rmse / path:.2f}")
+        ates.append(", ".join(each))
+    over = ", ".join(
+        f"{_over_sigma(after, np.flatnonzero(after.maps_in_turn() == number), truth):.1f}"
+        for number in range(1, after.maps_in_turn().max() + 1)
+    )
+    counts = len(after.loops), len(after.joins)
+    return LoopRow(name, *counts, ates[0], ates[1], over, after.closing_cpu_s)
+
+
+def _over_sigma(found: odometry.Odometry, rows: np.ndarray, truth: np.ndarray) -> float:
+    """RMS of position errors over standard deviations, in the gauge of the covariances: the first
+    pose of the map, and its distance to the furthest, are right."""
+    assert found.covariances is not None
+    poses, covariances = found.world_T_rigs[rows], found.covariances[rows]
+    true = poses[0] @ inverse(truth[rows[0]]) @ truth[rows]
+    offsets, wanted = (some[1:, :3, 3] - poses[0, :3, 3] for some in (poses, true))
+    lengths = np.linalg.norm(offsets, axis=1)
+    far = int(np.argmax(lengths))
+    wanted = wanted * (lengths[far] / np.linalg.norm(wanted[far]))
+    errors = np.linalg.norm(wanted - offsets, axis=1)
+    sigmas = np.sqrt(np.trace(covariances[1:, 3:, 3:], axis1=1, axis2=2))
+    return float(np.sqrt(np.mean((errors / sigmas) ** 2)))
 
 
 def in_memory(panoramas: SmallPanoramas, pictures: list[np.ndarray]) -> SmallPanoramas:
@@ -118,6 +168,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("walks", nargs="+", type=Path)
     parser.add_argument("--markdown", type=Path)
+    parser.add_argument("--loops", action="store_true", help="before and after closing loops alone")
     arguments = parser.parse_args()
     rows = []
     for n, folder in enumerate(arguments.walks):
@@ -125,9 +176,14 @@ def main() -> None:
         panoramas = odometry.of_frames(frames, folder, WIDTH)
         panoramas = odometry.without_carrier(panoramas)
         truth = read_trajectory(folder / "groundtruth.tum").world_T_rigs
+        if arguments.loops:
+            print(close_loops(folder.name, panoramas, truth), flush=True)
+            continue
         rows.append(follow(folder.name, panoramas, truth))
         if n == 0:
             rows += faults(folder.name, panoramas, truth)
+    if arguments.loops:
+        return
     head = "| sequence | frames | lost | maps | keyframes | ATE, % of the path | ms a frame |"
     lines = [head, "|---|---:|---|---:|---:|---|---:|"]
     for row in rows:

@@ -254,6 +254,55 @@ def relative_similarity(
     return similarity(points1[best], points0[best]), best
 
 
+def similarity_along(
+    points0: np.ndarray, points1: np.ndarray, f0_T_f1: np.ndarray, least: int = _MIN_POINTS
+) -> tuple[Sim3, np.ndarray] | None:
+    """As `relative_similarity`, where bearings have told the rotation and the direction already.
+
+    Points whose distances are poorly known give a poor rotation, three at a time; bearings do not.
+    What is left, the ratio of the step's length and the scale, each point tells alone.
+
+    Args:
+        points0, points1: (m, 3) points in the rigs of both frames, each in units of its own.
+        f0_T_f1: (4, 4) relative pose, whose translation has any length.
+        least: points that have to agree.
+
+    Returns:
+        rig 1 in rig 0, with its unit, and which points (m,) agree; None if too few.
+    """
+    rotation, direction = f0_T_f1[:3, :3], f0_T_f1[:3, 3]
+    direction = direction / max(float(np.linalg.norm(direction)), 1e-12)
+    turned = points1 @ rotation.T
+    # Along each bearing of frame 0 lies turned + ratio * direction.
+    across, normal = np.cross(points0, direction), np.cross(points0, turned)
+    squares = np.sum(across**2, axis=1)
+    ratios = -np.sum(across * normal, axis=1) / np.maximum(squares, 1e-24)
+    best, agree = None, np.zeros(len(points0), bool)
+    for ratio in [0.0, *ratios]:
+        fit = _scaled(points0, turned + ratio * direction, rotation, ratio * direction)
+        fits = agreeing_points(points0, points1, fit)
+        if fits.sum() > agree.sum():
+            best, agree = fit, fits
+    for _ in range(2 if agree.sum() >= least else 0):
+        ratio = float(np.median(ratios[agree]))
+        at = turned[agree] + ratio * direction
+        fit = _scaled(points0[agree], at, rotation, ratio * direction)
+        fits = agreeing_points(points0, points1, fit)
+        if fits.sum() < agree.sum():
+            break
+        best, agree = fit, fits
+    return None if best is None or agree.sum() < least else (best, agree)
+
+
+def _scaled(
+    points0: np.ndarray, points1: np.ndarray, rotation: np.ndarray, step: np.ndarray
+) -> Sim3:
+    """The similarity whose scale is the median ratio of distances; `step` (3,) in unit 1."""
+    lengths0, lengths1 = (np.linalg.norm(points, axis=1) for points in (points0, points1))
+    scale = float(np.median(lengths0 / np.maximum(lengths1, 1e-12)))
+    return Sim3(scale, rotation, scale * step)
+
+
 def _agree(points0: np.ndarray, points1: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Which points (m,) are seen alike from both frames under the fit to some of them."""
     try:

@@ -20,6 +20,14 @@ Report = Annotated[
         help="Report to write, JSON; default: beside --out, named -report.", metavar="FILE"
     ),
 ]
+Poses = Annotated[
+    Path | None,
+    typer.Option(
+        help="Maps, statuses and covariances of poses to write, CSV; default: beside --out, "
+        "named -poses.",
+        metavar="FILE",
+    ),
+]
 Width = Annotated[
     int | None, typer.Option(help="Pixels across the panoramas that are followed; 800 if unsaid.")
 ]
@@ -35,6 +43,7 @@ def track(
         Path, typer.Option(help="Trajectory to write: TUM, poses of all frames.", metavar="FILE")
     ],
     keyframes: Keyframes = None,
+    poses: Poses = None,
     report: Report = None,
     masks: Annotated[
         str,
@@ -79,6 +88,7 @@ def track(
         walk,
         out,
         keyframes or out.with_name(f"{out.stem}-keyframes{out.suffix}"),
+        poses or out.with_name(f"{out.stem}-poses.csv"),
         report or out.with_name(f"{out.stem}-report.json"),
     )
     typer.echo(f"{walk.summary()}: {out}")

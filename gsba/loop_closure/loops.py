@@ -85,16 +85,15 @@ def candidates(
     """Pairs (P, 2) int32 that look most alike among those that drift can have brought apart."""
     positions, depth = solved.world_T_rigs[:, :3, 3], solved.median_depth()
     num = len(positions)
-    alike = looks @ looks.T
+    drifts = np.concatenate([[0.0], np.cumsum(_drifts(positions, unseen, settings))])
     found: set[tuple[int, int]] = set()
     for f in range(num):
         others = np.arange(num)
         others = others[np.abs(others - f) > settings.pairs.window // 4]
         distance = np.linalg.norm(positions[others] - positions[f], axis=1)
         reach = settings.pairs.max_baseline_depths * depth
-        slack = np.array([_drift(f, int(g), positions, unseen, settings) for g in others])
-        others = others[distance < reach + slack]
-        for g in others[np.argsort(-alike[f, others])[:_LOOKS]]:
+        others = others[distance < reach + np.abs(drifts[others] - drifts[f])]
+        for g in others[np.argsort(-(looks[others] @ looks[f]))[:_LOOKS]]:
             found.add((min(f, int(g)), max(f, int(g))))
     return np.array(sorted(found), np.int32).reshape(-1, 2)
 
@@ -104,9 +103,14 @@ def _drift(
 ) -> float:
     """How far the map may have the one frame wrong relative to the other, map units."""
     first, last = min(f0, f1), max(f0, f1)
-    steps = np.linalg.norm(np.diff(positions[first : last + 1], axis=0), axis=1)
-    share = np.where(unseen[first:last], 1.0, settings.pairs.far_drift)
-    return float(share @ steps)
+    between = positions[first : last + 1]
+    return float(_drifts(between, unseen[first:last], settings).sum())
+
+
+def _drifts(positions: np.ndarray, unseen: np.ndarray, settings: RefineSettings) -> np.ndarray:
+    """How far each step (N - 1,) between positions (N, 3) may be off, map units."""
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    return np.where(unseen, 1.0, settings.pairs.far_drift) * steps
 
 
 def _measure(

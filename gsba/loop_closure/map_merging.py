@@ -16,8 +16,9 @@ from gsba.geometry import angles_between, inverse, unit
 from gsba.loop_closure import join_evidence, loops
 from gsba.loop_closure.break_crossing import agreed, crossing
 from gsba.loop_closure.connectivity import by_size
-from gsba.loop_closure.join_evidence import JoinEvidence, Places, Rates, around
-from gsba.loop_closure.map_similarity import Meeting, Proposal, alike, propose, refined
+from gsba.loop_closure.join_evidence import Places, Rates
+from gsba.loop_closure.join_test import JoinTest, Judged
+from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
 from gsba.loop_closure.merged_map import Registered
 from gsba.loop_closure.pose_graph import Loop
 from gsba.loop_closure.registration import resect
@@ -25,7 +26,7 @@ from gsba.loop_closure.retrieval import looks_of
 from gsba.matching import recovery
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.similarity import Sim3
-from gsba.types import Counts, Matches, Solution
+from gsba.types import Counts, Solution
 
 logger = logging.getLogger(__name__)
 _LOOKS = 3  # places compared for each frame of a part; twice as many for a frame alone
@@ -35,10 +36,6 @@ _BEST = 2  # meetings whose surroundings are compared too
 _MIN_MAP = 3  # frames of a part that is a map
 _BEHIND = 3.0  # times the pace: a frame alone is no further off than that
 _APART = 4.0  # extents between maps that nothing ties together
-_SAME_PLACE = (
-    2.0  # times the differences of two estimates of one join: no other place yet, as parts
-)
-# that drift meet a little differently at either end
 _LEVEL = np.deg2rad(5.0)  # between the verticals of two parts, besides how frames tilt in each
 
 
@@ -91,7 +88,7 @@ class _Joining:
         known = solved.points_by_keypoint(context.keypoints)
         self.own_known = [known[f] for f in range(num)]  # rig frames, units of their parts
         self.known = list(self.own_known)  # the same, in units of the map once carried
-        self.usual: Rates | None = None
+        self.test = JoinTest(context, self.poses, self.known, self.depth, self._usual_rates)
         self.usual_anywhere: Rates | None = None
         self.moves = [Sim3()] * num  # of each frame, so far
         self.components = np.full(num, -1)
@@ -149,7 +146,7 @@ class _Joining:
         if len(rows) < _MIN_MAP:
             return False
         inside = np.flatnonzero(self.components == self.current)
-        evidence = self._weigh(rows, inside, move)[0]
+        evidence = self.test.weigh(rows, inside, move)[0]
         if evidence.refuted:
             self.reasons[part] = f"not where the trajectory has it: {evidence}"
         return evidence.refuted
@@ -189,33 +186,23 @@ class _Joining:
         self, part: int, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray
     ) -> Sim3 | None:
         """The similarity that the surroundings of both parts confirm, if they confirm no other."""
-        weighed: list[tuple[Proposal, JoinEvidence]] = []
+        weighed: list[Judged] = []
         for proposal in propose(meetings, self.poses, self.depth, self.context.settings.seed):
             if self._held(rows) and not self._plausible(proposal):
                 continue
-            proposal, evidence = self._judged(proposal, rows, inside, join_evidence.LOCAL)
-            if not evidence.decided:  # more frames tell more, if drift lets them
-                wider = self._judged(proposal, rows, inside, join_evidence.WIDER)
-                proposal, evidence = max((proposal, evidence), wider, key=lambda one: one[1].least)
-            if self._is_level(rows, inside, proposal.move):
-                weighed.append((proposal, evidence))
+            judged = self.test.judge(proposal, rows, inside)
+            if self._is_level(rows, inside, judged.proposal.move):
+                weighed.append(judged)
         if not weighed:
             self.reasons[part] = (
                 "no frame of it knows enough points that frames of another map know"
             )
             return None
-        best, why = max(weighed, key=lambda one: one[1].least)
-        logger.info(
-            "a part of %d frames meets the map at frames %s: %s", len(rows), best.frames, why
-        )
-        rivals = (
-            other
-            for other, against in weighed
-            if against.confirmed and not why.beats(against)
-            if not alike(best, other, self.poses, self.depth, _SAME_PLACE)
-        )
-        if why.confirmed and not any(rivals):
-            return best.move
+        best = max(weighed, key=lambda one: one.evidence.least)
+        frames, why = best.proposal.frames, best.evidence
+        logger.info("a part of %d frames meets the map at frames %s: %s", len(rows), frames, why)
+        if why.confirmed and not self.test.rivals(best, weighed):
+            return best.proposal.move
         self.reasons[part] = "it fits two places alike" if why.confirmed else f"doubtful: {why}"
         return None
 
@@ -238,29 +225,11 @@ class _Joining:
             if best is None or (self._held(rows) and not self._plausible(best)):
                 continue
             own, theirs = ends if f in rows else ends[::-1]
-            evidence = self._weigh(own, theirs, best.move)[0]
+            evidence = self.test.weigh(own, theirs, best.move)[0]
             logger.info("a part of %d frames goes on at a break: %s", len(rows), evidence)
             if not evidence.refuted:
                 return best.move
         return None
-
-    def _judged(
-        self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, reach: int
-    ) -> tuple[Proposal, JoinEvidence]:
-        """A proposal fitted to all that both parts know around its meeting, and what speaks for it.
-
-        Args:
-            rows, inside: frames of the part and of the map.
-            reach: frames to either side of the meeting.
-        """
-        f, g = proposal.frames
-        groups = around(rows, f, reach), around(inside, g, reach)
-        evidence, found = self._weigh(*groups, proposal.move)
-        again = self._known_by_both(found, rows)
-        if again:
-            proposal = replace(proposal, move=refined(again, proposal.move, self.poses))
-            evidence, _ = self._weigh(*groups, proposal.move)
-        return proposal, evidence
 
     def _is_level(self, rows: np.ndarray, inside: np.ndarray, move: Sim3) -> bool:
         """Whether a part would stand upright on the map, as far as its frames do in themselves."""
@@ -272,41 +241,15 @@ class _Joining:
         ]
         return bool(angles_between(means[0], means[1]) < _LEVEL + 3 * np.hypot(*spreads))
 
-    def _weigh(
-        self, rows: np.ndarray, inside: np.ndarray, move: Sim3
-    ) -> tuple[JoinEvidence, Matches]:
-        """What speaks for a part being where a similarity carries it."""
-        poses, known = self.poses.copy(), list(self.known)
-        poses[rows] = move.poses(poses[rows])
-        for f in rows:
-            known[f] = move.scale * known[f]
-        usual, groups = self._usual(), (rows, inside)
-        return join_evidence.weigh(self.context, Places(poses, known), groups, usual, self.depth)
-
-    def _usual(self) -> Rates:
+    def _usual_rates(self) -> Rates:
         """How often points are found again within the parts, as they came."""
-        if self.usual is None:
-            places = Places(self.solved.world_T_rigs, self.own_known)
-            self.usual = join_evidence.rates(self.context, places, self.parts)
-        return self.usual
+        places = Places(self.solved.world_T_rigs, self.own_known)
+        return join_evidence.rates(self.context, places, self.parts)
 
     def _meetings(self, context: MatchContext, chosen: np.ndarray) -> list[Meeting]:
         """Points that both frames of pairs (P, 2), one outside and one inside the map, know."""
         verified = recovery.match_anywhere(context, np.sort(chosen, axis=1), rivals=False)
-        return self._known_by_both(verified.matches, chosen[:, 0])
-
-    def _known_by_both(self, matches: Matches, outside: np.ndarray) -> list[Meeting]:
-        """Matched points that both frames of pairs know, one of them among those outside."""
-        meetings = []
-        for p, (f0, f1) in enumerate(matches.pairs.tolist()):
-            matched = matches.of(p)
-            (f, g), columns = ((f0, f1), (0, 1)) if f0 in outside else ((f1, f0), (1, 0))
-            own = self.known[f][matched[:, columns[0]]]
-            theirs = self.known[g][matched[:, columns[1]]]
-            both = np.isfinite(own).all(axis=1) & np.isfinite(theirs).all(axis=1)
-            if both.any():
-                meetings.append(Meeting(f, g, own[both], theirs[both]))
-        return meetings
+        return self.test.meetings(verified.matches, chosen[:, 0])
 
     def _around(
         self, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray, chosen: np.ndarray

@@ -6,7 +6,7 @@ import numpy as np
 
 from gsba.geometry import inverse, rotation_angle
 from gsba.loop_closure.loops import AGREE, AGREE_DEG
-from gsba.similarity import Sim3, agreeing_points, relative_similarity
+from gsba.similarity import Sim3, agreeing_points, relative_similarity, similarity_along
 
 _AGREE_LOG = 0.15  # of scales
 _LOSS_DEG = 0.2  # scale of the robust loss: points of two maps err alike
@@ -22,6 +22,8 @@ class Meeting:
     g: int  # inside
     own: np.ndarray  # (m, 3) points in rig f, units of its part
     theirs: np.ndarray  # (m, 3) the same in rig g, units of the map
+    g_T_f: np.ndarray | None = None  # (4, 4) relative pose by bearings, its translation of any
+    # length; None = not known
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +46,12 @@ def propose(meetings: list[Meeting], poses: np.ndarray, depth: float, seed: int)
     """
     found = []
     for m in meetings:
-        asked = relative_similarity(m.theirs, m.own, seed, _LEAST_POINTS)
+        asked = _asked(m, seed)
         if asked is None:
             continue
         f_T_own = inverse(poses[m.f])
-        f_T_own[:3, 3] *= asked[0].scale
-        move = Sim3.of(asked[0].scale, poses[m.g] @ asked[0].new_T_old @ f_T_own)
+        f_T_own[:3, 3] *= asked.scale
+        move = Sim3.of(asked.scale, poses[m.g] @ asked.new_T_old @ f_T_own)
         support = sum(len(each.own) for each in _agreeing(meetings, move, poses))
         found.append(Proposal(move, (m.f, m.g), support))
     distinct: list[Proposal] = []
@@ -57,6 +59,16 @@ def propose(meetings: list[Meeting], poses: np.ndarray, depth: float, seed: int)
         if not any(alike(one, other, poses, depth) for other in distinct):
             distinct.append(one)
     return distinct[:_PROPOSALS]
+
+
+def _asked(meeting: Meeting, seed: int) -> Sim3 | None:
+    """The similarity of rig f in rig g that most points of a meeting agree with."""
+    given = meeting.theirs, meeting.own
+    found = [relative_similarity(*given, seed, _LEAST_POINTS)]
+    if meeting.g_T_f is not None:
+        found.append(similarity_along(*given, meeting.g_T_f, _LEAST_POINTS))
+    some = [one for one in found if one is not None]
+    return max(some, key=lambda one: int(one[1].sum()))[0] if some else None
 
 
 def _agreeing(meetings: list[Meeting], move: Sim3, poses: np.ndarray) -> list[Meeting]:

@@ -1,23 +1,64 @@
 """Odometry on disk: the trajectory, its keyframes, and what happened."""
 
+import csv
 from pathlib import Path
 
 import numpy as np
 
-from gsba.disk import write_json
+from gsba.disk import atomic_write, write_json
+from gsba.geometry import quaternion_from_rotation
 from gsba.log import GsbaError
+from gsba.odometry.tracker import FrameStatus
 from gsba.odometry.walk import Odometry
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
+_AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # of a pose covariance
 
-def write_odometry(found: Odometry, walk: Path, keyframes: Path, report: Path) -> None:
-    """Write the poses of all frames and of the keyframes as TUM files, and the report as JSON."""
-    for path in (walk, keyframes, report):
+
+def write_odometry(found: Odometry, walk: Path, keyframes: Path, poses: Path, report: Path) -> None:
+    """Write the poses of all frames and of the keyframes as TUM files, what is known of each pose
+    as CSV, and the report as JSON."""
+    for path in (walk, keyframes, poses, report):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_tum(keyframes, found.trajectory(keyframes=True))
     write_json(report, found.report())
+    _write_poses(poses, found)
     write_tum(walk, found.trajectory())
+
+
+def _write_poses(path: Path, found: Odometry) -> None:
+    """Status, map and pose of every frame, and the upper triangle of its covariance, row by row.
+
+    Covariances are of the tangent [rotation (radians), translation (map units)] in the rig frame.
+    Cells of unknown values are empty.
+    """
+    upper, covariances = np.triu_indices(6), found.covariances
+    if covariances is None:
+        covariances = np.full((len(found), 6, 6), np.nan)
+    numbers = np.hstack(
+        [
+            found.world_T_rigs[:, :3, 3],
+            quaternion_from_rotation(found.world_T_rigs[:, :3, :3]),
+            covariances[:, *upper],
+        ]
+    )
+    names = [f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in zip(*upper, strict=True)]
+    header = ["timestamp", "status", "keyframe", "map", "tx", "ty", "tz", "qw", "qx", "qy", "qz"]
+    maps, posed = found.maps_in_turn(), found.posed()
+
+    def write(temporary: Path) -> None:
+        with temporary.open("w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file)
+            table.writerow(header + names)
+            for f, timestamp in enumerate(found.timestamps):
+                status = FrameStatus(found.statuses[f]) if posed[f] else FrameStatus.LOST
+                row = [repr(float(timestamp)), status.name.lower(), int(found.keyframes[f])]
+                values = [f"{v:.9g}" if np.isfinite(v) else "" for v in numbers[f]]
+                known = [int(maps[f]), *values] if posed[f] else [""] * (1 + len(values))
+                table.writerow(row + known)
+
+    atomic_write(path, write)
 
 
 def write_chosen(found: Odometry, rows: np.ndarray, path: Path) -> None:

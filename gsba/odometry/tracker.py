@@ -109,6 +109,8 @@ class Tracker:
         records: of all frames so far.
         keyframe_poses: (4, 4) each, of all keyframes so far, in the world of their map.
         keyframe_frames: index of each keyframe's frame.
+        keyframe_features: of each keyframe, the features it sees: ids (N,) int64, and bearings
+            (N, 3) float32, rig frame.
     """
 
     width: int  # pixels across the panoramas
@@ -118,6 +120,7 @@ class Tracker:
     records: list[FrameRecord] = field(default_factory=list)
     keyframe_poses: list[np.ndarray] = field(default_factory=list)
     keyframe_frames: list[int] = field(default_factory=list)
+    keyframe_features: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
 
     _layout: AtlasLayout = field(init=False)
     _cutter: Cutter = field(init=False)
@@ -383,6 +386,7 @@ class Tracker:
         self._window.append(key)
         self.keyframe_poses.append(key.world_T_rig)
         self.keyframe_frames.append(frame)
+        self.keyframe_features.append((ids, bearings.astype(np.float32)))
         del self._window[: -(FREE + HELD)]
         for old in self._window[:-_REMEMBERED]:
             old.atlas = old.small = old.described = None
@@ -409,6 +413,7 @@ class Tracker:
             if len(false):
                 kept = ~np.isin(key.ids, false)
                 key.ids, key.bearings = key.ids[kept], key.bearings[kept]
+                self.keyframe_features[key.number] = key.ids, key.bearings.astype(np.float32)
                 if n == len(window) - 1:
                     self._features = features = features.taken(kept)
         last = window[-1]
@@ -528,5 +533,6 @@ class Tracker:
         if not self.keyframe_poses:
             self.keyframe_poses.append(np.eye(4))
             self.keyframe_frames.append(len(self.records))
+            self.keyframe_features.append((np.zeros(0, np.int64), np.zeros((0, 3), np.float32)))
         key = self._window[-1].number if self._window else len(self.keyframe_poses) - 1
         self.records.append(FrameRecord(status, self._map, key, key_T_rig, distance, inliers))

@@ -1,14 +1,20 @@
 """Odometry of a whole sequence: its poses, what is known of each, and what went wrong."""
 
 import logging
+import os
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
+from gsba.geometry import inverse
 from gsba.log import GsbaError, track
+from gsba.odometry.closing import ClosedKeyframes, TrackedKeyframes, close
 from gsba.odometry.panoramas import SmallPanoramas
+from gsba.odometry.places import compressed
+from gsba.odometry.pose_graph import carried_covariances
 from gsba.odometry.tracker import FrameStatus, Tracker
+from gsba.store.shards import Threads, Workers
 from gsba.types import Trajectory
 from gsba.video.likeness import sharpness
 
@@ -16,6 +22,10 @@ logger = logging.getLogger(__name__)
 
 _MIN_FRAMES_OF_MAP = 5  # fewer say nothing
 _PATIENCE_S, _MIN_PATIENCE = 1.5, 8  # seconds, and frames, before a lost camera begins a new map
+
+
+def _no_pairs() -> np.ndarray:
+    return np.zeros((0, 2), np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +50,14 @@ class Odometry:
     inliers: np.ndarray  # (F,) int32, features that fit the pose
     sharpness: np.ndarray  # (F,) float64, of the small picture; see gsba.video.likeness
     cpu_s: float  # processor time of tracking, decoding apart
+    covariances: np.ndarray | None = None  # (F, 6, 6) float64, of poses: tangent [rotation rad,
+    # translation], map units; the first pose of each map and its distance to the furthest are held;
+    # NaN and None = not known
+    loops: np.ndarray = field(default_factory=_no_pairs)  # (L, 2) int64, frames at which a map was
+    # found to meet itself
+    joins: np.ndarray = field(default_factory=_no_pairs)  # (M, 2) int64, frames at which a map was
+    # joined to one begun before
+    closing_cpu_s: float = 0.0  # processor time of joining maps and closing loops
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -63,18 +81,37 @@ class Odometry:
         return bool(np.count_nonzero(found) > 0.5 * len(self))
 
     def pieces(self) -> list[Trajectory]:
-        """Posed frames of each map; no two maps are related."""
-        posed = self.posed()
-        rows = [np.flatnonzero(posed & (self.maps == m)) for m in np.unique(self.maps[posed])]
-        return [Trajectory(self.timestamps[some], self.world_T_rigs[some]) for some in rows]
+        """Posed frames of each map in order of time; no two pieces are related.
+
+        A map that was joined to one before another that stands apart is a piece of its own here.
+        """
+        return [Trajectory(self.timestamps[rows], self.world_T_rigs[rows]) for rows in self._runs()]
 
     def trajectory(self, keyframes: bool = False) -> Trajectory:
-        """Posed frames of all maps one after another, or keyframes alone.
+        """Posed frames of all pieces one after another, or keyframes alone.
 
-        Each map begins at the identity, by which `gsba.trajectory.restarts` tells them apart.
+        Each begins at the identity, by which `gsba.trajectory.restarts` tells them apart.
         """
-        rows = self.posed() & (self.keyframes if keyframes else True)
-        return Trajectory(self.timestamps[rows], self.world_T_rigs[rows])
+        poses, seen = self.world_T_rigs.copy(), set[int]()
+        for rows in self._runs():
+            number = int(self.maps[rows[0]])
+            if number in seen:
+                poses[rows] = inverse(poses[rows[0]]) @ poses[rows]
+            seen.add(number)
+        chosen = self.posed() & (self.keyframes if keyframes else True)
+        return Trajectory(self.timestamps[chosen], poses[chosen])
+
+    def _runs(self) -> list[np.ndarray]:
+        """Rows of posed frames, cut wherever the next one is of another map."""
+        rows = np.flatnonzero(self.posed())
+        cuts = np.flatnonzero(np.diff(self.maps[rows])) + 1
+        return [run for run in np.split(rows, cuts) if len(run)]
+
+    def maps_in_turn(self) -> np.ndarray:
+        """Number (F,) of the map that each frame is in, 1 = the first; 0 = in none."""
+        numbers, posed = np.zeros(len(self), int), self.posed()
+        numbers[posed] = 1 + np.unique(self.maps[posed], return_inverse=True)[1]
+        return numbers
 
     def lost(self) -> list[Stretch]:
         """Stretches of frames without a pose."""
@@ -94,9 +131,12 @@ class Odometry:
             "keyframes": int((self.keyframes & posed).sum()),
             "turning_before_start": int((self.statuses == FrameStatus.TURNING).sum()),
             "maps": len(np.unique(self.maps[posed])),
+            "loops": self.timestamps[self.loops].tolist(),
+            "joins": self.timestamps[self.joins].tolist(),
             "path_lengths": self.path_lengths(),
             "lost": [asdict(stretch) for stretch in self.lost()],
             "cpu_ms_per_frame": 1e3 * self.cpu_s / max(len(self), 1),
+            "closing_cpu_s": self.closing_cpu_s,
         }
 
     def summary(self) -> str:
@@ -105,8 +145,13 @@ class Odometry:
         line = f"{told['posed']} of {told['frames']} frames posed, {told['keyframes']} keyframes"
         if not (self.statuses == FrameStatus.TRACKED).any():
             line += ", rotations only: the camera did not move enough to tell where it went"
-        elif len(self.pieces()) > 1:
-            line += f", {len(self.pieces())} maps that nothing ties together"
+        for count, name in ((len(self.loops), "loop"), (len(self.joins), "map")):
+            if count:
+                how = "closed" if name == "loop" else "joined to those before"
+                line += f", {count} {name}{'s' * (count > 1)} {how}"
+        maps = len(np.unique(self.maps[self.posed()]))
+        if maps > 1:
+            line += f", {maps} maps that nothing ties together"
         return f"{line}, {told['cpu_ms_per_frame']:.0f} ms of processor time a frame"
 
     def _stretches(self, chosen: np.ndarray) -> list[Stretch]:
@@ -118,12 +163,19 @@ class Odometry:
         ]
 
 
-def track_panoramas(panoramas: SmallPanoramas, seed: int = 0) -> Odometry:
-    """Follow a camera through a sequence.
+def track_panoramas(
+    panoramas: SmallPanoramas,
+    seed: int = 0,
+    workers: Workers | None = None,
+    with_loops: bool = True,
+) -> Odometry:
+    """Follow a camera through a sequence, then join its maps and close its loops.
 
     Args:
         panoramas: all frames, in time order; damaged ones count as lost.
-        seed: of the sampling at the start of a map.
+        seed: of the sampling.
+        workers: who compare places; None = threads of this process.
+        with_loops: False = leave maps and drift as they are, and covariances unknown.
 
     Raises:
         GsbaError: no picture can be decoded.
@@ -132,32 +184,96 @@ def track_panoramas(panoramas: SmallPanoramas, seed: int = 0) -> Odometry:
     interval = float(np.median(np.diff(panoramas.timestamps)))
     patience = max(_MIN_PATIENCE, round(_PATIENCE_S / interval))
     tracker = Tracker(panoramas.width, panoramas.usable, seed, patience)
-    rows, sharp, cpu_s = [], np.zeros(num), 0.0
+    rows, kept, sharp, cpu_s = [], list[np.ndarray](), np.zeros(num), 0.0
     pictures = panoramas.read(range(num), False)
     for row, grey in track(pictures, "tracking", num):
         began = time.thread_time()
         tracker.add(grey)
         sharp[row] = sharpness(grey)
         rows.append(row)
+        while len(tracker.keyframe_frames) > len(kept):
+            kept.append(compressed(grey))
         cpu_s += time.thread_time() - began
     if not rows:
         raise GsbaError(f"{panoramas.source}: none of its pictures could be decoded; copy it again")
-    records = tracker.records
-    poses = np.tile(np.eye(4), (num, 1, 1))
-    poses[rows] = tracker.world_T_rigs()
-    statuses = np.full(num, FrameStatus.LOST, np.uint8)
-    statuses[rows] = [record.status for record in records]
-    maps = np.zeros(num, np.int32)
-    maps[rows] = [record.map_number for record in records]
-    keyframes, distances, inliers = np.zeros(num, bool), np.full(num, np.nan), np.zeros(num, int)
-    keyframes[np.array(rows)[tracker.keyframe_frames]] = True
-    distances[rows] = [record.distance for record in records]
-    inliers[rows] = [record.inliers for record in records]
-    found = Odometry(
-        panoramas.timestamps, poses, statuses, maps, keyframes, distances, inliers, sharp, cpu_s
-    )
+    began = time.process_time()
+    keyframes = _tracked_keyframes(tracker, panoramas, np.array(rows), kept)
+    closed = ClosedKeyframes.unchanged(keyframes)
+    if with_loops:
+        closed = close(keyframes, seed, workers or Threads(os.cpu_count() or 1))
+    spent = cpu_s, time.process_time() - began
+    ends = keyframes, closed, panoramas.timestamps, np.array(rows)
+    found = _odometry(tracker, *ends, sharp, spent)
     _log(found)
     return found
+
+
+def _tracked_keyframes(
+    tracker: Tracker, panoramas: SmallPanoramas, rows: np.ndarray, pictures: list[np.ndarray]
+) -> TrackedKeyframes:
+    """What is known of keyframes; `rows` (R,): of the panoramas that were tracked."""
+    frames = np.array(tracker.keyframe_frames)
+    statuses = np.array([record.status for record in tracker.records])
+    numbers = np.array([record.map_number for record in tracker.records])
+    distances = np.array([record.distance for record in tracker.records])
+    maps = numbers[frames].astype(np.int32)
+    known = np.isfinite(distances)
+    with_points = np.unique(numbers[(statuses == FrameStatus.TRACKED) & known])
+    if len(with_points):
+        distances = np.interp(np.arange(len(distances)), np.flatnonzero(known), distances[known])
+    return TrackedKeyframes(
+        np.array(tracker.keyframe_poses),
+        maps,
+        np.isin(maps, with_points),
+        distances[frames],
+        tracker.keyframe_features,
+        pictures,
+        panoramas.timestamps[rows[frames]],
+        panoramas.width,
+        panoramas.usable,
+    )
+
+
+def _odometry(
+    tracker: Tracker,
+    tracked: TrackedKeyframes,
+    closed: ClosedKeyframes,
+    timestamps: np.ndarray,
+    rows: np.ndarray,
+    sharp: np.ndarray,
+    spent: tuple[float, float],
+) -> Odometry:
+    """Frames moved with their keyframes.
+
+    Args:
+        tracker: after the last frame.
+        tracked, closed: its keyframes before and after loops were closed.
+        timestamps, sharp: (F,) of all panoramas.
+        rows: (R,) of these, those that could be read.
+        spent: seconds of processor time, of tracking and of closing loops.
+    """
+    num, records = len(timestamps), tracker.records
+    keys = np.array([record.keyframe for record in records])
+    key_T_rigs = np.array([record.key_T_rig for record in records])
+    key_T_rigs[:, :3, 3] *= closed.scales[keys, None]
+    poses, covariances = np.tile(np.eye(4), (num, 1, 1)), np.full((num, 6, 6), np.nan)
+    poses[rows] = closed.world_T_keys[keys] @ key_T_rigs
+    statuses, maps = np.full(num, FrameStatus.LOST, np.uint8), np.zeros(num, np.int32)
+    statuses[rows] = [record.status for record in records]
+    key_maps = np.array([r.map_number for r in records])[tracker.keyframe_frames]
+    joined = dict(zip(key_maps.tolist(), closed.maps.tolist(), strict=True))
+    maps[rows] = [joined.get(record.map_number, record.map_number) for record in records]
+    keyframes, distances, inliers = np.zeros(num, bool), np.full(num, np.nan), np.zeros(num, int)
+    of_keys = rows[tracker.keyframe_frames]
+    keyframes[of_keys] = True
+    distances[rows] = [record.distance for record in records]
+    distances[rows] *= closed.scales[keys]
+    near = tracked.distances[keys] * closed.scales[keys]
+    covariances[rows] = carried_covariances(closed.covariances[keys], key_T_rigs, near)
+    inliers[rows] = [record.inliers for record in records]
+    known = statuses, maps, keyframes, distances, inliers, sharp
+    ends = of_keys[closed.loops], of_keys[closed.joins]
+    return Odometry(timestamps, poses, *known, spent[0], covariances, *ends, spent[1])
 
 
 def _log(found: Odometry) -> None:

@@ -207,8 +207,9 @@ def take_frames(
     odometry: bool | None,
     masks: Choice,
     calibration: Path | None,
-) -> tuple[list[Trajectory], RefineSettings]:
-    """Frames of the video that a run is about, in `out`/frames; its start, and settings for that.
+) -> tuple[list[Trajectory], RefineSettings, Odometry | None]:
+    """Frames of the video that a run is about, in `out`/frames; its start, settings for that, and
+    the odometry that it comes from.
 
     Args:
         given: trajectories; where there is none, the video may be followed by odometry.
@@ -218,9 +219,10 @@ def take_frames(
     follow = follows(settings.video, fps, odometry) and not given
     asked = settings, fps, fresh, masks if follow else None, calibration
     found = extract_frames(out, origin, *asked)
-    if not found:
-        return given, settings
-    return found, settings.with_faint_priors()  # made of these very images: no evidence beside them
+    if found is None:
+        return given, settings, None
+    # Made of these very images: no evidence beside them.
+    return found.pieces(), settings.with_faint_priors(), found
 
 
 def extract_frames(
@@ -231,7 +233,7 @@ def extract_frames(
     fresh: bool,
     by_odometry: Choice | None = None,
     calibration: Path | None = None,
-) -> list[Trajectory]:
+) -> Odometry | None:
     """Write the frames of the video that a run is about to `out`/frames.
 
     Args:
@@ -245,7 +247,8 @@ def extract_frames(
         calibration: of the lenses of a raw video, for the odometry.
 
     Returns:
-        The odometry's trajectory, in pieces; none where it was not asked for, or found too little.
+        The odometry that frames were chosen by; None where it was not asked for, or found too
+        little.
     """
     chosen = settings.video
     if EXIF in (settings.placement.gps, settings.gps.file):
@@ -254,15 +257,15 @@ def extract_frames(
         read_fixes(settings.gps.file)  # fails before hours of decoding
     if fps is not None:
         chosen = chosen.model_copy(update={"fps": check_fps(fps), "every": None, "at": None})
-    pieces: list[Trajectory] = []
+    found: Odometry | None = None
     with RunStore(out, dict(origin), fresh) as store:
         if by_odometry is not None:
-            pieces = _follow(store, origin["frames"], settings, by_odometry, calibration)
-        if pieces:
+            found = _follow(store, origin["frames"], settings, by_odometry, calibration)
+        if found is not None:
             chosen = chosen.model_copy(update={"at": str(out / CHOSEN), "sharpest": False})
         video.extract(origin["frames"], out / "frames", chosen, replace=True)
         store.claim(out / "frames")
-    return pieces
+    return found
 
 
 def _follow(
@@ -271,9 +274,9 @@ def _follow(
     settings: RefineSettings,
     masks: Choice,
     calibration: Path | None,
-) -> list[Trajectory]:
-    """Odometry of a video, its trajectory and chosen frames written to the run's folder."""
-
+) -> Odometry | None:
+    """Odometry of a video, its trajectory and chosen frames written to the run's folder; None
+    where it lost the camera in most of the video."""
     part = (settings.video.from_s, settings.video.to_s)
     width, seed = settings.odometry.width, settings.seed
 
@@ -290,11 +293,12 @@ def _follow(
     found = store.stage("odometry", key, compute, Odometry)
     if not found.usable():
         logger.warning("the odometry lost the camera in most of the video: frames at a fixed rate")
-        return []
+        return None
     rows = odometry.choose_frames(found, settings.odometry)
     logger.info("%d of %d frames chosen by what they show", len(rows), len(found))
     folder = store.root / CHOSEN.parent
-    write_odometry(found, folder / "walk.tum", folder / "keyframes.tum", folder / "odometry.json")
+    names = "walk.tum", "keyframes.tum", "poses.csv", "odometry.json"
+    write_odometry(found, *(folder / name for name in names))
     write_chosen(found, rows, store.root / CHOSEN)
     store.claim(folder)
-    return found.pieces()
+    return found

@@ -1,7 +1,7 @@
 """A run from frames and a coarse trajectory to refined poses, a cloud and datasets."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from gsba.imu.readings import Readings
 from gsba.loop_closure import connectivity
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
-from gsba.odometry.walk import Odometry
+from gsba.odometry import Odometry
 from gsba.photometric import direct
 from gsba.pipeline import acceptance, backend, densify, frontend, inputs, outputs, patch_rounds
 from gsba.pipeline.frontend import Seen
@@ -32,8 +32,9 @@ from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Journal, Run
 from gsba.placement import check
+from gsba.report.html import add_odometry
 from gsba.store import cluster
-from gsba.store.store import RunStore, load_stage
+from gsba.store.store import RunStore
 from gsba.trajectory.axes import quarter_turn
 from gsba.types import (
     CoarsePoses,
@@ -110,28 +111,23 @@ def refine(
     chosen, readings = merging.choose(masks, segment), inputs.read_gyro(imu, frames)
     origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
+    walk: Odometry | None = None
     if video.is_video(frames):
         asked = fps, fresh, odometry, chosen, calibration
-        given, settings = inputs.take_frames(out, origin, given, settings, *asked)
+        given, settings, walk = inputs.take_frames(out, origin, given, settings, *asked)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     lenses = calibration, inputs.given_circles(circles, calibration)
     frame_set = scan(frames, timestamps, fps, chosen.given, not given, *lenses)
     start = _start_of(frame_set, given, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
         begin = partial(_begin, store, given, settings, chosen, families, readings)
-        if given and len(origin) == 1:  # of the video's own odometry
-            walk = load_stage(out, "odometry", Odometry)
-
-            def measure(some: FrameSet) -> Prior:
-                run, prior = begin(_start_of(some, given, settings))
-                return _map_features(run, frontend.extract(run), prior, given)[0]
-
-            whole = densify.fetch_where_weak(
-                store, origin["frames"], walk, frame_set, settings, measure
-            )
-            start = start if whole is frame_set else _start_of(whole, given, settings)
+        if walk is not None:
+            start = _with_fetched(store, origin["frames"], walk, start, given, settings, begin)
         run, prior = begin(start)
-        return _refine(run, prior, given, len(origin) == 1)
+        result = _refine(run, prior, given, len(origin) == 1)
+        if walk is not None:
+            add_odometry(out / "report.html", walk)
+        return result
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +142,26 @@ class _Start:
 def _start_of(frames: FrameSet, given: Sequence[Trajectory], settings: RefineSettings) -> _Start:
     fixes = inputs.positions_of(frames, settings)
     return _Start(frames, inputs.coarse_poses(frames, given, settings), fixes)
+
+
+def _with_fetched(
+    store: RunStore,
+    video_file: Path,
+    walk: Odometry,
+    start: _Start,
+    given: Sequence[Trajectory],
+    settings: RefineSettings,
+    begin: Callable[[_Start], tuple[Run, Prior]],
+) -> _Start:
+    """The start with more frames of a video where the map of features is weak."""
+
+    def measure(some: FrameSet) -> Prior:
+        run, prior = begin(_start_of(some, given, settings))
+        return _map_features(run, frontend.extract(run), prior, given)[0]
+
+    given_frames = start.frames
+    whole = densify.fetch_where_weak(store, video_file, walk, given_frames, settings, measure)
+    return start if whole is given_frames else _start_of(whole, given, settings)
 
 
 def _begin(

@@ -1,5 +1,6 @@
 """`gsba track` on folders and videos, and the refinement of a video by its own odometry."""
 
+import csv
 import json
 from pathlib import Path
 
@@ -65,6 +66,12 @@ def test_every_frame_gets_a_pose(
     keyframes = read_trajectory(tmp_path / "walk-keyframes.tum")
     assert len(keyframes.timestamps) == report["keyframes"] < len(walk.frames)
     assert report["lost"] == [] and report["maps"] == 1
+    with (tmp_path / "walk-poses.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] for row in rows[1:]] == ["tracked"] * (len(walk.frames) - 1)
+    assert sum(int(row["keyframe"]) for row in rows) == report["keyframes"]
+    assert {row["map"] for row in rows} == {"1"}
+    assert all(float(row["cov_tx_tx"]) > 0 for row in rows)
 
 
 def test_a_mask_is_used_and_a_false_one_refused(folder: Path, tmp_path: Path) -> None:
@@ -108,7 +115,9 @@ def test_a_video_is_refined_from_its_own_odometry(
     light = ["--set", "patches.rounds=0", "--set", "features.max_per_face=300"]
     result = _run("refine", video, "--masks", "none", "--out", out, *light)
     assert result.exit_code == 0, result.output
-    assert (out / "odometry/walk.tum").is_file()
+    assert (out / "odometry/walk.tum").is_file() and (out / "odometry/poses.csv").is_file()
+    assert "Where the video's own odometry had the camera" in (out / "report.html").read_text()
+    assert '"odometry":{"summary":' in (out / "report.html").read_text()
     chosen = read_trajectory(out / "odometry/chosen.tum")
     assert len(list((out / "frames").glob("*.jpg"))) == len(chosen.timestamps)
     assert _ate(out / "trajectory.tum", walk) < 0.005

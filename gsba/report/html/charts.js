@@ -167,3 +167,32 @@ function sphere(canvas, scale, data) {
     return [`${where}\n${bias}\n${num(count[i][j])} observations`, -1];
   });
 }
+
+/* The video's own odometry from above: maps side by side, keyframes, loops, and where it was lost. */
+function odometryMap(canvas, legend) {
+  const { maps, loops, joins } = D.odometry;
+  const entries = [["keyframe", "--after"], ["loop closed", "--good"], ["maps joined", "--d"], ["lost until the next frame", "--bad"]];
+  for (const [name, colour] of entries)
+    legend.append(make("span", {}, make("i", { style: `background:var(${colour})` }), ` ${name}`));
+  const all = maps.flatMap(m => m.positions);
+  const range = k => [Math.min(...all.map(p => p[k])), Math.max(...all.map(p => p[k]))];
+  const [x0, x1] = range(0), [y0, y1] = range(1);
+  surface(canvas, (g, width, height) => {
+    const scale = 0.82 * Math.min(width / (x1 - x0 || 1), height / (y1 - y0 || 1));
+    const X = p => width / 2 + (p[0] - (x0 + x1) / 2) * scale, Y = p => height / 2 - (p[1] - (y0 + y1) / 2) * scale;
+    const line = (a, b, colour, size) => {
+      g.strokeStyle = css(colour); g.lineWidth = size;
+      g.beginPath(); g.moveTo(X(a), Y(a)); g.lineTo(X(b), Y(b)); g.stroke();
+    };
+    maps.forEach((m, number) => {
+      m.positions.forEach((p, i) => { if (i) line(m.positions[i - 1], p, m.lost[i] ? "--bad" : "--quiet", m.lost[i] ? 2 : 1.4); });
+      g.fillStyle = css("--after");
+      m.positions.forEach((p, i) => { if (m.keyframes[i]) { g.beginPath(); g.arc(X(p), Y(p), 2.2, 0, 7); g.fill(); } });
+      if (maps.length > 1) { g.textAlign = "left"; label(g, `map ${number + 1}`, X(m.positions[0]) + 8, Y(m.positions[0]) - 8); }
+    });
+    for (const [pairs, colour] of [[loops, "--good"], [joins, "--d"]]) for (const [a, b] of pairs) {
+      line(a, b, colour, 2);
+      for (const p of [a, b]) { g.strokeStyle = css(colour); g.beginPath(); g.arc(X(p), Y(p), 5, 0, 7); g.stroke(); }
+    }
+  });
+}

@@ -178,6 +178,10 @@ matrix(el("matrix"), el("matrix-scale"));
 sphere(el("sphere"), el("sphere-scale"), D.sphere);
 if (D.field) sphere(el("field"), el("field-scale"), D.field);
 else el("field-card").remove();
+if (D.odometry) {
+  el("odometry-lead").textContent = `Where the video's own odometry had the camera, before refinement: ${D.odometry.summary}.`;
+  odometryMap(el("walk"), el("odometry-legend"));
+} else el("odometry").remove();
 if (D.scan) scan();
 else el("scan").remove();
 worst();

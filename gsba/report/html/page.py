@@ -11,7 +11,9 @@ import numpy as np
 
 from gsba.disk import write_text
 from gsba.log import GsbaError
+from gsba.odometry import Odometry
 from gsba.report.html import figures, pictures
+from gsba.report.html.odometry import odometry_plan
 from gsba.report.report import frame_quality, plain
 from gsba.types import CoarsePoses, FrameSet, Reconstruction
 
@@ -49,6 +51,7 @@ def write_html(
         "erp_width": frames.panorama_width,
         "worst": _worst(frames, reconstruction),
         "scan": None,
+        "odometry": None,
     }
     write_text(path, _assembled(_dumped(data)))
 
@@ -63,12 +66,30 @@ def add_scan(path: Path, content: Mapping[str, Any]) -> None:
     Raises:
         GsbaError: the page is none, or cannot be written.
     """
-    if not path.exists():
-        return
+    if path.exists():
+        shown = {name: content[name] for name in ("scan", "before", "after") if name in content}
+        _add(path, "scan", shown)
+
+
+def add_odometry(path: Path, found: Odometry) -> None:
+    """Show a video's odometry on a run's page: its maps from above, keyframes, loops, losses.
+
+    Args:
+        path: the page, written by `write_html`.
+        found: of the video that the run is about.
+
+    Raises:
+        GsbaError: the page is none, or cannot be written.
+    """
+    _add(path, "odometry", odometry_plan(found))
+
+
+def _add(path: Path, name: str, content: Mapping[str, Any]) -> None:
+    """Put further data into a page."""
     try:
         text = path.read_text(encoding="utf-8")
         data = json.loads(text.partition(_BEFORE_DATA)[2].partition(_AFTER_DATA)[0])
-        data["scan"] = {name: content[name] for name in ("scan", "before", "after")}
+        data[name] = content
     except (OSError, ValueError, KeyError, TypeError):
         raise GsbaError(f"{path}: is no page of a run: refine again") from None
     write_text(path, _assembled(_dumped(data)))

@@ -1,0 +1,109 @@
+"""The test of joins: what the frames around a meeting say of a similarity that is proposed there.
+
+It judges joins of maps and loops within one map alike: evidence for and against, and rivals.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsba.geometry import inverse
+from gsba.loop_closure import join_evidence
+from gsba.loop_closure.join_evidence import JoinEvidence, Places, Rates, around
+from gsba.loop_closure.map_similarity import Meeting, Proposal, alike, refined
+from gsba.matching.guided_search import MatchContext
+from gsba.similarity import Sim3
+from gsba.types import Matches
+
+_SAME_PLACE = (
+    2.0  # times the differences of two estimates of one join: no other place yet, as parts
+)
+# that drift meet a little differently at either end
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A proposal fitted to all that both sides know around its meeting."""
+
+    proposal: Proposal
+    evidence: JoinEvidence
+
+
+@dataclass(slots=True)
+class JoinTest:
+    """Frames, their points, and how often points are found again where all is right."""
+
+    context: MatchContext
+    poses: np.ndarray  # (F, 4, 4) float64, changes while maps grow
+    known: Sequence[np.ndarray]  # (F) of (K_f, 3): points of keypoints, rig frames; NaN = unknown
+    depth: float  # median distance of points, map units
+    measure_rates: Callable[[], Rates]  # how often points are found again; asked once
+    _usual: Rates | None = None
+
+    def judge(self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray) -> Judged:
+        """Weigh a proposal that carries frames `rows` (N,) to frames `inside` (M,), ascending."""
+        found = self._judged(proposal, rows, inside, join_evidence.LOCAL)
+        if found.evidence.decided:
+            return found
+        # More frames tell more, if drift lets them.
+        wider = self._judged(proposal, rows, inside, join_evidence.WIDER)
+        return max((found, wider), key=lambda one: one.evidence.least)
+
+    def rivals(self, best: Judged, others: Sequence[Judged]) -> list[Judged]:
+        """Proposals for another place that are confirmed too, and no worse."""
+        return [
+            other
+            for other in others
+            if other.evidence.confirmed and not best.evidence.beats(other.evidence)
+            if not alike(best.proposal, other.proposal, self.poses, self.depth, _SAME_PLACE)
+        ]
+
+    def weigh(
+        self, rows: np.ndarray, inside: np.ndarray, move: Sim3
+    ) -> tuple[JoinEvidence, Matches]:
+        """What speaks for frames being where a similarity carries them, and what is found again."""
+        poses, known = self.poses.copy(), list(self.known)
+        poses[rows] = move.poses(poses[rows])
+        for f in rows:
+            known[f] = move.scale * known[f]
+        if self._usual is None:
+            self._usual = self.measure_rates()
+        places = Places(poses, known)
+        return join_evidence.weigh(self.context, places, (rows, inside), self._usual, self.depth)
+
+    def meetings(
+        self, matches: Matches, outside: np.ndarray, f0_T_f1s: np.ndarray | None = None
+    ) -> list[Meeting]:
+        """Matched points that both frames of pairs know, one of them among those outside.
+
+        Args:
+            matches: of P pairs.
+            outside: frames (N,).
+            f0_T_f1s: (P, 4, 4) relative poses by bearings, their translations of any length.
+        """
+        found = []
+        for p, (f0, f1) in enumerate(matches.pairs.tolist()):
+            matched = matches.of(p)
+            (f, g), columns = ((f0, f1), (0, 1)) if f0 in outside else ((f1, f0), (1, 0))
+            own = self.known[f][matched[:, columns[0]]]
+            theirs = self.known[g][matched[:, columns[1]]]
+            both = np.isfinite(own).all(axis=1) & np.isfinite(theirs).all(axis=1)
+            if both.any():
+                step = None if f0_T_f1s is None else f0_T_f1s[p]
+                g_T_f = inverse(step) if step is not None and f == f0 else step
+                found.append(Meeting(f, g, own[both], theirs[both], g_T_f))
+        return found
+
+    def _judged(
+        self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, reach: int
+    ) -> Judged:
+        """As `judge`, by frames at most `reach` to either side of the meeting."""
+        f, g = proposal.frames
+        groups = around(rows, f, reach), around(inside, g, reach)
+        evidence, found = self.weigh(*groups, proposal.move)
+        again = self.meetings(found, rows)
+        if again:
+            proposal = replace(proposal, move=refined(again, proposal.move, self.poses))
+            evidence, _ = self.weigh(*groups, proposal.move)
+        return Judged(proposal, evidence)

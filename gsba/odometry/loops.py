@@ -1,0 +1,253 @@
+"""Places of one map that are met again, believed by the test that judges joins of maps."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from gsba.geometry import inverse
+from gsba.loop_closure import join_evidence, loops
+from gsba.loop_closure.join_evidence import LOCAL, around
+from gsba.loop_closure.join_evidence import Places as KnownPlaces
+from gsba.loop_closure.join_test import JoinTest, Judged
+from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
+from gsba.loop_closure.pose_graph import Loop
+from gsba.loop_closure.retrieval import looks_of
+from gsba.matching import recovery
+from gsba.odometry.places import Places
+from gsba.odometry.pose_graph import Constraint
+from gsba.similarity import Sim3
+
+logger = logging.getLogger(__name__)
+
+_MAX_SCALE_DRIFT = 1.25  # of a map between two visits, either way
+_MIN_POINTS = 6  # that both places of a pair know
+_BESIDE = 4  # places from the ends of a meeting: others are a meeting of their own
+_MAX_TRIED = 4  # proposals of one meeting that are weighed
+_FITTED = 3  # places to either side of a meeting, by which the loop is measured
+_DIRECTION_SIGMA = np.deg2rad(0.25)  # of points that both sides know, as seen from a place
+_DISTANCE_SIGMA = 0.1  # of the logarithm of the ratio of their distances
+_FITTING = 4.0  # of these, from where a point should be seen from either side, at most: it fits
+_MIN_FITTING = 0.35  # share of points that fit a loop that is measured; true ones have 0.4 to 0.6
+_MIN_ROTATION = np.deg2rad(0.1)  # standard deviations of a loop however many points it rests on:
+_MIN_TRANSLATION = 0.003  # lenses have two centres, and each side has drifted; in median distances
+_MIN_LOG_SCALE = 0.01
+_UNMEASURED = 5.0  # times these, where too few points beside the meeting measure it
+_CORRELATED = 4.0  # times the variance of independent points: those of one surface err alike
+
+
+def find_loops(places: Places, unseen: np.ndarray) -> list[Constraint]:
+    """Loops that appearance proposes, and that geometry and all that is around confirm.
+
+    Args:
+        places: of one map, in time order.
+        unseen: (P - 1,) bool, steps between places that no image tells.
+    """
+    solved, context, num = places.solved, places.context, len(places.keyframes)
+    looks = looks_of(context.strongest, num, context.settings.seed, context.workers)
+    chosen = loops.candidates(looks, solved, unseen, context.settings)
+    strongest = replace(context, frames=context.strongest)
+    verified = recovery.match_anywhere(strongest, chosen, rivals=False)
+    test = _join_test(places)
+    none = np.zeros(0, np.int64)  # the later place of each pair is carried to the earlier one
+    meetings = test.meetings(verified.matches, none, verified.f0_T_f1s)
+    meetings = [found for found in meetings if len(found.own) >= _MIN_POINTS]
+    judged = [
+        one
+        for group in _meeting_by_meeting(meetings)
+        for one in _judged(group, places, unseen, test)
+    ]
+    kept = [one for one in judged if one.evidence.confirmed and not _rivals(one, judged, test)]
+    for one in judged:
+        logger.debug("a loop of places %s: %s", one.proposal.frames, one.evidence)
+    sides = [_sides(*one.proposal.frames, num) for one in kept]
+    measured = [_measured(one.proposal, *two, test) for one, two in zip(kept, sides, strict=True)]
+    return [one for one in measured if one is not None]
+
+
+def find_joins(places: Places) -> list[Constraint]:
+    """How maps that were joined lie in one another, each measured where it comes closest.
+
+    Args:
+        places: of one map that several were joined to, with poses in its world.
+    """
+    positions, maps = places.solved.world_T_rigs[:, :3, 3], places.maps
+    found, test = list[Constraint](), _join_test(places)
+    inside = maps == maps[0]
+    while not inside.all():
+        rows, others = np.flatnonzero(~inside), np.flatnonzero(inside)
+        distances = np.linalg.norm(positions[rows][:, None] - positions[others], axis=2)
+        f, g = np.unravel_index(np.argmin(distances), distances.shape)
+        proposal = Proposal(Sim3(), (int(rows[f]), int(others[g])), 0)
+        part = np.flatnonzero(maps == maps[rows[f]])
+        measured = _measured(proposal, part, others, test)
+        if measured is None:
+            # Frames that tell lie further off; the join itself is believed all the same.
+            end, start = others[g], rows[f]
+            poses, wide = places.solved.world_T_rigs, _UNMEASURED * _floor(test.depth)
+            step = Sim3.of(1.0, inverse(poses[end]) @ poses[start])
+            measured = Constraint(int(end), int(start), step, np.diag(np.square(wide)))
+        found.append(measured)
+        inside[part] = True
+    return found
+
+
+def _join_test(places: Places) -> JoinTest:
+    solved, context = places.solved, places.context
+    by_keypoint = solved.points_by_keypoint(context.keypoints)
+    frames = np.arange(len(places.keyframes))
+    known = [by_keypoint[int(f)] for f in frames]
+
+    def rates() -> join_evidence.Rates:
+        beside = KnownPlaces(solved.world_T_rigs, known)
+        return join_evidence.rates(context, beside, frames // (2 * LOCAL))
+
+    return JoinTest(context, solved.world_T_rigs, known, solved.median_depth(), rates)
+
+
+def _meeting_by_meeting(meetings: list[Meeting]) -> list[list[Meeting]]:
+    """Pairs of places grouped with those beside them, around the pairs that share most points."""
+    rest, groups = sorted(meetings, key=lambda m: -len(m.own)), list[list[Meeting]]()
+    while rest:
+        best = rest[0]
+        near = [max(abs(m.f - best.f), abs(m.g - best.g)) <= _BESIDE for m in rest]
+        groups.append([m for m, beside in zip(rest, near, strict=True) if beside])
+        rest = [m for m, beside in zip(rest, near, strict=True) if not beside]
+    return groups
+
+
+def _judged(
+    group: list[Meeting], places: Places, unseen: np.ndarray, test: JoinTest
+) -> list[Judged]:
+    """What the surroundings say of each similarity that a group of pairs proposes."""
+    poses, seed = places.solved.world_T_rigs, places.context.settings.seed
+    found = []
+    for proposal in propose(group, poses, test.depth, seed)[:_MAX_TRIED]:
+        if not _plausible(proposal, places, unseen):
+            continue
+        one = test.judge(proposal, *_sides(*proposal.frames, len(poses)))
+        if _plausible(one.proposal, places, unseen):
+            found.append(one)
+    return found
+
+
+def _plausible(proposal: Proposal, places: Places, unseen: np.ndarray) -> bool:
+    """Whether a loop asks for no more than the path between its places can have drifted."""
+    if abs(np.log(proposal.move.scale)) > np.log(_MAX_SCALE_DRIFT):
+        return False
+    (f, g), poses = proposal.frames, places.solved.world_T_rigs
+    g_T_f = inverse(poses[g]) @ proposal.move.poses(poses[f])
+    loop = Loop(g, f, g_T_f, proposal.support)
+    return loops.within_drift(loop, places.solved, unseen, places.context.settings)
+
+
+def _rivals(one: Judged, judged: list[Judged], test: JoinTest) -> list[Judged]:
+    """Other loops of the same stretch that would carry it elsewhere, and are no worse."""
+    f, g = one.proposal.frames
+    shared = [
+        other
+        for other in judged
+        if min(abs(other.proposal.frames[0] - f), abs(other.proposal.frames[1] - g)) <= _BESIDE
+    ]
+    return test.rivals(one, shared)
+
+
+def _measured(
+    proposal: Proposal, rows: np.ndarray, inside: np.ndarray, test: JoinTest
+) -> Constraint | None:
+    """A proposal that is believed, fitted to what the places next to the meeting know: drift is
+    least there. None where few of their points fit it.
+
+    Args:
+        proposal: carries places `rows` (N,) to places `inside` (M,), ascending.
+    """
+    (f, g), poses, move = proposal.frames, test.poses, proposal.move
+    rows, inside = around(rows, f, _FITTED), around(inside, g, _FITTED)
+    found = test.meetings(test.weigh(rows, inside, move)[1], rows)
+    start = Sim3.of(move.scale, inverse(poses[g]) @ move.poses(poses[f]))
+    if sum(len(m.own) for m in found) < _MIN_POINTS:
+        return None
+    fitted = fit_loop(found, poses, (f, g), start)
+    return None if fitted is None else Constraint(g, f, *fitted)
+
+
+def _sides(f: int, g: int, num: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places after and before the middle between a later place f and an earlier one g."""
+    middle = (f + g + 1) // 2
+    return np.arange(middle, num), np.arange(middle)
+
+
+def fit_loop(
+    meetings: list[Meeting], poses: np.ndarray, at: tuple[int, int], start: Sim3
+) -> tuple[Sim3, np.ndarray] | None:
+    """The similarity of two places by directions and distances of points that both sides know.
+
+    Directions fix the pose; distances fix the scale where the places are close to one another.
+
+    Args:
+        meetings: of places beside f and beside g.
+        poses: (P, 4, 4) of all places, right within either side.
+        at: the places f and g.
+        start: g_T_f, similarity of their rigs.
+
+    Returns:
+        g_T_f and its covariance (7, 7), see `Constraint`; None where few points fit it.
+    """
+    from scipy.optimize import least_squares
+
+    f, g = at
+    own = [m.own @ r[:3, :3].T + r[:3, 3] for m, r in _in_rig(meetings, poses, f, "f")]
+    theirs = [m.theirs @ r[:3, :3].T + r[:3, 3] for m, r in _in_rig(meetings, poses, g, "g")]
+    seers_own = [np.tile(r[:3, 3], (len(m.own), 1)) for m, r in _in_rig(meetings, poses, f, "f")]
+    seers = [np.tile(r[:3, 3], (len(m.own), 1)) for m, r in _in_rig(meetings, poses, g, "g")]
+    p, q = np.concatenate(own), np.concatenate(theirs)
+    from_p, from_q = np.concatenate(seers_own), np.concatenate(seers)
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        fit = moved(start, x)
+        there, back = fit.points(p) - from_q, fit.points_back(q) - from_p
+        at_q, at_p = q - from_q, p - from_p
+        lengths = [np.linalg.norm(v, axis=1, keepdims=True) for v in (there, at_q, back, at_p)]
+        parts = [
+            (there / lengths[0] - at_q / lengths[1]) / _DIRECTION_SIGMA,
+            (back / lengths[2] - at_p / lengths[3]) / _DIRECTION_SIGMA,
+            np.log(lengths[0] / lengths[1]) / _DISTANCE_SIGMA,
+        ]
+        return np.concatenate([part.ravel() for part in parts])
+
+    solved = least_squares(residuals, np.zeros(7), loss="soft_l1", x_scale="jac")
+    left = residuals(solved.x)
+    off = np.linalg.norm(left[: 6 * len(p)].reshape(2, len(p), 3), axis=2)
+    if np.mean((off < _FITTING).all(axis=0)) < _MIN_FITTING:
+        return None
+    noise = max(float(np.median(np.abs(left))) / 0.6745, 0.5)
+    information = solved.jac.T @ solved.jac
+    covariance = _CORRELATED * noise**2 * np.linalg.inv(information)
+    distance = float(np.median(np.linalg.norm(p, axis=1)))
+    return moved(start, solved.x), covariance + np.diag(np.square(_floor(distance)))
+
+
+def _floor(distance: float) -> np.ndarray:
+    """Standard deviations (7,) of a loop among points at a median distance."""
+    return np.array(
+        [_MIN_ROTATION] * 3 + [_MIN_TRANSLATION * distance] * 3 + [_MIN_LOG_SCALE], float
+    )
+
+
+def moved(similarity: Sim3, tangent: np.ndarray) -> Sim3:
+    """A similarity moved by a tangent (7,) [rotation, translation, log scale] on its right."""
+    from scipy.spatial.transform import Rotation
+
+    scale, rotation = similarity.scale, similarity.rotation
+    return Sim3(
+        scale * float(np.exp(tangent[6])),
+        rotation @ Rotation.from_rotvec(tangent[:3]).as_matrix(),
+        similarity.translation + scale * rotation @ tangent[3:6],
+    )
+
+
+def _in_rig(
+    meetings: list[Meeting], poses: np.ndarray, place: int, side: str
+) -> list[tuple[Meeting, np.ndarray]]:
+    """Each meeting with the pose of its frame on one side, "f" or "g", in the rig of a place."""
+    return [(m, inverse(poses[place]) @ poses[getattr(m, side)]) for m in meetings]

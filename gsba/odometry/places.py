@@ -1,0 +1,135 @@
+"""Places of a walk: some keyframes, with descriptors and points by which they are met again."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from gsba.bundle.tracks import build
+from gsba.bundle.triangulation import place
+from gsba.camera.rig import CubeRig
+from gsba.config import FeatureSettings, PairSettings, RefineSettings
+from gsba.features.detection import SiftExtractor, extract, gather
+from gsba.log import track
+from gsba.matching.correspondences import match_along_epipolars
+from gsba.matching.guided_search import MatchContext, SearchableFrames
+from gsba.odometry.atlas import AtlasLayout, Cutter
+from gsba.store.shards import Workers
+from gsba.types import Features, Solution
+
+_JPEG_QUALITY = 90
+_HFOV = np.deg2rad(94.0)  # of faces: keypoints near a border are described by what is beyond it
+_STEP = 0.12  # from one place to the next, at least; part of the median distance of points
+_MAX_PER_FACE = 150  # keypoints
+_STRONGEST_PER_FACE = 100  # of these, that are compared where nothing is predicted
+_SETTINGS = RefineSettings(
+    pairs=PairSettings(strongest_per_face=_STRONGEST_PER_FACE, far_drift=0.03)
+)
+_MAX_ERROR_SIGMAS = 6.0  # of an observation from its point
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Chosen keyframes of maps that have points; a place is a frame to whatever compares them."""
+
+    keyframes: np.ndarray  # (P,) int64, numbers of the keyframes
+    maps: np.ndarray  # (P,) int32, map that each was tracked in
+    features: Sequence[Features]  # (P), keypoints and their descriptors
+    solved: Solution  # poses, each in the world of its map, and points of the keypoints
+    context: MatchContext  # of the keypoints
+
+    def taken(self, rows: np.ndarray, world_T_rigs: np.ndarray) -> "Places":
+        """Some places (P',), ascending, with other poses (P', 4, 4) and points that fit these."""
+        features = [self.features[row] for row in rows]
+        seed, workers = self.context.settings.seed, self.context.workers
+        return make_places(
+            self.keyframes[rows], self.maps[rows], world_T_rigs, features, seed, workers
+        )
+
+
+def compressed(grey: np.ndarray) -> np.ndarray:
+    """A panorama (h, 2h) uint8 as JPEG, (n,) uint8: some tens of kilobytes."""
+    return np.asarray(cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])
+
+
+def chosen_keyframes(
+    world_T_rigs: np.ndarray, maps: np.ndarray, distances: np.ndarray
+) -> np.ndarray:
+    """Numbers (P,) of keyframes that are a step apart from the one chosen before.
+
+    Args:
+        world_T_rigs: (K, 4, 4) of all keyframes.
+        maps: (K,) map of each, -1 = none that has points.
+        distances: (K,) median distance of their points, map units.
+    """
+    chosen: list[int] = []
+    for k in np.flatnonzero(maps >= 0).tolist():
+        if chosen and maps[chosen[-1]] == maps[k]:
+            moved = world_T_rigs[k, :3, 3] - world_T_rigs[chosen[-1], :3, 3]
+            if np.linalg.norm(moved) < _STEP * distances[k]:
+                continue
+        chosen.append(k)
+    return np.array(chosen, np.int64)
+
+
+def described(
+    pictures: Sequence[np.ndarray], width: int, usable: np.ndarray | None
+) -> list[Features]:
+    """Keypoints of keyframes.
+
+    Args:
+        pictures: panoramas as `compressed` made them.
+        width: pixels across them.
+        usable: (h, 2h) bool, what shows the scene; None = all.
+    """
+    size = round(width / np.pi * np.tan(_HFOV / 2))
+    rig = CubeRig(size, _HFOV)
+    layout = AtlasLayout(rig)
+    cutter, extractor = Cutter(layout), SiftExtractor(FeatureSettings(max_per_face=_MAX_PER_FACE))
+
+    def faces(grey: np.ndarray) -> np.ndarray:
+        atlas = cutter.cut(grey, np.eye(3)).image.reshape(2, size, 3, size)
+        return atlas.swapaxes(1, 2).reshape(6, size, size)
+
+    masks = None if usable is None else faces(usable.astype(np.uint8) * 255) > 250
+
+    def describe(picture: np.ndarray) -> Features:
+        grey = faces(np.asarray(cv2.imdecode(picture, cv2.IMREAD_GRAYSCALE)))
+        return extract(np.repeat(grey[..., None], 3, axis=-1), masks, rig, extractor)
+
+    return [describe(picture) for picture in track(pictures, "describing places", len(pictures))]
+
+
+def make_places(
+    keyframes: np.ndarray,
+    maps: np.ndarray,
+    world_T_rigs: np.ndarray,
+    features: Sequence[Features],
+    seed: int,
+    workers: Workers,
+) -> Places:
+    """Match each place with those next to it, along the poses, and triangulate what they share.
+
+    Args:
+        keyframes, maps: (P,) of the places.
+        world_T_rigs: (P, 4, 4) poses, each in the world of its map.
+        features: (P) of `described`.
+        seed: of later sampling.
+        workers: who match.
+    """
+    context = MatchContext(
+        SearchableFrames(features.__getitem__),
+        SearchableFrames(features.__getitem__, _STRONGEST_PER_FACE),
+        gather(features),
+        _SETTINGS.model_copy(update={"seed": seed}),
+        workers,
+    )
+    start = Solution.without_points(world_T_rigs)
+    found = match_along_epipolars(context, start)
+    same = maps[found.pairs[:, 0]] == maps[found.pairs[:, 1]]
+    found, keypoints = found.taken(np.flatnonzero(same)), context.keypoints
+    tracks = build([found], np.diff(keypoints.starts))
+    settings = context.settings.triangulate
+    landmarks = place(tracks, keypoints, world_T_rigs, _MAX_ERROR_SIGMAS, settings)
+    return Places(keyframes, maps, features, replace(start, landmarks=landmarks), context)
