@@ -121,7 +121,6 @@ class Tracker:
 
     _layout: AtlasLayout = field(init=False)
     _cutter: Cutter = field(init=False)
-    _mask_cutter: Cutter = field(init=False)
     _window: list[_Keyframe] = field(default_factory=list)
     _features: _Features | None = None
     _points: np.ndarray = field(default_factory=lambda: np.full((4096, 3), np.nan))
@@ -137,7 +136,7 @@ class Tracker:
 
     def __post_init__(self) -> None:
         self._layout = AtlasLayout.of(self.width)
-        self._cutter, self._mask_cutter = Cutter(self._layout), Cutter(self._layout)
+        self._cutter = Cutter(self._layout)
 
     def world_T_rigs(self) -> np.ndarray:
         """Poses (F, 4, 4) of all frames so far, each in the world of its map."""
@@ -499,7 +498,7 @@ class Tracker:
         if self.usable is None:
             return None
         grey = self.usable.astype(np.uint8) * 255
-        return self._mask_cutter.cut(grey, atlas.cut_R_rig).image > 250
+        return self._cutter.cut(grey, atlas.cut_R_rig, exactly=True).image > 250
 
     def _distance(self, ids: np.ndarray, world_T_rig: np.ndarray) -> float:
         """Median distance of features' points from a pose; NaN without points."""
