@@ -69,13 +69,14 @@ class _Features:
 
     ids: np.ndarray  # (N,) int64
     bearings: np.ndarray  # (N, 3) unit, rig frame of the keyframe
-    latest_world: np.ndarray  # (N, 3) unit, world: direction when last found
+    assumed_world: np.ndarray  # (N, 3) map units: where features without a point are assumed, by
+    # their direction when last found and the distance of points beside them
     misses: np.ndarray  # (N,) int, frames since
 
     def taken(self, rows: np.ndarray) -> "_Features":
         """Some rows."""
         return _Features(
-            self.ids[rows], self.bearings[rows], self.latest_world[rows], self.misses[rows]
+            self.ids[rows], self.bearings[rows], self.assumed_world[rows], self.misses[rows]
         )
 
 
@@ -192,7 +193,7 @@ class Tracker:
         if solved is not None:
             self._start(frame, solved, atlas, small, ids, other)
             return
-        features.latest_world[found] = bearings[found] @ world_R_rig.T
+        features.assumed_world[found] = self._pose[:3, 3] + bearings[found] @ world_R_rig.T
         self._step(pose(world_R_rig, self._pose[:3, 3]), small)
         if len(ids) < _START_SHARE * key.most_found:
             # Turned away from what it saw, without a step: the rotation goes on from here.
@@ -212,7 +213,7 @@ class Tracker:
         """A frame's atlas, bearings (N, 3) of features in it, and which were found, by rotation."""
         assert key.atlas is not None
         atlas = self._cutter.cut(grey, world_R_rig)
-        expected = unit(features.latest_world @ world_R_rig)
+        expected = unit((features.assumed_world - self._pose[:3, 3]) @ world_R_rig)
         return atlas, *follow(self._layout, key.atlas, atlas, features.bearings, expected)
 
     def _start(
@@ -286,8 +287,8 @@ class Tracker:
         atlas = self._cutter.cut(grey, predicted[:3, :3])
         points = self._points[features.ids]
         known = np.isfinite(points[:, 0])
-        rays = np.where(known[:, None], points - predicted[:3, 3], features.latest_world)
-        expected = unit(rays @ predicted[:3, :3])
+        assumed = np.where(known[:, None], points, features.assumed_world)
+        expected = unit((assumed - predicted[:3, 3]) @ predicted[:3, :3])
         bearings, found = follow(self._layout, key.atlas, atlas, features.bearings, expected)
         rows = known & found
         fit = resect(points[rows], bearings[rows], predicted, self._sigma)
@@ -301,7 +302,7 @@ class Tracker:
         noise = float(np.clip(fit.noise, _MIN_SIGMA, _MAX_SIGMA))
         self._sigma += _ADAPTING * (noise - self._sigma)
         fits = self._fitting(features, tried, key)
-        features.latest_world[fits] = tried.bearings[fits] @ self._pose[:3, :3].T
+        self._assume(features, fits, tried.bearings[fits])
         features.misses = np.where(fits, 0, features.misses + 1)
         known = np.isfinite(self._points[features.ids, 0])
         distance = self._distance(features.ids[fits & known], self._pose)
@@ -385,14 +386,11 @@ class Tracker:
         del self._window[: -(FREE + HELD)]
         for old in self._window[:-_REMEMBERED]:
             old.atlas = old.small = old.described = None
-        self._features = _Features(
-            ids, bearings, bearings @ world_T_rig[:3, :3].T, np.zeros(len(ids), int)
-        )
+        self._features = self._followable(key)
 
     def _adjust(self) -> None:
         """Adjust the window, and drop features that do not fit it."""
-        window, features = self._window, self._features
-        assert features is not None
+        window = self._window
         held = max(len(window) - FREE, min(2, len(window) - 1))
         seen = WindowObservations.of([(key.ids, key.bearings) for key in window])
         poses = np.array([key.world_T_rig for key in window])
@@ -408,11 +406,9 @@ class Tracker:
             if len(false):
                 kept = ~np.isin(key.ids, false)
                 key.ids, key.bearings = key.ids[kept], key.bearings[kept]
-                if n == len(window) - 1:
-                    self._features = features = features.taken(kept)
         last = window[-1]
-        features.latest_world = features.bearings @ last.world_T_rig[:3, :3].T
         self._pose = last.world_T_rig.copy()
+        self._features = self._followable(last)
 
     # Frames that nothing is known of.
 
@@ -449,8 +445,7 @@ class Tracker:
         self, grey: np.ndarray, key: _Keyframe, predicted: np.ndarray
     ) -> _Attempt | None:
         """A frame followed from a keyframe, which leads then; None where no pose comes of it."""
-        world = key.bearings @ key.world_T_rig[:3, :3].T
-        features = _Features(key.ids, key.bearings, world, np.zeros(len(key.ids), int))
+        features = self._followable(key)
         tried = self._attempt(grey, key, features, predicted)
         if tried.fit.significant:
             tried = self._attempt(grey, key, features, tried.fit.world_T_rig)
@@ -499,6 +494,26 @@ class Tracker:
             return None
         grey = self.usable.astype(np.uint8) * 255
         return self._cutter.cut(grey, atlas.cut_R_rig, exactly=True).image > 250
+
+    def _followable(self, key: _Keyframe) -> _Features:
+        """Features of a keyframe, assumed as far away as the nearest that has a point."""
+        points = self._points[key.ids]
+        known = np.isfinite(points[:, 0])
+        distances = np.ones(len(points))
+        if known.any():
+            lengths = np.linalg.norm(points[known] - key.world_T_rig[:3, 3], axis=1)
+            nearest = np.argmax(key.bearings @ key.bearings[known].T, axis=1)
+            distances = lengths[nearest]
+        rays = distances[:, None] * (key.bearings @ key.world_T_rig[:3, :3].T)
+        assumed = key.world_T_rig[:3, 3] + rays
+        return _Features(key.ids, key.bearings, assumed, np.zeros(len(rays), int))
+
+    def _assume(self, features: _Features, found: np.ndarray, bearings: np.ndarray) -> None:
+        """Move where features found (N,) bool are assumed onto their bearings in the last frame."""
+        position = self._pose[:3, 3]
+        distances = np.linalg.norm(features.assumed_world[found] - position, axis=1)
+        rays = distances[:, None] * (bearings @ self._pose[:3, :3].T)
+        features.assumed_world[found] = position + rays
 
     def _distance(self, ids: np.ndarray, world_T_rig: np.ndarray) -> float:
         """Median distance of features' points from a pose; NaN without points."""
