@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from gsba.geometry import angles_between, inverse, nearest_rotation, pose, unit
+from gsba.geometry import angles_between, inverse, nearest_rotation, pose, rotation_angle, unit
 from gsba.odometry.atlas import Atlas, AtlasLayout, Cutter
 from gsba.odometry.corners import new_corners
 from gsba.odometry.derotation import Miniature, miniature, turned
@@ -35,6 +36,13 @@ _START_SHARE = 0.45  # of the first keyframe's features, below which a start is 
 _SIGMA, _MIN_SIGMA, _MAX_SIGMA = np.deg2rad([0.25, 0.05, 0.35])  # of bearings, per axis
 _ADAPTING = 0.1  # weight of one frame in the noise of bearings
 _GATE = 4.0  # standard deviations of a feature that fits
+_FEW_INLIERS = 60  # below which less parallax makes a keyframe
+_SOME_PARALLAX = np.deg2rad(1.0)
+_MIN_FOUND_AGAIN = 0.4  # of a keyframe's points, in a lost frame: another door shows some of them
+_NUDGE = 0.03  # median distances of the points along each axis, and a turn, that a pose found
+_NUDGE_R = Rotation.from_rotvec(np.deg2rad([1.2, 1.2, 1.2])).as_matrix()  # again is tried from
+_MIN_LEADING = 8  # features whose pose may lead to others
+_MAX_MISPREDICTED = np.deg2rad(1.5)  # of features, beyond which those not found are tried again
 _MIN_FEATURES = 40  # of a picture that shows anything
 _MAX_MISSES = 4  # frames in a row in which a feature without a point was not found
 _MAX_PENDING = 300  # frames before the start of a map that are posed again once it has points
@@ -282,16 +290,38 @@ class Tracker:
     def _attempt(
         self, grey: np.ndarray, key: _Keyframe, features: _Features, predicted: np.ndarray
     ) -> _Attempt:
-        """Follow a keyframe's features into a frame whose pose (4, 4) is predicted, and pose it."""
+        """Follow a keyframe's features into a frame whose pose (4, 4) is predicted, and pose it.
+
+        Features with points go first. Where the pose that they give is far from the predicted one,
+        those that do not fit it are looked for once more; all others are, by that pose.
+        """
         assert key.atlas is not None
         atlas = self._cutter.cut(grey, predicted[:3, :3])
         points = self._points[features.ids]
         known = np.isfinite(points[:, 0])
         assumed = np.where(known[:, None], points, features.assumed_world)
-        expected = unit((assumed - predicted[:3, 3]) @ predicted[:3, :3])
-        bearings, found = follow(self._layout, key.atlas, atlas, features.bearings, expected)
-        rows = known & found
+        bearings, found = np.empty_like(points), np.zeros(len(points), bool)
+
+        def look(rows: np.ndarray, world_T_rig: np.ndarray) -> None:
+            expected = _seen_from(world_T_rig, assumed[rows])
+            seen = features.bearings[rows]
+            bearings[rows], found[rows] = follow(self._layout, key.atlas, atlas, seen, expected)
+
+        look(np.flatnonzero(known), predicted)
+        rows = np.flatnonzero(known & found)
         fit = resect(points[rows], bearings[rows], predicted, self._sigma)
+        if np.count_nonzero(fit.inliers) >= _MIN_LEADING:
+            moved = angles_between(
+                _seen_from(predicted, points[rows]), _seen_from(fit.world_T_rig, points[rows])
+            )
+            if np.median(moved) > _MAX_MISPREDICTED:
+                astray = known.copy()
+                astray[rows[fit.inliers]] = False
+                look(np.flatnonzero(astray), fit.world_T_rig)
+                rows = np.flatnonzero(known & found)
+                fit = resect(points[rows], bearings[rows], fit.world_T_rig, self._sigma)
+        if fit.significant:
+            look(np.flatnonzero(~known), fit.world_T_rig)
         return _Attempt(atlas, bearings, found, fit)
 
     def _accept(self, frame: int, tried: _Attempt, small: Miniature) -> None:
@@ -309,7 +339,8 @@ class Tracker:
         parallax = self._parallax(features, tried, fits, key)
         key.most_found = max(key.most_found, int(np.count_nonzero(fits)))
         share = np.count_nonzero(fits) / max(key.most_found, 1)
-        if parallax > _KEYFRAME_PARALLAX or share < _KEYFRAME_SHARE:
+        few = np.count_nonzero(fit.inliers) < _FEW_INLIERS and parallax > _SOME_PARALLAX
+        if parallax > _KEYFRAME_PARALLAX or share < _KEYFRAME_SHARE or few:
             ids, bearings = features.ids[fits], tried.bearings[fits]
             self._become_keyframe(frame, tried.atlas, small, ids, bearings)
             return
@@ -441,6 +472,23 @@ class Tracker:
                 return found
         return None
 
+    def _confirmed(
+        self, grey: np.ndarray, key: _Keyframe, features: _Features, tried: _Attempt
+    ) -> bool:
+        """Whether features lead back to a pose from another near it.
+
+        What optical flow finds of features that are not there lies where they were expected, and
+        agrees with any pose that they were expected from.
+        """
+        nudge = pose(_NUDGE_R, np.full(3, _NUDGE * self._distance(key.ids, tried.fit.world_T_rig)))
+        other = self._attempt(grey, key, features, tried.fit.world_T_rig @ nudge)
+        if not other.fit.significant:
+            return False
+        off = inverse(tried.fit.world_T_rig) @ other.fit.world_T_rig
+        turned_back = rotation_angle(off[:3, :3]) < 0.3 * rotation_angle(_NUDGE_R)
+        moved_back = np.linalg.norm(off[:3, 3]) < 0.3 * np.linalg.norm(nudge[:3, 3])
+        return bool(turned_back and moved_back)
+
     def _by_keyframe(
         self, grey: np.ndarray, key: _Keyframe, predicted: np.ndarray
     ) -> _Attempt | None:
@@ -449,7 +497,11 @@ class Tracker:
         tried = self._attempt(grey, key, features, predicted)
         if tried.fit.significant:
             tried = self._attempt(grey, key, features, tried.fit.world_T_rig)
-        if not tried.fit.significant:
+        known = np.count_nonzero(np.isfinite(self._points[key.ids, 0]))
+        share = np.count_nonzero(tried.fit.inliers) / max(known, 1)
+        if not tried.fit.significant or share < _MIN_FOUND_AGAIN:
+            return None
+        if not self._confirmed(grey, key, features, tried):
             return None
         self._window = self._window[: self._window.index(key) + 1]
         self._features = features
@@ -544,3 +596,8 @@ class Tracker:
             self.keyframe_frames.append(len(self.records))
         key = self._window[-1].number if self._window else len(self.keyframe_poses) - 1
         self.records.append(FrameRecord(status, self._map, key, key_T_rig, distance, inliers))
+
+
+def _seen_from(world_T_rig: np.ndarray, points_world: np.ndarray) -> np.ndarray:
+    """Unit bearings (N, 3), rig frame, of points (N, 3) from a pose (4, 4)."""
+    return unit((points_world - world_T_rig[:3, 3]) @ world_T_rig[:3, :3])
