@@ -5,9 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors import tangent_basis
+from factors.compiled import kernel_and_part
 from gsba.camera.rig import witnesses
 from gsba.significance import least_agreeing
 
+_kernel, _part = kernel_and_part()
 _STEPS = 12  # Gauss-Newton
 _CONVERGED = 1e-6  # radians, and parts of the median distance
 _ANNEALED = (8.0, 4.0, 2.0, 1.0)  # scale of the loss in the first steps, times the last
@@ -42,38 +44,46 @@ def resect(
         start: (4, 4) world_T_rig to begin at.
         sigma: radians, standard deviation of bearings per axis.
     """
-    pose, distance = start.copy(), 1.0
-    bases = tangent_basis(bearings_rig) if len(bearings_rig) else np.zeros((0, 2, 3))
-    information = np.zeros((6, 6))
-    for step in range(_STEPS):
-        scale = 3 * sigma * _ANNEALED[min(step, len(_ANNEALED) - 1)]
-        residuals, jacobians, distances = linearised(points_world, bases, bearings_rig, pose)
-        if not len(residuals):
-            break
-        squares = np.sum(residuals**2, axis=1)
-        weights = (scale**2 / (scale**2 + squares)) ** 2
-        distance = float(np.median(distances))
-        jacobian = jacobians.reshape(-1, 6)
-        weighted = jacobian * np.repeat(weights, 2)[:, None]
-        information = weighted.T @ jacobian
-        damping = 1e-9 * np.diag([1.0] * 3 + [distance**-2] * 3) * len(weights)
-        tangent = -np.linalg.solve(information + damping, weighted.T @ residuals.ravel())
-        limit = 0.5 * distance / max(float(np.linalg.norm(tangent[3:])), 1e-12)
-        pose = retracted(pose, tangent * min(1.0, limit))
-        small = max(np.abs(tangent[:3]).max(), np.abs(tangent[3:]).max() / distance) < _CONVERGED
-        if small and step >= len(_ANNEALED):
-            break
-    residuals, _, distances = linearised(points_world, bases, bearings_rig, pose)
+    pose, information, residuals, distances = _fitted(points_world, bearings_rig, start, sigma)
     squares = np.sum(residuals**2, axis=1)
     inliers = squares < (_GATE * sigma) ** 2
     noise = sigma
     if inliers.any():
         noise = float(np.sqrt(np.median(squares[inliers]) / 1.386))
+    distance = float(np.median(distances)) if len(distances) else 1.0
     covariance = max(noise, 0.3 * sigma) ** 2 * np.linalg.pinv(information, hermitian=True)
     significant = _significant(bearings_rig, inliers, sigma)
     spread = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
     significant &= spread < _MAX_POSITION_SIGMA * distance
     return Resection(pose, inliers, noise, covariance, bool(significant))
+
+
+def _fitted(
+    points_world: np.ndarray, bearings_rig: np.ndarray, start: np.ndarray, sigma: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Pose (4, 4), its information (6, 6) at unit variance, residuals (N, 2), distances (N,)."""
+    num = len(bearings_rig)
+    world_T_rig = start.copy()
+    residuals, distances = np.empty((num, 2)), np.empty(num)
+    if not num:
+        return world_T_rig, np.zeros((6, 6)), residuals, distances
+    bases = tangent_basis(bearings_rig)
+    information, gradient = np.empty((6, 6)), np.empty(6)
+    observed = points_world, bases, bearings_rig
+    for step in range(_STEPS):
+        scale = 3 * sigma * _ANNEALED[min(step, len(_ANNEALED) - 1)]
+        _normal_equations(*observed, world_T_rig, scale, residuals, distances, information, gradient)
+        distance = float(np.median(distances))
+        damping = 1e-9 * np.diag([1.0] * 3 + [distance**-2] * 3) * num
+        tangent = -np.linalg.solve(information + damping, gradient)
+        limit = 0.5 * distance / max(float(np.linalg.norm(tangent[3:])), 1e-12)
+        world_T_rig = retracted(world_T_rig, tangent * min(1.0, limit))
+        small = max(np.abs(tangent[:3]).max(), np.abs(tangent[3:]).max() / distance) < _CONVERGED
+        if small and step >= len(_ANNEALED):
+            break
+    before = information.copy()
+    _normal_equations(*observed, world_T_rig, scale, residuals, distances, information, gradient)
+    return world_T_rig, before, residuals, distances
 
 
 def linearised(
@@ -88,19 +98,9 @@ def linearised(
         bases: (N, 2, 3) `tangent_basis` of the bearings.
         points_world, bearings_rig, world_T_rig: as for `resect`.
     """
-    rotation = world_T_rig[:3, :3]
-    offsets = (points_world - world_T_rig[:3, 3]) @ rotation
-    distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
-    directions = offsets / distances[:, None]
-    residuals = np.einsum("nij,nj->ni", bases, directions)
-    behind = np.einsum("ni,ni->n", directions, bearings_rig) <= 0
-    residuals[behind] = [1.0, 0.0]
-    # d(direction)/d(offset) = (I - d d^T) / distance; d(offset) = offset x rotation - translation.
-    across = (bases - residuals[:, :, None] * directions[:, None, :]) / distances[:, None, None]
-    jacobians = np.empty((len(offsets), 2, 6))
-    jacobians[:, :, :3] = np.cross(across, offsets[:, None, :])
-    jacobians[:, :, 3:] = -across
-    jacobians[behind] = 0.0
+    num = len(bearings_rig)
+    residuals, jacobians, distances = np.empty((num, 2)), np.empty((num, 2, 6)), np.empty(num)
+    _linearise(points_world, bases, bearings_rig, world_T_rig, residuals, jacobians, distances)
     return residuals, jacobians, distances
 
 
@@ -119,3 +119,69 @@ def _significant(bearings: np.ndarray, inliers: np.ndarray, sigma: float) -> boo
     per_witness = 1 - (1 - chance) ** (len(bearings) / max(num, 1))
     needed = least_agreeing(num, per_witness, _SAMPLE, _MAX_FALSE_ALARMS)
     return agreeing >= max(needed, _MIN_WITNESSES)
+
+
+@_part
+def _linearise_one(points, bases, bearings, world_T_rig, i, residual, jacobian):
+    """Residual (2,) and Jacobian (2, 6) of observation i, and the distance of its point."""
+    dx = points[i, 0] - world_T_rig[0, 3]
+    dy = points[i, 1] - world_T_rig[1, 3]
+    dz = points[i, 2] - world_T_rig[2, 3]
+    # The offset of the point in the rig frame.
+    x = world_T_rig[0, 0] * dx + world_T_rig[1, 0] * dy + world_T_rig[2, 0] * dz
+    y = world_T_rig[0, 1] * dx + world_T_rig[1, 1] * dy + world_T_rig[2, 1] * dz
+    z = world_T_rig[0, 2] * dx + world_T_rig[1, 2] * dy + world_T_rig[2, 2] * dz
+    distance = max(np.sqrt(x * x + y * y + z * z), 1e-12)
+    u, v, w = x / distance, y / distance, z / distance
+    if u * bearings[i, 0] + v * bearings[i, 1] + w * bearings[i, 2] <= 0:
+        residual[0], residual[1] = 1.0, 0.0
+        for k in range(6):
+            jacobian[0, k] = jacobian[1, k] = 0.0
+        return distance
+    for n in range(2):
+        a, b, c = bases[i, n, 0], bases[i, n, 1], bases[i, n, 2]
+        off = a * u + b * v + c * w
+        residual[n] = off
+        # d(direction)/d(offset) = (I - d d^T) / distance; d(offset) = offset x rotation -
+        # translation.
+        a, b, c = (a - off * u) / distance, (b - off * v) / distance, (c - off * w) / distance
+        jacobian[n, 0] = b * z - c * y
+        jacobian[n, 1] = c * x - a * z
+        jacobian[n, 2] = a * y - b * x
+        jacobian[n, 3], jacobian[n, 4], jacobian[n, 5] = -a, -b, -c
+    return distance
+
+
+@_kernel
+def _linearise(points, bases, bearings, world_T_rig, residuals, jacobians, distances):
+    """See `linearised`."""
+    for i in range(len(bearings)):
+        distances[i] = _linearise_one(
+            points, bases, bearings, world_T_rig, i, residuals[i], jacobians[i]
+        )
+
+
+@_kernel
+def _normal_equations(
+    points, bases, bearings, world_T_rig, scale, residuals, distances, information, gradient
+):
+    """J^T W J (6, 6) and J^T W r (6,) under Geman-McClure weights; residuals and distances."""
+    jacobian = np.empty((2, 6))
+    for k in range(6):
+        gradient[k] = 0.0
+        for m in range(6):
+            information[k, m] = 0.0
+    for i in range(len(bearings)):
+        distances[i] = _linearise_one(
+            points, bases, bearings, world_T_rig, i, residuals[i], jacobian
+        )
+        a, b = residuals[i, 0], residuals[i, 1]
+        weight = (scale * scale / (scale * scale + a * a + b * b)) ** 2
+        for k in range(6):
+            gradient[k] += weight * (jacobian[0, k] * a + jacobian[1, k] * b)
+            for m in range(k + 1):
+                products = jacobian[0, k] * jacobian[0, m] + jacobian[1, k] * jacobian[1, m]
+                information[k, m] += weight * products
+    for k in range(6):
+        for m in range(k):
+            information[m, k] = information[k, m]

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from gsba.geometry import angles_between, inverse, nearest_rotation, pose, unit
+from gsba.geometry import angles_between, inverse, nearest_rotation, pose, rotation_angle, unit
 from gsba.odometry.atlas import Atlas, AtlasLayout, Cutter
 from gsba.odometry.corners import new_corners
 from gsba.odometry.derotation import Miniature, miniature, turned
@@ -35,6 +36,13 @@ _START_SHARE = 0.45  # of the first keyframe's features, below which a start is 
 _SIGMA, _MIN_SIGMA, _MAX_SIGMA = np.deg2rad([0.25, 0.05, 0.35])  # of bearings, per axis
 _ADAPTING = 0.1  # weight of one frame in the noise of bearings
 _GATE = 4.0  # standard deviations of a feature that fits
+_FEW_INLIERS = 60  # below which less parallax makes a keyframe
+_SOME_PARALLAX = np.deg2rad(1.0)
+_MIN_FOUND_AGAIN = 0.4  # of a keyframe's points, in a lost frame: another door shows some of them
+_NUDGE = 0.03  # median distances of the points along each axis, and a turn, that a pose found
+_NUDGE_R = Rotation.from_rotvec(np.deg2rad([1.2, 1.2, 1.2])).as_matrix()  # again is tried from
+_MIN_LEADING = 8  # features whose pose may lead to others
+_MAX_MISPREDICTED = np.deg2rad(1.5)  # of features, beyond which those not found are tried again
 _MIN_FEATURES = 40  # of a picture that shows anything
 _MAX_MISSES = 4  # frames in a row in which a feature without a point was not found
 _MAX_PENDING = 300  # frames before the start of a map that are posed again once it has points
@@ -69,13 +77,14 @@ class _Features:
 
     ids: np.ndarray  # (N,) int64
     bearings: np.ndarray  # (N, 3) unit, rig frame of the keyframe
-    latest_world: np.ndarray  # (N, 3) unit, world: direction when last found
+    assumed_world: np.ndarray  # (N, 3) map units: where features without a point are assumed, by
+    # their direction when last found and the distance of points beside them
     misses: np.ndarray  # (N,) int, frames since
 
     def taken(self, rows: np.ndarray) -> "_Features":
         """Some rows."""
         return _Features(
-            self.ids[rows], self.bearings[rows], self.latest_world[rows], self.misses[rows]
+            self.ids[rows], self.bearings[rows], self.assumed_world[rows], self.misses[rows]
         )
 
 
@@ -124,7 +133,6 @@ class Tracker:
 
     _layout: AtlasLayout = field(init=False)
     _cutter: Cutter = field(init=False)
-    _mask_cutter: Cutter = field(init=False)
     _window: list[_Keyframe] = field(default_factory=list)
     _features: _Features | None = None
     _points: np.ndarray = field(default_factory=lambda: np.full((4096, 3), np.nan))
@@ -140,7 +148,7 @@ class Tracker:
 
     def __post_init__(self) -> None:
         self._layout = AtlasLayout.of(self.width)
-        self._cutter, self._mask_cutter = Cutter(self._layout), Cutter(self._layout)
+        self._cutter = Cutter(self._layout)
 
     def world_T_rigs(self) -> np.ndarray:
         """Poses (F, 4, 4) of all frames so far, each in the world of its map."""
@@ -196,7 +204,7 @@ class Tracker:
         if solved is not None:
             self._start(frame, solved, atlas, small, ids, other)
             return
-        features.latest_world[found] = bearings[found] @ world_R_rig.T
+        features.assumed_world[found] = self._pose[:3, 3] + bearings[found] @ world_R_rig.T
         self._step(pose(world_R_rig, self._pose[:3, 3]), small)
         if len(ids) < _START_SHARE * key.most_found:
             # Turned away from what it saw, without a step: the rotation goes on from here.
@@ -216,7 +224,7 @@ class Tracker:
         """A frame's atlas, bearings (N, 3) of features in it, and which were found, by rotation."""
         assert key.atlas is not None
         atlas = self._cutter.cut(grey, world_R_rig)
-        expected = unit(features.latest_world @ world_R_rig)
+        expected = unit((features.assumed_world - self._pose[:3, 3]) @ world_R_rig)
         return atlas, *follow(self._layout, key.atlas, atlas, features.bearings, expected)
 
     def _start(
@@ -285,16 +293,38 @@ class Tracker:
     def _attempt(
         self, grey: np.ndarray, key: _Keyframe, features: _Features, predicted: np.ndarray
     ) -> _Attempt:
-        """Follow a keyframe's features into a frame whose pose (4, 4) is predicted, and pose it."""
+        """Follow a keyframe's features into a frame whose pose (4, 4) is predicted, and pose it.
+
+        Features with points go first. Where the pose that they give is far from the predicted one,
+        those that do not fit it are looked for once more; all others are, by that pose.
+        """
         assert key.atlas is not None
         atlas = self._cutter.cut(grey, predicted[:3, :3])
         points = self._points[features.ids]
         known = np.isfinite(points[:, 0])
-        rays = np.where(known[:, None], points - predicted[:3, 3], features.latest_world)
-        expected = unit(rays @ predicted[:3, :3])
-        bearings, found = follow(self._layout, key.atlas, atlas, features.bearings, expected)
-        rows = known & found
+        assumed = np.where(known[:, None], points, features.assumed_world)
+        bearings, found = np.empty_like(points), np.zeros(len(points), bool)
+
+        def look(rows: np.ndarray, world_T_rig: np.ndarray) -> None:
+            expected = _seen_from(world_T_rig, assumed[rows])
+            seen = features.bearings[rows]
+            bearings[rows], found[rows] = follow(self._layout, key.atlas, atlas, seen, expected)
+
+        look(np.flatnonzero(known), predicted)
+        rows = np.flatnonzero(known & found)
         fit = resect(points[rows], bearings[rows], predicted, self._sigma)
+        if np.count_nonzero(fit.inliers) >= _MIN_LEADING:
+            moved = angles_between(
+                _seen_from(predicted, points[rows]), _seen_from(fit.world_T_rig, points[rows])
+            )
+            if np.median(moved) > _MAX_MISPREDICTED:
+                astray = known.copy()
+                astray[rows[fit.inliers]] = False
+                look(np.flatnonzero(astray), fit.world_T_rig)
+                rows = np.flatnonzero(known & found)
+                fit = resect(points[rows], bearings[rows], fit.world_T_rig, self._sigma)
+        if fit.significant:
+            look(np.flatnonzero(~known), fit.world_T_rig)
         return _Attempt(atlas, bearings, found, fit)
 
     def _accept(self, frame: int, tried: _Attempt, small: Miniature) -> None:
@@ -305,14 +335,15 @@ class Tracker:
         noise = float(np.clip(fit.noise, _MIN_SIGMA, _MAX_SIGMA))
         self._sigma += _ADAPTING * (noise - self._sigma)
         fits = self._fitting(features, tried, key)
-        features.latest_world[fits] = tried.bearings[fits] @ self._pose[:3, :3].T
+        self._assume(features, fits, tried.bearings[fits])
         features.misses = np.where(fits, 0, features.misses + 1)
         known = np.isfinite(self._points[features.ids, 0])
         distance = self._distance(features.ids[fits & known], self._pose)
         parallax = self._parallax(features, tried, fits, key)
         key.most_found = max(key.most_found, int(np.count_nonzero(fits)))
         share = np.count_nonzero(fits) / max(key.most_found, 1)
-        if parallax > _KEYFRAME_PARALLAX or share < _KEYFRAME_SHARE:
+        few = np.count_nonzero(fit.inliers) < _FEW_INLIERS and parallax > _SOME_PARALLAX
+        if parallax > _KEYFRAME_PARALLAX or share < _KEYFRAME_SHARE or few:
             ids, bearings = features.ids[fits], tried.bearings[fits]
             self._become_keyframe(frame, tried.atlas, small, ids, bearings)
             return
@@ -390,14 +421,11 @@ class Tracker:
         del self._window[: -(FREE + HELD)]
         for old in self._window[:-_REMEMBERED]:
             old.atlas = old.small = old.described = None
-        self._features = _Features(
-            ids, bearings, bearings @ world_T_rig[:3, :3].T, np.zeros(len(ids), int)
-        )
+        self._features = self._followable(key)
 
     def _adjust(self) -> None:
         """Adjust the window, and drop features that do not fit it."""
-        window, features = self._window, self._features
-        assert features is not None
+        window = self._window
         held = max(len(window) - FREE, min(2, len(window) - 1))
         seen = WindowObservations.of([(key.ids, key.bearings) for key in window])
         poses = np.array([key.world_T_rig for key in window])
@@ -414,11 +442,9 @@ class Tracker:
                 kept = ~np.isin(key.ids, false)
                 key.ids, key.bearings = key.ids[kept], key.bearings[kept]
                 self.keyframe_features[key.number] = key.ids, key.bearings.astype(np.float32)
-                if n == len(window) - 1:
-                    self._features = features = features.taken(kept)
         last = window[-1]
-        features.latest_world = features.bearings @ last.world_T_rig[:3, :3].T
         self._pose = last.world_T_rig.copy()
+        self._features = self._followable(last)
 
     # Frames that nothing is known of.
 
@@ -451,16 +477,36 @@ class Tracker:
                 return found
         return None
 
+    def _confirmed(
+        self, grey: np.ndarray, key: _Keyframe, features: _Features, tried: _Attempt
+    ) -> bool:
+        """Whether features lead back to a pose from another near it.
+
+        What optical flow finds of features that are not there lies where they were expected, and
+        agrees with any pose that they were expected from.
+        """
+        nudge = pose(_NUDGE_R, np.full(3, _NUDGE * self._distance(key.ids, tried.fit.world_T_rig)))
+        other = self._attempt(grey, key, features, tried.fit.world_T_rig @ nudge)
+        if not other.fit.significant:
+            return False
+        off = inverse(tried.fit.world_T_rig) @ other.fit.world_T_rig
+        turned_back = rotation_angle(off[:3, :3]) < 0.3 * rotation_angle(_NUDGE_R)
+        moved_back = np.linalg.norm(off[:3, 3]) < 0.3 * np.linalg.norm(nudge[:3, 3])
+        return bool(turned_back and moved_back)
+
     def _by_keyframe(
         self, grey: np.ndarray, key: _Keyframe, predicted: np.ndarray
     ) -> _Attempt | None:
         """A frame followed from a keyframe, which leads then; None where no pose comes of it."""
-        world = key.bearings @ key.world_T_rig[:3, :3].T
-        features = _Features(key.ids, key.bearings, world, np.zeros(len(key.ids), int))
+        features = self._followable(key)
         tried = self._attempt(grey, key, features, predicted)
         if tried.fit.significant:
             tried = self._attempt(grey, key, features, tried.fit.world_T_rig)
-        if not tried.fit.significant:
+        known = np.count_nonzero(np.isfinite(self._points[key.ids, 0]))
+        share = np.count_nonzero(tried.fit.inliers) / max(known, 1)
+        if not tried.fit.significant or share < _MIN_FOUND_AGAIN:
+            return None
+        if not self._confirmed(grey, key, features, tried):
             return None
         self._window = self._window[: self._window.index(key) + 1]
         self._features = features
@@ -504,7 +550,27 @@ class Tracker:
         if self.usable is None:
             return None
         grey = self.usable.astype(np.uint8) * 255
-        return self._mask_cutter.cut(grey, atlas.cut_R_rig).image > 250
+        return self._cutter.cut(grey, atlas.cut_R_rig, exactly=True).image > 250
+
+    def _followable(self, key: _Keyframe) -> _Features:
+        """Features of a keyframe, assumed as far away as the nearest that has a point."""
+        points = self._points[key.ids]
+        known = np.isfinite(points[:, 0])
+        distances = np.ones(len(points))
+        if known.any():
+            lengths = np.linalg.norm(points[known] - key.world_T_rig[:3, 3], axis=1)
+            nearest = np.argmax(key.bearings @ key.bearings[known].T, axis=1)
+            distances = lengths[nearest]
+        rays = distances[:, None] * (key.bearings @ key.world_T_rig[:3, :3].T)
+        assumed = key.world_T_rig[:3, 3] + rays
+        return _Features(key.ids, key.bearings, assumed, np.zeros(len(rays), int))
+
+    def _assume(self, features: _Features, found: np.ndarray, bearings: np.ndarray) -> None:
+        """Move where features found (N,) bool are assumed onto their bearings in the last frame."""
+        position = self._pose[:3, 3]
+        distances = np.linalg.norm(features.assumed_world[found] - position, axis=1)
+        rays = distances[:, None] * (bearings @ self._pose[:3, :3].T)
+        features.assumed_world[found] = position + rays
 
     def _distance(self, ids: np.ndarray, world_T_rig: np.ndarray) -> float:
         """Median distance of features' points from a pose; NaN without points."""
@@ -536,3 +602,8 @@ class Tracker:
             self.keyframe_features.append((np.zeros(0, np.int64), np.zeros((0, 3), np.float32)))
         key = self._window[-1].number if self._window else len(self.keyframe_poses) - 1
         self.records.append(FrameRecord(status, self._map, key, key_T_rig, distance, inliers))
+
+
+def _seen_from(world_T_rig: np.ndarray, points_world: np.ndarray) -> np.ndarray:
+    """Unit bearings (N, 3), rig frame, of points (N, 3) from a pose (4, 4)."""
+    return unit((points_world - world_T_rig[:3, 3]) @ world_T_rig[:3, :3])
