@@ -111,13 +111,7 @@ def export_all(
         rows = frames.chosen()
         reconstruction, frames = reconstruction.taken(rows), frames.taken(rows)
         lenses = lenses.taken(rows)
-    unrefined = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
-    if len(unrefined):
-        names = ", ".join(frames.names[f] for f in unrefined[:5])
-        more = ", ..." if len(unrefined) > 5 else ""
-        logger.warning("%d frames go out with unrefined poses: %s%s", len(unrefined), names, more)
-    if len(reconstruction.points_world) == 0:
-        logger.warning("no points: the poses alone go out, and trainers need a start cloud")
+    _warn_of_gaps(reconstruction, frames)
     placement = placement or Placement(map_number=map_number)
     reconstruction = placement.apply(reconstruction)
     seen_by, z_up = lenses.scaled(placement.similarity.scale), placement.up == "z"
@@ -141,6 +135,17 @@ def export_all(
     for to, out in outs.items():
         num_points = len(reconstruction.points_world)
         logger.info("%s: %d frames, %d points, in %s", to, len(frames), num_points, out)
+
+
+def _warn_of_gaps(reconstruction: Reconstruction, frames: FrameSet) -> None:
+    """Say what a trainer will miss: refined poses, points."""
+    unrefined = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
+    if len(unrefined):
+        names = ", ".join(frames.names[f] for f in unrefined[:5])
+        more = ", ..." if len(unrefined) > 5 else ""
+        logger.warning("%d frames go out with unrefined poses: %s%s", len(unrefined), names, more)
+    if len(reconstruction.points_world) == 0:
+        logger.warning("no points: the poses alone go out, and trainers need a start cloud")
 
 
 def _write_raw(

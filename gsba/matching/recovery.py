@@ -87,12 +87,8 @@ def recover(
         frames = map(tuple, neighbours.matches.pairs.tolist())
         neighbours = neighbours.taken([p for p, pair in enumerate(frames) if pair not in doubtful])
         trust = _judge(neighbours, keypoints, coarse, settings)
-    counts = Counts(
-        len(chosen),
-        len(neighbours.matches.pairs),
-        "pairs",
-        {"no common geometry": len(chosen) - len(neighbours.matches.pairs)},
-    )
+    num, kept = len(chosen), len(neighbours.matches.pairs)
+    counts = Counts(num, kept, "pairs", {"no common geometry": num - kept})
     neighbours = replace(neighbours, counts=counts)
     guessed = joining.guessed(joints, len(coarse.sources))
     guessed |= trust.unseen_steps & judgement.leaps(coarse.world_T_rigs, timestamps)

@@ -72,7 +72,8 @@ def _fitted(
     observed = points_world, bases, bearings_rig
     for step in range(_STEPS):
         scale = 3 * sigma * _ANNEALED[min(step, len(_ANNEALED) - 1)]
-        _normal_equations(*observed, world_T_rig, scale, residuals, distances, information, gradient)
+        found = residuals, distances, information, gradient
+        _normal_equations(*observed, world_T_rig, scale, *found)
         distance = float(np.median(distances))
         damping = 1e-9 * np.diag([1.0] * 3 + [distance**-2] * 3) * num
         tangent = -np.linalg.solve(information + damping, gradient)

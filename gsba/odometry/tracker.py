@@ -8,7 +8,6 @@ Frames hang on their keyframes, and move with them.
 
 import logging
 from dataclasses import dataclass, field
-from enum import IntEnum
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,6 +17,7 @@ from gsba.odometry.atlas import Atlas, AtlasLayout, Cutter
 from gsba.odometry.corners import new_corners
 from gsba.odometry.derotation import Miniature, miniature, turned
 from gsba.odometry.flow import follow
+from gsba.odometry.frame_record import FrameRecord, FrameStatus
 from gsba.odometry.relocalisation import Described, describe, placed
 from gsba.odometry.resection import Resection, resect
 from gsba.odometry.two_view_start import median_turn, start_map
@@ -46,14 +46,6 @@ _MAX_MISPREDICTED = np.deg2rad(1.5)  # of features, beyond which those not found
 _MIN_FEATURES = 40  # of a picture that shows anything
 _MAX_MISSES = 4  # frames in a row in which a feature without a point was not found
 _MAX_PENDING = 300  # frames before the start of a map that are posed again once it has points
-
-
-class FrameStatus(IntEnum):
-    """How the pose of a frame was found."""
-
-    TRACKED = 0  # from known points
-    TURNING = 1  # before the map had points: the rotation alone, the position is kept
-    LOST = 2  # not at all: the pose of the frame before stands in for it
 
 
 @dataclass(slots=True)
@@ -96,18 +88,6 @@ class _Attempt:
     bearings: np.ndarray  # (N, 3)
     found: np.ndarray  # (N,) bool
     fit: Resection
-
-
-@dataclass(slots=True)
-class FrameRecord:
-    """What is known of one frame."""
-
-    status: FrameStatus
-    map_number: int  # 0 = the first map
-    keyframe: int  # number of the keyframe it hangs on
-    key_T_rig: np.ndarray  # (4, 4) float64, pose in that keyframe
-    distance: float  # median distance of the points, map units; NaN = not known
-    inliers: int  # features that fit
 
 
 @dataclass(slots=True)
@@ -298,7 +278,8 @@ class Tracker:
         Features with points go first. Where the pose that they give is far from the predicted one,
         those that do not fit it are looked for once more; all others are, by that pose.
         """
-        assert key.atlas is not None
+        template = key.atlas
+        assert template is not None
         atlas = self._cutter.cut(grey, predicted[:3, :3])
         points = self._points[features.ids]
         known = np.isfinite(points[:, 0])
@@ -308,7 +289,7 @@ class Tracker:
         def look(rows: np.ndarray, world_T_rig: np.ndarray) -> None:
             expected = _seen_from(world_T_rig, assumed[rows])
             seen = features.bearings[rows]
-            bearings[rows], found[rows] = follow(self._layout, key.atlas, atlas, seen, expected)
+            bearings[rows], found[rows] = follow(self._layout, template, atlas, seen, expected)
 
         look(np.flatnonzero(known), predicted)
         rows = np.flatnonzero(known & found)

@@ -10,10 +10,11 @@ import numpy as np
 from gsba.geometry import inverse
 from gsba.log import GsbaError, track
 from gsba.odometry.closing import ClosedKeyframes, TrackedKeyframes, close
+from gsba.odometry.frame_record import FrameStatus
 from gsba.odometry.panoramas import SmallPanoramas
 from gsba.odometry.places import compressed
 from gsba.odometry.pose_graph import carried_covariances
-from gsba.odometry.tracker import FrameStatus, Tracker
+from gsba.odometry.tracker import Tracker
 from gsba.store.shards import Threads, Workers
 from gsba.types import Trajectory
 from gsba.video.likeness import sharpness

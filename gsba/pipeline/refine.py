@@ -89,7 +89,7 @@ def refine(
             on one clock, and the first one's world is kept. None = start from the images alone.
         out: folder of the run; a second call re-runs what depends on settings that changed.
         settings: see `gsba.config`.
-        keyframes: second trajectory file of the same run, with its keyframes: they lead.
+        keyframes: trajectory file of the same run's keyframes: they lead.
         masks: a file or a folder, "auto", "distractors", "none", or several: see `merging.choose`.
         segment: a command or a callable that masks faces; see `gsba.masks.segmentation.segmented`.
         timestamps: times of the frames (and of a KITTI trajectory's rows).
@@ -97,10 +97,10 @@ def refine(
         calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
         circles: image circles of raw fisheyes, x, y and radius in pixels; see `frames.scan`.
         imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
-        odometry: follow a video that has no trajectory; None = if it is open which frames to take.
+        odometry: follow a video without a trajectory; None = if it is open which frames to take.
         fresh: forget an earlier run in `out`.
         families: residuals of your own, see `gsba.Family`, beside those of settings.factors.
-        client: of a Dask scheduler whose workers take what can be shared out; None = threads here.
+        client: of a Dask scheduler whose workers take shards of stages; None = threads here.
 
     Raises:
         GsbaError: an input or setting that cannot be used.
@@ -111,23 +111,21 @@ def refine(
     chosen, readings = merging.choose(masks, segment), inputs.read_gyro(imu, frames)
     origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
     given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
-    walk: Odometry | None = None
+    walk, asked = None, (fps, fresh, odometry, chosen, calibration)
     if video.is_video(frames):
-        asked = fps, fresh, odometry, chosen, calibration
         given, settings, walk = inputs.take_frames(out, origin, given, settings, *asked)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     lenses = calibration, inputs.given_circles(circles, calibration)
-    frame_set = scan(frames, timestamps, fps, chosen.given, not given, *lenses)
-    start = _start_of(frame_set, given, settings)
+    found = scan(frames, timestamps, fps, chosen.given, not given, *lenses)
+    start = _start_of(found, given, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
         begin = partial(_begin, store, given, settings, chosen, families, readings)
-        if walk is not None:
-            start = _with_fetched(store, origin["frames"], walk, start, given, settings, begin)
-        run, prior = begin(start)
-        result = _refine(run, prior, given, len(origin) == 1)
-        if walk is not None:
-            add_odometry(out / "report.html", walk)
-        return result
+        if walk is None:
+            return _refine(*begin(start), given, len(origin) == 1)
+        start = _with_fetched(store, origin["frames"], walk, start, given, settings, begin)
+        result = _refine(*begin(start), given, images_alone=True)
+    add_odometry(out / "report.html", walk)
+    return result
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,26 @@
+"""What odometry knows of one frame."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+
+class FrameStatus(IntEnum):
+    """How the pose of a frame was found."""
+
+    TRACKED = 0  # from known points
+    TURNING = 1  # before the map had points: the rotation alone, the position is kept
+    LOST = 2  # not at all: the pose of the frame before stands in for it
+
+
+@dataclass(slots=True)
+class FrameRecord:
+    """What is known of one frame."""
+
+    status: FrameStatus
+    map_number: int  # 0 = the first map
+    keyframe: int  # number of the keyframe it hangs on
+    key_T_rig: np.ndarray  # (4, 4) float64, pose in that keyframe
+    distance: float  # median distance of the points, map units; NaN = not known
+    inliers: int  # features that fit
