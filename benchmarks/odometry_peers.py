@@ -187,7 +187,7 @@ def main() -> None:
     foot = (
         "ATE: rmse of positions after Sim(3) alignment, metres in flats, of the exported map or "
         f"the largest model. Wrong: a frame off by more than {MAX_ERROR:.0%} of the map's extent. "
-        "Our CPU seconds include decoding, odometry and the choice of frames; COLMAP gets the frames."
+        "Our CPU seconds include decoding, odometry and choice of frames; COLMAP gets the frames."
     )
     table = ["# Videos without a trajectory, beside peers", "", *HEAD, *lines, "", foot, ""]
     table += ["Before any refinement:", "", *ODOMETRY_HEAD, *alone]

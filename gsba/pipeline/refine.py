@@ -94,8 +94,7 @@ def refine(
         segment: a command or a callable that masks faces; see `gsba.masks.segmentation.segmented`.
         timestamps: times of the frames (and of a KITTI trajectory's rows).
         fps: frames per second, where no file gives times; of a video: frames kept per second.
-        calibration: of the lenses of raw fisheyes; see `gsba.camera.calibration`.
-        circles: image circles of raw fisheyes, x, y and radius in pixels; see `frames.scan`.
+        calibration, circles: of the lenses of raw fisheyes; see `frames.scan`.
         imu: a gyro's and an accelerometer's, see `gsba.imu.files`; None = those of a raw video.
         odometry: follow a video without a trajectory; None = if it is open which frames to take.
         fresh: forget an earlier run in `out`.
@@ -120,12 +119,9 @@ def refine(
     start = _start_of(found, given, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
         begin = partial(_begin, store, given, settings, chosen, families, readings)
-        if walk is None:
-            return _refine(*begin(start), given, len(origin) == 1)
-        start = _with_fetched(store, origin["frames"], walk, start, given, settings, begin)
-        result = _refine(*begin(start), given, images_alone=True)
-    add_odometry(out / "report.html", walk)
-    return result
+        if walk is not None:
+            start = _with_fetched(store, origin["frames"], walk, start, given, settings, begin)
+        return _refine(*begin(start), given, len(origin) == 1, walk)
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,14 +179,24 @@ def _begin(
     return run, Prior.of(coarse)
 
 
-def _refine(run: Run, prior: Prior, given: Sequence[Trajectory], images_alone: bool) -> RunResult:
-    """A run from its frames to what it leaves behind."""
+def _refine(
+    run: Run,
+    prior: Prior,
+    given: Sequence[Trajectory],
+    images_alone: bool,
+    walk: Odometry | None,
+) -> RunResult:
+    """A run from its frames to what it leaves behind, its video's odometry in the report."""
     in_pieces = prior.coarse.segments is not None
     run, seen, prior, world = _solve_raw(run, prior, given)
     result = backend.reconstruct(run, seen, prior, world)
     if images_alone or (prior.coarse.sources == PoseSource.NONE).all():
         acceptance.require_motion(run.frames, result, in_pieces)
-    return outputs.write(run, prior, world, result, backend.keep_lenses(run, world, result))
+    lenses = backend.keep_lenses(run, world, result)
+    written = outputs.write(run, prior, world, result, lenses)
+    if walk is not None:
+        add_odometry(written.out / "report.html", walk)
+    return written
 
 
 def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run, Seen, Prior, Map]:
