@@ -14,11 +14,14 @@ from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import Joint
 from gsba.trajectory.judgement import Trust
 from gsba.trajectory.steps import Steps, image_steps, length_ratios, off_steps
-from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
+from gsba.types import CoarsePoses, Counts, Keypoints, PoseSource, Trajectory, VerifiedPairs
 
 _PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
 _WIDER = 2, 4, 8  # frames
 _MANY_LOST = 0.2  # part of the neighbours
+_LEAST_ALIKE = 5  # points that tell how long a step is beside the one before it
+_MAX_STEP_RATIO = 4.0  # of two steps in a row; beyond, a floor's pattern met one tile further on
+_AGAIN = Gate(np.deg2rad(1.5), 0.03, np.pi)  # around relative poses that few matches have told
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +62,12 @@ def recover(
     intervals = np.diff(timestamps)
     close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
     lost = guided.missing(np.column_stack([close, close + 1]))
-    alone = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
+    absent = _is_absent(coarse)
+    found = match_anywhere(context, lost)
+    alone = VerifiedPairs.joined([guided, match_again(context, found) if absent else found])
     alone = _with_wider(context, alone)
+    if absent:
+        alone = _of_one_scale(alone, keypoints, settings.pairs.scarce_matches)
     steps = image_steps(alone, keypoints)
     alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
     coarse, joints = _joined(coarse, alone, steps, keypoints)
@@ -70,13 +77,15 @@ def recover(
         return Recovered(guided, trust, coarse)
     again = alone.missing(chosen)
     again = again[again[:, 1] - again[:, 0] == 2]
+    if absent:  # nothing else tells how long a step is that no image shows
+        again = again[steps.verified[again[:, 0]] & steps.verified[again[:, 0] + 1]]
     over = _match_along(context, trust.world_T_rigs, again)
     neighbours = VerifiedPairs.joined([alone, _consistent(over, steps, keypoints, settings)])
     alike = judgement.confirmed(coarse, steps, settings.priors)
     doubtful = {
         (f0, f1)
         for f0, f1 in lost.tolist()
-        if not (alike[f0] or _supported((f0, f1), neighbours, keypoints, settings))
+        if not (alike[f0] or _supported((f0, f1), neighbours, keypoints, absent))
     }
     if doubtful:
         frames = map(tuple, neighbours.matches.pairs.tolist())
@@ -93,6 +102,11 @@ def recover(
     guessed |= trust.unseen_steps & judgement.leaps(coarse.world_T_rigs, timestamps)
     trust = replace(trust, false_steps=trust.false_steps | guessed)
     return Recovered(neighbours, trust, coarse, joints)
+
+
+def _is_absent(coarse: CoarsePoses) -> bool:
+    """Whether there is no trajectory."""
+    return bool((coarse.sources == PoseSource.NONE).all())
 
 
 def _with_wider(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
@@ -191,16 +205,42 @@ def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = Tru
     return VerifiedPairs.joined([first, match(rest, strongest=False)]) if len(rest) else first
 
 
+def match_again(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
+    """Match pairs of few matches once more, all keypoints along the epipolar lines found, and
+    verify them anew; a pair keeps what more matches agree on.
+
+    Args:
+        context: of the run.
+        found: pairs of `match_anywhere`.
+    """
+    numbers = np.diff(found.matches.offsets)
+    few = (numbers < context.settings.pairs.scarce_matches) & np.isfinite(found.direction_sigmas)
+    better = []
+    for p in np.flatnonzero(few).tolist():
+        pair = found.matches.pairs[p : p + 1]
+        poses = np.tile(np.eye(4), (len(context.keypoints.starts) - 1, 1, 1))
+        poses[pair[0, 1]] = found.f0_T_f1s[p]
+        gates = [_AGAIN]
+        matches = context.match(pair, poses, gates, guided_only=True)
+        again = verified(matches, gates, None, None, context, rivals=True)
+        if len(again.matches.pairs) and len(again.matches.of(0)) > numbers[p]:
+            better.append((p, again))
+    replaced = {p for p, _ in better}
+    kept = found.taken([p for p in range(len(numbers)) if p not in replaced])
+    return VerifiedPairs.joined([kept, *(again for _, again in better)])
+
+
 def _judge(
     found: VerifiedPairs, keypoints: Keypoints, coarse: CoarsePoses, settings: RefineSettings
 ) -> Trust:
     steps = image_steps(found, keypoints)
-    logs, sigmas = length_ratios(found, steps, keypoints)
+    least = _LEAST_ALIKE if _is_absent(coarse) else None
+    logs, sigmas = length_ratios(found, steps, keypoints, least)
     return judgement.judge(coarse, steps, logs, sigmas, settings.verify, settings.priors)
 
 
 def _supported(
-    pair: tuple[int, int], found: VerifiedPairs, keypoints: Keypoints, settings: RefineSettings
+    pair: tuple[int, int], found: VerifiedPairs, keypoints: Keypoints, absent: bool
 ) -> bool:
     """Whether a third frame confirms a step that no trajectory guided.
 
@@ -214,8 +254,47 @@ def _supported(
     steps = image_steps(found, keypoints)
     if not steps.directed[f]:
         return True  # a turn on the spot: whole panoramas agree on one rotation
-    sigmas = length_ratios(found, steps, keypoints)[1]
+    least = _LEAST_ALIKE if absent else None
+    sigmas = length_ratios(found, steps, keypoints, least)[1]
     return bool(np.isfinite(sigmas[max(f - 1, 0) : f + 1]).any()) or len(steps.verified) == 1
+
+
+def _of_one_scale(found: VerifiedPairs, keypoints: Keypoints, scarce: int) -> VerifiedPairs:
+    """Pairs without the steps beside which another would be of any length.
+
+    Two views have no scale. Where the steps before and after a frame share too few points, and no
+    trajectory tells either, what lies behind would have a size by guess; and where a floor's
+    pattern is met one tile further on, a step is many times too short. One of the two steps is
+    given up there, and pairs over it: the map goes in parts, which the test of joins may join.
+
+    Args:
+        found: neighbours that no trajectory guided.
+        keypoints: of all frames.
+        scarce: steps that share as many points are sure of their lengths.
+    """
+    steps = image_steps(found, keypoints)
+    logs, sigmas = length_ratios(found, steps, keypoints, _LEAST_ALIKE)
+    rows = {int(f0): p for p, (f0, f1) in enumerate(found.matches.pairs) if f1 - f0 == 1}
+    open_at = set()
+    for f in range(1, len(steps.verified)):
+        both = [rows[g] for g in (f - 1, f) if g in rows]
+        if len(both) < 2 or not np.isfinite(found.direction_sigmas[both]).any():
+            continue  # a break, or turns on the spot
+        before, after = (found.matches.of(p) for p in both)
+        if len(np.intersect1d(before[:, 1], after[:, 0])) >= scarce:
+            continue
+        if np.isinf(sigmas[f - 1]) or abs(logs[f - 1]) > np.log(_MAX_STEP_RATIO):
+            open_at.add(f)
+    numbers, given_up = np.diff(found.matches.offsets), set[int]()
+    while open_at:
+        beside = {step for f in open_at for step in (f - 1, f)}
+        order = {f: (-len({f, f + 1} & open_at), int(numbers[rows[f]]), f) for f in beside}
+        worst = min(beside, key=order.__getitem__)
+        given_up.add(worst)
+        open_at -= {worst, worst + 1}
+    pairs = found.matches.pairs.tolist()
+    kept = [p for p, (f0, f1) in enumerate(pairs) if not given_up & set(range(f0, f1))]
+    return found.taken(kept)
 
 
 def _consistent(
