@@ -13,7 +13,15 @@ from gsba.trajectory import clock, joining, judgement, misread
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import Joint
 from gsba.trajectory.judgement import Trust
-from gsba.trajectory.steps import Steps, image_steps, length_ratios, off_steps
+from gsba.trajectory.steps import (
+    Steps,
+    given_up,
+    image_steps,
+    length_ratios,
+    matches_of_steps,
+    off_steps,
+    without_steps,
+)
 from gsba.types import CoarsePoses, Counts, Keypoints, PoseSource, Trajectory, VerifiedPairs
 
 _PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
@@ -63,11 +71,10 @@ def recover(
     close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
     lost = guided.missing(np.column_stack([close, close + 1]))
     absent = _is_absent(coarse)
-    found = match_anywhere(context, lost)
-    alone = VerifiedPairs.joined([guided, match_again(context, found) if absent else found])
+    alone = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
     alone = _with_wider(context, alone)
     if absent:
-        alone = _of_one_scale(alone, keypoints, settings.pairs.scarce_matches)
+        alone = _of_one_scale(context, alone)
     steps = image_steps(alone, keypoints)
     alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
     coarse, joints = _joined(coarse, alone, steps, keypoints)
@@ -205,28 +212,30 @@ def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = Tru
     return VerifiedPairs.joined([first, match(rest, strongest=False)]) if len(rest) else first
 
 
-def match_again(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
-    """Match pairs of few matches once more, all keypoints along the epipolar lines found, and
-    verify them anew; a pair keeps what more matches agree on.
+def match_again(context: MatchContext, found: VerifiedPairs, steps: set[int]) -> VerifiedPairs:
+    """Match steps once more, all keypoints along the epipolar lines found, and verify them anew.
 
     Args:
         context: of the run.
-        found: pairs of `match_anywhere`.
+        found: neighbours.
+        steps: first frames of the steps; each keeps what more matches agree on.
     """
-    numbers = np.diff(found.matches.offsets)
-    few = (numbers < context.settings.pairs.scarce_matches) & np.isfinite(found.direction_sigmas)
+    chosen = [
+        p
+        for p, (f0, f1) in enumerate(found.matches.pairs.tolist())
+        if f1 - f0 == 1 and f0 in steps and np.isfinite(found.direction_sigmas[p])
+    ]
     better = []
-    for p in np.flatnonzero(few).tolist():
-        pair = found.matches.pairs[p : p + 1]
+    for p in chosen:
         poses = np.tile(np.eye(4), (len(context.keypoints.starts) - 1, 1, 1))
-        poses[pair[0, 1]] = found.f0_T_f1s[p]
-        gates = [_AGAIN]
+        poses[found.matches.pairs[p, 1]] = found.f0_T_f1s[p]
+        pair, gates = found.matches.pairs[p : p + 1], [_AGAIN]
         matches = context.match(pair, poses, gates, guided_only=True)
         again = verified(matches, gates, None, None, context, rivals=True)
-        if len(again.matches.pairs) and len(again.matches.of(0)) > numbers[p]:
+        if len(again.matches.pairs) and len(again.matches.of(0)) > len(found.matches.of(p)):
             better.append((p, again))
     replaced = {p for p, _ in better}
-    kept = found.taken([p for p in range(len(numbers)) if p not in replaced])
+    kept = found.taken([p for p in range(len(found.matches.pairs)) if p not in replaced])
     return VerifiedPairs.joined([kept, *(again for _, again in better)])
 
 
@@ -259,42 +268,44 @@ def _supported(
     return bool(np.isfinite(sigmas[max(f - 1, 0) : f + 1]).any()) or len(steps.verified) == 1
 
 
-def _of_one_scale(found: VerifiedPairs, keypoints: Keypoints, scarce: int) -> VerifiedPairs:
-    """Pairs without the steps beside which another would be of any length.
+def _of_one_scale(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
+    """Neighbours without steps that are many times too short, as points beside them tell.
 
-    Two views have no scale. Where the steps before and after a frame share too few points, and no
-    trajectory tells either, what lies behind would have a size by guess; and where a floor's
-    pattern is met one tile further on, a step is many times too short. One of the two steps is
-    given up there, and pairs over it: the map goes in parts, which the test of joins may join.
+    Where a floor's pattern is met one tile further on, relative poses look right. One of the two
+    steps is given up there, and pairs over it: the map goes in parts, which the test of joins may
+    join. Steps that share too few points to tell their lengths are matched with all keypoints
+    first.
 
     Args:
-        found: neighbours that no trajectory guided.
-        keypoints: of all frames.
-        scarce: steps that share as many points are sure of their lengths.
+        context: of the run, which has no trajectory.
+        found: neighbours.
     """
-    steps = image_steps(found, keypoints)
-    logs, sigmas = length_ratios(found, steps, keypoints, _LEAST_ALIKE)
+    open_at = _open_ratios(context, found)[0]
+    found = match_again(context, found, {step for f in open_at for step in (f - 1, f)})
+    matches = matches_of_steps(found, len(context.keypoints.starts) - 1)
+    return without_steps(found, given_up(_open_ratios(context, found)[1], matches))
+
+
+def _open_ratios(context: MatchContext, found: VerifiedPairs) -> tuple[set[int], set[int]]:
+    """Frames between two steps that share few points: where these do not tell how long one step is
+    beside the other, or tell more than `_MAX_STEP_RATIO`; and the latter alone."""
+    steps = image_steps(found, context.keypoints)
+    logs, sigmas = length_ratios(found, steps, context.keypoints, _LEAST_ALIKE)
     rows = {int(f0): p for p, (f0, f1) in enumerate(found.matches.pairs) if f1 - f0 == 1}
-    open_at = set()
+    unknown, extreme = set[int](), set[int]()
     for f in range(1, len(steps.verified)):
         both = [rows[g] for g in (f - 1, f) if g in rows]
         if len(both) < 2 or not np.isfinite(found.direction_sigmas[both]).any():
             continue  # a break, or turns on the spot
         before, after = (found.matches.of(p) for p in both)
-        if len(np.intersect1d(before[:, 1], after[:, 0])) >= scarce:
+        shared = len(np.intersect1d(before[:, 1], after[:, 0]))
+        if shared >= context.settings.pairs.scarce_matches:
             continue
-        if np.isinf(sigmas[f - 1]) or abs(logs[f - 1]) > np.log(_MAX_STEP_RATIO):
-            open_at.add(f)
-    numbers, given_up = np.diff(found.matches.offsets), set[int]()
-    while open_at:
-        beside = {step for f in open_at for step in (f - 1, f)}
-        order = {f: (-len({f, f + 1} & open_at), int(numbers[rows[f]]), f) for f in beside}
-        worst = min(beside, key=order.__getitem__)
-        given_up.add(worst)
-        open_at -= {worst, worst + 1}
-    pairs = found.matches.pairs.tolist()
-    kept = [p for p, (f0, f1) in enumerate(pairs) if not given_up & set(range(f0, f1))]
-    return found.taken(kept)
+        if np.isinf(sigmas[f - 1]):
+            unknown.add(f)
+        elif abs(logs[f - 1]) > np.log(_MAX_STEP_RATIO):
+            extreme.add(f)
+    return unknown | extreme, extreme
 
 
 def _consistent(

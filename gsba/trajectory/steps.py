@@ -173,6 +173,40 @@ def length_ratios(
     return logs, sigmas
 
 
+def given_up(open_at: set[int], matches: np.ndarray) -> set[int]:
+    """Steps to give up so that no frame joins two of which neither tells the other's length.
+
+    Args:
+        open_at: frames between two such steps.
+        matches: (F - 1,) of each step; of two steps, that of fewer matches is given up.
+
+    Returns:
+        First frames of the steps.
+    """
+    out, left = set[int](), set(open_at)
+    while left:
+        beside = {step for f in left for step in (f - 1, f)}
+        order = {f: (-len({f, f + 1} & left), int(matches[f]), f) for f in beside}
+        worst = min(beside, key=order.__getitem__)
+        out.add(worst)
+        left -= {worst, worst + 1}
+    return out
+
+
+def without_steps(pairs: VerifiedPairs, steps: set[int]) -> VerifiedPairs:
+    """Pairs without some steps, by their first frames, and without pairs over them."""
+    frames = enumerate(pairs.matches.pairs.tolist())
+    return pairs.taken([p for p, (f0, f1) in frames if not steps & set(range(f0, f1))])
+
+
+def matches_of_steps(pairs: VerifiedPairs, num_frames: int) -> np.ndarray:
+    """Number of matches (F - 1,) of each step; 0 where there is none."""
+    out = np.zeros(max(num_frames - 1, 0), np.int64)
+    steps = pairs.matches.pairs[:, 1] - pairs.matches.pairs[:, 0] == 1
+    out[pairs.matches.pairs[steps, 0]] = np.diff(pairs.matches.offsets)[steps]
+    return out
+
+
 def _depths(rays0: np.ndarray, rays1: np.ndarray, f0_T_f1: np.ndarray) -> np.ndarray:
     """Distances (m,) from frame 0 along its rays to where both rays meet; NaN where unclear."""
     across = rays1 @ f0_T_f1[:3, :3].T
