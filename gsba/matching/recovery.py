@@ -73,8 +73,7 @@ def recover(
     absent = _is_absent(coarse)
     alone = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
     alone = _with_wider(context, alone)
-    if absent:
-        alone = _of_one_scale(context, alone)
+    alone = _of_one_scale(context, alone) if absent else alone
     steps = image_steps(alone, keypoints)
     alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
     coarse, joints = _joined(coarse, alone, steps, keypoints)
@@ -82,11 +81,7 @@ def recover(
     trust = _judge(alone, keypoints, coarse, settings)
     if trust.sound and not joints:
         return Recovered(guided, trust, coarse)
-    again = alone.missing(chosen)
-    again = again[again[:, 1] - again[:, 0] == 2]
-    if absent:  # nothing else tells how long a step is that no image shows
-        again = again[steps.verified[again[:, 0]] & steps.verified[again[:, 0] + 1]]
-    over = _match_along(context, trust.world_T_rigs, again)
+    over = _match_along(context, trust.world_T_rigs, _two_apart(alone, steps, absent))
     neighbours = VerifiedPairs.joined([alone, _consistent(over, steps, keypoints, settings)])
     alike = judgement.confirmed(coarse, steps, settings.priors)
     doubtful = {
@@ -109,6 +104,15 @@ def recover(
     guessed |= trust.unseen_steps & judgement.leaps(coarse.world_T_rigs, timestamps)
     trust = replace(trust, false_steps=trust.false_steps | guessed)
     return Recovered(neighbours, trust, coarse, joints)
+
+
+def _two_apart(found: VerifiedPairs, steps: Steps, absent: bool) -> np.ndarray:
+    """Pairs (P, 2) of frames two apart that are not found yet; without a trajectory, over steps
+    that images show: nothing else tells how long one is."""
+    first = np.arange(len(steps.verified) - 1)
+    if absent:
+        first = first[steps.verified[:-1] & steps.verified[1:]]
+    return found.missing(np.column_stack([first, first + 2]))
 
 
 def _is_absent(coarse: CoarsePoses) -> bool:
