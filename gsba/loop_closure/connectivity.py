@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsba.types import Matches, Solution
+from gsba.types import Matches, Solution, Tracks
 
 
 def parted(
@@ -55,3 +55,17 @@ def within(matches: Matches, parts: np.ndarray | None) -> Matches:
 def starving(solved: Solution, least: int) -> np.ndarray:
     """Frames (F,) bool with fewer than `least` observations of a map."""
     return solved.observations() < least
+
+
+def bridging(tracks: Tracks, num_frames: int) -> np.ndarray:
+    """Points (F,) that hand the scale on at each frame: seen from three frames or more, of which
+    some are before it and some after it."""
+    first = np.flatnonzero(np.diff(tracks.points, prepend=-1))
+    if not len(first):
+        return np.zeros(num_frames, np.int64)
+    last = np.append(first[1:], len(tracks.points)) - 1
+    several_views = last - first >= 2
+    starts, ends = tracks.frames[first[several_views]], tracks.frames[last[several_views]]
+    changes = np.bincount(starts + 1, minlength=num_frames + 1)
+    changes -= np.bincount(ends, minlength=num_frames + 1)
+    return np.cumsum(changes)[:num_frames]

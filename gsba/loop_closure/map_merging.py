@@ -34,6 +34,8 @@ _SAMPLED = 24  # frames of a part that are looked for elsewhere
 _BESIDE = 3  # frames from a break that are compared whatever they look like
 _BEST = 2  # meetings whose surroundings are compared too
 _MIN_MAP = 3  # frames of a part that is a map
+_MIN_TESTABLE = 6  # frames of a map that joins can be tested by: two small parts in rooms with one
+# floor look like one place all around
 _BEHIND = 3.0  # times the pace: a frame alone is no further off than that
 _APART = 4.0  # extents between maps that nothing ties together
 _LEVEL = np.deg2rad(5.0)  # between the verticals of two parts, besides how frames tilt in each
@@ -172,6 +174,9 @@ class _Joining:
 
     def _similarity(self, part: int, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
         """The similarity that carries a part to where it meets the map; None if none is sure."""
+        if len(inside) < _MIN_TESTABLE and not self._held(rows):
+            self.reasons[part] = f"a map of {len(inside)} frames is too small to test a join by"
+            return None
         sampled = np.linspace(0, len(rows) - 1, _SAMPLED).astype(int)
         sampled = rows[np.unique([*sampled, *range(_BESIDE), *range(-_BESIDE, 0)])]
         chosen = self._candidates(sampled, inside, _LOOKS)

@@ -13,12 +13,23 @@ from gsba.trajectory import clock, joining, judgement, misread
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import Joint
 from gsba.trajectory.judgement import Trust
-from gsba.trajectory.steps import Steps, image_steps, length_ratios, off_steps
-from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
+from gsba.trajectory.steps import (
+    Steps,
+    given_up,
+    image_steps,
+    length_ratios,
+    matches_of_steps,
+    off_steps,
+    without_steps,
+)
+from gsba.types import CoarsePoses, Counts, Keypoints, PoseSource, Trajectory, VerifiedPairs
 
 PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
 _WIDER = 2, 4, 8  # frames
 _MANY_LOST = 0.2  # part of the neighbours
+_LEAST_ALIKE = 5  # points that tell how long a step is beside the one before it
+_MAX_STEP_RATIO = 4.0  # of two steps in a row; beyond, a floor's pattern met one tile further on
+_AGAIN = Gate(np.deg2rad(1.5), 0.03, np.pi)  # around relative poses that few matches have told
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +75,10 @@ def recover(
     intervals = np.diff(timestamps)
     close = np.flatnonzero(intervals <= PAUSE * np.median(intervals))
     lost = guided.missing(_of_one_piece(np.column_stack([close, close + 1]), coarse))
+    absent = _is_absent(coarse)
     alone = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
     alone = _with_wider(context, alone)
+    alone = _of_one_scale(context, alone) if absent else alone
     steps = image_steps(alone, keypoints)
     alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
     coarse, joints = joining.join(coarse)
@@ -73,15 +86,13 @@ def recover(
     trust = _judge(alone, keypoints, coarse, settings)
     if trust.sound and not joints:
         return Recovered(guided, trust, coarse)
-    again = alone.missing(chosen)
-    again = again[again[:, 1] - again[:, 0] == 2]
-    over = _match_along(context, trust.world_T_rigs, again)
+    over = _match_along(context, trust.world_T_rigs, _two_apart(alone, steps, absent))
     neighbours = VerifiedPairs.joined([alone, _consistent(over, steps, keypoints, settings)])
     alike = judgement.confirmed(coarse, steps, settings.priors)
     doubtful = {
         (f0, f1)
         for f0, f1 in lost.tolist()
-        if not (alike[f0] or _supported((f0, f1), neighbours, keypoints, settings))
+        if not (alike[f0] or _supported((f0, f1), neighbours, keypoints, absent))
     }
     if doubtful:
         frames = map(tuple, neighbours.matches.pairs.tolist())
@@ -94,6 +105,20 @@ def recover(
     guessed |= trust.unseen_steps & judgement.leaps(coarse.world_T_rigs, timestamps)
     trust = replace(trust, false_steps=trust.false_steps | guessed)
     return Recovered(neighbours, trust, coarse, joints)
+
+
+def _two_apart(found: VerifiedPairs, steps: Steps, absent: bool) -> np.ndarray:
+    """Pairs (P, 2) of frames two apart that are not found yet; without a trajectory, over steps
+    that images show: nothing else tells how long one is."""
+    first = np.arange(len(steps.verified) - 1)
+    if absent:
+        first = first[steps.verified[:-1] & steps.verified[1:]]
+    return found.missing(np.column_stack([first, first + 2]))
+
+
+def _is_absent(coarse: CoarsePoses) -> bool:
+    """Whether there is no trajectory."""
+    return bool((coarse.sources == PoseSource.NONE).all())
 
 
 def _with_wider(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
@@ -191,16 +216,44 @@ def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = Tru
     return VerifiedPairs.joined([first, match(rest, strongest=False)]) if len(rest) else first
 
 
+def match_again(context: MatchContext, found: VerifiedPairs, steps: set[int]) -> VerifiedPairs:
+    """Match steps once more, all keypoints along the epipolar lines found, and verify them anew.
+
+    Args:
+        context: of the run.
+        found: neighbours.
+        steps: first frames of the steps; each keeps what more matches agree on.
+    """
+    chosen = [
+        p
+        for p, (f0, f1) in enumerate(found.matches.pairs.tolist())
+        if f1 - f0 == 1 and f0 in steps and np.isfinite(found.direction_sigmas[p])
+    ]
+    better = []
+    for p in chosen:
+        poses = np.tile(np.eye(4), (len(context.keypoints.starts) - 1, 1, 1))
+        poses[found.matches.pairs[p, 1]] = found.f0_T_f1s[p]
+        pair, gates = found.matches.pairs[p : p + 1], [_AGAIN]
+        matches = context.match(pair, poses, gates, guided_only=True)
+        again = verified(matches, gates, None, None, context, rivals=True)
+        if len(again.matches.pairs) and len(again.matches.of(0)) > len(found.matches.of(p)):
+            better.append((p, again))
+    replaced = {p for p, _ in better}
+    kept = found.taken([p for p in range(len(found.matches.pairs)) if p not in replaced])
+    return VerifiedPairs.joined([kept, *(again for _, again in better)])
+
+
 def _judge(
     found: VerifiedPairs, keypoints: Keypoints, coarse: CoarsePoses, settings: RefineSettings
 ) -> Trust:
     steps = image_steps(found, keypoints)
-    logs, sigmas = length_ratios(found, steps, keypoints)
+    least = _LEAST_ALIKE if _is_absent(coarse) else None
+    logs, sigmas = length_ratios(found, steps, keypoints, least)
     return judgement.judge(coarse, steps, logs, sigmas, settings.verify, settings.priors)
 
 
 def _supported(
-    pair: tuple[int, int], found: VerifiedPairs, keypoints: Keypoints, settings: RefineSettings
+    pair: tuple[int, int], found: VerifiedPairs, keypoints: Keypoints, absent: bool
 ) -> bool:
     """Whether a third frame confirms a step that no trajectory guided.
 
@@ -214,8 +267,49 @@ def _supported(
     steps = image_steps(found, keypoints)
     if not steps.directed[f]:
         return True  # a turn on the spot: whole panoramas agree on one rotation
-    sigmas = length_ratios(found, steps, keypoints)[1]
+    least = _LEAST_ALIKE if absent else None
+    sigmas = length_ratios(found, steps, keypoints, least)[1]
     return bool(np.isfinite(sigmas[max(f - 1, 0) : f + 1]).any()) or len(steps.verified) == 1
+
+
+def _of_one_scale(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
+    """Neighbours without steps that are many times too short, as points beside them tell.
+
+    Where a floor's pattern is met one tile further on, relative poses look right. One of the two
+    steps is given up there, and pairs over it: the map goes in parts, which the test of joins may
+    join. Steps that share too few points to tell their lengths are matched with all keypoints
+    first.
+
+    Args:
+        context: of the run, which has no trajectory.
+        found: neighbours.
+    """
+    open_at = _open_ratios(context, found)[0]
+    found = match_again(context, found, {step for f in open_at for step in (f - 1, f)})
+    matches = matches_of_steps(found, len(context.keypoints.starts) - 1)
+    return without_steps(found, given_up(_open_ratios(context, found)[1], matches))
+
+
+def _open_ratios(context: MatchContext, found: VerifiedPairs) -> tuple[set[int], set[int]]:
+    """Frames between two steps that share few points: where these do not tell how long one step is
+    beside the other, or tell more than `_MAX_STEP_RATIO`; and the latter alone."""
+    steps = image_steps(found, context.keypoints)
+    logs, sigmas = length_ratios(found, steps, context.keypoints, _LEAST_ALIKE)
+    rows = {int(f0): p for p, (f0, f1) in enumerate(found.matches.pairs) if f1 - f0 == 1}
+    unknown, extreme = set[int](), set[int]()
+    for f in range(1, len(steps.verified)):
+        both = [rows[g] for g in (f - 1, f) if g in rows]
+        if len(both) < 2 or not np.isfinite(found.direction_sigmas[both]).any():
+            continue  # a break, or turns on the spot
+        before, after = (found.matches.of(p) for p in both)
+        shared = len(np.intersect1d(before[:, 1], after[:, 0]))
+        if shared >= context.settings.pairs.scarce_matches:
+            continue
+        if np.isinf(sigmas[f - 1]):
+            unknown.add(f)
+        elif abs(logs[f - 1]) > np.log(_MAX_STEP_RATIO):
+            extreme.add(f)
+    return unknown | extreme, extreme
 
 
 def _consistent(

@@ -13,6 +13,7 @@ from gsba.geometry import inverse, nearest_rotation
 from gsba.types import Keypoints, VerifiedPairs
 
 _MIN_COMMON = 8  # points that two steps must share to compare their lengths
+_ALIKE = 0.15  # of logarithms of ratios: points of rigid scenes are within that, half of them .02
 _MIN_POINT_PARALLAX = np.deg2rad(1.0)  # of a point, or its depth is not worth comparing
 _STILL = np.deg2rad(0.1)  # median: what a mere turn leaves over of bearings
 _RATIO_SIGMA = 0.02  # least noise of the logarithm of a ratio of lengths
@@ -128,9 +129,16 @@ def _angle_to_arc(direction: np.ndarray, start: np.ndarray, end: np.ndarray) -> 
 
 
 def length_ratios(
-    pairs: VerifiedPairs, found: Steps, keypoints: Keypoints
+    pairs: VerifiedPairs, found: Steps, keypoints: Keypoints, least_alike: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Length of each step over that of the step before, from points that both see.
+
+    Args:
+        pairs: of frames at most a few apart.
+        found: steps of these pairs.
+        keypoints: of all frames.
+        least_alike: points that suffice if they agree on one ratio to 15 %; None = eight points,
+            whatever they agree on.
 
     Returns:
         Logarithms (F - 2,) of the ratios and their standard deviations, infinite where unknown.
@@ -155,12 +163,48 @@ def length_ratios(
         )
         ratios = np.log(back / ahead)
         ratios = ratios[np.isfinite(ratios)]
-        if len(ratios) < _MIN_COMMON:
+        if least_alike is not None and len(ratios):
+            ratios = ratios[np.abs(ratios - np.median(ratios)) < _ALIKE]
+        if len(ratios) < (_MIN_COMMON if least_alike is None else least_alike):
             continue
         logs[f - 1] = np.median(ratios)
         spread = 1.4826 * np.median(np.abs(ratios - logs[f - 1]))
         sigmas[f - 1] = max(1.25 * spread / np.sqrt(len(ratios)), _RATIO_SIGMA)
     return logs, sigmas
+
+
+def given_up(open_at: set[int], matches: np.ndarray) -> set[int]:
+    """Steps to give up so that no frame joins two of which neither tells the other's length.
+
+    Args:
+        open_at: frames between two such steps.
+        matches: (F - 1,) of each step; of two steps, that of fewer matches is given up.
+
+    Returns:
+        First frames of the steps.
+    """
+    out, left = set[int](), set(open_at)
+    while left:
+        beside = {step for f in left for step in (f - 1, f)}
+        order = {f: (-len({f, f + 1} & left), int(matches[f]), f) for f in beside}
+        worst = min(beside, key=order.__getitem__)
+        out.add(worst)
+        left -= {worst, worst + 1}
+    return out
+
+
+def without_steps(pairs: VerifiedPairs, steps: set[int]) -> VerifiedPairs:
+    """Pairs without some steps, by their first frames, and without pairs over them."""
+    frames = enumerate(pairs.matches.pairs.tolist())
+    return pairs.taken([p for p, (f0, f1) in frames if not steps & set(range(f0, f1))])
+
+
+def matches_of_steps(pairs: VerifiedPairs, num_frames: int) -> np.ndarray:
+    """Number of matches (F - 1,) of each step; 0 where there is none."""
+    out = np.zeros(max(num_frames - 1, 0), np.int64)
+    steps = pairs.matches.pairs[:, 1] - pairs.matches.pairs[:, 0] == 1
+    out[pairs.matches.pairs[steps, 0]] = np.diff(pairs.matches.offsets)[steps]
+    return out
 
 
 def ray_depths(rays0: np.ndarray, rays1: np.ndarray, f0_T_f1: np.ndarray) -> np.ndarray:

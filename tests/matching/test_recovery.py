@@ -1,5 +1,6 @@
 """Neighbours matched without the trajectory where it misleads, and only there."""
 
+from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
@@ -14,7 +15,7 @@ from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
 from gsba.similarity import Sim3
 from gsba.store.shards import Threads
-from gsba.types import CoarsePoses, Keypoints, PoseSource, Solution
+from gsba.types import CoarsePoses, Keypoints, Matches, PoseSource, Solution, VerifiedPairs
 
 NUM, NUM_FRAMES = 250, 8
 TRUTH = pose(
@@ -118,3 +119,50 @@ def test_frames_of_two_pieces_are_never_tied_by_two_views() -> None:
     assert not found.trust.held_steps.any()  # where the second piece lies is a guess
     steps = np.linalg.norm(np.diff(found.trust.world_T_rigs[:, :3, 3], axis=0), axis=1)
     np.testing.assert_allclose(steps, steps[0], rtol=0.05)
+
+
+def _walk(poses: np.ndarray, seen: np.ndarray) -> MatchContext:
+    """A walk with poses (F, 4, 4) among points of which each frame sees some: (F, NUM) bool."""
+    rng = np.random.default_rng(1)
+    points = rng.uniform(2, 5, (NUM, 1)) * unit(rng.normal(size=(NUM, 3))) + [1, 0, 0]
+    descriptors = (200 * rng.random((NUM, 64)) ** 4).astype(np.uint8)
+    frames = [
+        features_of(with_noise(bearings_of(points[some], T), 3e-4, rng), descriptors[some])
+        for T, some in zip(poses, seen, strict=True)
+    ]
+    searchable = SearchableFrames(frames.__getitem__)
+    return MatchContext(searchable, searchable, detection.gather(frames), SETTINGS, Threads(1))
+
+
+def _from_images_alone(context: MatchContext) -> Recovered:
+    nowhere = np.tile(np.eye(4), (NUM_FRAMES, 1, 1))
+    coarse = CoarsePoses(nowhere, np.full(NUM_FRAMES, PoseSource.NONE, np.uint8), 0.0)
+    return recovery.recover(context, VerifiedPairs.none(), coarse, TIMES)
+
+
+def _frames(found: Recovered) -> set[tuple[int, int]]:
+    return {(f0, f1) for f0, f1 in found.neighbours.matches.pairs.tolist()}
+
+
+def test_few_points_do_not_make_a_step_many_times_shorter() -> None:
+    """As a pattern of tiles does that is met one tile further on; many points are believed."""
+    even = TRUTH.copy()
+    even[:, :3, 3] *= 1.5
+    poses = even.copy()
+    poses[4:, :3, 3] -= 0.82 * (even[4] - even[3])[:3, 3]
+    everything = np.ones((NUM_FRAMES, NUM), bool)
+    few = everything & (np.arange(NUM) < 45)
+    assert {(2, 3), (3, 4), (4, 5)} <= _frames(_from_images_alone(_walk(poses, everything)))
+    pairs = _frames(_from_images_alone(_walk(poses, few)))
+    assert (3, 4) not in pairs and {(2, 3), (4, 5)} <= pairs
+    assert {(2, 3), (3, 4), (4, 5)} <= _frames(_from_images_alone(_walk(even, few)))
+
+
+def test_steps_are_matched_again_with_all_keypoints() -> None:
+    context = _walk(TRUTH, np.ones((NUM_FRAMES, NUM), bool))
+    pair = np.array([[2, 3]], np.int32)
+    whole = recovery.match_anywhere(context, pair)
+    few = replace(whole, matches=Matches.of_rows(pair, [whole.matches.of(0)[::6]]))
+    again = recovery.match_again(context, few, {2})
+    assert len(few.matches.of(0)) < 45 and len(again.matches.of(0)) > 0.9 * NUM
+    assert len(recovery.match_again(context, few, {3}).matches.of(0)) < 45
