@@ -77,7 +77,7 @@ def recover(
     lost = guided.missing(_of_one_piece(np.column_stack([close, close + 1]), coarse))
     absent = _is_absent(coarse)
     alone = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
-    alone = _with_wider(context, alone)
+    alone = _with_wider(context, alone).within(coarse.segments)
     alone = _of_one_scale(context, alone) if absent else alone
     steps = image_steps(alone, keypoints)
     alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
@@ -86,7 +86,8 @@ def recover(
     trust = _judge(alone, keypoints, coarse, settings)
     if trust.sound and not joints:
         return Recovered(guided, trust, coarse)
-    over = _match_along(context, trust.world_T_rigs, _two_apart(alone, steps, absent))
+    again = _of_one_piece(_two_apart(alone, steps, absent), coarse)
+    over = _match_along(context, trust.world_T_rigs, again)
     neighbours = VerifiedPairs.joined([alone, _consistent(over, steps, keypoints, settings)])
     alike = judgement.confirmed(coarse, steps, settings.priors)
     doubtful = {
