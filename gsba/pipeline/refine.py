@@ -269,17 +269,17 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
     Raises:
         GsbaError: images that do not match, or that contradict the trajectory.
     """
-    rounds, families = run.settings.rounds, run.settings.direct_families()
+    families = run.settings.direct_families()
     prior, seen, world, along = _map_features(run, seen, prior, given)
     if prior.turning_only:
         return prior, world
     seen, solved, along = _look_closer(run, seen, prior, world.solution, along)
-    # The map matched anew from itself.
-    for n in range(1, rounds.map_passes + 1):
-        wide = frontend.match_known_points(run, seen, solved, f"everywhere{n}")
-        name, final = f"refined{n}", n == rounds.map_passes and not run.settings.patches.rounds
-        matches = [along, wide]
-        solved = backend.adjust(run, seen, prior, name, matches, solved, rounds.refined, final)
+    # The map matched anew from itself; lenses that neighbours hide may show in it.
+    solved, matches = _match_from_itself(run, seen, prior, solved, along)
+    if not world.lenses and run.frames.fisheyes is None:
+        seen, world = _find_camera(run, seen, prior, matches, solved, "again_")
+        if world.lenses:
+            solved, _ = _match_from_itself(run, seen, prior, world.solution, along, "again_")
     # Below a pixel: patches, pixels, splats.
     world = replace(world, solution=solved, observed=seen.shown)
     prior, world = patch_rounds.align(run, prior, world)
@@ -327,6 +327,19 @@ def _map_features(
     return prior, seen, world, along
 
 
+def _match_from_itself(
+    run: Run, seen: Seen, prior: Prior, solved: Solution, along: Matches, prefix: str = ""
+) -> tuple[Solution, list[Matches]]:
+    """The map after its own points were looked for everywhere, and the matches it is made of."""
+    rounds, matches = run.settings.rounds, [along]
+    for n in range(1, rounds.map_passes + 1):
+        wide = frontend.match_known_points(run, seen, solved, f"{prefix}everywhere{n}")
+        final = n == rounds.map_passes and not run.settings.patches.rounds
+        name, matches = f"{prefix}refined{n}", [along, wide]
+        solved = backend.adjust(run, seen, prior, name, matches, solved, rounds.refined, final)
+    return solved, matches
+
+
 def _merge_maps(
     run: Run,
     seen: Seen,
@@ -349,9 +362,18 @@ def _merge_maps(
 
 
 def _find_camera(
-    run: Run, seen: Seen, prior: Prior, matches: Sequence[Matches], solved: Solution
+    run: Run,
+    seen: Seen,
+    prior: Prior,
+    matches: Sequence[Matches],
+    solved: Solution,
+    prefix: str = "",
 ) -> tuple[Seen, Map]:
-    """Lenses and readout, before gates take what tells of them; and the map that these give."""
+    """Lenses and readout, before gates take what tells of them; and the map that these give.
+
+    Args:
+        prefix: of the names of stages.
+    """
     settings = run.settings
     if settings.camera.model == "central" or not run.frames.panoramic:
         return seen, Map.of(solved, seen.shown)
@@ -360,27 +382,30 @@ def _find_camera(
     looking = seen.through(Lenses())
     guess = None
     if not run.frames.lens_axes_known:
-        guess = backend.guess_axes(run, looking, prior, "axes", matches, solved)
+        guess = backend.guess_axes(run, looking, prior, f"{prefix}axes", matches, solved)
         looking = seen.through(guess.lenses)
     band, better, gates = np.deg2rad(settings.camera.seam_deg), solved, settings.rounds.loops
     looking = seen.through(replace(looking.lenses, band_rad=float(band)))
     for n in range(2):  # on trial, then judged by what is matched with them
-        found = backend.find_lenses(run, looking, prior, f"lenses{n}", matches, better)
+        name = f"{prefix}lenses{n}"
+        found = backend.find_lenses(run, looking, prior, name, matches, better)
         if not found.lenses:
             return seen, Map.of(solved, seen.shown, found)
-        looking = seen.through(found.lenses)
-        better = backend.adjust(run, looking, prior, f"lensed{n}", matches, better, gates)
+        looking, name = seen.through(found.lenses), f"{prefix}lensed{n}"
+        better = backend.adjust(run, looking, prior, name, matches, better, gates)
         gates = settings.rounds.dense
         if n == 0:
-            along = frontend.match_along_epipolars(run, looking, better, "adjacent_lenses")
-            wide = frontend.match_known_points(run, looking, better, "wide_lenses")
+            name = f"{prefix}adjacent_lenses"
+            along = frontend.match_along_epipolars(run, looking, better, name)
+            wide = frontend.match_known_points(run, looking, better, f"{prefix}wide_lenses")
             matches = [along, wide]
-    radius = backend.find_stitch_radius(run, looking, prior, "stitch_radius", matches, better)
+    name = f"{prefix}stitch_radius"
+    radius = backend.find_stitch_radius(run, looking, prior, name, matches, better)
     if not radius.reason:
-        looking = seen.through(radius.lenses)
-        better = backend.adjust(run, looking, prior, "lensed2", matches, better, gates)
+        looking, name = seen.through(radius.lenses), f"{prefix}lensed2"
+        better = backend.adjust(run, looking, prior, name, matches, better, gates)
     world = replace(Map.of(better, seen.shown, found), axes=guess, radius=radius)
-    return _settle_camera(run, looking, prior, matches, world, "settled")
+    return _settle_camera(run, looking, prior, matches, world, f"{prefix}settled")
 
 
 def _find_raw_camera(
