@@ -18,10 +18,11 @@ from gsba.odometry.atlas import Atlas, AtlasLayout, Cutter
 from gsba.odometry.corners import new_corners
 from gsba.odometry.derotation import Miniature, miniature, turned
 from gsba.odometry.flow import follow
+from gsba.odometry.occlusion import Occlusion
 from gsba.odometry.relocalisation import Described, describe, placed
 from gsba.odometry.resection import Resection, resect
 from gsba.odometry.two_view_start import median_turn, start_map
-from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window
+from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window, judge_features
 
 logger = logging.getLogger(__name__)
 
@@ -133,6 +134,8 @@ class Tracker:
     _window: list[_Keyframe] = field(default_factory=list)
     _features: _Features | None = None
     _points: np.ndarray = field(default_factory=lambda: np.full((4096, 3), np.nan))
+    _suspect: np.ndarray = field(default_factory=lambda: np.zeros(4096, bool))  # of features: may
+    # move on their own
     _num_ids: int = 0
     _map: int = 0
     _has_points: bool = False
@@ -142,10 +145,12 @@ class Tracker:
     _sigma: float = float(_SIGMA)
     _pending: list[tuple[int, np.ndarray, np.ndarray]] = field(default_factory=list)
     _failures: int = 0
+    _occlusion: Occlusion = field(init=False)
 
     def __post_init__(self) -> None:
         self._layout = AtlasLayout.of(self.width)
         self._cutter = Cutter(self._layout)
+        self._occlusion = Occlusion(max(1, self.patience // 3))
 
     def world_T_rigs(self) -> np.ndarray:
         """Poses (F, 4, 4) of all frames so far, each in the world of its map."""
@@ -333,12 +338,14 @@ class Tracker:
         self._sigma += _ADAPTING * (noise - self._sigma)
         fits = self._fitting(features, tried, key)
         self._assume(features, fits, tried.bearings[fits])
+        self._watch(frame, features, fits)
         features.misses = np.where(fits, 0, features.misses + 1)
         known = np.isfinite(self._points[features.ids, 0])
         distance = self._distance(features.ids[fits & known], self._pose)
-        parallax = self._parallax(features, tried, fits, key)
-        key.most_found = max(key.most_found, int(np.count_nonzero(fits)))
-        share = np.count_nonzero(fits) / max(key.most_found, 1)
+        believed = fits & ~self._suspect[features.ids]
+        parallax = self._parallax(features, tried, believed, key)
+        key.most_found = max(key.most_found, int(np.count_nonzero(believed)))
+        share = np.count_nonzero(believed) / max(key.most_found, 1)
         few = np.count_nonzero(fit.inliers) < _FEW_INLIERS and parallax > _SOME_PARALLAX
         if parallax > _KEYFRAME_PARALLAX or share < _KEYFRAME_SHARE or few:
             ids, bearings = features.ids[fits], tried.bearings[fits]
@@ -349,6 +356,14 @@ class Tracker:
         number = int(np.count_nonzero(fit.inliers))
         key_T_rig = inverse(key.world_T_rig) @ self._pose
         self._record(FrameStatus.TRACKED, key_T_rig, distance, number)
+
+    def _watch(self, frame: int, features: _Features, fits: np.ndarray) -> None:
+        """See whether something covers the scene."""
+        points = self._points[features.ids]
+        rows = np.flatnonzero(np.isfinite(points[:, 0]) & (features.misses == 0))
+        where = _seen_from(self._pose, points[rows])
+        if self._occlusion.update(frame, where, fits[rows]):
+            logger.debug("frame %d: known points vanish at once from a part of the picture", frame)
 
     def _fitting(self, features: _Features, tried: _Attempt, key: _Keyframe) -> np.ndarray:
         """Features (N,) bool that were found where the pose allows them."""
@@ -405,6 +420,8 @@ class Tracker:
         self._num_ids += len(corners)
         while self._num_ids > len(self._points):
             self._points = np.concatenate([self._points, np.full_like(self._points, np.nan)])
+            self._suspect = np.concatenate([self._suspect, np.zeros_like(self._suspect)])
+        self._suspect[ids] = self._occlusion.covers(corners)
         bearings = corners
         if followed is not None:
             ids = np.concatenate([followed[0], ids])
@@ -423,7 +440,10 @@ class Tracker:
         """Adjust the window, and drop features that do not fit it."""
         window = self._window
         held = max(len(window) - FREE, min(2, len(window) - 1))
-        seen = WindowObservations.of([(key.ids, key.bearings) for key in window])
+        suspect = [self._suspect[key.ids] for key in window]
+        seen = WindowObservations.of(
+            [(key.ids[~s], key.bearings[~s]) for key, s in zip(window, suspect, strict=True)]
+        )
         poses = np.array([key.world_T_rig for key in window])
         solved = adjust_window(poses, held, seen, self._sigma, _GATE)
         for key, world_T_rig in zip(window[held:], solved.world_T_rigs[held:], strict=True):
@@ -437,9 +457,26 @@ class Tracker:
             if len(false):
                 kept = ~np.isin(key.ids, false)
                 key.ids, key.bearings = key.ids[kept], key.bearings[kept]
+        if any(s.any() for s in suspect):
+            self._acquit(solved.world_T_rigs)
         last = window[-1]
         self._pose = last.world_T_rig.copy()
         self._features = self._followable(last)
+
+    def _acquit(self, world_T_rigs: np.ndarray) -> None:
+        """Believe features that agree with the window's poses (K, 4, 4), given by all others."""
+        rows = [np.flatnonzero(self._suspect[key.ids]) for key in self._window]
+        seen = WindowObservations.of(
+            [(key.ids[r], key.bearings[r]) for key, r in zip(self._window, rows, strict=True)]
+        )
+        judged = judge_features(world_T_rigs, seen, self._sigma, _GATE)
+        last = self._window[-1]
+        now = np.isin(judged.ids, last.ids)
+        where = last.bearings[np.searchsorted(last.ids, judged.ids[now])]
+        self._occlusion.clear(where, judged.agree[now])
+        free = now.copy()
+        free[now] = judged.agree[now] & ~self._occlusion.covers(where)
+        self._suspect[judged.ids[free]] = False
 
     # Frames that nothing is known of.
 
@@ -526,6 +563,7 @@ class Tracker:
         logger.warning("frame %d: nothing ties it to the map: a new one begins", frame)
         self.records.pop()
         self._map += 1
+        self._occlusion = Occlusion(max(1, self.patience // 3))
         self._has_points, self._features, self._pose = False, None, np.eye(4)
         self._pending.clear()
         self._begin_map(grey, small, frame)
