@@ -9,7 +9,7 @@ import numpy as np
 _DIRECTIONS = 60  # centres of caps, spread evenly over the sphere
 _MIN_COSINE = np.cos(np.deg2rad(60.0))  # of a cap: a quarter of the sphere
 _MIN_JUDGED = 10  # points, or new features, of a cap that is judged
-_GONE_SHARE = 0.15  # of a cap's points, at most found from one frame to the next where it is covered
+_GONE_SHARE = 0.15  # of a cap's points in the frame before, at most found where it is covered
 _MIN_CAPS = 6  # covered at once: where walls are bare, the points of three may vanish behind a post
 _CLEAR_SHARE = 0.6  # of a cap's new features, that agree where it shows the scene
 
@@ -28,7 +28,7 @@ class Occlusion:
         self._latest = np.zeros(_DIRECTIONS, bool)  # caps whose points vanished in the last frame
 
     def update(self, frame: int, bearings_rig: np.ndarray, fits: np.ndarray) -> bool:
-        """Take note of a frame; True where more is covered than before.
+        """Update the covered caps from a frame; True if more of them are covered than before.
 
         Args:
             frame: its index.
@@ -46,11 +46,11 @@ class Occlusion:
         elif grows:
             self._covered |= gone
         self._latest = gone
-        return np.count_nonzero(self._covered) > before
+        return bool(np.count_nonzero(self._covered) > before)
 
     def covers(self, bearings_rig: np.ndarray) -> np.ndarray:
         """Which bearings (N, 3), rig frame, are covered, (N,) bool."""
-        return _within_caps(bearings_rig)[:, self._covered].any(axis=1)
+        return np.asarray(_within_caps(bearings_rig)[:, self._covered].any(axis=1))
 
     def clear(self, bearings_rig: np.ndarray, agree: np.ndarray) -> None:
         """Uncover caps by their new features.

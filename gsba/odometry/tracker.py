@@ -40,8 +40,10 @@ _GATE = 4.0  # standard deviations of a feature that fits
 _FEW_INLIERS = 60  # below which less parallax makes a keyframe
 _SOME_PARALLAX = np.deg2rad(1.0)
 _MIN_FOUND_AGAIN = 0.4  # of a keyframe's points, in a lost frame: another door shows some of them
-_NUDGE = 0.03  # median distances of the points along each axis, and a turn, that a pose found
-_NUDGE_R = Rotation.from_rotvec(np.deg2rad([1.2, 1.2, 1.2])).as_matrix()  # again is tried from
+# A pose found again is confirmed from one that is turned, and shifted along each axis by this part of
+# the median distance of the points.
+_NUDGE = 0.03
+_NUDGE_R = Rotation.from_rotvec(np.deg2rad([1.2, 1.2, 1.2])).as_matrix()
 _MIN_LEADING = 8  # features whose pose may lead to others
 _MAX_MISPREDICTED = np.deg2rad(1.5)  # of features, beyond which those not found are tried again
 _MIN_FEATURES = 40  # of a picture that shows anything
@@ -300,7 +302,8 @@ class Tracker:
         Features with points go first. Where the pose that they give is far from the predicted one,
         those that do not fit it are looked for once more; all others are, by that pose.
         """
-        assert key.atlas is not None
+        template = key.atlas
+        assert template is not None
         atlas = self._cutter.cut(grey, predicted[:3, :3])
         points = self._points[features.ids]
         known = np.isfinite(points[:, 0])
@@ -310,7 +313,7 @@ class Tracker:
         def look(rows: np.ndarray, world_T_rig: np.ndarray) -> None:
             expected = _seen_from(world_T_rig, assumed[rows])
             seen = features.bearings[rows]
-            bearings[rows], found[rows] = follow(self._layout, key.atlas, atlas, seen, expected)
+            bearings[rows], found[rows] = follow(self._layout, template, atlas, seen, expected)
 
         look(np.flatnonzero(known), predicted)
         rows = np.flatnonzero(known & found)
