@@ -40,7 +40,7 @@ _GATE = 4.0  # standard deviations of a feature that fits
 _FEW_INLIERS = 60  # below which less parallax makes a keyframe
 _SOME_PARALLAX = np.deg2rad(1.0)
 _MIN_FOUND_AGAIN = 0.4  # of a keyframe's points, in a lost frame: another door shows some of them
-# A pose found again is confirmed from one that is turned, and shifted along each axis by this part of
+# A pose found again is confirmed from one that is turned, and shifted along each axis by a part of
 # the median distance of the points.
 _NUDGE = 0.03
 _NUDGE_R = Rotation.from_rotvec(np.deg2rad([1.2, 1.2, 1.2])).as_matrix()
@@ -443,9 +443,15 @@ class Tracker:
         """Adjust the window, and drop features that do not fit it."""
         window = self._window
         held = max(len(window) - FREE, min(2, len(window) - 1))
+        # Points that held keyframes alone see stay as they are.
+        movable = np.unique(np.concatenate([key.ids for key in window[held:]]))
         suspect = [self._suspect[key.ids] for key in window]
+        rows = [
+            np.flatnonzero(~s & np.isin(key.ids, movable, assume_unique=True))
+            for key, s in zip(window, suspect, strict=True)
+        ]
         seen = WindowObservations.of(
-            [(key.ids[~s], key.bearings[~s]) for key, s in zip(window, suspect, strict=True)]
+            [(key.ids[r], key.bearings[r]) for key, r in zip(window, rows, strict=True)]
         )
         poses = np.array([key.world_T_rig for key in window])
         solved = adjust_window(poses, held, seen, self._sigma, _GATE)

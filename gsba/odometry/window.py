@@ -17,6 +17,7 @@ _SOLVER = SolverSettings(
 )
 _MIN_PARALLAX_DEG = 1.0  # of a point's rays
 _MIN_VIEWS, _MIN_TOLD_PARALLAX_DEG = 3, 2.0  # of a feature that is judged
+_POLISH_STEPS = 1  # on points after each step of the poses
 _HELD = 1e-6  # standard deviation of poses that are held: radians, and parts of their extent
 
 
@@ -77,7 +78,9 @@ def adjust_window(
         marks.tracks.frames, marks.tracks.points, seen.bearings_rig[used], sigmas[used], None
     )
     keys = [prior_factors.X(k) for k in range(len(world_T_rigs))]
-    block = LandmarkBlock(keys, marks.points_world, [term], RobustLoss("cauchy", 2.0), 1)
+    block = LandmarkBlock(
+        keys, marks.points_world, [term], RobustLoss("cauchy", 2.0), 1, _POLISH_STEPS
+    )
     graph = _held(world_T_rigs, num_held)
     poses = poses_of(optimize(graph, [block], values_of(world_T_rigs), _SOLVER).values, len(keys))
     marks = place(poses, gate)
