@@ -10,8 +10,8 @@ process, decoding apart.
 
     python benchmarks/odometry.py WALK --long 20000
 
-goes to and fro through one walk until that many frames are tracked, and prints the processor time of
-a frame in each tenth, and the most memory that the process has held.
+goes to and fro through one walk until that many frames are tracked, and prints the processor time
+of a frame in each tenth, and the most memory that the process has held.
 """
 
 import argparse
