@@ -7,16 +7,9 @@ is: `shared/tools/render_home.py` and `render_walk.py` make such. Each is follow
 by what carries the camera), and its first 90 frames with faults put in: darkness, a hand, standing,
 turning on the spot, frames left out. A row says what came of it; times are processor times of this
 process, decoding apart.
-
-    python benchmarks/odometry.py WALK --long 20000
-
-goes to and fro through one walk until that many frames are tracked, and prints the processor time
-of a frame in each tenth, and the most memory that the process has held.
 """
 
 import argparse
-import resource
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -31,9 +24,7 @@ from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearin
 from gsba.evaluate.trajectory import evaluate
 from gsba.frames.scan import scan
 from gsba.geometry import inverse
-from gsba.odometry.frame_record import FrameStatus
 from gsba.odometry.panoramas import SmallPanoramas
-from gsba.odometry.tracker import Tracker
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory
 
@@ -173,42 +164,17 @@ def faults(name: str, panoramas: SmallPanoramas, truth: np.ndarray) -> list[Row]
     ]
 
 
-def follow_long(panoramas: SmallPanoramas, num: int) -> None:
-    """Track `num` frames, to and fro through a sequence."""
-    pictures = [picture for _, picture in panoramas.read(range(len(panoramas)), False)]
-    order = [*range(len(pictures)), *range(len(pictures) - 2, 0, -1)]
-    tracker = Tracker(panoramas.width, panoramas.usable)
-    tenth, began = max(num // 10, 1), time.process_time()
-    for n in range(num):
-        tracker.add(pictures[order[n % len(order)]])
-        if (n + 1) % tenth == 0:
-            now = time.process_time()
-            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
-            maps = tracker.records[-1].map_number + 1
-            ms = 1e3 * (now - began) / tenth
-            print(
-                f"{n + 1} frames: {ms:.0f} ms a frame, peak {peak:.2f} GiB, {maps} maps", flush=True
-            )
-            began = now
-    lost = sum(record.status == FrameStatus.LOST for record in tracker.records)
-    print(f"{len(tracker.keyframe_poses)} keyframes, {lost} frames lost")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("walks", nargs="+", type=Path)
     parser.add_argument("--markdown", type=Path)
     parser.add_argument("--loops", action="store_true", help="before and after closing loops alone")
-    parser.add_argument("--long", type=int, help="frames tracked to and fro through the first walk")
     arguments = parser.parse_args()
     rows = []
     for n, folder in enumerate(arguments.walks):
         frames = scan(folder / "images", fps=8.0, order_suffices=True)
         panoramas = odometry.of_frames(frames, folder, WIDTH)
         panoramas = odometry.without_carrier(panoramas)
-        if arguments.long is not None:
-            follow_long(panoramas, arguments.long)
-            return
         truth = read_trajectory(folder / "groundtruth.tum").world_T_rigs
         if arguments.loops:
             print(close_loops(folder.name, panoramas, truth), flush=True)

@@ -22,12 +22,12 @@ _PAD = 2  # pixels beyond seam and poles that interpolation reads
 _MAX_CUT_ERROR = np.deg2rad(6.0)  # of the axes of a cut: maps are computed anew beyond it
 _SAME_CUT = 1e-9  # radians between axes that are the same
 # Minimax polynomial of arctan(t) / t in t^2 on [0, 1] (Chebyshev nodes): 7e-7 at most off.
-_A0, _A1, _A2, _A3, _A4, _A5, _A6 = np.array(
-    [
-        *(0.999999328, -0.333263745, 0.198798722, -0.134804056),
-        *(0.0837415565, -0.0368986292, 0.00782548295),
-    ],
-    np.float32,
+_A0, _A1, _A2, _A3, _A4, _A5, _A6 = (
+    np.float32(a)
+    for a in (
+        *(0.999999328, -0.333263745, 0.198798722, -0.134804056, 0.0837415565, -0.0368986292),
+        0.00782548295,
+    )
 )
 _QUARTER, _HALF, _ONE_HALF = np.float32(np.pi / 2), np.float32(np.pi), np.float32(0.5)
 _TINY = np.float32(1e-30)

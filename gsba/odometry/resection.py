@@ -69,11 +69,11 @@ def _fitted(
         return world_T_rig, np.zeros((6, 6)), residuals, distances
     bases = tangent_basis(bearings_rig)
     information, gradient = np.empty((6, 6)), np.empty(6)
-    observed, results = (points_world, bases, bearings_rig), (residuals, distances)
-    system = information, gradient
+    observed = points_world, bases, bearings_rig
     for step in range(_STEPS):
         scale = 3 * sigma * _ANNEALED[min(step, len(_ANNEALED) - 1)]
-        _normal_equations(*observed, world_T_rig, scale, *results, *system)
+        found = residuals, distances, information, gradient
+        _normal_equations(*observed, world_T_rig, scale, *found)
         distance = float(np.median(distances))
         damping = 1e-9 * np.diag([1.0] * 3 + [distance**-2] * 3) * num
         tangent = -np.linalg.solve(information + damping, gradient)
@@ -83,7 +83,7 @@ def _fitted(
         if small and step >= len(_ANNEALED):
             break
     before = information.copy()
-    _normal_equations(*observed, world_T_rig, scale, *results, *system)
+    _normal_equations(*observed, world_T_rig, scale, residuals, distances, information, gradient)
     return world_T_rig, before, residuals, distances
 
 

@@ -18,12 +18,10 @@ from gsba.odometry.corners import new_corners
 from gsba.odometry.derotation import Miniature, miniature, turned
 from gsba.odometry.flow import follow
 from gsba.odometry.frame_record import FrameRecord, FrameStatus
-from gsba.odometry.keyframe import Attempt, Features, Keyframe
-from gsba.odometry.occlusion import Occlusion
 from gsba.odometry.relocalisation import Described, describe, placed
-from gsba.odometry.resection import resect
+from gsba.odometry.resection import Resection, resect
 from gsba.odometry.two_view_start import median_turn, start_map
-from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window, judge_features
+from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window
 
 logger = logging.getLogger(__name__)
 
@@ -41,15 +39,55 @@ _GATE = 4.0  # standard deviations of a feature that fits
 _FEW_INLIERS = 60  # below which less parallax makes a keyframe
 _SOME_PARALLAX = np.deg2rad(1.0)
 _MIN_FOUND_AGAIN = 0.4  # of a keyframe's points, in a lost frame: another door shows some of them
-# A pose found again is confirmed from one that is turned, and shifted along each axis by a part of
-# the median distance of the points.
-_NUDGE = 0.03
-_NUDGE_R = Rotation.from_rotvec(np.deg2rad([1.2, 1.2, 1.2])).as_matrix()
+_NUDGE = 0.03  # median distances of the points along each axis, and a turn, that a pose found
+_NUDGE_R = Rotation.from_rotvec(np.deg2rad([1.2, 1.2, 1.2])).as_matrix()  # again is tried from
 _MIN_LEADING = 8  # features whose pose may lead to others
 _MAX_MISPREDICTED = np.deg2rad(1.5)  # of features, beyond which those not found are tried again
 _MIN_FEATURES = 40  # of a picture that shows anything
 _MAX_MISSES = 4  # frames in a row in which a feature without a point was not found
 _MAX_PENDING = 300  # frames before the start of a map that are posed again once it has points
+
+
+@dataclass(slots=True)
+class _Keyframe:
+    """A keyframe of the map that is being made."""
+
+    number: int  # of the keyframe in the whole recording
+    frame: int  # index of its frame
+    world_T_rig: np.ndarray  # (4, 4)
+    ids: np.ndarray  # (N,) int64, features seen
+    bearings: np.ndarray  # (N, 3) unit, rig frame
+    atlas: Atlas | None  # None = forgotten
+    small: Miniature | None
+    described: Described | None = None  # when a lost frame was first compared with it
+    most_found: int = 0  # of its features in one of the frames after it
+
+
+@dataclass(slots=True)
+class _Features:
+    """Features of the last keyframe that are followed."""
+
+    ids: np.ndarray  # (N,) int64
+    bearings: np.ndarray  # (N, 3) unit, rig frame of the keyframe
+    assumed_world: np.ndarray  # (N, 3) map units: where features without a point are assumed, by
+    # their direction when last found and the distance of points beside them
+    misses: np.ndarray  # (N,) int, frames since
+
+    def taken(self, rows: np.ndarray) -> "_Features":
+        """Some rows."""
+        return _Features(
+            self.ids[rows], self.bearings[rows], self.assumed_world[rows], self.misses[rows]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    """Where the features are in a frame, and the pose they give."""
+
+    atlas: Atlas
+    bearings: np.ndarray  # (N, 3)
+    found: np.ndarray  # (N,) bool
+    fit: Resection
 
 
 @dataclass(slots=True)
@@ -75,11 +113,9 @@ class Tracker:
 
     _layout: AtlasLayout = field(init=False)
     _cutter: Cutter = field(init=False)
-    _window: list[Keyframe] = field(default_factory=list)
-    _features: Features | None = None
+    _window: list[_Keyframe] = field(default_factory=list)
+    _features: _Features | None = None
     _points: np.ndarray = field(default_factory=lambda: np.full((4096, 3), np.nan))
-    _suspect: np.ndarray = field(default_factory=lambda: np.zeros(4096, bool))  # of features: may
-    # move on their own
     _num_ids: int = 0
     _map: int = 0
     _has_points: bool = False
@@ -89,12 +125,10 @@ class Tracker:
     _sigma: float = float(_SIGMA)
     _pending: list[tuple[int, np.ndarray, np.ndarray]] = field(default_factory=list)
     _failures: int = 0
-    _occlusion: Occlusion = field(init=False)
 
     def __post_init__(self) -> None:
         self._layout = AtlasLayout.of(self.width)
         self._cutter = Cutter(self._layout)
-        self._occlusion = Occlusion(max(1, self.patience // 3))
 
     def world_T_rigs(self) -> np.ndarray:
         """Poses (F, 4, 4) of all frames so far, each in the world of its map."""
@@ -165,7 +199,7 @@ class Tracker:
         self._record(FrameStatus.TURNING, inverse(key.world_T_rig) @ self._pose)
 
     def _followed(
-        self, grey: np.ndarray, key: Keyframe, features: Features, world_R_rig: np.ndarray
+        self, grey: np.ndarray, key: _Keyframe, features: _Features, world_R_rig: np.ndarray
     ) -> tuple[Atlas, np.ndarray, np.ndarray]:
         """A frame's atlas, bearings (N, 3) of features in it, and which were found, by rotation."""
         assert key.atlas is not None
@@ -197,7 +231,9 @@ class Tracker:
         false = np.isin(ids, solved.outliers[:, 1])
         self._become_keyframe(frame, atlas, small, ids[~false], bearings[~false])
 
-    def _pose_again(self, frame: int, ids: np.ndarray, bearings: np.ndarray, key: Keyframe) -> None:
+    def _pose_again(
+        self, frame: int, ids: np.ndarray, bearings: np.ndarray, key: _Keyframe
+    ) -> None:
         """Pose a frame before the start of the map from the points it has now."""
         points = self._points[ids]
         known = np.isfinite(points[:, 0])
@@ -235,8 +271,8 @@ class Tracker:
             self._motion = np.eye(4)
 
     def _attempt(
-        self, grey: np.ndarray, key: Keyframe, features: Features, predicted: np.ndarray
-    ) -> Attempt:
+        self, grey: np.ndarray, key: _Keyframe, features: _Features, predicted: np.ndarray
+    ) -> _Attempt:
         """Follow a keyframe's features into a frame whose pose (4, 4) is predicted, and pose it.
 
         Features with points go first. Where the pose that they give is far from the predicted one,
@@ -270,9 +306,9 @@ class Tracker:
                 fit = resect(points[rows], bearings[rows], fit.world_T_rig, self._sigma)
         if fit.significant:
             look(np.flatnonzero(~known), fit.world_T_rig)
-        return Attempt(atlas, bearings, found, fit)
+        return _Attempt(atlas, bearings, found, fit)
 
-    def _accept(self, frame: int, tried: Attempt, small: Miniature) -> None:
+    def _accept(self, frame: int, tried: _Attempt, small: Miniature) -> None:
         """Take the pose of a frame; make it a keyframe if it is time."""
         features, key, fit = self._features, self._window[-1], tried.fit
         assert features is not None
@@ -281,14 +317,12 @@ class Tracker:
         self._sigma += _ADAPTING * (noise - self._sigma)
         fits = self._fitting(features, tried, key)
         self._assume(features, fits, tried.bearings[fits])
-        self._watch(frame, features, fits)
         features.misses = np.where(fits, 0, features.misses + 1)
         known = np.isfinite(self._points[features.ids, 0])
         distance = self._distance(features.ids[fits & known], self._pose)
-        believed = fits & ~self._suspect[features.ids]
-        parallax = self._parallax(features, tried, believed, key)
-        key.most_found = max(key.most_found, int(np.count_nonzero(believed)))
-        share = np.count_nonzero(believed) / max(key.most_found, 1)
+        parallax = self._parallax(features, tried, fits, key)
+        key.most_found = max(key.most_found, int(np.count_nonzero(fits)))
+        share = np.count_nonzero(fits) / max(key.most_found, 1)
         few = np.count_nonzero(fit.inliers) < _FEW_INLIERS and parallax > _SOME_PARALLAX
         if parallax > _KEYFRAME_PARALLAX or share < _KEYFRAME_SHARE or few:
             ids, bearings = features.ids[fits], tried.bearings[fits]
@@ -300,15 +334,7 @@ class Tracker:
         key_T_rig = inverse(key.world_T_rig) @ self._pose
         self._record(FrameStatus.TRACKED, key_T_rig, distance, number)
 
-    def _watch(self, frame: int, features: Features, fits: np.ndarray) -> None:
-        """See whether something covers the scene."""
-        points = self._points[features.ids]
-        rows = np.flatnonzero(np.isfinite(points[:, 0]) & (features.misses == 0))
-        where = _seen_from(self._pose, points[rows])
-        if self._occlusion.update(frame, where, fits[rows]):
-            logger.debug("frame %d: known points vanish at once from a part of the picture", frame)
-
-    def _fitting(self, features: Features, tried: Attempt, key: Keyframe) -> np.ndarray:
+    def _fitting(self, features: _Features, tried: _Attempt, key: _Keyframe) -> np.ndarray:
         """Features (N,) bool that were found where the pose allows them."""
         points = self._points[features.ids]
         known = np.isfinite(points[:, 0])
@@ -327,7 +353,7 @@ class Tracker:
         return fits
 
     def _parallax(
-        self, features: Features, tried: Attempt, fits: np.ndarray, key: Keyframe
+        self, features: _Features, tried: _Attempt, fits: np.ndarray, key: _Keyframe
     ) -> float:
         """Median angle between where features lie from the keyframe and from the frame."""
         if not fits.any():
@@ -363,14 +389,12 @@ class Tracker:
         self._num_ids += len(corners)
         while self._num_ids > len(self._points):
             self._points = np.concatenate([self._points, np.full_like(self._points, np.nan)])
-            self._suspect = np.concatenate([self._suspect, np.zeros_like(self._suspect)])
-        self._suspect[ids] = self._occlusion.covers(corners)
         bearings = corners
         if followed is not None:
             ids = np.concatenate([followed[0], ids])
             bearings = np.concatenate([followed[1], corners])
         number = len(self.keyframe_poses)
-        key = Keyframe(number, frame, world_T_rig.copy(), ids, bearings, atlas, small)
+        key = _Keyframe(number, frame, world_T_rig.copy(), ids, bearings, atlas, small)
         self._window.append(key)
         self.keyframe_poses.append(key.world_T_rig)
         self.keyframe_frames.append(frame)
@@ -384,16 +408,7 @@ class Tracker:
         """Adjust the window, and drop features that do not fit it."""
         window = self._window
         held = max(len(window) - FREE, min(2, len(window) - 1))
-        # Points that held keyframes alone see stay as they are.
-        movable = np.unique(np.concatenate([key.ids for key in window[held:]]))
-        suspect = [self._suspect[key.ids] for key in window]
-        rows = [
-            np.flatnonzero(~s & np.isin(key.ids, movable, assume_unique=True))
-            for key, s in zip(window, suspect, strict=True)
-        ]
-        seen = WindowObservations.of(
-            [(key.ids[r], key.bearings[r]) for key, r in zip(window, rows, strict=True)]
-        )
+        seen = WindowObservations.of([(key.ids, key.bearings) for key in window])
         poses = np.array([key.world_T_rig for key in window])
         solved = adjust_window(poses, held, seen, self._sigma, _GATE)
         for key, world_T_rig in zip(window[held:], solved.world_T_rigs[held:], strict=True):
@@ -408,30 +423,13 @@ class Tracker:
                 kept = ~np.isin(key.ids, false)
                 key.ids, key.bearings = key.ids[kept], key.bearings[kept]
                 self.keyframe_features[key.number] = key.ids, key.bearings.astype(np.float32)
-        if any(s.any() for s in suspect):
-            self._acquit(solved.world_T_rigs)
         last = window[-1]
         self._pose = last.world_T_rig.copy()
         self._features = self._followable(last)
 
-    def _acquit(self, world_T_rigs: np.ndarray) -> None:
-        """Believe features that agree with the window's poses (K, 4, 4), given by all others."""
-        rows = [np.flatnonzero(self._suspect[key.ids]) for key in self._window]
-        seen = WindowObservations.of(
-            [(key.ids[r], key.bearings[r]) for key, r in zip(self._window, rows, strict=True)]
-        )
-        judged = judge_features(world_T_rigs, seen, self._sigma, _GATE)
-        last = self._window[-1]
-        now = np.isin(judged.ids, last.ids)
-        where = last.bearings[np.searchsorted(last.ids, judged.ids[now])]
-        self._occlusion.clear(where, judged.agree[now])
-        free = now.copy()
-        free[now] = judged.agree[now] & ~self._occlusion.covers(where)
-        self._suspect[judged.ids[free]] = False
-
     # Frames that nothing is known of.
 
-    def _relocalised(self, grey: np.ndarray, small: Miniature) -> Attempt | None:
+    def _relocalised(self, grey: np.ndarray, small: Miniature) -> _Attempt | None:
         """A lost frame posed by one of the last keyframes, which takes the lead then; or None."""
         if small.contrast < _MIN_CONTRAST:
             return None
@@ -461,7 +459,7 @@ class Tracker:
         return None
 
     def _confirmed(
-        self, grey: np.ndarray, key: Keyframe, features: Features, tried: Attempt
+        self, grey: np.ndarray, key: _Keyframe, features: _Features, tried: _Attempt
     ) -> bool:
         """Whether features lead back to a pose from another near it.
 
@@ -478,8 +476,8 @@ class Tracker:
         return bool(turned_back and moved_back)
 
     def _by_keyframe(
-        self, grey: np.ndarray, key: Keyframe, predicted: np.ndarray
-    ) -> Attempt | None:
+        self, grey: np.ndarray, key: _Keyframe, predicted: np.ndarray
+    ) -> _Attempt | None:
         """A frame followed from a keyframe, which leads then; None where no pose comes of it."""
         features = self._followable(key)
         tried = self._attempt(grey, key, features, predicted)
@@ -514,7 +512,6 @@ class Tracker:
         logger.warning("frame %d: nothing ties it to the map: a new one begins", frame)
         self.records.pop()
         self._map += 1
-        self._occlusion = Occlusion(max(1, self.patience // 3))
         self._has_points, self._features, self._pose = False, None, np.eye(4)
         self._pending.clear()
         self._begin_map(grey, small, frame)
@@ -536,7 +533,7 @@ class Tracker:
         grey = self.usable.astype(np.uint8) * 255
         return self._cutter.cut(grey, atlas.cut_R_rig, exactly=True).image > 250
 
-    def _followable(self, key: Keyframe) -> Features:
+    def _followable(self, key: _Keyframe) -> _Features:
         """Features of a keyframe, assumed as far away as the nearest that has a point."""
         points = self._points[key.ids]
         known = np.isfinite(points[:, 0])
@@ -547,9 +544,9 @@ class Tracker:
             distances = lengths[nearest]
         rays = distances[:, None] * (key.bearings @ key.world_T_rig[:3, :3].T)
         assumed = key.world_T_rig[:3, 3] + rays
-        return Features(key.ids, key.bearings, assumed, np.zeros(len(rays), int))
+        return _Features(key.ids, key.bearings, assumed, np.zeros(len(rays), int))
 
-    def _assume(self, features: Features, found: np.ndarray, bearings: np.ndarray) -> None:
+    def _assume(self, features: _Features, found: np.ndarray, bearings: np.ndarray) -> None:
         """Move where features found (N,) bool are assumed onto their bearings in the last frame."""
         position = self._pose[:3, 3]
         distances = np.linalg.norm(features.assumed_world[found] - position, axis=1)

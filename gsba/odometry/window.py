@@ -16,8 +16,6 @@ _SOLVER = SolverSettings(
     max_iterations=8, relative_tolerance=1e-3, absolute_tolerance=1.0, lambda_initial=1e-6
 )
 _MIN_PARALLAX_DEG = 1.0  # of a point's rays
-_MIN_VIEWS, _MIN_TOLD_PARALLAX_DEG = 3, 2.0  # of a feature that is judged
-_POLISH_STEPS = 1  # on points after each step of the poses
 _HELD = 1e-6  # standard deviation of poses that are held: radians, and parts of their extent
 
 
@@ -78,9 +76,7 @@ def adjust_window(
         marks.tracks.frames, marks.tracks.points, seen.bearings_rig[used], sigmas[used], None
     )
     keys = [prior_factors.X(k) for k in range(len(world_T_rigs))]
-    block = LandmarkBlock(
-        keys, marks.points_world, [term], RobustLoss("cauchy", 2.0), 1, _POLISH_STEPS
-    )
+    block = LandmarkBlock(keys, marks.points_world, [term], RobustLoss("cauchy", 2.0), 1)
     graph = _held(world_T_rigs, num_held)
     poses = poses_of(optimize(graph, [block], values_of(world_T_rigs), _SOLVER).values, len(keys))
     marks = place(poses, gate)
@@ -91,41 +87,6 @@ def adjust_window(
     false = ~kept & np.isin(seen.ids, ids)
     outliers = np.stack([seen.frames[false], seen.ids[false]], axis=1)
     return AdjustedWindow(poses, ids, marks.points_world, outliers)
-
-
-@dataclass(frozen=True, slots=True)
-class JudgedFeatures:
-    """Features whose observations tell whether they stand still."""
-
-    ids: np.ndarray  # (J,) int64, rising
-    agree: np.ndarray  # (J,) bool, one point explains all observations
-
-
-def judge_features(
-    world_T_rigs: np.ndarray, seen: WindowObservations, sigma: float, gate: float
-) -> JudgedFeatures:
-    """Which features one point explains under poses that others gave.
-
-    Features in fewer than `_MIN_VIEWS` keyframes, and those that poses hardly tell from a point at
-    infinity, are left out.
-
-    Args:
-        world_T_rigs, seen, sigma, gate: as for `adjust_window`.
-    """
-    ids, points = np.unique(seen.ids, return_inverse=True)
-    rows = np.arange(len(seen.ids), dtype=np.int32)
-    tracks = Tracks(points.astype(np.int32), seen.frames, rows, len(ids))
-    settings = TriangulateSettings(min_parallax_deg=_MIN_TOLD_PARALLAX_DEG)
-    sigmas = np.full(len(rows), sigma)
-    marks = triangulate(tracks, seen.bearings_rig, sigmas, world_T_rigs, gate, settings)
-    counts = np.bincount(points, minlength=len(ids))
-    fitting = np.bincount(points[marks.tracks.keypoints], minlength=len(ids))
-    flat = TriangulateSettings(min_parallax_deg=1e-6)
-    marks = triangulate(tracks, seen.bearings_rig, sigmas, world_T_rigs, gate, flat)
-    anywhere = np.bincount(points[marks.tracks.keypoints], minlength=len(ids))
-    agree, undecided = fitting == counts, (anywhere == counts) & (fitting == 0)
-    judged = (counts >= _MIN_VIEWS) & ~undecided
-    return JudgedFeatures(ids[judged], agree[judged])
 
 
 def _held(world_T_rigs: np.ndarray, num_held: int) -> gtsam.NonlinearFactorGraph:

@@ -124,23 +124,3 @@ def test_a_picture_that_shows_nothing_begins_no_map() -> None:
         tracker.add(np.full((WIDTH // 2, WIDTH), 20, np.uint8))
     assert (_statuses(tracker) == FrameStatus.LOST).all()
     np.testing.assert_array_equal(tracker.world_T_rigs(), np.tile(np.eye(4), (3, 1, 1)))
-
-
-def test_frames_far_apart_are_followed_in_one_map(walk: RenderedWalk) -> None:
-    sparse = walk.at([*range(0, 6), *range(6, 34, 3)])
-    tracker = _track(sparse)
-    assert not (_statuses(tracker) == FrameStatus.LOST).any()
-    ate, _ = _error(tracker, sparse, np.arange(len(sparse.frames)))
-    assert ate < 0.01
-
-
-def test_a_lost_frame_is_not_placed_by_a_keyframe_most_of_which_it_lacks(
-    walk: RenderedWalk,
-) -> None:
-    tracker = _track(RenderedWalk(walk.frames[:12], walk.world_T_rigs[:12]))
-    key = tracker._window[-1]
-    same = walk.frames[key.frame]
-    assert tracker._by_keyframe(same, key, key.world_T_rig) is not None
-    other = np.ascontiguousarray(walk.frames[30][::-1])
-    other[:, : WIDTH // 4] = same[:, : WIDTH // 4]  # a door that looks like the keyframe's
-    assert tracker._by_keyframe(other, key, key.world_T_rig) is None
