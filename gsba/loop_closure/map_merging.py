@@ -48,6 +48,7 @@ def merge(
     held: np.ndarray,
     seen: np.ndarray,
     timestamps: np.ndarray,
+    absent: bool = True,
 ) -> Registered:
     """Join the parts of a map where they meet, and register frames that are in none.
 
@@ -58,8 +59,10 @@ def merge(
         held: (F - 1,) bool, steps that no image shows but the trajectory knows.
         seen: (F - 1,) bool, steps that images show: what becomes of frames with too few points.
         timestamps: (F,) seconds.
+        absent: whether there is no trajectory; maps of few frames test no join then.
     """
     joining = _Joining(context, solved, parts, held, held | seen, timestamps)
+    joining.min_testable = _MIN_TESTABLE if absent else _MIN_MAP
     component = 0
     while joining.begin(component):
         progress = True
@@ -92,6 +95,7 @@ class _Joining:
         self.known = list(self.own_known)  # the same, in units of the map once carried
         self.test = JoinTest(context, self.poses, self.known, self.depth, self._usual_rates)
         self.usual_anywhere: Rates | None = None
+        self.min_testable = _MIN_TESTABLE  # frames of a map that joins can be tested by
         self.moves = [Sim3()] * num  # of each frame, so far
         self.components = np.full(num, -1)
         self.met, self.alone = np.zeros(num, bool), np.zeros(num, bool)
@@ -174,7 +178,7 @@ class _Joining:
 
     def _similarity(self, part: int, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
         """The similarity that carries a part to where it meets the map; None if none is sure."""
-        if len(inside) < _MIN_TESTABLE and not self._held(rows):
+        if len(inside) < self.min_testable and not self._held(rows):
             self.reasons[part] = f"a map of {len(inside)} frames is too small to test a join by"
             return None
         sampled = np.linspace(0, len(rows) - 1, _SAMPLED).astype(int)

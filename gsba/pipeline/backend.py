@@ -295,7 +295,8 @@ def merge_maps(
         if prior.absent:  # images show a step between parts, but not how long it is
             fed = ~connectivity.starving(solved, run.settings.rounds.min_observations)
             shown &= ~((parts[1:] != parts[:-1]) & fed[1:] & fed[:-1])
-        return map_merging.merge(seen.context, solved, parts, held, shown, run.frames.timestamps)
+        given = held, shown, run.frames.timestamps, prior.absent
+        return map_merging.merge(seen.context, solved, parts, *given)
 
     merged = run.stage("registered", run.matching_key(), compute, Registered)
     coarse, trust, joints = follow(merged, prior.coarse, trust, prior.joints)

@@ -128,7 +128,7 @@ class RunStore:
         """
         key = self._key(name, settings, after)
         name = self._prefix + name
-        if self._types.setdefault(name, returns) is not returns:
+        if self._types.setdefault(name, returns) != returns:
             raise ValueError(f"stage {name} has results of two types: name one of them otherwise")
         path = _stage_path(self.root, name)
         stored = _load_if_current(path, key, returns)
