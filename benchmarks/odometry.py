@@ -67,7 +67,7 @@ def follow(name: str, panoramas: SmallPanoramas, truth: np.ndarray) -> Row:
 
 
 class LoopRow(NamedTuple):
-    """What closing loops made of one sequence."""
+    """Errors of one sequence before and after its loops are closed."""
 
     name: str
     loops: int

@@ -60,7 +60,7 @@ class Walk(NamedTuple):
         return cls(folder.name, images, truth)
 
     def errors(self, estimate: Trajectory) -> dict[str, Any]:
-        """What a row tells of poses at the walk's times."""
+        """Errors of poses at the walk's times, for a row of the table."""
         found = pose_errors(estimate, self.truth)
         at = self.truth.world_T_rigs[:, :3, 3]
         extent = float(np.linalg.norm(np.ptp(at[found.true_rows], axis=0)))

@@ -48,7 +48,7 @@ class Barometer(Family):
         return graph
 
     def report(self, snapshot: MapSnapshot) -> dict[str, float]:
-        """What it turned out to be off by."""
+        """The bias and the scale as solved."""
         bias, metres = snapshot.variables.atVector(B)
         return {"bias_m": bias, "metres_per_unit": metres}
 

@@ -36,7 +36,7 @@ class WheelOdometry(Family):
         return graph
 
     def report(self, snapshot: MapSnapshot) -> dict[str, float]:
-        """How far wheels and images are apart."""
+        """The difference of wheels and images, and the length of the path."""
         steps = np.linalg.norm(np.diff(snapshot.world_T_rigs[:, :3, 3], axis=0), axis=1)
         off = float(np.median(np.abs(steps - self.metres)))
         return {"median_difference_m": off, "path_m": float(steps.sum())}

@@ -257,7 +257,7 @@ def relative_similarity(
 def similarity_along(
     points0: np.ndarray, points1: np.ndarray, f0_T_f1: np.ndarray, least: int = _MIN_POINTS
 ) -> tuple[Sim3, np.ndarray] | None:
-    """As `relative_similarity`, where bearings have told the rotation and the direction already.
+    """Similarity of two rigs whose rotation and direction bearings have told already.
 
     Points whose distances are poorly known give a poor rotation, three at a time; bearings do not.
     What is left, the ratio of the step's length and the scale, each point tells alone.

@@ -86,10 +86,8 @@ class FrameSet:
         False  # whether these are but a start: plain lenses in image circles, the
     )
     # maker's calibration of another day, or a calibration that pictures contradict
-    fetched: tuple[
-        bool, ...
-    ] = ()  # (F,) frames of a video that strengthen the map where those that
-    # were chosen left it weak: datasets go without them; () = none
+    fetched: tuple[bool, ...] = ()  # (F,) frames of a video that strengthen the map where those
+    # that were chosen left it weak: datasets go without them; () = none
 
     def __post_init__(self) -> None:
         for name in self.names:
@@ -160,6 +158,11 @@ class CoarsePoses:
     time_offset: float  # seconds added to frame times to reach the trajectory's clock
     segments: np.ndarray | None = None  # (F,) int32, piece of the trajectory that each frame's pose
     # is of, ascending; pieces have worlds of their own until joined; None = there is one
+
+    @property
+    def absent(self) -> bool:
+        """Whether there is no trajectory."""
+        return bool((self.sources == PoseSource.NONE).all())
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,7 +40,7 @@ _LEAST_LEFT = 1e-3  # share of a residual that a point leaves over, or it says n
 
 @dataclass(frozen=True, slots=True)
 class Terms:
-    """What an adjustment minimises beside the blocks of images, and where it starts."""
+    """Factors and blocks that an adjustment minimises beside those of images, and its start."""
 
     graph: gtsam.NonlinearFactorGraph
     blocks: tuple[Block, ...]

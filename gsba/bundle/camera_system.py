@@ -205,7 +205,7 @@ class _Camera:
         return graph
 
     def blocks(self, stretch: float = 1.0) -> list[Block]:
-        """What bearings say of them, its curvature stretched; and the families' blocks."""
+        """The bearings' quadratic model, its curvature stretched, and the families' blocks."""
         bearings = QuadraticBlock(self.keys, stretch * self.hessian, self.gradient, self.cost)
         return [bearings, *self.families.blocks]
 

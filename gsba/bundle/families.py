@@ -56,13 +56,13 @@ class Family(Protocol):
         return ()
 
     def report(self, snapshot: MapSnapshot) -> Mapping[str, Any]:
-        """What report.json shows under `families.NAME`: JSON values, of the final map."""
+        """The family's part of report.json, under `families.NAME`: JSON values of the final map."""
         return {}
 
 
 @dataclass(frozen=True, slots=True)
 class FamilyTerms:
-    """What families add to an adjustment."""
+    """Factors, blocks and variables that families add to an adjustment."""
 
     graph: gtsam.NonlinearFactorGraph
     blocks: tuple[Block, ...]
@@ -94,7 +94,7 @@ class Families:
         return Families(members, self.names, self.timestamps)
 
     def digests(self) -> list[tuple[str, str]]:
-        """What results rest on."""
+        """Names and digests of the families, on which results rest."""
         return [(family.name, family.digest) for family in self.members]
 
     def snapshot(self, solved: Solution, maps: np.ndarray | None = None) -> MapSnapshot:
@@ -104,14 +104,13 @@ class Families:
             solved: poses, points, and own variables so far.
             maps: (F,) map of each frame; None = there is one.
         """
-        num = len(solved.world_T_rigs)
-        of_frames = np.zeros(num, np.int64) if maps is None else np.asarray(maps, np.int64)
+        of_frames = numbered(maps, len(solved.world_T_rigs))
         variables = restored(solved.variables)
         given = self.names, self.timestamps, solved.world_T_rigs, of_frames
         return MapSnapshot(*given, solved.landmarks, variables)
 
     def terms(self, solved: Solution, maps: np.ndarray | None = None) -> FamilyTerms:
-        """What all families add to an adjustment that starts from a solution.
+        """Factors, blocks and variables of all families, for an adjustment from a solution.
 
         Raises:
             GsbaError: a factor on a variable that has no value, or a variable that two families
@@ -139,6 +138,11 @@ class Families:
         for block in blocks:
             block.refresh(start)
         return FamilyTerms(graph, tuple(blocks), values)
+
+
+def numbered(maps: np.ndarray | None, num_frames: int) -> np.ndarray:
+    """Map (F,) int64 of each frame; None = there is one, map 0."""
+    return np.zeros(num_frames, np.int64) if maps is None else np.asarray(maps, np.int64)
 
 
 def _check_keys(family: Family, own: gtsam.Values, others: gtsam.Values) -> None:

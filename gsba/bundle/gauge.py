@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from gsba.bundle.families import Families, FamilyTerms
+from gsba.bundle.families import Families, FamilyTerms, numbered
 from gsba.bundle.prior_factors import X, values_of
 from gsba.similarity import Sim3
 from gsba.types import Solution
@@ -33,6 +33,20 @@ class Gauge:
         """By the number of the map."""
         return dict(zip(self.maps.tolist(), self.moves_by_map, strict=True))
 
+    def poses(self, world_T_rigs: np.ndarray, maps: np.ndarray | None) -> np.ndarray:
+        """Poses (F, 4, 4) moved map by map.
+
+        Args:
+            world_T_rigs: (F, 4, 4).
+            maps: (F,) map of each frame; None = there is one.
+        """
+        return _moved(world_T_rigs, numbered(maps, len(world_T_rigs)), self.moves)
+
+    def scales(self, maps: np.ndarray | None, num_frames: int) -> np.ndarray:
+        """Factors (F,) by which lengths beside each frame grow."""
+        of_frames, moves = numbered(maps, num_frames), self.moves
+        return np.array([moves[number].scale for number in of_frames.tolist()])
+
     def moved(self, solved: Solution, maps: np.ndarray | None) -> Solution:
         """A solution's poses moved map by map, without points and variables of families.
 
@@ -40,8 +54,7 @@ class Gauge:
             solved: the solution.
             maps: (F,) map of each frame; None = there is one.
         """
-        of_frames = np.zeros(len(solved.world_T_rigs), np.int64) if maps is None else maps
-        start = Solution.without_points(_moved(solved.world_T_rigs, of_frames, self.moves))
+        start = Solution.without_points(self.poses(solved.world_T_rigs, maps))
         return replace(start, noise=solved.noise, rounds=solved.rounds)
 
 
@@ -57,7 +70,7 @@ def align(families: Families, solved: Solution, maps: np.ndarray | None = None) 
         maps: (F,) map of each frame; None = there is one.
     """
     chosen = families.fixing_gauge
-    of_frames = np.zeros(len(solved.world_T_rigs), np.int64) if maps is None else maps
+    of_frames = numbered(maps, len(solved.world_T_rigs))
     numbers = np.unique(of_frames).tolist()
     moves = {number: Sim3() for number in numbers}
     terms = chosen.terms(solved, maps)
@@ -80,7 +93,7 @@ def align(families: Families, solved: Solution, maps: np.ndarray | None = None) 
             damping *= 10
         else:
             break
-        moves = {number: _after(tried[number], moves[number]) for number in numbers}
+        moves = {number: tried[number].after(moves[number]) for number in numbers}
         poses, own, damping = new_poses, new_own, max(damping / 10, 1e-12)
         converged = cost - new_cost <= _CONVERGED * cost
         cost = new_cost
@@ -175,12 +188,6 @@ def _add_graph(graph, values, dims, basis, hessian, gradient) -> None:
 def _exp(step: np.ndarray) -> Sim3:
     """The similarity of a step [rotation, translation, log scale]."""
     return Sim3(float(np.exp(step[6])), gtsam.Rot3.Expmap(step[:3]).matrix(), step[3:6])
-
-
-def _after(second: Sim3, first: Sim3) -> Sim3:
-    """One similarity after another."""
-    scale, rotation = second.scale * first.scale, second.rotation @ first.rotation
-    return Sim3(scale, rotation, second.points(first.translation[None])[0])
 
 
 def _retracted(own: gtsam.Values, steps: np.ndarray) -> gtsam.Values:

@@ -8,7 +8,7 @@ the step is in its unit; so both maps together say what the one's unit is in the
 import numpy as np
 
 from gsba.geometry import inverse
-from gsba.loop_closure.map_similarity import Proposal, alike
+from gsba.loop_closure.map_similarity import Proposal, alike, carrying
 from gsba.similarity import Sim3
 from gsba.trajectory.steps import ray_depths
 from gsba.types import Keypoints, VerifiedPairs
@@ -25,7 +25,7 @@ def crossing(
     known: list[np.ndarray],
     outside: np.ndarray,
 ) -> list[Proposal]:
-    """What each pair over a break says of how a part lies in the map.
+    """Similarities of a part and the map, one from each pair of frames over a break.
 
     Args:
         pairs: of one frame outside the map and one inside.
@@ -50,9 +50,7 @@ def crossing(
             continue
         g_T_f = inverse(f0_T_f1) if f0 == f else f0_T_f1.copy()
         g_T_f[:3, 3] *= in_map
-        world_T_f, scale = poses[g] @ g_T_f, in_map / in_own
-        rotation = world_T_f[:3, :3] @ poses[f, :3, :3].T
-        move = Sim3(scale, rotation, world_T_f[:3, 3] - scale * rotation @ poses[f, :3, 3])
+        move = carrying(Sim3.of(in_map / in_own, g_T_f), poses[f], poses[g])
         found.append(Proposal(move, (f, g), len(rows)))
     return found
 

@@ -16,10 +16,8 @@ from gsba.matching.guided_search import MatchContext
 from gsba.similarity import Sim3
 from gsba.types import Matches
 
-_SAME_PLACE = (
-    2.0  # times the differences of two estimates of one join: no other place yet, as parts
-)
-# that drift meet a little differently at either end
+_SAME_PLACE = 2.0  # times the differences of two estimates of one join: no other place yet, as
+# parts that drift meet a little differently at either end
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +60,7 @@ class JoinTest:
     def weigh(
         self, rows: np.ndarray, inside: np.ndarray, move: Sim3
     ) -> tuple[JoinEvidence, Matches]:
-        """What speaks for frames being where a similarity carries them, and what is found again."""
+        """Evidence for frames being where a similarity carries them, and points found again."""
         poses, known = self.poses.copy(), list(self.known)
         poses[rows] = move.poses(poses[rows])
         for f in rows:
@@ -98,7 +96,7 @@ class JoinTest:
     def _judged(
         self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, reach: int
     ) -> Judged:
-        """As `judge`, by frames at most `reach` to either side of the meeting."""
+        """The proposal judged by frames at most `reach` to either side of the meeting."""
         f, g = proposal.frames
         groups = around(rows, f, reach), around(inside, g, reach)
         evidence, found = self.weigh(*groups, proposal.move)

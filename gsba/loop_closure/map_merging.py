@@ -23,7 +23,7 @@ from gsba.loop_closure.merged_map import Registered
 from gsba.loop_closure.pose_graph import Loop
 from gsba.loop_closure.registration import resect
 from gsba.loop_closure.retrieval import looks_of
-from gsba.matching import recovery
+from gsba.matching import pairs, recovery
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.similarity import Sim3
 from gsba.types import Counts, Solution
@@ -61,8 +61,8 @@ def merge(
         timestamps: (F,) seconds.
         absent: whether there is no trajectory; maps of few frames test no join then.
     """
-    joining = _Joining(context, solved, parts, held, held | seen, timestamps)
-    joining.min_testable = _MIN_TESTABLE if absent else _MIN_MAP
+    min_testable = _MIN_TESTABLE if absent else _MIN_MAP
+    joining = _Joining(context, solved, parts, held, held | seen, timestamps, min_testable)
     component = 0
     while joining.begin(component):
         progress = True
@@ -83,6 +83,7 @@ class _Joining:
         held: np.ndarray,
         ties: np.ndarray,
         timestamps: np.ndarray,
+        min_testable: int,
     ) -> None:
         num = len(parts)
         self.context, self.solved, self.parts = context, solved, parts
@@ -95,7 +96,7 @@ class _Joining:
         self.known = list(self.own_known)  # the same, in units of the map once carried
         self.test = JoinTest(context, self.poses, self.known, self.depth, self._usual_rates)
         self.usual_anywhere: Rates | None = None
-        self.min_testable = _MIN_TESTABLE  # frames of a map that joins can be tested by
+        self.min_testable = min_testable  # frames of a map that joins can be tested by
         self.moves = [Sim3()] * num  # of each frame, so far
         self.components = np.full(num, -1)
         self.met, self.alone = np.zeros(num, bool), np.zeros(num, bool)
@@ -221,15 +222,14 @@ class _Joining:
 
         The camera cannot have gone far in between, so that a look-alike is no danger here.
         """
-        intervals = np.diff(self.times)
-        for f in np.flatnonzero(intervals <= recovery.PAUSE * np.median(intervals)).tolist():
-            if not ((f in rows and f + 1 in inside) or (f in inside and f + 1 in rows)):
+        for f, after in pairs.without_pause(self.times).tolist():
+            if not ((f in rows and after in inside) or (f in inside and after in rows)):
                 continue
-            before, after = (rows, inside) if f in rows else (inside, rows)
-            ends = before[before <= f][-_BESIDE:], after[after > f][:_BESIDE]
+            earlier, later = (rows, inside) if f in rows else (inside, rows)
+            ends = earlier[earlier <= f][-_BESIDE:], later[later > f][:_BESIDE]
             chosen = np.array([(a, b) for a in ends[0] for b in ends[1] if b - a <= _BESIDE])
-            pairs = recovery.match_anywhere(self.context, chosen)
-            given = pairs, self.context.keypoints, self.poses, self.known, rows
+            found = recovery.match_anywhere(self.context, chosen)
+            given = found, self.context.keypoints, self.poses, self.known, rows
             best = agreed(crossing(*given), self.poses, self.depth)
             if best is None or (self._held(rows) and not self._plausible(best)):
                 continue

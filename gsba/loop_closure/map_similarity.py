@@ -49,9 +49,7 @@ def propose(meetings: list[Meeting], poses: np.ndarray, depth: float, seed: int)
         asked = _asked(m, seed)
         if asked is None:
             continue
-        f_T_own = inverse(poses[m.f])
-        f_T_own[:3, 3] *= asked.scale
-        move = Sim3.of(asked.scale, poses[m.g] @ asked.new_T_old @ f_T_own)
+        move = carrying(asked, poses[m.f], poses[m.g])
         support = sum(len(each.own) for each in _agreeing(meetings, move, poses))
         found.append(Proposal(move, (m.f, m.g), support))
     distinct: list[Proposal] = []
@@ -59,6 +57,18 @@ def propose(meetings: list[Meeting], poses: np.ndarray, depth: float, seed: int)
         if not any(alike(one, other, poses, depth) for other in distinct):
             distinct.append(one)
     return distinct[:_PROPOSALS]
+
+
+def carrying(g_T_f: Sim3, world_T_f: np.ndarray, world_T_g: np.ndarray) -> Sim3:
+    """The similarity that carries the world of rig f to that of rig g.
+
+    Args:
+        g_T_f: rig f in rig g, with its unit.
+        world_T_f, world_T_g: (4, 4) poses of both, each in the world of its map.
+    """
+    f_T_own = inverse(world_T_f)
+    f_T_own[:3, 3] *= g_T_f.scale
+    return Sim3.of(g_T_f.scale, world_T_g @ g_T_f.new_T_old @ f_T_own)
 
 
 def _asked(meeting: Meeting, seed: int) -> Sim3 | None:

@@ -7,7 +7,7 @@ import numpy as np
 from gsba.similarity import Sim3
 from gsba.trajectory.joining import PLACES, Joint
 from gsba.trajectory.judgement import Trust
-from gsba.types import CoarsePoses, Counts, PoseSource, Solution
+from gsba.types import CoarsePoses, Counts, Solution
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ def follow(
     placed = registered.solved.world_T_rigs.copy()
     trust = replace(trust, world_T_rigs=placed.copy(), false_steps=false)
     placed[:, :3, 3] -= registered.offsets
-    if (coarse.sources == PoseSource.NONE).all():
+    if coarse.absent:
         return replace(coarse, world_T_rigs=placed), trust, joints
     poses, followed = coarse.world_T_rigs.copy(), []
     in_main = registered.met & ~registered.alone & (registered.components == 0)

@@ -8,12 +8,24 @@ from gsba.config import PairSettings
 
 _GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 _HERE = 0.125  # part of the reach within which a place counts as the same
+_PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
 
 
 def adjacent(num_frames: int, reach: int = 2) -> np.ndarray:
     """Pairs (P, 2) int32 of frames at most `reach` apart in time, the closest in time first."""
     rows = [(f, f + gap) for gap in range(1, reach + 1) for f in range(num_frames - gap)]
     return np.array(rows, np.int32).reshape(-1, 2)
+
+
+def without_pause(timestamps: np.ndarray) -> np.ndarray:
+    """Pairs (P, 2) int64 of neighbours in time without a pause between them.
+
+    Args:
+        timestamps: (F,) seconds.
+    """
+    intervals = np.diff(timestamps)
+    close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
+    return np.column_stack([close, close + 1])
 
 
 def covisible(

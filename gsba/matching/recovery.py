@@ -22,9 +22,8 @@ from gsba.trajectory.steps import (
     off_steps,
     without_steps,
 )
-from gsba.types import CoarsePoses, Counts, Keypoints, PoseSource, Trajectory, VerifiedPairs
+from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
 
-PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
 _WIDER = 2, 4, 8  # frames
 _MANY_LOST = 0.2  # part of the neighbours
 _LEAST_ALIKE = 5  # points that tell how long a step is beside the one before it
@@ -72,10 +71,8 @@ def recover(
     settings, keypoints = context.settings, context.keypoints
     chosen = _of_one_piece(pairs.adjacent(len(coarse.sources)), coarse)
     guided = guided.within(coarse.segments)
-    intervals = np.diff(timestamps)
-    close = np.flatnonzero(intervals <= PAUSE * np.median(intervals))
-    lost = guided.missing(_of_one_piece(np.column_stack([close, close + 1]), coarse))
-    absent = _is_absent(coarse)
+    lost = guided.missing(_of_one_piece(pairs.without_pause(timestamps), coarse))
+    absent = coarse.absent
     alone = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
     alone = _with_wider(context, alone).within(coarse.segments)
     alone = _of_one_scale(context, alone) if absent else alone
@@ -115,11 +112,6 @@ def _two_apart(found: VerifiedPairs, steps: Steps, absent: bool) -> np.ndarray:
     if absent:
         first = first[steps.verified[:-1] & steps.verified[1:]]
     return found.missing(np.column_stack([first, first + 2]))
-
-
-def _is_absent(coarse: CoarsePoses) -> bool:
-    """Whether there is no trajectory."""
-    return bool((coarse.sources == PoseSource.NONE).all())
 
 
 def _with_wider(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
@@ -168,9 +160,7 @@ def check_clock(
     Raises:
         GsbaError: it is reversed, mirrored, inverted or in other axes.
     """
-    settings, intervals = context.settings, np.diff(timestamps)
-    close = np.flatnonzero(intervals <= PAUSE * np.median(intervals))
-    chosen = np.column_stack([close, close + 1])
+    settings, chosen = context.settings, pairs.without_pause(timestamps)
     lost = guided.missing(chosen)
     if len(lost) > _MANY_LOST * len(chosen):
         guided = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
@@ -248,9 +238,15 @@ def _judge(
     found: VerifiedPairs, keypoints: Keypoints, coarse: CoarsePoses, settings: RefineSettings
 ) -> Trust:
     steps = image_steps(found, keypoints)
-    least = _LEAST_ALIKE if _is_absent(coarse) else None
-    logs, sigmas = length_ratios(found, steps, keypoints, least)
+    logs, sigmas = _length_ratios(found, steps, keypoints, coarse.absent)
     return judgement.judge(coarse, steps, logs, sigmas, settings.verify, settings.priors)
+
+
+def _length_ratios(
+    found: VerifiedPairs, steps: Steps, keypoints: Keypoints, absent: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """See `length_ratios`; without a trajectory fewer points suffice, if they agree."""
+    return length_ratios(found, steps, keypoints, _LEAST_ALIKE if absent else None)
 
 
 def _supported(
@@ -268,8 +264,7 @@ def _supported(
     steps = image_steps(found, keypoints)
     if not steps.directed[f]:
         return True  # a turn on the spot: whole panoramas agree on one rotation
-    least = _LEAST_ALIKE if absent else None
-    sigmas = length_ratios(found, steps, keypoints, least)[1]
+    sigmas = _length_ratios(found, steps, keypoints, absent)[1]
     return bool(np.isfinite(sigmas[max(f - 1, 0) : f + 1]).any()) or len(steps.verified) == 1
 
 

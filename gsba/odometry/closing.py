@@ -1,4 +1,4 @@
-"""What is made of a walk once all of it is tracked: maps joined, loops closed, covariances.
+"""The end of odometry, once a whole walk is tracked: maps joined, loops closed, covariances.
 
 A wrong loop or join is the worst that can happen to a map, and one that is missed is only drift:
 both are believed by the test of joins alone (`gsba.loop_closure.join_test`).
@@ -109,24 +109,15 @@ def _joined(found: ClosedKeyframes, places: Places, tracked: TrackedKeyframes) -
     for component in np.unique(registered.components):
         together = np.unique(some.maps[registered.components == component])
         moves = [registered.move(int(np.flatnonzero(some.maps == m)[0])) for m in together]
-        first = np.flatnonzero(tracked.maps == together[0])[0]
-        back = _carrying_back(moves[0], tracked.world_T_keys[first])
         for number, move in zip(together, moves, strict=True):
             keys = tracked.maps == number
-            poses[keys] = back.poses(move.poses(tracked.world_T_keys[keys]))
-            scales[keys], maps[keys] = back.scale * move.scale, together[0]
+            poses[keys] = move.poses(tracked.world_T_keys[keys])
+            scales[keys], maps[keys] = move.scale, together[0]
     for number, reason in enumerate(registered.reasons):
         if reason:
             rows = registered.components == number
             logger.info("map %d is joined to no other: %s", some.maps[rows][0] + 1, reason)
     return replace(found, world_T_keys=poses, scales=scales, maps=maps)
-
-
-def _carrying_back(move: Sim3, pose: np.ndarray) -> Sim3:
-    """The similarity that undoes another, exactly so for one pose (4, 4)."""
-    carried, scale = move.poses(pose), 1 / move.scale
-    rotation = pose[:3, :3] @ carried[:3, :3].T
-    return Sim3(scale, rotation, pose[:3, 3] - scale * rotation @ carried[:3, 3])
 
 
 def _closed(

@@ -1,4 +1,4 @@
-"""What odometry knows of one frame."""
+"""Status and pose of one frame of odometry."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -16,7 +16,7 @@ class FrameStatus(IntEnum):
 
 @dataclass(slots=True)
 class FrameRecord:
-    """What is known of one frame."""
+    """Status, map and pose of one frame, relative to its keyframe."""
 
     status: FrameStatus
     map_number: int  # 0 = the first map

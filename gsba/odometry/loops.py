@@ -66,7 +66,7 @@ def find_loops(places: Places, unseen: np.ndarray) -> list[Constraint]:
 
 
 def find_joins(places: Places) -> list[Constraint]:
-    """How maps that were joined lie in one another, each measured where it comes closest.
+    """Constraints between maps that were joined, each measured where it comes closest.
 
     Args:
         places: of one map that several were joined to, with poses in its world.
@@ -119,7 +119,7 @@ def _meeting_by_meeting(meetings: list[Meeting]) -> list[list[Meeting]]:
 def _judged(
     group: list[Meeting], places: Places, unseen: np.ndarray, test: JoinTest
 ) -> list[Judged]:
-    """What the surroundings say of each similarity that a group of pairs proposes."""
+    """Each similarity that a group of pairs proposes, judged by its surroundings."""
     poses, seed = places.solved.world_T_rigs, places.context.settings.seed
     found = []
     for proposal in propose(group, poses, test.depth, seed)[:_MAX_TRIED]:
@@ -196,12 +196,10 @@ def fit_loop(
     from scipy.optimize import least_squares
 
     f, g = at
-    own = [m.own @ r[:3, :3].T + r[:3, 3] for m, r in _in_rig(meetings, poses, f, "f")]
-    theirs = [m.theirs @ r[:3, :3].T + r[:3, 3] for m, r in _in_rig(meetings, poses, g, "g")]
-    seers_own = [np.tile(r[:3, 3], (len(m.own), 1)) for m, r in _in_rig(meetings, poses, f, "f")]
-    seers = [np.tile(r[:3, 3], (len(m.own), 1)) for m, r in _in_rig(meetings, poses, g, "g")]
-    p, q = np.concatenate(own), np.concatenate(theirs)
-    from_p, from_q = np.concatenate(seers_own), np.concatenate(seers)
+    beside_f = [inverse(poses[f]) @ poses[m.f] for m in meetings]  # poses of frames, rig f
+    beside_g = [inverse(poses[g]) @ poses[m.g] for m in meetings]
+    p, from_p = _in_rig([m.own for m in meetings], beside_f)
+    q, from_q = _in_rig([m.theirs for m in meetings], beside_g)
 
     def residuals(x: np.ndarray) -> np.ndarray:
         fit = moved(start, x)
@@ -247,7 +245,9 @@ def moved(similarity: Sim3, tangent: np.ndarray) -> Sim3:
 
 
 def _in_rig(
-    meetings: list[Meeting], poses: np.ndarray, place: int, side: str
-) -> list[tuple[Meeting, np.ndarray]]:
-    """Each meeting with the pose of its frame on one side, "f" or "g", in the rig of a place."""
-    return [(m, inverse(poses[place]) @ poses[getattr(m, side)]) for m in meetings]
+    points: list[np.ndarray], rig_T_frames: list[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) of frames in one rig, and where the frame of each is there (N, 3)."""
+    there = [p @ T[:3, :3].T + T[:3, 3] for p, T in zip(points, rig_T_frames, strict=True)]
+    seers = [np.tile(T[:3, 3], (len(p), 1)) for p, T in zip(points, rig_T_frames, strict=True)]
+    return np.concatenate(there), np.concatenate(seers)

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from gsba.bundle.prior_factors import X
-from gsba.geometry import pose
+from gsba.geometry import adjoint, inverse, pose
 from gsba.similarity import Sim3
 
 _HELD = 1e-5  # standard deviation of the first keyframe of a map, all parts of its tangent
@@ -26,7 +26,7 @@ _ERROR_RATE = 1e-9  # of leaving out a true loop: covariances are of random erro
 
 @dataclass(frozen=True, slots=True)
 class Constraint:
-    """How one keyframe lies in another, and how well that is known."""
+    """Relative similarity of two keyframes, with its covariance."""
 
     first: int  # row of a keyframe
     second: int  # row of the other
@@ -139,18 +139,12 @@ def carried_covariances(
         key_T_rigs: (F, 4, 4) poses of frames in their keyframes, map units.
         distances: (F,) median distance of points, map units.
     """
-    rotations = np.swapaxes(key_T_rigs[:, :3, :3], 1, 2)
-    x, y, z = key_T_rigs[:, :3, 3].T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    adjoint = np.zeros((len(key_T_rigs), 6, 6))  # of the inverse of key_T_rig
-    adjoint[:, :3, :3] = adjoint[:, 3:, 3:] = rotations
-    adjoint[:, 3:, :3] = -rotations @ cross
-    own = np.zeros_like(adjoint)
+    into_rigs = adjoint(inverse(key_T_rigs))
+    own = np.zeros_like(into_rigs)
     turn, step = np.arange(3), np.arange(3, 6)
     own[:, turn, turn] = _POSE_ROTATION**2
     own[:, step, step] = np.square(_POSE_TRANSLATION * distances)[:, None]
-    return adjoint @ covariances @ np.swapaxes(adjoint, 1, 2) + own
+    return into_rigs @ covariances @ np.swapaxes(into_rigs, 1, 2) + own
 
 
 def _fixed_distance(far: int, world_T_ends: np.ndarray, scale: float) -> gtsam.CustomFactor:

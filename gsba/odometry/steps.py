@@ -10,7 +10,6 @@ from gsba.bundle import triangulate
 from gsba.config import TriangulateSettings
 from gsba.odometry.resection import linearised
 from gsba.odometry.window import WindowObservations
-from gsba.types import Tracks
 
 _REACH = 12  # keyframes before one among which it was followed from one
 _MIN_SHARED = 8  # features with points that tell a step
@@ -38,7 +37,7 @@ def measure_steps(
     maps: np.ndarray,
     distances: np.ndarray,
 ) -> MeasuredSteps:
-    """How well the features that keyframes share tell each step, the scale it hands on included.
+    """Covariances of steps between keyframes, by the features that both see; scale included.
 
     Rotation and translation: information of the directions to points that the keyframe before sees
     too. Scale: a point hands it on as well as the angle tells under which the first keyframe that
@@ -73,15 +72,12 @@ def _points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """By id, the point (3,) of each feature, NaN = unknown, and the first keyframe that sees it."""
     seen = WindowObservations.of(features)
-    ids, numbers = np.unique(seen.ids, return_inverse=True)
-    rows = np.arange(len(seen.ids), dtype=np.int32)
-    tracks = Tracks(numbers.astype(np.int32), seen.frames, rows, len(ids))
-    sigmas = np.full(len(rows), _SIGMA)
+    sigmas = np.full(len(seen.ids), _SIGMA)
     bearings, settings = seen.bearings_rig.astype(float), TriangulateSettings()
-    found = triangulate(tracks, bearings, sigmas, world_T_keys, _GATE, settings)
+    found = triangulate(seen.tracks(), bearings, sigmas, world_T_keys, _GATE, settings)
     first_rows = np.unique(found.tracks.points, return_index=True)[1]
-    known = seen.ids[found.tracks.keypoints[first_rows]]
-    most = int(ids[-1]) + 1 if len(ids) else 0
+    known = seen.features_of(found)
+    most = int(seen.ids.max(initial=-1)) + 1
     points, first_seen = np.full((most, 3), np.nan), np.zeros(most, np.int64)
     points[known] = found.points_world
     first_seen[known] = found.tracks.frames[first_rows]

@@ -10,7 +10,7 @@ from factors import BearingTerm, LandmarkBlock, RobustLoss
 from gsba.bundle import optimize, prior_factors, triangulate
 from gsba.bundle.adjustment import poses_of, values_of
 from gsba.config import SolverSettings, TriangulateSettings
-from gsba.types import Tracks
+from gsba.types import Landmarks, Tracks
 
 _SOLVER = SolverSettings(
     max_iterations=8, relative_tolerance=1e-3, absolute_tolerance=1.0, lambda_initial=1e-6
@@ -36,6 +36,17 @@ class WindowObservations:
         order = np.lexsort((frames, ids))
         return cls(frames[order].astype(np.int32), ids[order], bearings[order])
 
+    def tracks(self) -> Tracks:
+        """One track a feature; its keypoints are rows of these observations."""
+        found, points = np.unique(self.ids, return_inverse=True)
+        rows = np.arange(len(self.ids), dtype=np.int32)
+        return Tracks(points.astype(np.int32), self.frames, rows, len(found))
+
+    def features_of(self, landmarks: Landmarks) -> np.ndarray:
+        """Features (J,) of points that were triangulated from `tracks`."""
+        first = np.unique(landmarks.tracks.points, return_index=True)[1]
+        return self.ids[landmarks.tracks.keypoints[first]]
+
 
 @dataclass(frozen=True, slots=True)
 class AdjustedWindow:
@@ -60,11 +71,7 @@ def adjust_window(
         sigma: radians, of bearings per axis.
         gate: observations further off their point are outliers, standard deviations.
     """
-    _, points = np.unique(seen.ids, return_inverse=True)
-    num = int(points[-1]) + 1 if len(points) else 0
-    rows = np.arange(len(seen.ids), dtype=np.int32)
-    tracks = Tracks(points.astype(np.int32), seen.frames, rows, num)
-    sigmas = np.full(len(rows), sigma)
+    tracks, sigmas = seen.tracks(), np.full(len(seen.ids), sigma)
     settings = TriangulateSettings(min_parallax_deg=_MIN_PARALLAX_DEG)
 
     def place(poses: np.ndarray, limit: float):
@@ -80,10 +87,9 @@ def adjust_window(
     graph = _held(world_T_rigs, num_held)
     poses = poses_of(optimize(graph, [block], values_of(world_T_rigs), _SOLVER).values, len(keys))
     marks = place(poses, gate)
-    kept = np.zeros(len(rows), bool)
+    kept = np.zeros(len(seen.ids), bool)
     kept[marks.tracks.keypoints] = True
-    first = np.unique(marks.tracks.points, return_index=True)[1]
-    ids = seen.ids[marks.tracks.keypoints[first]]
+    ids = seen.features_of(marks)
     false = ~kept & np.isin(seen.ids, ids)
     outliers = np.stack([seen.frames[false], seen.ids[false]], axis=1)
     return AdjustedWindow(poses, ids, marks.points_world, outliers)

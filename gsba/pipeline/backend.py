@@ -98,7 +98,7 @@ def align_gauge(run: Run, prior: Prior, solved: Solution, name: str) -> tuple[Pr
         return gauge.align(run.families, solved, prior.parts)
 
     found = run.stage(name, run.families.digests(), compute, Gauge, noted=False)
-    return prior.moved(found.moves), found.moved(solved, prior.parts)
+    return prior.moved(found), found.moved(solved, prior.parts)
 
 
 def place(

@@ -178,13 +178,13 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
 
 
 def _of_families(run: Run, prior: Prior, world: Map) -> dict[str, Any]:
-    """What families of the caller and of packages say of the map, by their names."""
+    """The report of each family of the caller and of packages, by its name."""
     snapshot = run.families.snapshot(world.solution, prior.parts)
     return {family.name: plain(family.report(snapshot)) for family in run.families.members}
 
 
 def _gauge(run: Run, prior: Prior) -> str:
-    """What defines world and scale of the poses, and what their covariances hold."""
+    """A sentence on what defines world and scale, and on the gauge of covariances."""
     fixing = run.families.fixing_gauge.members
     if fixing:
         return _FAMILIES_GAUGE.format(names=", ".join(family.name for family in fixing))

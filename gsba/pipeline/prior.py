@@ -1,21 +1,20 @@
 """What is believed of the trajectory: what it says itself, and what images add and take away."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from gsba.bundle import prior_factors
+from gsba.bundle.gauge import Gauge
 from gsba.bundle.map_strength import MapStrength
 from gsba.config import PriorSettings
 from gsba.imu.alignment import Alignment
 from gsba.loop_closure.merged_map import Registered, side_by_side
-from gsba.similarity import Sim3
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import Joint
 from gsba.trajectory.judgement import Trust
-from gsba.types import CoarsePoses, PoseSource, Solution, Turning
+from gsba.types import CoarsePoses, Solution, Turning
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +39,7 @@ class Prior:
     @property
     def absent(self) -> bool:
         """Whether there is no trajectory."""
-        return bool((self.coarse.sources == PoseSource.NONE).all())
+        return self.coarse.absent
 
     @property
     def turning_only(self) -> bool:
@@ -59,7 +58,7 @@ class Prior:
     def graph(
         self, settings: PriorSettings, first: np.ndarray | None = None, *, gauge: bool = True
     ) -> gtsam.NonlinearFactorGraph:
-        """What the trajectory says, as far as it is believed, and the gauge.
+        """Priors of the trajectory, as far as it is believed, and the gauge.
 
         Args:
             settings: noise of the trajectory, unless images told it.
@@ -80,18 +79,16 @@ class Prior:
             graph.push_back(prior_factors.turns(self.turning, extent, settings.loss_sigmas))
         return graph
 
-    def moved(self, moves: Mapping[int, Sim3]) -> "Prior":
+    def moved(self, gauge: Gauge) -> "Prior":
         """The trajectory carried to another world, part by part as numbered in `parts`."""
-        parts = np.zeros(len(self.coarse.sources), np.int64) if self.parts is None else self.parts
-        coarse, start = self.coarse.world_T_rigs.copy(), self.trust.world_T_rigs.copy()
-        scales = np.ones(len(parts))
-        for number, move in moves.items():
-            inside = parts == number
-            coarse[inside], start[inside] = move.poses(coarse[inside]), move.poses(start[inside])
-            scales[inside] = move.scale
-        lengths = self.trust.lengths * scales[:-1]
-        trust = replace(self.trust, world_T_rigs=start, lengths=lengths)
-        return replace(self, coarse=replace(self.coarse, world_T_rigs=coarse), trust=trust)
+        coarse, trust, parts = self.coarse, self.trust, self.parts
+        lengths = trust.lengths * gauge.scales(parts, len(coarse.sources))[:-1]
+        start = gauge.poses(trust.world_T_rigs, parts)
+        return replace(
+            self,
+            coarse=replace(coarse, world_T_rigs=gauge.poses(coarse.world_T_rigs, parts)),
+            trust=replace(trust, world_T_rigs=start, lengths=lengths),
+        )
 
     def _side_by_side(self) -> np.ndarray:
         return side_by_side(self.coarse.world_T_rigs, self.merged)

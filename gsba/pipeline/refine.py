@@ -190,7 +190,7 @@ def _refine(
     in_pieces = prior.coarse.segments is not None
     run, seen, prior, world = _solve_raw(run, prior, given)
     result = backend.reconstruct(run, seen, prior, world)
-    if images_alone or (prior.coarse.sources == PoseSource.NONE).all():
+    if images_alone or prior.absent:
         acceptance.require_motion(run.frames, result, in_pieces)
     lenses = backend.keep_lenses(run, world, result)
     written = outputs.write(run, prior, world, result, lenses)

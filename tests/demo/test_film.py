@@ -1,6 +1,6 @@
 """`gsba demo --video`: a filmed walk, refined without a trajectory."""
 
-import builtins
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -60,14 +60,7 @@ def test_what_cannot_be_filmed_is_refused_in_one_line(tmp_path: Path) -> None:
 def test_without_pyav_a_line_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = builtins.__import__
-
-    def without_pyav(name: str, *rest, **options):
-        if name == "av":
-            raise ImportError(name)
-        return found(name, *rest, **options)
-
-    monkeypatch.setattr(builtins, "__import__", without_pyav)
+    monkeypatch.setitem(sys.modules, "av", None)  # as if it were not installed
     result = CliRunner().invoke(app, ["demo", "--video", "--out", str(tmp_path / "demo")])
     assert result.exit_code == 1 and "pip install 'gsba[video]'" in result.stderr
     assert not (tmp_path / "demo").exists()

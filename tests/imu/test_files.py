@@ -1,6 +1,5 @@
 """Readings from tables and makers' files."""
 
-import builtins
 import sys
 from pathlib import Path
 
@@ -172,14 +171,7 @@ def test_a_panic_of_the_library_is_one_line_too(tmp_path: Path) -> None:
 def test_without_telemetry_parser_a_line_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = builtins.__import__
-
-    def none(name: str, *rest, **more):
-        if name == "telemetry_parser":
-            raise ImportError(name)
-        return real(name, *rest, **more)
-
-    monkeypatch.setattr(builtins, "__import__", none)
+    monkeypatch.setitem(sys.modules, "telemetry_parser", None)  # as if it were not installed
     path = tmp_path / "walk.insv"
     path.write_bytes(b"anything")
     with pytest.raises(GsbaError, match=r"pip install 'gsba\[imu\]'"):
