@@ -23,7 +23,13 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.common import write_table
 from gsba.bundle import gps_factors, prior_factors
-from gsba.bundle.adjustment import Problem, adjust, landmark_block, pose_covariances, values_of
+from gsba.bundle.adjustment import (
+    AdjustmentContext,
+    adjust,
+    landmark_block,
+    pose_covariances,
+    values_of,
+)
 from gsba.bundle.fixes import FrameFixes
 from gsba.bundle.optimizer import marginal_covariances
 from gsba.camera.rig import CubeRig, owner_faces
@@ -122,11 +128,11 @@ def fixes_of(walk: Walk, rng: np.random.Generator, wild: float) -> FrameFixes:
     return FrameFixes(np.arange(num), positions, sigmas, walk.times, origin, TAU_S)
 
 
-def problem_of(walk: Walk, world_T_rigs: np.ndarray, fixes: FrameFixes | None) -> Problem:
+def problem_of(walk: Walk, world_T_rigs: np.ndarray, fixes: FrameFixes | None) -> AdjustmentContext:
     """What an adjustment from these poses knows besides images."""
     settings = RefineSettings()
     given = walk.coarse_T_rigs, settings.priors.faint(), None, None, world_T_rigs[0]
-    problem = Problem(prior_factors.build(*given), RIG, settings, 1)
+    problem = AdjustmentContext(prior_factors.build(*given), RIG, settings, 1)
     if fixes is None:
         return problem
     anchors = gps_factors.anchor(world_T_rigs, fixes, GpsSettings())

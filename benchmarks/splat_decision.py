@@ -90,7 +90,7 @@ def poor_frames(case: Case, seed: int) -> Given:
     )
     rig = CubeRig(SETTINGS.cubemap.face_size, np.pi / 2)  # bearings ask no face
     priors = prior_factors.build(case.result.coarse.world_T_rigs, SETTINGS.priors)
-    problem = adjustment.Problem(priors, rig, SETTINGS, 2)
+    problem = adjustment.AdjustmentContext(priors, rig, SETTINGS, 2)
     block = adjustment.landmark_block(landmarks, keypoints, 1.0, problem)
     values = adjustment.values_of(solved.world_T_rigs)
     block.polish(values)

@@ -71,7 +71,9 @@ def refined(walk: Path, out: Path, model: str) -> Path:
 def one_eye_between(optics: Optics) -> Optics:
     """Views of the same directions in the pictures, all from the middle, nothing taken out."""
     lenses = optics.lenses
-    middle = replace(lenses, centre=_ALMOST * lenses.centre, nearness=0.0, twists=None)
+    middle = replace(
+        lenses, centre=_ALMOST * lenses.centre, inverse_stitch_radius=0.0, readout_motion=None
+    )
     return Optics(middle)
 
 

@@ -60,7 +60,7 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
     priors = prior_factors.build(start.world_T_rigs, settings.priors)
     used, held = split(start.landmarks, settings.seed)
     none, threads, workers = SphereField.none(), 2, Threads(2)
-    problem = adjustment.Problem(priors, rig, settings, threads)
+    problem = adjustment.AdjustmentContext(priors, rig, settings, threads)
 
     bearing = adjustment.adjust(
         used.tracks, keypoints, start, problem, settings.rounds.refined[-1:]

@@ -84,7 +84,7 @@ class FeatureSettings(_Settings):
     )  # further noise, as a part of the keypoint's size
 
 
-class CloserSettings(_Settings):
+class WeakFrameSettings(_Settings):
     """Frames that get more keypoints, because the first of them hold the map poorly."""
 
     mode: Literal["auto", "off"] = "auto"  # off: all frames alike
@@ -249,7 +249,7 @@ class CameraSettings(_Settings):
             )
         return self
 
-    def nearness(self, front: float) -> float | None:
+    def inverse_stitch_radius(self, front: float) -> float | None:
         """Inverse of the stitch radius as is said, the front lens `front` from the middle.
 
         In what that is given in; None = nothing is said.
@@ -473,7 +473,7 @@ class RefineSettings(_Settings):
     read: ReadSettings = ReadSettings()
     cubemap: CubemapSettings = CubemapSettings()
     features: FeatureSettings = FeatureSettings()
-    closer: CloserSettings = CloserSettings()
+    weak_frames: WeakFrameSettings = WeakFrameSettings()
     matching: MatchingSettings = MatchingSettings()
     pairs: PairSettings = PairSettings()
     verify: VerifySettings = VerifySettings()

@@ -175,7 +175,7 @@ class StepNoise:
 
 
 @dataclass(frozen=True, slots=True)
-class Turning:
+class GyroConstraints:
     """How frames turn, as a gyro says: in the rig's axes."""
 
     steps: np.ndarray  # (F - 1, 3) float64, rotation vectors of f_R_next, radians

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import RIG, World, make_world, unit, with_noise
 
 from gsba.bundle import adjustment, prior_factors, triangulation
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import owner_faces
 from gsba.config import CameraSettings, RefineSettings
@@ -55,10 +55,10 @@ def times(num_frames: int) -> np.ndarray:
     return INTERVAL_S * np.arange(num_frames)
 
 
-def problem_of(world: World, camera: CameraSettings | None = None) -> Problem:
+def problem_of(world: World, camera: CameraSettings | None = None) -> AdjustmentContext:
     priors = prior_factors.build(world.world_T_rigs, SETTINGS.priors)
     settings = SETTINGS.model_copy(update={"camera": camera or SETTINGS.camera})
-    return Problem(priors, RIG, settings, 2)
+    return AdjustmentContext(priors, RIG, settings, 2)
 
 
 def solved_under(

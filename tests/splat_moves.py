@@ -8,7 +8,7 @@ import numpy as np
 from tiny_run import SETTINGS, Case
 
 from gsba.bundle import prior_factors
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.config import RefineSettings
 from gsba.frames import cubemap
 from gsba.splat import refinement
@@ -40,7 +40,7 @@ def spoiled(case: Case, degrees: float, distance: float, noise: float, seed: int
 def run(case: Case, given: Given, settings: RefineSettings, **options) -> SplatResult:
     priors = prior_factors.build(case.result.coarse.world_T_rigs, settings.priors)
     rig = cubemap.rig_for(case.result.frames, settings.cubemap)
-    return refinement.refine(*given, Problem(priors, rig, settings, 2), **options)
+    return refinement.refine(*given, AdjustmentContext(priors, rig, settings, 2), **options)
 
 
 Harm = Callable[[np.ndarray, np.random.Generator], np.ndarray]  # of steps (F, 6), tangents

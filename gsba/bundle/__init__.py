@@ -4,7 +4,7 @@ Takes matches, keypoints, a start and what is believed of the trajectory.
 Gives solutions with their noise and covariances, and the result in the trajectory's world.
 """
 
-from gsba.bundle.adjustment import Problem, adjust, adjust_sighted, pose_covariances
+from gsba.bundle.adjustment import AdjustmentContext, adjust, adjust_sighted, pose_covariances
 from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.optimizer import OptimizeResult, optimize
 from gsba.bundle.prior_factors import X
@@ -13,9 +13,9 @@ from gsba.bundle.stitching import Stitching
 from gsba.bundle.triangulation import triangulate
 
 __all__ = [
+    "AdjustmentContext",
     "MapStrength",
     "OptimizeResult",
-    "Problem",
     "Stitching",
     "X",
     "adjust",

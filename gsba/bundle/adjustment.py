@@ -24,7 +24,16 @@ from gsba.bundle.optimizer import marginal_covariances, optimize
 from gsba.bundle.prior_factors import poses_of, values_of
 from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.config import RefineSettings, SolverSettings
-from gsba.types import JointErrors, Keypoints, Landmarks, Round, Sighted, Solution, Tracks, Turning
+from gsba.types import (
+    GyroConstraints,
+    JointErrors,
+    Keypoints,
+    Landmarks,
+    Round,
+    Sighted,
+    Solution,
+    Tracks,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -49,14 +58,14 @@ class Terms:
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class AdjustmentContext:
     """What all adjustments at one time of a run share."""
 
     priors: gtsam.NonlinearFactorGraph  # factors on the poses, gauge included
     rig: CubeRig  # the faces, for the reprojection family
     settings: RefineSettings  # families, loss, solver, rounds
     num_threads: int  # of the solver
-    turning: Turning | None = None  # of the frames, by a gyro; its say on poses is in the priors
+    turning: GyroConstraints | None = None  # of the frames; `priors` hold its factors on poses
     anchors: Anchors | None = None  # GPS fixes in the world of the poses; None = there are none
     ungauged: gtsam.NonlinearFactorGraph | None = None  # `priors` without the gauge, which anchors
     # or families give; None = neither does
@@ -107,7 +116,7 @@ class Problem:
 
 
 def adjust_sighted(
-    sighted: Sighted, before: Solution, problem: Problem, gates: Sequence[float]
+    sighted: Sighted, before: Solution, problem: AdjustmentContext, gates: Sequence[float]
 ) -> tuple[Solution, Keypoints]:
     """As `adjust`, of aligned and former observations, the noise of either estimated on its own.
 
@@ -116,7 +125,7 @@ def adjust_sighted(
     """
     solved, rounds, settings = before, [], problem.settings
     for number, gate in enumerate(gates, 1):
-        sighted = calibrate(sighted, solved, settings)
+        sighted = rescale_noise(sighted, solved, settings)
         tracks, keypoints, start = (
             sighted.tracks,
             sighted.keypoints,
@@ -129,7 +138,7 @@ def adjust_sighted(
     return replace(solved, rounds=tuple(rounds)), sighted.keypoints
 
 
-def calibrate(sighted: Sighted, before: Solution, settings: RefineSettings) -> Sighted:
+def rescale_noise(sighted: Sighted, before: Solution, settings: RefineSettings) -> Sighted:
     """Scale new and former observations' noise to what a solution shows of each.
 
     A patch's covariance knows the image's noise and texture, not how far a surface or a lens is
@@ -157,7 +166,7 @@ def adjust(
     tracks: Tracks,
     keypoints: Keypoints,
     start: Solution,
-    problem: Problem,
+    problem: AdjustmentContext,
     gates: Sequence[float],
     final: bool = True,
 ) -> Solution:
@@ -224,7 +233,7 @@ def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
 
 
 def landmark_block(
-    landmarks: Landmarks, keypoints: Keypoints, noise: float, problem: Problem
+    landmarks: Landmarks, keypoints: Keypoints, noise: float, problem: AdjustmentContext
 ) -> LandmarkBlock:
     """The factor block of the chosen families; several share each observation's information.
 
@@ -266,7 +275,7 @@ def landmark_block(
 def pose_covariances(
     solved: Solution,
     keypoints: Keypoints,
-    problem: Problem,
+    problem: AdjustmentContext,
     components: np.ndarray | None = None,
 ) -> tuple[np.ndarray, JointErrors]:
     """Marginal covariances (F, 6, 6) with the first pose and the extent of each map held fixed."""

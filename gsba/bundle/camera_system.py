@@ -15,15 +15,15 @@ from scipy.sparse import csr_matrix
 from factors import Block
 from factors.cholesky import DIM
 from factors.quadratic_block import QuadraticBlock
-from factors.reduced import ReducedSystem
+from factors.reduced_camera_system import ReducedSystem
 from gsba.bundle import lens_axes, prior_factors, readout, self_calibration
-from gsba.bundle.adjustment import DRAWS, Problem, values_of
+from gsba.bundle.adjustment import DRAWS, AdjustmentContext, values_of
 from gsba.bundle.families import FamilyTerms
-from gsba.bundle.lens_centres import by_nearness
+from gsba.bundle.lens_centres import by_inverse_stitch_radius
 from gsba.bundle.optimizer import marginal_covariances
-from gsba.bundle.readout import Readout
+from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.shared_parameters import by_origin, weighted, without_points
-from gsba.types import JointErrors, Keypoints, Solution, Turning
+from gsba.types import GyroConstraints, JointErrors, Keypoints, Solution
 
 A = gtsam.symbol_shorthand.A  # turn (2,) rad of a frame's lenses, about x and y of their frame
 B = gtsam.symbol_shorthand.B  # turn (3,) rad of the back lens of raw pairs in the rig
@@ -31,7 +31,7 @@ C = gtsam.symbol_shorthand.C  # the front lens's centre (3,), lenses' frame, map
 D = gtsam.symbol_shorthand.D  # duration (1,) of the readout, s
 F = gtsam.symbol_shorthand.F  # relative focal length and principal point (3,) of a lens
 K = gtsam.symbol_shorthand.K  # radial terms (4,) of a lens
-N = gtsam.symbol_shorthand.N  # nearness (1,) that panoramas are stitched for, 1 / map units
+N = gtsam.symbol_shorthand.N  # inverse of the stitching radius (1,), 1 / map units
 W = gtsam.symbol_shorthand.W  # own motion (6,) of a frame, beside that of its velocity
 
 _OF_LENSES = (F(0), 3), (K(0), 4), (F(1), 3), (K(1), 4), (B(0), 3)  # as `self_calibration` has them
@@ -50,7 +50,7 @@ class CameraCovariances:
     joint: JointErrors  # what the poses' errors have in common
     centre: np.ndarray  # (3, 3) float64, of the front lens
     readout_sigma: float  # s; NaN = no readout was taken
-    nearness_sigma: float  # 1 / map units; NaN = stitched at infinity, or as settings say
+    inverse_stitch_radius_sigma: float  # 1 / map units; NaN = infinity, or as settings say
     lens_sigmas: np.ndarray | None = None  # (FREE,) of what lenses of raw pairs are; None = they
     # are as calibrated
 
@@ -62,31 +62,31 @@ class CameraSystem:
     solved: Solution  # poses, points, noise
     keypoints: Keypoints  # of its observations, as rays of the camera so far
     shown: np.ndarray  # (N, 3) their directions in the pictures: these tell rows
-    seeing: Readout  # the camera so far
+    seeing: CameraEstimate  # the camera so far
     timestamps: np.ndarray  # (F,) seconds
-    problem: Problem  # priors, loss
+    problem: AdjustmentContext  # priors, loss
 
-    def step(self) -> Readout:
+    def step(self) -> CameraEstimate:
         """The camera that bearings ask for, poses and points adjusted with it.
 
         Frames turn while they are read as a gyro says, unless images have it otherwise.
         """
         turning = readout.turning_of(self.seeing.lenses, self.problem)
-        if turning is None or self.seeing.lenses.twists is None:
+        if turning is None or self.seeing.lenses.readout_motion is None:
             return self._step()
         seeing = replace(self.seeing, by_gyro=self._agrees(turning))
         return replace(self, seeing=seeing)._step()
 
-    def _step(self) -> Readout:
+    def _step(self) -> CameraEstimate:
         camera, num = _linearized(self), len(self.solved.world_T_rigs)
         lenses, found = self.seeing.lenses, self.seeing
         variances = None
-        for _ in range(1 if lenses.twists is None else _SPREADS):
+        for _ in range(1 if lenses.readout_motion is None else _SPREADS):
             system = camera.system(self.problem.graph)
             steps = system.solve(_DAMPING)
             if steps is None:
                 return self.seeing
-            if lenses.twists is None:
+            if lenses.readout_motion is None:
                 continue
             if variances is None:  # they hardly change with what is typical
                 variances = _own_variances(camera, system)
@@ -99,14 +99,16 @@ class CameraSystem:
 
         lenses = replace(lenses, centre=lenses.centre + of(C, 1, 3)[0])
         if camera.values.exists(N(0)):
-            lenses = replace(lenses, nearness=max(lenses.nearness + float(of(N, 1, 1)[0, 0]), 0.0))
-        elif lenses.nearness:
-            said = self.problem.settings.camera.nearness(float(np.linalg.norm(lenses.centre)))
-            lenses = replace(lenses, nearness=said)
-        if lenses.twists is not None:
+            inverse_radius = max(lenses.inverse_stitch_radius + float(of(N, 1, 1)[0, 0]), 0.0)
+            lenses = replace(lenses, inverse_stitch_radius=inverse_radius)
+        elif lenses.inverse_stitch_radius:
+            baseline = float(np.linalg.norm(lenses.centre))
+            inverse_radius = self.problem.settings.camera.inverse_stitch_radius(baseline)
+            lenses = replace(lenses, inverse_stitch_radius=inverse_radius)
+        if lenses.readout_motion is not None:
             motion = _velocities(self)
             longer, own = float(of(D, 1, 1)[0, 0]), of(W, num, 6)
-            lenses = replace(lenses, twists=lenses.twists + longer * motion + own)
+            lenses = replace(lenses, readout_motion=lenses.readout_motion + longer * motion + own)
             duration, sigmas = self.seeing.readout_s + longer, camera.own[0].sigmas
             found = replace(found, readout_s=duration, own_sigmas=sigmas)
         if lenses.axes is not None:
@@ -116,7 +118,7 @@ class CameraSystem:
             lenses = self_calibration.moved(lenses, np.concatenate(each))
         return replace(found, lenses=lenses)
 
-    def _agrees(self, turning: Turning) -> bool:
+    def _agrees(self, turning: GyroConstraints) -> bool:
         """Whether frames turn while they are read as a gyro says, by images alone."""
         camera = _linearized(replace(self, seeing=replace(self.seeing, by_gyro=False)))
         system, own = camera.system(self.problem.graph), camera.own[0]
@@ -268,28 +270,27 @@ def _linearized(given: CameraSystem) -> _Camera:
     frames, directions = tracks.frames, given.shown[seen.rows]
     rotations = solved.world_T_rigs[frames, :3, :3]
     bearings = given.keypoints.bearings_rig[seen.rows]
-    by_start = by_origin(seen, rotations, bearings, lenses.nearness)
+    by_start = by_origin(seen, rotations, bearings, lenses.inverse_stitch_radius)
     by_centre = lenses.by_centre(by_start, directions, frames)
     own, shared, by_frame = list[_Own](), list[tuple[int, np.ndarray]](), [seen.by_pose]
-    if lenses.nearness:
-        by_near = by_nearness(bearings, lenses.origins(directions, frames))
+    if lenses.inverse_stitch_radius:
+        by_near = by_inverse_stitch_radius(bearings, lenses.origins(directions, frames))
         if given.problem.settings.camera.stitch_radius_m is None:
             shared.append((N(0), by_near))
         else:  # metres: in map units it goes with the distance between the lenses
-            by_centre = (
-                by_centre - by_near * lenses.nearness / np.sum(lenses.centre**2) * lenses.centre
-            )
+            per_centre = lenses.inverse_stitch_radius / np.sum(lenses.centre**2) * lenses.centre
+            by_centre = by_centre - by_near * per_centre
     shared.insert(0, (C(0), by_centre))
     off = None
     if lenses.fisheyes is not None:
         off = self_calibration.from_calibrated(lenses)
         by_lenses = self_calibration.by_lenses(bearings, directions, lenses, seen.residuals)
         shared += _of_lenses(by_lenses)
-    if lenses.twists is not None:
+    if lenses.readout_motion is not None:
         velocities = _velocities(given)
         times = lenses.fractions(directions, frames)[:, None, None]
         shared.append((D(0), times * (seen.by_pose @ velocities[frames, :, None])))
-        beside = lenses.twists - seeing.readout_s * velocities
+        beside = lenses.readout_motion - seeing.readout_s * velocities
         own.append(_held(given, _Own(W, beside, readout.own_sigmas(seeing, velocities))))
         by_frame.append(times * seen.by_pose)
     if lenses.axes is not None:

@@ -13,7 +13,7 @@ from scipy.sparse import diags_array as diags
 from scipy.sparse.linalg import splu
 
 from factors.elimination import LinearSystem
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
     PARTS,
     Weighted,
@@ -55,7 +55,7 @@ def models_of(
     landmarks: Landmarks,
     keypoints: Keypoints,
     solved: Solution,
-    problem: Problem,
+    problem: AdjustmentContext,
     by_parameters: Callable[[Weighted], np.ndarray],
 ) -> list[FrameModel]:
     """Models of the robust cost of parts of some points, at a solution's poses.

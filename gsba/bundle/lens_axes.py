@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsba.bundle import shared_parameters
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.frame_parameters import models_of, part_gains
 from gsba.bundle.shared_parameters import (
     PARTS,
@@ -45,7 +45,11 @@ class LensAxes:
 
 
 def guess(
-    landmarks: Landmarks, keypoints: Keypoints, solved: Solution, so_far: Lenses, problem: Problem
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    solved: Solution,
+    so_far: Lenses,
+    problem: AdjustmentContext,
 ) -> LensAxes:
     """Lenses with axes that explain most with two centres: the rig's, turned ones, or the walk's.
 
@@ -84,7 +88,11 @@ def guess(
 
 
 def loosened(
-    landmarks: Landmarks, keypoints: Keypoints, solved: Solution, so_far: Lenses, problem: Problem
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    solved: Solution,
+    so_far: Lenses,
+    problem: AdjustmentContext,
 ) -> LensAxes:
     """Axes of each frame's own, the rig's yet, if turning them by some points predicts others.
 
@@ -102,7 +110,7 @@ def loosened(
     def by_axes(seen: Weighted) -> np.ndarray:
         there, bearings = frames[seen.rows], keypoints.bearings_rig[seen.rows]
         rotations = solved.world_T_rigs[there, :3, :3]
-        by_start = by_origin(seen, rotations, bearings, so_far.nearness)
+        by_start = by_origin(seen, rotations, bearings, so_far.inverse_stitch_radius)
         return so_far.by_centre(by_start, bearings, there) @ by_turn(so_far)
 
     models = models_of(used, keypoints, solved, problem, by_axes)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factors.bearing import tangent_basis
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
     PARTS,
     SharedModel,
@@ -49,8 +49,8 @@ class LensCentres:
 class StitchRadius:
     """How far away panoramas take things to be."""
 
-    lenses: Lenses  # with nearness, if it was taken
-    nearness: float  # 1 / map units, inverse of the radius, taken or not
+    lenses: Lenses  # with inverse_stitch_radius, if it was taken
+    inverse_stitch_radius: float  # 1 / map units, inverse of the radius, taken or not
     sigma: float
     part_gains: np.ndarray  # (PARTS,) float64, share of the robust cost of each part of the
     # sequence that what other parts give takes off, beside centres alone
@@ -62,7 +62,7 @@ def estimate(
     keypoints: Keypoints,
     solved: Solution,
     so_far: Lenses,
-    problem: Problem,
+    problem: AdjustmentContext,
 ) -> LensCentres:
     """Find the lenses' centres from a map, poses and points adjusted with them.
 
@@ -81,7 +81,9 @@ def estimate(
 
     systems, counts = models_of(landmarks, _MOST, keypoints, solved, problem, by_centre)
     whole = None
-    if not systems and so_far.cut_by is not None:  # raw pairs are of two, also where frames are few
+    if (
+        not systems and so_far.reference_calibration is not None
+    ):  # raw pairs are of two, also where frames are few
         whole = whole_model_of(landmarks, _MOST, keypoints, solved, problem, by_centre)
     if not systems and whole is None:
         unknown, nothing = np.full((3, 3), np.nan), np.full(PARTS, np.nan)
@@ -101,7 +103,7 @@ def estimate(
     shares = gains / np.array([part.cost for part in around]) if systems else np.full(PARTS, np.nan)
     strength = float(np.sqrt(found @ np.linalg.solve(covariance, found)))
     reason = ""
-    if chosen.model == "auto" and so_far.cut_by is None:  # raw pairs are of two
+    if chosen.model == "auto" and so_far.reference_calibration is None:  # raw pairs are of two
         # Matches that one centre has chosen hide the lenses from some parts of the sequence.
         if not (predicts(gains) if so_far else gains.sum() > 0):
             reason = "it does not predict parts of the sequence that it was not found from"
@@ -130,7 +132,7 @@ def stitched_for(
     shown: np.ndarray,
     solved: Solution,
     so_far: Lenses,
-    problem: Problem,
+    problem: AdjustmentContext,
 ) -> StitchRadius:
     """Find the radius that panoramas are stitched for, centres, poses and points adjusted with it.
 
@@ -144,16 +146,16 @@ def stitched_for(
         so_far: the lenses.
         problem: loss, settings.
     """
-    said = problem.settings.camera.nearness(float(np.linalg.norm(so_far.centre)))
+    said = problem.settings.camera.inverse_stitch_radius(float(np.linalg.norm(so_far.centre)))
     if said is not None:
         reason, unknown = "" if said else "camera.stitch_radius_m says so", np.full(PARTS, np.nan)
-        return StitchRadius(replace(so_far, nearness=said), said, 0.0, unknown, reason)
+        return StitchRadius(replace(so_far, inverse_stitch_radius=said), said, 0.0, unknown, reason)
     frames = keypoints.frames()
 
     def by_both(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
         directions, there = shown[rows], frames[rows]
         starts = so_far.origins(directions, there)
-        by_near = by_nearness(keypoints.bearings_rig[rows], starts)
+        by_near = by_inverse_stitch_radius(keypoints.bearings_rig[rows], starts)
         return np.concatenate([so_far.by_centre(by_origin, directions, there), by_near], axis=2)
 
     systems, _ = models_of(landmarks, _MOST, keypoints, solved, problem, by_both)
@@ -166,18 +168,22 @@ def stitched_for(
         others = systems[:p] + systems[p + 1 :]
         without = part.gain(_step([each.of(slice(3)) for each in others]))
         gains.append(part.gain(_step(others)) - without)
-    nearness, gains = float(found[3]), np.array(gains)
+    inverse_stitch_radius, gains = float(found[3]), np.array(gains)
     shares = gains / np.array([part.cost for part in systems])
-    logger.info("stitched for a nearness of %.3f (sigma %.3f)", nearness, sigma)
+    logger.info(
+        "stitched for a inverse_stitch_radius of %.3f (sigma %.3f)", inverse_stitch_radius, sigma
+    )
     reason = ""
-    if not predicts(gains) or nearness < _SIGNIFICANT * sigma:
+    if not predicts(gains) or inverse_stitch_radius < _SIGNIFICANT * sigma:
         reason = "as well stitched at infinity"
-    taken = replace(so_far, centre=so_far.centre + found[:3], nearness=nearness)
-    return StitchRadius(so_far if reason else taken, nearness, sigma, shares, reason)
+    taken = replace(
+        so_far, centre=so_far.centre + found[:3], inverse_stitch_radius=inverse_stitch_radius
+    )
+    return StitchRadius(so_far if reason else taken, inverse_stitch_radius, sigma, shares, reason)
 
 
-def by_nearness(bearings_rig: np.ndarray, origins_rig: np.ndarray) -> np.ndarray:
-    """Jacobian (O, 2, 1) of residuals of bearings (O, 3) by the nearness they are stitched for.
+def by_inverse_stitch_radius(bearings_rig: np.ndarray, origins_rig: np.ndarray) -> np.ndarray:
+    """Jacobian (O, 2, 1) of residuals of bearings (O, 3) by the inverse stitch radius.
 
     Args:
         bearings_rig: of the rays.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.config import CloserSettings, PriorSettings
+from gsba.config import PriorSettings, WeakFrameSettings
 from gsba.geometry import inverse, rotation_angle, step_covariances
 from gsba.types import Counts, JointErrors, StepNoise
 
@@ -43,7 +43,7 @@ def measure(
     coarse_world_T_rigs: np.ndarray,
     seen: np.ndarray,
     believed: np.ndarray,
-    closer: CloserSettings,
+    weak_frames: WeakFrameSettings,
     priors: PriorSettings,
     components: np.ndarray | None = None,
 ) -> MapStrength:
@@ -56,7 +56,7 @@ def measure(
         coarse_world_T_rigs: (F, 4, 4) the trajectory.
         seen: (F - 1,) bool, steps that images show.
         believed: (F - 1,) bool, steps of the trajectory that they do not contradict.
-        closer: limits, and how far around a weak place frames count as near.
+        weak_frames: limits, and how far around a weak place frames count as near.
         priors: noise of the trajectory's steps, as far as the images do not know it.
         components: (F,) map of each frame, from 0; None = there is one.
     """
@@ -65,13 +65,13 @@ def measure(
     drift = np.array(
         [_drift(world_T_rigs[maps == m], joint.draws[:, maps == m]) for m in range(maps.max() + 1)]
     )
-    drifting = drift[maps] > closer.max_drift
+    drifting = drift[maps] > weak_frames.max_drift
     sigmas = scale_sigmas(world_T_rigs, joint.draws)
     between = seen[:-1] & seen[1:] & np.isfinite(sigmas)
     poor = np.zeros(num, bool)
-    poor[1:-1] = drifting[1:-1] & between & (np.nan_to_num(sigmas) > closer.max_scale_sigma)
-    reach = np.ones(2 * closer.reach + 1)
-    weak = np.convolve(poor, reach)[closer.reach : closer.reach + num] > 0
+    poor[1:-1] = drifting[1:-1] & between & (np.nan_to_num(sigmas) > weak_frames.max_scale_sigma)
+    reach = np.ones(2 * weak_frames.reach + 1)
+    weak = np.convolve(poor, reach)[weak_frames.reach : weak_frames.reach + num] > 0
     held = seen & _held(world_T_rigs, covariances, joint, priors)
     noise = _noise(world_T_rigs, coarse_world_T_rigs, held & believed, priors)
     counts = Counts(num, int((~weak).sum()), "frames", {"held loosely": int(weak.sum())})

@@ -11,7 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from factors import Block
-from factors.reduced import ReducedSystem
+from factors.reduced_camera_system import ReducedSystem
 from gsba.config import SolverSettings
 from gsba.log import GsbaError
 from gsba.types import Iteration, JointErrors

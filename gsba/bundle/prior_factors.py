@@ -5,7 +5,7 @@ import numpy as np
 
 from gsba.config import PriorSettings
 from gsba.geometry import furthest, inverse
-from gsba.types import StepNoise, Turning
+from gsba.types import GyroConstraints, StepNoise
 
 X = gtsam.symbol_shorthand.X
 _ANYWHERE = 1e4  # extents of a map: as good as no say
@@ -85,7 +85,9 @@ def build(
     return graph
 
 
-def turns(turning: Turning, extent: float, loss_sigmas: float) -> gtsam.NonlinearFactorGraph:
+def turns(
+    turning: GyroConstraints, extent: float, loss_sigmas: float
+) -> gtsam.NonlinearFactorGraph:
     """Relative rotations of neighbours as a gyro has them, of no say on where they are.
 
     Args:

@@ -11,11 +11,11 @@ from itertools import product
 
 import numpy as np
 
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of, predicts
 from gsba.camera.lens import Lenses, rows_run
 from gsba.config import CameraSettings
-from gsba.types import Counts, Keypoints, Landmarks, Solution, Turning
+from gsba.types import Counts, GyroConstraints, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
 
@@ -30,10 +30,10 @@ _AXES = np.eye(3)[:2]
 
 
 @dataclass(frozen=True, slots=True)
-class Readout:
+class CameraEstimate:
     """How frames move while they are read."""
 
-    lenses: Lenses  # with sweeps and twists, if they were taken
+    lenses: Lenses  # with row_directions and readout_motion, if they were taken
     readout_s: float = float("nan")  # from first to last row; NaN = not known
     readout_sigma: float = float("nan")
     own_sigmas: np.ndarray | None = None  # (6,) float64, of what frames move beside their velocity,
@@ -52,8 +52,8 @@ def estimate(
     solved: Solution,
     lenses: Lenses,
     timestamps: np.ndarray,
-    problem: Problem,
-) -> Readout:
+    problem: AdjustmentContext,
+) -> CameraEstimate:
     """Find how long the readout takes and which way rows are read, frames moving by velocity.
 
     Args:
@@ -79,33 +79,36 @@ def estimate(
 
     systems, counts = models_of(landmarks, _MOST, keypoints, solved, problem, by_duration)
     if not systems:
-        return Readout(lenses, reason="too few points to tell rows apart", counts=counts)
+        return CameraEstimate(lenses, reason="too few points to tell rows apart", counts=counts)
     durations, sigmas, gains = _durations(systems)
     best = int(np.argmax(gains.sum(axis=0)))
     duration, sigma = float(durations[best]), float(sigmas[best])
     sign = -1.0 if duration < 0 else 1.0  # rows are read the other way
     shares = gains[:, best] / np.array([part.cost for part in systems])
-    found = Readout(lenses, abs(duration), sigma, gains=shares, counts=counts)
+    found = CameraEstimate(lenses, abs(duration), sigma, gains=shares, counts=counts)
     logger.info("readout: %.2f ms (sigma %.2f)", 1e3 * abs(duration), 1e3 * sigma)
     if not predicts(gains[:, best]) or abs(duration) < _SIGNIFICANT * sigma:
         return replace(found, reason="motion during the readout does not predict unseen parts")
     if problem.settings.camera.sweep is not None and duration < 0:
         return replace(found, reason="rows are read the other way than camera.sweep says")
-    twists = abs(duration) * motion
-    return replace(found, lenses=replace(lenses, sweeps=sign * ways[best], twists=twists))
+    readout_motion = abs(duration) * motion
+    return replace(
+        found,
+        lenses=replace(lenses, row_directions=sign * ways[best], readout_motion=readout_motion),
+    )
 
 
-def total_sigma(found: Readout, sigma: float) -> float:
+def total_sigma(found: CameraEstimate, sigma: float) -> float:
     """Standard deviation of the duration, seconds, with that of the scale of rows.
 
     Args:
         sigma: by the covariance of the adjustment, in which rows are known exactly.
     """
-    scale_sigma = 0.0 if found.lenses.cut_by is not None else _ROW_SCALE_SIGMA
+    scale_sigma = 0.0 if found.lenses.reference_calibration is not None else _ROW_SCALE_SIGMA
     return float(np.hypot(sigma, scale_sigma * found.readout_s))
 
 
-def own_sigmas(found: Readout, motion: np.ndarray) -> np.ndarray:
+def own_sigmas(found: CameraEstimate, motion: np.ndarray) -> np.ndarray:
     """Standard deviations (6,) of what frames move meanwhile beside their velocities (F, 6)."""
     if found.own_sigmas is not None:
         return found.own_sigmas
@@ -124,13 +127,13 @@ def _offsets(landmarks: Landmarks, keypoints: Keypoints, solved: Solution) -> np
     return offsets
 
 
-def turning_of(lenses: Lenses, problem: Problem) -> Turning | None:
+def turning_of(lenses: Lenses, problem: AdjustmentContext) -> GyroConstraints | None:
     """What a gyro says of the frames' turning; None where a stabiliser took it out of them."""
     return None if lenses.axes is not None else problem.turning
 
 
 def velocities(
-    world_T_rigs: np.ndarray, timestamps: np.ndarray, turning: Turning | None = None
+    world_T_rigs: np.ndarray, timestamps: np.ndarray, turning: GyroConstraints | None = None
 ) -> np.ndarray:
     """Mean velocity (F, 6) around each frame, [rotation rad/s, translation per s], rig frame.
 
@@ -160,8 +163,8 @@ def _durations(systems: list[SharedModel]) -> tuple[np.ndarray, np.ndarray, np.n
 
 def _ways(camera: CameraSettings, lenses: Lenses) -> list[np.ndarray]:
     """Ways (2, 3) in which the two lenses can be read, up to both reversed."""
-    if lenses.cut_by is not None:
-        down, reversed_back = rows_run(lenses.cut_by), np.array([[1.0], [-1.0]])
+    if lenses.reference_calibration is not None:
+        down, reversed_back = rows_run(lenses.reference_calibration), np.array([[1.0], [-1.0]])
         return [down, reversed_back * down]
     if camera.sweep is not None:
         named = {"+x": _AXES[0], "-x": -_AXES[0], "+y": _AXES[1], "-y": -_AXES[1]}

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factors.bearing import tangent_basis
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
     PARTS,
     SharedModel,
@@ -63,7 +63,7 @@ def estimate(
     shown: np.ndarray,
     solved: Solution,
     so_far: Lenses,
-    problem: Problem,
+    problem: AdjustmentContext,
     nominal: bool = False,
 ) -> SelfCalibration:
     """Find what lenses are from a map, poses, points and their centre adjusted with them.
@@ -194,16 +194,17 @@ def moved(lenses: Lenses, step: np.ndarray) -> Lenses:
 
 def from_calibrated(lenses: Lenses) -> np.ndarray:
     """How far (FREE,) lenses are from what they were calibrated as."""
-    assert lenses.cut_by is not None
+    assert lenses.reference_calibration is not None
     of_front, of_back = (
-        difference(one, before) for one, before in zip(now(lenses), lenses.cut_by, strict=True)
+        difference(one, before)
+        for one, before in zip(now(lenses), lenses.reference_calibration, strict=True)
     )
     return np.concatenate([of_front[:OF_FRONT], of_back])
 
 
 def apart(one: Lenses, other: Lenses) -> float:
     """How differently two calibrations of raw pairs take pixels, radians rms over the sphere."""
-    if one.cut_by is None or one.fisheyes == other.fisheyes:
+    if one.reference_calibration is None or one.fisheyes == other.fisheyes:
         return 0.0
     places = np.random.default_rng(0).normal(size=(_PLACES, 3))
     places /= np.linalg.norm(places, axis=1, keepdims=True)
@@ -213,8 +214,8 @@ def apart(one: Lenses, other: Lenses) -> float:
 
 def now(lenses: Lenses) -> Pair:
     """What lenses of raw pairs are taken for."""
-    assert lenses.cut_by is not None
-    return lenses.fisheyes or lenses.cut_by
+    assert lenses.reference_calibration is not None
+    return lenses.fisheyes or lenses.reference_calibration
 
 
 def _pull() -> np.ndarray:

@@ -16,7 +16,7 @@ from factors.bearing import bearing_residuals, tangent_basis
 from factors.cholesky import BlockCholesky
 from factors.elimination import LinearSystem, eliminate
 from factors.robust import RobustLoss
-from gsba.bundle.adjustment import Problem, landmark_block, values_of
+from gsba.bundle.adjustment import AdjustmentContext, landmark_block, values_of
 from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
 
 BySharedParameters = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -127,7 +127,7 @@ class Weighted:
 
 
 def weighted(
-    landmarks: Landmarks, keypoints: Keypoints, solved: Solution, problem: Problem
+    landmarks: Landmarks, keypoints: Keypoints, solved: Solution, problem: AdjustmentContext
 ) -> Weighted:
     """Residuals of some points' bearings at a solution's poses, and their Jacobians."""
     block = landmark_block(landmarks, keypoints, solved.noise, problem)
@@ -159,7 +159,7 @@ def models_of(
     most: int,
     keypoints: Keypoints,
     solved: Solution,
-    problem: Problem,
+    problem: AdjustmentContext,
     by_shared: BySharedParameters,
 ) -> tuple[list[SharedModel], Counts]:
     """Models of the cost of each part of the sequence, by at most so many observations.
@@ -185,7 +185,7 @@ def whole_model_of(
     most: int,
     keypoints: Keypoints,
     solved: Solution,
-    problem: Problem,
+    problem: AdjustmentContext,
     by_shared: BySharedParameters,
 ) -> SharedModel | None:
     """Model of the cost of a sequence that is too short for parts; None = it has no points.
@@ -202,7 +202,7 @@ def model_of(
     landmarks: Landmarks,
     keypoints: Keypoints,
     solved: Solution,
-    problem: Problem,
+    problem: AdjustmentContext,
     by_shared: BySharedParameters,
 ) -> SharedModel:
     """Model of the robust cost of some points and their bearings, at a solution's poses.
@@ -278,7 +278,7 @@ def without_points(
 
 
 def by_origin(
-    seen: Weighted, world_R_rigs: np.ndarray, bearings_rig: np.ndarray, nearness: float
+    seen: Weighted, world_R_rigs: np.ndarray, bearings_rig: np.ndarray, inverse_stitch_radius: float
 ) -> np.ndarray:
     """Jacobian (O, 2, 3) of residuals by where rays start, rig frame, and point by what they show.
 
@@ -286,6 +286,6 @@ def by_origin(
         seen: the residuals.
         world_R_rigs: (O, 3, 3) of their poses.
         bearings_rig: (O, 3) of their rays.
-        nearness: see `Lenses`.
+        inverse_stitch_radius: see `Lenses`.
     """
-    return -seen.by_point @ world_R_rigs + nearness * tangent_basis(bearings_rig)
+    return -seen.by_point @ world_R_rigs + inverse_stitch_radius * tangent_basis(bearings_rig)

@@ -8,7 +8,7 @@ import numpy as np
 from factors.bearing import tangent_basis
 from factors.sphere_field import SphereField, degrees_of, harmonics, num_harmonics
 from gsba.bundle import adjustment
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import PARTS, BySharedParameters, SharedModel, models_of
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig, owner_faces
@@ -67,7 +67,7 @@ def estimate(
     keypoints: Keypoints,
     before: Solution,
     field: SphereField,
-    problem: Problem,
+    problem: AdjustmentContext,
     lenses: Lenses = ONE_CENTRE,
 ) -> Stitching:
     """Find the field, by cross-validation over parts of the sequence, and solve the map with it.
@@ -115,7 +115,7 @@ def estimate(
 
 
 def _systems(
-    now: Stitching, most: int, max_degree: int, problem: Problem, lenses: Lenses
+    now: Stitching, most: int, max_degree: int, problem: AdjustmentContext, lenses: Lenses
 ) -> tuple[list[SharedModel], Counts]:
     """Models of the cost of each part of the sequence; none where there is too little."""
     there, solved = lenses.seen(corrected(now.keypoints, now.field, problem.rig)), now.adjustment

@@ -33,16 +33,17 @@ class Lenses:
 
     centre: np.ndarray = field(default_factory=_centre)  # (3,) float64, of the front lens in the
     # lenses' frame, map units; the other one is as far behind the rig's centre
-    nearness: float = 0.0  # 1 / map units, inverse of the radius that panoramas are stitched for
+    inverse_stitch_radius: float = 0.0  # 1 / map units; 0 = panoramas are stitched at infinity
     band_rad: float = 0.0  # from the seam, within which a picture is of neither lens alone
-    sweeps: np.ndarray | None = None  # (2, 3) float64, unit, lenses' frame: the way in which rows
+    row_directions: np.ndarray | None = None  # (2, 3) float64, unit, lenses' frame: in which rows
     # of the front and of the back lens are read; None = all at one instant
-    twists: np.ndarray | None = None  # (F, 6) float64, motion of each frame from its first row to
+    readout_motion: np.ndarray | None = None  # (F, 6) float64, of each frame from its first row to
     # its last one, [rotation rad, translation map units], rig frame; None = none
     axes: np.ndarray | None = None  # (F, 3, 3) float64, rig_R_lenses of each frame, where a
     # stabiliser turned the panorama above them; None = they are the rig's
-    cut_by: Pair | None = None  # what panoramas of raw pairs were cut by; None = they came as such
-    fisheyes: Pair | None = None  # what the lenses of raw pairs were found to be; None = cut_by
+    reference_calibration: Pair | None = None  # by which panoramas of raw pairs were cut; None =
+    # they came as panoramas
+    fisheyes: Pair | None = None  # lenses of raw pairs as estimated; None = reference_calibration
 
     def __bool__(self) -> bool:
         return bool(self.centre.any()) or self.fisheyes is not None
@@ -77,38 +78,45 @@ class Lenses:
         self,
         directions: np.ndarray,
         frames: np.ndarray,
-        sweeps: np.ndarray | None = None,
+        row_directions: np.ndarray | None = None,
         signs: np.ndarray | None = None,
     ) -> np.ndarray:
         """When frames (N,) read unit directions (N, 3), part of the readout, (N,), 0 = its middle.
 
-        Of raw pairs rows are known. Else a lens is taken to be equidistant: what it is not, twists
-        take up. The lens is the one that faces a direction, or that of `signs` as in `origins`.
+        Of raw pairs rows are known. Else a lens is taken to be equidistant: the motion takes up
+        what it is not. The lens is the one that faces a direction, or that of `signs` as in
+        `origins`.
         """
-        sweeps = self.sweeps if sweeps is None else sweeps
-        if sweeps is None:
+        row_directions = self.row_directions if row_directions is None else row_directions
+        if row_directions is None:
             return np.zeros(len(directions))
-        if self.cut_by is not None:
+        if self.reference_calibration is not None:
             behind = None if signs is None else signs < 0
-            lens, pixels = pixels_of(self.cut_by, directions, behind)
-            heights = np.array([one.height for one in self.cut_by])[lens]
-            down = rows_run(self.cut_by)
-            return np.sign(np.sum(down * sweeps, axis=1))[lens] * (pixels[:, 1] / heights - 0.5)
+            lens, pixels = pixels_of(self.reference_calibration, directions, behind)
+            heights = np.array([one.height for one in self.reference_calibration])[lens]
+            down = rows_run(self.reference_calibration)
+            return np.sign(np.sum(down * row_directions, axis=1))[lens] * (
+                pixels[:, 1] / heights - 0.5
+            )
         own = self.own(directions, frames)
         across = own[:, :2]
         radii = np.linalg.norm(across, axis=1)
         signs = facing(own) if signs is None else signs
         angles = np.arctan2(radii, signs * own[:, 2])
         lens = (signs < 0).astype(int)
-        along = np.einsum("ni,ni->n", across, np.asarray(sweeps)[lens, :2])
+        along = np.einsum("ni,ni->n", across, np.asarray(row_directions)[lens, :2])
         return angles / (2 * _HALF_FOV) * along / np.maximum(radii, 1e-12)
 
     def swept(self, frame: int) -> np.ndarray:
         """The rig of a frame when the front and the back lens of a raw pair read their top and
         their bottom edge, (2, 2, 4, 4), in the rig in the middle of the readout."""
-        assert self.cut_by is not None and self.twists is not None and self.sweeps is not None
-        ways = np.sign(np.sum(rows_run(self.cut_by) * self.sweeps, axis=1))
-        moved = np.multiply.outer(np.outer(ways, [-0.5, 0.5]), self.twists[frame])
+        assert (
+            self.reference_calibration is not None
+            and self.readout_motion is not None
+            and self.row_directions is not None
+        )
+        ways = np.sign(np.sum(rows_run(self.reference_calibration) * self.row_directions, axis=1))
+        moved = np.multiply.outer(np.outer(ways, [-0.5, 0.5]), self.readout_motion[frame])
         turns = _rotations(moved[..., :3].reshape(4, 3)).reshape(2, 2, 3, 3)
         return pose(turns, moved[..., 3:])
 
@@ -116,10 +124,10 @@ class Lenses:
         """Directions and starts (N, 3) of what frames (N,) show in directions (N, 3), rig frame
         in the middle of the readout."""
         origins, seen = self.origins(directions, frames), self.calibrated(directions)
-        if self.nearness:
-            seen = directions - self.nearness * origins
+        if self.inverse_stitch_radius:
+            seen = directions - self.inverse_stitch_radius * origins
             seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-        if self.twists is None:
+        if self.readout_motion is None:
             return seen, origins
         turns, moves = self._moved(directions, frames)
         turned = np.einsum("nij,nj->ni", turns, seen)
@@ -131,11 +139,11 @@ class Lenses:
         A view has it in the same directions as the picture, from where the rays start. By how much
         a stitch radius magnifies is left out.
         """
-        bent, starts = replace(self, twists=None).rays(directions, frames)
+        bent, starts = replace(self, readout_motion=None).rays(directions, frames)
         axes = np.cross(directions, bent)
         sines = np.linalg.norm(axes, axis=1, keepdims=True)
         turns = _rotations(axes * (np.arcsin(np.minimum(sines, 1)) / np.maximum(sines, 1e-300)))
-        if self.twists is not None:
+        if self.readout_motion is not None:
             later, moves = self._moved(directions, frames)
             turns, starts = later @ turns, np.einsum("nij,nj->ni", later, starts) + moves
         return pose(turns, starts)
@@ -147,7 +155,7 @@ class Lenses:
         faces each has them, or that of `signs` as in `origins`: vectors (N, 3) along the directions
         in which they are shown."""
         vectors = self._shown(points_rig, frames, signs)
-        if self.twists is None:
+        if self.readout_motion is None:
             return vectors
         for _ in range(_SETTLED):
             units = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
@@ -158,17 +166,19 @@ class Lenses:
 
     def calibrated(self, directions: np.ndarray) -> np.ndarray:
         """Where pixels of directions (N, 3) in the panoramas are by the lenses."""
-        if self.cut_by is None or self.fisheyes is None:
+        if self.reference_calibration is None or self.fisheyes is None:
             return directions
-        return recalibrated(directions, self.cut_by, self.fisheyes)
+        return recalibrated(directions, self.reference_calibration, self.fisheyes)
 
     def _moved(
         self, directions: np.ndarray, frames: np.ndarray, signs: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """How frames (N,) turn (N, 3, 3) and move (N, 3) from their middle to the rows of unit
         directions (N, 3)."""
-        assert self.twists is not None
-        moved = self.fractions(directions, frames, signs=signs)[:, None] * self.twists[frames]
+        assert self.readout_motion is not None
+        moved = (
+            self.fractions(directions, frames, signs=signs)[:, None] * self.readout_motion[frames]
+        )
         return _rotations(moved[:, :3]), moved[:, 3:]
 
     def _shown(
@@ -177,15 +187,15 @@ class Lenses:
         """Points (N, 3) along where a stitcher puts the directions that their lens sees them in."""
         origins = self.origins(points, frames, signs)
         vectors = points - origins
-        if self.cut_by is not None and self.fisheyes is not None:
+        if self.reference_calibration is not None and self.fisheyes is not None:
             lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
             units = vectors / np.maximum(lengths, 1e-300)
             behind = None if signs is None else signs < 0
-            return lengths * recalibrated(units, self.fisheyes, self.cut_by, behind)
-        if not self.nearness:
+            return lengths * recalibrated(units, self.fisheyes, self.reference_calibration, behind)
+        if not self.inverse_stitch_radius:
             return vectors
         lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-        units, near = vectors / np.maximum(lengths, 1e-300), self.nearness * origins
+        units, near = vectors / np.maximum(lengths, 1e-300), self.inverse_stitch_radius * origins
         along = np.sum(near * units, axis=1, keepdims=True)
         left = 1 + along**2 - np.sum(near**2, axis=1, keepdims=True)
         return lengths * (near + (np.sqrt(np.maximum(left, 0)) - along) * units)
@@ -211,20 +221,29 @@ class Lenses:
 
     def scaled(self, scale: float) -> "Lenses":
         """The same in a unit of which a map unit has `scale`."""
-        twists = None if self.twists is None else self.twists * np.repeat([1.0, scale], 3)
+        readout_motion = (
+            None
+            if self.readout_motion is None
+            else self.readout_motion * np.repeat([1.0, scale], 3)
+        )
         return replace(
-            self, centre=scale * self.centre, nearness=self.nearness / scale, twists=twists
+            self,
+            centre=scale * self.centre,
+            inverse_stitch_radius=self.inverse_stitch_radius / scale,
+            readout_motion=readout_motion,
         )
 
     def cut_anew(self) -> "Lenses":
         """The same of panoramas that are cut by what the lenses of raw pairs were found to be."""
-        return replace(self, cut_by=self.fisheyes or self.cut_by, fisheyes=None)
+        return replace(
+            self, reference_calibration=self.fisheyes or self.reference_calibration, fisheyes=None
+        )
 
     def taken(self, rows: np.ndarray) -> "Lenses":
         """The same of some frames (F',)."""
         axes = None if self.axes is None else self.axes[rows]
-        twists = None if self.twists is None else self.twists[rows]
-        return replace(self, axes=axes, twists=twists)
+        readout_motion = None if self.readout_motion is None else self.readout_motion[rows]
+        return replace(self, axes=axes, readout_motion=readout_motion)
 
     def of_frame(self, frame: int) -> "Lenses":
         """The same for one frame alone, which is then number 0."""

@@ -87,7 +87,7 @@ class Stitcher:
     def stitched_raw(self, pictures: list[np.ndarray], width: int) -> np.ndarray:
         """The panorama (width / 2, width, C) uint8 of both pictures (h, w, C) uint8 of a raw
         pair."""
-        pair = self._lenses.cut_by
+        pair = self._lenses.reference_calibration
         assert pair is not None
 
         def look(lens: int, shown: np.ndarray) -> np.ndarray:

@@ -144,7 +144,7 @@ def _side_extents(band_rad: float) -> tuple[float, float]:
 def seen_from_lenses(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
     """The same with rigs whose axes are the lenses', all seen from where these are in the middle of
     the readout."""
-    if lenses.twists is not None:
+    if lenses.readout_motion is not None:
         reconstruction = _in_the_middle(reconstruction, lenses)
     if lenses.axes is None:
         return reconstruction
@@ -176,7 +176,7 @@ def _in_the_middle(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruc
 
 def shown_in_pictures(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
     """The same with bearings along the directions in which pictures show them."""
-    if lenses.twists is None:
+    if lenses.readout_motion is None:
         return reconstruction
     frames = reconstruction.observation_frames
     shown = lenses.seeing(observed_points(reconstruction), frames)
@@ -257,7 +257,7 @@ class ViewCutter:
         self._views = views
         self._offsets = [_offsets(view, lenses, frame, scene) for view in views]
         self._turn = np.eye(3) if lenses.axes is None else lenses.axes[frame]
-        self._cut_by, self._front = lenses.cut_by, lenses.centre[2]
+        self._cut_by, self._front = lenses.reference_calibration, lenses.centre[2]
 
     def cut(self, erp: np.ndarray) -> list[np.ndarray]:
         """Images (height, width[, C]) uint8, bicubic, of a panorama (H, 2 H[, C]) uint8."""

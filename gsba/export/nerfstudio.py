@@ -92,7 +92,7 @@ def write_nerfstudio_raw(
     pair = raw_lenses(frames)
     out_R_world = _write_cloud(partial, reconstruction, z_up)
     files = _files(partial, LENSES, masked=True)
-    moving = lenses.twists is not None and lenses.sweeps is not None
+    moving = lenses.readout_motion is not None and lenses.row_directions is not None
     entries = []
     for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
         rigs = lenses.swept(f) if moving else None

@@ -16,7 +16,7 @@ from gsba.geometry import nearest_rotation, pose
 from gsba.imu.readings import Readings, Sensor
 from gsba.trajectory.clock import MIN_STEPS, Clock, simplest
 from gsba.trajectory.clock_search import ClockFit, Turns, merged, noise
-from gsba.types import Counts, Trajectory, Turning
+from gsba.types import Counts, GyroConstraints, Trajectory
 
 _SPACING, _SPACING_S = 0.25, 0.05  # of a step, and seconds, between offsets tried at most
 _MOST_TRIED = 60_000  # offsets
@@ -86,7 +86,7 @@ def align(
     return _judged(best.settled(), others, timestamps, counts)
 
 
-def turning_of(readings: Readings, found: Alignment, timestamps: np.ndarray) -> Turning:
+def turning_of(readings: Readings, found: Alignment, timestamps: np.ndarray) -> GyroConstraints:
     """What the gyro says of frames at timestamps (F,): between them, and during each."""
     times = found.clock.times(timestamps)
     readings = readings.between(times[0] - _READOUT, times[-1] + _READOUT)
@@ -98,7 +98,7 @@ def turning_of(readings: Readings, found: Alignment, timestamps: np.ndarray) -> 
     bent = max(bent**2 - 2 * (noisy / every) ** 2, 0.0) ** 0.5  # rad/s^2, without that noise
     sigma = np.hypot(noisy / np.sqrt(max(_READOUT / every, 1.0)), found.offset_sigma * bent)
     known = readings.covers(spans)
-    return Turning(turned, np.where(known, found.noise, np.inf), rates, float(sigma))
+    return GyroConstraints(turned, np.where(known, found.noise, np.inf), rates, float(sigma))
 
 
 def orientations(readings: Readings, found: Alignment, times: np.ndarray) -> np.ndarray:

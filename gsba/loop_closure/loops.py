@@ -16,7 +16,7 @@ from gsba.loop_closure import join_evidence
 from gsba.loop_closure.connectivity import parted
 from gsba.loop_closure.join_evidence import LOCAL, Places, around
 from gsba.loop_closure.pose_graph import Loop, bend, met
-from gsba.loop_closure.retrieval import looks_of
+from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import recovery
 from gsba.matching.guided_search import MatchContext
 from gsba.similarity import relative_map
@@ -49,7 +49,7 @@ def close(context: MatchContext, solved: Solution, unseen: np.ndarray) -> Closed
     """
     settings, keypoints = context.settings, context.keypoints
     num = len(solved.world_T_rigs)
-    looks = looks_of(context.strongest, num, settings.seed, context.workers)
+    looks = global_descriptors(context.strongest, num, settings.seed, context.workers)
     chosen = candidates(looks, solved, unseen, settings)
     strongest = replace(context, frames=context.strongest)
     verified = recovery.match_anywhere(strongest, chosen)

@@ -22,7 +22,7 @@ from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
 from gsba.loop_closure.merged_map import Registered
 from gsba.loop_closure.pose_graph import Loop
 from gsba.loop_closure.registration import resect
-from gsba.loop_closure.retrieval import looks_of
+from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import pairs, recovery
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.similarity import Sim3
@@ -89,7 +89,9 @@ class _Joining:
         self.context, self.solved, self.parts = context, solved, parts
         self.held, self.ties = held, ties
         self.times, self.depth = timestamps, solved.median_depth()
-        self.looks = looks_of(context.strongest, num, context.settings.seed, context.workers)
+        self.looks = global_descriptors(
+            context.strongest, num, context.settings.seed, context.workers
+        )
         self.poses = solved.world_T_rigs.copy()
         known = solved.points_by_keypoint(context.keypoints)
         self.own_known = [known[f] for f in range(num)]  # rig frames, units of their parts

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.similarity import Sim3
-from gsba.trajectory.joining import PLACES, Joint
-from gsba.trajectory.judgement import Trust
+from gsba.trajectory.joining import PLACES, SegmentAlignment
+from gsba.trajectory.judgement import StepChecks
 from gsba.types import CoarsePoses, Counts, Solution
 
 
@@ -40,8 +40,11 @@ def side_by_side(world_T_rigs: np.ndarray, registered: Registered | None) -> np.
 
 
 def follow(
-    registered: Registered, coarse: CoarsePoses, trust: Trust, joints: tuple[Joint, ...]
-) -> tuple[CoarsePoses, Trust, tuple[Joint, ...]]:
+    registered: Registered,
+    coarse: CoarsePoses,
+    trust: StepChecks,
+    joints: tuple[SegmentAlignment, ...],
+) -> tuple[CoarsePoses, StepChecks, tuple[SegmentAlignment, ...]]:
     """The trajectory, its judgement and its joints after parts of the map were carried.
 
     Steps that no image shows lose their prior where images tie both their frames to one map. A

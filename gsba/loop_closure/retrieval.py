@@ -20,7 +20,9 @@ _SAMPLES = 20_000  # descriptors it is made from
 _ROUNDING = 1e-5  # of descriptors, float32 and of length one: a shorter sum has no direction
 
 
-def looks_of(frames: SearchableFrames, num_frames: int, seed: int, workers: Workers) -> np.ndarray:
+def global_descriptors(
+    frames: SearchableFrames, num_frames: int, seed: int, workers: Workers
+) -> np.ndarray:
     """What each panorama looks like, whatever its heading: (F, D) float32 of length one."""
     share = max(_SAMPLES // max(num_frames, 1), 8)
     draw = partial(_drawn, share=share, seed=seed)

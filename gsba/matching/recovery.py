@@ -11,8 +11,8 @@ from gsba.matching.correspondences import verified
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.trajectory import clock, joining, judgement, misread
 from gsba.trajectory.clock import ClockEstimate
-from gsba.trajectory.joining import Joint
-from gsba.trajectory.judgement import Trust
+from gsba.trajectory.joining import SegmentAlignment
+from gsba.trajectory.judgement import StepChecks
 from gsba.trajectory.steps import (
     Steps,
     given_up,
@@ -36,9 +36,9 @@ class Recovered:
     """Neighbours in time, verified with or without the trajectory, and its judgement."""
 
     neighbours: VerifiedPairs
-    trust: Trust
+    trust: StepChecks
     coarse: CoarsePoses  # the trajectory, its pieces in one world
-    joints: tuple[Joint, ...] = ()  # of those pieces
+    joints: tuple[SegmentAlignment, ...] = ()  # of those pieces
 
     @property
     def counts(self) -> Counts:
@@ -236,7 +236,7 @@ def match_again(context: MatchContext, found: VerifiedPairs, steps: set[int]) ->
 
 def _judge(
     found: VerifiedPairs, keypoints: Keypoints, coarse: CoarsePoses, settings: RefineSettings
-) -> Trust:
+) -> StepChecks:
     steps = image_steps(found, keypoints)
     logs, sigmas = _length_ratios(found, steps, keypoints, coarse.absent)
     return judgement.judge(coarse, steps, logs, sigmas, settings.verify, settings.priors)

@@ -12,7 +12,7 @@ from gsba.loop_closure.join_evidence import Places as KnownPlaces
 from gsba.loop_closure.join_test import JoinTest, Judged
 from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
 from gsba.loop_closure.pose_graph import Loop
-from gsba.loop_closure.retrieval import looks_of
+from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import recovery
 from gsba.odometry.places import Places
 from gsba.odometry.pose_graph import Constraint
@@ -44,7 +44,7 @@ def find_loops(places: Places, unseen: np.ndarray) -> list[Constraint]:
         unseen: (P - 1,) bool, steps between places that no image tells.
     """
     solved, context, num = places.solved, places.context, len(places.keyframes)
-    looks = looks_of(context.strongest, num, context.settings.seed, context.workers)
+    looks = global_descriptors(context.strongest, num, context.settings.seed, context.workers)
     chosen = loops.candidates(looks, solved, unseen, context.settings)
     strongest = replace(context, frames=context.strongest)
     verified = recovery.match_anywhere(strongest, chosen, rivals=False)

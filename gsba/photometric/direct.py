@@ -11,7 +11,7 @@ from factors.patch_windows import PatchPixels, PatchTable, patch_spans, poor_vie
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
 from gsba.bundle import adjustment, prior_factors, triangulation
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.optimizer import OptimizeResult, optimize
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import PhotometricSettings, RefineSettings
@@ -63,7 +63,7 @@ def refine(
     frames: FrameSet,
     keypoints: Keypoints,
     start: Solution,
-    problem: Problem,
+    problem: AdjustmentContext,
     lenses: Lenses = ONE_CENTRE,
 ) -> PhotometricResult:
     """Refine a solved map by the grey values of patches, level after level.
@@ -206,7 +206,7 @@ def _solve(
     trust: np.ndarray,
     keypoints: Keypoints,
     solved: Solution,
-    problem: Problem,
+    problem: AdjustmentContext,
 ) -> tuple[Solution, np.ndarray, np.ndarray]:
     """The joint solve, repeated once where frames are doubted: their weights, their residuals.
 

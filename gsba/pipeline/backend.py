@@ -20,13 +20,13 @@ from gsba.bundle import (
     tracks,
     triangulation,
 )
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.camera_system import CameraCovariances, CameraSystem
 from gsba.bundle.gauge import Gauge
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of
 from gsba.bundle.map_strength import MapStrength
-from gsba.bundle.readout import Readout
+from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.reconstruction import assemble, world_scale
 from gsba.bundle.self_calibration import SelfCalibration
 from gsba.camera.lens import ONE_CENTRE, Lenses
@@ -40,7 +40,7 @@ from gsba.loop_closure.merged_map import Registered, follow
 from gsba.matching import correspondences
 from gsba.photometric import direct
 from gsba.photometric.direct import PhotometricResult
-from gsba.pipeline.frontend import Seen
+from gsba.pipeline.frontend import ObservedFrames
 from gsba.pipeline.map import Map
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
@@ -68,7 +68,7 @@ _WIDE = 30.0  # gate in standard deviations of observations that a wrong camera 
 
 def adjust(
     run: Run,
-    seen: Seen,
+    seen: ObservedFrames,
     prior: Prior,
     name: str,
     matches: Sequence[Matches],
@@ -102,7 +102,12 @@ def align_gauge(run: Run, prior: Prior, solved: Solution, name: str) -> tuple[Pr
 
 
 def place(
-    run: Run, seen: Seen, prior: Prior, name: str, matches: Sequence[Matches], solved: Solution
+    run: Run,
+    seen: ObservedFrames,
+    prior: Prior,
+    name: str,
+    matches: Sequence[Matches],
+    solved: Solution,
 ) -> Solution:
     """Points of these matches under poses as they are."""
     settings = run.settings
@@ -122,7 +127,12 @@ def place(
 
 
 def guess_axes(
-    run: Run, seen: Seen, prior: Prior, name: str, matches: Sequence[Matches], solved: Solution
+    run: Run,
+    seen: ObservedFrames,
+    prior: Prior,
+    name: str,
+    matches: Sequence[Matches],
+    solved: Solution,
 ) -> LensAxes:
     """Which way two lenses would look, from matches as they came."""
 
@@ -133,8 +143,13 @@ def guess_axes(
     return _of_matches(run, seen, prior, name, matches, solved, found, LensAxes)
 
 
-def calibrate(
-    run: Run, seen: Seen, prior: Prior, name: str, matches: Sequence[Matches], solved: Solution
+def self_calibrate_lenses(
+    run: Run,
+    seen: ObservedFrames,
+    prior: Prior,
+    name: str,
+    matches: Sequence[Matches],
+    solved: Solution,
 ) -> SelfCalibration:
     """What the lenses of raw pairs are, from matches that no solution has chosen among."""
 
@@ -146,7 +161,12 @@ def calibrate(
 
 
 def find_lenses(
-    run: Run, seen: Seen, prior: Prior, name: str, matches: Sequence[Matches], solved: Solution
+    run: Run,
+    seen: ObservedFrames,
+    prior: Prior,
+    name: str,
+    matches: Sequence[Matches],
+    solved: Solution,
 ) -> LensCentres:
     """Where the lenses are, from matches that no solution has chosen among."""
 
@@ -158,7 +178,12 @@ def find_lenses(
 
 
 def find_stitch_radius(
-    run: Run, seen: Seen, prior: Prior, name: str, matches: Sequence[Matches], solved: Solution
+    run: Run,
+    seen: ObservedFrames,
+    prior: Prior,
+    name: str,
+    matches: Sequence[Matches],
+    solved: Solution,
 ) -> StitchRadius:
     """How far away panoramas take things to be, from the same under two lenses."""
 
@@ -169,41 +194,46 @@ def find_stitch_radius(
 
 
 def find_readout(
-    run: Run, seen: Seen, prior: Prior, name: str, matches: Sequence[Matches], solved: Solution
-) -> Readout:
+    run: Run,
+    seen: ObservedFrames,
+    prior: Prior,
+    name: str,
+    matches: Sequence[Matches],
+    solved: Solution,
+) -> CameraEstimate:
     """How long rows are read and which way, from the same."""
 
-    def found(wide: Solution) -> Readout:
+    def found(wide: Solution) -> CameraEstimate:
         shown, times = seen.shown.bearings_rig, run.frames.timestamps
         problem = run.problem(prior, wide)
         given = wide.landmarks, seen.keypoints, shown, wide, seen.lenses, times, problem
         return readout.estimate(*given)
 
-    return _of_matches(run, seen, prior, name, matches, solved, found, Readout, noted=True)
+    return _of_matches(run, seen, prior, name, matches, solved, found, CameraEstimate, noted=True)
 
 
 def settle_camera(
     run: Run,
-    seen: Seen,
+    seen: ObservedFrames,
     prior: Prior,
     name: str,
     matches: Sequence[Matches],
     solved: Solution,
-    camera: Readout,
-) -> Readout:
+    camera: CameraEstimate,
+) -> CameraEstimate:
     """The camera that was found, from the same, and each frame's own motion and axes."""
 
-    def found(wide: Solution) -> Readout:
+    def found(wide: Solution) -> CameraEstimate:
         shown, times = seen.shown.bearings_rig, run.frames.timestamps
         problem = run.problem(prior, wide)
         return CameraSystem(wide, seen.keypoints, shown, camera, times, problem).step()
 
-    return _of_matches(run, seen, prior, name, matches, solved, found, Readout)
+    return _of_matches(run, seen, prior, name, matches, solved, found, CameraEstimate)
 
 
 def _under_lenses(
-    run: Run, seen: Seen, prior: Prior, wide: Solution
-) -> tuple[Landmarks, Keypoints, np.ndarray, Solution, Lenses, Problem]:
+    run: Run, seen: ObservedFrames, prior: Prior, wide: Solution
+) -> tuple[Landmarks, Keypoints, np.ndarray, Solution, Lenses, AdjustmentContext]:
     """What is asked of a map for what its lenses do to pictures."""
     shown, problem = seen.shown.bearings_rig, run.problem(prior, wide)
     return wide.landmarks, seen.keypoints, shown, wide, seen.lenses, problem
@@ -211,7 +241,7 @@ def _under_lenses(
 
 def _of_matches(
     run: Run,
-    seen: Seen,
+    seen: ObservedFrames,
     prior: Prior,
     name: str,
     matches: Sequence[Matches],
@@ -248,10 +278,16 @@ def camera_key(run: Run) -> list[object]:
     """Settings that what is found of the camera rests on."""
     camera = run.settings.camera
     said = camera.model_dump(exclude={"name", "baseline_mm", "readout_ms"})
-    return [run.solving_key(), said, camera.readout(), camera.nearness(1.0), run.settings.seed]
+    return [
+        run.solving_key(),
+        said,
+        camera.readout(),
+        camera.inverse_stitch_radius(1.0),
+        run.settings.seed,
+    ]
 
 
-def _tracks(seen: Seen, prior: Prior, matches: Sequence[Matches]) -> Tracks:
+def _tracks(seen: ObservedFrames, prior: Prior, matches: Sequence[Matches]) -> Tracks:
     """Tracks that matches make, within parts that nothing ties together yet."""
     tied = [connectivity.within(some, prior.parts) for some in matches]
     found = tracks.build(tied, np.diff(seen.keypoints.starts))
@@ -285,7 +321,7 @@ def scattered(run: Run, prior: Prior, near: VerifiedPairs, solved: Solution) -> 
 
 
 def merge_maps(
-    run: Run, seen: Seen, prior: Prior, solved: Solution, parts: np.ndarray
+    run: Run, seen: ObservedFrames, prior: Prior, solved: Solution, parts: np.ndarray
 ) -> tuple[Prior, Registered]:
     """Parts of the map joined where they meet, frames in none of them registered."""
     trust = prior.trust
@@ -305,9 +341,9 @@ def merge_maps(
     return prior, merged
 
 
-def measure_strength(run: Run, seen: Seen, prior: Prior, solved: Solution) -> Prior:
+def measure_strength(run: Run, seen: ObservedFrames, prior: Prior, solved: Solution) -> Prior:
     """What images hold well goes without priors; the rest are worth what the others show."""
-    closer, settings, trust = run.settings.closer, run.settings.priors, prior.trust
+    limits, settings, trust = run.settings.weak_frames, run.settings.priors, prior.trust
 
     def compute() -> MapStrength:
         problem = run.problem(prior, None, settings.faint())
@@ -321,12 +357,12 @@ def measure_strength(run: Run, seen: Seen, prior: Prior, solved: Solution) -> Pr
             prior.coarse.world_T_rigs,
             ~trust.unseen_steps,
             ~trust.false_steps,
-            closer,
+            limits,
             settings,
             prior.parts,
         )
 
-    strength = run.stage("strength", [run.solving_key(), closer], compute, MapStrength)
+    strength = run.stage("strength", [run.solving_key(), limits], compute, MapStrength)
     return replace(prior, strength=strength)
 
 
@@ -403,7 +439,7 @@ def measure_camera(run: Run, prior: Prior, world: Map) -> Map:
             world.solution,
             world.lenses.seen(straight),
             straight.bearings_rig,
-            world.seeing(),
+            world.camera(),
             run.frames.timestamps,
             run.problem(prior, world.solution),
         )
@@ -411,12 +447,12 @@ def measure_camera(run: Run, prior: Prior, world: Map) -> Map:
 
     found = run.stage("camera", camera_key(run), compute, CameraCovariances, noted=False)
     centres = replace(world.centres, covariance=found.centre)
-    seeing = world.seeing()
+    seeing = world.camera()
     read = replace(seeing, readout_sigma=readout.total_sigma(seeing, found.readout_sigma))
-    return replace(world, centres=centres, covariances=found).read(read)
+    return replace(world, centres=centres, covariances=found).with_camera(read)
 
 
-def reconstruct(run: Run, seen: Seen, prior: Prior, world: Map) -> Reconstruction:
+def reconstruct(run: Run, seen: ObservedFrames, prior: Prior, world: Map) -> Reconstruction:
     """Covariances, and everything back in the trajectory's world; of a turn, rotations alone."""
     if prior.turning_only:
         return _reconstruct_rotations(run, seen, prior)
@@ -470,7 +506,7 @@ def keep_lenses(run: Run, world: Map, result: Reconstruction) -> Lenses:
     return run.stage("lenses", [], lambda: lenses, Lenses, noted=False)
 
 
-def _reconstruct_rotations(run: Run, seen: Seen, prior: Prior) -> Reconstruction:
+def _reconstruct_rotations(run: Run, seen: ObservedFrames, prior: Prior) -> Reconstruction:
     """Rotations alone, of a camera that stayed in one place."""
     least, poses = run.settings.rounds.min_observations, prior.start().world_T_rigs
 

@@ -32,7 +32,7 @@ _DARK = 32  # of 255
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ObservedFrames:
     """What was found in the frames."""
 
     features: tuple[PerFrame[Features], ...]  # (F,) stage that holds each frame's
@@ -45,21 +45,21 @@ class Seen:
         """Of all frames, as rays of the lenses."""
         return self.context.keypoints
 
-    def through(self, lenses: Lenses) -> "Seen":
+    def through(self, lenses: Lenses) -> "ObservedFrames":
         """The same, its keypoints as rays that start at these lenses."""
         context = replace(self.context, keypoints=lenses.seen(self.shown), lenses=lenses)
         return replace(self, context=context, lenses=lenses)
 
 
-def extract(run: Run) -> Seen:
+def extract(run: Run) -> ObservedFrames:
     """Keypoints of all frames."""
     found = _extract(run, run.settings)
     return _see(run, "keypoints", [found] * len(run.frames), "features")
 
 
-def extract_more(run: Run, seen: Seen, weak: np.ndarray) -> Seen:
+def extract_more(run: Run, seen: ObservedFrames, weak: np.ndarray) -> ObservedFrames:
     """More keypoints at some frames (F,) bool, and those of the others as they were."""
-    more = run.settings.closer.model_dump(include={"max_per_face", "contrast_threshold"})
+    more = run.settings.weak_frames.model_dump(include={"max_per_face", "contrast_threshold"})
     enlarged = run.settings.features.model_copy(update=more)
     settings = run.settings.model_copy(update={"features": enlarged})
     found = _extract(run, settings, "features_closer", weak)
@@ -75,7 +75,7 @@ def _extract(
     return extraction.extract(run.store, run.frames, run.rig, settings, make, files, name, chosen)
 
 
-def _see(run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str) -> Seen:
+def _see(run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str) -> ObservedFrames:
     """Features of each frame (F,), ready to be matched; `stage`: the last one they are of."""
     frames, settings = run.frames, run.matching_settings
 
@@ -93,11 +93,11 @@ def _see(run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str) -
         run.store.workers,
         learned.make_matcher(settings, run.weights, run.rig.size),
     )
-    return Seen(tuple(found), keypoints, context)
+    return ObservedFrames(tuple(found), keypoints, context)
 
 
 def match_neighbours(
-    run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]
+    run: Run, seen: ObservedFrames, prior: Prior, given: Sequence[Trajectory]
 ) -> tuple[Prior, VerifiedPairs]:
     """Verified matches of frames next to one another in time, the clock set right first.
 
@@ -128,7 +128,7 @@ def match_neighbours(
     return prior, _match_neighbours(run, seen, prior, "neighbours_on_time")
 
 
-def _match_neighbours(run: Run, seen: Seen, prior: Prior, name: str) -> VerifiedPairs:
+def _match_neighbours(run: Run, seen: ObservedFrames, prior: Prior, name: str) -> VerifiedPairs:
     if prior.absent:
         return VerifiedPairs.none()
     compute = partial(correspondences.match_neighbours, seen.context, prior.start())
@@ -136,7 +136,7 @@ def _match_neighbours(run: Run, seen: Seen, prior: Prior, name: str) -> Verified
 
 
 def judge_trajectory(
-    run: Run, seen: Seen, prior: Prior, near: VerifiedPairs
+    run: Run, seen: ObservedFrames, prior: Prior, near: VerifiedPairs
 ) -> tuple[Prior, VerifiedPairs]:
     """The trajectory without what images contradict; neighbours once more where it misled.
 
@@ -160,7 +160,7 @@ def judge_trajectory(
     return replace(prior, coarse=coarse), near
 
 
-def align_imu(run: Run, seen: Seen, prior: Prior, near: VerifiedPairs) -> Prior:
+def align_imu(run: Run, seen: ObservedFrames, prior: Prior, near: VerifiedPairs) -> Prior:
     """What a gyro says of the frames' turning, found from how neighbours turn."""
     readings, times = run.imu, run.frames.timestamps
     if readings is None:
@@ -188,14 +188,14 @@ def _hindrance(run: Run) -> str:
 
 
 def match_along_epipolars(
-    run: Run, seen: Seen, solved: Solution, name: str = "adjacent"
+    run: Run, seen: ObservedFrames, solved: Solution, name: str = "adjacent"
 ) -> Matches:
     """Matches of neighbours in time along their solved epipolar lines."""
     compute = partial(correspondences.match_along_epipolars, seen.context, solved)
     return run.stage(name, run.matching_key(), compute, Matches)
 
 
-def match_across(run: Run, seen: Seen, merged: Registered, parts: np.ndarray) -> Matches:
+def match_across(run: Run, seen: ObservedFrames, merged: Registered, parts: np.ndarray) -> Matches:
     """Verified matches of frames whose parts (F,) of the map were joined by images."""
     given = seen.context, merged.solved, parts, merged.met
     compute = partial(correspondences.match_across, *given)
@@ -203,7 +203,7 @@ def match_across(run: Run, seen: Seen, merged: Registered, parts: np.ndarray) ->
 
 
 def match_known_points(
-    run: Run, seen: Seen, solved: Solution, name: str, loops_closed: bool = True
+    run: Run, seen: ObservedFrames, solved: Solution, name: str, loops_closed: bool = True
 ) -> Matches:
     """Matches of solved points in frames further apart."""
     compute = partial(correspondences.match_known_points, seen.context, solved, loops_closed)
@@ -211,7 +211,7 @@ def match_known_points(
 
 
 def close_loops(
-    run: Run, seen: Seen, prior: Prior, solved: Solution
+    run: Run, seen: ObservedFrames, prior: Prior, solved: Solution
 ) -> tuple[Prior, Solution, Matches]:
     """Matches of places met again, and the map, bent first where drift had hidden them."""
     near = _match_loops(run, seen, solved, "loops")
@@ -221,14 +221,14 @@ def close_loops(
     return prior, bent, near.matches
 
 
-def _match_loops(run: Run, seen: Seen, solved: Solution, name: str) -> VerifiedPairs:
+def _match_loops(run: Run, seen: ObservedFrames, solved: Solution, name: str) -> VerifiedPairs:
     """Verified matches of frames that met the same place again."""
     compute = partial(correspondences.match_loops, seen.context, solved)
     return run.stage(name, run.matching_key(), compute, VerifiedPairs)
 
 
 def _meet_places(
-    run: Run, seen: Seen, prior: Prior, solved: Solution, near: VerifiedPairs
+    run: Run, seen: ObservedFrames, prior: Prior, solved: Solution, near: VerifiedPairs
 ) -> tuple[Prior, Solution]:
     """The map bent so that places met again meet, where guided search could not reach them."""
     trust = prior.trust

@@ -9,7 +9,7 @@ from gsba.bundle import stitching
 from gsba.bundle.camera_system import CameraCovariances
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius
-from gsba.bundle.readout import Readout
+from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.self_calibration import SelfCalibration
 from gsba.bundle.stitching import Stitching
 from gsba.camera.lens import Lenses
@@ -32,7 +32,7 @@ class Map:
     axes: LensAxes | None = None  # where these look; None = not looked for
     radius: StitchRadius | None = None  # what panoramas are stitched for; None = not looked for
     calibrated: SelfCalibration | None = None  # of raw pairs; None = not looked for
-    readout: Readout | None = None  # how lenses are read; None = not looked for
+    readout: CameraEstimate | None = None  # how lenses are read; None = not looked for
     covariances: CameraCovariances | None = None  # with these unknown beside the poses
     moves: tuple[Move, ...] = ()  # of the poses against a splat
 
@@ -47,7 +47,7 @@ class Map:
         weights = np.ones(len(solution.world_T_rigs))
         return cls(solution, keypoints, weights, centres=centres)
 
-    def read(self, readout: Readout) -> "Map":
+    def with_camera(self, readout: CameraEstimate) -> "Map":
         """The same seen by another camera."""
         if self.centres is None:
             return self
@@ -65,10 +65,10 @@ class Map:
         """What sees the observations."""
         return Lenses() if self.centres is None else self.centres.lenses
 
-    def seeing(self) -> Readout:
+    def camera(self) -> CameraEstimate:
         """The camera."""
         if self.readout is None:
-            return Readout(self.lenses, reason="not looked for")
+            return CameraEstimate(self.lenses, reason="not looked for")
         return replace(self.readout, lenses=self.lenses)
 
     def keypoints(self, rig: CubeRig) -> Keypoints:

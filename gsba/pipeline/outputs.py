@@ -113,8 +113,8 @@ def _calibration(
     baseline, metres = settings.camera.baseline(), None
     if baseline is not None and result.lens_baseline is not None:
         metres = metres_per_unit(result.lens_baseline, baseline)[0]
-    read = world.seeing()
-    more = {"readout_s": read.readout_s} if read.lenses.twists is not None else {}
+    read = world.camera()
+    more = {"readout_s": read.readout_s} if read.lenses.readout_motion is not None else {}
     centre = lenses.centre * (1.0 if metres is None else metres)
     return calibration_json(pair, centre, "map" if metres is None else "m", more)
 
@@ -152,7 +152,7 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
         anchors = anchor(poses, run.fixes, run.settings.gps, prior.parts)
         gps, more = of_gps(run.fixes, anchors, poses, frames)
         notes += more
-    most = run.settings.closer.max_scale_sigma
+    most = run.settings.weak_frames.max_scale_sigma
     notes += findings.of_frames(frames, coarse, result, world.frame_weights, most)
     report = build_report(
         settings=run.settings,

@@ -16,7 +16,7 @@ from gsba.bundle import (
 )
 from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.lens_axes import LensAxes
-from gsba.bundle.readout import Readout
+from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.self_calibration import SelfCalibration
 from gsba.bundle.stitching import Stitching
 from gsba.photometric import alignment
@@ -110,7 +110,7 @@ def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, n
 
     def placed_anew() -> tuple[Solution, Keypoints]:
         there = replace(sighted, keypoints=world.rays(sighted.keypoints, run.rig))
-        there = adjustment.calibrate(there, world.solution, run.settings)
+        there = adjustment.rescale_noise(there, world.solution, run.settings)
         placed = triangulation.place(
             there.tracks,
             there.keypoints,
@@ -129,15 +129,15 @@ def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, n
     shown = stitching.corrected(sighted.keypoints, world.field, run.rig).bearings_rig
     times = run.frames.timestamps
 
-    def rows() -> Readout:
+    def rows() -> CameraEstimate:
         solved, keypoints = placed_anew()
         around, problem = solved.landmarks, run.problem(prior, solved)
         return readout.estimate(around, keypoints, shown, solved, world.lenses, times, problem)
 
-    def settle() -> Readout:
+    def settle() -> CameraEstimate:
         solved, keypoints = placed_anew()
         problem = run.problem(prior, solved)
-        return CameraSystem(solved, keypoints, shown, world.seeing(), times, problem).step()
+        return CameraSystem(solved, keypoints, shown, world.camera(), times, problem).step()
 
     def lenses() -> SelfCalibration:
         solved, keypoints = placed_anew()
@@ -146,17 +146,19 @@ def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, n
         return self_calibration.estimate(*given, run.frames.lenses_nominal)
 
     key = backend.camera_key(run)
-    if number == 0 and world.lenses.twists is None:
-        world = world.read(run.stage(f"readout_{name}", key, rows, Readout))
+    if number == 0 and world.lenses.readout_motion is None:
+        world = world.with_camera(run.stage(f"readout_{name}", key, rows, CameraEstimate))
     raw = run.frames.fisheyes is not None
     if number == 1 and raw and world.lenses.fisheyes is None:  # the rest has settled
         known = run.stage(f"calibrated_{name}", key, lenses, SelfCalibration)
         world = replace(world, calibrated=known)
-        world = world.read(replace(world.seeing(), lenses=known.lenses))
+        world = world.with_camera(replace(world.camera(), lenses=known.lenses))
     if number == 1 and not run.frames.lens_axes_known and world.lenses.axes is None:
         found = run.stage(f"axes_{name}", key, axes, LensAxes)
-        world = replace(world, axes=found).read(replace(world.seeing(), lenses=found.lenses))
-    return world.read(run.stage(f"camera_{name}_{number}", key, settle, Readout, noted=False))
+        world = replace(world, axes=found).with_camera(replace(world.camera(), lenses=found.lenses))
+    return world.with_camera(
+        run.stage(f"camera_{name}_{number}", key, settle, CameraEstimate, noted=False)
+    )
 
 
 def _adjust_aligned(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str) -> Map | None:

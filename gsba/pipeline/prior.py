@@ -12,9 +12,9 @@ from gsba.config import PriorSettings
 from gsba.imu.alignment import Alignment
 from gsba.loop_closure.merged_map import Registered, side_by_side
 from gsba.trajectory.clock import ClockEstimate
-from gsba.trajectory.joining import Joint
-from gsba.trajectory.judgement import Trust
-from gsba.types import CoarsePoses, Solution, Turning
+from gsba.trajectory.joining import SegmentAlignment
+from gsba.trajectory.judgement import StepChecks
+from gsba.types import CoarsePoses, GyroConstraints, Solution
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,19 +22,19 @@ class Prior:
     """What is believed of the trajectory; its factors and the start follow from that."""
 
     coarse: CoarsePoses  # the trajectory at the frames' times
-    trust: Trust  # which of its steps hold, and where to start instead
+    trust: StepChecks  # which of its steps hold, and where to start instead
     clock: ClockEstimate | None = None  # None = not checked
-    joints: tuple[Joint, ...] = ()  # of pieces of the trajectory
+    joints: tuple[SegmentAlignment, ...] = ()  # of pieces of the trajectory
     parts: np.ndarray | None = None  # (F,) int64, parts that nothing ties together; None = one
     merged: Registered | None = None  # parts of the map, joined; None = it never was in parts
     strength: MapStrength | None = None  # of the map, by images alone; None = not measured
     gyro: Alignment | None = None  # of the sensor that rides along; None = there is none
-    turning: Turning | None = None  # what it says of the frames; None = it is not believed
+    turning: GyroConstraints | None = None  # what it says of the frames; None = it is not believed
 
     @classmethod
     def of(cls, coarse: CoarsePoses) -> "Prior":
         """The trajectory, believed as it is."""
-        return cls(coarse, Trust.of_all(coarse.world_T_rigs))
+        return cls(coarse, StepChecks.of_all(coarse.world_T_rigs))
 
     @property
     def absent(self) -> bool:

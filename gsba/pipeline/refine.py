@@ -26,7 +26,7 @@ from gsba.masks.segmentation import Segment
 from gsba.odometry import Odometry
 from gsba.photometric import direct
 from gsba.pipeline import acceptance, backend, densify, frontend, inputs, outputs, patch_rounds
-from gsba.pipeline.frontend import Seen
+from gsba.pipeline.frontend import ObservedFrames
 from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
@@ -199,7 +199,9 @@ def _refine(
     return written
 
 
-def _solve_raw(run: Run, prior: Prior, given: Sequence[Trajectory]) -> tuple[Run, Seen, Prior, Map]:
+def _solve_raw(
+    run: Run, prior: Prior, given: Sequence[Trajectory]
+) -> tuple[Run, ObservedFrames, Prior, Map]:
     """The method; raw pairs anew, cut by what their lenses turned out to be, where that is far off.
 
     Returns:
@@ -240,7 +242,7 @@ def _cut_better(coarse: CoarsePoses, world: Map) -> _Cut | None:
     """What raw pairs are better cut by, in the trajectory's axes, and whether that was found, not
     given; None = they are cut well."""
     lenses = world.lenses
-    if lenses.cut_by is None:
+    if lenses.reference_calibration is None:
         return None
     found, turn = self_calibration.now(lenses), np.eye(3)
     if (coarse.sources == PoseSource.SLAM).any():
@@ -252,7 +254,9 @@ def _cut_better(coarse: CoarsePoses, world: Map) -> _Cut | None:
     return turned(found, turn), lenses.fisheyes is not None
 
 
-def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tuple[Prior, Map]:
+def solve(
+    run: Run, seen: ObservedFrames, prior: Prior, given: Sequence[Trajectory]
+) -> tuple[Prior, Map]:
     """The method: from keypoints and a coarse trajectory to poses and points.
 
     A stage that is optional takes a map and gives one: it is left out by leaving out its line.
@@ -292,8 +296,8 @@ def solve(run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]) -> tu
 
 
 def _map_features(
-    run: Run, seen: Seen, prior: Prior, given: Sequence[Trajectory]
-) -> tuple[Prior, Seen, Map, Matches]:
+    run: Run, seen: ObservedFrames, prior: Prior, given: Sequence[Trajectory]
+) -> tuple[Prior, ObservedFrames, Map, Matches]:
     """One map of all frames' features, the camera that sees them, and how well images hold it.
 
     Returns:
@@ -328,7 +332,7 @@ def _map_features(
 
 
 def _match_from_itself(
-    run: Run, seen: Seen, prior: Prior, solved: Solution, along: Matches, prefix: str = ""
+    run: Run, seen: ObservedFrames, prior: Prior, solved: Solution, along: Matches, prefix: str = ""
 ) -> tuple[Solution, list[Matches]]:
     """The map after its own points were looked for everywhere, and the matches it is made of."""
     rounds, matches = run.settings.rounds, [along]
@@ -342,7 +346,7 @@ def _match_from_itself(
 
 def _merge_maps(
     run: Run,
-    seen: Seen,
+    seen: ObservedFrames,
     prior: Prior,
     near: VerifiedPairs,
     solved: Solution,
@@ -363,12 +367,12 @@ def _merge_maps(
 
 def _find_camera(
     run: Run,
-    seen: Seen,
+    seen: ObservedFrames,
     prior: Prior,
     matches: Sequence[Matches],
     solved: Solution,
     prefix: str = "",
-) -> tuple[Seen, Map]:
+) -> tuple[ObservedFrames, Map]:
     """Lenses and readout, before gates take what tells of them; and the map that these give.
 
     Args:
@@ -409,10 +413,10 @@ def _find_camera(
 
 
 def _find_raw_camera(
-    run: Run, seen: Seen, prior: Prior, matches: Sequence[Matches], solved: Solution
-) -> tuple[Seen, Map]:
+    run: Run, seen: ObservedFrames, prior: Prior, matches: Sequence[Matches], solved: Solution
+) -> tuple[ObservedFrames, Map]:
     """As `_find_camera`, of raw pairs: where their lenses are, and what they are."""
-    looking = seen.through(Lenses(band_rad=float(SEAM), cut_by=run.frames.fisheyes))
+    looking = seen.through(Lenses(band_rad=float(SEAM), reference_calibration=run.frames.fisheyes))
     better, gates = solved, run.settings.rounds.loops
     for n in range(2):
         found = backend.find_lenses(run, looking, prior, f"lenses{n}", matches, better)
@@ -422,13 +426,15 @@ def _find_raw_camera(
     world = Map.of(better, seen.shown, found)
     looking, world = _settle_camera(run, looking, prior, matches, world, "settled")
     if run.lenses_found:  # patches say more of them than features do
-        read = world.seeing()
-        free = replace(read.lenses, fisheyes=read.lenses.cut_by)
-        return looking, world.read(replace(read, lenses=free))
-    known = backend.calibrate(run, looking, prior, "calibrated", matches, world.solution)
+        read = world.camera()
+        free = replace(read.lenses, fisheyes=read.lenses.reference_calibration)
+        return looking, world.with_camera(replace(read, lenses=free))
+    known = backend.self_calibrate_lenses(
+        run, looking, prior, "calibrated", matches, world.solution
+    )
     world = replace(world, calibrated=known)
     for n in range(0 if known.reason else _CALIBRATIONS):
-        world = world.read(replace(world.seeing(), lenses=known.lenses)) if n == 0 else world
+        world = world.with_camera(replace(world.camera(), lenses=known.lenses)) if n == 0 else world
         looking, better = seen.through(world.lenses), world.solution
         better = backend.adjust(run, looking, prior, f"recalibrated{n}", matches, better, gates)
         along = frontend.match_along_epipolars(run, looking, better, f"adjacent_raw{n}")
@@ -442,11 +448,16 @@ def _find_raw_camera(
 
 
 def _settle_camera(
-    run: Run, looking: Seen, prior: Prior, matches: Sequence[Matches], world: Map, name: str
-) -> tuple[Seen, Map]:
+    run: Run,
+    looking: ObservedFrames,
+    prior: Prior,
+    matches: Sequence[Matches],
+    world: Map,
+    name: str,
+) -> tuple[ObservedFrames, Map]:
     """All that is known of the camera found together, how rows are read first."""
-    gates, solved, read = run.settings.rounds.dense, world.solution, world.seeing()
-    if read.lenses.twists is None:
+    gates, solved, read = run.settings.rounds.dense, world.solution, world.camera()
+    if read.lenses.readout_motion is None:
         read = backend.find_readout(run, looking, prior, f"{name}_readout", matches, solved)
     for n in range(_CAMERA_ROUNDS):
         looking = looking.through(read.lenses)
@@ -454,15 +465,15 @@ def _settle_camera(
         read = backend.settle_camera(run, looking, prior, key, matches, solved, read)
         looking = looking.through(read.lenses)
         solved = backend.adjust(run, looking, prior, f"{name}{n}", matches, solved, gates)
-    return looking, replace(world, solution=solved).read(read)
+    return looking, replace(world, solution=solved).with_camera(read)
 
 
 def _look_closer(
-    run: Run, seen: Seen, prior: Prior, solved: Solution, along: Matches
-) -> tuple[Seen, Solution, Matches]:
+    run: Run, seen: ObservedFrames, prior: Prior, solved: Solution, along: Matches
+) -> tuple[ObservedFrames, Solution, Matches]:
     """More keypoints where images hold the map poorly, and the map that these give."""
     weak = prior.weak_frames()
-    if run.settings.closer.mode == "off" or not weak.any():
+    if run.settings.weak_frames.mode == "off" or not weak.any():
         return seen, solved, along
     seen = frontend.extract_more(run, seen, weak)
     along = frontend.match_along_epipolars(run, seen, solved, "adjacent_closer")

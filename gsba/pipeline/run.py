@@ -9,7 +9,7 @@ import numpy as np
 
 from gsba import learned
 from gsba.bundle import gps_factors
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.families import Families, Family
 from gsba.bundle.fixes import FrameFixes
 from gsba.camera.rig import CubeRig
@@ -135,7 +135,7 @@ class Run:
 
     def problem(
         self, prior: Prior, solved: Solution | None, noise: PriorSettings | None = None
-    ) -> Problem:
+    ) -> AdjustmentContext:
         """What adjustments share while this is believed of the trajectory.
 
         Args:
@@ -156,7 +156,7 @@ class Run:
         graph = prior.graph(noise, first)
         settings = settings if self.frames.timed else settings.untimed()
         given = graph, self.rig, settings, self.num_threads, prior.turning
-        return Problem(*given, anchors, ungauged, families, prior.parts)
+        return AdjustmentContext(*given, anchors, ungauged, families, prior.parts)
 
     @property
     def matching_settings(self) -> RefineSettings:

@@ -7,7 +7,7 @@ import numpy as np
 from gsba.bundle.camera_system import CameraCovariances
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of
-from gsba.bundle.readout import Readout
+from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.self_calibration import FREE, OF_FRONT, SelfCalibration, undetermined
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
@@ -18,7 +18,7 @@ _CONTRADICTS = 3.0  # standard deviations between what is said of a camera and w
 
 def of_camera(
     centres: LensCentres,
-    readout: Readout | None,
+    readout: CameraEstimate | None,
     axes: LensAxes | None,
     radius: StitchRadius | None,
     known: CameraCovariances | None,
@@ -64,11 +64,13 @@ def of_camera(
         said["gain_of_axes"] = axes.gains
         if centres.lenses.axes is not None:
             notes.append("the lenses turn below the panoramas: a stabiliser was on")
-    nearness = centres.lenses.nearness
+    inverse_stitch_radius = centres.lenses.inverse_stitch_radius
     if radius is not None:
-        said["stitch_radius"] = _of_radius(radius, nearness, known, scale)
-    if nearness:
-        notes.append(f"they are stitched for a radius of {scale / nearness:.3g} map units")
+        said["stitch_radius"] = _of_radius(radius, inverse_stitch_radius, known, scale)
+    if inverse_stitch_radius:
+        notes.append(
+            f"they are stitched for a radius of {scale / inverse_stitch_radius:.3g} map units"
+        )
     if readout is not None:
         said["readout"] = _of_readout(readout, timed)
         if timed:
@@ -128,33 +130,36 @@ def _scale_note(metres: float, sigma: float, baseline: float) -> str:
 
 
 def _of_radius(
-    radius: StitchRadius, nearness: float, known: CameraCovariances | None, scale: float
+    radius: StitchRadius,
+    inverse_stitch_radius: float,
+    known: CameraCovariances | None,
+    scale: float,
 ) -> dict[str, Any]:
-    sigma = radius.sigma if known is None else known.nearness_sigma
+    sigma = radius.sigma if known is None else known.inverse_stitch_radius_sigma
     return {
         "taken": not radius.reason,
         "reason": radius.reason,
-        "inverse": (nearness or radius.nearness) / scale,
-        "inverse_sigma": (sigma if nearness else radius.sigma) / scale,
+        "inverse": (inverse_stitch_radius or radius.inverse_stitch_radius) / scale,
+        "inverse_sigma": (sigma if inverse_stitch_radius else radius.sigma) / scale,
         "gain_of_unseen_parts": radius.part_gains,
     }
 
 
-def _of_readout(found: Readout, timed: bool) -> dict[str, Any]:
-    taken = found.lenses.twists is not None
+def _of_readout(found: CameraEstimate, timed: bool) -> dict[str, Any]:
+    taken = found.lenses.readout_motion is not None
     return {
         "taken": taken,
         "reason": found.reason,
         "ms": 1e3 * found.readout_s if timed else None,
         "ms_sigma": 1e3 * found.readout_sigma if timed else None,
-        "rows_run_along": found.lenses.sweeps if taken else None,
+        "rows_run_along": found.lenses.row_directions if taken else None,
         "gain_of_unseen_parts": found.gains,
     }
 
 
-def _readout_notes(found: Readout, settings: CameraSettings) -> list[str]:
+def _readout_notes(found: CameraEstimate, settings: CameraSettings) -> list[str]:
     """What the images say of the readout, and whether it is what was said."""
-    if found.lenses.twists is None:
+    if found.lenses.readout_motion is None:
         return []
     notes = [
         f"rows are read in {1e3 * found.readout_s:.1f} ms (sigma {1e3 * found.readout_sigma:.1g}), "

@@ -10,8 +10,8 @@ from gsba.bundle.map_strength import scale_sigmas
 from gsba.bundle.stitching import Stitching
 from gsba.loop_closure.merged_map import Registered
 from gsba.trajectory.clock import ClockEstimate
-from gsba.trajectory.joining import GUESS, Joint
-from gsba.trajectory.judgement import Trust
+from gsba.trajectory.joining import GUESS, SegmentAlignment
+from gsba.trajectory.judgement import StepChecks
 from gsba.types import CoarsePoses, FrameSet, PoseSource, PoseStatus, Reconstruction
 
 logger = logging.getLogger(__name__)
@@ -21,10 +21,10 @@ _MANY = 0.1  # part of a trajectory's steps: contradicted, the rest of it is in 
 
 
 def of_trajectory(
-    trust: Trust,
+    trust: StepChecks,
     clock: ClockEstimate | None,
     merged: Registered | None,
-    joints: tuple[Joint, ...],
+    joints: tuple[SegmentAlignment, ...],
     frames: FrameSet,
     absent: bool = False,
 ) -> tuple[dict[str, Any], list[str]]:
@@ -50,7 +50,7 @@ def of_trajectory(
     return found | maps, notes + more
 
 
-def _steps(trust: Trust, frames: FrameSet, absent: bool) -> tuple[dict[str, Any], list[str]]:
+def _steps(trust: StepChecks, frames: FrameSet, absent: bool) -> tuple[dict[str, Any], list[str]]:
     """The judgement by the names of frames, for the report, and what to note of it."""
     names = np.array(frames.names)
 
@@ -82,7 +82,7 @@ def _steps(trust: Trust, frames: FrameSet, absent: bool) -> tuple[dict[str, Any]
 
 
 def _maps(
-    registered: Registered | None, joints: tuple[Joint, ...], frames: FrameSet
+    registered: Registered | None, joints: tuple[SegmentAlignment, ...], frames: FrameSet
 ) -> tuple[dict[str, Any], list[str]]:
     """Pieces, maps and registered frames by their names, for the report, and what to note."""
     names, notes = np.array(frames.names), []

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from gsba.bundle.readout import Readout
+from gsba.bundle.readout import CameraEstimate
 from gsba.imu.alignment import Alignment
-from gsba.types import Turning
+from gsba.types import GyroConstraints
 
 logger = logging.getLogger(__name__)
 
@@ -15,7 +15,10 @@ _LOST = 3.0  # standard deviations beyond which a step of the gyro has next to n
 
 
 def of_gyro(
-    found: Alignment, turning: Turning | None, readout: Readout | None, world_T_rigs: np.ndarray
+    found: Alignment,
+    turning: GyroConstraints | None,
+    readout: CameraEstimate | None,
+    world_T_rigs: np.ndarray,
 ) -> tuple[dict[str, Any], list[str]]:
     """Clock, bias and axes of a gyro, and how much of what it says was used.
 
@@ -43,7 +46,9 @@ def of_gyro(
         logger.warning(note)
         return said, [note]
     steps = _steps_used(turning, world_T_rigs)
-    during = None if readout is None or readout.lenses.twists is None else bool(readout.by_gyro)
+    during = (
+        None if readout is None or readout.lenses.readout_motion is None else bool(readout.by_gyro)
+    )
     said |= {"steps_used": steps, "during_readout": during}
     bias = ", ".join(f"{value:.3g}" for value in np.rad2deg(found.sensor.bias))
     notes = [
@@ -58,7 +63,7 @@ def of_gyro(
     return said, notes
 
 
-def _steps_used(turning: Turning, world_T_rigs: np.ndarray) -> float:
+def _steps_used(turning: GyroConstraints, world_T_rigs: np.ndarray) -> float:
     """Part of all steps about which refined poses agree with the gyro."""
     from scipy.spatial.transform import Rotation
 

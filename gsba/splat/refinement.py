@@ -25,7 +25,7 @@ import numpy as np
 
 from factors import Block, LandmarkBlock
 from gsba.bundle import adjustment, triangulation
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.optimizer import OptimizeResult, optimize
 from gsba.camera.optics import ONE_EYE, Optics
 from gsba.config import SplatSettings
@@ -88,7 +88,7 @@ def refine(
     frames: FrameSet,
     keypoints: Keypoints,
     start: Solution,
-    problem: Problem,
+    problem: AdjustmentContext,
     further: Sequence[Block] = (),
     checkpoint: Path | None = None,
     key: str = "",
@@ -166,7 +166,7 @@ class _Turns:
         self,
         keypoints: Keypoints,
         solved: Solution,
-        problem: Problem,
+        problem: AdjustmentContext,
         further: Sequence[Block],
         split: Split,
     ) -> None:

@@ -7,8 +7,8 @@ Gives a pose for every frame, and which steps to believe.
 from gsba.trajectory.association import associate, matched_in_time, without_trajectory
 from gsba.trajectory.clock import Clock, ClockEstimate
 from gsba.trajectory.files import read_trajectory, write_tum
-from gsba.trajectory.joining import Joint
-from gsba.trajectory.judgement import Trust
+from gsba.trajectory.joining import SegmentAlignment
+from gsba.trajectory.judgement import StepChecks
 from gsba.trajectory.keyframes import follow_keyframes
 from gsba.trajectory.restarts import associate_pieces, split_restarts
 from gsba.trajectory.steps import Steps, image_steps
@@ -16,9 +16,9 @@ from gsba.trajectory.steps import Steps, image_steps
 __all__ = [
     "Clock",
     "ClockEstimate",
-    "Joint",
+    "SegmentAlignment",
+    "StepChecks",
     "Steps",
-    "Trust",
     "associate",
     "associate_pieces",
     "follow_keyframes",

@@ -16,7 +16,7 @@ PLACES, GUESS = "points that both know", "guess: the same pace"
 
 
 @dataclass(frozen=True, slots=True)
-class Joint:
+class SegmentAlignment:
     """How a piece of the trajectory lies in the world of the first: x = scale * R @ own + t."""
 
     first: int  # its first frame
@@ -26,7 +26,7 @@ class Joint:
     how: str
 
 
-def join(coarse: CoarsePoses) -> tuple[CoarsePoses, tuple[Joint, ...]]:
+def join(coarse: CoarsePoses) -> tuple[CoarsePoses, tuple[SegmentAlignment, ...]]:
     """Lay the pieces of a trajectory into the world of the first, each by guess.
 
     Args:
@@ -42,11 +42,13 @@ def join(coarse: CoarsePoses) -> tuple[CoarsePoses, tuple[Joint, ...]]:
         rows = np.flatnonzero(coarse.segments == coarse.segments[before + 1])
         move = _by_pace(before, poses, coarse.segments)
         poses[rows] = move.poses(poses[rows])
-        joints.append(Joint(int(rows[0]), int(rows[-1]), move.scale, move.new_T_old, GUESS))
+        joints.append(
+            SegmentAlignment(int(rows[0]), int(rows[-1]), move.scale, move.new_T_old, GUESS)
+        )
     return replace(coarse, world_T_rigs=poses), tuple(joints)
 
 
-def guessed(joints: tuple[Joint, ...], num_frames: int) -> np.ndarray:
+def guessed(joints: tuple[SegmentAlignment, ...], num_frames: int) -> np.ndarray:
     """Steps (F - 1,) bool over which no image says how two pieces lie."""
     steps = np.zeros(max(num_frames - 1, 0), bool)
     steps[[joint.first - 1 for joint in joints if joint.how == GUESS]] = True

@@ -30,7 +30,7 @@ _NOISE = (
 
 
 @dataclass(frozen=True, slots=True)
-class Trust:
+class StepChecks:
     """Which steps of the trajectory the images contradict, and where to start instead."""
 
     world_T_rigs: np.ndarray  # (F, 4, 4) float64, the trajectory chained past false steps
@@ -41,7 +41,7 @@ class Trust:
     turning_only: bool  # no two frames have parallax: only rotations can be had
 
     @classmethod
-    def of_all(cls, world_T_rigs: np.ndarray) -> "Trust":
+    def of_all(cls, world_T_rigs: np.ndarray) -> "StepChecks":
         """Of a trajectory (F, 4, 4) that nothing contradicts."""
         none = np.zeros(max(len(world_T_rigs) - 1, 0), bool)
         lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
@@ -65,7 +65,7 @@ def judge(
     sigmas: np.ndarray,
     verify: VerifySettings,
     priors: PriorSettings,
-) -> Trust:
+) -> StepChecks:
     """Compare the trajectory's steps with those of the images.
 
     Args:
@@ -112,7 +112,7 @@ def judge(
     named = false_frames(
         wrong, slam, chosen, own, outlier_limits(slam, seen, known & found.directed, verify)
     )
-    return Trust(start, wrong, named, unseen, lengths, False)
+    return StepChecks(start, wrong, named, unseen, lengths, False)
 
 
 def confirmed(coarse: CoarsePoses, found: Steps, priors: PriorSettings) -> np.ndarray:
@@ -127,7 +127,7 @@ def confirmed(coarse: CoarsePoses, found: Steps, priors: PriorSettings) -> np.nd
 
 def _from_images_alone(
     coarse: CoarsePoses, slam: np.ndarray, found: Steps, logs: np.ndarray, sigmas: np.ndarray
-) -> Trust:
+) -> StepChecks:
     """A start from the steps of the images wherever there are any; no step keeps its prior."""
     slam_lengths = np.linalg.norm(slam[:, :3, 3], axis=1)
     lengths = slam_lengths
@@ -144,7 +144,7 @@ def _from_images_alone(
         chosen[:, :3, 3] = 0
     start = _chain(coarse.world_T_rigs, chosen, own)
     every, nobody = np.ones(len(slam), bool), np.zeros(len(slam) + 1, bool)
-    return Trust(start, every, nobody, ~found.verified, lengths, turning_only)
+    return StepChecks(start, every, nobody, ~found.verified, lengths, turning_only)
 
 
 def leaps(world_T_rigs: np.ndarray, timestamps: np.ndarray) -> np.ndarray:

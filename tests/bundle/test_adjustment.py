@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from synthetic import RIG, World, drifted, make_world
 
 from gsba.bundle import adjustment, prior_factors, triangulation
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.optimizer import OptimizeResult
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle
@@ -40,7 +40,7 @@ def _run(
 ) -> Solution:
     priors = prior_factors.build(coarse, settings.priors)
     start = Solution.without_points(coarse)
-    problem = Problem(priors, RIG, settings, 1)
+    problem = AdjustmentContext(priors, RIG, settings, 1)
     return adjustment.adjust(world.tracks, world.keypoints, start, problem, gates)
 
 
@@ -48,7 +48,7 @@ def _covariances(
     solved: Solution, world: World, coarse: np.ndarray, settings: RefineSettings
 ) -> np.ndarray:
     priors = prior_factors.build(coarse, settings.priors)
-    problem = Problem(priors, RIG, settings, 1)
+    problem = AdjustmentContext(priors, RIG, settings, 1)
     return adjustment.pose_covariances(solved, world.keypoints, problem)[0]
 
 

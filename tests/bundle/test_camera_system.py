@@ -10,14 +10,14 @@ from scipy.sparse import csr_matrix
 from synthetic import loop_walk
 
 from factors.quadratic_block import QuadraticBlock
-from factors.reduced import ReducedSystem
+from factors.reduced_camera_system import ReducedSystem
 from gsba.bundle import adjustment
 from gsba.bundle.camera_system import CameraSystem
-from gsba.bundle.readout import Readout
+from gsba.bundle.readout import CameraEstimate
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
 from gsba.similarity import pose_similarity
-from gsba.types import Solution, Turning
+from gsba.types import GyroConstraints, Solution
 
 CENTRE, BAND, READOUT_S = np.array([0.004, -0.003, 0.05]), np.deg2rad(4), 0.03
 SWEEPS = np.array([[-1.0, 0, 0], [0, 1.0, 0]])
@@ -26,11 +26,11 @@ LENSES = Lenses(CENTRE, 0.2, BAND, SWEEPS, motion(loop_walk(24), READOUT_S))
 
 def _settled(
     camera: Lenses,
-    known: Readout,
+    known: CameraEstimate,
     seed: int = 0,
     rounds: int = 5,
     said: CameraSettings | None = None,
-    turning: Turning | None = None,
+    turning: GyroConstraints | None = None,
 ):
     world, shown = seen_through(camera, seed)
     solved = Solution.without_points(world.world_T_rigs)
@@ -44,63 +44,72 @@ def _settled(
 
 
 def test_all_of_a_camera_is_found_from_a_start_that_is_off() -> None:
-    start = replace(LENSES, centre=0.8 * CENTRE, nearness=0.1, twists=0.7 * LENSES.twists)
-    world, found, given = _settled(LENSES, Readout(start, 0.7 * READOUT_S))
+    start = replace(
+        LENSES,
+        centre=0.8 * CENTRE,
+        inverse_stitch_radius=0.1,
+        readout_motion=0.7 * LENSES.readout_motion,
+    )
+    world, found, given = _settled(LENSES, CameraEstimate(start, 0.7 * READOUT_S))
     scale = pose_similarity(given[0].world_T_rigs, world.world_T_rigs).scale
     np.testing.assert_allclose(scale * found.lenses.centre, CENTRE, atol=0.001)
-    assert found.lenses.nearness / scale == pytest.approx(0.2, abs=0.03)
+    assert found.lenses.inverse_stitch_radius / scale == pytest.approx(0.2, abs=0.03)
     assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
 
 
 def test_a_stitch_radius_that_is_said_goes_with_the_lenses() -> None:
     """Both pictures meet 5 m away, the lenses are as far apart as they are said to be."""
     front = float(np.linalg.norm(CENTRE))
-    said = CameraSettings(baseline_mm=2e3 * front, stitch_radius_m=1 / LENSES.nearness)
-    start = replace(LENSES, centre=0.8 * CENTRE, nearness=LENSES.nearness / 0.8)
-    world, found, given = _settled(LENSES, Readout(start, READOUT_S), said=said)
+    said = CameraSettings(baseline_mm=2e3 * front, stitch_radius_m=1 / LENSES.inverse_stitch_radius)
+    start = replace(
+        LENSES, centre=0.8 * CENTRE, inverse_stitch_radius=LENSES.inverse_stitch_radius / 0.8
+    )
+    world, found, given = _settled(LENSES, CameraEstimate(start, READOUT_S), said=said)
     scale = pose_similarity(given[0].world_T_rigs, world.world_T_rigs).scale
     length = float(np.linalg.norm(found.lenses.centre))
-    assert found.lenses.nearness * length == pytest.approx(LENSES.nearness * front)
+    assert found.lenses.inverse_stitch_radius * length == pytest.approx(
+        LENSES.inverse_stitch_radius * front
+    )
     np.testing.assert_allclose(scale * found.lenses.centre, CENTRE, atol=0.001)
     measured = CameraSystem(*given).covariances()
-    assert np.isnan(measured.nearness_sigma) and np.isfinite(measured.readout_sigma)
+    assert np.isnan(measured.inverse_stitch_radius_sigma) and np.isfinite(measured.readout_sigma)
 
 
-def _turning(twists: np.ndarray, known: np.ndarray) -> Turning:
-    """A gyro's rates of frames that turn by twists, where they are known (F,)."""
-    rates = np.where(known[:, None], twists[:, :3] / READOUT_S, np.nan)
-    return Turning(np.zeros((23, 3)), np.full(23, np.inf), rates, np.deg2rad(0.1))
+def _turning(readout_motion: np.ndarray, known: np.ndarray) -> GyroConstraints:
+    """A gyro's rates of frames that turn by readout_motion, where they are known (F,)."""
+    rates = np.where(known[:, None], readout_motion[:, :3] / READOUT_S, np.nan)
+    return GyroConstraints(np.zeros((23, 3)), np.full(23, np.inf), rates, np.deg2rad(0.1))
 
 
 def test_frames_turn_while_they_are_read_as_a_gyro_says() -> None:
     """Nobody else knows that as well; frames that the gyro does not know are found as before."""
     known = np.arange(24) % 6 > 0
-    still = replace(LENSES, twists=LENSES.twists * np.repeat([0.0, 1.0], 3))
-    start, off = Readout(still, 0.8 * READOUT_S), {}
-    for gyro in (None, _turning(LENSES.twists, known)):
+    still = replace(LENSES, readout_motion=LENSES.readout_motion * np.repeat([0.0, 1.0], 3))
+    start, off = CameraEstimate(still, 0.8 * READOUT_S), {}
+    for gyro in (None, _turning(LENSES.readout_motion, known)):
         _, found, _ = _settled(LENSES, start, rounds=4, turning=gyro)
         assert found.by_gyro is (None if gyro is None else True)
         assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
-        off[gyro is None] = np.abs(found.lenses.twists - LENSES.twists)[:, :3]
+        off[gyro is None] = np.abs(found.lenses.readout_motion - LENSES.readout_motion)[:, :3]
     assert np.median(off[False][known]) < 0.2 * np.median(off[True][known])
     assert np.median(off[False][~known]) < 1.2 * np.median(off[True][~known])
 
 
 def test_a_gyro_that_images_contradict_is_not_followed() -> None:
     """As if it were of another time: by as much, but otherwise."""
-    still = replace(LENSES, twists=LENSES.twists * np.repeat([0.0, 1.0], 3))
-    twists = []
-    for gyro in (None, _turning(LENSES.twists[::-1], np.ones(24, bool))):
-        _, found, _ = _settled(LENSES, Readout(still, READOUT_S), rounds=2, turning=gyro)
+    still = replace(LENSES, readout_motion=LENSES.readout_motion * np.repeat([0.0, 1.0], 3))
+    readout_motion = []
+    for gyro in (None, _turning(LENSES.readout_motion[::-1], np.ones(24, bool))):
+        _, found, _ = _settled(LENSES, CameraEstimate(still, READOUT_S), rounds=2, turning=gyro)
         assert not found.by_gyro
-        twists.append(found.lenses.twists)
-    np.testing.assert_array_equal(*twists)
+        readout_motion.append(found.lenses.readout_motion)
+    np.testing.assert_array_equal(*readout_motion)
 
 
 def test_covariances_are_those_of_errors_and_wider_than_of_a_known_camera() -> None:
     errors = []
     for seed in range(4):
-        world, _, given = _settled(LENSES, Readout(LENSES, READOUT_S), seed, 4)
+        world, _, given = _settled(LENSES, CameraEstimate(LENSES, READOUT_S), seed, 4)
         measured = CameraSystem(*given).covariances()
         scale = pose_similarity(given[0].world_T_rigs, world.world_T_rigs).scale
         off = scale * given[3].lenses.centre - CENTRE

@@ -11,7 +11,7 @@ from factors import Block
 from factors.block import PoseSystem
 from gsba import Family, MapSnapshot, X
 from gsba.bundle import adjustment, gauge, prior_factors
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.families import Families
 from gsba.bundle.family_variables import kept, restored
 from gsba.bundle.optimizer import optimize
@@ -131,12 +131,12 @@ class Ranges(Family):
         return graph
 
 
-def _adjusted(world: World, *members: Family) -> tuple[Solution, Problem]:
+def _adjusted(world: World, *members: Family) -> tuple[Solution, AdjustmentContext]:
     """The synthetic world from a drifting start, with families."""
     coarse = drifted(world.world_T_rigs, np.random.default_rng(0))
     families = Families(members, tuple(map(str, range(len(coarse)))), np.arange(float(len(coarse))))
     priors = prior_factors.build(coarse, SETTINGS.priors)
-    problem = Problem(priors, RIG, SETTINGS, 1, families=families)
+    problem = AdjustmentContext(priors, RIG, SETTINGS, 1, families=families)
     start = Solution.without_points(coarse)
     gates = (200.0, 60.0, 20.0, 8.0, 8.0)
     return adjustment.adjust(world.tracks, world.keypoints, start, problem, gates), problem

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import RIG, World, drifted, make_world
 
 from gsba.bundle import adjustment, gps_factors, prior_factors
-from gsba.bundle.adjustment import Problem, values_of
+from gsba.bundle.adjustment import AdjustmentContext, values_of
 from gsba.bundle.fixes import FrameFixes
 from gsba.config import GpsSettings, RefineSettings
 from gsba.geometry import furthest, inverse
@@ -29,11 +29,11 @@ def _fixes(world: World, seed: int, noise: float = 1.0) -> FrameFixes:
     return fixes_at(level + noise * lasting_errors(TIMES, rng), TIMES)
 
 
-def _problem(coarse: np.ndarray, poses: np.ndarray, fixes: FrameFixes | None) -> Problem:
+def _problem(coarse: np.ndarray, poses: np.ndarray, fixes: FrameFixes | None) -> AdjustmentContext:
     """As `gsba.pipeline.run.Run.problem` has it."""
     settings = RefineSettings()
     given = coarse, settings.priors, None, None, poses[0]
-    problem = Problem(prior_factors.build(*given), RIG, settings, 1)
+    problem = AdjustmentContext(prior_factors.build(*given), RIG, settings, 1)
     if fixes is None:
         return problem
     anchors = gps_factors.anchor(poses, fixes, GpsSettings())

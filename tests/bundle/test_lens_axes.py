@@ -11,7 +11,7 @@ from synthetic import loop_walk
 from gsba.bundle import lens_axes, lens_centres
 from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.lens_axes import upright
-from gsba.bundle.readout import Readout
+from gsba.bundle.readout import CameraEstimate
 from gsba.camera.lens import Lenses
 from gsba.similarity import pose_similarity
 from gsba.types import Solution
@@ -52,7 +52,7 @@ def test_axes_below_a_stabilised_panorama_are_found(seed: int) -> None:
     assert lenses.axes is not None and np.median(_off_deg(lenses.axes, truth)) < 20
     found = lens_centres.estimate(around, keypoints, solved, lenses, problem)
     assert not found.reason
-    camera = Readout(found.lenses)
+    camera = CameraEstimate(found.lenses)
     for _ in range(5):
         solved, keypoints, tracks = solved_under(world, shown, camera.lenses, solved)
         there = replace(solved, landmarks=placed(solved, keypoints, tracks))

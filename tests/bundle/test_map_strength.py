@@ -6,14 +6,14 @@ from synthetic import drifted, loop_walk, unit
 
 from gsba.bundle import map_strength, prior_factors
 from gsba.bundle.map_strength import MapStrength
-from gsba.config import CloserSettings, PriorSettings
+from gsba.config import PriorSettings, WeakFrameSettings
 from gsba.geometry import inverse, rotation_angle, step_covariances
 from gsba.types import JointErrors, StepNoise
 
 NUM = 24
 POSES = loop_walk(NUM)
 LENGTHS = np.linalg.norm(np.diff(POSES[:, :3, 3], axis=0), axis=1)
-CLOSER, PRIORS = CloserSettings(), PriorSettings()
+CLOSER, PRIORS = WeakFrameSettings(), PriorSettings()
 ALL = np.ones(NUM - 1, bool)
 
 

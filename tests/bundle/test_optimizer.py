@@ -17,7 +17,7 @@ from factors import (
     RobustLoss,
     landmarks,
 )
-from factors.reduced import ReducedSystem
+from factors.reduced_camera_system import ReducedSystem
 from gsba.bundle.optimizer import marginal_covariances, optimize
 from gsba.config import SolverSettings
 from gsba.log import GsbaError

@@ -10,7 +10,7 @@ from gsba.bundle import prior_factors
 from gsba.bundle.prior_factors import X
 from gsba.config import PriorSettings
 from gsba.geometry import inverse, pose, rotation_angle
-from gsba.types import Turning
+from gsba.types import GyroConstraints
 
 SETTINGS = PriorSettings()
 
@@ -149,7 +149,7 @@ def test_turns_of_a_gyro_hold_rotations_and_nothing_else() -> None:
     for step in steps:
         rotations.append(rotations[-1] * Rotation.from_rotvec(step))
     sigmas = np.array([1e-3, np.inf, 2e-3])
-    turning = Turning(steps, sigmas, np.full((4, 3), np.nan), 0.0)
+    turning = GyroConstraints(steps, sigmas, np.full((4, 3), np.nan), 0.0)
     graph = prior_factors.turns(turning, 5.0, 2.0)
     values = gtsam.Values()
     for f, rotation in enumerate(rotations):

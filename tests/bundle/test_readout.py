@@ -9,7 +9,7 @@ from synthetic import loop_walk
 
 from gsba.bundle import readout
 from gsba.bundle.camera_system import CameraSystem
-from gsba.bundle.readout import Readout
+from gsba.bundle.readout import CameraEstimate
 from gsba.camera.lens import Lenses
 from gsba.types import Fisheye, Solution
 
@@ -20,7 +20,7 @@ SWEEPS = np.array([[-1.0, 0, 0], [0, 1.0, 0]])
 TWISTS = motion(loop_walk(24), READOUT_S)
 
 
-def _found(camera: Lenses, seed: int, rounds: int = 5) -> tuple[Readout, float]:
+def _found(camera: Lenses, seed: int, rounds: int = 5) -> tuple[CameraEstimate, float]:
     world, shown = seen_through(camera, seed)
     start, moments = Solution.without_points(world.world_T_rigs), times(len(world.world_T_rigs))
     solved, keypoints, tracks = solved_under(world, shown, LENSES, start)
@@ -37,12 +37,12 @@ def _found(camera: Lenses, seed: int, rounds: int = 5) -> tuple[Readout, float]:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_duration_way_and_each_frames_motion_are_found(seed: int) -> None:
-    found, noise = _found(replace(LENSES, sweeps=SWEEPS, twists=TWISTS), seed)
+    found, noise = _found(replace(LENSES, row_directions=SWEEPS, readout_motion=TWISTS), seed)
     assert not found.reason and (found.gains > 0).all()
-    np.testing.assert_allclose(found.lenses.sweeps, SWEEPS)
+    np.testing.assert_allclose(found.lenses.row_directions, SWEEPS)
     assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
-    assert found.lenses.twists is not None
-    off = found.lenses.twists - TWISTS
+    assert found.lenses.readout_motion is not None
+    off = found.lenses.readout_motion - TWISTS
     before = np.sqrt(np.mean(TWISTS**2, axis=0))
     left = np.sqrt(np.mean(off**2, axis=0)) / before
     assert left[:3].max() < 0.4 and left[3:].max() < 0.3
@@ -50,7 +50,7 @@ def test_duration_way_and_each_frames_motion_are_found(seed: int) -> None:
 
 
 def test_how_far_frames_own_motion_is_spread_is_found() -> None:
-    found, _ = _found(replace(LENSES, sweeps=SWEEPS, twists=TWISTS), 0)
+    found, _ = _found(replace(LENSES, row_directions=SWEEPS, readout_motion=TWISTS), 0)
     own = TWISTS - READOUT_S * readout.velocities(loop_walk(24), times(24))
     assert found.own_sigmas is not None
     np.testing.assert_allclose(found.own_sigmas, np.sqrt(np.mean(own**2, axis=0)), rtol=0.4)
@@ -59,12 +59,12 @@ def test_how_far_frames_own_motion_is_spread_is_found() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_frames_of_one_instant_have_none(seed: int) -> None:
     found, _ = _found(LENSES, seed)
-    assert found.reason and found.lenses.twists is None
+    assert found.reason and found.lenses.readout_motion is None
 
 
 def test_rows_of_stitched_pictures_are_known_to_three_per_cent() -> None:
     """How many rows lie between two directions hangs on lenses that a panorama does not tell."""
-    stitched = Readout(Lenses(), readout_s=0.012)
-    raw = replace(stitched, lenses=Lenses(cut_by=(FISHEYE, FISHEYE)))
+    stitched = CameraEstimate(Lenses(), readout_s=0.012)
+    raw = replace(stitched, lenses=Lenses(reference_calibration=(FISHEYE, FISHEYE)))
     assert readout.total_sigma(stitched, 1e-4) == pytest.approx(np.hypot(1e-4, 0.03 * 0.012))
     assert readout.total_sigma(raw, 1e-4) == 1e-4

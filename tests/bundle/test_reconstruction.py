@@ -198,12 +198,12 @@ def test_each_map_has_its_own_unit(world: World) -> None:
     np.testing.assert_array_equal(other.world_T_rigs, whole.world_T_rigs[6:])
     for part in (largest, other):
         assert part.components is None and part.map_scales is None and part.num_maps == 1
-    lenses = Lenses(np.array([0.0, 0, 0.125]), twists=np.arange(60.0).reshape(10, 6))
+    lenses = Lenses(np.array([0.0, 0, 0.125]), readout_motion=np.arange(60.0).reshape(10, 6))
     of_other = lenses_of_map(lenses, whole, 2)
     assert 2 * of_other.centre[2] == pytest.approx(other.lens_baseline[0])
-    assert of_other.twists is not None and lenses.twists is not None
-    np.testing.assert_allclose(of_other.twists[:, :3], lenses.twists[6:, :3])
-    np.testing.assert_allclose(of_other.twists[:, 3:], 3 * lenses.twists[6:, 3:])
+    assert of_other.readout_motion is not None and lenses.readout_motion is not None
+    np.testing.assert_allclose(of_other.readout_motion[:, :3], lenses.readout_motion[6:, :3])
+    np.testing.assert_allclose(of_other.readout_motion[:, 3:], 3 * lenses.readout_motion[6:, 3:])
 
 
 def test_a_frame_alone_is_no_map(world: World) -> None:

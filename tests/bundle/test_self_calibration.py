@@ -9,7 +9,7 @@ from lens_world import placed, problem_of, seen_through, solved_under, times
 from factors.bearing import bearing_residuals
 from gsba.bundle import self_calibration
 from gsba.bundle.camera_system import CameraSystem
-from gsba.bundle.readout import Readout
+from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.self_calibration import FREE, SelfCalibration
 from gsba.camera.fisheye import Pair, changed, recalibrated
 from gsba.camera.lens import Lenses
@@ -25,9 +25,16 @@ FRONT_OFF = np.concatenate([OFF[:7], np.zeros(3)])  # its turn is one of the rig
 CUT: Pair = (changed(TRUE[0], FRONT_OFF), changed(TRUE[1], OFF))
 
 
-def _estimated(cut_by: Pair, seed: int, rounds: int) -> tuple[SelfCalibration, Solution]:
-    world, shown = seen_through(Lenses(CENTRE, cut_by=cut_by, fisheyes=TRUE), seed)
-    solved, lenses = Solution.without_points(world.world_T_rigs), Lenses(CENTRE, cut_by=cut_by)
+def _estimated(
+    reference_calibration: Pair, seed: int, rounds: int
+) -> tuple[SelfCalibration, Solution]:
+    world, shown = seen_through(
+        Lenses(CENTRE, reference_calibration=reference_calibration, fisheyes=TRUE), seed
+    )
+    solved, lenses = (
+        Solution.without_points(world.world_T_rigs),
+        Lenses(CENTRE, reference_calibration=reference_calibration),
+    )
     problem = problem_of(world)
     for _ in range(rounds):
         solved, keypoints, tracks = solved_under(world, shown, lenses, solved)
@@ -41,7 +48,9 @@ def _estimated(cut_by: Pair, seed: int, rounds: int) -> tuple[SelfCalibration, S
 def _off_deg(pair: Pair | None) -> float:
     """How far directions of pixels are from the true ones, rms over the sphere."""
     assert pair is not None
-    off = self_calibration.apart(Lenses(cut_by=pair), Lenses(cut_by=pair, fisheyes=TRUE))
+    off = self_calibration.apart(
+        Lenses(reference_calibration=pair), Lenses(reference_calibration=pair, fisheyes=TRUE)
+    )
     return float(np.rad2deg(off))
 
 
@@ -56,8 +65,11 @@ def test_lenses_are_found_from_a_calibration_that_is_off(seed: int) -> None:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_noise_makes_no_lens_longer(seed: int) -> None:
     """Angles of residuals shrink where focal lengths grow: that must not count as a gain."""
-    world, shown = seen_through(Lenses(CENTRE, cut_by=TRUE, fisheyes=TRUE), seed)
-    solved, lenses = Solution.without_points(world.world_T_rigs), Lenses(CENTRE, cut_by=TRUE)
+    world, shown = seen_through(Lenses(CENTRE, reference_calibration=TRUE, fisheyes=TRUE), seed)
+    solved, lenses = (
+        Solution.without_points(world.world_T_rigs),
+        Lenses(CENTRE, reference_calibration=TRUE),
+    )
     problem = problem_of(world)
     solved, keypoints, tracks = solved_under(world, shown, lenses, solved)
     given = placed(solved, keypoints, tracks), keypoints, shown.bearings_rig, solved, lenses
@@ -74,10 +86,10 @@ def test_lenses_that_are_known_are_left_as_they_are(seed: int) -> None:
 
 
 def test_the_graph_settles_lenses_beside_poses_and_says_how_well() -> None:
-    world, shown = seen_through(Lenses(CENTRE, cut_by=CUT, fisheyes=TRUE))
+    world, shown = seen_through(Lenses(CENTRE, reference_calibration=CUT, fisheyes=TRUE))
     solved, problem = Solution.without_points(world.world_T_rigs), problem_of(world)
-    near = self_calibration.moved(Lenses(CENTRE, cut_by=CUT), _step_to(TRUE, 0.7))
-    seeing = Readout(near)
+    near = self_calibration.moved(Lenses(CENTRE, reference_calibration=CUT), _step_to(TRUE, 0.7))
+    seeing = CameraEstimate(near)
     for _ in range(5):
         solved, keypoints, tracks = solved_under(world, shown, seeing.lenses, solved)
         there = replace(solved, landmarks=placed(solved, keypoints, tracks))
@@ -93,14 +105,16 @@ def test_the_graph_settles_lenses_beside_poses_and_says_how_well() -> None:
 
 def _step_to(pair: Pair, share: float) -> np.ndarray:
     """Part of the way (FREE,) from what panoramas are cut by."""
-    return share * self_calibration.from_calibrated(Lenses(cut_by=CUT, fisheyes=pair))
+    return share * self_calibration.from_calibrated(
+        Lenses(reference_calibration=CUT, fisheyes=pair)
+    )
 
 
 def test_residuals_change_with_lenses_as_their_jacobian_says() -> None:
     rng = np.random.default_rng(0)
     shown = rng.normal(size=(40, 3))
     shown /= np.linalg.norm(shown, axis=1, keepdims=True)
-    lenses = Lenses(CENTRE, cut_by=CUT, fisheyes=TRUE)
+    lenses = Lenses(CENTRE, reference_calibration=CUT, fisheyes=TRUE)
     frames = np.zeros(40, int)
     bearings, origins = lenses.rays(shown, frames)
     points = origins + 3 * bearings
@@ -122,11 +136,11 @@ def test_lenses_take_rays_where_they_point_and_points_back_where_they_are_shown(
     shown = rng.normal(size=(200, 3))
     shown /= np.linalg.norm(shown, axis=1, keepdims=True)
     shown = shown[np.abs(shown[:, 2]) > 0.05]
-    lenses = Lenses(CENTRE, cut_by=CUT, fisheyes=TRUE)
+    lenses = Lenses(CENTRE, reference_calibration=CUT, fisheyes=TRUE)
     frames = np.zeros(len(shown), int)
     bearings, origins = lenses.rays(shown, frames)
     np.testing.assert_allclose(bearings, recalibrated(shown, CUT, TRUE), atol=1e-12)
     back = lenses.seeing(origins + 4 * bearings, frames)
     np.testing.assert_allclose(back / np.linalg.norm(back, axis=1)[:, None], shown, atol=1e-9)
-    assert not Lenses(cut_by=CUT)
-    assert lenses.cut_anew().cut_by == TRUE
+    assert not Lenses(reference_calibration=CUT)
+    assert lenses.cut_anew().reference_calibration == TRUE

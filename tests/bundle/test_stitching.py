@@ -9,7 +9,7 @@ from synthetic import RIG, World, make_world
 
 from factors.sphere_field import SphereField, num_harmonics
 from gsba.bundle import adjustment, prior_factors, stitching
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.optimizer import optimize
 from gsba.bundle.shared_parameters import PARTS, SharedModel, model_of, parts_of
 from gsba.bundle.stitching import Stitching, corrected, with_noise_of
@@ -48,7 +48,7 @@ def _found(bent: bool) -> tuple[World, Solution, Keypoints, Stitching]:
     )
     priors = prior_factors.build(world.world_T_rigs, SETTINGS.priors)
     start = Solution.without_points(world.world_T_rigs)
-    problem = Problem(priors, RIG, SETTINGS, 1)
+    problem = AdjustmentContext(priors, RIG, SETTINGS, 1)
     solved, calibrated = adjustment.adjust_sighted(sighted, start, problem, (30.0, 6.0))
     found = stitching.estimate(sighted, calibrated, solved, SphereField.none(), problem)
     return world, solved, keypoints, found
@@ -113,7 +113,7 @@ def test_too_little_is_left_alone() -> None:
     small = replace(before, landmarks=landmarks)
     sighted = Sighted(keypoints, np.ones(len(keypoints.faces), bool), some, Counts(0, 0, "o"))
     priors = prior_factors.build(world.world_T_rigs, SETTINGS.priors)
-    problem = Problem(priors, RIG, SETTINGS, 1)
+    problem = AdjustmentContext(priors, RIG, SETTINGS, 1)
     found = stitching.estimate(sighted, keypoints, small, SphereField.none(), problem)
     assert not found.field and found.adjustment is small
 
@@ -126,7 +126,7 @@ def test_model_predicts_the_cost() -> None:
     )  # fmt: skip
     settings = SETTINGS.model_copy(update={"solver": plain})
     priors = prior_factors.build(world.world_T_rigs, settings.priors)
-    problem = Problem(priors, RIG, settings, 1)
+    problem = AdjustmentContext(priors, RIG, settings, 1)
     landmarks = Landmarks(world.points_world, world.tracks, Counts(0, 0, "tracks"))
 
     def solved(field: SphereField) -> tuple[Solution, float]:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from synthetic import RIG, World, make_world
 
 from gsba.bundle import shared_parameters, triangulation
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.reconstruction import assemble
 from gsba.camera.lens import Lenses
 from gsba.config import PatchSettings, RefineSettings
@@ -20,7 +20,7 @@ from gsba.types import CoarsePoses, Counts, Landmarks, PoseSource, Solution, Tra
 
 NUM_FRAMES, NUM_POINTS = 12, 60
 SETTINGS = RefineSettings()
-PROBLEM = Problem(gtsam.NonlinearFactorGraph(), RIG, SETTINGS, 1)
+PROBLEM = AdjustmentContext(gtsam.NonlinearFactorGraph(), RIG, SETTINGS, 1)
 
 
 @cache

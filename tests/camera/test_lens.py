@@ -19,9 +19,11 @@ AXES = Rotation.from_rotvec(RNG.normal(size=(5, 3))).as_matrix()
 TWO = Lenses(np.array([0.001, -0.002, 0.04]), band_rad=np.deg2rad(4))
 LENSES = {
     "two centres": TWO,
-    "read row by row": replace(TWO, sweeps=SWEEPS, twists=TWISTS),
-    "turned below the panorama": replace(TWO, sweeps=SWEEPS, twists=TWISTS, axes=AXES),
-    "stitched for a radius": replace(TWO, nearness=0.3),
+    "read row by row": replace(TWO, row_directions=SWEEPS, readout_motion=TWISTS),
+    "turned below the panorama": replace(
+        TWO, row_directions=SWEEPS, readout_motion=TWISTS, axes=AXES
+    ),
+    "stitched for a radius": replace(TWO, inverse_stitch_radius=0.3),
     "all of it": Lenses(TWO.centre, 0.3, TWO.band_rad, SWEEPS, TWISTS, AXES),
 }
 
@@ -58,7 +60,7 @@ def test_a_view_has_things_where_the_picture_shows_them(lenses: Lenses) -> None:
 
 
 def test_rows_of_a_lens_are_read_from_edge_to_edge() -> None:
-    lenses, one = Lenses(np.array([0, 0, 0.1]), sweeps=SWEEPS), np.zeros(3, int)
+    lenses, one = Lenses(np.array([0, 0, 0.1]), row_directions=SWEEPS), np.zeros(3, int)
     edge = np.deg2rad(89.999)
     rim = np.array([[np.sin(edge), 0, np.cos(edge)], [-np.sin(edge), 0, np.cos(edge)]])
     np.testing.assert_allclose(
@@ -95,7 +97,7 @@ def test_a_stitcher_is_right_at_its_radius() -> None:
     """What is as far from the rig's centre as panoramas are stitched for shows no parallax."""
     rng = np.random.default_rng(0)
     radius = 3.0
-    lenses, frames = replace(TWO, nearness=1 / radius), np.zeros(50, int)
+    lenses, frames = replace(TWO, inverse_stitch_radius=1 / radius), np.zeros(50, int)
     directions = unit(rng.normal(size=(50, 3)))
     shown = unit(lenses.seeing(radius * directions, frames))
     clear = ~lenses.blended(directions, frames)

@@ -23,7 +23,7 @@ TWIST = np.array([[0.01, -0.02, 0.015, 0.03, 0.02, -0.04]])
 STITCHED = {
     "two centres": Lenses(CENTRE, band_rad=np.deg2rad(3)),
     "turned below the panorama": Lenses(CENTRE, band_rad=np.deg2rad(3), axes=AXES),
-    "stitched for a radius": Lenses(CENTRE, nearness=0.5, band_rad=np.deg2rad(3)),
+    "stitched for a radius": Lenses(CENTRE, inverse_stitch_radius=0.5, band_rad=np.deg2rad(3)),
 }
 
 
@@ -59,7 +59,7 @@ def _stitched(lenses: Lenses) -> np.ndarray:
     image = 0.0
     for sign, share in ((1, ahead), (-1, 1 - ahead)):
         starts = lenses.origins(shown, nowhere, np.full(len(shown), sign))
-        image = image + share * _seen(starts, unit(shown - lenses.nearness * starts))
+        image = image + share * _seen(starts, unit(shown - lenses.inverse_stitch_radius * starts))
     return np.rint(image).astype(np.uint8).reshape(WIDTH // 2, WIDTH, 3)
 
 
@@ -96,8 +96,14 @@ def _picture(lens: Fisheye, sign: float, way: float) -> np.ndarray:
 
 
 def _raw(pair: Pair, ways: tuple[float, float]) -> tuple[Lenses, list[np.ndarray]]:
-    sweeps = np.array(ways)[:, None] * rows_run(pair)
-    lenses = Lenses(CENTRE, band_rad=0.02, sweeps=sweeps, twists=TWIST, cut_by=pair)
+    row_directions = np.array(ways)[:, None] * rows_run(pair)
+    lenses = Lenses(
+        CENTRE,
+        band_rad=0.02,
+        row_directions=row_directions,
+        readout_motion=TWIST,
+        reference_calibration=pair,
+    )
     lenses_of = zip(pair, (1.0, -1.0), ways, strict=True)
     return lenses, [_picture(lens, sign, way) for lens, sign, way in lenses_of]
 
@@ -109,7 +115,7 @@ def test_raw_pictures_become_one_cameras_at_one_instant(ways: tuple[float, float
     seam = np.abs(_erp_rays()[..., 2]) < np.sin(np.deg2rad(5))
     found = _off(Stitcher(lenses, 0, _scene()).stitched_raw(pictures, WIDTH), seam)
     assert max(found) < 0.6
-    still = replace(lenses, twists=None)
+    still = replace(lenses, readout_motion=None)
     for wrong, scene in ((lenses, np.zeros((0, 3))), (still, _scene())):
         other = _off(Stitcher(wrong, 0, scene).stitched_raw(pictures, WIDTH), seam)
         assert min(other) > 3 * max(found)

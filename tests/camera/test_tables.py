@@ -49,7 +49,10 @@ def test_a_panorama_is_padded_where_it_lies(shape: tuple[int, ...]) -> None:
 
 
 def test_places_are_the_same_band_by_band(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig, lenses = CubeRig(333, np.pi / 2), Lenses(np.array([0.0, 0.01, 0.2]), nearness=0.1)
+    rig, lenses = (
+        CubeRig(333, np.pi / 2),
+        Lenses(np.array([0.0, 0.01, 0.2]), inverse_stitch_radius=0.1),
+    )
     views, scene = lens_views(lenses, 333), np.random.default_rng(1).normal(size=(50, 3))
     erp = np.random.default_rng(2).integers(0, 255, (256, 512, 3), dtype=np.uint8)
     compute = cubemap._face_maps.__wrapped__  # type: ignore[attr-defined]

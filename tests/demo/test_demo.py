@@ -368,8 +368,8 @@ def test_rows_are_read_one_after_another_from_their_lens(bend):
     moved = pose(Rotation.from_rotvec(after * turn).as_matrix(), after * move)
     lenses = Lenses(
         np.array([0, 0, camera.baseline / 2]),
-        sweeps=np.tile([*SWEEP, 0.0], (2, 1)),
-        twists=np.concatenate([turn, move])[None],
+        row_directions=np.tile([*SWEEP, 0.0], (2, 1)),
+        readout_motion=np.concatenate([turn, move])[None],
     )
     errors, shifts = [], []
     for world_T_rig in _views():

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from synthetic import RIG, make_world
 
 from gsba.bundle import adjustment, prior_factors
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.config import RefineSettings
 from gsba.evaluate.consistency import (
     EXPECTED,
@@ -43,7 +43,7 @@ def _solved(seed: int) -> tuple[Reconstruction, Trajectory]:
     priors = gtsam.NonlinearFactorGraph(held)
     priors.push_back(prior_factors.fixed_scale(true))
     start = Solution.without_points(true)
-    problem = Problem(priors, RIG, settings, 1)
+    problem = AdjustmentContext(priors, RIG, settings, 1)
     solved = adjustment.adjust(world.tracks, world.keypoints, start, problem, (8.0,))
     solved = replace(solved, noise=1.0)
     problem = replace(problem, priors=held)

@@ -39,9 +39,9 @@ TWISTS = np.random.default_rng(1).normal(size=(NUM_FRAMES, 6)) * np.repeat([0.02
 RAW = Lenses(
     np.array([0.01, -0.02, 0.2]),
     band_rad=np.deg2rad(1.5),
-    sweeps=np.array([[1.0], [-1.0]]) * rows_run(PAIR),
-    twists=TWISTS,
-    cut_by=PAIR,
+    row_directions=np.array([[1.0], [-1.0]]) * rows_run(PAIR),
+    readout_motion=TWISTS,
+    reference_calibration=PAIR,
 )
 PANORAMAS = {"two centres": TWO, "turned below the panorama": TURNED}
 

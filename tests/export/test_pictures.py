@@ -28,8 +28,8 @@ BENT = tuple(0.004 * np.random.default_rng(3).normal(size=num_harmonics(3)))
 TWO = Lenses(np.array([0.01, -0.02, 0.2]), band_rad=np.deg2rad(3))
 MOVING = replace(
     TWO,
-    sweeps=np.array([[0, 1.0, 0], [0, 1.0, 0]]),
-    twists=0.02 * np.random.default_rng(4).normal(size=(NUM_FRAMES, 6)),
+    row_directions=np.array([[0, 1.0, 0], [0, 1.0, 0]]),
+    readout_motion=0.02 * np.random.default_rng(4).normal(size=(NUM_FRAMES, 6)),
     axes=Rotation.from_rotvec(
         0.1 * np.random.default_rng(5).normal(size=(NUM_FRAMES, 3))
     ).as_matrix(),

@@ -22,9 +22,9 @@ TWO = Lenses(np.array([0.01, -0.02, 0.2]), band_rad=np.deg2rad(3))
 RNG = np.random.default_rng(1)
 TURNING = replace(
     TWO,
-    nearness=0.1,
-    sweeps=np.array([[1.0, 0, 0], [0, -1.0, 0]]),
-    twists=RNG.normal(size=(NUM_FRAMES, 6)) * np.repeat([0.005, 0.0], 3),
+    inverse_stitch_radius=0.1,
+    row_directions=np.array([[1.0, 0, 0], [0, -1.0, 0]]),
+    readout_motion=RNG.normal(size=(NUM_FRAMES, 6)) * np.repeat([0.005, 0.0], 3),
     axes=Rotation.from_rotvec(0.3 * RNG.normal(size=(NUM_FRAMES, 3))).as_matrix(),
 )
 LENSES = {"two centres": TWO, "read row by row, turned below the panorama": TURNING}
@@ -62,7 +62,7 @@ def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 def test_points_land_on_their_observations_and_pictures(written, to: str) -> None:
     lenses, folder = written
     model, checked, looked = pycolmap.Reconstruction(folder / to / "sparse/0"), 0, 0
-    most = 1e-6 if lenses.twists is None else 0.05  # px: a lens moves while rows are read
+    most = 1e-6 if lenses.readout_motion is None else 0.05  # px: a lens moves while rows are read
     assert model.num_rigs() == 1 and model.num_cameras() == 10
     for image in model.images.values():
         pixels = cv2.imread(str(folder / to / "images" / image.name))[..., ::-1]

@@ -12,7 +12,7 @@ from gsba.features import detection
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.loop_closure import loops
 from gsba.loop_closure.pose_graph import Loop
-from gsba.loop_closure.retrieval import _aggregate, _drawn, looks_of
+from gsba.loop_closure.retrieval import _aggregate, _drawn, global_descriptors
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.similarity import relative_map
 from gsba.store.shards import Threads
@@ -90,7 +90,7 @@ def _context(frames: SearchableFrames, keypoints: Keypoints) -> MatchContext:
 
 
 def test_the_same_place_looks_most_alike() -> None:
-    looks = looks_of(_scene()[0], NUM_FRAMES, 0, Threads(1))
+    looks = global_descriptors(_scene()[0], NUM_FRAMES, 0, Threads(1))
     far = [f for f in range(NUM_FRAMES) if 4 < f < NUM_FRAMES - 4]
     alike = looks @ looks.T
     assert alike[0, NUM_FRAMES - 1] > max(alike[0, f] for f in far)

@@ -10,8 +10,8 @@ from gsba.geometry import inverse, pose, rotation_angle
 from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.merged_map import Registered, follow
 from gsba.similarity import Sim3
-from gsba.trajectory.joining import GUESS, PLACES, Joint
-from gsba.trajectory.judgement import Trust
+from gsba.trajectory.joining import GUESS, PLACES, SegmentAlignment
+from gsba.trajectory.judgement import StepChecks
 from gsba.types import CoarsePoses, PoseSource, Solution, Tracks
 
 TIMES = np.arange(NUM, dtype=float)
@@ -154,9 +154,9 @@ def test_a_frame_with_too_few_points_stays_where_its_steps_have_it() -> None:
     assert not found.lost.any() and not found.components.any()
 
 
-def _trust(poses: np.ndarray, unseen: np.ndarray) -> Trust:
+def _trust(poses: np.ndarray, unseen: np.ndarray) -> StepChecks:
     nobody = np.zeros(NUM, bool)
-    return Trust(poses, unseen.copy(), nobody, unseen, np.ones(NUM - 1), False)
+    return StepChecks(poses, unseen.copy(), nobody, unseen, np.ones(NUM - 1), False)
 
 
 def test_a_piece_of_the_trajectory_goes_where_its_frames_were_carried() -> None:
@@ -167,7 +167,7 @@ def test_a_piece_of_the_trajectory_goes_where_its_frames_were_carried() -> None:
     segments = (np.arange(NUM) >= HALF).astype(np.int32)
     slam = np.full(NUM, PoseSource.SLAM, np.uint8)
     coarse = CoarsePoses(parts.world_T_rigs, slam, 0.0, segments)
-    joints = (Joint(HALF, NUM - 1, 2.0, MOVE, GUESS),)
+    joints = (SegmentAlignment(HALF, NUM - 1, 2.0, MOVE, GUESS),)
     found = map_merging.merge(context, parts, _halves(), NOBODY, ~BREAK, TIMES)
     moved, trust, joints = follow(found, coarse, _trust(parts.world_T_rigs, unseen), joints)
     np.testing.assert_allclose(moved.world_T_rigs, found.solved.world_T_rigs, atol=1e-9)

@@ -9,7 +9,7 @@ import pytest
 from synthetic import bearings_of
 
 from gsba.bundle import adjustment, prior_factors
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.camera.rig import CubeRig
 from gsba.config import PatchSettings, RefineSettings
 from gsba.frames.panorama import Greys
@@ -176,7 +176,7 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
         Solution.without_points(world_T_rigs),
         landmarks=landmarks,
     )
-    problem, gates = Problem(priors, RIG, settings, 2), (6.0, 3.0)
+    problem, gates = AdjustmentContext(priors, RIG, settings, 2), (6.0, 3.0)
     before = adjustment.adjust(landmarks.tracks, keypoints, start, problem, gates)
     sighted = alignment.align(
         before.landmarks, before.world_T_rigs, keypoints, before.noise, Greys(frames, 4096), RIG,

@@ -12,7 +12,7 @@ from tiny_run import SETTINGS, Case, computed_stages
 
 from factors.patch_windows import PatchTable, patch_spans, pixel_grid, planes_from
 from gsba.bundle import adjustment
-from gsba.bundle.adjustment import Problem
+from gsba.bundle.adjustment import AdjustmentContext
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import erp_from_bearings
 from gsba.config import PhotometricSettings, RefineSettings
@@ -155,7 +155,7 @@ def test_nothing_to_see_changes_nothing(case: Case) -> None:
         update={"photometric": PhotometricSettings(min_gradient=1e3, depth_levels=0)}
     )
     frames, keypoints, solved, priors, rig = _start(case, settings)
-    result = direct.refine(frames, keypoints, solved, Problem(priors, rig, settings, 1))
+    result = direct.refine(frames, keypoints, solved, AdjustmentContext(priors, rig, settings, 1))
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
     assert all(counts.kept == 0 for counts in result.counts)
 
@@ -194,7 +194,7 @@ def test_a_solve_against_the_map_is_undone(case: Case) -> None:
         update={"photometric": PhotometricSettings(max_growth=1e-3, depth_levels=0, spacing_deg=20)}
     )
     frames, keypoints, solved, priors, rig = _start(case, settings)
-    result = direct.refine(frames, keypoints, solved, Problem(priors, rig, settings, 1))
+    result = direct.refine(frames, keypoints, solved, AdjustmentContext(priors, rig, settings, 1))
     assert not result.adjustment.rounds[-1].accepted
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
 
@@ -218,7 +218,7 @@ def test_a_small_panorama_has_fewer_levels(case: Case) -> None:
         update={"photometric": PhotometricSettings(levels=(9,), spacing_deg=20, size=5)}
     )
     frames, keypoints, solved, priors, rig = _start(case, settings)
-    result = direct.refine(frames, keypoints, solved, Problem(priors, rig, settings, 1))
+    result = direct.refine(frames, keypoints, solved, AdjustmentContext(priors, rig, settings, 1))
     assert np.isfinite(result.adjustment.world_T_rigs).all() and len(result.counts) == 2
 
 

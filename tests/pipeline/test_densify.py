@@ -17,7 +17,7 @@ from gsba.pipeline import densify
 from gsba.pipeline.prior import Prior
 from gsba.store.store import RunStore
 from gsba.trajectory.files import read_trajectory
-from gsba.trajectory.judgement import Trust
+from gsba.trajectory.judgement import StepChecks
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource
 from gsba.video import extract
 
@@ -46,7 +46,7 @@ def _walk() -> Odometry:
 def _prior(num: int, unseen: list[int]) -> Prior:
     poses = np.tile(np.eye(4), (num, 1, 1))
     steps = np.isin(np.arange(num - 1), unseen)
-    trust = replace(Trust.of_all(poses), unseen_steps=steps)
+    trust = replace(StepChecks.of_all(poses), unseen_steps=steps)
     return Prior(CoarsePoses(poses, np.full(num, PoseSource.SLAM, np.uint8), 0.0), trust)
 
 

@@ -11,7 +11,7 @@ import pytest
 from tiny_run import NUM_FRAMES, SETTINGS, Case, computed_stages
 
 import gsba
-from gsba.config import CloserSettings
+from gsba.config import WeakFrameSettings
 from gsba.matching import correspondences
 
 
@@ -113,7 +113,7 @@ def test_an_interrupt_leaves_what_is_finished(
 
 def test_a_weak_map_gets_more_keypoints_and_resumes(case: Case, tmp_path: Path) -> None:
     closer = {"max_drift": 1e-12, "max_scale_sigma": 1e-12, "max_per_face": 600}
-    settings = SETTINGS.model_copy(update={"closer": CloserSettings(**closer)})
+    settings = SETTINGS.model_copy(update={"weak_frames": WeakFrameSettings(**closer)})
     out = case.copy(tmp_path / "run")
     result = case.refine(out, settings)
     stages = {stage["name"]: stage for stage in result.report["stages"]}

@@ -8,7 +8,7 @@ import pytest
 from export_scene import panoramas
 
 from gsba.report.findings import of_trajectory
-from gsba.trajectory.judgement import Trust
+from gsba.trajectory.judgement import StepChecks
 
 
 @pytest.mark.parametrize(
@@ -21,7 +21,7 @@ def test_steps_that_no_image_shows_are_in_doubt_where_others_are_wrong(
     num = len(frames)
     steps = np.arange(num - 1)
     trust = replace(
-        Trust.of_all(np.tile(np.eye(4), (num, 1, 1))),
+        StepChecks.of_all(np.tile(np.eye(4), (num, 1, 1))),
         unseen_steps=steps == num - 2,
         false_steps=steps < contradicted,
     )
@@ -35,7 +35,7 @@ def test_without_a_trajectory_images_contradict_nothing(tmp_path: Path) -> None:
     frames = panoramas(tmp_path, ".png")
     num = len(frames)
     every = np.ones(num - 1, bool)
-    trust = Trust.of_all(np.tile(np.eye(4), (num, 1, 1)))
+    trust = StepChecks.of_all(np.tile(np.eye(4), (num, 1, 1)))
     trust = replace(trust, false_steps=every, unseen_steps=np.arange(num - 1) == 2)
     found, _ = of_trajectory(trust, None, None, (), frames, absent=True)
     assert found["false_steps"] == found["false_frames"] == []

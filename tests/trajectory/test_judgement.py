@@ -8,7 +8,7 @@ from synthetic import RIG, bearings_of, drifted, loop_walk, unit, with_noise
 from gsba.config import PriorSettings, VerifySettings
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.trajectory import judgement
-from gsba.trajectory.judgement import Trust
+from gsba.trajectory.judgement import StepChecks
 from gsba.trajectory.steps import chained, image_steps, length_ratios, off_steps, step_lengths
 from gsba.types import CoarsePoses, Counts, Keypoints, Matches, PoseSource, VerifiedPairs
 
@@ -45,7 +45,9 @@ def _seen(missing: tuple[int, ...] = ()) -> tuple[VerifiedPairs, Keypoints]:
     return VerifiedPairs(matches, f0_T_f1s, np.zeros(len(steps)), counts), keypoints
 
 
-def _judge(slam: np.ndarray, missing: tuple[int, ...] = (), lost: tuple[int, ...] = ()) -> Trust:
+def _judge(
+    slam: np.ndarray, missing: tuple[int, ...] = (), lost: tuple[int, ...] = ()
+) -> StepChecks:
     pairs, keypoints = _seen(missing)
     sources = np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8)
     sources[list(lost)] = PoseSource.INTERPOLATED

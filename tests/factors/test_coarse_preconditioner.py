@@ -8,8 +8,8 @@ from gtsam.symbol_shorthand import X
 from factors import BearingTerm, LandmarkBlock, RobustLoss, groups, reduced
 from factors._schur_kernels import GROUP_DIM
 from factors._terms import pose_rows
-from factors.groups import Groups, covisible_groups
-from factors.reduced import ReducedSystem
+from factors.pose_clusters import Groups, covisible_groups
+from factors.reduced_camera_system import ReducedSystem
 from gsba.bundle.optimizer import optimize
 from gsba.config import SolverSettings
 

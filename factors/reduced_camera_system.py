@@ -10,12 +10,12 @@ from scipy.sparse import csr_matrix
 from factors._terms import pose_rows
 from factors.block import Block
 from factors.cholesky import DIM, BlockCholesky
+from factors.coarse_preconditioner import Coarse, coarse_system
 from factors.compiled import kernel_and_part
 from factors.conjugate_gradients import conjugate_gradients, multiply_blocks
-from factors.groups import covisible_groups
 from factors.landmarks import LandmarkBlock
+from factors.pose_clusters import covisible_groups
 from factors.schur_complement import GroupVisits, group_visits
-from factors.two_level import Coarse, coarse_system
 
 _kernel, _ = kernel_and_part()
 
@@ -41,7 +41,7 @@ class ReducedSystem:
 
     Where frames see so much in common that a factorization would fill in, what landmarks say of
     them is not written out, but kept as products; steps and covariances are then found by
-    iterations (`factors.two_level`).
+    iterations (`factors.coarse_preconditioner`).
     """
 
     def __init__(

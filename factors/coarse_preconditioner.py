@@ -9,7 +9,7 @@ from scipy.sparse import csr_matrix
 
 from factors._schur_kernels import GROUP_DIM, add_pairs_of_groups
 from factors.cholesky import DIM
-from factors.groups import Groups
+from factors.pose_clusters import Groups
 from factors.schur_complement import GroupVisits, SchurComplement
 
 _LEAST_PART = 1e-10  # of its curvature, that is added to a motion of a group
