@@ -14,6 +14,7 @@ from factors.compiled import kernel_and_part
 from gsba.camera.rig import RIG_R_FACE, CubeRig, owner_faces
 from gsba.camera.sphere import around_sphere
 from gsba.geometry import rotation_angle, unit
+from gsba.odometry.lucas_kanade import pyramid
 
 _kernel, _part = kernel_and_part()
 HFOV = np.deg2rad(106.0)  # of a face: a feature may move 8 degrees beyond the face that owns it
@@ -39,6 +40,11 @@ class Atlas:
 
     image: np.ndarray  # (2 s, 3 s) uint8, faces of s pixels, FACES order row by row
     cut_R_rig: np.ndarray  # (3, 3) float64, axes of the cube of faces
+
+    @cached_property
+    def pyramid(self) -> tuple[np.ndarray, ...]:
+        """The image and its halvings, float32."""
+        return pyramid(self.image)
 
 
 @dataclass(frozen=True)

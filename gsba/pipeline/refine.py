@@ -147,7 +147,13 @@ def _with_fetched(
     settings: RefineSettings,
     begin: Callable[[_Start], tuple[Run, Prior]],
 ) -> _Start:
-    """The start with more frames of a video where the map of features is weak."""
+    """The start with more frames of a video where the map of features is weak.
+
+    Raises:
+        GsbaError: the odometry is in pieces, and a vehicle carries the camera.
+    """
+    if start.coarse.segments is not None:
+        acceptance.refuse_vehicle_in_pieces(begin(start)[0].frames)
 
     def measure(some: FrameSet) -> Prior:
         run, prior = begin(_start_of(some, given, settings))
@@ -187,11 +193,10 @@ def _refine(
     walk: Odometry | None,
 ) -> RunResult:
     """A run from its frames to what it leaves behind, its video's odometry in the report."""
-    in_pieces = prior.coarse.segments is not None
     run, seen, prior, world = _solve_raw(run, prior, given)
     result = backend.reconstruct(run, seen, prior, world)
     if images_alone or prior.absent:
-        acceptance.require_motion(run.frames, result, in_pieces)
+        acceptance.require_motion(run.frames, result)
     lenses = backend.keep_lenses(run, world, result)
     written = outputs.write(run, prior, world, result, lenses)
     if walk is not None:
