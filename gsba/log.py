@@ -2,7 +2,8 @@
 
 import logging
 import sys
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator, Sized
 from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
@@ -49,16 +50,50 @@ def brief(text: str, most: int = 60) -> str:
     return text if len(text) <= most else f"{text[:kept]}...{text[-kept + 1 :]}"
 
 
-def track(items: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
-    """Yield `items` behind a progress bar on stderr; silent in a quiet run or without terminal."""
+def track(
+    items: Iterable[T],
+    description: str,
+    total: int | None = None,
+    done: int = 0,
+    note: Callable[[], str] | None = None,
+) -> Iterator[T]:
+    """Yield `items` behind a progress bar on stderr; silent in a quiet run or without terminal.
+
+    Args:
+        items: work to do.
+        description: of the work.
+        total: number of items, those done before among them; None = len(items).
+        done: items that were done before.
+        note: gives a text that stands behind the speed.
+    """
     if not (sys.stderr.isatty() and logging.getLogger("gsba").isEnabledFor(logging.INFO)):
         yield from items
         return
-    from rich.progress import track as rich_track
-
-    yield from rich_track(
-        items, description=description, total=total, console=_console(), transient=True
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
     )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    if total is None and isinstance(items, Sized):
+        total = len(items)
+    began = time.monotonic()
+    with Progress(*columns, console=_console(), transient=True) as bar:
+        task = bar.add_task(description, total=total, completed=done, note="")
+        for count, item in enumerate(items, start=1):
+            yield item
+            speed = count / max(time.monotonic() - began, 1e-6)
+            more = "" if note is None else f", {note()}"
+            bar.update(task, completed=done + count, note=f"{speed:.3g} a second{more}")
 
 
 @cache

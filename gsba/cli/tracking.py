@@ -83,7 +83,8 @@ def track(
         panoramas = odometry.masked(panoramas, mask)
     elif masks == "auto":
         panoramas = odometry.without_carrier(panoramas)
-    walk = odometry.track_panoramas(panoramas)
+    unfinished = out.with_name(f"{out.stem}-unfinished.npz")
+    walk = odometry.track_panoramas(panoramas, checkpoint=unfinished)
     write_odometry(
         walk,
         out,

@@ -104,13 +104,14 @@ class AtlasLayout:
 class Cutter:
     """Cuts frames along axes that stay within `_MAX_CUT_ERROR` of those of the world."""
 
-    def __init__(self, layout: AtlasLayout) -> None:
+    def __init__(self, layout: AtlasLayout, cut_R_rig: np.ndarray | None = None) -> None:
+        """A cutter for one layout; `cut_R_rig` (3, 3): axes of the cut before, if there was one."""
         self._layout = layout
         rays = layout.directions.reshape(-1, 3)
         self._rays = np.ascontiguousarray(rays.T, np.float32)
-        self._cut_R_rig: np.ndarray | None = None
         self._height = 0
         self._maps: tuple[np.ndarray, np.ndarray] | None = None
+        self.cut_R_rig = cut_R_rig  # axes of the last cut
 
     def cut(self, grey: np.ndarray, world_R_rig: np.ndarray, exactly: bool = False) -> Atlas:
         """The atlas of a panorama (h, 2h) uint8 whose orientation is roughly known.
@@ -121,18 +122,22 @@ class Cutter:
             exactly: cut along these axes, not along others near them.
         """
         off = np.inf
-        if self._cut_R_rig is not None and self._height == len(grey):
-            off = float(rotation_angle(self._cut_R_rig.T @ world_R_rig))
+        if self.cut_R_rig is not None:
+            off = float(rotation_angle(self.cut_R_rig.T @ world_R_rig))
         if off > (_SAME_CUT if exactly else _MAX_CUT_ERROR):
-            self._cut_R_rig, self._height = world_R_rig.copy(), len(grey)
+            self.cut_R_rig, self._maps = world_R_rig.copy(), None
+        assert self.cut_R_rig is not None
+        if self._maps is None or self._height != len(grey):
+            self._height = len(grey)
             maps = np.empty_like(self._rays[:2])
-            _erp_pixels(*self._rays, world_R_rig.astype(np.float32), np.float32(len(grey)), *maps)
+            axes = self.cut_R_rig.astype(np.float32)
+            _erp_pixels(*self._rays, axes, np.float32(len(grey)), *maps)
             across, down = (maps + np.float32(_PAD)).reshape(2, *self._layout.directions.shape[:2])
             self._maps = cv2.convertMaps(across, down, cv2.CV_16SC2)
-        assert self._cut_R_rig is not None and self._maps is not None
+        assert self._maps is not None
         first, second = self._maps
         image = cv2.remap(around_sphere(grey, _PAD), first, second, cv2.INTER_LINEAR)
-        return Atlas(image, self._cut_R_rig)
+        return Atlas(image, self.cut_R_rig)
 
 
 def shared_faces(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from gsba.odometry.flow import follow
 from gsba.odometry.frame_record import FrameRecord, FrameStatus
 from gsba.odometry.relocalisation import Described, describe, placed
 from gsba.odometry.resection import Resection, resect
+from gsba.odometry.tracker_state import Features, Keyframe, TrackerState
 from gsba.odometry.two_view_start import median_turn, start_map
 from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window
 
@@ -33,7 +34,7 @@ _KEYFRAME_PARALLAX = np.deg2rad(3.0)  # median of the features, since the last k
 _KEYFRAME_SHARE = 0.7  # of the last keyframe's features that could be followed, still found
 _FADING_SHARE = 0.7  # of the first keyframe's features, below which less parallax has to do
 _START_SHARE = 0.45  # of the first keyframe's features, below which a start is begun anew
-_SIGMA, _MIN_SIGMA, _MAX_SIGMA = np.deg2rad([0.25, 0.05, 0.35])  # of bearings, per axis
+_MIN_SIGMA, _MAX_SIGMA = np.deg2rad([0.05, 0.35])  # of bearings, per axis
 _ADAPTING = 0.1  # weight of one frame in the noise of bearings
 _GATE = 4.0  # standard deviations of a feature that fits
 _FEW_INLIERS = 60  # below which less parallax makes a keyframe
@@ -48,38 +49,6 @@ _MAX_MISSES = 4  # frames in a row in which a feature without a point was not fo
 _MAX_PENDING = 300  # frames before the start of a map that are posed again once it has points
 
 
-@dataclass(slots=True)
-class _Keyframe:
-    """A keyframe of the map that is being made."""
-
-    number: int  # of the keyframe in the whole recording
-    frame: int  # index of its frame
-    world_T_rig: np.ndarray  # (4, 4)
-    ids: np.ndarray  # (N,) int64, features seen
-    bearings: np.ndarray  # (N, 3) unit, rig frame
-    atlas: Atlas | None  # None = forgotten
-    small: Miniature | None
-    described: Described | None = None  # when a lost frame was first compared with it
-    most_found: int = 0  # of its features in one of the frames after it
-
-
-@dataclass(slots=True)
-class _Features:
-    """Features of the last keyframe that are followed."""
-
-    ids: np.ndarray  # (N,) int64
-    bearings: np.ndarray  # (N, 3) unit, rig frame of the keyframe
-    assumed_world: np.ndarray  # (N, 3) map units: where features without a point are assumed, by
-    # their direction when last found and the distance of points beside them
-    misses: np.ndarray  # (N,) int, frames since
-
-    def taken(self, rows: np.ndarray) -> "_Features":
-        """Some rows."""
-        return _Features(
-            self.ids[rows], self.bearings[rows], self.assumed_world[rows], self.misses[rows]
-        )
-
-
 @dataclass(frozen=True, slots=True)
 class _Attempt:
     """Where the features are in a frame, and the pose they give."""
@@ -92,79 +61,61 @@ class _Attempt:
 
 @dataclass(slots=True)
 class Tracker:
-    """State of the odometry between frames.
-
-    Attributes:
-        records: of all frames so far.
-        keyframe_poses: (4, 4) each, of all keyframes so far, in the world of their map.
-        keyframe_frames: index of each keyframe's frame.
-        keyframe_features: of each keyframe, the features it sees: ids (N,) int64, and bearings
-            (N, 3) float32, rig frame.
-    """
+    """Follows a camera from frame to frame; `state` is all that it knows."""
 
     width: int  # pixels across the panoramas
     usable: np.ndarray | None = None  # (h, 2h) bool, what shows the scene in every frame
     seed: int = 0  # of the sampling at the start of a map
     patience: int = 8  # frames that show something and fit no keyframe before a new map is begun
-    records: list[FrameRecord] = field(default_factory=list)
-    keyframe_poses: list[np.ndarray] = field(default_factory=list)
-    keyframe_frames: list[int] = field(default_factory=list)
-    keyframe_features: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
+    state: TrackerState = field(default_factory=TrackerState)  # one stored before goes on
 
     _layout: AtlasLayout = field(init=False)
     _cutter: Cutter = field(init=False)
-    _window: list[_Keyframe] = field(default_factory=list)
-    _features: _Features | None = None
-    _points: np.ndarray = field(default_factory=lambda: np.full((4096, 3), np.nan))
-    _num_ids: int = 0
-    _map: int = 0
-    _has_points: bool = False
-    _pose: np.ndarray = field(default_factory=lambda: np.eye(4))
-    _motion: np.ndarray = field(default_factory=lambda: np.eye(4))
-    _small: Miniature | None = None
-    _sigma: float = float(_SIGMA)
-    _pending: list[tuple[int, np.ndarray, np.ndarray]] = field(default_factory=list)
-    _failures: int = 0
+    _mask_cutter: Cutter = field(init=False)  # its axes are those of the mask cut last
+    _mask: Atlas | None = None  # `usable` as it was cut last
 
     def __post_init__(self) -> None:
         self._layout = AtlasLayout.of(self.width)
-        self._cutter = Cutter(self._layout)
+        self._cutter = Cutter(self._layout, self.state.cut_R_rig)
+        self._mask_cutter = Cutter(self._layout)
 
     def world_T_rigs(self) -> np.ndarray:
         """Poses (F, 4, 4) of all frames so far, each in the world of its map."""
-        return np.array([self.keyframe_poses[r.keyframe] @ r.key_T_rig for r in self.records])
+        poses = self.state.keyframe_poses
+        return np.array([poses[r.keyframe] @ r.key_T_rig for r in self.state.records])
 
     def add(self, grey: np.ndarray) -> FrameRecord:
         """Pose the next frame, a panorama (width / 2, width) uint8."""
-        frame = len(self.records)
+        frame = len(self.state.records)
         small = miniature(grey, self.usable)
-        if self._features is None:
+        if self.state.features is None:
             self._begin_map(grey, small, frame)
-        elif not self._has_points:
+        elif not self.state.has_points:
             self._add_before_start(grey, small, frame)
         else:
             self._add_to_map(grey, small, frame)
-        return self.records[-1]
+        self.state.cut_R_rig = self._cutter.cut_R_rig
+        return self.state.records[-1]
 
     # A frame before the map has points.
 
     def _begin_map(self, grey: np.ndarray, small: Miniature, frame: int) -> None:
         """Make a frame the first keyframe of a map, if it shows anything."""
-        atlas = self._cutter.cut(grey, self._pose[:3, :3])
+        atlas = self._cutter.cut(grey, self.state.world_T_rig[:3, :3])
         corners = self._corners(atlas, np.zeros((0, 3)))
         if len(corners) < _MIN_FEATURES or small.contrast < _MIN_CONTRAST:
             self._record(FrameStatus.LOST, np.eye(4))
             return
-        self._window = []
-        self._add_keyframe(frame, self._pose, atlas, small, None, corners)
+        self.state.window = []
+        self._add_keyframe(frame, self.state.world_T_rig, atlas, small, None, corners)
         self._record(FrameStatus.TURNING, np.eye(4))
-        self._small = small
+        self.state.small = small
 
     def _add_before_start(self, grey: np.ndarray, small: Miniature, frame: int) -> None:
         """Follow the first keyframe's features until they show that the camera moved."""
-        key, features = self._window[-1], self._features
+        key, features = self.state.window[-1], self.state.features
         assert key.atlas is not None and features is not None
-        predicted_R = self._pose[:3, :3] @ self._motion[:3, :3]
+        predicted_R = self.state.world_T_rig[:3, :3] @ self.state.motion[:3, :3]
         atlas, bearings, found = self._followed(grey, key, features, predicted_R)
         if np.count_nonzero(found) < _START_SHARE * (key.most_found or len(features.ids)):
             again = self._followed(grey, key, features, self._turned(small, predicted_R))
@@ -179,32 +130,33 @@ class Tracker:
         world_R_rig = key.world_T_rig[:3, :3] @ turn.one_R_other
         fading = len(ids) < _FADING_SHARE * key.most_found
         seed = self.seed + frame
-        solved = start_map(ids, one, other, turn, self._sigma, seed, fading)
-        self._failures = 0
+        solved = start_map(ids, one, other, turn, self.state.sigma, seed, fading)
+        self.state.failures = 0
         if solved is not None:
             self._start(frame, solved, atlas, small, ids, other)
             return
-        features.assumed_world[found] = self._pose[:3, 3] + bearings[found] @ world_R_rig.T
-        self._step(pose(world_R_rig, self._pose[:3, 3]), small)
+        position = self.state.world_T_rig[:3, 3]
+        features.assumed_world[found] = position + bearings[found] @ world_R_rig.T
+        self._step(pose(world_R_rig, position), small)
         if len(ids) < _START_SHARE * key.most_found:
             # Turned away from what it saw, without a step: the rotation goes on from here.
-            self._pending.clear()
+            self.state.pending.clear()
             corners = self._corners(atlas, np.zeros((0, 3)))
-            self._window = []
-            self._add_keyframe(frame, self._pose, atlas, small, None, corners)
+            self.state.window = []
+            self._add_keyframe(frame, self.state.world_T_rig, atlas, small, None, corners)
             self._record(FrameStatus.TURNING, np.eye(4))
             return
-        self._pending.append((frame, ids, other))
-        del self._pending[:-_MAX_PENDING]
-        self._record(FrameStatus.TURNING, inverse(key.world_T_rig) @ self._pose)
+        self.state.pending.append((frame, ids, other))
+        del self.state.pending[:-_MAX_PENDING]
+        self._record(FrameStatus.TURNING, inverse(key.world_T_rig) @ self.state.world_T_rig)
 
     def _followed(
-        self, grey: np.ndarray, key: _Keyframe, features: _Features, world_R_rig: np.ndarray
+        self, grey: np.ndarray, key: Keyframe, features: Features, world_R_rig: np.ndarray
     ) -> tuple[Atlas, np.ndarray, np.ndarray]:
         """A frame's atlas, bearings (N, 3) of features in it, and which were found, by rotation."""
         assert key.atlas is not None
         atlas = self._cutter.cut(grey, world_R_rig)
-        expected = unit((features.assumed_world - self._pose[:3, 3]) @ world_R_rig)
+        expected = unit((features.assumed_world - self.state.world_T_rig[:3, 3]) @ world_R_rig)
         return atlas, *follow(self._layout, key.atlas, atlas, features.bearings, expected)
 
     def _start(
@@ -217,29 +169,27 @@ class Tracker:
         bearings: np.ndarray,
     ) -> None:
         """Give the map its first points, in the world that the first keyframe has."""
-        key = self._window[-1]
+        key = self.state.window[-1]
         world_T_key = key.world_T_rig
         points = solved.points_world @ world_T_key[:3, :3].T + world_T_key[:3, 3]
-        self._points[solved.ids] = points
-        self._has_points = True
-        for before, seen, where in self._pending:
+        self.state.points[solved.ids] = points
+        self.state.has_points = True
+        for before, seen, where in self.state.pending:
             self._pose_again(before, seen, where, key)
-        last = self.records[-1]
-        self._pose = self.keyframe_poses[last.keyframe] @ last.key_T_rig
+        last = self.state.records[-1]
+        self.state.world_T_rig = self.state.keyframe_poses[last.keyframe] @ last.key_T_rig
         self._step(world_T_key @ solved.world_T_rigs[1], small)
-        self._pending.clear()
+        self.state.pending.clear()
         false = np.isin(ids, solved.outliers[:, 1])
         self._become_keyframe(frame, atlas, small, ids[~false], bearings[~false])
 
-    def _pose_again(
-        self, frame: int, ids: np.ndarray, bearings: np.ndarray, key: _Keyframe
-    ) -> None:
+    def _pose_again(self, frame: int, ids: np.ndarray, bearings: np.ndarray, key: Keyframe) -> None:
         """Pose a frame before the start of the map from the points it has now."""
-        points = self._points[ids]
+        points = self.state.points[ids]
         known = np.isfinite(points[:, 0])
-        record = self.records[frame]
+        record = self.state.records[frame]
         start = key.world_T_rig @ record.key_T_rig
-        fit = resect(points[known], bearings[known], start, self._sigma)
+        fit = resect(points[known], bearings[known], start, self.state.sigma)
         if fit.significant:
             record.key_T_rig = inverse(key.world_T_rig) @ fit.world_T_rig
             record.status = FrameStatus.TRACKED
@@ -250,28 +200,28 @@ class Tracker:
 
     def _add_to_map(self, grey: np.ndarray, small: Miniature, frame: int) -> None:
         """Pose a frame by known points; look for it among keyframes where that fails."""
-        assert self._features is not None
-        key = self._window[-1]
-        tried = self._attempt(grey, key, self._features, self._pose @ self._motion)
+        features, key = self.state.features, self.state.window[-1]
+        assert features is not None
+        tried = self._attempt(grey, key, features, self.state.world_T_rig @ self.state.motion)
         if not tried.fit.significant:
             turned_pose = pose(
-                self._turned(small, tried.fit.world_T_rig[:3, :3]), self._pose[:3, 3]
+                self._turned(small, tried.fit.world_T_rig[:3, :3]), self.state.world_T_rig[:3, 3]
             )
-            again = self._attempt(grey, key, self._features, turned_pose)
+            again = self._attempt(grey, key, features, turned_pose)
             tried = again if again.fit.significant else None
         if tried is None:
             tried = self._relocalised(grey, small)
         if tried is None:
             self._lose(grey, small, frame)
             return
-        found_again = self.records[-1].status == FrameStatus.LOST
-        self._failures = 0
+        found_again = self.state.records[-1].status == FrameStatus.LOST
+        self.state.failures = 0
         self._accept(frame, tried, small)
         if found_again:  # the step from where the camera was lost is no velocity
-            self._motion = np.eye(4)
+            self.state.motion = np.eye(4)
 
     def _attempt(
-        self, grey: np.ndarray, key: _Keyframe, features: _Features, predicted: np.ndarray
+        self, grey: np.ndarray, key: Keyframe, features: Features, predicted: np.ndarray
     ) -> _Attempt:
         """Follow a keyframe's features into a frame whose pose (4, 4) is predicted, and pose it.
 
@@ -281,7 +231,7 @@ class Tracker:
         template = key.atlas
         assert template is not None
         atlas = self._cutter.cut(grey, predicted[:3, :3])
-        points = self._points[features.ids]
+        points = self.state.points[features.ids]
         known = np.isfinite(points[:, 0])
         assumed = np.where(known[:, None], points, features.assumed_world)
         bearings, found = np.empty_like(points), np.zeros(len(points), bool)
@@ -293,7 +243,7 @@ class Tracker:
 
         look(np.flatnonzero(known), predicted)
         rows = np.flatnonzero(known & found)
-        fit = resect(points[rows], bearings[rows], predicted, self._sigma)
+        fit = resect(points[rows], bearings[rows], predicted, self.state.sigma)
         if np.count_nonzero(fit.inliers) >= _MIN_LEADING:
             moved = angles_between(
                 _seen_from(predicted, points[rows]), _seen_from(fit.world_T_rig, points[rows])
@@ -303,23 +253,23 @@ class Tracker:
                 astray[rows[fit.inliers]] = False
                 look(np.flatnonzero(astray), fit.world_T_rig)
                 rows = np.flatnonzero(known & found)
-                fit = resect(points[rows], bearings[rows], fit.world_T_rig, self._sigma)
+                fit = resect(points[rows], bearings[rows], fit.world_T_rig, self.state.sigma)
         if fit.significant:
             look(np.flatnonzero(~known), fit.world_T_rig)
         return _Attempt(atlas, bearings, found, fit)
 
     def _accept(self, frame: int, tried: _Attempt, small: Miniature) -> None:
         """Take the pose of a frame; make it a keyframe if it is time."""
-        features, key, fit = self._features, self._window[-1], tried.fit
+        features, key, fit = self.state.features, self.state.window[-1], tried.fit
         assert features is not None
         self._step(fit.world_T_rig, small)
         noise = float(np.clip(fit.noise, _MIN_SIGMA, _MAX_SIGMA))
-        self._sigma += _ADAPTING * (noise - self._sigma)
+        self.state.sigma += _ADAPTING * (noise - self.state.sigma)
         fits = self._fitting(features, tried, key)
         self._assume(features, fits, tried.bearings[fits])
         features.misses = np.where(fits, 0, features.misses + 1)
-        known = np.isfinite(self._points[features.ids, 0])
-        distance = self._distance(features.ids[fits & known], self._pose)
+        known = np.isfinite(self.state.points[features.ids, 0])
+        distance = self._distance(features.ids[fits & known], self.state.world_T_rig)
         parallax = self._parallax(features, tried, fits, key)
         key.most_found = max(key.most_found, int(np.count_nonzero(fits)))
         share = np.count_nonzero(fits) / max(key.most_found, 1)
@@ -329,36 +279,36 @@ class Tracker:
             self._become_keyframe(frame, tried.atlas, small, ids, bearings)
             return
         kept = known | (features.misses <= _MAX_MISSES)
-        self._features = features.taken(kept)
+        self.state.features = features.taken(kept)
         number = int(np.count_nonzero(fit.inliers))
-        key_T_rig = inverse(key.world_T_rig) @ self._pose
+        key_T_rig = inverse(key.world_T_rig) @ self.state.world_T_rig
         self._record(FrameStatus.TRACKED, key_T_rig, distance, number)
 
-    def _fitting(self, features: _Features, tried: _Attempt, key: _Keyframe) -> np.ndarray:
+    def _fitting(self, features: Features, tried: _Attempt, key: Keyframe) -> np.ndarray:
         """Features (N,) bool that were found where the pose allows them."""
-        points = self._points[features.ids]
+        points = self.state.points[features.ids]
         known = np.isfinite(points[:, 0])
         fits = tried.found.copy()
         rows = np.flatnonzero(known & tried.found)
         fits[rows] = tried.fit.inliers
         rows = np.flatnonzero(~known & tried.found)
-        key_T_rig = inverse(key.world_T_rig) @ self._pose
+        key_T_rig = inverse(key.world_T_rig) @ self.state.world_T_rig
         rays = tried.bearings[rows] @ key_T_rig[:3, :3].T
         normals = np.cross(key_T_rig[:3, 3], features.bearings[rows])
         lengths = np.linalg.norm(normals, axis=1)
         across = np.abs(np.sum(normals * rays, axis=1)) / np.maximum(lengths, 1e-12)
         # Near the epipole, and without a step, what is left is compared with the bearing itself.
         off = angles_between(features.bearings[rows], rays)
-        fits[rows] = np.minimum(across, off) < _GATE * self._sigma
+        fits[rows] = np.minimum(across, off) < _GATE * self.state.sigma
         return fits
 
     def _parallax(
-        self, features: _Features, tried: _Attempt, fits: np.ndarray, key: _Keyframe
+        self, features: Features, tried: _Attempt, fits: np.ndarray, key: Keyframe
     ) -> float:
         """Median angle between where features lie from the keyframe and from the frame."""
         if not fits.any():
             return 0.0
-        key_R_rig = key.world_T_rig[:3, :3].T @ self._pose[:3, :3]
+        key_R_rig = key.world_T_rig[:3, :3].T @ self.state.world_T_rig[:3, :3]
         rays = tried.bearings[fits] @ key_R_rig.T
         return float(np.median(angles_between(features.bearings[fits], rays)))
 
@@ -369,10 +319,10 @@ class Tracker:
     ) -> None:
         """Make the frame posed last a keyframe: add features, adjust the window."""
         corners = self._corners(atlas, bearings)
-        self._add_keyframe(frame, self._pose, atlas, small, (ids, bearings), corners)
+        self._add_keyframe(frame, self.state.world_T_rig, atlas, small, (ids, bearings), corners)
         self._adjust()
-        known = np.isfinite(self._points[ids, 0])
-        distance = self._distance(ids[known], self._pose)
+        known = np.isfinite(self.state.points[ids, 0])
+        distance = self._distance(ids[known], self.state.world_T_rig)
         self._record(FrameStatus.TRACKED, np.eye(4), distance, len(ids))
 
     def _add_keyframe(
@@ -385,47 +335,48 @@ class Tracker:
         corners: np.ndarray,
     ) -> None:
         """Add a keyframe with features that were followed to it (ids, bearings), and new ones."""
-        ids = self._num_ids + np.arange(len(corners))
-        self._num_ids += len(corners)
-        while self._num_ids > len(self._points):
-            self._points = np.concatenate([self._points, np.full_like(self._points, np.nan)])
+        state = self.state
+        ids = state.num_ids + np.arange(len(corners))
+        state.num_ids += len(corners)
+        while state.num_ids > len(state.points):
+            state.points = np.concatenate([state.points, np.full_like(state.points, np.nan)])
         bearings = corners
         if followed is not None:
             ids = np.concatenate([followed[0], ids])
             bearings = np.concatenate([followed[1], corners])
-        number = len(self.keyframe_poses)
-        key = _Keyframe(number, frame, world_T_rig.copy(), ids, bearings, atlas, small)
-        self._window.append(key)
-        self.keyframe_poses.append(key.world_T_rig)
-        self.keyframe_frames.append(frame)
-        self.keyframe_features.append((ids, bearings.astype(np.float32)))
-        del self._window[: -(FREE + HELD)]
-        for old in self._window[:-_REMEMBERED]:
+        number = len(state.keyframe_poses)
+        key = Keyframe(number, frame, world_T_rig.copy(), ids, bearings, atlas, small)
+        state.window.append(key)
+        state.keyframe_poses.append(key.world_T_rig)
+        state.keyframe_frames.append(frame)
+        state.keyframe_features.append((ids, bearings.astype(np.float32)))
+        del state.window[: -(FREE + HELD)]
+        for old in state.window[:-_REMEMBERED]:
             old.atlas = old.small = old.described = None
-        self._features = self._followable(key)
+        state.features = self._followable(key)
 
     def _adjust(self) -> None:
         """Adjust the window, and drop features that do not fit it."""
-        window = self._window
+        window = self.state.window
         held = max(len(window) - FREE, min(2, len(window) - 1))
         seen = WindowObservations.of([(key.ids, key.bearings) for key in window])
         poses = np.array([key.world_T_rig for key in window])
-        solved = adjust_window(poses, held, seen, self._sigma, _GATE)
+        solved = adjust_window(poses, held, seen, self.state.sigma, _GATE)
         for key, world_T_rig in zip(window[held:], solved.world_T_rigs[held:], strict=True):
             key.world_T_rig = world_T_rig
-            self.keyframe_poses[key.number] = world_T_rig
+            self.state.keyframe_poses[key.number] = world_T_rig
         everything = np.unique(seen.ids)
-        self._points[everything] = np.nan
-        self._points[solved.ids] = solved.points_world
+        self.state.points[everything] = np.nan
+        self.state.points[solved.ids] = solved.points_world
         for n, key in enumerate(window):
             false = solved.outliers[solved.outliers[:, 0] == n, 1]
             if len(false):
                 kept = ~np.isin(key.ids, false)
                 key.ids, key.bearings = key.ids[kept], key.bearings[kept]
-                self.keyframe_features[key.number] = key.ids, key.bearings.astype(np.float32)
+                self.state.keyframe_features[key.number] = key.ids, key.bearings.astype(np.float32)
         last = window[-1]
-        self._pose = last.world_T_rig.copy()
-        self._features = self._followable(last)
+        self.state.world_T_rig = last.world_T_rig.copy()
+        self.state.features = self._followable(last)
 
     # Frames that nothing is known of.
 
@@ -433,23 +384,23 @@ class Tracker:
         """A lost frame posed by one of the last keyframes, which takes the lead then; or None."""
         if small.contrast < _MIN_CONTRAST:
             return None
-        for key in reversed(self._window):
+        for key in reversed(self.state.window):
             if key.atlas is None or key.small is None:
                 break
             world_R_rig = key.world_T_rig[:3, :3] @ turned(key.small, small, [np.eye(3)])
             found = self._by_keyframe(grey, key, pose(world_R_rig, key.world_T_rig[:3, 3]))
             if found is not None:
                 return found
-        frame = self._described(self._cutter.cut(grey, self._pose[:3, :3]))
-        for key in reversed(self._window[-_DESCRIBED:]):
+        frame = self._described(self._cutter.cut(grey, self.state.world_T_rig[:3, :3]))
+        for key in reversed(self.state.window[-_DESCRIBED:]):
             if key.atlas is None:
                 break
             if key.described is None:
                 key.described = self._described(key.atlas)
-            points = self._points[key.ids]
+            points = self.state.points[key.ids]
             known = np.isfinite(points[:, 0])
             distances = np.linalg.norm(points[known] - key.world_T_rig[:3, 3], axis=1)
-            seed = self.seed + len(self.records)
+            seed = self.seed + len(self.state.records)
             key_T_rig = placed(key.described, frame, key.bearings[known], distances, seed)
             if key_T_rig is None:
                 continue
@@ -459,7 +410,7 @@ class Tracker:
         return None
 
     def _confirmed(
-        self, grey: np.ndarray, key: _Keyframe, features: _Features, tried: _Attempt
+        self, grey: np.ndarray, key: Keyframe, features: Features, tried: _Attempt
     ) -> bool:
         """Whether features lead back to a pose from another near it.
 
@@ -476,22 +427,22 @@ class Tracker:
         return bool(turned_back and moved_back)
 
     def _by_keyframe(
-        self, grey: np.ndarray, key: _Keyframe, predicted: np.ndarray
+        self, grey: np.ndarray, key: Keyframe, predicted: np.ndarray
     ) -> _Attempt | None:
         """A frame followed from a keyframe, which leads then; None where no pose comes of it."""
         features = self._followable(key)
         tried = self._attempt(grey, key, features, predicted)
         if tried.fit.significant:
             tried = self._attempt(grey, key, features, tried.fit.world_T_rig)
-        known = np.count_nonzero(np.isfinite(self._points[key.ids, 0]))
+        known = np.count_nonzero(np.isfinite(self.state.points[key.ids, 0]))
         share = np.count_nonzero(tried.fit.inliers) / max(known, 1)
         if not tried.fit.significant or share < _MIN_FOUND_AGAIN:
             return None
         if not self._confirmed(grey, key, features, tried):
             return None
-        self._window = self._window[: self._window.index(key) + 1]
-        self._features = features
-        logger.debug("frame %d: found again by keyframe %d", len(self.records), key.number)
+        self.state.window = self.state.window[: self.state.window.index(key) + 1]
+        self.state.features = features
+        logger.debug("frame %d: found again by keyframe %d", len(self.state.records), key.number)
         return tried
 
     def _described(self, atlas: Atlas) -> Described:
@@ -499,30 +450,31 @@ class Tracker:
 
     def _lose(self, grey: np.ndarray, small: Miniature, frame: int) -> None:
         """Leave a frame without a pose; begin a new map after several."""
-        self._motion = np.eye(4)
-        self._small = self._small if self._small is not None else small
-        key = self._window[-1]
-        self._record(FrameStatus.LOST, inverse(key.world_T_rig) @ self._pose)
+        state = self.state
+        state.motion = np.eye(4)
+        state.small = state.small if state.small is not None else small
+        key = state.window[-1]
+        self._record(FrameStatus.LOST, inverse(key.world_T_rig) @ state.world_T_rig)
         if small.contrast < _MIN_CONTRAST:
             return
-        self._failures += 1
-        if self._failures < self.patience:
+        state.failures += 1
+        if state.failures < self.patience:
             return
-        self._failures = 0
+        state.failures = 0
         logger.warning("frame %d: nothing ties it to the map: a new one begins", frame)
-        self.records.pop()
-        self._map += 1
-        self._has_points, self._features, self._pose = False, None, np.eye(4)
-        self._pending.clear()
+        state.records.pop()
+        state.map_number += 1
+        state.has_points, state.features, state.world_T_rig = False, None, np.eye(4)
+        state.pending.clear()
         self._begin_map(grey, small, frame)
 
     # Small things.
 
     def _turned(self, small: Miniature, guess: np.ndarray) -> np.ndarray:
         """Orientation (3, 3) by the panorama as a whole, from that of the frame posed last."""
-        assert self._small is not None
-        before = self._pose[:3, :3]
-        return before @ turned(self._small, small, [before.T @ guess, np.eye(3)])
+        assert self.state.small is not None
+        before = self.state.world_T_rig[:3, :3]
+        return before @ turned(self.state.small, small, [before.T @ guess, np.eye(3)])
 
     def _corners(self, atlas: Atlas, known: np.ndarray) -> np.ndarray:
         return new_corners(self._layout, atlas, self._usable_in(atlas), known)
@@ -530,12 +482,14 @@ class Tracker:
     def _usable_in(self, atlas: Atlas) -> np.ndarray | None:
         if self.usable is None:
             return None
-        grey = self.usable.astype(np.uint8) * 255
-        return self._cutter.cut(grey, atlas.cut_R_rig, exactly=True).image > 250
+        if self._mask is None or (self._mask.cut_R_rig != atlas.cut_R_rig).any():
+            grey = self.usable.astype(np.uint8) * 255
+            self._mask = self._mask_cutter.cut(grey, atlas.cut_R_rig, exactly=True)
+        return self._mask.image > 250
 
-    def _followable(self, key: _Keyframe) -> _Features:
+    def _followable(self, key: Keyframe) -> Features:
         """Features of a keyframe, assumed as far away as the nearest that has a point."""
-        points = self._points[key.ids]
+        points = self.state.points[key.ids]
         known = np.isfinite(points[:, 0])
         distances = np.ones(len(points))
         if known.any():
@@ -544,18 +498,18 @@ class Tracker:
             distances = lengths[nearest]
         rays = distances[:, None] * (key.bearings @ key.world_T_rig[:3, :3].T)
         assumed = key.world_T_rig[:3, 3] + rays
-        return _Features(key.ids, key.bearings, assumed, np.zeros(len(rays), int))
+        return Features(key.ids, key.bearings, assumed, np.zeros(len(rays), int))
 
-    def _assume(self, features: _Features, found: np.ndarray, bearings: np.ndarray) -> None:
+    def _assume(self, features: Features, found: np.ndarray, bearings: np.ndarray) -> None:
         """Move where features found (N,) bool are assumed onto their bearings in the last frame."""
-        position = self._pose[:3, 3]
+        position = self.state.world_T_rig[:3, 3]
         distances = np.linalg.norm(features.assumed_world[found] - position, axis=1)
-        rays = distances[:, None] * (bearings @ self._pose[:3, :3].T)
+        rays = distances[:, None] * (bearings @ self.state.world_T_rig[:3, :3].T)
         features.assumed_world[found] = position + rays
 
     def _distance(self, ids: np.ndarray, world_T_rig: np.ndarray) -> float:
         """Median distance of features' points from a pose; NaN without points."""
-        points = self._points[ids]
+        points = self.state.points[ids]
         points = points[np.isfinite(points[:, 0])]
         if not len(points):
             return float("nan")
@@ -564,10 +518,10 @@ class Tracker:
     def _step(self, world_T_rig: np.ndarray, small: Miniature) -> None:
         """Go on to the pose of the next frame."""
         # A product of products would double what rounding leaves of R^T R - I with every frame.
-        motion = inverse(self._pose) @ world_T_rig
-        self._motion = pose(nearest_rotation(motion[:3, :3]), motion[:3, 3])
-        self._pose = pose(nearest_rotation(world_T_rig[:3, :3]), world_T_rig[:3, 3])
-        self._small = small
+        motion = inverse(self.state.world_T_rig) @ world_T_rig
+        self.state.motion = pose(nearest_rotation(motion[:3, :3]), motion[:3, 3])
+        self.state.world_T_rig = pose(nearest_rotation(world_T_rig[:3, :3]), world_T_rig[:3, 3])
+        self.state.small = small
 
     def _record(
         self,
@@ -577,12 +531,14 @@ class Tracker:
         inliers: int = 0,
     ) -> None:
         """Note the frame after the last one."""
-        if not self.keyframe_poses:
-            self.keyframe_poses.append(np.eye(4))
-            self.keyframe_frames.append(len(self.records))
-            self.keyframe_features.append((np.zeros(0, np.int64), np.zeros((0, 3), np.float32)))
-        key = self._window[-1].number if self._window else len(self.keyframe_poses) - 1
-        self.records.append(FrameRecord(status, self._map, key, key_T_rig, distance, inliers))
+        state = self.state
+        if not state.keyframe_poses:
+            state.keyframe_poses.append(np.eye(4))
+            state.keyframe_frames.append(len(state.records))
+            state.keyframe_features.append((np.zeros(0, np.int64), np.zeros((0, 3), np.float32)))
+        key = state.window[-1].number if state.window else len(state.keyframe_poses) - 1
+        found = key_T_rig, distance, inliers
+        state.records.append(FrameRecord(status, state.map_number, key, *found))
 
 
 def _seen_from(world_T_rig: np.ndarray, points_world: np.ndarray) -> np.ndarray:

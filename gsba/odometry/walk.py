@@ -4,25 +4,23 @@ import logging
 import os
 import time
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from gsba.geometry import inverse
-from gsba.log import GsbaError, track
+from gsba.log import GsbaError
 from gsba.odometry.closing import ClosedKeyframes, TrackedKeyframes, close
 from gsba.odometry.frame_record import FrameStatus
 from gsba.odometry.panoramas import SmallPanoramas
-from gsba.odometry.places import compressed
 from gsba.odometry.pose_graph import carried_covariances
-from gsba.odometry.tracker import Tracker
+from gsba.odometry.tracking import Tracking, track_frames
 from gsba.store.shards import Threads, Workers
 from gsba.types import Trajectory
-from gsba.video.likeness import sharpness
 
 logger = logging.getLogger(__name__)
 
 _MIN_FRAMES_OF_MAP = 5  # fewer say nothing
-_PATIENCE_S, _MIN_PATIENCE = 1.5, 8  # seconds, and frames, before a lost camera begins a new map
 
 
 def _no_pairs() -> np.ndarray:
@@ -169,6 +167,7 @@ def track_panoramas(
     seed: int = 0,
     workers: Workers | None = None,
     with_loops: bool = True,
+    checkpoint: Path | None = None,
 ) -> Odometry:
     """Follow a camera through a sequence, then join its maps and close its loops.
 
@@ -177,58 +176,47 @@ def track_panoramas(
         seed: of the sampling.
         workers: who compare places; None = threads of this process.
         with_loops: False = leave maps and drift as they are, and covariances unknown.
+        checkpoint: file in which tracking is kept each minute; one of the same panoramas is gone
+            on with, and it is removed in the end. None = keep nothing.
 
     Raises:
         GsbaError: no picture can be decoded.
     """
-    num = len(panoramas)
-    interval = float(np.median(np.diff(panoramas.timestamps)))
-    patience = max(_MIN_PATIENCE, round(_PATIENCE_S / interval))
-    tracker = Tracker(panoramas.width, panoramas.usable, seed, patience)
-    rows, kept, sharp, cpu_s = [], list[np.ndarray](), np.zeros(num), 0.0
-    pictures = panoramas.read(range(num), False)
-    for row, grey in track(pictures, "tracking", num):
-        began = time.thread_time()
-        tracker.add(grey)
-        sharp[row] = sharpness(grey)
-        rows.append(row)
-        while len(tracker.keyframe_frames) > len(kept):
-            kept.append(compressed(grey))
-        cpu_s += time.thread_time() - began
-    if not rows:
+    tracked = track_frames(panoramas, seed, checkpoint)
+    if not tracked.rows:
         raise GsbaError(f"{panoramas.source}: none of its pictures could be decoded; copy it again")
     began = time.process_time()
-    keyframes = _tracked_keyframes(tracker, panoramas, np.array(rows), kept)
+    keyframes = _tracked_keyframes(tracked, panoramas)
     closed = ClosedKeyframes.unchanged(keyframes)
     if with_loops:
         closed = close(keyframes, seed, workers or Threads(os.cpu_count() or 1))
-    spent = cpu_s, time.process_time() - began
-    ends = keyframes, closed, panoramas.timestamps, np.array(rows)
-    found = _odometry(tracker, *ends, sharp, spent)
+    closing_cpu_s = time.process_time() - began
+    found = _odometry(tracked, keyframes, closed, panoramas.timestamps, closing_cpu_s)
+    if checkpoint is not None:
+        checkpoint.unlink(missing_ok=True)
     _log(found)
     return found
 
 
-def _tracked_keyframes(
-    tracker: Tracker, panoramas: SmallPanoramas, rows: np.ndarray, pictures: list[np.ndarray]
-) -> TrackedKeyframes:
-    """What is known of keyframes; `rows` (R,): of the panoramas that were tracked."""
-    frames = np.array(tracker.keyframe_frames)
-    statuses = np.array([record.status for record in tracker.records])
-    numbers = np.array([record.map_number for record in tracker.records])
-    distances = np.array([record.distance for record in tracker.records])
+def _tracked_keyframes(tracked: Tracking, panoramas: SmallPanoramas) -> TrackedKeyframes:
+    """Keyframes as tracking left them."""
+    state, rows = tracked.state, np.array(tracked.rows)
+    frames = np.array(state.keyframe_frames)
+    statuses = np.array([record.status for record in state.records])
+    numbers = np.array([record.map_number for record in state.records])
+    distances = np.array([record.distance for record in state.records])
     maps = numbers[frames].astype(np.int32)
     known = np.isfinite(distances)
     with_points = np.unique(numbers[(statuses == FrameStatus.TRACKED) & known])
     if len(with_points):
         distances = np.interp(np.arange(len(distances)), np.flatnonzero(known), distances[known])
     return TrackedKeyframes(
-        np.array(tracker.keyframe_poses),
+        np.array(state.keyframe_poses),
         maps,
         np.isin(maps, with_points),
         distances[frames],
-        tracker.keyframe_features,
-        pictures,
+        state.keyframe_features,
+        tracked.pictures,
         panoramas.timestamps[rows[frames]],
         panoramas.width,
         panoramas.usable,
@@ -236,24 +224,23 @@ def _tracked_keyframes(
 
 
 def _odometry(
-    tracker: Tracker,
-    tracked: TrackedKeyframes,
+    tracked: Tracking,
+    tracked_keyframes: TrackedKeyframes,
     closed: ClosedKeyframes,
     timestamps: np.ndarray,
-    rows: np.ndarray,
-    sharp: np.ndarray,
-    spent: tuple[float, float],
+    closing_cpu_s: float,
 ) -> Odometry:
     """Frames moved with their keyframes.
 
     Args:
-        tracker: after the last frame.
-        tracked, closed: its keyframes before and after loops were closed.
-        timestamps, sharp: (F,) of all panoramas.
-        rows: (R,) of these, those that could be read.
-        spent: seconds of processor time, of tracking and of closing loops.
+        tracked: all frames.
+        tracked_keyframes, closed: its keyframes before and after loops were closed.
+        timestamps: (F,) of all panoramas.
+        closing_cpu_s: processor time of closing loops.
     """
-    num, records = len(timestamps), tracker.records
+    num, records, rows = len(timestamps), tracked.state.records, np.array(tracked.rows)
+    key_frames, sharp = tracked.state.keyframe_frames, np.zeros(num)
+    sharp[rows] = tracked.sharpness
     keys = np.array([record.keyframe for record in records])
     key_T_rigs = np.array([record.key_T_rig for record in records])
     key_T_rigs[:, :3, 3] *= closed.scales[keys, None]
@@ -261,20 +248,20 @@ def _odometry(
     poses[rows] = closed.world_T_keys[keys] @ key_T_rigs
     statuses, maps = np.full(num, FrameStatus.LOST, np.uint8), np.zeros(num, np.int32)
     statuses[rows] = [record.status for record in records]
-    key_maps = np.array([r.map_number for r in records])[tracker.keyframe_frames]
+    key_maps = np.array([r.map_number for r in records])[key_frames]
     joined = dict(zip(key_maps.tolist(), closed.maps.tolist(), strict=True))
     maps[rows] = [joined.get(record.map_number, record.map_number) for record in records]
     keyframes, distances, inliers = np.zeros(num, bool), np.full(num, np.nan), np.zeros(num, int)
-    of_keys = rows[tracker.keyframe_frames]
+    of_keys = rows[key_frames]
     keyframes[of_keys] = True
     distances[rows] = [record.distance for record in records]
     distances[rows] *= closed.scales[keys]
-    near = tracked.distances[keys] * closed.scales[keys]
+    near = tracked_keyframes.distances[keys] * closed.scales[keys]
     covariances[rows] = carried_covariances(closed.covariances[keys], key_T_rigs, near)
     inliers[rows] = [record.inliers for record in records]
     known = statuses, maps, keyframes, distances, inliers, sharp
     ends = of_keys[closed.loops], of_keys[closed.joins]
-    return Odometry(timestamps, poses, *known, spent[0], covariances, *ends, spent[1])
+    return Odometry(timestamps, poses, *known, tracked.cpu_s, covariances, *ends, closing_cpu_s)
 
 
 def _log(found: Odometry) -> None:

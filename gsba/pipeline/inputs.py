@@ -286,7 +286,8 @@ def _follow(
             panoramas = odometry.masked(panoramas, masks.given)
         if masks.carrier:
             panoramas = odometry.without_carrier(panoramas)
-        return odometry.track_panoramas(panoramas, seed)
+        unfinished = store.root / "stages/odometry/unfinished.npz"
+        return odometry.track_panoramas(panoramas, seed, checkpoint=unfinished)
 
     files = fingerprint([*files_of(video_file), calibration, masks.given])
     key = [width, seed, part, masks.carrier, files]

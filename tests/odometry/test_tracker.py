@@ -20,7 +20,7 @@ def _track(walk: RenderedWalk, **options) -> Tracker:
 
 
 def _statuses(tracker: Tracker) -> np.ndarray:
-    return np.array([record.status for record in tracker.records])
+    return np.array([record.status for record in tracker.state.records])
 
 
 def _error(tracker: Tracker, walk: RenderedWalk, rows: np.ndarray) -> tuple[float, float]:
@@ -35,7 +35,7 @@ def _error(tracker: Tracker, walk: RenderedWalk, rows: np.ndarray) -> tuple[floa
 def test_every_frame_of_a_walk_is_posed_in_one_map(walk: RenderedWalk) -> None:
     tracker = _track(walk)
     assert not (_statuses(tracker) == FrameStatus.LOST).any()
-    assert {record.map_number for record in tracker.records} == {0}
+    assert {record.map_number for record in tracker.state.records} == {0}
     ate, rotation = _error(tracker, walk, np.arange(len(walk.frames)))
     assert ate < 0.01  # of the path, as asked of odometry alone
     assert rotation < 1.0
@@ -74,7 +74,7 @@ def test_a_turn_during_a_walk_is_followed(walk: RenderedWalk, degrees: float) ->
 def test_a_camera_that_stands_adds_no_keyframes(walk: RenderedWalk) -> None:
     standing = walk.at([*range(10), *[10] * 20])
     tracker = _track(standing)
-    assert max(tracker.keyframe_frames) <= 11
+    assert max(tracker.state.keyframe_frames) <= 11
     positions = tracker.world_T_rigs()[11:, :3, 3]
     step = np.linalg.norm(np.diff(tracker.world_T_rigs()[:10, :3, 3], axis=0), axis=1).mean()
     assert np.linalg.norm(positions - positions.mean(axis=0), axis=1).max() < 0.2 * step
@@ -88,7 +88,7 @@ def test_dark_frames_get_no_pose_and_the_map_goes_on(walk: RenderedWalk) -> None
     tracker = _track(dark)
     lost = _statuses(tracker) == FrameStatus.LOST
     np.testing.assert_array_equal(np.flatnonzero(lost), np.arange(14, 24))
-    assert {record.map_number for record in tracker.records} == {0}
+    assert {record.map_number for record in tracker.state.records} == {0}
     ate, _ = _error(tracker, dark, np.flatnonzero(~lost))
     assert ate < 0.02
 
@@ -97,7 +97,7 @@ def test_another_place_begins_a_map_of_its_own(walk: RenderedWalk) -> None:
     flipped = [np.ascontiguousarray(frame[:, ::-1]) for frame in walk.frames]  # no place of it
     elsewhere = RenderedWalk(walk.frames[:12] + flipped[20:], walk.world_T_rigs)
     tracker = _track(elsewhere, patience=3)
-    numbers = [record.map_number for record in tracker.records]
+    numbers = [record.map_number for record in tracker.state.records]
     assert numbers[11] == 0 and numbers[-1] == 1
     first = numbers.index(1)
     np.testing.assert_array_equal(tracker.world_T_rigs()[first], np.eye(4))
@@ -107,15 +107,15 @@ def test_what_is_masked_is_not_followed(walk: RenderedWalk) -> None:
     usable = np.ones((WIDTH // 2, WIDTH), bool)
     usable[:, : WIDTH // 2] = False
     tracker = _track(RenderedWalk(walk.frames[:4], walk.world_T_rigs[:4]), usable=usable)
-    bearings = tracker._window[0].bearings
+    bearings = tracker.state.window[0].bearings
     longitudes = np.arctan2(bearings[:, 0], bearings[:, 2])
     assert len(bearings) > 50 and (longitudes > -0.05).all()
 
 
 def test_memory_is_that_of_the_window(walk: RenderedWalk) -> None:
     tracker = _track(walk)
-    assert len(tracker.keyframe_poses) > FREE + HELD
-    assert len(tracker._window) == FREE + HELD
+    assert len(tracker.state.keyframe_poses) > FREE + HELD
+    assert len(tracker.state.window) == FREE + HELD
 
 
 def test_a_picture_that_shows_nothing_begins_no_map() -> None:

@@ -1,0 +1,73 @@
+"""All that a tracker knows after a frame, so that it can be stored and taken up again."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsba.odometry.atlas import Atlas
+from gsba.odometry.derotation import Miniature
+from gsba.odometry.frame_record import FrameRecord
+from gsba.odometry.relocalisation import Described
+
+SIGMA = float(np.deg2rad(0.25))  # of bearings, per axis, at first
+
+
+@dataclass(slots=True)
+class Keyframe:
+    """A keyframe of the map that is being made."""
+
+    number: int  # of the keyframe in the whole recording
+    frame: int  # index of its frame
+    world_T_rig: np.ndarray  # (4, 4)
+    ids: np.ndarray  # (N,) int64, features seen
+    bearings: np.ndarray  # (N, 3) unit, rig frame
+    atlas: Atlas | None  # None = forgotten
+    small: Miniature | None
+    described: Described | None = None  # when a lost frame was first compared with it
+    most_found: int = 0  # of its features in one of the frames after it
+
+
+@dataclass(slots=True)
+class Features:
+    """Features of the last keyframe that are followed."""
+
+    ids: np.ndarray  # (N,) int64
+    bearings: np.ndarray  # (N, 3) unit, rig frame of the keyframe
+    assumed_world: np.ndarray  # (N, 3) map units: where features without a point are assumed, by
+    # their direction when last found and the distance of points beside them
+    misses: np.ndarray  # (N,) int, frames since
+
+    def taken(self, rows: np.ndarray) -> "Features":
+        """Some rows."""
+        return Features(
+            self.ids[rows], self.bearings[rows], self.assumed_world[rows], self.misses[rows]
+        )
+
+
+@dataclass(slots=True)
+class TrackerState:
+    """Every frame so far, and what the next one is posed by."""
+
+    records: list[FrameRecord] = field(default_factory=list)  # of all frames so far
+    keyframe_poses: list[np.ndarray] = field(default_factory=list)  # (4, 4) each, of all keyframes
+    # so far, in the world of their map
+    keyframe_frames: list[int] = field(default_factory=list)  # index of each keyframe's frame
+    keyframe_features: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)  # that
+    # each keyframe sees: ids (N,) int64, bearings (N, 3) float32 in the rig frame
+    window: list[Keyframe] = field(default_factory=list)  # the last keyframes
+    features: Features | None = None  # that are followed; None = a map is to be begun
+    points: np.ndarray = field(default_factory=lambda: np.full((4096, 3), np.nan))  # (ids, 3) of
+    # features, world of the map; NaN = unknown
+    num_ids: int = 0  # of features so far
+    map_number: int = 0  # of the map that is being made
+    has_points: bool = False  # whether it has some
+    world_T_rig: np.ndarray = field(default_factory=lambda: np.eye(4))  # of the frame posed last
+    motion: np.ndarray = field(
+        default_factory=lambda: np.eye(4)
+    )  # (4, 4) to it from the last but one
+    small: Miniature | None = None  # of the frame posed last
+    sigma: float = SIGMA  # radians, noise of bearings per axis
+    pending: list[tuple[int, np.ndarray, np.ndarray]] = field(default_factory=list)  # frames before
+    # the start of the map: index, ids (N,), bearings (N, 3)
+    failures: int = 0  # frames in a row that show something and fit nothing
+    cut_R_rig: np.ndarray | None = None  # (3, 3) axes along which frames are cut
