@@ -232,7 +232,9 @@ def test_a_stuck_receiver_is_refused(
         place(result, frames, settings)
     rng = np.random.default_rng(11)
     path = _gps_csv(path, frames.timestamps, geodetic_of(rng.normal(0, 2, (40, 3))))
-    with pytest.raises(GsbaError, match=r"gps.csv: its positions and the frames' have nothing"):
+    with pytest.raises(
+        GsbaError, match=r"gps.csv: its positions and the frames' are not correlated"
+    ):
         place(result, frames, settings)
 
 
