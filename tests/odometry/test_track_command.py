@@ -116,7 +116,7 @@ def test_a_video_is_refined_from_its_own_odometry(
     result = _run("refine", video, "--masks", "none", "--out", out, *light)
     assert result.exit_code == 0, result.output
     assert (out / "odometry/walk.tum").is_file() and (out / "odometry/poses.csv").is_file()
-    assert "Where the video's own odometry had the camera" in (out / "report.html").read_text()
+    assert "Camera path by the odometry on the video" in (out / "report.html").read_text()
     assert '"odometry":{"summary":' in (out / "report.html").read_text()
     chosen = read_trajectory(out / "odometry/chosen.tum")
     assert len(list((out / "frames").glob("*.jpg"))) == len(chosen.timestamps)
