@@ -58,7 +58,7 @@ def test_raw_pairs_and_their_lenses(tmp_path: Path) -> None:
             cv2.imwrite(str(path), np.ascontiguousarray(picture(lens)[..., ::-1]))
     facts = _facts(inspect(tmp_path))
     assert facts["layout"] == "raw, two fisheyes a frame, files of 240x240"
-    assert facts["frames"] == "3, in the order of their names: nothing says when"
+    assert facts["frames"] == "3, in the order of their names: they have no times"
     lenses = scan(tmp_path, order_suffices=True).fisheyes
     assert lenses is not None
     for name, lens in zip(("front lens", "back lens"), lenses, strict=True):
@@ -75,7 +75,7 @@ def test_what_would_be_refused_says_why(tmp_path: Path) -> None:
 
 def test_neither_footage_nor_there(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("hello")
-    for name, why in (("notes.txt", "no video, picture or folder"), ("nowhere", "no such file")):
+    for name, why in (("notes.txt", "no video, image or folder"), ("nowhere", "no such file")):
         with pytest.raises(GsbaError, match=why):
             inspect(tmp_path / name)
 

@@ -173,7 +173,7 @@ def test_a_map_that_there_is_not_is_refused(two_places: tuple[Path, Result], num
     out, _ = two_places
     result = _gsba("export", out, "--to", "tum", "--map", number)
     assert result.exit_code == 1 and not result.stdout
-    message = f"{out} has no map {number}: it has 2, numbered from the largest, 1"
+    message = f"{out} has no map {number}: it has 2, numbered from 1, the largest"
     assert result.stderr == f"error: {message}\n"
     whole = load_stage(out, "reconstruction", Reconstruction)
     frames, folder = load_stage(out, "frames", FrameSet), out.parent / "none"
@@ -231,7 +231,7 @@ def test_covariances_are_judged_by_the_truth(case: Case, tmp_path: Path) -> None
     command = ["evaluate", case.out, "--truth", tmp_path / "truth.tum", "--json", numbers]
     result = CliRunner().invoke(app, [str(part) for part in command])
     assert result.exit_code == 0 and "\nabsolute " in result.output
-    assert "with the pose of 000000 and its distance to 000007 held" in result.output
+    assert "fixes the pose of 000000 and its distance to 000007" in result.output
     claims = json.loads(numbers.read_text())["consistency"]
     for kind in ("absolute", "consecutive"):
         assert claims[kind]["num"] == NUM_FRAMES - 1
