@@ -104,10 +104,10 @@ def _savez_text(path: Path, header: str) -> None:
         (lambda path: np.savez(path, depth=np.ones((2, 4))), "holds no array `range`"),
         (lambda path: np.savez(path, range=np.array([{}, None])), "holds no array `range`"),
         (lambda path: _savez_text(path, "{'descr': '<f8', 'shape': (2, 4"), "damaged depth map"),
-        (lambda path: np.savez(path, range=np.array([["a"]])), "no image of numbers"),
-        (lambda path: np.savez(path, range=np.ones(8)), "no image of numbers"),
-        (lambda path: np.savez(path, range=np.ones((0, 0))), "0x0, but a map is 2:1"),
-        (lambda path: np.savez(path, range=np.ones((4, 4))), "4x4, but a map is 2:1"),
+        (lambda path: np.savez(path, range=np.array([["a"]])), "must be an image of numbers"),
+        (lambda path: np.savez(path, range=np.ones(8)), "must be an image of numbers"),
+        (lambda path: np.savez(path, range=np.ones((0, 0))), "0x0, but it must be 2:1"),
+        (lambda path: np.savez(path, range=np.ones((4, 4))), "4x4, but it must be 2:1"),
     ],
 )
 def test_damaged_depth_maps_are_named(

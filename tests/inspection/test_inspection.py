@@ -70,7 +70,7 @@ def test_what_would_be_refused_says_why(tmp_path: Path) -> None:
     assert "at least 3 are needed" in two.problem and not two.command
     assert "refused: " in two.text()
     one = inspect(tmp_path / "two/pano0.jpg")
-    assert _facts(one)["size"] == f"{WIDTH}x{WIDTH // 2}" and "one picture" in one.problem
+    assert _facts(one)["size"] == f"{WIDTH}x{WIDTH // 2}" and "is one image" in one.problem
 
 
 def test_neither_footage_nor_there(tmp_path: Path) -> None:

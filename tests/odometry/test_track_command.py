@@ -87,7 +87,7 @@ def test_what_is_no_input_is_refused_in_one_line(folder: Path, video: Path, tmp_
     for arguments, said in (
         ((tmp_path / "none.mp4", "--out", out), "none.mp4"),
         ((folder, "--out", tmp_path), "is a folder"),
-        ((video, "--out", out, "--fps", 3), "times of its own"),
+        ((video, "--out", out, "--fps", 3), "holds the times of its frames"),
         ((video, "--out", out, "--width", 801), "width"),
     ):
         result = _run("track", *arguments)
