@@ -207,7 +207,7 @@ def test_walk_is_reproducible_and_replaces_only_walks(walk, tmp_path):
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "thesis.tex").write_text("years of work")
-    with pytest.raises(GsbaError, match="something else"):
+    with pytest.raises(GsbaError, match="not a walk's folder"):
         make_walk(mine, num_frames=FRAMES, width=WIDTH)
     assert (mine / "thesis.tex").exists()
 

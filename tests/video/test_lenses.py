@@ -151,7 +151,7 @@ def test_tracks_out_of_step(tmp_path: Path, caplog: pytest.LogCaptureFixture) ->
     np.testing.assert_allclose(
         list(_times(tmp_path / "frames").values()), np.array(both) / 30, atol=1e-9
     )
-    assert "4 instants left out that one lens alone shows (3 front, 1 back)" in caplog.text
+    assert "4 instants are left out, which only one lens has (3 front, 1 back)" in caplog.text
     assert "two tracks of 96x96: front lens, back lens" in caplog.text
 
 
@@ -361,8 +361,11 @@ def _of_size(width: int, height: int, num: int = 4) -> Track:
     ("tracks", "message"),
     [
         ([_of_size(96, 96), _of_size(64, 64)], "tracks of 96x96 and 64x64; those of two lenses"),
-        ([_of_size(128, 64), _of_size(128, 64)], "2:1 each (128x64 and 128x64), so stitched twice"),
-        ([_of_size(160, 64), _of_size(160, 64)], "neither fisheyes (square) nor a panorama (2:1)"),
+        (
+            [_of_size(128, 64), _of_size(128, 64)],
+            "two stitched video tracks of 2:1 (128x64 and 128x64)",
+        ),
+        ([_of_size(160, 64), _of_size(160, 64)], "neither fisheyes (square) nor panoramas (2:1)"),
         ([_of_size(96, 96)] * 3, "holds 3 video tracks"),
     ],
 )
