@@ -172,11 +172,11 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--peer", action="store_true")
     parser.add_argument("--markdown", type=Path)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     names = ["walk", "as", "taken", *(title for _, title, *_ in COLUMNS)]
     lines = [f"| {' | '.join(names)} |", "|---|---|" + "---:|" * (len(names) - 2)]
-    for walk in asked.walks:
-        for name, outcomes in rows_of(walk, asked.out, asked.seeds, asked.peer):
+    for walk in arguments.walks:
+        for name, outcomes in rows_of(walk, arguments.out, arguments.seeds, arguments.peer):
             for row in outcomes:
                 if "reason" in row:
                     print(f"{walk.name} {name}: {row['reason']}")
@@ -187,7 +187,7 @@ def main() -> None:
             lines.append(f"| `{walk.name}` | {name} | {times} | {' | '.join(cells)} |")
             print(lines[-1], flush=True)
     print("\n".join(lines))
-    write_table(lines, asked.markdown)
+    write_table(lines, arguments.markdown)
 
 
 if __name__ == "__main__":

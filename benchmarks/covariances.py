@@ -85,11 +85,11 @@ def table(names: list[str], data: Path, out: Path) -> Iterator[str]:
     """Lines of the table."""
     yield "| sequence | ATE e-3 | poses | rotation error/σ | position error/σ | NEES |"
     yield "|---|---|---|---|---|---|"
-    for asked in names:
-        name = "/".join(Path(asked).parts[-2:])
+    for given in names:
+        name = "/".join(Path(given).parts[-2:])
         folder = out / re.sub(r"\W+", "_", name)
         try:
-            found, ate = measured(find(asked, data, folder), folder / "run")
+            found, ate = measured(find(given, data, folder), folder / "run")
         except GsbaError as error:
             yield f"| {name} | | | | | {error} |"
             continue

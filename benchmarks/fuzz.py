@@ -52,10 +52,10 @@ class Outcome:
 
     number: int
     family: str
-    what: str  # how it was spoiled
+    what: str  # description of the damage
     exit_code: int
     seconds: float
-    said: str  # last line of stderr
+    last_line: str  # of stderr
     findings: list[str] = field(default_factory=list)
 
 
@@ -158,9 +158,9 @@ def run(number: int, options: argparse.Namespace) -> Outcome:
             if result.exception and not isinstance(result.exception, SystemExit):
                 traceback.print_exception(result.exception)
         findings = list(_complaints(case, result, folder, before))
-        said = (result.stderr.splitlines() or [""])[-1][:300]
+        last_line = (result.stderr.splitlines() or [""])[-1][:300]
         code = result.exit_code
-    return Outcome(number, case.family, case.what, code, seconds, said, findings)
+    return Outcome(number, case.family, case.what, code, seconds, last_line, findings)
 
 
 @contextmanager

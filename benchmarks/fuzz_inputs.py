@@ -64,7 +64,7 @@ class Spoiled:
     make: Callable[[Path, Path], None]  # (prepared folder, empty folder): makes its files
     check: Callable[[Path, Any], str | None]  # (folder, result) -> fault; None = none
     limit_s: float = 30.0
-    resumes: bool = False  # whether what is there after a failure is of use to the next call
+    resumes: bool = False  # a next call uses the output left after a failure
 
     def keeps(self, path: Path) -> bool:
         """True if a file must not change when the call fails."""
@@ -83,7 +83,7 @@ class Draft:
     rng: np.random.Generator
     arguments: list[str] = field(default_factory=list)
     steps: list[Callable[[Path, Path], None]] = field(default_factory=list)
-    said: list[str] = field(default_factory=list)
+    changes: list[str] = field(default_factory=list)
 
     def pick(self, options: Sequence[Any]) -> Any:
         return options[int(self.rng.integers(len(options)))]
@@ -94,7 +94,7 @@ class Draft:
             self.steps.append(lambda source, here, name=name: copied(source / name, here / name))
 
     def edit(self, name: str, change: Callable[[bytes], bytes], what: str) -> None:
-        self.said.append(f"{name} {what}")
+        self.changes.append(f"{name} {what}")
 
         def step(_: Path, here: Path) -> None:
             path = here / name
@@ -109,7 +109,7 @@ class Draft:
             for step in steps:
                 step(source, here)
 
-        what = ", ".join(self.said) or "as it should be"
+        what = ", ".join(self.changes) or "undamaged"
         return Spoiled(family, what[:200], self.arguments, make, check, **more)
 
 
@@ -131,7 +131,7 @@ def _settings(draft: Draft) -> Spoiled:
         key = draft.pick([key, key, key, key.partition(".")[0], key + "x", key + ".x", ""])
         value = draft.pick([*map(json.dumps, (value, -1, 0, [value], {"x": value})), *WORDS, "7"])
         text.append((key, value))
-    draft.said = [f"{key}={value[:40]}" for key, value in text]
+    draft.changes = [f"{key}={value[:40]}" for key, value in text]
     if draft.rng.random() < 0.7:
         for key, value in text:
             draft.arguments += ["--set", f"{key}={value}"]
@@ -199,7 +199,7 @@ def _starts(draft: Draft) -> Spoiled:
         key = draft.pick(["read.clock_offset_s", "seed", "placement.gps", "placement.align"])
         options += ["--set", f"{key}={draft.pick(WORDS)}"]
     draft.arguments = ["--quiet", "refine", "flat", *options, "--out", "out", *small_settings()]
-    draft.said.append(" ".join(options)[:120])
+    draft.changes.append(" ".join(options)[:120])
     return draft.done("starts", lambda *_: "frames that show nothing were refined", resumes=True)
 
 
@@ -234,7 +234,7 @@ def _placements(draft: Draft) -> Spoiled:
         [[], [], ["--face-size", draft.pick(["16", "0", "15", "-1", "1e9", "10000000"])]]
     )
     draft.arguments = ["--quiet", "export", _RUN, "--to", to, "--out", "out", *up, *options, *size]
-    draft.said.append(" ".join([*up, *options])[:120])
+    draft.changes.append(" ".join([*up, *options])[:120])
     return draft.done("placements", check_export)
 
 
@@ -278,7 +278,7 @@ def _depths(draft: Draft) -> Spoiled:
     elif how == 2:
         draft.edit(name, lambda _: draft.pick([b"", b"range", b"\x93NUMPY", b"PK"]), "text")
     else:
-        draft.said.append(f"{name} gone")
+        draft.changes.append(f"{name} gone")
         draft.steps.append(lambda _, here: (here / name).unlink())
     draft.arguments = ["evaluate", "slam.tum", "--truth", "truth.tum", "--depth", "depth"]
     draft.arguments += ["--json", "numbers.json"]
@@ -300,7 +300,7 @@ def _videos(draft: Draft) -> Spoiled:
         if draft.rng.random() < 0.15:
             value = draft.pick(["slam.tum", "x", ""] if option == "--at" else numbers)
             draft.arguments += [option, value]
-            draft.said.append(f"{option} {value[:30]}")
+            draft.changes.append(f"{option} {value[:30]}")
 
     def check(here: Path, _: Any) -> str | None:
         rows = list(csv.reader(_lines_of(here / "out/timestamps.csv")))[1:]
@@ -352,7 +352,7 @@ def _runs(draft: Draft) -> Spoiled:
     draft.arguments = ["--quiet", "refine", _FRAMES, *poses, *options, "--out", "out"]
     for key, value in _flat(SETTINGS):
         draft.arguments += ["--set", f"{key}={json.dumps(value)}"]
-    draft.said.append(" ".join([*poses, *options])[:150])
+    draft.changes.append(" ".join([*poses, *options])[:150])
     with_features = poses == ["slam.tum"]
 
     def features(source: Path, here: Path) -> None:
@@ -623,7 +623,7 @@ def _spoil_names(draft: Draft, folder: str) -> None:
     """Rename, add or remove files of a folder of frames."""
     how = int(draft.rng.integers(6))
     odd = draft.pick([b"\xff.jpg", b"a\n.jpg", b"..jpg", b"x_front.jpg", b"9" * 200 + b".jpg"])
-    draft.said.append(f"{folder}: names {how} {odd!r:.30}")
+    draft.changes.append(f"{folder}: names {how} {odd!r:.30}")
 
     def step(_: Path, here: Path) -> None:
         files = sorted((here / folder).iterdir())
@@ -649,10 +649,12 @@ def check_export(here: Path, _: Any) -> str | None:
     """Fault of an export; None = none."""
     if not (here / "out/transform.json").exists():
         return "no transform.json"
-    said = json.loads((here / "out/transform.json").read_text())
-    rotation = np.array(said["rotation"])
-    wrong = _not_finite([said["scale"], said["matrix"], said["inverse"], said["offset"]])
-    if wrong or not said["scale"] > 0 or not np.allclose(rotation @ rotation.T, np.eye(3)):
+    transform = json.loads((here / "out/transform.json").read_text())
+    rotation = np.array(transform["rotation"])
+    wrong = _not_finite(
+        [transform["scale"], transform["matrix"], transform["inverse"], transform["offset"]]
+    )
+    if wrong or not transform["scale"] > 0 or not np.allclose(rotation @ rotation.T, np.eye(3)):
         return wrong or "transform"
     if np.linalg.det(rotation) < 0:
         return "a mirrored world"

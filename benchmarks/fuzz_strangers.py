@@ -159,7 +159,7 @@ def _names(draft: Draft) -> Spoiled:
         return json.dumps(tree).encode()
 
     draft.edit("light/stages/frames.npz", change_member(draft, "manifest.json", change), "names")
-    draft.said.append(f"{key}: {name[:40]!r}")
+    draft.changes.append(f"{key}: {name[:40]!r}")
     draft.arguments = ["--quiet", "export", "light", "--out", "out", "--face-size", "16"]
     draft.arguments += ["--to", draft.pick(["colmap", "nerfstudio", "colmap-erp", "tum"])]
 
@@ -202,7 +202,7 @@ def _links(draft: Draft) -> Spoiled:
     draft.steps.append(step)
     draft.arguments = ["--quiet", *options[command]]
     draft.arguments += small_settings() if "refine" in options[command] else []
-    draft.said.append(f"{command} with a {kind} at {place}")
+    draft.changes.append(f"{command} with a {kind} at {place}")
     spoiled = draft.done("links", _unharmed, resumes=True)
     return _Ours(**{name: getattr(spoiled, name) for name in spoiled.__dataclass_fields__})
 
@@ -338,7 +338,7 @@ def _clusters(draft: Draft) -> Spoiled:
             [change_tree(draft), change_bytes(draft), lambda _: draft.pick([b"{}", b""])]
         )
         draft.edit(address, way, "spoiled")
-    draft.said.append(f"--cluster {address[:40]}")
+    draft.changes.append(f"--cluster {address[:40]}")
     draft.arguments = ["--quiet", "refine", "flat", "slam.tum", "--fps", "2", "--out", "out"]
     draft.arguments += ["--cluster", address, *small_settings()]
     return draft.done("clusters", lambda *_: "frames that show nothing were refined", resumes=True)
@@ -373,7 +373,7 @@ def _numbers(draft: Draft) -> Spoiled:
         ],
     ]
     draft.arguments = ["--quiet", *draft.pick(commands)]
-    draft.said.append(" ".join(draft.arguments)[:120])
+    draft.changes.append(" ".join(draft.arguments)[:120])
     return draft.done("numbers", lambda *_: None, resumes=True)
 
 

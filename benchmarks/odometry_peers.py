@@ -56,7 +56,7 @@ class Walk(NamedTuple):
         if not images or len(images) != len(truth.timestamps):
             raise GsbaError(f"{folder}: {len(images)} images, {len(truth.timestamps)} true poses")
         times = np.arange(len(images)) * float(np.median(np.diff(truth.timestamps)))
-        truth = Trajectory(times, truth.world_T_rigs)  # as the video has them, from 0
+        truth = Trajectory(times, truth.world_T_rigs)  # seconds of the video, from 0
         return cls(folder.name, images, truth)
 
     def errors(self, estimate: Trajectory) -> dict[str, Any]:

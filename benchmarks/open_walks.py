@@ -245,7 +245,7 @@ def main() -> None:
         "ATE in 1e-3 units of the truth, after Sim(3). Targets: every ATE with a trajectory at "
         f"most {MAX_RATIO} times that without (worst ratio), none above {1e3 * MAX_ATE:g}. Of "
         "medians: median over trajectories by median over seeds. Chance: largest over smallest "
-        "ATE without a trajectory of the seeds; a ratio no larger than that says little. Numbers "
+        "ATE without a trajectory of the seeds; a ratio below it is within chance. Numbers "
         "under trajectories are seeds of degradations of the truth.",
         *(["", options.note] if options.note else []),
         *(["", f"With {', '.join(options.sets)}."] if options.sets else []),

@@ -250,8 +250,8 @@ def main() -> None:
         (every, *(name for name in options.sequences if (options.data / name).is_dir()))
     )
     known = ((options.sequences, there), (options.peers, ",".join(MODES)), (options.factors, sets))
-    for asked, allowed in known:
-        if unknown := set(asked) - set(allowed.split(",")):
+    for given, allowed in known:
+        if unknown := set(given) - set(allowed.split(",")):
             parser.error(f"{', '.join(sorted(unknown))}: use some of {allowed}")
     bench = Bench(options.out, 60 * options.timeout_min, options.fresh)
     table, text, held = [], [], True

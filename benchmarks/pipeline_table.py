@@ -61,7 +61,7 @@ def _against_peers(ours: dict, peers: Sequence[dict]) -> Iterator[tuple[str, boo
     best = max(row["errors"]["auc"]["0.5"] for row in peers)
     yield f"AUC@0.5° {100 * area:.1f}, best peer {100 * best:.1f}", area >= best
     whole = [e for row in peers if (e := row["errors"])["num_matched"] == e["num_truth"]]
-    if whole:  # the ATE of a part of the frames says little
+    if whole:  # the ATE over a part of the frames is not comparable
         best = min(e["ate"]["rmse"] for e in whole)
         yield f"ATE {ate:.5f}, best peer that posed all frames {best:.5f}", ate <= best
 

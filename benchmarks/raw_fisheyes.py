@@ -257,20 +257,20 @@ def main() -> None:
     parser.add_argument("--ways", nargs="*", choices=WAYS, default=list(WAYS))
     parser.add_argument("--peer", nargs="*", choices=MODES, metavar="MODE", help="none named: all")
     parser.add_argument("--markdown", type=Path)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     names = ["walk", "as", *(title for _, title, *_ in COLUMNS)]
     lines = [f"| {' | '.join(names)} |", "|---|---|" + "---:|" * (len(names) - 2)]
-    for walk in (path.resolve() for path in asked.walks):
-        found = list(rows_of(walk, asked.out, asked.seeds, asked.ways))
-        if asked.peer is not None:
-            found += peers_of(walk, asked.out, asked.peer or MODES)
+    for walk in (path.resolve() for path in arguments.walks):
+        found = list(rows_of(walk, arguments.out, arguments.seeds, arguments.ways))
+        if arguments.peer is not None:
+            found += peers_of(walk, arguments.out, arguments.peer or MODES)
         for name, outcomes in found:
             reasons = {row["reason"] for row in outcomes if "reason" in row}
             title = ": ".join([name, *sorted(reasons)]).replace("|", "/")
             cells = [cell(outcomes, key, factor, form) for key, _, factor, form in COLUMNS]
             lines.append(f"| `{walk.name}` | {title} | {' | '.join(cells)} |")
     print("\n".join(lines))
-    write_table(lines, asked.markdown)
+    write_table(lines, arguments.markdown)
 
 
 if __name__ == "__main__":

@@ -254,31 +254,31 @@ def main() -> None:
     for name in ("frames", "calibration", "out"):
         parser.add_argument(name, type=Path)
     parser.add_argument("--start", type=Path, help="trajectory of the rig, metres")
-    asked = parser.parse_args()
-    if asked.out.exists() and any(path.name != "log.txt" for path in asked.out.iterdir()):
-        sys.exit(f"{asked.out}: is not empty")
-    pair = read_calibration(asked.calibration)
-    asked.out.mkdir(parents=True, exist_ok=True)
-    if asked.mode == "faces":
-        views = faces(asked.frames, pair, asked.out)
+    arguments = parser.parse_args()
+    if arguments.out.exists() and any(path.name != "log.txt" for path in arguments.out.iterdir()):
+        sys.exit(f"{arguments.out}: is not empty")
+    pair = read_calibration(arguments.calibration)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    if arguments.mode == "faces":
+        views = faces(arguments.frames, pair, arguments.out)
     else:
-        views = fisheyes(asked.frames, pair, FISHEYES[asked.mode], asked.out)
-    database, times = match(views, asked.out), times_of(asked.frames)
+        views = fisheyes(arguments.frames, pair, FISHEYES[arguments.mode], arguments.out)
+    database, times = match(views, arguments.out), times_of(arguments.frames)
     ways: dict[str, Callable[[], Any]] = {}
-    if asked.start:
-        ways["trajectory"] = lambda: adjusted(database, views, times, asked.start)
-    ways["alone"] = lambda: mapped(database, asked.out)
+    if arguments.start:
+        ways["trajectory"] = lambda: adjusted(database, views, times, arguments.start)
+    ways["alone"] = lambda: mapped(database, arguments.out)
     costs = {}
     for name, way in ways.items():
         wall, cpu = time.perf_counter(), time.process_time()
         model = way()
         if model is not None:
-            write_poses(model, views, times, asked.out / f"{name}.tum")
+            write_poses(model, views, times, arguments.out / f"{name}.tum")
         costs[name] = {
             "wall_s": time.perf_counter() - wall,
             "cpu_s": time.process_time() - cpu,
         }
-    (asked.out / "costs.json").write_text(json.dumps(costs))
+    (arguments.out / "costs.json").write_text(json.dumps(costs))
 
 
 if __name__ == "__main__":

@@ -205,9 +205,9 @@ def main() -> None:
         print(rows[-1], flush=True)
     sigmas = [row["sigmas"] for row in rows[:right] if row["outcome"] == "taken"]
     ratio = float(np.sqrt(np.mean(np.square(sigmas)))) if sigmas else float("nan")
-    said = f"Errors over standard deviations, root mean square of all seeds: {ratio:.2f}"
-    print(said)
-    write_table([*_table(rows), "", f"{said}."], arguments.markdown)
+    summary = f"Errors over standard deviations, root mean square of all seeds: {ratio:.2f}"
+    print(summary)
+    write_table([*_table(rows), "", f"{summary}."], arguments.markdown)
     sys.exit(0 if good else 1)
 
 

@@ -174,7 +174,7 @@ def main() -> None:
             max_gaussians=options.max_gaussians,
             backend="cpu",
             seed=seed,
-            rate_means=5e-4,  # as `splat_quality.py --rates short`
+            rate_means=5e-4,  # `splat_quality.py --rates short` uses these
             rate_means_end=5e-6,
             rate_scales=0.015,
             rate_fade=0.1,

@@ -28,7 +28,7 @@ class Verdict:
 
     explained: np.ndarray  # (N,) bool, points on a surface
     contradicted: np.ndarray  # (N,) bool, points that surfaces contradict
-    told: np.ndarray  # (N,) bool, points with evidence: near a surface, or hidden by one
+    informed: np.ndarray  # (N,) bool, points with evidence: near a surface, or hidden by one
     logs: np.ndarray  # (N,) float64, log likelihood ratios of their distances over uniform ones
     cells: tuple[np.ndarray, ...]  # each (N,) int64: cell of each point, in the cloud's world
 
@@ -52,7 +52,7 @@ class Verdict:
         p value over several sizes of cells is taken: a lead that large cells do not show may come
         from errors that small cells share.
         """
-        both = self.told & other.told
+        both = self.informed & other.informed
         gains = (self.logs - other.logs)[both]
         return max(_chance(np.bincount(c[both], gains)) for c in self.cells)
 
@@ -135,9 +135,9 @@ def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: Grid, noise: Noise) -> Ve
     contradicted = ~explained & (hidden | behind | near)
     logs = np.where(near, noise.logs(off, variances, reach), np.log(1 - noise.inliers))
     logs += _brightness_logs(cloud, scan, nearest, near)
-    told = near | hidden
+    informed = near | hidden
     cells = tuple(cells_of(cloud.points, cloud.size / part) for part in _CELLS_PER_SIZE)
-    return Verdict(explained, contradicted, told, np.where(told, logs, 0.0), cells)
+    return Verdict(explained, contradicted, informed, np.where(informed, logs, 0.0), cells)
 
 
 def _brightness_logs(cloud: Cloud, scan: Scan, nearest: np.ndarray, near: np.ndarray) -> np.ndarray:

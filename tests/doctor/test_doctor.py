@@ -193,7 +193,7 @@ def test_what_a_gpu_is_good_for(changed: dict, told: str, remedy: str) -> None:
 def test_notes_on_extras() -> None:
     codecs = dict.fromkeys(facts.CODECS, True) | {"av1": False}
     notes, remedy = examination._conclusions({"codecs": codecs})
-    assert notes[1] == "not av1" and remedy.startswith("pip install")
+    assert notes[1] == "cannot decode av1" and remedy.startswith("pip install")
     assert examination._conclusions({"weights": []})[0] == ["no weights yet: see --download"]
     assert examination._conclusions({"weights": ["disk"]}) == (["weights of disk"], "")
     assert examination._conclusions({"laz": False}) == (["reads LAS, not LAZ"], "pip install lazrs")

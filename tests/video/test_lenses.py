@@ -383,7 +383,7 @@ def test_lenses_that_do_not_match_are_refused(tmp_path: Path) -> None:
     video = _encode(tmp_path / "short.mp4", front, _seen("back", range(17), ticks))
     result = _gsba("extract", video, *out)
     _fails(
-        result, "the back lens's pictures last 0.567 s, the front one's 0.667 s: one is cut short"
+        result, "the back lens's pictures last 0.567 s, the front one's 0.667 s: one is truncated"
     )
     _fails(result, "pass --to 0.533")
     assert _gsba("extract", video, *out, "--to", 0.533, "--every", 4).exit_code == 0
@@ -397,10 +397,8 @@ def test_files_that_do_not_match_are_refused(tmp_path: Path) -> None:
     _encode(front, _seen("front", range(20), _steady(20)), container_format="mp4")
     _fails(_gsba("extract", front, *out), "v_10_1.insv is not beside it: copy the other lens's")
     _encode(back, _of_size(64, 64, 20), container_format="mp4")
-    _fails(
-        _gsba("extract", front, *out), "v_10_1.insv: is 64x64, but v_00_1.insv, the front lens's"
-    )
-    _fails(_gsba("extract", back, *out), "v_10_1.insv: is 64x64, but v_00_1.insv, the front lens's")
+    _fails(_gsba("extract", front, *out), "v_10_1.insv is 64x64, but v_00_1.insv, the front lens's")
+    _fails(_gsba("extract", back, *out), "v_10_1.insv is 64x64, but v_00_1.insv, the front lens's")
     _encode(back, _seen("back", range(10), _steady(20)), container_format="mp4")
     _fails(_gsba("extract", front, *out), "v_10_1.insv: the back lens's pictures last 0.333 s")
     back.write_bytes(b"no video")

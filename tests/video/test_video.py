@@ -209,17 +209,17 @@ def test_frames_of_two_extractions_do_not_mix(film: Path, tmp_path: Path) -> Non
     assert json.loads((out / "extract.json").read_text())["counts"]["kept"] == 5
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos/holiday.jpg").write_bytes(b"mine")
-    with pytest.raises(GsbaError, match="not empty and no extraction"):
+    with pytest.raises(GsbaError, match="not empty and not an extraction"):
         extract(film, tmp_path / "photos", VideoSettings(), replace=True)
 
 
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("extract.json", "[]", "no extraction"),
-        ("extract.json", '{"counts": {"received": []}, "key": 1}', "no extraction"),
-        ("extract.json", '{"counts": [3], "key": 1}', "no extraction"),
-        ("extract.json", "[" * 99_999, "no extraction"),
+        ("extract.json", "[]", "not an extraction"),
+        ("extract.json", '{"counts": {"received": []}, "key": 1}', "not an extraction"),
+        ("extract.json", '{"counts": [3], "key": 1}', "not an extraction"),
+        ("extract.json", "[" * 99_999, "not an extraction"),
         ("extract.json", '{"counts": null, "key": 1}', "another extraction"),
         ("extract.partial.csv", "000000.jpg\n", "damaged"),
         ("extract.partial.csv", "000000.jpg,x,y,z\n", "damaged"),
