@@ -1,13 +1,13 @@
-"""What two lenses and their rolling rows cost, and what is left of that once they are found.
+"""Errors by two lenses and their rolling shutter, without and with a camera model of these.
 
     python -m benchmarks.camera WALK... --out WORK [--seeds 0 1 2] [--peer] [--markdown FILE]
 
 A WALK is a folder of panoramas with exact truth: `images/` with timestamps.csv, `groundtruth.tum`,
-`slam.tum` (spoiled from the truth where it is absent) and, to judge what is found of the camera,
+`slam.tum` (made from the truth with drift if it is absent) and, to check the estimated camera,
 `calibration.json` with the lenses' `rig_T_lens`, `readout_s` and `stitch_radius`. Each is refined
-as one view point (`central`) and as the images have it (`auto`, the baseline given; the same with
-the photometric family), with every seed, and by the peer's spherical incremental mode. Errors are
-root mean squares.
+with one centre (`central`) and with two lenses if images show them (`auto`, the baseline given;
+without and with the photometric family), with every seed, and by the peer's spherical incremental
+mode. Errors are root mean squares.
 """
 
 import argparse
@@ -55,7 +55,7 @@ COLUMNS = (
 
 
 def case_of(walk: Path, work: Path) -> Case:
-    """A walk, its trajectory spoiled in `work` where it has none."""
+    """Walk, whose coarse trajectory is made in `work` if it has none."""
     slam = walk / "slam.tum"
     if not slam.exists():
         slam = work / walk.name / "slam.tum"
@@ -65,7 +65,7 @@ def case_of(walk: Path, work: Path) -> Case:
 
 
 def true_camera(walk: Path) -> dict[str, float]:
-    """Baseline and readout in units of the truth, where they are known."""
+    """True baseline, in units of the truth, and readout time, as far as they are known."""
     path = walk / "calibration.json"
     if not path.exists():
         return {}
@@ -76,7 +76,7 @@ def true_camera(walk: Path) -> dict[str, float]:
 
 
 def judged(run: Path, truth: Trajectory, camera: dict[str, float]) -> dict[str, Any]:
-    """Errors of a run, and of what it found of its camera."""
+    """Errors of a run's poses and of its estimated camera."""
     errors = evaluate(read_trajectory(run / "trajectory.tum"), truth)
     reconstruction, frames = load_run(run)
     claims = consistency_of(reconstruction, frames.timestamps, truth).absolute
@@ -102,7 +102,7 @@ def judged(run: Path, truth: Trajectory, camera: dict[str, float]) -> dict[str, 
 
 
 def judged_peer(out: Path, truth: Trajectory) -> dict[str, Any]:
-    """Errors of a peer's poses, whose times are frames' numbers."""
+    """Errors of a peer's poses, whose times are the numbers of frames."""
     found = read_trajectory(out / "trajectory.tum")
     rows = np.rint(found.timestamps).astype(int)
     timed = Trajectory(truth.timestamps[rows], found.world_T_rigs)
@@ -112,7 +112,7 @@ def judged_peer(out: Path, truth: Trajectory) -> dict[str, Any]:
 
 
 def rows_of(walk: Path, work: Path, seeds: list[int], peer: bool) -> list[tuple[str, list[dict]]]:
-    """Outcomes of each way of solving a walk."""
+    """Outcomes of each method on a walk."""
     case, camera = case_of(walk, work), true_camera(walk)
     truth, seen = read_trajectory(case.truth), digest(sorted(case.images.iterdir()))
     assert case.trajectory is not None
@@ -150,7 +150,7 @@ def rows_of(walk: Path, work: Path, seeds: list[int], peer: bool) -> list[tuple[
 
 
 def cell(outcomes: list[dict], name: str, factor: float, form: str) -> str:
-    """Median of some outcomes, and their range where there are several."""
+    """Median of the outcomes, and their range if there are several."""
     values = [
         factor * (row[name] if name in row else row["errors"][name])
         for row in outcomes
@@ -165,18 +165,18 @@ def cell(outcomes: list[dict], name: str, factor: float, form: str) -> str:
 
 
 def main() -> None:
-    """Run what is asked for and print the table."""
+    """Run the chosen rows and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("walks", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--peer", action="store_true")
     parser.add_argument("--markdown", type=Path)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     names = ["walk", "as", "taken", *(title for _, title, *_ in COLUMNS)]
     lines = [f"| {' | '.join(names)} |", "|---|---|" + "---:|" * (len(names) - 2)]
-    for walk in asked.walks:
-        for name, outcomes in rows_of(walk, asked.out, asked.seeds, asked.peer):
+    for walk in arguments.walks:
+        for name, outcomes in rows_of(walk, arguments.out, arguments.seeds, arguments.peer):
             for row in outcomes:
                 if "reason" in row:
                     print(f"{walk.name} {name}: {row['reason']}")
@@ -187,7 +187,7 @@ def main() -> None:
             lines.append(f"| `{walk.name}` | {name} | {times} | {' | '.join(cells)} |")
             print(lines[-1], flush=True)
     print("\n".join(lines))
-    write_table(lines, asked.markdown)
+    write_table(lines, arguments.markdown)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""What sharing work out to a Dask scheduler's workers costs, and what it gives.
+"""Cost and gain of work on a Dask scheduler's workers.
 
     python -m benchmarks.cluster FRAMES SLAM --out WORK [--shards 2000] [--slots 64]
 
-First one run with threads here, and with 1, 2, ... worker processes of one thread each: wall clock
-and CPU seconds of the stages that are shared out, those of all workers counted, and whether results
-are equal to the byte. Then shards that sleep and write only, on many slots: what scheduler, shared
-files and this process add to them. Walls depend on what else the machine does: compare within a
-table.
+The first table is of one run with threads of this process, and with 1, 2, ... worker processes of
+one thread each: wall clock and CPU seconds of the parallel stages, with those of all workers, and a
+check that results are equal to the byte. The second table is of shards that only sleep and write,
+on many slots: it shows the overhead of scheduler, shared files and this process. Wall times depend
+on other load of the machine: compare them within a table only.
 """
 
 import argparse
@@ -30,12 +30,12 @@ from gsba.store.cluster import Cluster
 from gsba.store.shards import even_blocks
 
 OUTPUTS = "trajectory.tum", "poses.csv", "points.ply", "colmap/**/*"
-WRITTEN = 100_000  # bytes that a generated shard leaves
+WRITTEN = 100_000  # bytes that a generated shard writes
 
 
 @dataclass(frozen=True)
 class Sleeps:
-    """A job of items that sleep and leave some bytes."""
+    """Job of items that sleep and write some bytes."""
 
     items: np.ndarray
     seconds: float
@@ -57,10 +57,10 @@ class Sleeps:
 
 
 def refine(frames: Path, slam: Path, out: Path, num: int) -> tuple[float, float, float, float]:
-    """A run on so many workers, 0 = one thread here.
+    """Run on `num` workers; 0 = one thread of this process.
 
     Returns:
-        Wall and CPU seconds of the stages that are shared out, and of the others.
+        Wall and CPU seconds of the parallel stages, and of the others.
     """
     settings = RefineSettings.model_validate({"solver": {"num_threads": 1}})
     if num == 0:
@@ -77,7 +77,7 @@ def refine(frames: Path, slam: Path, out: Path, num: int) -> tuple[float, float,
 
 
 def stages(out: Path) -> tuple[float, float, float, float]:
-    """See `refine`."""
+    """Wall and CPU seconds of a finished run, see `refine`."""
     shared = ("features", "neighbours", "steps", "adjacent", "near", "loops", "everywhere", "align",
               "places", "export-colmap")  # fmt: skip
     found = np.zeros((2, 2))
@@ -89,7 +89,7 @@ def stages(out: Path) -> tuple[float, float, float, float]:
 
 
 def asleep(num: int, slots: int, seconds: float) -> tuple[float, float]:
-    """Wall and CPU seconds, of scheduler, workers and this process, of shards that sleep."""
+    """Wall and CPU seconds of scheduler, workers and this process for shards that sleep."""
     with (
         tempfile.TemporaryDirectory() as folder,
         LocalCluster(

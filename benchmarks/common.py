@@ -1,8 +1,8 @@
-"""What the benchmarks share: child processes and the rows kept of them, cut walks, the machine.
+"""Functions of all benchmarks: child processes and their kept rows, cut walks, the machine.
 
-The kernel counts the peak of the process that forks into its child's `ru_maxrss`. So `measure`
-starts commands from this file, run as a process of its own that is too small to blur them:
-heavy imports go in the functions that need them.
+The kernel includes the peak memory of the forking process in its child's `ru_maxrss`. Therefore
+`measure` starts commands from this file in a separate process, which must stay small: heavy imports
+are in the functions that need them.
 """
 
 import hashlib
@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """What a command cost, from its start to its exit."""
+    """Cost of a command, from its start to its exit."""
 
     wall_s: float
     cpu_s: float  # user and system, all threads
@@ -59,7 +59,7 @@ def _stopwatch(timeout_s: float, command: Sequence[str]) -> dict[str, float | bo
 
 
 def kept_row(folder: Path, key: dict, timeout_s: float) -> dict | None:
-    """The row of a folder, if it is of this key and running it again would not end otherwise."""
+    """Row of a folder, if it has this key and a repetition would not change it; None otherwise."""
     kept = folder / "row.json"
     if not kept.exists():
         return None
@@ -74,9 +74,11 @@ def run_row(
     """Run a command; keep and return the row with its cost and outcome.
 
     Args:
-        folder: where `row.json` and `log.txt` go.
-        row: what is known before; its `key` says what `kept_row` may use it for.
-        finish: judges what the command left, into `errors` among others.
+        command: the command.
+        folder: folder of `row.json` and `log.txt`.
+        row: entries known before; `kept_row` compares its `key`.
+        finish: computes the outcome from the command's files, `errors` among others.
+        timeout_s: time after which the command is killed, seconds.
     """
     cost = measure(command, folder / "log.txt", timeout_s)
     row = row | asdict(cost)
@@ -91,7 +93,7 @@ def run_row(
 
 
 def outcome(finish: Callable[[], dict]) -> dict[str, Any]:
-    """What a row is judged to be worth, or why it cannot be judged."""
+    """Outcome of a row, or the reason why it has none."""
     from gsba.log import GsbaError
 
     try:
@@ -101,14 +103,14 @@ def outcome(finish: Callable[[], dict]) -> dict[str, Any]:
 
 
 def refine_command(frames: Path, run: Path, options: Sequence[str]) -> list[str]:
-    """A whole run in a process of its own, without a dataset."""
+    """Command of a whole run without a dataset."""
     command = [sys.executable, "-c", "from gsba.cli import main; main()", "refine", str(frames)]
     options = [*options, "--out", str(run), "--fresh", "--allow-partial"]
     return [*command, *options, "--set", "export.formats=[]"]
 
 
 def last_line(log: Path) -> str:
-    """What a command said last."""
+    """Last line of a command's output."""
     lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
     return lines[-1] if lines else "failed without a word"
 
@@ -139,7 +141,7 @@ class Case(NamedTuple):
 
 
 def cut_short(case: Case, num_frames: int, folder: Path) -> Case:
-    """The first frames of a case, as links in `folder`, and the poses up to the last of them."""
+    """Case of the first frames, as links in `folder`, with the poses up to the last of them."""
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "images").mkdir(parents=True)
     header, *rows = (case.images / "timestamps.csv").read_text().splitlines()
@@ -171,7 +173,7 @@ def machine() -> str:
 
 
 def write_table(lines: Sequence[str], path: Path | None) -> None:
-    """Write the lines of a Markdown table and the machine they are of, if there is a path."""
+    """Write the lines of a Markdown table and the machine, if there is a path."""
     if path is not None:
         _write(path, "\n".join([*lines, "", f"{machine()}.", ""]))
 

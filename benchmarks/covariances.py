@@ -1,10 +1,9 @@
-"""Can the covariances of poses be believed: errors over sigma and NEES where there is a truth.
+"""Consistency of pose covariances: errors over sigma and NEES, on sequences with a truth.
 
     python benchmarks/covariances.py --out WORK --markdown benchmarks/results/covariances.md
 
-Refines each sequence (a finished run in WORK is used again) and prints what `gsba evaluate` says
-of its covariances: `gsba.evaluate.consistency`. Open walks are closed ones cut short, and the
-demo's.
+Refines each sequence (a finished run in WORK is used again) and prints the statistics of
+`gsba.evaluate.consistency`. Open walks are the first part of closed ones, and the demo's.
 Recorded sequences are read from `--data` and skipped if absent; `--walk FILE.tum` is a trajectory
 of your own, beside `images/` and `groundtruth.tum`.
 """
@@ -34,7 +33,7 @@ WANTED = 0.7, 1.5  # error over sigma
 
 
 class Recorded(NamedTuple):
-    """A sequence of the data folder, whole or its first frames."""
+    """Sequence of the data folder, whole or its first frames."""
 
     folder: str
     trajectory: str = "slam.tum"
@@ -56,7 +55,7 @@ DEMOS: dict[str, tuple[WalkPath, Heading]] = {
 
 
 def find(name: str, data: Path, out: Path) -> Case:
-    """Inputs of a sequence; GsbaError where it is not on this machine."""
+    """Inputs of a sequence; GsbaError if it is not on this machine."""
     if name in DEMOS:
         folder = out / "walk"
         if not (folder / "groundtruth.tum").exists():
@@ -72,7 +71,7 @@ def find(name: str, data: Path, out: Path) -> Case:
 
 
 def measured(case: Case, out: Path) -> tuple[Consistency, float]:
-    """What the covariances of a run are worth, and its ATE in units of the truth."""
+    """Consistency of a run's covariances, and its ATE in units of the truth."""
     settings = RefineSettings.model_validate({"export": {"formats": []}})
     refine(case.images, case.trajectory, out, settings)
     reconstruction, frames = load_run(out)
@@ -86,11 +85,11 @@ def table(names: list[str], data: Path, out: Path) -> Iterator[str]:
     """Lines of the table."""
     yield "| sequence | ATE e-3 | poses | rotation error/σ | position error/σ | NEES |"
     yield "|---|---|---|---|---|---|"
-    for asked in names:
-        name = "/".join(Path(asked).parts[-2:])
+    for given in names:
+        name = "/".join(Path(given).parts[-2:])
         folder = out / re.sub(r"\W+", "_", name)
         try:
-            found, ate = measured(find(asked, data, folder), folder / "run")
+            found, ate = measured(find(given, data, folder), folder / "run")
         except GsbaError as error:
             yield f"| {name} | | | | | {error} |"
             continue
@@ -104,7 +103,7 @@ def table(names: list[str], data: Path, out: Path) -> Iterator[str]:
 
 
 def _cell(one: Statistic, wanted: bool = True) -> str:
-    """A figure with its interval; bold where it is not what is wanted."""
+    """Statistic with its interval; bold if it is outside of the target range."""
     right = WANTED[0] <= one.value <= WANTED[1] if wanted else one.expected
     value = f"{one.value:.2f}" if right else f"**{one.value:.2f}**"
     return f"{value} ({one.low:.2f} to {one.high:.2f})"

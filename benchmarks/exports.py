@@ -1,12 +1,12 @@
-"""Cost of exports of 8K panoramas, beside bare decoding and encoding of the same pictures.
+"""Cost of exports of 8K panoramas, beside bare decoding and encoding of the same images.
 
     python -m benchmarks.exports --out WORK [--frames 20] [--width 8192] [--images FOLDER]
         [--markdown FILE]
 
-Each row is a process of its own. `bare` decodes each panorama into the same memory and encodes six
-pictures as large as its faces; `sampled` also samples them, bicubic, in one thread: nothing that
-gives the same pixels can cost less. What is counted is CPU time from the first frame to the last,
-without imports, tables of `sampled` and what it copies for encoding.
+Each row is a separate process. `bare` decodes each panorama into the same memory and encodes six
+images as large as its faces; `sampled` also samples them, bicubic, in one thread, which is a lower
+bound for these pixels. CPU time is counted from the first frame to the last, without imports, and
+for `sampled` without tables and copies for encoding.
 """
 
 import argparse
@@ -33,7 +33,7 @@ ROWS = ("bare", "sampled", "colmap", "colmap,colmap-flat,nerfstudio")
 
 
 def make_map(frames: FrameSet, num_points: int = 50) -> Reconstruction:
-    """A straight walk among points that every frame sees."""
+    """Straight walk among points that every frame sees."""
     num_frames, rng = len(frames), np.random.default_rng(0)
     poses = np.tile(np.eye(4), (num_frames, 1, 1))
     poses[:, 0, 3] = np.arange(num_frames)
@@ -56,7 +56,7 @@ def make_map(frames: FrameSet, num_points: int = 50) -> Reconstruction:
 
 
 def bare(frames: FrameSet, sampled: bool) -> float:
-    """CPU seconds a frame of decoding and encoding, and of sampling in between if wanted."""
+    """CPU seconds per frame of decoding and encoding, and of sampling if `sampled`."""
     size, buffers, spent = face_size_for(frames, None), Buffers(), 0.0
     rig, room = CubeRig(size, np.pi / 2), np.empty((size, size, 3), np.uint8)
     cv2.setNumThreads(1)
@@ -78,7 +78,7 @@ def bare(frames: FrameSet, sampled: bool) -> float:
 
 
 def run(folder: Path, row: str, out: Path) -> dict[str, float]:
-    """What a row costs in this process."""
+    """Cost of a row, measured in this process."""
     frames = scan(folder, None, None, None)
     if row in ("bare", "sampled"):
         return {"cpu_s": bare(frames, row == "sampled"), "before_mb": 0.0, "peak_mb": peak_mb()}

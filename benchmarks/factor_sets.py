@@ -1,13 +1,13 @@
-"""What each set of observations is worth: features' bearings alone, and patches aligned on top.
+"""Accuracy by sets of observations: bearings of features alone, and with aligned patches.
 
-`bearing` are the features that `aligned` starts from, `tuned bearing` the finer ones of
-`configs/bearing.toml`, the best there is without patches.
+`bearing` has the features that `aligned` starts from; `tuned bearing` has the finer ones of
+`configs/bearing.toml`, the best configuration without patches.
 
     python benchmarks/factor_sets.py --data DATA --sequences aisle_loop,demo_rectangle --out WORK
 
 Every sequence is refined from several coarse trajectories, one for each seed, with every set.
 Sequences are folders of `--data` with `images/`, `groundtruth.tum` and, for induced errors,
-`depth/`; or demo walks, rendered into WORK. `--disturb` spoils the images first. Runs are kept in
+`depth/`; or demo walks, rendered into WORK. `--disturb` changes the images first. Runs are kept in
 WORK and resumed.
 """
 
@@ -62,7 +62,7 @@ def find_walk(name: str, data: Path, out: Path) -> Path:
     """Folder of a sequence with `images/` and `groundtruth.tum`.
 
     Raises:
-        GsbaError: it is not on this machine.
+        GsbaError: the sequence is not on this machine.
     """
     if name in WALKS:
         folder = out / name / "walk"
@@ -115,7 +115,7 @@ def disturbed(images: Path, how: str, folder: Path, seed: int = 0) -> Path:
 def run_case(
     name: str, walk: Path, images: Path, how: str, start: Path, out: Path, settings: RefineSettings
 ) -> Iterable[Row]:
-    """Refine with each set, `aligned` from the stages of `bearing`."""
+    """Refine with each set; `aligned` reuses the stages of `bearing`."""
     truth = read_trajectory(walk / "groundtruth.tum")
     plain = settings.patches.model_copy(update={"rounds": 0})
     sets = {
@@ -172,7 +172,7 @@ def to_markdown(rows: Sequence[Row]) -> str:
 
 
 def main() -> None:
-    """Run what was asked for and print the table."""
+    """Run the chosen sequences and print the table."""
     parser = argparse.ArgumentParser(description="Bearings alone against aligned patches.")
     parser.add_argument("--data", type=Path, default=Path("data"))
     parser.add_argument("--sequences", default="aisle_loop,gallery_forward,demo_rectangle")

@@ -1,4 +1,4 @@
-"""Loops forged by hand: frames that pretend to stand where others do, as identical bays would."""
+"""Synthetic false loop closures between different places, like those of identical bays."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,14 +12,14 @@ from gsba.matching import correspondences
 from gsba.matching.guided_search import MatchContext
 from gsba.types import Counts, Matches, Solution, VerifiedPairs
 
-MAX_DEG = 0.5  # between a keypoint and where the forged pose would see the other frame's point
+MAX_DEG = 0.5  # between a keypoint and the other frame's point projected by the false pose
 
 
 def forge(context: MatchContext, solved: Solution, pairs: list[tuple[int, int]]) -> VerifiedPairs:
-    """Verified matches of frames that see nothing in common.
+    """Verified matches of frames that share no part of the scene.
 
-    The second frame of a pair is given the pose of the first one's successor; keypoints that
-    happen to lie where points of the map would then be seen are its matches.
+    The second frame of a pair gets the pose of the first one's successor. Its matches are the
+    keypoints near map points projected by that pose.
     """
     known = solved.points_by_keypoint(context.keypoints)
     rows, poses = [], []
@@ -41,10 +41,10 @@ def forge(context: MatchContext, solved: Solution, pairs: list[tuple[int, int]])
 
 @contextmanager
 def forged_loops(first: int, far: int, count: int) -> Iterator[list[int]]:
-    """Runs find `count` false loops besides their own: frame `first` + n with n + `far` further on.
+    """Add `count` false loop closures to runs in this context, of frames `first` + n and n + `far`.
 
     Yields:
-        Matches of each forged pair, once a run has come past its loops.
+        number of matches of each false pair, filled when a run has closed its loops.
     """
     honest, sizes = correspondences.match_loops, []
 

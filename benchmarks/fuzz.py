@@ -1,18 +1,19 @@
-"""Thousands of spoiled inputs through the command line: no traceback, no hang, no nonsense.
+"""Fuzzing of the command line with thousands of damaged inputs: tracebacks, hangs, wrong output.
 
     python benchmarks/fuzz.py                       # 10,000 cases, on 2 cores about an hour
     python benchmarks/fuzz.py --family gps --cases 500 --seed 3
-    python benchmarks/fuzz.py --case 1234           # one again, with what it was and said
+    python benchmarks/fuzz.py --case 1234           # repeats one case and prints its output
 
 Case N of a seed is always the same. A walk of a few small frames, its run, a video, a splat and
-tables of all kinds are made first (`--out`, kept). Each case copies what it needs, spoils a file or
-an option, and calls the command line in this process. A worker does this behind a limit in time and
-memory; one that hangs, dies or swells costs its case, and the next one goes on. Expected is
-- exit 0, or 3 for a run of several maps, and then output that is true: finite poses, a positive
-  scale, residuals of a solution;
+tables of all kinds are made first (`--out`, kept). Each case copies its inputs, damages a file or
+an option, and calls the command line in this process. A worker with limits on time and memory does
+this; if it hangs, dies or exceeds its memory, the case is a finding and a new worker goes on.
+Expected is
+- exit 0, or 3 for a run of several maps, with plausible output: finite poses, a positive scale,
+  small residuals;
 - exit 1 with one line "error: ..." of readable length, nothing half-written, no input changed;
 - exit 2 for options that do not parse.
-Anything else is a finding. Exits with 1 where there is one.
+Any other result is a finding. The exit code is 1 if there is one.
 """
 
 import argparse
@@ -40,26 +41,26 @@ from fuzz_inputs import Spoiled, located
 from fuzz_strangers import FAMILIES, prepare, spoil
 
 LIMIT_S = 30.0  # of a case; whole runs get more
-GRACE_S = 60.0  # after which a worker that no signal reaches is killed; kernels compile once
+GRACE_S = 60.0  # until a worker that ignores signals is killed; the first case compiles kernels
 MEMORY_GB = 4.0  # of address space
 MOST_LETTERS = 1100  # of a line
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a case."""
+    """Outcome of a case."""
 
     number: int
     family: str
-    what: str  # how it was spoiled
+    what: str  # description of the damage
     exit_code: int
     seconds: float
-    said: str  # last line of stderr
+    last_line: str  # of stderr
     findings: list[str] = field(default_factory=list)
 
 
 class _Late(BaseException):
-    """The limit in time, raised into whatever runs."""
+    """Raised in the running case at its time limit."""
 
 
 def main() -> None:
@@ -70,7 +71,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--family", choices=FAMILIES, help="only this one")
-    parser.add_argument("--case", type=int, help="only this one, and show all it says")
+    parser.add_argument("--case", type=int, help="only this one, with all its output")
     parser.add_argument("--markdown", type=Path)
     parser.add_argument("--worker", nargs=2, type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -91,7 +92,7 @@ def main() -> None:
 
 
 def campaign(options: argparse.Namespace) -> Iterator[Outcome]:
-    """Outcomes of all cases, from a worker that is begun anew wherever one ended it."""
+    """Yield outcomes of all cases, from a worker that is restarted after each crash."""
     number = 0
     while number < options.cases:
         command = [sys.executable, __file__, "--out", str(options.out), "--seed", str(options.seed)]
@@ -129,7 +130,7 @@ def campaign(options: argparse.Namespace) -> Iterator[Outcome]:
 
 
 def run(number: int, options: argparse.Namespace) -> Outcome:
-    """One case, in a folder of its own."""
+    """Run one case in its own folder."""
     from typer.testing import CliRunner
 
     from gsba.cli import app
@@ -157,14 +158,14 @@ def run(number: int, options: argparse.Namespace) -> Outcome:
             if result.exception and not isinstance(result.exception, SystemExit):
                 traceback.print_exception(result.exception)
         findings = list(_complaints(case, result, folder, before))
-        said = (result.stderr.splitlines() or [""])[-1][:300]
+        last_line = (result.stderr.splitlines() or [""])[-1][:300]
         code = result.exit_code
-    return Outcome(number, case.family, case.what, code, seconds, said, findings)
+    return Outcome(number, case.family, case.what, code, seconds, last_line, findings)
 
 
 @contextmanager
 def _inside(folder: Path) -> Iterator[Path]:
-    """Work in a folder: what is written by relative names stays there."""
+    """Make a folder the working folder, so that relative paths stay in it."""
     here = Path.cwd()
     os.chdir(folder)
     try:
@@ -188,7 +189,7 @@ def _limited(seconds: float) -> Iterator[None]:
 
 
 def _contents(folder: Path) -> dict[str, tuple[int, int]]:
-    """Size and time of change of every file that a command is not meant to write."""
+    """Size and modification time of every file that a command must not write."""
     files = [path for path in folder.rglob("*") if path.is_file()]
     return {str(f): (f.stat().st_size, f.stat().st_mtime_ns) for f in files}
 
@@ -234,7 +235,7 @@ def _complaints(case: Spoiled, result: Any, folder: Path, before: dict) -> Itera
 
 
 def table(outcomes: list[Outcome], seconds: float, seed: int) -> list[str]:
-    """Markdown: a row for each family, and every finding."""
+    """Markdown table with a row for each family, and all findings."""
     lines = [
         f"{len(outcomes)} cases of seed {seed} in {seconds:.0f} s.",
         "",

@@ -1,4 +1,4 @@
-"""What `fuzz.py` calls and how it spoils it: inputs made once, and a case for every number."""
+"""Inputs and cases of `fuzz.py`: inputs are made once, and each number gives a damaged case."""
 
 import csv
 import io
@@ -56,45 +56,45 @@ _UNFINISHED = ("gsba.json", "stages", "masks", "frames", "extract.json", "extrac
 
 @dataclass(frozen=True)
 class Spoiled:
-    """A case: what it needs, what it calls, and how to tell whether output is true."""
+    """Case: its files, its command, and the check of its output."""
 
     family: str
     what: str
     arguments: list[str]
-    make: Callable[[Path, Path], None]  # of the prepared folder and an empty one: its files
-    check: Callable[[Path, Any], str | None]  # of that folder and the result: what is wrong
+    make: Callable[[Path, Path], None]  # (prepared folder, empty folder): makes its files
+    check: Callable[[Path, Any], str | None]  # (folder, result) -> fault; None = none
     limit_s: float = 30.0
-    resumes: bool = False  # whether what is there after a failure is of use to the next call
+    resumes: bool = False  # a next call uses the output left after a failure
 
     def keeps(self, path: Path) -> bool:
-        """Whether a file must not change when the call fails."""
+        """True if a file must not change when the call fails."""
         return "out" not in path.parts
 
     def finished(self, path: Path) -> bool:
-        """Whether a file in the output folder belongs to finished output only."""
+        """True if a file in the output folder belongs to finished output only."""
         unfinished = path.parts[0] in _UNFINISHED or path.suffix == ".jpg"  # of a video, so far
         return not (self.resumes and unfinished)
 
 
 @dataclass
 class Draft:
-    """A case while it is drawn; `make` is the steps in order."""
+    """Case under construction; its steps in order become `make`."""
 
     rng: np.random.Generator
     arguments: list[str] = field(default_factory=list)
     steps: list[Callable[[Path, Path], None]] = field(default_factory=list)
-    said: list[str] = field(default_factory=list)
+    changes: list[str] = field(default_factory=list)
 
     def pick(self, options: Sequence[Any]) -> Any:
         return options[int(self.rng.integers(len(options)))]
 
     def copy(self, *names: str) -> None:
-        """Bring prepared files or folders."""
+        """Copy prepared files or folders."""
         for name in names:
             self.steps.append(lambda source, here, name=name: copied(source / name, here / name))
 
     def edit(self, name: str, change: Callable[[bytes], bytes], what: str) -> None:
-        self.said.append(f"{name} {what}")
+        self.changes.append(f"{name} {what}")
 
         def step(_: Path, here: Path) -> None:
             path = here / name
@@ -109,7 +109,7 @@ class Draft:
             for step in steps:
                 step(source, here)
 
-        what = ", ".join(self.said) or "as it should be"
+        what = ", ".join(self.changes) or "undamaged"
         return Spoiled(family, what[:200], self.arguments, make, check, **more)
 
 
@@ -123,7 +123,7 @@ def spoil(number: int, seed: int, family: str | None = None) -> Spoiled:
 
 
 def _settings(draft: Draft) -> Spoiled:
-    """Overrides and files of settings, printed and read back."""
+    """Case of overrides and files of settings, printed and read back."""
     draft.arguments = ["show-config"]
     keys, text = list(_flat(RefineSettings().model_dump())), []
     for _ in range(int(draft.rng.integers(1, 4))):
@@ -131,7 +131,7 @@ def _settings(draft: Draft) -> Spoiled:
         key = draft.pick([key, key, key, key.partition(".")[0], key + "x", key + ".x", ""])
         value = draft.pick([*map(json.dumps, (value, -1, 0, [value], {"x": value})), *WORDS, "7"])
         text.append((key, value))
-    draft.said = [f"{key}={value[:40]}" for key, value in text]
+    draft.changes = [f"{key}={value[:40]}" for key, value in text]
     if draft.rng.random() < 0.7:
         for key, value in text:
             draft.arguments += ["--set", f"{key}={value}"]
@@ -157,7 +157,7 @@ def _settings(draft: Draft) -> Spoiled:
 
 
 def _trajectories(draft: Draft) -> Spoiled:
-    """Poses of every format, read and compared with the truth."""
+    """Case of poses in every format, read and compared with the truth."""
     name = draft.pick(["slam.tum", "slam.tum", "map.msg"])
     draft.copy(name, "truth.tum")
     spoiled = draft.pick([name, name, name, "truth.tum"])
@@ -174,7 +174,7 @@ def _trajectories(draft: Draft) -> Spoiled:
 
 
 def _starts(draft: Draft) -> Spoiled:
-    """Calls of refine on frames that show nothing: all but the last should be refused earlier."""
+    """Case of refine on frames without texture, which it should refuse early."""
     draft.copy("flat", "slam.tum", "times.csv", "mask.png", "poses.kitti", "keyframes.tum")
     when = draft.pick([["--fps", "2"], ["--timestamps", "times.csv"], []])
     poses = draft.pick([["slam.tum"], ["slam.tum"], ["poses.kitti"], [], ["slam.tum", "slam.tum"]])
@@ -199,12 +199,12 @@ def _starts(draft: Draft) -> Spoiled:
         key = draft.pick(["read.clock_offset_s", "seed", "placement.gps", "placement.align"])
         options += ["--set", f"{key}={draft.pick(WORDS)}"]
     draft.arguments = ["--quiet", "refine", "flat", *options, "--out", "out", *small_settings()]
-    draft.said.append(" ".join(options)[:120])
+    draft.changes.append(" ".join(options)[:120])
     return draft.done("starts", lambda *_: "frames that show nothing were refined", resumes=True)
 
 
 def _images(draft: Draft) -> Spoiled:
-    """A picture whose bytes are spoiled, among good ones: refused, or decoded and of no use."""
+    """Case of an image with damaged bytes among good ones."""
     draft.copy("noisy", "slam.tum")
     name = draft.pick(["0.jpg", "1.png", "2.jpg"])
     draft.edit(f"noisy/{name}", change_bytes(draft), "bytes")
@@ -215,7 +215,7 @@ def _images(draft: Draft) -> Spoiled:
 
 
 def _placements(draft: Draft) -> Spoiled:
-    """Exports placed by spoiled tables and extreme options."""
+    """Case of exports that are placed by damaged tables and extreme options."""
     draft.copy("gps.csv", "track.gpx", "truth.tum")
     way = draft.pick(["gps.csv", "gps.csv", "track.gpx", "truth.tum", "between", "between"])
     numbers = [*WORDS, "1e-200", "3.5", "1e13", "1e-13"]
@@ -234,12 +234,12 @@ def _placements(draft: Draft) -> Spoiled:
         [[], [], ["--face-size", draft.pick(["16", "0", "15", "-1", "1e9", "10000000"])]]
     )
     draft.arguments = ["--quiet", "export", _RUN, "--to", to, "--out", "out", *up, *options, *size]
-    draft.said.append(" ".join([*up, *options])[:120])
+    draft.changes.append(" ".join([*up, *options])[:120])
     return draft.done("placements", check_export)
 
 
 def _edited(draft: Draft) -> Spoiled:
-    """A finished run with a file that was edited or damaged."""
+    """Case of a finished run with a file that was edited or damaged."""
     draft.copy("light")
     name = draft.pick(
         ["gsba.json", "stages/reconstruction.npz", "stages/frames.npz", "trajectory.tum"]
@@ -267,7 +267,7 @@ def _edited(draft: Draft) -> Spoiled:
 
 
 def _depths(draft: Draft) -> Spoiled:
-    """True depth maps that are none."""
+    """Case of invalid depth maps."""
     draft.copy("depth", "truth.tum", "slam.tum")
     name = f"depth/{int(draft.rng.integers(NUM)):06d}.npz"
     how = int(draft.rng.integers(4))
@@ -278,7 +278,7 @@ def _depths(draft: Draft) -> Spoiled:
     elif how == 2:
         draft.edit(name, lambda _: draft.pick([b"", b"range", b"\x93NUMPY", b"PK"]), "text")
     else:
-        draft.said.append(f"{name} gone")
+        draft.changes.append(f"{name} gone")
         draft.steps.append(lambda _, here: (here / name).unlink())
     draft.arguments = ["evaluate", "slam.tum", "--truth", "truth.tum", "--depth", "depth"]
     draft.arguments += ["--json", "numbers.json"]
@@ -290,7 +290,7 @@ def _depths(draft: Draft) -> Spoiled:
 
 
 def _videos(draft: Draft) -> Spoiled:
-    """A video whose bytes are spoiled, or odd wishes for its frames."""
+    """Case of a video with damaged bytes, or of unusual options for its frames."""
     draft.copy("walk.mp4", "slam.tum")
     draft.arguments = ["--quiet", "extract", "walk.mp4", "--out", "out"]
     if draft.rng.random() < 0.7:
@@ -300,7 +300,7 @@ def _videos(draft: Draft) -> Spoiled:
         if draft.rng.random() < 0.15:
             value = draft.pick(["slam.tum", "x", ""] if option == "--at" else numbers)
             draft.arguments += [option, value]
-            draft.said.append(f"{option} {value[:30]}")
+            draft.changes.append(f"{option} {value[:30]}")
 
     def check(here: Path, _: Any) -> str | None:
         rows = list(csv.reader(_lines_of(here / "out/timestamps.csv")))[1:]
@@ -315,7 +315,7 @@ def _videos(draft: Draft) -> Spoiled:
 
 
 def _splats(draft: Draft) -> Spoiled:
-    """A splat whose file is spoiled, rendered."""
+    """Case of rendering a splat from a damaged file."""
     draft.copy("splat.ply")
     if draft.rng.random() < 0.5:
         draft.edit("splat.ply", change_bytes(draft), "bytes")
@@ -335,7 +335,7 @@ def _splats(draft: Draft) -> Spoiled:
 
 
 def _runs(draft: Draft) -> Spoiled:
-    """Whole runs on what reads well and may mean nothing: other clocks, worlds and settings."""
+    """Case of a whole run on readable but wrong input: other clocks, worlds and settings."""
     draft.copy("slam.tum", "times.csv")
     options: list[str] = []
     how = int(draft.rng.integers(4))
@@ -352,7 +352,7 @@ def _runs(draft: Draft) -> Spoiled:
     draft.arguments = ["--quiet", "refine", _FRAMES, *poses, *options, "--out", "out"]
     for key, value in _flat(SETTINGS):
         draft.arguments += ["--set", f"{key}={json.dumps(value)}"]
-    draft.said.append(" ".join([*poses, *options])[:150])
+    draft.changes.append(" ".join([*poses, *options])[:150])
     with_features = poses == ["slam.tum"]
 
     def features(source: Path, here: Path) -> None:
@@ -404,13 +404,13 @@ _TRUTH = Trajectory(_WALK.timestamps[:NUM], _WALK.world_T_rigs[:NUM])
 
 
 def located(arguments: Sequence[str], prepared: Path) -> list[str]:
-    """Arguments with the names of what is used where it lies."""
+    """Arguments with paths of prepared files that are used without a copy."""
     known = {_RUN: str(prepared / "run"), _FRAMES: str(prepared / "frames")}
     return [known.get(argument, argument) for argument in arguments]
 
 
 def small_settings() -> list[str]:
-    """Settings under which looking for features in a tiny frame takes no time."""
+    """Settings that make runs on tiny frames fast."""
     sizes = [f"cubemap.{name}_face_size=64" for name in ("min", "max")]
     return [part for size in [*sizes, "features.max_per_face=16"] for part in ("--set", size)]
 
@@ -425,7 +425,7 @@ def _flat(tree: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, Any]]
 
 
 def _extreme(draft: Draft) -> str:
-    """A setting at or beyond the ends of what may be: most of these must still do."""
+    """Setting at or beyond the ends of its range; most of these must still work."""
     skipped = ("video.", "export.", "placement.", "splat.", "photometric.", "solver.num", "factors")
     numbers = [
         (key, value)
@@ -441,7 +441,7 @@ def _extreme(draft: Draft) -> str:
 def spoil_file(
     draft: Draft, name: str, how: Callable[[Draft], Callable[[bytes], bytes]] | None = None
 ) -> None:
-    """Spoil a table or a file of bytes in one of the ways there are."""
+    """Damage a table or a binary file in a random or the given way."""
     ways = [change_bytes, _word, _word, _lines, _columns, _encoded]
     if name.endswith((".msg", ".png")):
         ways = [change_bytes]
@@ -469,7 +469,7 @@ def change_bytes(draft: Draft) -> Callable[[bytes], bytes]:
 
 
 def _word(draft: Draft) -> Callable[[bytes], bytes]:
-    """Put an odd word where another was."""
+    """Replace a word by an unusual one."""
     at, word = draft.rng.random(2), draft.pick([*WORDS, "\x00", "a" * 140_000])
 
     def change(data: bytes) -> bytes:
@@ -532,7 +532,7 @@ def _columns(draft: Draft) -> Callable[[bytes], bytes]:
 
 
 def _encoded(draft: Draft) -> Callable[[bytes], bytes]:
-    """Another encoding, other ends of lines, other separators."""
+    """Change the encoding, the line ends or the separators."""
     ways: list[Callable[[str], bytes]] = [
         lambda text: text.encode("utf-16"),
         lambda text: text.encode("utf-32"),
@@ -551,7 +551,7 @@ def _encoded(draft: Draft) -> Callable[[bytes], bytes]:
 
 
 def change_tree(draft: Draft) -> Callable[[bytes], bytes]:
-    """Put an odd value somewhere into a JSON tree."""
+    """Replace a random value of a JSON tree by an unusual one."""
     value, turns = draft.pick(TREES), draft.rng.random(6)
 
     def change(data: bytes) -> bytes:
@@ -571,7 +571,7 @@ def change_tree(draft: Draft) -> Callable[[bytes], bytes]:
 
 
 def _array(draft: Draft) -> Callable[[bytes], bytes]:
-    """Another array in the place of one: other shapes, types and values."""
+    """Replace an array by one of another shape, type or values."""
     how, at = int(draft.rng.integers(11)), draft.rng.random()
 
     def change(data: bytes) -> bytes:
@@ -623,7 +623,7 @@ def _spoil_names(draft: Draft, folder: str) -> None:
     """Rename, add or remove files of a folder of frames."""
     how = int(draft.rng.integers(6))
     odd = draft.pick([b"\xff.jpg", b"a\n.jpg", b"..jpg", b"x_front.jpg", b"9" * 200 + b".jpg"])
-    draft.said.append(f"{folder}: names {how} {odd!r:.30}")
+    draft.changes.append(f"{folder}: names {how} {odd!r:.30}")
 
     def step(_: Path, here: Path) -> None:
         files = sorted((here / folder).iterdir())
@@ -646,13 +646,15 @@ def _spoil_names(draft: Draft, folder: str) -> None:
 
 
 def check_export(here: Path, _: Any) -> str | None:
-    """What is wrong with an export."""
+    """Fault of an export; None = none."""
     if not (here / "out/transform.json").exists():
         return "no transform.json"
-    said = json.loads((here / "out/transform.json").read_text())
-    rotation = np.array(said["rotation"])
-    wrong = _not_finite([said["scale"], said["matrix"], said["inverse"], said["offset"]])
-    if wrong or not said["scale"] > 0 or not np.allclose(rotation @ rotation.T, np.eye(3)):
+    transform = json.loads((here / "out/transform.json").read_text())
+    rotation = np.array(transform["rotation"])
+    wrong = _not_finite(
+        [transform["scale"], transform["matrix"], transform["inverse"], transform["offset"]]
+    )
+    if wrong or not transform["scale"] > 0 or not np.allclose(rotation @ rotation.T, np.eye(3)):
         return wrong or "transform"
     if np.linalg.det(rotation) < 0:
         return "a mirrored world"
@@ -685,7 +687,7 @@ def _written(path: Path, data: bytes) -> None:
 
 
 def prepare(out: Path) -> None:
-    """Make what cases are spoiled from, once: a walk and its run, tables, pictures, a video."""
+    """Make the inputs of all cases once: a walk and its run, tables, images, a video."""
     from gsba import GsbaError, load_run, refine
     from gsba.splat import read_ply
     from gsba.splat.gaussians import from_cloud
@@ -711,7 +713,7 @@ def prepare(out: Path) -> None:
 
 
 def _make_pictures(out: Path) -> None:
-    """The walk, its video, frames that show nothing or noise, a mask, true depths."""
+    """Make the walk, its video, frames without texture or of noise, a mask, true depths."""
     import av
     from PIL import Image
 
@@ -744,7 +746,7 @@ def _make_pictures(out: Path) -> None:
 
 
 def _make_tables(out: Path, slam: Trajectory) -> None:
-    """Poses in every format, and positions from satellites."""
+    """Make poses in every format, and GPS positions."""
     import msgpack
 
     from gsba.geometry import inverse, quaternion_from_rotation

@@ -1,4 +1,4 @@
-"""Cases of files that a stranger has made: for `fuzz.py`, beside those of `fuzz_inputs.py`."""
+"""Cases of malicious files for `fuzz.py`, besides those of `fuzz_inputs.py`."""
 
 import importlib.util
 import json
@@ -66,7 +66,7 @@ def spoil(number: int, seed: int, family: str | None = None) -> Spoiled:
 
 
 def prepare(out: Path) -> None:
-    """Make what cases are spoiled from, once."""
+    """Make the inputs of all cases once."""
     usual.prepare(out)
     if (out / "strangers").exists():
         return
@@ -99,7 +99,7 @@ def prepare(out: Path) -> None:
 
 
 def _make_scans(made: Path, points: np.ndarray) -> None:
-    """Scans of a run's points in the forms that are read."""
+    """Make scans of a run's points in all formats."""
     num, points = len(points), points.astype(np.float32)
     head = f"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {num}\nHEIGHT 1\n"
     head += f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {num}\nDATA "
@@ -124,25 +124,25 @@ def _make_scans(made: Path, points: np.ndarray) -> None:
 
 
 def _copy(draft: Draft, name: str) -> None:
-    """Bring a prepared file of a stranger."""
+    """Copy a prepared malicious file."""
     draft.steps.append(lambda source, here: usual.copied(source / "strangers" / name, here / name))
 
 
 def _unharmed(here: Path, _: Any = None) -> str | None:
-    """What a command may not have touched."""
+    """Fault if a command changed files outside of its run; None = none."""
     whole = (here / "elsewhere/precious.npz").read_text() == "precious"
     alone = sorted(path.name for path in (here / "elsewhere").iterdir()) == ["precious.npz"]
     return None if whole and alone else "a file elsewhere was written or deleted"
 
 
 def _refined(here: Path, _: Any) -> str | None:
-    """What is wrong with poses of pictures that show next to nothing."""
+    """Fault of poses of images with hardly any texture; None = none."""
     found = read_trajectory(here / "out/trajectory.tum").world_T_rigs
     return None if np.isfinite(found).all() else "poses"
 
 
 def _names(draft: Draft) -> Spoiled:
-    """A run whose frames have names that lead elsewhere."""
+    """Case of a run whose frames have names with other folders."""
     draft.copy("light")
     name, at = draft.pick([*_NAMES, *WORDS]), draft.rng.random()
     key = draft.pick(["names", "names", "names", "faces", "layout", "paths", "mask_paths"])
@@ -159,7 +159,7 @@ def _names(draft: Draft) -> Spoiled:
         return json.dumps(tree).encode()
 
     draft.edit("light/stages/frames.npz", change_member(draft, "manifest.json", change), "names")
-    draft.said.append(f"{key}: {name[:40]!r}")
+    draft.changes.append(f"{key}: {name[:40]!r}")
     draft.arguments = ["--quiet", "export", "light", "--out", "out", "--face-size", "16"]
     draft.arguments += ["--to", draft.pick(["colmap", "nerfstudio", "colmap-erp", "tum"])]
 
@@ -171,7 +171,7 @@ def _names(draft: Draft) -> Spoiled:
 
 
 def _links(draft: Draft) -> Spoiled:
-    """Links, pipes and folders where a run keeps its files."""
+    """Case of links, pipes and folders in place of a run's files."""
     draft.copy("light", "truth.tum", "flat", "slam.tum")
     places = ["stages", "stages/frames.npz", "stages/shards", "stages/features", "stages/x.npz"]
     place = draft.pick([*places, "masks", "gsba.json", "trajectory.tum", "config.toml", "colmap"])
@@ -202,20 +202,20 @@ def _links(draft: Draft) -> Spoiled:
     draft.steps.append(step)
     draft.arguments = ["--quiet", *options[command]]
     draft.arguments += small_settings() if "refine" in options[command] else []
-    draft.said.append(f"{command} with a {kind} at {place}")
+    draft.changes.append(f"{command} with a {kind} at {place}")
     spoiled = draft.done("links", _unharmed, resumes=True)
     return _Ours(**{name: getattr(spoiled, name) for name in spoiled.__dataclass_fields__})
 
 
 class _Ours(Spoiled):
-    """A case whose run folder is written to; what lies elsewhere is not."""
+    """Case whose command may write to its run folder only."""
 
     def keeps(self, path: Path) -> bool:
         return "light" not in path.parts
 
 
 def _calibrations(draft: Draft) -> Spoiled:
-    """Lenses of raw pictures, spoiled."""
+    """Case of damaged calibrations of raw fisheyes."""
     name = draft.pick(["lenses.json", "chain.yaml"])
     draft.copy("strangers/raw", "slam.tum")
     _copy(draft, name)
@@ -246,7 +246,7 @@ def _calibrations(draft: Draft) -> Spoiled:
 
 
 def _tiffs(draft: Draft) -> Spoiled:
-    """Pictures as TIFF: damaged, or with a directory that asks for much."""
+    """Case of TIFF images that are damaged, or whose directory claims much memory."""
     draft.copy("flat", "slam.tum")
     _copy(draft, "a.tif")
     if draft.rng.random() < 0.5:
@@ -283,7 +283,7 @@ def _tiffs(draft: Draft) -> Spoiled:
 
 
 def _insta360_trailer() -> bytes:
-    """What a camera appends to a video: gyro, exposures, fixes, lenses, and where they are."""
+    """Trailer of a camera's video: gyro, exposures, fixes, lenses, and their directory."""
     lenses = b"2_15.5_16_16_0_0_0_15.5_48_16_0_0_180_64_32_1"
     metadata = b"\x12\x02X1" + b"\x2a" + bytes([len(lenses)]) + lenses + b"\xf0\x03\x01"
     gyro = b"".join(struct.pack("<q6H", 10_000 * n, *[33_000 + n] * 6) for n in range(300))
@@ -300,7 +300,7 @@ def _insta360_trailer() -> bytes:
 
 
 def _insta360(draft: Draft) -> Spoiled:
-    """A camera's own video, the end of which is damaged: what it says of lenses, and its gyro."""
+    """Case of a camera's video with a damaged trailer: its lenses and its gyro."""
     draft.copy("flat", "slam.tum")
     _copy(draft, "walk.insv")
     count, change = draft.pick([120, 300, 9000]), change_bytes(draft)  # bytes with more that leads
@@ -314,7 +314,7 @@ def _insta360(draft: Draft) -> Spoiled:
 
 
 def _clusters(draft: Draft) -> Spoiled:
-    """Schedulers that are none."""
+    """Case of invalid schedulers."""
     draft.copy("flat", "slam.tum")
     _copy(draft, "scheduler.json")
     odd = [
@@ -338,14 +338,14 @@ def _clusters(draft: Draft) -> Spoiled:
             [change_tree(draft), change_bytes(draft), lambda _: draft.pick([b"{}", b""])]
         )
         draft.edit(address, way, "spoiled")
-    draft.said.append(f"--cluster {address[:40]}")
+    draft.changes.append(f"--cluster {address[:40]}")
     draft.arguments = ["--quiet", "refine", "flat", "slam.tum", "--fps", "2", "--out", "out"]
     draft.arguments += ["--cluster", address, *small_settings()]
     return draft.done("clusters", lambda *_: "frames that show nothing were refined", resumes=True)
 
 
 def _numbers(draft: Draft) -> Spoiled:
-    """Sizes of what is to be made that nobody means."""
+    """Case of implausible sizes of output."""
     large = [str(10**k) for k in (6, 9, 12, 20, 400)]
     number = draft.pick([*WORDS, *large, "-5", "1", "2"])
     commands = [
@@ -373,12 +373,12 @@ def _numbers(draft: Draft) -> Spoiled:
         ],
     ]
     draft.arguments = ["--quiet", *draft.pick(commands)]
-    draft.said.append(" ".join(draft.arguments)[:120])
+    draft.changes.append(" ".join(draft.arguments)[:120])
     return draft.done("numbers", lambda *_: None, resumes=True)
 
 
 def _scans(draft: Draft) -> Spoiled:
-    """Scans that are damaged, or of another place."""
+    """Case of scans that are damaged, or of another place."""
     name = draft.pick(_SCANS)
     draft.copy("light", "truth.tum")
     _copy(draft, name)
@@ -391,7 +391,7 @@ def _scans(draft: Draft) -> Spoiled:
 
 
 def _head(draft: Draft) -> Callable[[bytes], bytes]:
-    """Change bytes of the header alone: counts, sizes, offsets."""
+    """Change bytes of the header only: counts, sizes, offsets."""
     places = draft.rng.integers(0, 380, int(draft.rng.integers(1, 6)))
     values = [draft.pick([0, 1, 127, 128, 255, 57, 48]) for _ in places]
 

@@ -1,14 +1,14 @@
-"""GPS factors on a long open walk: error at its far end, without and with fixes, and as predicted.
+"""GPS factors on a long open walk: error and sigma at its far end, without and with fixes.
 
     python -m benchmarks.gps [--seeds 8] [--markdown benchmarks/results/gps.md]
 
-Poses and tracks of a walk of 900 m in 750 s are drawn. Points are so few and bearings so noisy that
-images leave most of the drift of a SLAM-like start. Errors of fixes last: a first-order
-Gauss-Markov process of 3 m across and 5 m up, time constant 60 s. Every row places its poses on
-the earth by its fixes; errors are of the last tenth of the frames. "claimed" is what the placement
-(images alone) or the covariances of the adjustment (with fixes) say of these frames. The second
-table is of a walk whose images are good: how far fixes move its poses, beside what these are known
-to without them.
+Poses and tracks of a walk of 900 m in 750 s are generated. Points are so few and bearings so noisy
+that images leave most of the drift of a SLAM-like start. Errors of fixes are a first-order
+Gauss-Markov process of 3 m horizontally and 5 m vertically, with a time constant of 60 s. Every row
+places its poses on the earth by its fixes; errors are of the last tenth of the frames. "claimed" is
+the sigma of these frames by the placement (images alone) or by the covariances of the adjustment
+(with fixes). The second table is of a walk with good images: it shows the motion of its poses by
+fixes, beside the sigma of these poses without fixes.
 """
 
 import argparse
@@ -43,13 +43,13 @@ RIG = CubeRig(512, np.pi / 2)
 SIGMAS_M = np.array([3.0, 3.0, 5.0])  # of fixes, east, north, up
 TAU_S, WHITE = 60.0, 0.1  # of their errors: time constant, and share of the variance that is white
 SPEED = 1.2  # m/s
-WILD_M = 50.0  # a wild fix is that far off
+WILD_M = 50.0  # error of an outlier
 GATES = (60.0, 6.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Walk:
-    """What is true of a walk, and what images and SLAM have of it."""
+    """True walk, its observations, and a SLAM-like trajectory."""
 
     level_T_rigs: np.ndarray  # (F, 4, 4) metres, east, north, up
     times: np.ndarray  # (F,) seconds
@@ -72,11 +72,14 @@ def lasting_errors(times: np.ndarray, rng: np.random.Generator, tau: float = TAU
 def make_walk(
     seed: int, num: int = 240, length: float = 900.0, noise: float = 2e-2, per_frame: int = 5
 ) -> Walk:
-    """An open walk of so many metres, points around it, each seen from the frames near it.
+    """Open walk with points around it, each observed by the frames near it.
 
     Args:
-        noise: of bearings, radians per axis.
-        per_frame: points drawn for each frame.
+        seed: seed of the walk.
+        num: number of frames.
+        length: metres.
+        noise: noise of bearings, radians per axis.
+        per_frame: number of points for each frame.
     """
     rng = np.random.default_rng(seed)
     t = np.linspace(0, 1, num)
@@ -118,7 +121,7 @@ def make_walk(
 
 
 def fixes_of(walk: Walk, rng: np.random.Generator, wild: float) -> FrameFixes:
-    """Noisy fixes of all frames, a share of them wild."""
+    """Noisy fixes of all frames, a share `wild` of them outliers."""
     positions = walk.level_T_rigs[:, :3, 3] + lasting_errors(walk.times, rng)
     num = len(positions)
     away = rng.normal(size=(num, 3))
@@ -129,7 +132,7 @@ def fixes_of(walk: Walk, rng: np.random.Generator, wild: float) -> FrameFixes:
 
 
 def problem_of(walk: Walk, world_T_rigs: np.ndarray, fixes: FrameFixes | None) -> AdjustmentContext:
-    """What an adjustment from these poses knows besides images."""
+    """Context of an adjustment from these poses: priors and fixes."""
     settings = RefineSettings()
     given = walk.coarse_T_rigs, settings.priors.faint(), None, None, world_T_rigs[0]
     problem = AdjustmentContext(prior_factors.build(*given), RIG, settings, 1)
@@ -144,7 +147,7 @@ def problem_of(walk: Walk, world_T_rigs: np.ndarray, fixes: FrameFixes | None) -
 def solve(
     walk: Walk, fixes: FrameFixes | None, start: np.ndarray | None = None, passes: int = 2
 ) -> Solution:
-    """The walk adjusted as often as a run does at least, fixes carried to its poses each time."""
+    """Walk after `passes` adjustments, with fixes aligned to its poses before each."""
     poses = walk.coarse_T_rigs if start is None else start
     solved = Solution.without_points(poses)
     for gates in (GATES, *[GATES[-1:]] * (passes - 1)):
@@ -154,7 +157,7 @@ def solve(
 
 
 def far_end(walk: Walk, solved: Solution, fixes: FrameFixes) -> tuple[float, float]:
-    """Error of the last tenth of the frames, placed by the fixes, and as the placement claims."""
+    """Error of the last tenth of the frames placed by the fixes, and its sigma by the placement."""
     poses = solved.world_T_rigs[:, :3, 3]
     found, last = fit_fixes(poses, fixes), slice(-max(len(poses) // 10, 1), None)
     off = found.similarity.points(poses)[last] - walk.level_T_rigs[last, :3, 3]
@@ -163,7 +166,7 @@ def far_end(walk: Walk, solved: Solution, fixes: FrameFixes) -> tuple[float, flo
 
 
 def claimed_of(walk: Walk, solved: Solution, fixes: FrameFixes) -> float:
-    """What the covariances of the adjustment say of the last tenth of the frames, metres."""
+    """Sigma of the last tenth of the frames by the covariances of the adjustment, metres."""
     problem = problem_of(walk, solved.world_T_rigs, fixes)
     assert problem.anchors is not None and problem.ungauged is not None
     block = landmark_block(solved.landmarks, walk.keypoints, solved.noise, problem)
@@ -186,9 +189,10 @@ def _length(vectors: np.ndarray) -> float:
 
 
 def moved_by_fixes(seed: int) -> tuple[float, float]:
-    """How far fixes move the poses of a walk with good images, and how well these were known.
+    """Motion by fixes of the poses of a walk with good images, and sigma of these poses without.
 
-    Both in the gauge of the covariances: the first pose and the extent are held. Metres, rms.
+    Both are in the gauge of the covariances, which fixes the first pose and the extent; metres,
+    RMS.
     """
     walk = make_walk(seed, num=120, length=240.0, noise=1e-3, per_frame=12)
     alone = solve(walk, None)
@@ -204,7 +208,7 @@ def moved_by_fixes(seed: int) -> tuple[float, float]:
 
 
 def rows(seeds: Sequence[int], **walk_options: float) -> dict[str, np.ndarray]:
-    """For each kind of row an error and a claim (S, 2) by seed, metres."""
+    """Errors and sigmas (S, 2) by seed for each kind of row, metres."""
     out: dict[str, list[tuple[float, float]]] = {}
     for seed in seeds:
         walk = make_walk(seed, **walk_options)  # type: ignore[arg-type]

@@ -1,14 +1,14 @@
-"""Cost of a walk that comes back to the same places, lap after lap: n frames, 2n, 4n, ...
+"""Cost of a walk of several laps through the same places: n frames, 2n, 4n, ...
 
     python ../shared/tools/render_long.py WALK -n 800          (needs open3d)
     python -m benchmarks.laps WALK --out WORK [--frames 200 400 800] [--markdown FILE]
         [--enlarged 8192] [--export colmap]
 
-Each row is a whole run of `gsba refine` over the walk's first frames, from a spoiled trajectory
-whose steps are as good at any length: drift grows as the root of the path. CPU seconds are the
-stages' own, of the run's report; "solving" is what grows with the places' visits: `closed`,
-`refined`, `aligned`, `reconstruction`. Enlarged frames are files of that width with noise of their
-own: what they cost is real, their detail is not.
+Each row is a whole run of `gsba refine` over the walk's first frames, from a trajectory whose drift
+grows with the root of the path. CPU seconds are those of stages in the run's report; "solving" are
+the stages whose cost grows with the visits of each place: `closed`, `refined`, `aligned`,
+`reconstruction`. Enlarged frames are files of that width with their own noise: their cost is
+realistic, their detail is not.
 """
 
 import argparse
@@ -34,13 +34,13 @@ GROUPS = {
     "patches": ("align",),
 }  # fmt: skip
 NOISE_GREY = 2.0  # standard deviation, of enlarged frames
-DRIFT_OF = 200  # frames of a walk whose drift is that of `degrade`
+DRIFT_OF = 200  # frames of a walk with the default drift of `degrade`
 
 
 def cut(
     walk: Path, num: int, folder: Path, seed: int, width: int | None = None
 ) -> tuple[Path, Path, Path]:
-    """The first frames of a walk as links or enlarged, their spoiled trajectory, and the truth."""
+    """First frames of a walk as links or enlarged, their trajectory with drift, and the truth."""
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
     header, *rows = (walk / "images/timestamps.csv").read_text().splitlines()
@@ -78,7 +78,7 @@ def camera_noise(width: int, seed: int) -> np.ndarray:
 
 
 def enlarge(source: Path, target: Path, noise: np.ndarray) -> None:
-    """Write a panorama anew, as large as this noise (h, w, 3) int8 and with it."""
+    """Write a panorama with noise (h, w, 3) int8, enlarged to its size."""
     picture = cv2.imread(str(source))
     assert picture is not None, source
     large = cv2.resize(picture, noise.shape[1::-1], interpolation=cv2.INTER_CUBIC)
@@ -87,7 +87,7 @@ def enlarge(source: Path, target: Path, noise: np.ndarray) -> None:
 
 
 def group(stage: str) -> str:
-    """What a stage counts to."""
+    """Group of stages that a stage belongs to."""
     name = stage.partition("-")[0].rstrip("0123456789")
     if name == "export":
         return name

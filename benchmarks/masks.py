@@ -1,14 +1,14 @@
-"""What masks find and what they are worth: people and a carrier pasted into a known walk.
+"""Recall and effect of masks: people and a carrier pasted into a known walk.
 
     python benchmarks/masks.py --data DATA --out WORK --json FILE --markdown FILE
 
 `DATA/SCENE` holds `images/`, `slam.tum` and `groundtruth.tum`; without `--data` the gallery of
-`gsba demo` is rendered. Where there is `DATA/apartment`, its carrier is compared with an outline
-drawn by hand. Each of `--seeds` draws people, how a splat begins, and noise of one grey
-level for clean and crowded frames alike: a run's ATE scatters by a fifth over such noise, so means
-are compared, and the clean frames have been decoded, spoilt and encoded like the others. `--splat
-STEPS` trains a splat on each run and measures it against clean frames that were held out. Runs are
-kept in WORK and resumed while code and settings stay the same.
+`gsba demo` is rendered. If there is `DATA/apartment`, its carrier is compared with an outline drawn
+by hand. Each of `--seeds` determines people, the start of a splat, and noise of one grey level, for
+frames with and without people: a run's ATE scatters by a fifth over such noise, so that means are
+compared. Frames without people are also decoded, changed and encoded. `--splat STEPS` trains a
+splat on each run and measures it against held-out frames without people. Runs are kept in WORK and
+resumed while code and settings stay the same.
 """
 
 import argparse
@@ -46,14 +46,14 @@ NUM_PEOPLE = 4
 MAX_ATE, MAX_CLEAN, MIN_CARRIER, MAX_REST, MAX_DB = 1.10, 0.01, 0.9, 0.03, 0.2
 OUTLINE = Path(__file__).parent / "reference" / "apartment_carrier.csv"
 OUTLINE_WIDTH = 2688  # pixels of the panorama it is drawn on
-LOW_ROWS = 0.86  # of the height: what the carrier is asked for below
+LOW_ROWS = 0.86  # part of the height below which the carrier's recall is measured
 NOISE_GREY = 1.0  # standard deviation, grey levels
 FACE_SIZE = 128  # pixels, of splats
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One run or one carrier."""
+    """Result of one run or of one carrier."""
 
     name: str
     ate: float | None = None  # map units of the reference
@@ -66,7 +66,7 @@ class Row:
 
 
 def people_rows(scene: Path, work: Path, tall: float, steps: int, seed: int) -> list[Row]:
-    """Runs of a scene clean and with people, without and with masks."""
+    """Rows of runs without people, with people, and with people and masks."""
     truth = read_trajectory(scene / "groundtruth.tum")
     work.mkdir(parents=True, exist_ok=True)
     clean, crowded, true = work / "clean-images", work / "people-images", work / "true"
@@ -96,7 +96,7 @@ def people_rows(scene: Path, work: Path, tall: float, steps: int, seed: int) -> 
 def _populate(
     scene: Path, world_T_rigs: np.ndarray, tall: float, seed: int, folders: Sequence[Path]
 ) -> None:
-    """Write frames with noise alone, with people too, and masks without the people."""
+    """Write frames with noise, frames with noise and people, and masks that leave people out."""
     clean, crowded, true = folders
     frames = scan(scene / "images")
     up = -world_T_rigs[:, :3, 1].mean(axis=0)
@@ -116,7 +116,7 @@ def _populate(
 
 
 def mean_rows(draws: Sequence[Sequence[Row]]) -> list[Row]:
-    """The rows of several draws as one."""
+    """Mean rows over several seeds."""
 
     def mean(column: str, rows: Sequence[Row]) -> float | None:
         values = [getattr(row, column) for row in rows]
@@ -137,7 +137,7 @@ def splat_psnr(
     out: Path,
     seed: int,
 ) -> float:
-    """PSNR of a splat trained on a run's frames with their masks, against clean frames held out."""
+    """PSNR of a splat trained on a run's masked frames, against held-out frames without people."""
     settings = SplatSettings(
         iterations=steps,
         face_size=FACE_SIZE,
@@ -161,7 +161,7 @@ def splat_psnr(
 
 
 def _masks(frames: FrameSet, true_masks: Path | None) -> dict[str, float]:
-    """How the masks of a run compare with where people are."""
+    """Recall and false share of a run's masks by the true masks of people."""
     inter = union = true_sum = false = masked = 0.0
     for f, name in enumerate(frames.names):
         mask = load_mask(frames, f)
@@ -179,7 +179,7 @@ def _masks(frames: FrameSet, true_masks: Path | None) -> dict[str, float]:
 
 
 def carrier_rows(frames: FrameSet, work: Path) -> list[Row]:
-    """A bag and a stick pasted into a walk, fixed in the picture and turning below it."""
+    """Rows of a bag and a stick pasted into a walk, fixed in the image and rotating below it."""
     rng = np.random.default_rng(0)
     height, width = frames.height, frames.width
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + 0.5
@@ -211,7 +211,7 @@ def carrier_rows(frames: FrameSet, work: Path) -> list[Row]:
 
 
 def apartment_row(folder: Path) -> Row:
-    """The carrier of a real capture against a hand-drawn outline; recall is that of low rows."""
+    """Row of a real capture's carrier against a hand-drawn outline; recall is of low rows."""
     frames = find_panoramas(folder / "images")
     corners = np.loadtxt(OUTLINE, delimiter=",") * (frames.width / OUTLINE_WIDTH)
     drawn = np.zeros((frames.height, frames.width), np.uint8)
@@ -253,7 +253,7 @@ def _cell(value: float | None, scale: float, form: str) -> str:
 
 
 def missed(rows: Sequence[Row]) -> list[str]:
-    """Targets that do not hold."""
+    """Targets that are missed."""
     named = {row.name: row for row in rows}
     out = []
     crowd, clean = named.get("people, distractors masked"), named.get("clean")

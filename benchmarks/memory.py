@@ -2,8 +2,8 @@
 
     python -m benchmarks.memory --out WORK [--frames 24] [--width 8192] [--markdown FILE]
 
-Frames are made by shifting one textured panorama: a camera that turns, in front of points whose
-true places are known. What is measured is the process that aligns them, and nothing before it.
+Frames are made by shifting one textured panorama, which is a rotating camera among points with
+known positions. Only the process that aligns patches is measured.
 """
 
 import argparse
@@ -24,11 +24,11 @@ from gsba.photometric import alignment
 from gsba.store.shards import Threads
 from gsba.types import Counts, Keypoints, Landmarks, Tracks
 
-POINTS, DISTANCE = 60, 1e4  # of each frame, and how far they are: no parallax, so no shift is wrong
+POINTS, DISTANCE = 60, 1e4  # points per frame, and their distance, units: without parallax
 
 
 def make_frames(folder: Path, num: int, width: int) -> None:
-    """JPEG panoramas of texture, each turned by its number in columns, and their times."""
+    """Write textured JPEG panoramas, each shifted by its number of columns, and their times."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
     small = rng.uniform(0, 255, (width // 8, width // 4)).astype(np.float32)
@@ -44,7 +44,7 @@ def make_frames(folder: Path, num: int, width: int) -> None:
 
 
 def make_map(num: int, width: int) -> tuple[Landmarks, np.ndarray, Keypoints, CubeRig]:
-    """Points seen by seven frames each, poses that turn as the frames do, exact keypoints."""
+    """Points with seven observations each, poses that rotate like the frames, exact keypoints."""
     angles = -2 * np.pi * 16 * np.arange(num) / width
     turns = np.array([cv2.Rodrigues(np.array([0.0, a, 0.0]))[0] for a in angles])
     poses = pose(turns, 1e-3 * np.arange(num)[:, None] * [1.0, 0.0, 0.0])

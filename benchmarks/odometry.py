@@ -1,12 +1,12 @@
-"""Odometry alone, on sequences with exact truth, and under what breaks it.
+"""Odometry on sequences with exact truth, without and with faults.
 
     python benchmarks/odometry.py WALK... --markdown benchmarks/results/odometry.md
 
-WALK is a folder with `images/` (2:1, named by frame number) and `groundtruth.tum`, dense as a video
-is: `shared/tools/render_home.py` and `render_walk.py` make such. Each is followed as it is (masked
-by what carries the camera), and its first 90 frames with faults put in: darkness, a hand, standing,
-turning on the spot, frames left out. A row says what came of it; times are processor times of this
-process, decoding apart.
+WALK is a folder with `images/` (2:1, named by frame number) and `groundtruth.tum`, as dense as a
+video: `shared/tools/render_home.py` and `render_walk.py` make such. Odometry runs on each whole
+sequence (with the carrier masked), and on its first 90 frames with faults: darkness, a hand, a
+standing camera, rotation on the spot, missing frames. Times are processor times of this process
+without decoding.
 """
 
 import argparse
@@ -29,13 +29,13 @@ from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory
 
 WIDTH = 800
-FIRST = 90  # frames of a walk that faults are put into
+FIRST = 90  # frames of a walk for the rows with faults
 AT, LASTING = 40, 10  # frame at which a fault begins, and frames that it lasts
 TURN_DEG = 10.0  # a frame
 
 
 class Row(NamedTuple):
-    """What came of one sequence."""
+    """Result of one sequence."""
 
     name: str
     frames: int
@@ -47,7 +47,7 @@ class Row(NamedTuple):
 
 
 def follow(name: str, panoramas: SmallPanoramas, truth: np.ndarray) -> Row:
-    """Odometry of a sequence, map by map beside the truth (F, 4, 4)."""
+    """Odometry of a sequence, each map compared with the truth (F, 4, 4)."""
     found = odometry.track_panoramas(panoramas)
     errors = []
     for piece in found.pieces():
@@ -67,7 +67,7 @@ def follow(name: str, panoramas: SmallPanoramas, truth: np.ndarray) -> Row:
 
 
 class LoopRow(NamedTuple):
-    """Errors of one sequence before and after its loops are closed."""
+    """Errors of one sequence before and after loop closure."""
 
     name: str
     loops: int
@@ -79,7 +79,7 @@ class LoopRow(NamedTuple):
 
 
 def close_loops(name: str, panoramas: SmallPanoramas, truth: np.ndarray) -> LoopRow:
-    """Odometry of a sequence without and with loops closed, beside the truth (F, 4, 4)."""
+    """Odometry of a sequence before and after loop closure, compared with the truth (F, 4, 4)."""
     before = odometry.track_panoramas(panoramas, with_loops=False)
     after = odometry.track_panoramas(panoramas)
     ates = []
@@ -101,8 +101,8 @@ def close_loops(name: str, panoramas: SmallPanoramas, truth: np.ndarray) -> Loop
 
 
 def _over_sigma(found: odometry.Odometry, rows: np.ndarray, truth: np.ndarray) -> float:
-    """RMS of position errors over standard deviations, in the gauge of the covariances: the first
-    pose of the map, and its distance to the furthest, are right."""
+    """RMS of position errors over standard deviations, in the gauge of the covariances, which fixes
+    the map's first pose and its distance to the furthest."""
     assert found.covariances is not None
     poses, covariances = found.world_T_rigs[rows], found.covariances[rows]
     true = poses[0] @ inverse(truth[rows[0]]) @ truth[rows]
@@ -116,14 +116,14 @@ def _over_sigma(found: odometry.Odometry, rows: np.ndarray, truth: np.ndarray) -
 
 
 def in_memory(panoramas: SmallPanoramas, pictures: list[np.ndarray]) -> SmallPanoramas:
-    """A sequence of given pictures (h, 2h) uint8."""
+    """Sequence of images (h, 2h) uint8 in memory."""
     times = np.arange(len(pictures)) / 8.0
     read = lambda rows, _: ((row, pictures[row]) for row in rows)  # noqa: E731
     return replace(panoramas, timestamps=times, read=read)
 
 
 def turned(grey: np.ndarray, rig_R_turned: np.ndarray) -> np.ndarray:
-    """What a turned camera sees."""
+    """Image of a rotated camera."""
     height, width = grey.shape
     v, u = np.mgrid[:height, :width] + 0.5
     rays = bearings_from_erp(np.stack([u, v], axis=-1), width, height) @ rig_R_turned.T
@@ -132,7 +132,7 @@ def turned(grey: np.ndarray, rig_R_turned: np.ndarray) -> np.ndarray:
 
 
 def faults(name: str, panoramas: SmallPanoramas, truth: np.ndarray) -> list[Row]:
-    """The beginning of a sequence with one fault after another."""
+    """Rows of the first frames of a sequence, with each fault."""
     pictures = [picture for _, picture in panoramas.read(range(FIRST), False)]
     rng = np.random.default_rng(0)
     spoilt = range(AT, AT + LASTING)
@@ -168,7 +168,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("walks", nargs="+", type=Path)
     parser.add_argument("--markdown", type=Path)
-    parser.add_argument("--loops", action="store_true", help="before and after closing loops alone")
+    parser.add_argument(
+        "--loops", action="store_true", help="only compare before and after loop closure"
+    )
     arguments = parser.parse_args()
     rows = []
     for n, folder in enumerate(arguments.walks):

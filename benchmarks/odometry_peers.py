@@ -3,11 +3,11 @@
     python benchmarks/odometry_peers.py --out WORK WALK... --slam WALK FRAME_TRAJECTORY \
         --markdown benchmarks/results/odometry_peers.md
 
-A WALK is a folder with `images/` (2:1, named by frame number) and `groundtruth.tum`, dense as a
-video is: `shared/tools/render_home.py` and `render_walk.py` make such. Each is encoded (H.264), the
-video is refined as a user would, and COLMAP's spherical pipeline gets RUN/frames, incremental and
-global. A trajectory that a SLAM made of a walk (`--slam`) is set beside our odometry alone. Rows
-are kept in WORK and used again while code, options and input stay the same.
+A WALK is a folder with `images/` (2:1, named by frame number) and `groundtruth.tum`, as dense as a
+video: `shared/tools/render_home.py` and `render_walk.py` make such. Each is encoded (H.264), the
+video is refined with default options, and COLMAP's spherical pipeline gets RUN/frames, incremental
+and global. A SLAM's trajectory of a walk (`--slam`) is compared with our odometry. Rows are kept in
+WORK and used again while code, options and input stay the same.
 """
 
 import argparse
@@ -46,17 +46,17 @@ class Walk(NamedTuple):
 
     @classmethod
     def read(cls, folder: Path) -> "Walk":
-        """The walk in a folder.
+        """Read the walk in a folder.
 
         Raises:
-            GsbaError: its truth does not tell the pose of each frame.
+            GsbaError: the truth has not one pose for each frame.
         """
         images = sorted((folder / "images").glob("*.jpg"))
         truth = read_trajectory(folder / "groundtruth.tum")
         if not images or len(images) != len(truth.timestamps):
             raise GsbaError(f"{folder}: {len(images)} images, {len(truth.timestamps)} true poses")
         times = np.arange(len(images)) * float(np.median(np.diff(truth.timestamps)))
-        truth = Trajectory(times, truth.world_T_rigs)  # as the video has them, from 0
+        truth = Trajectory(times, truth.world_T_rigs)  # seconds of the video, from 0
         return cls(folder.name, images, truth)
 
     def errors(self, estimate: Trajectory) -> dict[str, Any]:
@@ -75,7 +75,7 @@ class Walk(NamedTuple):
 
 
 def encode(walk: Walk, video: Path) -> None:
-    """Write the frames of a walk as a video at the rate of its truth, unless it is there."""
+    """Write the frames of a walk as a video at the rate of its truth, unless it exists."""
     if video.is_file():
         return
     import av
@@ -98,7 +98,7 @@ def encode(walk: Walk, video: Path) -> None:
 
 
 def refined(walk: Walk, home: Path, code: str) -> dict[str, Any]:
-    """The row of a run on the video alone; its frames are in `home`/ours/run/frames."""
+    """Row of a run on the video; its frames are in `home`/ours/run/frames."""
     video, folder = home / f"{walk.name}.mp4", home / "ours"
     encode(walk, video)
     key = {"code": code, "input": digest(walk.images)}
@@ -119,7 +119,7 @@ def refined(walk: Walk, home: Path, code: str) -> dict[str, Any]:
 
 
 def peer(walk: Walk, home: Path, mode: str) -> dict[str, Any]:
-    """The row of a peer on the frames that our run chose."""
+    """Row of a peer on the frames that our run chose."""
     folder, frames = home / mode, sorted((home / "ours/run/frames").glob("*.jpg"))
     key = {"pycolmap": version("pycolmap"), "input": digest(frames)}
     if row := kept_row(folder, key, TIMEOUT_S):
@@ -145,7 +145,7 @@ def peer(walk: Walk, home: Path, mode: str) -> dict[str, Any]:
 
 
 def line(walk: Walk, chosen: int, row: dict[str, Any]) -> str:
-    """The row of the table that a run makes."""
+    """Line of the table for a run."""
     cost = f"{row['cpu_s']:.0f}"
     cells = [walk.name, str(len(walk.images)), str(chosen), row["method"]]
     if errors := row.get("errors"):
@@ -158,7 +158,7 @@ def line(walk: Walk, chosen: int, row: dict[str, Any]) -> str:
 
 
 def odometry_line(walk: Walk, method: str, errors: dict[str, Any]) -> str:
-    """The row of the table of trajectories before any refinement."""
+    """Line of the table of trajectories before refinement."""
     posed = f"{errors['posed']} of {len(walk.images)}"
     return f"| {walk.name} | {method} | {posed} | {100 * errors['of_path']:.2f} |"
 

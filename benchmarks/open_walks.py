@@ -1,13 +1,14 @@
-"""Open walks with and without a trajectory: none may make the result worse than having none.
+"""Open walks with and without a trajectory: no trajectory may make the result worse.
 
     python benchmarks/open_walks.py --out WORK --markdown benchmarks/results/open_walks.md
 
-Closed sequences of `--data` cut open (skipped if absent), the demo's open walk, and walks of your
-own: `--walk FOLDER` with `images/` and their timestamps.csv, `groundtruth.tum` and, if there is
-one, `slam.tum`. Each is refined without a trajectory and with three: `slam.tum`, then
-degradations of the truth. Seeds of the run without one show what chance does. Every run is a
-process of its own; rows are kept in WORK and used again while code, options and input stay the
-same. `--set` goes to `gsba refine`, to compare variants. Exits with 1 where a target is missed.
+Walks are the first parts of closed sequences of `--data` (skipped if absent), the demo's open walk,
+and your own: `--walk FOLDER` with `images/` and their timestamps.csv, `groundtruth.tum` and, if
+there is one, `slam.tum`. Each is refined without a trajectory and with three: `slam.tum`, then
+degradations of the truth. Several seeds of the run without a trajectory show its scatter. Every run
+is a separate process; rows are kept in WORK and used again while code, options and input stay the
+same. `--set` is passed to `gsba refine`, to compare variants. The exit code is 1 if a target is
+missed.
 """
 
 import argparse
@@ -48,7 +49,7 @@ TIMEOUT_S = 2400.0
 
 
 def find(name: str, data: Path, out: Path) -> Case:
-    """Frames and truth of a sequence; GsbaError where it is not on this machine."""
+    """Frames and truth of a sequence; GsbaError if it is not on this machine."""
     if name in DEMOS:
         folder = out / "walk"
         if not (folder / "groundtruth.tum").exists():
@@ -63,7 +64,7 @@ def find(name: str, data: Path, out: Path) -> Case:
 
 
 def coarse_trajectories(case: Case, out: Path) -> list[Path]:
-    """The recorded trajectory if there is one, filled up with degradations of the truth."""
+    """Recorded trajectory if there is one, and degradations of the truth, three in all."""
     paths = [case.trajectory] if case.trajectory else []
     truth = read_trajectory(case.truth)
     for seed in DEGRADE_SEEDS[: NUM_TRAJECTORIES - len(paths)]:
@@ -73,7 +74,7 @@ def coarse_trajectories(case: Case, out: Path) -> list[Path]:
 
 
 class Bench(NamedTuple):
-    """Where rows are kept and under what conditions they run."""
+    """Folder and conditions of the rows of one call."""
 
     out: Path
     code: str
@@ -81,7 +82,7 @@ class Bench(NamedTuple):
     num_seeds: int
 
     def rows(self, folder: Path, case: Case) -> tuple[list[dict], list[dict]]:
-        """Rows without a trajectory, one for each seed, and rows with one."""
+        """Rows without a trajectory, one for each seed, and rows with a trajectory."""
         starts = coarse_trajectories(case, folder)
         without = [self._row(folder, case, None, seed) for seed in range(self.num_seeds)]
         return without, [self._row(folder, case, start, 0) for start in starts]
@@ -110,7 +111,7 @@ class Bench(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """A sequence's line in the table, and the errors in it."""
+    """Line of a sequence in the table, with its errors."""
 
     line: str
     without: list[float]  # ATE, units, one for each seed
@@ -129,7 +130,7 @@ def judge(name: str, without: list[dict], with_one: list[dict]) -> Judged:
     """Compare the runs of one sequence.
 
     Raises:
-        GsbaError: one of them failed.
+        GsbaError: a run failed.
     """
     for row in (*without, *with_one):
         if "errors" not in row:
@@ -162,7 +163,7 @@ def _ate(row: dict) -> float:
 
 
 def _ate_cell(row: dict) -> str:
-    """1e-3 units, and how many frames are posed if not all are."""
+    """ATE in 1e-3 units, and the number of posed frames if it is not that of all."""
     errors = row["errors"]
     posed = f"{errors['num_matched']}/{errors['num_truth']}"
     ate = f"{1e3 * _ate(row):.2f}"
@@ -174,7 +175,7 @@ def _auc_cell(row: dict) -> str:
 
 
 def summary(judged: list[Judged]) -> str:
-    """What a trajectory changes over all sequences, where chance evens out."""
+    """Line on the mean effect of a trajectory over all sequences."""
     logs = [(np.log(one.with_one), np.log(one.without)) for one in judged if one.without]
     if not logs:
         return "Nothing was measured."
@@ -186,7 +187,7 @@ def summary(judged: list[Judged]) -> str:
 
 
 def table(bench: Bench, names: list[str], data: Path) -> Iterator[Judged]:
-    """Lines of the table as they come."""
+    """Yield the lines of the table."""
     for name in names:
         label = f"{name}, first {CUT[name]}" if name in CUT else Path(name).name
         folder = bench.out / _slug(label)
@@ -211,14 +212,16 @@ def _slug(text: str) -> str:
 
 
 def main() -> None:
-    """Parse, run, print; exit 1 where a target is missed."""
+    """Parse, run, print; exit with 1 if a target is missed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     every = [*CUT, *DEMOS]
     parser.add_argument("--data", type=Path, default=DATA, help="recorded sequences")
     parser.add_argument("--only", action="append", choices=every, help="repeatable")
     parser.add_argument("--walk", action="append", default=[], type=os.path.abspath)
     parser.add_argument("--set", action="append", default=[], dest="sets", metavar="KEY=VALUE")
-    parser.add_argument("--seeds", type=int, default=3, help="of the run without a trajectory")
+    parser.add_argument(
+        "--seeds", type=int, default=3, help="seeds of the run without a trajectory"
+    )
     parser.add_argument("--out", type=Path, default=Path("build/open_walks"), help="kept rows")
     parser.add_argument("--note", default="", help="a paragraph for the table's foot")
     parser.add_argument("--markdown", type=Path)
@@ -242,7 +245,7 @@ def main() -> None:
         "ATE in 1e-3 units of the truth, after Sim(3). Targets: every ATE with a trajectory at "
         f"most {MAX_RATIO} times that without (worst ratio), none above {1e3 * MAX_ATE:g}. Of "
         "medians: median over trajectories by median over seeds. Chance: largest over smallest "
-        "ATE without a trajectory of the seeds; a ratio no larger than that says little. Numbers "
+        "ATE without a trajectory of the seeds; a ratio below it is within chance. Numbers "
         "under trajectories are seeds of degradations of the truth.",
         *(["", options.note] if options.note else []),
         *(["", f"With {', '.join(options.sets)}."] if options.sets else []),

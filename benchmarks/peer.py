@@ -2,8 +2,8 @@
 
     python benchmarks/peer.py spherical-incremental FRAMES OUT
 
-Writes the peer's model and, of the largest model, `trajectory.tum`: T_world_panorama of the frames
-it posed. Times of frames are their numbers in name order. The perspective modes need Pillow.
+Writes the peer's model and, of the largest model, `trajectory.tum`: T_world_panorama of its posed
+frames. Times of frames are their numbers in name order. The perspective modes need Pillow.
 """
 
 import argparse

@@ -2,8 +2,8 @@
 
     python -m benchmarks.photometric [--patches 9000] [--targets 8] [--size 9] [--width 1536]
 
-Frames stand in a ball of texture (random, band-limited), on a line; every patch is seen in the
-`targets` frames next to its host. CPU seconds of one thread, best of three.
+Frames are on a line in a sphere with a random, band-limited texture; every patch is observed in the
+`targets` frames next to its host. CPU seconds are of one thread, the best of three.
 """
 
 import argparse
@@ -20,11 +20,11 @@ from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
 from gsba.photometric.patches import halved
 
-RADIUS = 4.0  # of the ball, units
+RADIUS = 4.0  # of the sphere, units
 
 
 def make_block(num_patches: int, num_targets: int, size: int, width: int) -> tuple:
-    """A block and its values: 24 frames, patches at random bearings."""
+    """Block and values of 24 frames with patches at random bearings."""
     rng = np.random.default_rng(0)
     num_frames = 24
     world_T_rigs = np.tile(np.eye(4), (num_frames, 1, 1))
@@ -59,7 +59,7 @@ def make_block(num_patches: int, num_targets: int, size: int, width: int) -> tup
 
 
 def measure(block: PhotometricBlock, values: gtsam.Values) -> dict[str, float]:
-    """CPU seconds of the three things that a step of the solver asks for."""
+    """CPU seconds of the three calls of a solver step."""
     steps = np.full((len(block.keys), 6), 1e-4)
     seconds = {}
     for name, call in (

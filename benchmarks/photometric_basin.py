@@ -1,10 +1,10 @@
-"""From how many pixels of pose error direct alignment converges, by the levels it starts on.
+"""Basin of convergence of direct alignment: largest pose error in pixels, by starting level.
 
     python -m benchmarks.photometric_basin FOLDER [--width 1024] [--trials 4]
 
-Six frames of a rendered walk with exact depth (made where FOLDER does not exist); two are held, the
-poses of the others are turned and shifted so that patches land the given number of pixels off (root
-mean square). A frame has converged where less than a tenth of a pixel is left.
+Six frames of a rendered walk with exact depth are used (rendered if FOLDER does not exist). Two are
+fixed; the poses of the others are rotated and shifted so that patches have the given error in
+pixels (root mean square). A frame has converged if its remaining error is below a tenth of a pixel.
 """
 
 import argparse
@@ -31,7 +31,7 @@ STRATEGIES = {"level 0": (0,), "levels 1, 0": (1, 0), "levels 2, 1, 0": (2, 1, 0
 
 
 def exact_table(folder: Path, truth: np.ndarray, pyramids: list, settings: PhotometricSettings):
-    """Patches of all frames, planes through the rendered depth, seen in all other frames."""
+    """Patches of all frames on planes of the rendered depth, observed in all other frames."""
     hosts, bearings, planes = [], [], []
     for f, (greys, usable) in enumerate(pyramids):
         depth = np.load(folder / "depth" / f"{f:06d}.npz")["range"]
@@ -53,7 +53,7 @@ def exact_table(folder: Path, truth: np.ndarray, pyramids: list, settings: Photo
 
 
 def off_by(table: PatchTable, true: np.ndarray, poses: np.ndarray, width: int) -> np.ndarray:
-    """Root mean square (F,) of the pixels by which patches land off their place in each frame."""
+    """RMS errors (F,) of the patches' projections in each frame, pixels."""
     rows = np.arange(len(table.targets))
     a, b = (
         pixels_of(patch_spans(table, p, table.planes, rows)[:, 0], width) for p in (true, poses)
@@ -66,7 +66,7 @@ def off_by(table: PatchTable, true: np.ndarray, poses: np.ndarray, width: int) -
 
 
 def disturb(table: PatchTable, true: np.ndarray, error_px: float, width: int, rng) -> np.ndarray:
-    """Poses whose patches land `error_px` off, but for the held ones."""
+    """Poses whose patches have an RMS error of `error_px`; fixed frames keep theirs."""
     out = true.copy()
     distance = 1 / np.median(table.planes[:, 0])
     for f in range(HELD, len(true)):
@@ -82,7 +82,7 @@ def disturb(table: PatchTable, true: np.ndarray, error_px: float, width: int, rn
 def solve(
     table: PatchTable, pyramids: list, start: np.ndarray, levels: tuple, error_px: float
 ) -> np.ndarray:
-    """Poses after alignment on one level after the other."""
+    """Poses after alignment on successive levels."""
     poses = start
     for level in levels:
         width = pyramids[0][0][level].shape[1]

@@ -2,9 +2,9 @@
 
     python benchmarks/pipeline.py --sequences aisle_loop,demo_rectangle --out WORK
 
-Every row is a process of its own, measured from start to exit, and its trajectory is compared with
-the truth. Rows are kept in WORK and used again while code, options and frames stay the same, so a
-table can be filled in over several calls. The last lines say whether the targets hold.
+Every row is a separate process, measured from start to exit, and its trajectory is compared with
+the truth. Rows are kept in WORK and used again while code, options and frames stay the same, so
+that several calls can fill a table. The last lines state whether the targets hold.
 """
 
 import argparse
@@ -70,22 +70,22 @@ FACTOR_SETS = {  # row -> options of `gsba refine`
 
 @dataclass(frozen=True, slots=True)
 class Walk:
-    """Frames with one or more coarse trajectories and what to judge by."""
+    """Frames with coarse trajectories and a reference."""
 
     name: str
     folder: Path  # images/ and the trajectories
     trajectories: tuple[str, ...]
-    reference: Path  # TUM; the truth, or where there is none a peer's result
+    reference: Path  # TUM; the truth, or a peer's result if there is none
     mask: Path | None
 
     @property
     def has_truth(self) -> bool:
-        """Whether the reference is exact."""
+        """True if the reference is the truth."""
         return self.reference.stem == "groundtruth"
 
 
 def find_walk(name: str, data: Path, out: Path) -> Walk:
-    """A recorded sequence of the data folder, or a demo walk rendered into `out`.
+    """Recorded sequence of the data folder, or a demo walk rendered into `out`.
 
     Raises:
         GsbaError: the sequence is not on this machine.
@@ -105,7 +105,7 @@ def find_walk(name: str, data: Path, out: Path) -> Walk:
 
 
 class Bench:
-    """Rows of one call: where they are kept and under what conditions they run."""
+    """Folder and conditions of the rows of one call."""
 
     def __init__(self, out: Path, timeout_s: float, fresh: bool) -> None:
         self.out, self.timeout_s, self.fresh = out, timeout_s, fresh
@@ -113,7 +113,7 @@ class Bench:
         self.warm = False
 
     def rows(self, walk: Walk, sets: Sequence[str], peers: Sequence[str]) -> Iterator[dict]:
-        """Rows of one walk, in the order of the table."""
+        """Yield the rows of one walk, in the order of the table."""
         frames = scan(walk.folder / "images", masks=walk.mask)
         for place, name in enumerate(walk.trajectories):
             for row in sets:
@@ -125,7 +125,7 @@ class Bench:
             yield self.peer(walk, frames, mode)
 
     def slam(self, walk: Walk, frames: FrameSet, trajectory: str) -> dict:
-        """The input, at every frame's time."""
+        """Row of the input trajectory, interpolated at the frames' times."""
 
         def finish() -> dict:
             coarse = associate(frames, read_trajectory(walk.folder / trajectory), ReadSettings())
@@ -134,7 +134,8 @@ class Bench:
         return {**_head(walk, "slam", trajectory), **outcome(finish)}
 
     def refine(self, walk: Walk, frames: FrameSet, trajectory: str, factor_set: str) -> dict:
-        """A whole run with one factor set, without a dataset: the peer writes none either."""
+        """Row of a whole run with one factor set, without a dataset, which the peer does not write
+        either."""
         head = _head(walk, factor_set, None if factor_set == "no-trajectory" else trajectory)
         folder = self.out / walk.name / f"{factor_set}-{Path(trajectory).stem}"
         inputs = [walk.folder / trajectory, *([walk.mask] if walk.mask else [])]
@@ -152,7 +153,7 @@ class Bench:
         return self._measured(head, folder, key, command, finish)
 
     def peer(self, walk: Walk, frames: FrameSet, mode: str) -> dict:
-        """One of the peer's modes, which take neither trajectory nor mask."""
+        """Row of one of the peer's modes, which take neither trajectory nor mask."""
         head = {**_head(walk, mode, None), "peer": True}
         folder = self.out / walk.name / mode
         key = {"pycolmap": version("pycolmap"), "input": digest(_images(frames))}
@@ -174,7 +175,7 @@ class Bench:
     def _measured(
         self, head: dict, folder: Path, key: dict, command: list[str], finish: Callable[[], dict]
     ) -> dict:
-        """The kept row, or the outcome of running the command."""
+        """Kept row, or the row of running the command."""
         if not self.fresh and (row := kept_row(folder, key, self.timeout_s)):
             return {**row, **head}
         if "peer" not in head and not self.warm:
@@ -199,7 +200,7 @@ def _errors(walk: Walk, estimate: Trajectory) -> dict[str, Any]:
 
 
 def _compile_kernels(out: Path) -> None:
-    """Fill numba's cache by a small run, so that no measured one pays for it."""
+    """Fill numba's cache by a small run, so that measured runs do not compile."""
     folder = out / "walk"
     _make_walk(folder, "'open', num_frames=8, width=512")
     images, trajectory = folder / "images", folder / "slam.tum"
@@ -229,7 +230,7 @@ def _split(text: str) -> list[str]:
 
 
 def main() -> None:
-    """Parse, run, print; exit 1 where a target is missed."""
+    """Parse, run, print; exit with 1 if a target is missed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     every = ",".join((*RECORDED, *WALKS))
     parser.add_argument("--data", type=Path, default=DATA, help="recorded sequences")
@@ -249,8 +250,8 @@ def main() -> None:
         (every, *(name for name in options.sequences if (options.data / name).is_dir()))
     )
     known = ((options.sequences, there), (options.peers, ",".join(MODES)), (options.factors, sets))
-    for asked, allowed in known:
-        if unknown := set(asked) - set(allowed.split(",")):
+    for given, allowed in known:
+        if unknown := set(given) - set(allowed.split(",")):
             parser.error(f"{', '.join(sorted(unknown))}: use some of {allowed}")
     bench = Bench(options.out, 60 * options.timeout_min, options.fresh)
     table, text, held = [], [], True
@@ -276,7 +277,7 @@ def main() -> None:
 
 
 def _section(walk: Walk, rows: list[dict]) -> tuple[str, bool]:
-    """Markdown of one walk, and whether it holds all targets."""
+    """Markdown of one walk; and True if all targets hold."""
     judged = list(verdicts(rows))
     reference = "the exact truth" if walk.has_truth else f"{walk.reference.name}, a peer's result"
     lines = [f"## {walk.name}", "", f"Against {reference}.", "", to_markdown(rows), ""]

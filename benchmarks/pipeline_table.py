@@ -1,18 +1,18 @@
-"""Tables of `benchmarks/pipeline.py`: rows as Markdown, and whether they reach the targets.
+"""Tables of `benchmarks/pipeline.py`: rows as Markdown, and the check of the targets.
 
-A row is the dictionary that the benchmark keeps: `sequence`, `row`, `trajectory`, and as far as
-it got there `errors` (gsba.evaluate.trajectory), `wall_s`, `cpu_s`, `peak_mb`, `load`, or `reason`.
+A row is the dictionary that the benchmark keeps: `sequence`, `row`, `trajectory`, and either
+`errors` (gsba.evaluate.trajectory), `wall_s`, `cpu_s`, `peak_mb`, `load`, or `reason`.
 """
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 AUC_DEG = ("0.1", "0.25", "0.5", "1", "5")
-DEFAULT = "bearing"  # the row that targets and ratios are about, from the first trajectory
+DEFAULT = "bearing"  # row of the targets and ratios, from the first trajectory
 MAX_ATE = {"aisle_loop": 0.003, "gallery_forward": 0.003, "aisle_slam": 0.006}  # rmse, units
 MAX_ROTATION = {"aisle_loop": 0.02, "gallery_forward": 0.02}  # median between frames, degrees
-MAX_PART = 0.002  # of the path, ATE against a peer's result where there is no truth
-MAX_RESIDUAL = 0.03  # median, degrees, where there is no truth
+MAX_PART = 0.002  # ATE against a peer's result, part of the path, for sequences without a truth
+MAX_RESIDUAL = 0.03  # median, degrees, for sequences without a truth
 MAX_TIME = 0.25  # of the fastest peer's wall time
 
 
@@ -26,7 +26,7 @@ def to_markdown(rows: Sequence[dict]) -> str:
 
 
 def verdicts(rows: Sequence[dict]) -> Iterator[tuple[str, bool]]:
-    """What was to be reached on one sequence and whether it was, as far as its rows tell."""
+    """Yield the targets of one sequence that its rows can check, with True if they hold."""
     ours = _ours(rows)
     if ours is None:
         yield f"`{DEFAULT}` ends with a result", all(row["row"] != DEFAULT for row in rows)
@@ -48,7 +48,7 @@ def verdicts(rows: Sequence[dict]) -> Iterator[tuple[str, bool]]:
 
 
 def _against_peers(ours: dict, peers: Sequence[dict]) -> Iterator[tuple[str, bool]]:
-    """Time beside the fastest peer with a result, accuracy beside the best."""
+    """Yield targets: time against the fastest peer with a result, accuracy against the best."""
     peers = [row for row in peers if "errors" in row and row["machine"] == ours["machine"]]
     if not peers:
         return
@@ -61,7 +61,7 @@ def _against_peers(ours: dict, peers: Sequence[dict]) -> Iterator[tuple[str, boo
     best = max(row["errors"]["auc"]["0.5"] for row in peers)
     yield f"AUC@0.5° {100 * area:.1f}, best peer {100 * best:.1f}", area >= best
     whole = [e for row in peers if (e := row["errors"])["num_matched"] == e["num_truth"]]
-    if whole:  # the ATE of a part of the frames says little
+    if whole:  # the ATE over a part of the frames is not comparable
         best = min(e["ate"]["rmse"] for e in whole)
         yield f"ATE {ate:.5f}, best peer that posed all frames {best:.5f}", ate <= best
 

@@ -1,19 +1,19 @@
-"""What raw fisheyes are worth, by what is known of their lenses, beside COLMAP on the same files.
+"""Accuracy on raw fisheyes by the known calibration, beside COLMAP on the same files.
 
     python -m benchmarks.raw_fisheyes WALK... --out WORK [--seeds 0 1] [--peer [MODE...]]
         [--markdown FILE]
 
 A WALK is a folder with exact truth: `front/`, `back/` and timestamps.csv (all three beside each
-other or in `images/`), `groundtruth.tum`, `calibration.json` with the lenses as they are, and
-`slam.tum` (spoiled from the truth where it is absent). Ways: `known`, with that calibration;
-`nominal`, with one that is 3 % off in focal length, has no distortion, principal points 4 pixels
-and a back lens 1 degree and 5 mm off; `nothing`, without; `stitched`, the panoramas of the same
-walk, where it has them. The peer is given what is known, and in half of its rows the trajectory, in
-metres (`benchmarks/raw_peer.py`).
+other or in `images/`), `groundtruth.tum`, `calibration.json` with the true lenses, and `slam.tum`
+(made from the truth with drift if it is absent). Rows: `known`, with that calibration; `nominal`,
+with errors of 3 % in focal length, without distortion, of 4 pixels in principal points, and of
+1 degree and 5 mm in the back lens; `nothing`, without a calibration; `stitched`, the panoramas of
+the same walk, if it has them. The peer gets the true calibration, and in half of its rows the
+trajectory, in metres (`benchmarks/raw_peer.py`).
 
-Errors are root mean squares, of the middle between the lenses. Nothing says how raw pictures lie in
-a rig's axes, so for every row, the peer's too, the constant rotation of the rig that fits best is
-taken away first, if steps turn more like the true ones for it (poses far off show none).
+Errors are root mean squares, of the middle between the lenses. The rotation between raw images and
+the rig's axes is unknown, so that the best constant rotation of the rig is removed first in every
+row, the peer's too, if it makes steps more similar to the true ones.
 """
 
 import argparse
@@ -58,11 +58,11 @@ COLUMNS = (
 _FOCAL, _PRINCIPAL = 0.97, (-3.0, 2.6)  # of a nominal calibration: factor, pixels
 _TURN_DEG, _TURN_AXIS = 1.0, (0.42, 1.0, 0.40)  # of its back lens, in the rig
 _MOVE_M = (3.0e-3, 3.2e-3, 2.4e-3)
-_WORST_DEG = 95.0  # from the axis, to which directions are compared
+_WORST_DEG = 95.0  # largest angle from the axis at which directions are compared
 
 
 def linked(walk: Path, folder: Path) -> Path:
-    """A folder with the raw pictures of a walk as links, their times and nothing else."""
+    """Folder with links to the raw images of a walk and their times only."""
     home = next(home for home in (walk / "images", walk) if (home / "front").is_dir())
     shutil.rmtree(folder, ignore_errors=True)
     for name in ("front", "back"):
@@ -75,7 +75,7 @@ def linked(walk: Path, folder: Path) -> Path:
 
 
 def nominal(truth: Path, path: Path) -> Path:
-    """Write what a data sheet might say of a camera whose calibration is `truth`."""
+    """Write a nominal calibration, like a data sheet's, of a camera with calibration `truth`."""
     from scipy.spatial.transform import Rotation
 
     content = json.loads(truth.read_text())
@@ -95,7 +95,7 @@ def nominal(truth: Path, path: Path) -> Path:
 
 
 def between_lenses(truth: Trajectory, calibration: Path) -> Trajectory:
-    """True poses of the middle between the lenses, which need not be the rig of the files."""
+    """True poses of the middle between the lenses, which may differ from the files' rig."""
     lenses = json.loads(calibration.read_text())["lenses"]
     centres = [np.array(lenses[name]["rig_T_lens"])[:3, 3] for name in ("front", "back")]
     poses = truth.world_T_rigs.copy()
@@ -104,8 +104,8 @@ def between_lenses(truth: Trajectory, calibration: Path) -> Trajectory:
 
 
 def in_axes_of(estimate: Trajectory, truth: Trajectory) -> Trajectory:
-    """The truth in a rig turned by the constant rotation that fits an estimate best, its world laid
-    upon the true one by positions; as it is, where that makes steps turn more alike."""
+    """Truth in a rig that is rotated by the best constant rotation for an estimate, whose world is
+    aligned by positions; unchanged if the steps' rotations are more similar without it."""
     rows_e, rows_t = matched_in_time(estimate, truth, 0.01)
     poses, true_poses = estimate.world_T_rigs[rows_e], truth.world_T_rigs[rows_t]
     world = similarity(poses[:, :3, 3], true_poses[:, :3, 3]).rotation
@@ -118,8 +118,8 @@ def in_axes_of(estimate: Trajectory, truth: Trajectory) -> Trajectory:
 
 
 def lens_errors(found: Pair, truth: Pair) -> dict[str, float]:
-    """How lenses that were found are off: relative focal length of the worse one, degrees by which
-    the back one is turned against the front one, and degrees of the worst direction."""
+    """Errors of estimated lenses: larger relative error of the focal length, rotation of the back
+    lens against the front one, degrees, and largest error of a direction, degrees."""
     focal = [a.focal / b.focal - 1 for a, b in zip(found, truth, strict=True)]
     front_R_backs = [rotation_of(pair[0]).T @ rotation_of(pair[1]) for pair in (found, truth)]
     angles, around = np.meshgrid(
@@ -143,7 +143,7 @@ def lens_errors(found: Pair, truth: Pair) -> dict[str, float]:
 
 
 def judged_run(run: Path, truth: Trajectory, calibration: Path) -> dict[str, Any]:
-    """Errors of a run's poses, and of what it found of its camera and lenses."""
+    """Errors of a run's poses and of its estimated lenses."""
     estimate = read_trajectory(run / "trajectory.tum")
     camera = true_camera(calibration.parent)
     errors = judged(run, in_axes_of(estimate, truth), camera)["errors"]
@@ -155,7 +155,7 @@ def judged_run(run: Path, truth: Trajectory, calibration: Path) -> dict[str, Any
 
 
 def judged_peer(out: Path, truth: Trajectory) -> dict[str, Any]:
-    """Errors of the peer's poses, found alone and from a trajectory, each with its own cost."""
+    """Errors of the peer's poses, without and with a trajectory, each with its own cost."""
     parts = {}
     for name, cost in json.loads((out / "costs.json").read_text()).items():
         parts[name] = {"cost": cost, "reason": "found no model"}
@@ -171,7 +171,7 @@ def judged_peer(out: Path, truth: Trajectory) -> dict[str, Any]:
 def rows_of(
     walk: Path, work: Path, seeds: list[int], ways: list[str]
 ) -> Iterator[tuple[str, list[dict]]]:
-    """Outcomes of each way of solving a walk."""
+    """Yield outcomes of each row on a walk."""
     home, case, known = work / walk.name, case_of(walk, work), walk / "calibration.json"
     raw = linked(walk, home / "frames")
     rough = nominal(known, home / "nominal.json")
@@ -202,7 +202,7 @@ def rows_of(
 
 
 def peers_of(walk: Path, work: Path, modes: Sequence[str]) -> Iterator[tuple[str, list[dict]]]:
-    """Outcomes of the peer's modes on a walk that `rows_of` has laid out."""
+    """Yield outcomes of the peer's modes on a walk that `rows_of` has prepared."""
     home, known = work / walk.name, walk / "calibration.json"
     truth = between_lenses(read_trajectory(walk / "groundtruth.tum"), known)
     coarse = case_of(walk, work).trajectory
@@ -224,7 +224,7 @@ def peers_of(walk: Path, work: Path, modes: Sequence[str]) -> Iterator[tuple[str
 
 
 def _parts(title: str, row: dict) -> Iterator[tuple[str, list[dict]]]:
-    """The rows of a run of the peer: each costs all of it but what only the other one needed."""
+    """Yield the two rows of a run of the peer; the cost of each excludes the other's own steps."""
     for name, part in sorted(row.get("parts", {"alone": row}).items()):
         others = [other["cost"] for key, other in row.get("parts", {}).items() if key != name]
         cost = {of: row[of] - sum(other[of] for other in others) for of in ("wall_s", "cpu_s")}
@@ -232,7 +232,7 @@ def _parts(title: str, row: dict) -> Iterator[tuple[str, list[dict]]]:
 
 
 def scaled(trajectory: Path, truth: Trajectory, path: Path) -> Path:
-    """Write a trajectory in units of the truth: a rig of known size needs a start in metres."""
+    """Write a trajectory in metres, the unit of the truth, which a rig of known size needs."""
     found = read_trajectory(trajectory)
     poses = found.world_T_rigs.copy()
     poses[:, :3, 3] *= evaluate(found, truth).scale
@@ -249,7 +249,7 @@ def _finish(run: Path, truth: Trajectory, known: Path):
 
 
 def main() -> None:
-    """Run what is asked for and print the table."""
+    """Run the chosen rows and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("walks", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, required=True)
@@ -257,20 +257,20 @@ def main() -> None:
     parser.add_argument("--ways", nargs="*", choices=WAYS, default=list(WAYS))
     parser.add_argument("--peer", nargs="*", choices=MODES, metavar="MODE", help="none named: all")
     parser.add_argument("--markdown", type=Path)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     names = ["walk", "as", *(title for _, title, *_ in COLUMNS)]
     lines = [f"| {' | '.join(names)} |", "|---|---|" + "---:|" * (len(names) - 2)]
-    for walk in (path.resolve() for path in asked.walks):
-        found = list(rows_of(walk, asked.out, asked.seeds, asked.ways))
-        if asked.peer is not None:
-            found += peers_of(walk, asked.out, asked.peer or MODES)
+    for walk in (path.resolve() for path in arguments.walks):
+        found = list(rows_of(walk, arguments.out, arguments.seeds, arguments.ways))
+        if arguments.peer is not None:
+            found += peers_of(walk, arguments.out, arguments.peer or MODES)
         for name, outcomes in found:
             reasons = {row["reason"] for row in outcomes if "reason" in row}
             title = ": ".join([name, *sorted(reasons)]).replace("|", "/")
             cells = [cell(outcomes, key, factor, form) for key, _, factor, form in COLUMNS]
             lines.append(f"| `{walk.name}` | {title} | {' | '.join(cells)} |")
     print("\n".join(lines))
-    write_table(lines, asked.markdown)
+    write_table(lines, arguments.markdown)
 
 
 if __name__ == "__main__":

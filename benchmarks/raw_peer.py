@@ -1,18 +1,18 @@
-"""The peer of `benchmarks/raw_fisheyes.py`: COLMAP on raw pairs whose lenses and rig are given.
+"""The peer of `benchmarks/raw_fisheyes.py`: COLMAP on raw pairs with known lenses and rig.
 
     python benchmarks/raw_peer.py faces FRAMES CALIBRATION OUT [--start TRAJECTORY]
 
-FRAMES holds `front/`, `back/` and timestamps.csv. All is driven as `pycolmap.panorama` drives its
-own rig of views: on the CPU, sequential matching with its defaults, the incremental mapper with rig
-and intrinsics held. Only matches are verified by pairs of pictures, as COLMAP does unless told
-otherwise: by the rig, 60 frames of ten faces were not through after 25 minutes of CPU time, and on
-8 frames identical arches were taken for one another all the same. With a trajectory, the mapper's
-triangulation and global refinement also start from its poses.
+FRAMES holds `front/`, `back/` and timestamps.csv. Settings are those of `pycolmap.panorama` for its
+rig of views: on the CPU, sequential matching with defaults, the incremental mapper with fixed rig
+and intrinsics. Only the verification of matches is by pairs of images, COLMAP's default:
+verification by the rig did not finish 60 frames of ten faces in 25 minutes of CPU time, and on 8
+frames it still confused identical arches. With a trajectory, the mapper's triangulation and global
+refinement also start from its poses.
 
-Modes: `faces`, pinholes cut out of either lens up to its rim; `fisheyes`, the pictures as they are,
-one OPENCV_FISHEYE camera each; `fisheyes-88`, the same without what is further than 88 degrees from
-the axis. Writes `alone.tum` and `trajectory.tum`, poses of the rig midway between the lenses, and
-costs.json of what they do not share.
+Modes: `faces`, pinholes cut out of either lens up to its rim; `fisheyes`, the raw images, one
+OPENCV_FISHEYE camera each; `fisheyes-88`, the raw images within 88 degrees from the axis. Writes
+`alone.tum` and `trajectory.tum`, poses of the rig midway between the lenses, and costs.json of the
+steps that they do not share.
 """
 
 import argparse
@@ -29,11 +29,11 @@ import cv2
 import numpy as np
 
 LENSES = ("front", "back")
-FISHEYES = {"fisheyes": 99.0, "fisheyes-88": 88.0}  # mode -> how far from the axis, degrees
+FISHEYES = {"fisheyes": 99.0, "fisheyes-88": 88.0}  # mode -> largest angle from the axis, degrees
 MODES = ("faces", *FISHEYES)
-_BEYOND = np.tan(np.deg2rad(9.0))  # of the sides behind a lens, so that corners stay within it
+_BEYOND = np.tan(np.deg2rad(9.0))  # extent of side faces behind a lens: corners stay within it
 _AHEAD = np.eye(3), np.diag([-1.0, 1.0, -1.0])  # rig_R_lens of upright lenses
-_SIDES = {  # upright lens_R_face, and how far the face goes: left, top, right, bottom tangents
+_SIDES = {  # upright lens_R_face, and the extent of the face: left, top, right, bottom tangents
     "ahead": ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], (1, 1, 1, 1)),
     "right": ([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], (1, 1, _BEYOND, 1)),
     "left": ([[0, 0, -1], [0, 1, 0], [1, 0, 0]], (_BEYOND, 1, 1, 1)),
@@ -54,7 +54,7 @@ class View:
 
 
 def faces(frames: Path, pair, out: Path) -> list[View]:
-    """Cut the pinholes of all frames, as dense as pycolmap.panorama cuts a panorama of them."""
+    """Cut the pinholes of all frames, with pycolmap.panorama's density."""
     from gsba.camera.fisheye import project
     from gsba.frames.dual_fisheye import width_of
     from gsba.geometry import pose
@@ -86,7 +86,7 @@ def faces(frames: Path, pair, out: Path) -> list[View]:
 
 
 def fisheyes(frames: Path, pair, half_fov_deg: float, out: Path) -> list[View]:
-    """The pictures as they are, with masks of what is within some angle of the axis."""
+    """Link the raw images, with masks of pixels within an angle from the axis."""
     from gsba.camera.fisheye import rotation_of, unproject
     from gsba.geometry import pose
 
@@ -109,7 +109,7 @@ def fisheyes(frames: Path, pair, half_fov_deg: float, out: Path) -> list[View]:
 
 
 def match(views: list[View], out: Path) -> Path:
-    """Features and verified matches of the pictures that `out` holds, in the peer's database."""
+    """Peer's database with features and verified matches of the images in `out`."""
     import pycolmap
 
     pycolmap.set_random_seed(0)
@@ -132,7 +132,7 @@ def match(views: list[View], out: Path) -> Path:
 
 
 def mapped(database: Path, out: Path):
-    """The largest model of the incremental mapper; None = it found none."""
+    """Largest model of the incremental mapper; None = it found none."""
     import pycolmap
 
     (out / "sparse").mkdir()
@@ -141,7 +141,7 @@ def mapped(database: Path, out: Path):
 
 
 def adjusted(database: Path, views: list[View], seconds: dict[str, float], start: Path):
-    """The model that the peer triangulates and adjusts from the poses of a trajectory in metres."""
+    """Model that the peer triangulates and adjusts from the poses of a trajectory in metres."""
     import pycolmap
 
     from gsba.geometry import inverse
@@ -202,7 +202,7 @@ def write_poses(model, views: list[View], times: dict[str, float], path: Path) -
 
 
 def _options():
-    """The mapper's, with rig and intrinsics held."""
+    """Options of the mapper, with fixed rig and intrinsics."""
     import pycolmap
 
     return pycolmap.IncrementalPipelineOptions(
@@ -215,7 +215,7 @@ def _options():
 
 
 def _rig(views: list[View]):
-    """What the peer is told: the first view is the rig, the others hang on it."""
+    """Rig of the peer, whose frame is that of the first view."""
     import pycolmap
 
     from gsba.geometry import inverse
@@ -246,7 +246,7 @@ def _read(path: Path) -> np.ndarray:
 
 
 def main() -> None:
-    """Cut or link the pictures, reconstruct, and write the poses."""
+    """Cut or link the images, reconstruct, and write the poses."""
     from gsba.camera.calibration import read_calibration
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -254,31 +254,31 @@ def main() -> None:
     for name in ("frames", "calibration", "out"):
         parser.add_argument(name, type=Path)
     parser.add_argument("--start", type=Path, help="trajectory of the rig, metres")
-    asked = parser.parse_args()
-    if asked.out.exists() and any(path.name != "log.txt" for path in asked.out.iterdir()):
-        sys.exit(f"{asked.out}: is not empty")
-    pair = read_calibration(asked.calibration)
-    asked.out.mkdir(parents=True, exist_ok=True)
-    if asked.mode == "faces":
-        views = faces(asked.frames, pair, asked.out)
+    arguments = parser.parse_args()
+    if arguments.out.exists() and any(path.name != "log.txt" for path in arguments.out.iterdir()):
+        sys.exit(f"{arguments.out}: is not empty")
+    pair = read_calibration(arguments.calibration)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    if arguments.mode == "faces":
+        views = faces(arguments.frames, pair, arguments.out)
     else:
-        views = fisheyes(asked.frames, pair, FISHEYES[asked.mode], asked.out)
-    database, times = match(views, asked.out), times_of(asked.frames)
+        views = fisheyes(arguments.frames, pair, FISHEYES[arguments.mode], arguments.out)
+    database, times = match(views, arguments.out), times_of(arguments.frames)
     ways: dict[str, Callable[[], Any]] = {}
-    if asked.start:
-        ways["trajectory"] = lambda: adjusted(database, views, times, asked.start)
-    ways["alone"] = lambda: mapped(database, asked.out)
+    if arguments.start:
+        ways["trajectory"] = lambda: adjusted(database, views, times, arguments.start)
+    ways["alone"] = lambda: mapped(database, arguments.out)
     costs = {}
     for name, way in ways.items():
         wall, cpu = time.perf_counter(), time.process_time()
         model = way()
         if model is not None:
-            write_poses(model, views, times, asked.out / f"{name}.tum")
+            write_poses(model, views, times, arguments.out / f"{name}.tum")
         costs[name] = {
             "wall_s": time.perf_counter() - wall,
             "cpu_s": time.process_time() - cpu,
         }
-    (asked.out / "costs.json").write_text(json.dumps(costs))
+    (arguments.out / "costs.json").write_text(json.dumps(costs))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""How badly wrong a trajectory may be: drift, outliers, gaps, scale, clock, swept one by one.
+"""Robustness to errors of the trajectory: drift, outliers, gaps, scale, clock, swept one by one.
 
-Renders a walk (or takes FRAMES and their TRUTH), spoils its exact trajectory by growing amounts,
-refines each and compares with the truth. Frames are searched for features once. `missing loop`
-leaves out the last frames, pictures and all, of a drifting trajectory, so that it never returns;
-`false loops` forces loops between places that have nothing in common into the run.
+Renders a walk (or takes FRAMES and their TRUTH), adds errors of growing size to its exact
+trajectory, refines each and compares with the truth. Features are detected once. `missing loop`
+leaves out the last frames and poses of a drifting trajectory, so that it does not return to its
+start; `false loops` forces loop closures between different places into the run.
 """
 
 import argparse
@@ -41,11 +41,11 @@ MISSING = (5, 10, 20)  # last frames left out
 MISSING_DRIFT = 0.05  # of the path, of the trajectory whose loop is missing
 FALSE_LOOPS = (3, 8)  # in a row, between frames a quarter and three quarters into the walk
 TURN_DEG_PER_DRIFT = 100.0  # degrees of rotation drift that go with a drift of one path length
-OUTLIER_STEPS, OUTLIER_DEG = (1.0, 3.0), (5.0, 20.0)  # how far off: least and most
+OUTLIER_STEPS, OUTLIER_DEG = (1.0, 3.0), (5.0, 20.0)  # smallest and largest error of an outlier
 
 
 class Point(NamedTuple):
-    """A trajectory to refine."""
+    """Trajectory to refine, of one sweep and amount."""
 
     sweep: str
     amount: float
@@ -54,7 +54,7 @@ class Point(NamedTuple):
 
 
 def spoiled(truth: Trajectory, seed: int) -> Iterator[tuple[str, float, Trajectory, list[int]]]:
-    """Name, amount, trajectory, and the frames made outliers, of every point of the sweeps."""
+    """Yield name, amount, trajectory and outlier frames of every point of the sweeps."""
     base = degrade(truth, seed)
     for amount in DRIFTS:
         turn = TURN_DEG_PER_DRIFT * amount
@@ -89,7 +89,7 @@ def spoiled(truth: Trajectory, seed: int) -> Iterator[tuple[str, float, Trajecto
 def with_outliers(
     world_T_rigs: np.ndarray, share: float, seed: int
 ) -> tuple[np.ndarray, list[int]]:
-    """Poses of which some, never the ends, are displaced by steps and turned; and which ones."""
+    """Poses of which a share, without the ends, is displaced and rotated; and these frames."""
     rng = np.random.default_rng(seed)
     poses = world_T_rigs.copy()
     step = np.median(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))
@@ -114,7 +114,7 @@ def rescaled(truth: Trajectory, amount: float) -> np.ndarray:
 
 
 def _point(run: Callable[[], dict[str, Any]], names: list[str], truth: Trajectory, out: Path):
-    """Errors, naming of outliers and cost of one refinement, or why it was refused."""
+    """Errors, detection of outliers and cost of one refinement, or the reason of its refusal."""
     start = time.process_time()
     try:
         report = run()
@@ -136,7 +136,7 @@ def _point(run: Callable[[], dict[str, Any]], names: list[str], truth: Trajector
 def _row(
     point: Point, frames: Path, truth: Trajectory, work: Path, settings: RefineSettings
 ) -> dict[str, Any]:
-    """One refinement, in a folder of its own where it is not of the same frames and stages."""
+    """Row of one refinement; points with the same frames and stages share a folder."""
     slam, folder, false, trajectory = (
         work / "slam.tum",
         work / "run",
@@ -168,7 +168,7 @@ def _report(
 
 
 def _without_last(frames: Path, truth: Trajectory, missing: int, folder: Path) -> Path:
-    """A folder of links to all frames but the last ones, and their times."""
+    """Folder of links to all frames but the last ones, and their times."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     images = sorted(path for path in frames.iterdir() if path.suffix != ".csv")[:-missing]

@@ -1,11 +1,11 @@
-"""Runs of the demo laid on scans: how exactly where it is right, and what is refused.
+"""Registration of demo runs with scans: its accuracy, and refusals of wrong scans.
 
     python -m benchmarks.scans --out WORK [--seeds 40 41 ...] [--markdown FILE]
 
-The gallery is cast as a scan from six stations: 5 mm noise along rays, a third missing in balls of
-one to two metres, all furniture a metre from where the run saw it, in a world of unknown pose and
-scale, without colours. Then buildings that are none of the run's. Limits: .1 % of scale, 5 mm of
-place, no wrong building taken. Needs open3d; a run is refined where WORK has none yet.
+The gallery is scanned from six stations: with 5 mm noise along rays, a third missing in balls of
+one to two metres, all furniture a metre from its place in the run, in a world of unknown pose and
+scale, without colours. Further scans are of other buildings. Limits: 0.1 % of scale, 5 mm of
+position, and no wrong building accepted. Needs open3d; runs that WORK lacks are refined.
 """
 
 import argparse
@@ -43,7 +43,7 @@ SCALE_LIMIT, PLACE_LIMIT = 0.1, 5.0  # %, mm
 
 
 class Moving(MeshBuilder):
-    """Puts faces a metre aside, by the quarter of the gallery that they are in."""
+    """Mesh builder that moves faces by a metre, in a direction by their quarter of the gallery."""
 
     moving = False
 
@@ -64,7 +64,7 @@ class Moving(MeshBuilder):
 
 
 def building(seed: int = 0, pictures: bool = True, **sizes: float) -> Scene:
-    """The gallery with its furniture moved; other sizes or another seed are another building."""
+    """Gallery with its furniture moved; other sizes or another seed give another building."""
     kept = {name: getattr(gallery, name) for name in sizes}
     for name, size in sizes.items():
         setattr(gallery, name, size)
@@ -101,7 +101,7 @@ def scanned(scene: Scene, seed: int) -> np.ndarray:
 
 
 class Run(NamedTuple):
-    """A run of the gallery, and where it truly is."""
+    """Run of the gallery, and its true placement."""
 
     cloud: Cloud
     eyes: np.ndarray  # (F, 3), of the run
@@ -109,7 +109,7 @@ class Run(NamedTuple):
 
 
 def run_of(out: Path, walk: str, seed: int) -> Run:
-    """Refined, if it is not there yet."""
+    """Run of a walk, refined if it does not exist yet."""
     folder = out / f"{walk}{seed}"
     if not (folder / "run" / "gsba.json").exists():
         made = make_walk(folder / "walk", walk, "locked", 40, 1024, seed)  # type: ignore[arg-type]
@@ -121,7 +121,7 @@ def run_of(out: Path, walk: str, seed: int) -> Run:
 
 
 def judged(run: Run, points: np.ndarray, seed: int) -> dict[str, Any]:
-    """A row: taken or refused, and how far off."""
+    """Row: accepted or refused, and its errors."""
     rng = np.random.default_rng([seed, 1])
     turn = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
     into = Sim3(float(np.exp(rng.uniform(-1, 1))), turn, rng.normal(0, 20, 3))
@@ -134,7 +134,7 @@ def judged(run: Run, points: np.ndarray, seed: int) -> dict[str, Any]:
 
 
 def _errors(found: Registration, run: Run, into: Sim3) -> dict[str, float]:
-    """Of scale, of cameras' places, and of both over what the registration claims."""
+    """Errors of the scale and of camera positions, and both over the registration's sigmas."""
     fit, true = found.fit, run.true
     true = Sim3(
         into.scale * true.scale,
@@ -156,7 +156,7 @@ def _errors(found: Registration, run: Run, into: Sim3) -> dict[str, float]:
 
 
 def wrong_buildings(seed: int) -> dict[str, Callable[[], np.ndarray]]:
-    """Their scans, by name."""
+    """Scans of other buildings, by name."""
     return {
         "mirrored": lambda: scanned(building(), seed) * [-1, 1, 1],
         "2 % longer": lambda: scanned(building(), seed) * [1.02, 1, 1],
@@ -205,9 +205,9 @@ def main() -> None:
         print(rows[-1], flush=True)
     sigmas = [row["sigmas"] for row in rows[:right] if row["outcome"] == "taken"]
     ratio = float(np.sqrt(np.mean(np.square(sigmas)))) if sigmas else float("nan")
-    said = f"Errors over standard deviations, root mean square of all seeds: {ratio:.2f}"
-    print(said)
-    write_table([*_table(rows), "", f"{said}."], arguments.markdown)
+    summary = f"Errors over standard deviations, root mean square of all seeds: {ratio:.2f}"
+    print(summary)
+    write_table([*_table(rows), "", f"{summary}."], arguments.markdown)
     sys.exit(0 if good else 1)
 
 

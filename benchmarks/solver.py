@@ -1,10 +1,10 @@
-"""Bundle adjustment of synthetic 360-degree walks: ours beside pycolmap's, same optimum or not.
+"""Bundle adjustment of synthetic 360-degree walks by our solver and by pycolmap's.
 
     python benchmarks/solver.py --size M --peer
 
-Each solver runs in a process of its own; CPU seconds count its solve, peak memory the process. All
-results are judged by one function: the robust angular cost with landmarks at their best for the
-resulting poses. The table says whether the targets hold.
+Each solver runs in a separate process; CPU seconds are of its solve, peak memory is of the process.
+All results are compared by one function: the robust angular cost with landmarks optimised for the
+resulting poses. The table states whether the targets hold.
 """
 
 import argparse
@@ -35,7 +35,7 @@ OURS, PEER = "ours", "pycolmap-erp"
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A closed walk, seen with noise; poses and landmarks start as a drifting SLAM leaves them."""
+    """Closed walk with noisy observations; initial poses and landmarks have the drift of SLAM."""
 
     truth_world_T_rigs: np.ndarray  # (F, 4, 4)
     world_T_rigs: np.ndarray  # (F, 4, 4) start
@@ -47,7 +47,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What one solver did."""
+    """Result of one solver."""
 
     solver: str
     cpu_s: float  # of the solve
@@ -59,7 +59,7 @@ class Result:
 
 
 def make_problem(num_frames: int, num_points: int, seed: int = 0) -> Problem:
-    """Draw a closed oval walk of 0.3 units a frame, landmarks within 6 units around it."""
+    """Generate a closed oval walk of 0.3 units a frame, with landmarks within 6 units around it."""
     rng = np.random.default_rng(seed)
     angle = 2 * np.pi * np.arange(num_frames) / num_frames
     radius = 0.3 * num_frames / (2 * np.pi)
@@ -91,7 +91,7 @@ def make_problem(num_frames: int, num_points: int, seed: int = 0) -> Problem:
 
 
 def solve_ours(problem: Problem, num_threads: int) -> tuple[Result, np.ndarray, np.ndarray]:
-    """Our loop; the gauge is a prior on the first pose and one distance."""
+    """Solve by our optimiser; priors on the first pose and on one distance fix the gauge."""
     import gtsam
     from gtsam.symbol_shorthand import X
 
@@ -130,7 +130,7 @@ def _block(problem: Problem, world_T_rigs: np.ndarray, points: np.ndarray, num_t
 
 
 def solve_pycolmap(problem: Problem, num_threads: int) -> tuple[Result, np.ndarray, np.ndarray]:
-    """The peer: one equirectangular camera a frame, its loss on the same scale in pixels."""
+    """Solve by the peer: one equirectangular camera a frame, with the same loss scale in pixels."""
     import pycolmap
 
     reconstruction = _reconstruction(problem)
@@ -167,7 +167,7 @@ def solve_pycolmap(problem: Problem, num_threads: int) -> tuple[Result, np.ndarr
 
 
 def _reconstruction(problem: Problem):
-    """The problem as a pycolmap reconstruction of equirectangular images."""
+    """Problem as a pycolmap reconstruction of equirectangular images."""
     import pycolmap
 
     from gsba.camera.sphere import erp_from_bearings
@@ -200,7 +200,7 @@ def _reconstruction(problem: Problem):
 
 
 def common_cost(problem: Problem, world_T_rigs: np.ndarray, points: np.ndarray) -> float:
-    """Robust angular cost of poses, each landmark at its best for them."""
+    """Robust angular cost of poses, with landmarks optimised for them."""
     block, values = _block(problem, world_T_rigs, points, os.cpu_count() or 1)
     return block.polish(values, num_steps=50)
 
@@ -218,7 +218,7 @@ def _poses(rotations: np.ndarray, positions: np.ndarray) -> np.ndarray:
 
 
 def _noisy(vectors: np.ndarray, sigma: float, rng: np.random.Generator) -> np.ndarray:
-    """Unit vectors of `vectors`, turned by a tangent noise of `sigma` radians per axis."""
+    """Unit vectors of `vectors` with a tangent noise of `sigma` radians per axis."""
     unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     noise = sigma * rng.normal(size=unit.shape)
     noise -= np.einsum("ni,ni->n", noise, unit)[:, None] * unit
@@ -227,7 +227,7 @@ def _noisy(vectors: np.ndarray, sigma: float, rng: np.random.Generator) -> np.nd
 
 
 def _warm_up(problem: Problem) -> None:
-    """Load or compile the kernels on the first frames, so that no run pays for it."""
+    """Load or compile the kernels on the first frames, so that measured solves do not compile."""
     import gtsam
 
     from gsba.bundle.optimizer import optimize
@@ -259,7 +259,7 @@ def _child(solver: str, folder: Path, num_threads: int) -> None:
 
 
 def run(problem: Problem, solver: str, num_threads: int) -> Result:
-    """Solve in a child process and judge the outcome."""
+    """Solve in a child process and compute the cost of the result."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         arrays = {field.name: getattr(problem, field.name) for field in fields(problem)}
@@ -273,7 +273,7 @@ def run(problem: Problem, solver: str, num_threads: int) -> Result:
 
 
 def verdicts(results: dict[str, list[Result]]) -> list[tuple[str, bool]]:
-    """What was to be reached, and whether it was, for the sizes and solvers that ran."""
+    """Targets for the sizes and solvers that ran, with True if they hold."""
     out = []
     for size, rows in results.items():
         ours, peers = rows[0], rows[1:]
@@ -297,7 +297,7 @@ def verdicts(results: dict[str, list[Result]]) -> list[tuple[str, bool]]:
 
 
 def main() -> None:
-    """Parse, run, print; exit 1 where a target is missed."""
+    """Parse, run, print; exit with 1 if a target is missed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--size", choices=SIZES, nargs="+", default=["S"])
     parser.add_argument("--peer", action="store_true", help="run pycolmap too")

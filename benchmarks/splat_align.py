@@ -1,10 +1,11 @@
-"""How far a splat brings perturbed poses back, alone and together with bearings.
+"""Alignment of perturbed poses to a splat, alone and together with bearings.
 
     python benchmarks/splat_align.py RUN SPLAT --truth TRUTH.tum
 
-Every pose of the finished RUN is perturbed independently, then aligned to the SPLAT trained on the
-run's refined poses, which stays as it is. Errors are against the truth. Exit 1 where the joint
-result is further off than twice what the same alignment gives from the unperturbed poses.
+Every pose of the finished RUN is perturbed independently, then aligned to the SPLAT that was
+trained on the run's refined poses, which does not change. Errors are against the truth. The exit
+code is 1 if the error of the joint result exceeds twice that of an alignment from the unperturbed
+poses.
 """
 
 import argparse
@@ -30,7 +31,7 @@ MAX_FACTOR = 2.0  # of the error from unperturbed poses
 
 
 def perturbed(world_T_rigs: np.ndarray, degrees: float, distance: float, seed: int) -> np.ndarray:
-    """Poses (F, 4, 4) moved at random: root mean square angle and distance as given."""
+    """Poses (F, 4, 4) moved at random, with the given RMS angle and distance."""
     rng = np.random.default_rng(seed)
     scale = np.repeat([np.deg2rad(degrees), distance], 3) / np.sqrt(3)
     steps = scale * rng.standard_normal((len(world_T_rigs), 6))
@@ -47,7 +48,9 @@ def main() -> None:
     parser.add_argument("splat", type=Path)
     parser.add_argument("--truth", type=Path, required=True)
     parser.add_argument("--degrees", type=float, default=0.3)
-    parser.add_argument("--path-share", type=float, default=0.01, help="of the path's length")
+    parser.add_argument(
+        "--path-share", type=float, default=0.01, help="RMS distance, part of the path's length"
+    )
     parser.add_argument("--sizes", type=int, nargs="+", default=[24, 48, 96, 192])
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()

@@ -1,13 +1,13 @@
-"""Whether moves of poses against a splat are kept where they help and undone where they harm.
+"""Decisions on moves of poses by a splat: helpful moves should be kept, harmful ones undone.
 
     python benchmarks/splat_decision.py --table benchmarks/results/splat_decision.md
 
-The walk of the tests, eight frames, with a seed for what is wrong with its poses and for the
-training. Either all poses are off and all observations are doubted, or three frames have but a few
-poor observations, and only pixels can tell (half as many seeds). Moves are as the joint step finds
-them, or made harmful. Twice: with code for this CPU, and with generic kernels and another CPU's
-BLAS. Exit 1 where a helpful move of the first scene is undone in more than a case of twenty, or any
-harmful one is kept.
+The walk is that of the tests, eight frames, with a seed for the errors of its poses and for the
+training. In the first scene all poses have errors and all observations low weights; in the second
+one three frames have few and noisy observations (half as many seeds). Moves are those of the joint
+step, or are made harmful. All is done twice: with code for this CPU, and with generic kernels and
+another CPU's BLAS. The exit code is 1 if more than one helpful move in twenty of the first scene is
+undone, or any harmful one is kept.
 """
 
 import argparse
@@ -48,7 +48,7 @@ WEAK, FEW, WEAK_DEG = (1, 4, 5), 25, 2.0  # frames, observations left of each, t
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """A move and what became of it."""
+    """Move of poses, and the decision on it."""
 
     kind: str  # of CPU code
     scene: str
@@ -60,11 +60,11 @@ class Decision:
     growth: float
     evidence: float
     ate_ratio: float  # of the moved poses, over that before
-    turn_ratio: float  # median relative rotation error, the same
+    turn_ratio: float  # median relative rotation error of the moved poses, over that before
 
 
 def poor_frames(case: Case, seed: int) -> Given:
-    """The solved walk, solved again with few and poor observations of three frames."""
+    """Solved walk, solved again with few and noisy observations of three frames."""
     solved, keypoints = load_stage(case.out, "aligned2", tuple[Solution, Keypoints])
     rng, tracks = np.random.default_rng(seed), solved.landmarks.tracks
     kept = ~np.isin(tracks.frames, WEAK)
@@ -102,7 +102,7 @@ def poor_frames(case: Case, seed: int) -> Given:
 
 
 def decide(case: Case, kind: str, scene: str, move: str, seed: int) -> Decision:
-    """One first move of all poses, and the decision on it."""
+    """Decision on the first move of all poses."""
     if scene == DOUBTED:
         given = spoiled(case, 0.1, 0.003, 50.0, seed)
         settings = settings_for(sizes=(48,), first_steps=80, steps=120)
@@ -133,7 +133,7 @@ def decide(case: Case, kind: str, scene: str, move: str, seed: int) -> Decision:
 
 
 def one_kind(kind: str, seeds: int) -> Iterator[Decision]:
-    """All decisions in this process."""
+    """Yield all decisions of this process."""
     with tempfile.TemporaryDirectory() as folder:
         case = make_case(Path(folder))
         for scene, moves in MOVES.items():
@@ -143,7 +143,7 @@ def one_kind(kind: str, seeds: int) -> Iterator[Decision]:
 
 
 def other_process(kind: str, seeds: int) -> Iterator[Decision]:
-    """All decisions by code of a kind, compiled kernels of which are kept apart."""
+    """Yield all decisions by code of another kind, with a separate cache of compiled kernels."""
     with tempfile.TemporaryDirectory() as cache:
         apart = {"NUMBA_CACHE_DIR": cache} if KINDS[kind] else {}
         command = [sys.executable, __file__, "--seeds", str(seeds), "--kind", kind]

@@ -2,28 +2,28 @@
 
     python -m benchmarks.splat_lenses --out WORK [--seeds 0 1 2] [--markdown FILE]
 
-For each seed the demo's gallery is walked with the two-lens camera and refined with and without its
-model. Splats are trained on the CPU, each frame is shown equally often:
+For each seed a walk through the demo's gallery with the two-lens camera is refined with and without
+its camera model. Splats are trained on the CPU, with each frame equally often:
 
-- `lenses`, on ten faces of one lens each, as `gsba train` does it;
-- `middle`, from the same poses on the same ten views of the panoramas, all from one centre;
-- `stitched`, from these poses on six faces of the panoramas;
-- `central`, on six faces with what was refined as seen from one centre.
+- `lenses`, on ten faces of one lens each, like `gsba train`;
+- `middle`, with the same poses on the same ten views of the panoramas, all of one centre;
+- `stitched`, with these poses on six faces of the panoramas;
+- `central`, on six faces with the poses of the model with one centre.
 
-Ten views take more steps than six, which show less each: `longer` is `stitched` with as many steps
-as `lenses`, `shorter` is `lenses` with as many as `stitched`.
+Ten views take more steps than six larger ones: `longer` is `stitched` with as many steps as
+`lenses`, `shorter` is `lenses` with as many as `stitched`.
 
 Whole frames are held out. They are scored twice, each splat rendered at its own poses:
 
-- on pixels that the lenses took: ten views that leave out what is blended at the seam. A splat of
-  lenses is rendered from either lens, and what moved during the readout is taken out of its
-  pictures, as in training. A splat of one centre is rendered from there, in the directions that the
-  same pixels have in the panorama: its own account of them.
+- on pixels of the lenses: ten views without the blended band at the seam. A splat of lenses is
+  rendered from either lens, and the motion during the readout is corrected in the images, like in
+  training. A splat of one centre is rendered from that, in the directions that these pixels have in
+  the panorama.
 - on exact renderings of the gallery from the middle between the lenses at the true pose, six faces
-  of one centre, without noise; after the gain of each channel that fits best, because a frame's
-  exposure is its own.
+  of one centre, without noise; with the best gain of each channel, because each frame has its own
+  exposure.
 
-Runs and splats are kept in WORK and taken up again. Exit 1 where `lenses` is behind on the first.
+Runs and splats are kept in WORK and resumed. The exit code is 1 if `lenses` is worse on the first.
 """
 
 import argparse
@@ -57,11 +57,11 @@ from gsba.trajectory.files import read_trajectory
 
 WIDTH, FINE = 1024, 2048  # pixels across the walk's panoramas, and across exact ones
 ROWS = ("lenses", "middle", "stitched", "central", "longer", "shorter")
-_ALMOST = 1e-9  # of the distance between lenses: views of both, all from the middle
+_ALMOST = 1e-9  # factor on the distance between the lenses, which puts both in the middle
 
 
 def refined(walk: Path, out: Path, model: str) -> Path:
-    """The finished run of a walk."""
+    """Finished run of a walk with a camera model."""
     camera = CameraSettings.model_validate({"model": model})
     settings = RefineSettings(camera=camera, export=ExportSettings(formats=()))
     refine(walk / "images", walk / "slam.tum", out, settings)
@@ -69,7 +69,7 @@ def refined(walk: Path, out: Path, model: str) -> Path:
 
 
 def one_eye_between(optics: Optics) -> Optics:
-    """Views of the same directions in the pictures, all from the middle, nothing taken out."""
+    """Optics with the same views, all from the middle, without correction of the readout."""
     lenses = optics.lenses
     middle = replace(
         lenses, centre=_ALMOST * lenses.centre, inverse_stitch_radius=0.0, readout_motion=None
@@ -78,7 +78,7 @@ def one_eye_between(optics: Optics) -> Optics:
 
 
 def exact_faces(walk: Path, which: np.ndarray, size: int) -> Faces:
-    """What an ideal camera sees at the true poses of some frames."""
+    """Exact renderings of an ideal camera at the true poses of some frames."""
     scene, rig = build_gallery(), CubeRig(size, np.pi / 2)
     truth, images = read_trajectory(walk / "groundtruth.tum").world_T_rigs, []
     for f in which:
@@ -98,7 +98,7 @@ def run_seed(
     reconstruction, frames = load_run(runs["auto"])
     lenses = load_lenses(runs["auto"], reconstruction)
     if not lenses:
-        raise GsbaError(f"{runs['auto']}: no two lenses were found")
+        raise GsbaError(f"{runs['auto']}: the run has one centre, not two lenses")
     optics = Optics.of(lenses, reconstruction)
     between = one_eye_between(optics)
     split = split_frames(refined_frames(reconstruction), settings.held_out_every)
@@ -132,7 +132,7 @@ def run_seed(
 
 
 def to_markdown(results: Mapping[int, Mapping[str, tuple[Score, Score]]]) -> str:
-    """A line for each row, with the scores of each seed."""
+    """Table with a line for each row and the scores of each seed."""
     lines = [
         "| trained on | lenses' pixels: PSNR dB | of each seed | exposure aside dB | SSIM "
         "| exact: PSNR dB | of each seed | SSIM |",
@@ -156,7 +156,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of walks, runs and splats")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--rows", nargs="+", default=list(ROWS), choices=ROWS)
-    parser.add_argument("--iterations", type=int, default=1500, help="of six faces a frame")
+    parser.add_argument(
+        "--iterations", type=int, default=1500, help="training steps of six faces a frame"
+    )
     parser.add_argument("--face-size", type=int, default=128)
     parser.add_argument("--max-gaussians", type=int, default=40_000)
     parser.add_argument("--threads", type=int, default=2)
@@ -172,7 +174,7 @@ def main() -> None:
             max_gaussians=options.max_gaussians,
             backend="cpu",
             seed=seed,
-            rate_means=5e-4,  # as `splat_quality.py --rates short`
+            rate_means=5e-4,  # `splat_quality.py --rates short` uses these
             rate_means_end=5e-6,
             rate_scales=0.015,
             rate_fade=0.1,

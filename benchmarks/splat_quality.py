@@ -1,16 +1,16 @@
-"""What poses are worth to a splat: raw, refined by each set of factors, COLMAP's and true ones.
+"""Quality of splats by poses: coarse, refined by each set of factors, COLMAP's and true ones.
 
     python benchmarks/splat_quality.py --out WORK --scenes demo_rectangle demo_oval
     python benchmarks/splat_quality.py --out WORK --scenes aisle_loop apartment --data FOLDER
 
-Every source trains on the same frames with the same settings and seeds, on the CPU, and is measured
-on whole panoramas it never saw, at its own poses. Densification is chaotic: poses that differ by
-nothing to speak of end tenths of a dB apart: give several `--seeds` and trust means. Scenes named
-demo_… are rendered on the spot, the others are folders of FOLDER with images/, a coarse trajectory
-(`--coarse NAME` takes another one, in a WORK of its own), and groundtruth.tum and mask.png if there
-are. COLMAP's poses are peer_colmap.tum of the folder, or what `benchmarks/peer.py` makes of the
-frames. Runs, models and splats are kept in WORK and taken up again. The lines below a table say
-whether the targets hold; exit 1 where one is missed.
+Splats of all sources of poses are trained on the same frames with the same settings and seeds, on
+the CPU, and measured on held-out panoramas at the source's own poses. Densification is chaotic:
+almost equal poses give scores that differ by tenths of a dB, so that means over several `--seeds`
+are compared. Scenes named demo_… are rendered; the others are folders of FOLDER with images/, a
+coarse trajectory (`--coarse NAME` takes another one, with its own WORK), and, if they exist,
+groundtruth.tum and mask.png. COLMAP's poses are peer_colmap.tum of the folder, or the result of
+`benchmarks/peer.py`. Runs, models and splats are kept in WORK and resumed. The lines below a table
+state whether the targets hold; the exit code is 1 if one is missed.
 """
 
 import argparse
@@ -81,7 +81,7 @@ def find_scene(name: str, data: Path | None, out: Path) -> Path:
 def find_poses(
     row: str, folder: Path, coarse: Path, out: Path, frames: FrameSet
 ) -> np.ndarray | None:
-    """Poses (F, 4, 4) of one source; None where a scene has none."""
+    """Poses (F, 4, 4) of one source; None if the scene has none."""
     if row in REFINED:
         return load_run(_refined(row, folder, coarse, out))[0].world_T_rigs
     if row == "raw":
@@ -93,10 +93,10 @@ def find_poses(
 
 
 def find_coarse(folder: Path, names: Sequence[str]) -> Path:
-    """The first trajectory of these names that a scene has.
+    """First trajectory with one of these names in a scene.
 
     Raises:
-        GsbaError: it has none.
+        GsbaError: the scene has none of them.
     """
     for name in names:
         if (folder / name).is_file():
@@ -105,7 +105,7 @@ def find_coarse(folder: Path, names: Sequence[str]) -> Path:
 
 
 def _refined(row: str, folder: Path, coarse: Path, out: Path) -> Path:
-    """A finished run; what it shares with the first one is taken from there."""
+    """Finished run; stages shared with the first run are copied from it."""
     run, first = out / f"run-{row}", out / f"run-{next(iter(REFINED))}"
     if not run.exists() and first.exists():
         shutil.copytree(first, run)
@@ -117,7 +117,7 @@ def _refined(row: str, folder: Path, coarse: Path, out: Path) -> Path:
 
 
 def _peer(folder: Path, out: Path, frames: FrameSet) -> np.ndarray:
-    """Poses of COLMAP's panorama pipeline, which takes the frames alone."""
+    """Poses of COLMAP's panorama pipeline on the frames, without a trajectory."""
     model, links = out / PEER / "model", out / "images"
     if not (model / "trajectory.tum").is_file():
         links.mkdir(parents=True, exist_ok=True)
@@ -159,7 +159,7 @@ def mean_of(results: list[SourceResult]) -> Score:
 
 
 def verdicts(results: dict[str, list[SourceResult]]) -> list[tuple[str, bool]]:
-    """Each target with the figure found, and whether it holds."""
+    """Targets with the measured figures, and True if they hold."""
     means = {row: mean_of(result) for row, result in results.items()}
     ours, judged = means[next(iter(REFINED))], []
     if "raw" in means:
@@ -179,7 +179,7 @@ def verdicts(results: dict[str, list[SourceResult]]) -> list[tuple[str, bool]]:
 
 
 def to_markdown(name: str, results: dict[str, list[SourceResult]], seconds: float) -> str:
-    """A scene's table and verdicts."""
+    """Table of a scene, with its targets."""
     first = next(iter(results.values()))
     raw, frames = mean_of(first), len(first[0].frames)
     lines = [
@@ -209,7 +209,10 @@ def main() -> None:
     parser.add_argument("--sources", nargs="+", default=list(SOURCES), choices=SOURCES)
     parser.add_argument("--data", type=Path, help="folder of recorded scenes")
     parser.add_argument(
-        "--coarse", nargs="+", default=["slam.tum", "coarse.tum"], help="the first that is there"
+        "--coarse",
+        nargs="+",
+        default=["slam.tum", "coarse.tum"],
+        help="names of the coarse trajectory; the first that exists is taken",
     )
     parser.add_argument("--iterations", type=int, default=800)
     parser.add_argument("--rates", choices=RATES, default="short", help="of learning")
@@ -256,7 +259,7 @@ def main() -> None:
 
 
 def _write(options: argparse.Namespace, settings: SplatSettings, report: dict, text: list) -> None:
-    """What is measured so far."""
+    """Write the results so far."""
     if options.json:
         content = {"machine": machine(), "settings": settings.model_dump(), "scenes": report}
         lines = json.dumps(content, indent=1) + "\n"

@@ -1,10 +1,11 @@
-"""Speed of the CPU rasteriser: forward and backward of one face, and how the cost grows.
+"""Speed of the CPU rasteriser: forward and backward pass of one face, and growth of the cost.
 
     python benchmarks/splat_speed.py
 
-Gaussians of about two pixels, drawn over a face; times are the least of several calls. Ratios say
-how much more a pixel, or a splat in a tile, costs when there are four times as many: 1 is linear.
-The last lines say whether the targets hold; exit 1 where one is missed.
+Gaussians of about two pixels are rendered on a face; times are the smallest of several calls.
+Ratios are the cost of a pixel, or of a splat in a tile, at four times the number over that at the
+number itself: 1 is linear. The last lines state whether the targets hold; the exit code is 1 if one
+is missed.
 """
 
 import argparse
@@ -35,7 +36,7 @@ CASES = {
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One case."""
+    """Times of one case."""
 
     gaussians: int
     size: int  # pixels
@@ -60,7 +61,7 @@ def scene(num: int, size: int, logit: float) -> Gaussians:
 
 
 def run(num: int, size: int, logit: float, repeats: int, num_threads: int) -> Row:
-    """Least times of several calls."""
+    """Row with the smallest times of several calls."""
     gaussians, camera = scene(num, size, logit), face_camera(np.eye(4), 0, CubeRig(size, np.pi / 2))
     d_color = np.random.default_rng(1).normal(size=(size, size, 3)).astype(np.float32)
     forward, backward, cpu, entries = [], [], [], 0
@@ -77,7 +78,7 @@ def run(num: int, size: int, logit: float, repeats: int, num_threads: int) -> Ro
 
 
 def verdicts(rows: dict[str, Row]) -> list[tuple[str, bool]]:
-    """Each target with the figure found, and whether it holds."""
+    """Targets with the measured figures, and True if they hold."""
     base, wide, faint, deep = rows.values()
     wall = base.forward_ms + base.backward_ms
     per_pixel = wide.cpu_ms / wide.size**2 / (base.cpu_ms / base.size**2)
@@ -90,7 +91,7 @@ def verdicts(rows: dict[str, Row]) -> list[tuple[str, bool]]:
 
 
 def main() -> None:
-    """Run, print; exit 1 where a target is missed."""
+    """Run, print; exit with 1 if a target is missed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--repeats", type=int, default=10)
     parser.add_argument("--threads", type=int, default=min(os.cpu_count() or 1, 2))

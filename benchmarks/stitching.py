@@ -1,14 +1,14 @@
-"""What a shared field of directions is worth at points that no solve has seen.
+"""Effect of a stitching field on held-out points.
 
     python -m benchmarks.stitching FRAMES TRAJECTORY --out WORK [--masks FILE] [--markdown FILE]
 
-A fifth of the points is held out. Poses come from the other points: from features' bearings
-alone, from aligned patches, and from aligned patches with a field. Held-out points are aligned
-once, under the last of these, and judged under each: placed anew by their observations, how far
-these are off (reprojection), and how much the pixels of two views of a patch differ where poses
-and depth put them, after gain and offset (grey). No poses could do better than patches put where
-they were aligned: what is left there (noise, JPEG, surfaces that are no planes) is the last row,
-and "over" is the mean of what pairs of views have beyond it.
+A fifth of the points is held out. Poses are estimated from the other points: by bearings of
+features alone, by aligned patches, and by aligned patches with a field. Held-out points are aligned
+once, under the last of these, and measured under each: they are triangulated again, which gives
+reprojection errors, and the pixels of two views of a patch are compared at their projected
+positions, after gain and offset (grey). The last row is the lower bound, with patches at their
+aligned positions (noise, JPEG, surfaces that are not planar remain); "over" is the mean excess of
+pairs of views over it.
 """
 
 import argparse
@@ -34,12 +34,12 @@ from gsba.types import FrameSet, Keypoints, Landmarks, Sighted, Solution, Tracks
 
 SHARE = 0.2  # of points held out
 GATE = 1e3  # sigmas: no held-out observation is left out by its own residual
-REACH = 5  # pixels from the middle of a patch
+REACH = 5  # pixels from the middle of a patch to its edge
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """Poses, and the field that goes with them."""
+    """Poses with their stitching field."""
 
     name: str
     solved: Solution
@@ -47,13 +47,13 @@ class Variant:
 
 
 def split(landmarks: Landmarks, seed: int) -> tuple[Landmarks, Landmarks]:
-    """Points to solve with, and points held out."""
+    """Points for the solve, and held-out points."""
     held = np.random.default_rng(seed).random(landmarks.tracks.num_points) < SHARE
     return of_points(landmarks, ~held), of_points(landmarks, held)
 
 
 def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[Variant], Sighted]:
-    """Variants from the points not held out; held-out points aligned under the last."""
+    """Variants from the other points, and held-out points aligned under the last variant."""
     keypoints = load_stage(run, "keypoints", Keypoints)
     start, rig = load_stage(run, "refined1", Solution), cubemap.rig_for(frames, settings.cubemap)
     greys = panorama.Greys(frames, settings.patches.max_width)
@@ -98,7 +98,7 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
 def place(
     variant: Variant, tracks: Tracks, keypoints: Keypoints, settings: RefineSettings
 ) -> Landmarks:
-    """Points under a variant's poses."""
+    """Points triangulated under a variant's poses."""
     rows = keypoints.rows(tracks)
     bearings = variant.field.corrected(keypoints.bearings_rig[rows])
     given = keypoints.sigmas_rad[rows], variant.solved.world_T_rigs, GATE, settings.triangulate
@@ -121,9 +121,9 @@ def grey_differences(
     images: list[SphereImage],
     aligned: Keypoints | None = None,
 ) -> np.ndarray:
-    """Root mean square (N,) of what patches differ by in neighbouring views, grey values.
+    """RMS differences (N,) of patches in successive views, grey values.
 
-    With `aligned` they are shifted to where they were observed.
+    With `aligned`, patches are sampled at their observed positions, else at the projected ones.
     """
     tracks, poses = landmarks.tracks, variant.solved.world_T_rigs
     places = None if aligned is None else aligned.bearings_rig[aligned.rows(tracks)]

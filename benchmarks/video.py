@@ -1,13 +1,13 @@
-"""Video in, poses out: a generated 4K walk refined in one call, and by way of a folder of frames.
+"""Refinement of a generated 4K video in one call, and through a folder of extracted frames.
 
-    python benchmarks/video.py --frames 120                     # as large as it is meant to be
-    python benchmarks/video.py --frames 24 --rendered-width 1280    # cheaper: coarser pictures
+    python benchmarks/video.py --frames 120                     # full size
+    python benchmarks/video.py --frames 24 --rendered-width 1280    # cheaper: coarser images
 
-The walk of `gsba demo` is shown over `--seconds` at irregular presentation times (a variable frame
-rate), H.264, 3840x1920. Every picture of the video is another pose, so that the frame rate is
-frames / seconds and not that of a camera; pictures rendered coarser than the video are enlarged.
-Asked is whether times come back to 1 ms, whether both routes give the same poses, and how far these
-are from the truth. Exits with 1 where a target is missed.
+The walk of `gsba demo` is encoded over `--seconds` at irregular presentation times (a variable
+frame rate), H.264, 3840x1920. Every frame of the video is another pose, so that the frame rate is
+frames / seconds and not that of a camera; images rendered coarser than the video are enlarged.
+Targets: times are correct to 1 ms, both ways give the same poses, and these are close to the truth.
+The exit code is 1 if a target is missed.
 """
 
 import argparse
@@ -74,7 +74,7 @@ def main() -> None:
 
 
 def make_video(options: argparse.Namespace) -> tuple[Path, np.ndarray, Trajectory]:
-    """The video, when each picture is shown (F,) in ticks, and its true poses on that clock."""
+    """Video, presentation times (F,) of its frames in ticks, and its true poses on that clock."""
     import av
 
     rng = np.random.default_rng(1)
@@ -108,7 +108,7 @@ def make_video(options: argparse.Namespace) -> tuple[Path, np.ndarray, Trajector
 
 
 def call(*arguments: object) -> Measurement:
-    """A gsba command in a process of its own; its output goes beside the video."""
+    """Run a gsba command in a separate process; its output is written beside the video."""
     words = [str(argument) for argument in arguments]
     cost = measure([*GSBA, *words], Path(words[words.index("--out") + 1] + ".log"), TIMEOUT_S)
     if cost.exit_code:
@@ -140,7 +140,7 @@ def compare(
 
 
 def targets(result: dict) -> dict[str, bool]:
-    """What has to hold."""
+    """Targets, with True if they hold."""
     worst = max(result["max_time_error_s"].values())
     return {
         f"times exact to 1 ms: worst {1e3 * worst:.4f} ms": worst <= MAX_TIME_ERROR_S,
@@ -154,7 +154,7 @@ def targets(result: dict) -> dict[str, bool]:
 
 
 def table(result: dict) -> str:
-    """Markdown."""
+    """Markdown table of the result."""
     enlarged = f", rendered {result['rendered_width']} wide and enlarged"
     lines = [
         "# A 4K video refined in one call, and by way of a folder",

@@ -1,13 +1,13 @@
-"""Is any exported map wrong? Walks through places that mislead, every map of every run checked.
+"""Search for wrong maps: walks through ambiguous places, with every map of every run checked.
 
     python benchmarks/wrong_maps.py --out WORK --markdown benchmarks/results/wrong_maps.md WALK...
 
 A WALK is a folder with `images/` and their timestamps.csv, `groundtruth.tum` and perhaps a mask:
-white-walled flats, rooms that look alike, dim rooms. Each is refined without a trajectory and from
-a spoiled one. All maps of a run are aligned to the truth, each by itself: a map is wrong where one
-of its frames is off by more than 3 % of the map's extent. A run that leaves frames out, or says
-that the map is in pieces, is no wrong map. Every run is a process of its own; rows are kept in
-WORK and used again while code, options and input stay the same. Exits with 1 where a map is wrong.
+white-walled flats, similar rooms, dim rooms. Each is refined without a trajectory and from one with
+drift and jumps. All maps of a run are aligned to the truth, each by itself: a map is wrong if the
+error of one of its frames exceeds 3 % of the map's extent. Left-out frames and several maps are not
+wrong. Every run is a separate process; rows are kept in WORK and used again while code, options and
+input stay the same. The exit code is 1 if a map is wrong.
 """
 
 import argparse
@@ -43,7 +43,7 @@ HEAD = [
 
 
 class CheckedMap(NamedTuple):
-    """A map of a run beside the truth."""
+    """Errors of one map of a run."""
 
     frames: int
     ate: float  # truth units
@@ -52,10 +52,10 @@ class CheckedMap(NamedTuple):
 
 
 def check_maps(run: Path, truth: Trajectory) -> list[CheckedMap]:
-    """The maps of a run that can be checked, the exported one first.
+    """Checked maps of a run, the exported one first.
 
     Raises:
-        GsbaError: positions of a map coincide: it says nothing of where its frames are.
+        GsbaError: all positions of a map coincide.
     """
     report = json.loads((run / "report.json").read_text())
     checked = []
@@ -85,7 +85,7 @@ def _turn(poses: np.ndarray, n: int) -> np.ndarray:
 
 
 class Bench(NamedTuple):
-    """Where rows are kept and under what conditions they run."""
+    """Folder and conditions of the rows of one call."""
 
     out: Path
     code: str
@@ -124,12 +124,12 @@ class Bench(NamedTuple):
 
 
 def is_wrong(row: dict[str, Any]) -> bool:
-    """Whether a run left a map of which a frame is far off."""
+    """True if a run has a wrong map."""
     return any(one["worst"] > MAX_ERROR for one in row.get("errors", ()))
 
 
 def line(walk: str, row: dict[str, Any]) -> str:
-    """The row of the table that a run makes."""
+    """Line of the table for a run."""
     cells = [walk, str(row["frames"]), row["start"]]
     cost = f"{row['cpu_s']:.0f}"
     if not row.get("errors"):
@@ -150,11 +150,13 @@ def line(walk: str, row: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Parse, run, print; exit 1 where a map is wrong."""
+    """Parse, run, print; exit with 1 if a map is wrong."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("walks", nargs="+", type=Path, metavar="WALK")
     parser.add_argument("--set", action="append", default=[], dest="sets", metavar="KEY=VALUE")
-    parser.add_argument("--seed", action="append", type=int, help="of spoiled trajectories")
+    parser.add_argument(
+        "--seed", action="append", type=int, help="seeds of the trajectories' errors"
+    )
     parser.add_argument("--out", type=Path, default=Path("build/wrong_maps"), help="kept rows")
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()

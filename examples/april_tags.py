@@ -1,8 +1,8 @@
-"""AprilTags of known size on walls, at poses that nobody measured: they set the scale.
+"""AprilTags of known size at unknown poses, which set the scale.
 
     python examples/april_tags.py FRAMES TRAJECTORY RUN 0.2
 
-Own variables: the pose of each tag. Tags (family 36h11) are found by OpenCV on cube faces.
+The family's variables are the poses of the tags. OpenCV detects tags (family 36h11) on cube faces.
 """
 
 import hashlib
@@ -16,11 +16,11 @@ from tag_detection import UNIT, Sighting, find_tags
 from factors import bearing_residuals
 from gsba import Family, MapSnapshot, RunResult, X, refine
 
-SIGMA = np.deg2rad(0.1)  # of a corner
+SIGMA_RAD = np.deg2rad(0.1)  # of a corner's bearing, per axis
 
 
 class AprilTags(Family):
-    """Corners of tags of `size_m` metres."""
+    """Bearings of the corners of tags with an edge of `size_m` metres."""
 
     name = "tags"
     fixes_gauge = True
@@ -31,7 +31,7 @@ class AprilTags(Family):
         self.digest = hashlib.sha256(repr((known, size_m)).encode()).hexdigest()
 
     def variables(self, snapshot: MapSnapshot) -> gtsam.Values:
-        """Tags where the nearest frame sees them."""
+        """Initial poses of the tags, each by the nearest frame that sees it."""
         values = gtsam.Values()
         for s in sorted(self.sightings, key=lambda s: np.linalg.norm(s.rig_T_tag[:3, 3])):
             if not values.exists(gtsam.symbol("T", s.tag)):
@@ -40,9 +40,9 @@ class AprilTags(Family):
         return values
 
     def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
-        """Eight residuals a sighting, under a robust loss."""
+        """Factors of eight residuals for each detection, under a robust loss."""
         graph, loss = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)
-        noise = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Isotropic.Sigma(8, SIGMA))
+        noise = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Isotropic.Sigma(8, SIGMA_RAD))
         for s in self.sightings:
             keys = [X(s.frame), gtsam.symbol("T", s.tag)]
             graph.add(gtsam.CustomFactor(noise, keys, self._error_of(keys, s.bearings_rig)))
@@ -63,14 +63,14 @@ class AprilTags(Family):
         return error
 
     def report(self, snapshot: MapSnapshot) -> dict[str, list]:
-        """Where the tags are, metres."""
+        """Positions of the tags, metres."""
         tags = sorted({s.tag for s in self.sightings})
         poses = [snapshot.variables.atPose3(gtsam.symbol("T", tag)) for tag in tags]
         return {str(tag): p.translation().tolist() for tag, p in zip(tags, poses, strict=True)}
 
 
 def main(frames: Path, trajectory: Path, out: Path, size_m: float) -> RunResult:
-    """Refine with the tags that are seen."""
+    """Refine frames with the tags that are detected in them."""
     found = list(find_tags(sorted(frames.glob("*.jpg")), size_m))
     result = refine(frames, trajectory, out, families=[AprilTags(found, size_m)])
     print(result.report["families"]["tags"])

@@ -1,8 +1,8 @@
-"""A barometer with an unknown bias: heights of frames in metres, above nobody knows what.
+"""Barometer with an unknown bias: heights of frames in metres above an unknown level.
 
     gsba demo && python examples/barometer.py gsba-demo/walk level-run
 
-Own variables: the bias, and metres per map unit, as images alone leave the scale open.
+The family's variables are the bias, and metres per map unit, as images do not determine the scale.
 """
 
 import hashlib
@@ -15,12 +15,12 @@ import numpy as np
 from gsba import Family, MapSnapshot, RunResult, X, refine
 from gsba.trajectory.files import read_trajectory
 
-UP = np.array([0.0, -1.0, 0.0])  # the demo's trajectory starts level, and y is down
+UP = np.array([0.0, -1.0, 0.0])  # the demo's first frame is level, and its y points down
 B = gtsam.symbol("B", 0)  # [bias, metres per map unit]
 
 
 class Barometer(Family):
-    """Heights (F,) in metres to `sigma`, all off by the same bias."""
+    """Heights (F,) of frames in metres with a standard deviation and one common bias."""
 
     name = "barometer"
 
@@ -29,14 +29,14 @@ class Barometer(Family):
         self.digest = hashlib.sha256(heights_m.tobytes() + str(sigma_m).encode()).hexdigest()
 
     def variables(self, snapshot: MapSnapshot) -> gtsam.Values:
-        """The bias that the poses so far ask for, at one metre per unit."""
+        """Initial bias by the current poses, at one metre per unit."""
         values = gtsam.Values()
         bias = np.mean(self.heights_m - snapshot.world_T_rigs[:, :3, 3] @ UP)
         values.insert(B, np.array([bias, 1.0]))
         return values
 
     def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
-        """One factor a frame, and that units are metres to a factor of two or so."""
+        """A factor for each frame, and a loose prior of one metre per unit."""
         graph, noise = (
             gtsam.NonlinearFactorGraph(),
             gtsam.noiseModel.Isotropic.Sigma(1, self.sigma_m),
@@ -48,7 +48,7 @@ class Barometer(Family):
         return graph
 
     def report(self, snapshot: MapSnapshot) -> dict[str, float]:
-        """The bias and the scale as solved."""
+        """Estimated bias and scale."""
         bias, metres = snapshot.variables.atVector(B)
         return {"bias_m": bias, "metres_per_unit": metres}
 
@@ -70,7 +70,7 @@ def _error_of(height_m: float):
 def main(walk: Path, out: Path) -> RunResult:
     """Refine a walk of the demo with a simulated barometer that reads 100 m too much."""
     truth = read_trajectory(walk / "groundtruth.tum").world_T_rigs
-    truth = np.linalg.inv(truth[0]) @ truth  # in the world of the first frame
+    truth = np.linalg.inv(truth[0]) @ truth  # the first frame becomes the world
     noise = np.random.default_rng(0).normal(0, 0.01, len(truth))
     barometer = Barometer(truth[:, :3, 3] @ UP + 100.0 + noise, 0.01)
     result = refine(walk / "images", walk / "slam.tum", out, families=[barometer])

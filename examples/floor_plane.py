@@ -1,8 +1,9 @@
-"""A floor that is flat: the camera stays at one distance from a plane that nobody measured.
+"""Flat floor: the camera keeps its distance from an unknown plane.
 
     gsba demo && python examples/floor_plane.py gsba-demo/walk flat-run
 
-Own variables: the plane's normal (two degrees of freedom) and its distance from the origin.
+The family's variables are the plane's normal (two degrees of freedom) and its distance from the
+origin.
 """
 
 import sys
@@ -17,7 +18,7 @@ N, D = gtsam.symbol("N", 0), gtsam.symbol("D", 0)
 
 
 class FloorPlane(Family):
-    """Frames keep their distance from a plane to `sigma`, map units."""
+    """Distances of frames from a plane, with a standard deviation `sigma` in map units."""
 
     name = "floor"
 
@@ -26,7 +27,7 @@ class FloorPlane(Family):
         self.digest = str(sigma)
 
     def variables(self, snapshot: MapSnapshot) -> gtsam.Values:
-        """The plane that fits the positions so far best."""
+        """Initial plane, fitted to the current positions."""
         positions = snapshot.world_T_rigs[:, :3, 3]
         middle = positions.mean(axis=0)
         normal = np.linalg.svd(positions - middle)[2][2]
@@ -36,14 +37,14 @@ class FloorPlane(Family):
         return values
 
     def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
-        """One factor a frame."""
+        """A factor for each frame."""
         graph, noise = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Isotropic.Sigma(1, self.sigma)
         for f in range(len(snapshot.world_T_rigs)):
             graph.add(gtsam.CustomFactor(noise, [X(f), N, D], _error))
         return graph
 
     def report(self, snapshot: MapSnapshot) -> dict[str, object]:
-        """The plane."""
+        """Estimated plane."""
         normal = snapshot.variables.atUnit3(N).point3()
         return {"normal": normal, "distance": snapshot.variables.atDouble(D)}
 
@@ -60,7 +61,7 @@ def _error(factor, values, jacobians):
 
 
 def main(walk: Path, out: Path) -> RunResult:
-    """Refine a walk of the demo, whose camera bobs by some hundredths of a unit."""
+    """Refine a walk of the demo, whose camera moves up and down by some hundredths of a unit."""
     result = refine(walk / "images", walk / "slam.tum", out, families=[FloorPlane(0.03)])
     print(result.report["families"]["floor"])
     return result

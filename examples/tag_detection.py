@@ -1,4 +1,4 @@
-"""AprilTags in panoramas, found by OpenCV on cube faces: see april_tags.py."""
+"""Detection of AprilTags in panoramas by OpenCV on cube faces, for april_tags.py."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,22 +11,22 @@ from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.frames.cubemap import cut
 from gsba.geometry import pose
 
-RIG = CubeRig(768, np.deg2rad(100.0))  # faces overlap: a tag at an edge is whole on one of them
+RIG = CubeRig(768, np.deg2rad(100.0))  # overlapping faces: one of them shows the whole tag
 UNIT = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) / 2  # corners, OpenCV's order
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """A tag in a frame."""
+    """Detection of a tag in a frame."""
 
-    frame: int
-    tag: int
-    bearings_rig: np.ndarray  # (4, 3) unit, of its corners
-    rig_T_tag: np.ndarray  # (4, 4) metres
+    frame: int  # number of the frame
+    tag: int  # number of the tag in its family
+    bearings_rig: np.ndarray  # (4, 3) unit, bearings of its corners
+    rig_T_tag: np.ndarray  # (4, 4) pose, metres
 
 
 def find_tags(panoramas: list[Path], size_m: float) -> Iterator[Sighting]:
-    """Tags on the cube faces of panoramas, each on the face that shows it whole."""
+    """Yield detections of tags in panoramas; each tag of a frame once."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX

@@ -1,4 +1,4 @@
-"""Wheels that count metres: they set the scale of the map, which images cannot know.
+"""Wheel odometry in metres, which sets the scale of the map.
 
 gsba demo && python examples/wheel_odometry.py gsba-demo/walk metric-run
 """
@@ -15,17 +15,17 @@ from gsba.trajectory.files import read_trajectory
 
 
 class WheelOdometry(Family):
-    """Metres (F - 1,) from each frame to the next, to a share of their length."""
+    """Distances (F - 1,) from each frame to the next, metres, with a relative noise."""
 
     name = "wheels"
-    fixes_gauge = True  # poses and points come out in metres
+    fixes_gauge = True  # poses and points of the result are in metres
 
     def __init__(self, metres: np.ndarray, relative_sigma: float) -> None:
         self.metres, self.relative_sigma = metres, relative_sigma
         self.digest = hashlib.sha256(metres.tobytes() + str(relative_sigma).encode()).hexdigest()
 
     def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
-        """GTSAM's range factors; a wheel that slips is no more than an outlier."""
+        """GTSAM's range factors under a robust loss, for which a slipping wheel is an outlier."""
         graph, loss = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.mEstimator.Cauchy.Create(2.0)
         typical = float(np.median(self.metres))
         for f, metres in enumerate(self.metres.tolist()):
@@ -36,14 +36,14 @@ class WheelOdometry(Family):
         return graph
 
     def report(self, snapshot: MapSnapshot) -> dict[str, float]:
-        """The difference of wheels and images, and the length of the path."""
+        """Median difference of wheels and images, and the length of the path, metres."""
         steps = np.linalg.norm(np.diff(snapshot.world_T_rigs[:, :3, 3], axis=0), axis=1)
         off = float(np.median(np.abs(steps - self.metres)))
         return {"median_difference_m": off, "path_m": float(steps.sum())}
 
 
 def main(walk: Path, out: Path) -> RunResult:
-    """Refine a walk of the demo, of which a unit is taken for 2.5 m, with simulated wheels."""
+    """Refine a walk of the demo with simulated wheels, by which a unit is 2.5 m."""
     truth = read_trajectory(walk / "groundtruth.tum").world_T_rigs
     metres = 2.5 * np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)
     metres *= 1 + np.random.default_rng(0).normal(0, 0.01, len(metres))

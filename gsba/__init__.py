@@ -1,8 +1,8 @@
 """gsba: pixel-true camera poses for 360-degree video.
 
-The public names below are imported when first used, so that `import gsba` stays light. Every room
-of the package lists its own: `from gsba.export import export`, `from gsba.evaluate import
-evaluate`; docs/architecture.md shows them all.
+The public names below are imported on first use, so that `import gsba` is fast. Every room of the
+package lists its own names: `from gsba.export import export`, `from gsba.evaluate import evaluate`.
+docs/architecture.md lists all rooms.
 """
 
 from importlib import import_module
@@ -54,7 +54,7 @@ def __getattr__(name: str) -> Any:
 
 
 def _require_our_factors() -> None:
-    """ImportError where `factors` is another distribution's package; does not import it."""
+    """Raise ImportError if `factors` is another distribution's package, without importing it."""
     spec = find_spec("factors")
     origin = spec.origin if spec else None
     if origin is None or "LandmarkBlock" not in Path(origin).read_text(encoding="utf-8"):

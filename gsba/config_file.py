@@ -26,7 +26,7 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Refi
         path: TOML file with a table per stage, holding overrides only.
         overrides: `stage.key=value` each, the value written as in TOML; bare words are texts.
     Raises:
-        GsbaError: unreadable file, unknown key, or a value out of range; says what is allowed.
+        GsbaError: unreadable file, unknown key, or a value out of range, with the allowed values.
     """
     tree = _read_toml(path) if path else {}
     _check_keys(tree, RefineSettings, (), str(path))
@@ -40,7 +40,7 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Refi
 
 
 def to_toml(settings: BaseModel) -> str:
-    """TOML text of all settings, each with what is allowed; `load_config` reads it back equal."""
+    """TOML text of all settings with their allowed values; `load_config` reads it back equal."""
     return "\n".join(_toml_lines(settings, ())) + "\n"
 
 
@@ -49,7 +49,10 @@ def _read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise GsbaError(f"cannot read settings {path}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:  # of syntax, encoding, digits, nesting
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # bad syntax or encoding, too many digits, nesting
         raise GsbaError(f"{path} is not valid TOML: {error}") from error
 
 
@@ -64,7 +67,7 @@ def _parse_override(text: str) -> tuple[tuple[str, ...], Any]:
     except tomllib.TOMLDecodeError:
         parsed = value.strip()
     except (ValueError, RecursionError) as error:  # thousands of digits or brackets
-        raise GsbaError(f"--set {brief(text)}: not a value that can be read ({error})") from None
+        raise GsbaError(f"--set {brief(text)}: the value is not valid TOML ({error})") from None
     return tuple(part.strip() for part in name.split(".")), parsed
 
 
@@ -96,7 +99,7 @@ def _check_keys(
 
 
 def _with_none(tree: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:
-    """The tree with the text "none" as None where the setting may be None."""
+    """Tree in which the text "none" is None where the setting may be None."""
     out: dict[str, Any] = {}
     for key, value in tree.items():
         nested = _nested_model(model, key)
@@ -110,7 +113,7 @@ def _with_none(tree: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any
 
 
 def validated(tree: Mapping[str, Any]) -> RefineSettings:
-    """Settings from a tree of values with known keys; GsbaError says which is out of range."""
+    """Settings from a tree of values with known keys; GsbaError names a value out of range."""
     tree = _completed(tree, RefineSettings)
     try:
         return RefineSettings.model_validate(tree)
@@ -124,15 +127,15 @@ def validated(tree: Mapping[str, Any]) -> RefineSettings:
         name, value = f"{name}.{key}".lstrip("."), value[key]
         allowed = _allowed(_schema(model, key))
         model = _nested_model(model, key)
-    said = first["msg"].removeprefix("Value error, ")
+    message = first["msg"].removeprefix("Value error, ")
     if model is not None:  # a check across several settings
-        raise GsbaError(f"settings {name}: {said}" if name else said)
-    use = said if first["type"] == "value_error" else f"use {allowed}"
+        raise GsbaError(f"settings {name}: {message}" if name else message)
+    use = message if first["type"] == "value_error" else f"use {allowed}"
     raise GsbaError(f"setting {name} = {brief(_toml_value(value))} is not allowed: {use}")
 
 
 def _completed(tree: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:
-    """The tree with what its tables leave unsaid as it is by default in their place."""
+    """Tree whose tables also hold the defaults of that table's field for keys it lacks."""
     out: dict[str, Any] = {}
     for key, value in tree.items():
         nested = _nested_model(model, key)
@@ -171,7 +174,7 @@ def _schema(model: type[BaseModel], key: str) -> dict[str, Any]:
 
 
 def _allowed(schema: Mapping[str, Any]) -> str:
-    """What a setting may be, in words."""
+    """Allowed values of a setting, in words."""
     if "anyOf" in schema:
         return " or ".join(_allowed(arm) for arm in schema["anyOf"])
     if "const" in schema:

@@ -1,4 +1,4 @@
-"""Files written beside their place and renamed into it; failures of the disk in one line."""
+"""Atomic writing of files, locks on folders, and disk errors in one line."""
 
 import errno
 import fcntl
@@ -23,12 +23,12 @@ _TEMPORARY = ".gsba-tmp-"  # prefix of files still being written
 
 
 class FullDiskError(GsbaError):
-    """No space is left."""
+    """No space is left on the disk."""
 
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """Turn an OSError of writing to `path` into one line that says what to do."""
+    """Turn an OSError of writing to `path` into one line with the remedy."""
     try:
         yield
     except OSError as error:
@@ -45,11 +45,11 @@ def atomic_write(path: Path, write: Callable[[Path], object], parents: bool = Tr
     Args:
         path: final file.
         write: called with a temporary path of the same folder and suffix.
-        parents: whether missing parent folders are made.
+        parents: make missing parent folders.
     Raises:
-        GsbaError: full disk, no permission and the like.
+        GsbaError: the disk is full, or writing is not permitted.
     """
-    # Processes of several machines may write the same file at a time.
+    # Processes of several machines may write the same file at the same time.
     temporary = path.with_name(f"{_TEMPORARY}{uuid.uuid4().hex[:8]}-{path.name}")
     with disk_errors(path):
         if parents:
@@ -80,16 +80,16 @@ def write_image(path: Path, image: "np.ndarray", jpeg_quality: int = 95) -> None
     """Encode (H, W, 3) RGB or (H, W) uint8 by the suffix of `path`, atomically.
 
     Raises:
-        GsbaError: a picture that cannot be encoded so, or the disk refuses.
+        GsbaError: the image cannot be encoded, or the disk cannot be written.
     """
     write_bytes(path, encoded_image(image, path, jpeg_quality))
 
 
 def encoded_image(image: "np.ndarray", path: Path, jpeg_quality: int = 95) -> bytes:
-    """The content of the file at `path` that shows (H, W, 3) RGB or (H, W) uint8.
+    """Encode (H, W, 3) RGB or (H, W) uint8 as the content of an image file with this suffix.
 
     Raises:
-        GsbaError: a picture that cannot be encoded as the suffix says.
+        GsbaError: the image cannot be encoded in the format of the suffix.
     """
     import cv2
 
@@ -97,27 +97,28 @@ def encoded_image(image: "np.ndarray", path: Path, jpeg_quality: int = 95) -> by
     pixels = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
     done, encoded = cv2.imencode(path.suffix, pixels, options)
     if not done:
-        raise GsbaError(f"{path}: cannot be encoded")
+        height, width = image.shape[:2]
+        raise GsbaError(f"{path}: OpenCV cannot encode {width}x{height} pixels as {path.suffix}")
     return encoded.tobytes()
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Delete what a killed process left half-written under `folder`."""
+    """Delete temporary files that killed processes left under `folder`."""
     for path in folder.rglob(f"{_TEMPORARY}*"):
         path.unlink(missing_ok=True)
 
 
 def refuse_links(folder: Path, below: bool = False) -> None:
-    """Refuse a folder that gsba writes if it holds anything but files and folders.
+    """Refuse a folder to write to if it holds anything but files and folders.
 
-    Through a link, files elsewhere would be replaced or deleted; a pipe is waited for for ever.
+    Through a link, gsba would replace or delete files elsewhere. Reading a pipe never ends.
 
     Args:
-        folder: which need not be there.
-        below: look into its folders too.
+        folder: may be missing; may not itself be a link, pipe or device.
+        below: check its subfolders too.
 
     Raises:
-        GsbaError: naming the link, pipe or device; `folder` itself may not be one either.
+        GsbaError: the folder holds a link, pipe or device, which the message names.
     """
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise _not_ours(folder)
@@ -140,14 +141,14 @@ def _not_ours(path: Path) -> GsbaError:
 
 
 def hold_folder(folder: Path) -> int:
-    """Hold a folder against other processes, until what is returned is closed or this one dies.
+    """Lock a folder against other processes until the lock is closed or this process ends.
 
     The kernel keeps the lock, so it is never stale.
 
     Returns:
         File descriptor of the lock.
     Raises:
-        GsbaError: a live process holds it.
+        GsbaError: another process holds the lock.
     """
     lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -163,7 +164,7 @@ def hold_folder(folder: Path) -> int:
 
 
 def remove_unheld(folders: Iterable[Path]) -> None:
-    """Delete folders that no process holds any more, see `hold_folder`."""
+    """Delete folders that no process has locked, see `hold_folder`."""
     for folder in folders:
         with suppress(OSError):
             lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)

@@ -53,7 +53,7 @@ def inverse(a_T_b: np.ndarray) -> np.ndarray:
 
 
 def moved_to(world_T_rigs: np.ndarray, origins_rig: np.ndarray | None) -> np.ndarray:
-    """Poses (O, 4, 4) moved to where rays start, (O, 3) in the rig frame; None = as they are."""
+    """Poses (O, 4, 4) moved to the rays' origins (O, 3), rig frame; None = not moved."""
     if origins_rig is None:
         return world_T_rigs
     moved = world_T_rigs.copy()
@@ -95,14 +95,14 @@ def median_direction(directions: np.ndarray) -> np.ndarray:
 
 
 def furthest(positions: np.ndarray) -> tuple[int, float]:
-    """Row of the position (N, 3) that is furthest from the first, and its distance."""
+    """Row of the position, of (N, 3), that is furthest from the first, and its distance."""
     distances = np.linalg.norm(positions - positions[0], axis=1)
     far = int(np.argmax(distances))
     return far, float(distances[far])
 
 
 def adjoint(a_T_b: np.ndarray) -> np.ndarray:
-    """Adjoints (N, 6, 6) of poses (N, 4, 4): tangents of b in a."""
+    """Adjoints (N, 6, 6) of poses (N, 4, 4): they map tangents at b to tangents at a."""
     rotation, (x, y, z) = a_T_b[:, :3, :3], a_T_b[:, :3, 3].T
     zero = np.zeros_like(x)
     skew = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
@@ -118,9 +118,9 @@ def step_covariances(
     """Covariances (F - 1, 6, 6) of the steps f_T_next, perturbed on the right.
 
     Args:
-        world_T_rigs: (F, 4, 4).
-        covariances: (F, 6, 6) of their tangents [rotation rad, translation].
-        neighbours: (F - 1, 6, 6) E[x_f x_(f+1)^T].
+        world_T_rigs: (F, 4, 4) poses.
+        covariances: (F, 6, 6) of the poses' tangents x_f: [rotation rad, translation].
+        neighbours: (F - 1, 6, 6) cross-covariances E[x_f x_(f+1)^T].
     """
     before = -adjoint(inverse(world_T_rigs[1:]) @ world_T_rigs[:-1])
     shared = before @ neighbours
@@ -129,7 +129,7 @@ def step_covariances(
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) at length one; 0 stays 0."""
+    """Vectors (..., 3) scaled to length one; 0 stays 0."""
     lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.maximum(lengths, 1e-300)
 

@@ -1,4 +1,4 @@
-"""The one expected failure, what the terminal shows, and progress of long work."""
+"""Expected failures, the log on the terminal, and progress bars."""
 
 import logging
 import sys
@@ -14,20 +14,20 @@ T = TypeVar("T")
 
 
 class GsbaError(Exception):
-    """Input or setting that cannot be used: one line saying what, where and what to do."""
+    """Input or setting that cannot be used: one line with the problem, its place and the remedy."""
 
 
 class StoppedError(GsbaError):
-    """Work that something outside ended, and that goes on where it stopped if run again."""
+    """Work that an outside cause ended, and that resumes when it is run again."""
 
 
 def show_log(level: int = logging.INFO) -> None:
-    """Send the log of gsba and its factors to stderr, below the progress bar on a terminal.
+    """Send the log of gsba and its factors to stderr, for the command line.
 
-    For the command line.
+    On a terminal, log lines do not disturb the progress bar.
 
     Args:
-        level: least level shown, e.g. `logging.WARNING` for a quiet run.
+        level: lowest level shown, e.g. `logging.WARNING` for a quiet run.
     """
     if sys.stderr.isatty():
         from rich.logging import RichHandler
@@ -45,7 +45,7 @@ def show_log(level: int = logging.INFO) -> None:
 
 
 def brief(text: str, most: int = 60) -> str:
-    """A text of at most so many characters, its middle left out where it is longer."""
+    """Text of at most `most` characters; of a longer one the middle is left out."""
     kept = most // 2 - 1
     return text if len(text) <= most else f"{text[:kept]}...{text[-kept + 1 :]}"
 
@@ -57,7 +57,7 @@ def track(
     done: int = 0,
     note: Callable[[], str] | None = None,
 ) -> Iterator[T]:
-    """Yield `items` behind a progress bar on stderr; silent in a quiet run or without terminal.
+    """Yield `items` and show a progress bar on stderr, on a terminal unless the run is quiet.
 
     Args:
         items: work to do.
@@ -98,7 +98,7 @@ def track(
 
 @cache
 def _console() -> "Console":
-    """The one console on stderr: bars and log lines must share it to stay out of each other."""
+    """Console on stderr that progress bars and log lines share, so that they do not overlap."""
     from rich.console import Console
 
     return Console(stderr=True)

@@ -1,31 +1,32 @@
-"""What the C library does with freed memory: kept where it is soon needed again, else returned."""
+"""Settings of glibc's allocator: keep freed memory that is soon used again, return the rest."""
 
 import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3), from malloc.h
-_USUAL = 32 << 20, 64 << 20  # where glibc itself moves both thresholds in the end
-_WORTH = 256 << 20  # bytes: to fetch and clear as much again is a tenth of a second
+_DEFAULT_THRESHOLDS = 32 << 20, 64 << 20  # bytes, glibc's own mapping and trimming thresholds
+_MIN_RETURNED_BYTES = 256 << 20  # fetching and clearing so much again takes a tenth of a second
 
 
 @contextmanager
 def freed_memory_kept() -> Iterator[None]:
-    """Have glibc hold on to freed blocks meanwhile, not return them to the system at once.
+    """Make glibc keep freed blocks within this context, not return them to the system.
 
     SIFT's pyramids allocate the same tens of megabytes for every face. Without this, fetching and
-    clearing fresh pages is a third of its time on faces of 600 pixels and more. Afterwards large
-    blocks are the system's again: on a heap they leave gaps, gigabytes of thousands of frames.
+    clearing fresh pages takes a third of its time on faces of 600 pixels and more. Afterwards
+    glibc maps large blocks separately again: on the heap they leave gaps, which grow to gigabytes
+    over thousands of frames.
     """
     _set_thresholds(1 << 30, 1 << 30)
     try:
         yield
     finally:
-        _set_thresholds(*_USUAL)
+        _set_thresholds(*_DEFAULT_THRESHOLDS)
 
 
-def give_back_freed_memory(least: int = _WORTH) -> None:
-    """Have glibc return what was freed and it holds on to, where that is so many bytes."""
+def give_back_freed_memory(least: int = _MIN_RETURNED_BYTES) -> None:
+    """Make glibc return freed memory to the system if it keeps at least `least` bytes."""
     libc = ctypes.CDLL(None)
     if hasattr(libc, "mallinfo2"):
         libc.mallinfo2.restype = _Mallinfo
@@ -48,7 +49,7 @@ class _Mallinfo(ctypes.Structure):
 
 
 def _set_thresholds(mapped: int, trimmed: int) -> None:
-    """Bytes from which a block is mapped by itself, and of free heap that goes back."""
+    """Set the smallest block that is mapped separately, and the free heap to return, in bytes."""
     libc = ctypes.CDLL(None)
     if hasattr(libc, "mallopt"):
         libc.mallopt(_M_MMAP_THRESHOLD, mapped)

@@ -1,4 +1,4 @@
-"""Similarities of two worlds, from points or poses that both have, some of them wrong."""
+"""Similarity transforms of two worlds, from corresponding points or poses with outliers."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,19 +10,19 @@ import numpy as np
 from gsba.geometry import nearest_rotation, pose
 from gsba.log import GsbaError
 
-_LEAST_ALIKE = 1e-6  # correlation of positions: below, the scale that carries them vanishes
-_DRAWS, _SEED = 500, 0
-_ALIKE = 0.5  # least correlation of the points and where the similarity carries them
-_MEDIAN_LENGTH = 1.538  # of a 3-vector of independent unit normals
+_MIN_CORRELATION = 1e-6  # smallest correlation of positions that leaves a positive scale
+_NUM_DRAWS, _SEED = 500, 0  # samples of the least median of squares
+_MIN_INLIER_CORRELATION = 0.5  # smallest correlation of inliers with their transformed positions
+_MEDIAN_LENGTH = 1.538  # median length of a 3-vector of independent unit normals
 _OUTLIER_SIGMAS = 4.6  # 99.99% of such vectors are shorter
-_TRIALS = 200  # of three points each
-_POINT_DEG = 1.0  # a point of one frame's map seen in the other
+_NUM_TRIALS = 200  # samples of three points each
+_MAX_ANGLE_DEG = 1.0  # largest angle between a point's bearing and the other frame's point
 _MIN_POINTS = 15
 
 
 @dataclass(frozen=True, slots=True)
 class Sim3:
-    """A change of world: new = scale * rotation @ old + translation."""
+    """Similarity transform between worlds: new = scale * rotation @ old + translation."""
 
     scale: float = 1.0  # new units per old one, positive
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))  # (3, 3) float64
@@ -30,7 +30,7 @@ class Sim3:
 
     @classmethod
     def of(cls, scale: float, new_T_old: np.ndarray) -> "Sim3":
-        """With the rotation and translation of a rigid pose (4, 4)."""
+        """Similarity with the rotation and translation of a rigid pose (4, 4)."""
         return cls(scale, new_T_old[:3, :3], new_T_old[:3, 3])
 
     @property
@@ -39,30 +39,30 @@ class Sim3:
         return pose(self.rotation, self.translation)
 
     def inverse(self) -> "Sim3":
-        """From the new world to the old one."""
+        """Similarity from the new world to the old one."""
         rotation = self.rotation.T
         return Sim3(1 / self.scale, rotation, -rotation @ self.translation / self.scale)
 
     def after(self, first: "Sim3") -> "Sim3":
-        """The change of world `first`, and then this one."""
+        """Composition: `first`, then this one."""
         return Sim3.of(self.scale * first.scale, self.poses(first.new_T_old))
 
     def points(self, old: np.ndarray) -> np.ndarray:
-        """Points (N, 3) of the old world in the new one."""
+        """Points (N, 3) transformed from the old world to the new one."""
         return self.scale * old @ self.rotation.T + self.translation
 
     def points_back(self, new: np.ndarray) -> np.ndarray:
-        """Points (N, 3) of the new world in the old one."""
+        """Points (N, 3) transformed from the new world to the old one."""
         return (new - self.translation) @ self.rotation / self.scale
 
     def poses(self, old_T_rigs: np.ndarray) -> np.ndarray:
-        """Poses (..., 4, 4) in the old world as they are in the new one."""
+        """Poses (..., 4, 4) transformed from the old world to the new one."""
         positions = self.scale * old_T_rigs[..., :3, 3] @ self.rotation.T + self.translation
         return pose(self.rotation @ old_T_rigs[..., :3, :3], positions)
 
 
 class NoSimilarityError(GsbaError):
-    """No positive scale carries one set of positions onto the other."""
+    """No positive scale maps one set of positions to the other."""
 
 
 def similarity(source: np.ndarray, target: np.ndarray) -> Sim3:
@@ -72,66 +72,68 @@ def similarity(source: np.ndarray, target: np.ndarray) -> Sim3:
         source, target: (N, 3) float64, N >= 3, not all on one point.
 
     Raises:
-        NoSimilarityError: the targets are all on one point, or not where any turn has the sources.
+        NoSimilarityError: the targets are all on one point, or uncorrelated with the sources.
     """
     s, t = source - source.mean(axis=0), target - target.mean(axis=0)
     return turned_similarity(source, target, nearest_rotation(t.T @ s / len(s)))
 
 
 def pose_similarity(
-    source_T_rigs: np.ndarray, target_T_rigs: np.ndarray, least_alike: float = _LEAST_ALIKE
+    source_T_rigs: np.ndarray, target_T_rigs: np.ndarray, min_correlation: float = _MIN_CORRELATION
 ) -> Sim3:
-    """Similarity that carries one set of poses onto another of the same rigs.
+    """Similarity that maps one set of poses to another of the same rigs.
 
-    The rotation is the chordal mean over orientations, so that a straight path will do; scale and
-    translation are least squares over positions; a rig that never moves leaves the scale at 1.
+    The rotation is the chordal mean over orientations, so that a straight path suffices. Scale and
+    translation are least squares over positions. A rig that never moves leaves the scale at 1.
 
     Args:
         source_T_rigs, target_T_rigs: (N, 4, 4) poses of the same rigs in two worlds.
-        least_alike: see `turned_similarity`.
+        min_correlation: see `turned_similarity`.
 
     Raises:
-        NoSimilarityError: the rigs are not where the targets have them, at no positive scale.
+        NoSimilarityError: no positive scale maps the rigs' positions to the targets'.
     """
     between = np.einsum("nij,nkj->ik", target_T_rigs[:, :3, :3], source_T_rigs[:, :3, :3])
     source, target = source_T_rigs[:, :3, 3], target_T_rigs[:, :3, 3]
-    return turned_similarity(source, target, nearest_rotation(between), least_alike)
+    return turned_similarity(source, target, nearest_rotation(between), min_correlation)
 
 
 def turned_similarity(
-    source: np.ndarray, target: np.ndarray, rotation: np.ndarray, least_alike: float = _LEAST_ALIKE
+    source: np.ndarray,
+    target: np.ndarray,
+    rotation: np.ndarray,
+    min_correlation: float = _MIN_CORRELATION,
 ) -> Sim3:
-    """The similarity with a given rotation, scale and translation being least squares.
+    """Similarity with a given rotation; scale and translation are least squares.
 
-    Every similarity of gsba ends here: an inverted or vanishing world is none.
+    Every similarity of gsba is made here, so that none has a negative or vanishing scale.
 
     Args:
         source, target: (N, 3) float64, N >= 1; sources on one point leave the scale at 1.
         rotation: (3, 3).
-        least_alike: correlation of both, once turned, from 0 to 1, that there must be.
+        min_correlation: smallest correlation, 0 to 1, of the rotated sources with the targets.
 
     Raises:
-        NoSimilarityError: positions correlate less, so that their scale would be nothing's.
+        NoSimilarityError: the positions' correlation is smaller.
     """
     turned = source @ rotation.T
     s, t = turned - turned.mean(axis=0), target - target.mean(axis=0)
     spread, across, wanted = (float(np.sum(a * b)) for a, b in ((s, s), (s, t), (t, t)))
-    if spread <= 1e-24 * float(np.sum(source * source)):  # on one point, but for rounding
+    if spread <= 1e-24 * float(np.sum(source * source)):  # all on one point, up to rounding
         scale = 1.0
-    elif across > least_alike * np.sqrt(spread * wanted) > 0:
+    elif across > min_correlation * np.sqrt(spread * wanted) > 0:
         scale = across / spread
     else:
         raise NoSimilarityError(
-            "no positive scale carries one set of positions onto the other: they have nothing in "
-            "common"
+            "no positive scale maps one set of positions to the other: they are not correlated"
         )
     return Sim3(scale, rotation, target.mean(axis=0) - scale * turned.mean(axis=0))
 
 
 def level_similarity(source: np.ndarray, target: np.ndarray) -> Sim3:
-    """Least-squares similarity that turns around z only: scale, heading and shift.
+    """Least-squares similarity whose rotation is around z: scale, heading and translation.
 
-    Closed form of the plane (Umeyama's with complex numbers); heights only help the scale.
+    Closed form of the plane (Umeyama's with complex numbers); heights only constrain the scale.
 
     Raises:
         NoSimilarityError: see `gsba.similarity.turned_similarity`.
@@ -150,25 +152,25 @@ def robust_similarity(
     solve: Callable[[np.ndarray, np.ndarray], Sim3],
     num_needed: int,
 ) -> tuple[Sim3, np.ndarray, float]:
-    """Similarity of most of the points, whatever fewer than half of them say.
+    """Similarity of corresponding points, fewer than half of which may be outliers.
 
     Least median of squares over random draws (Rousseeuw, JASA 79, 1984), then least squares over
-    what lies within the noise, until that settles.
+    the inliers until these no longer change.
 
     Args:
         source, target: (N, 3) float64.
-        solve: least squares over some of them.
-        num_needed: how many it needs at least.
+        solve: least-squares similarity of some of them.
+        num_needed: smallest number of points that `solve` takes.
 
     Returns:
-        the similarity, (N,) bool what it rests on, and their RMS residual in target units.
+        the similarity, its inliers (N,) bool, and their RMS residual in target units.
 
     Raises:
-        NoSimilarityError: the points of both have little in common.
+        NoSimilarityError: the inliers of both worlds are barely correlated.
     """
     rng = np.random.default_rng(_SEED)
     best, fit = np.inf, None
-    draws = (rng.choice(len(source), num_needed, replace=False) for _ in range(_DRAWS))
+    draws = (rng.choice(len(source), num_needed, replace=False) for _ in range(_NUM_DRAWS))
     for draw in draws if len(source) > num_needed else [np.arange(len(source))]:
         try:
             candidate = solve(source[draw], target[draw])
@@ -187,13 +189,13 @@ def robust_similarity(
         fit = solve(source[used], target[used])
         if np.array_equal(before, used):
             break
-    turned_similarity(source[used], target[used], fit.rotation, _ALIKE)
+    turned_similarity(source[used], target[used], fit.rotation, _MIN_INLIER_CORRELATION)
     rms = float(np.sqrt(np.mean(residuals_of(fit, source, target)[used] ** 2)))
     return fit, used, rms
 
 
 def residuals_of(fit: Sim3, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Distances (N,) between targets and carried sources."""
+    """Distances (N,) between targets and transformed sources."""
     return np.linalg.norm(fit.points(source) - target, axis=1)
 
 
@@ -206,28 +208,28 @@ def extents(positions: np.ndarray) -> np.ndarray:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Say that it is this file's positions which no similarity fits."""
+    """Name the file in the message where no similarity fits its positions."""
     try:
         yield
     except NoSimilarityError:
         raise GsbaError(
-            f"{path}: its positions and the frames' have nothing in common: check that they are "
-            "of this recording and on the frames' clock, and that the path is longer than they "
-            "are wrong"
+            f"{path}: its positions and the frames' are not correlated: check that the file is of "
+            "this recording, that its times are on the frames' clock, and that the path is longer "
+            "than the error of the positions"
         ) from None
 
 
 def relative_map(
     points0: np.ndarray, points1: np.ndarray, seed: int
 ) -> tuple[np.ndarray, int] | None:
-    """Pose of one frame in another from the same points in both, each with a scale of its own.
+    """Relative pose of two frames from corresponding points, each frame with its own scale.
 
     Args:
         points0, points1: (m, 3) points in the rigs of both frames, map units.
         seed: of the sampling.
 
     Returns:
-        f0_T_f1 (4, 4) in the units of frame 0, and how many points agree; None if too few.
+        f0_T_f1 (4, 4) in the units of frame 0, and the number of inliers; None if too few.
     """
     found = relative_similarity(points0, points1, seed)
     return None if found is None else (found[0].new_T_old, int(found[1].sum()))
@@ -236,12 +238,15 @@ def relative_map(
 def relative_similarity(
     points0: np.ndarray, points1: np.ndarray, seed: int, least: int = _MIN_POINTS
 ) -> tuple[Sim3, np.ndarray] | None:
-    """As `relative_map`: rig 1 in rig 0, with its unit; and which points (m,) agree, if `least`."""
+    """Similarity from rig 1 to rig 0 and its inliers (m,) bool; None if fewer than `least`.
+
+    For the arguments see `relative_map`.
+    """
     if len(points0) < least:
         return None
     rng = np.random.default_rng(seed)
     best = np.zeros(len(points0), bool)
-    for _ in range(_TRIALS):
+    for _ in range(_NUM_TRIALS):
         three = rng.choice(len(points0), 3, replace=False)
         agree = _agree(points0, points1, three)
         best = agree if agree.sum() > best.sum() else best
@@ -257,18 +262,18 @@ def relative_similarity(
 def similarity_along(
     points0: np.ndarray, points1: np.ndarray, f0_T_f1: np.ndarray, least: int = _MIN_POINTS
 ) -> tuple[Sim3, np.ndarray] | None:
-    """Similarity of two rigs whose rotation and direction bearings have told already.
+    """Similarity of two rigs whose rotation and direction of translation are given.
 
-    Points whose distances are poorly known give a poor rotation, three at a time; bearings do not.
-    What is left, the ratio of the step's length and the scale, each point tells alone.
+    Three points with uncertain distances give a poor rotation; bearings give a good one. Each point
+    alone then determines the length of the step and the scale.
 
     Args:
-        points0, points1: (m, 3) points in the rigs of both frames, each in units of its own.
+        points0, points1: (m, 3) points in the rigs of both frames, each in its own unit.
         f0_T_f1: (4, 4) relative pose, whose translation has any length.
-        least: points that have to agree.
+        least: smallest number of inliers.
 
     Returns:
-        rig 1 in rig 0, with its unit, and which points (m,) agree; None if too few.
+        similarity from rig 1 to rig 0, and its inliers (m,) bool; None if too few.
     """
     rotation, direction = f0_T_f1[:3, :3], f0_T_f1[:3, 3]
     direction = direction / max(float(np.linalg.norm(direction)), 1e-12)
@@ -297,14 +302,14 @@ def similarity_along(
 def _scaled(
     points0: np.ndarray, points1: np.ndarray, rotation: np.ndarray, step: np.ndarray
 ) -> Sim3:
-    """The similarity whose scale is the median ratio of distances; `step` (3,) in unit 1."""
+    """Similarity whose scale is the median ratio of distances; `step` (3,) in units of rig 1."""
     lengths0, lengths1 = (np.linalg.norm(points, axis=1) for points in (points0, points1))
     scale = float(np.median(lengths0 / np.maximum(lengths1, 1e-12)))
     return Sim3(scale, rotation, scale * step)
 
 
 def _agree(points0: np.ndarray, points1: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Which points (m,) are seen alike from both frames under the fit to some of them."""
+    """Inliers (m,) bool of the similarity that fits the chosen points."""
     try:
         fit = similarity(points1[chosen], points0[chosen])
     except NoSimilarityError:
@@ -313,9 +318,9 @@ def _agree(points0: np.ndarray, points1: np.ndarray, chosen: np.ndarray) -> np.n
 
 
 def agreeing_points(points0: np.ndarray, points1: np.ndarray, fit: Sim3) -> np.ndarray:
-    """Which points (m, 3) of two rigs are seen alike from both (m,) bool; `fit`: rig 1 in rig 0."""
+    """Inliers (m,) bool: points (m, 3) whose bearings agree in both rigs; `fit`: rig 1 to rig 0."""
     in0, in1 = fit.points(points1), fit.points_back(points0)
-    limit = np.cos(np.deg2rad(_POINT_DEG))
+    limit = np.cos(np.deg2rad(_MAX_ANGLE_DEG))
     return (_cosines(in0, points0) > limit) & (_cosines(in1, points1) > limit)
 
 

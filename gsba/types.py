@@ -1,4 +1,4 @@
-"""Records that stages hand to one another. Arrays inside; one comment per field."""
+"""Records that stages pass to one another: arrays, with one comment per field."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -22,30 +22,31 @@ class PoseSource(IntEnum):
 
 
 class PoseStatus(IntEnum):
-    """What became of a frame."""
+    """Result of a frame."""
 
-    REFINED = 0  # images constrain it
-    UNREFINED = 1  # matched nothing: carried by its priors alone
+    REFINED = 0  # images constrain its pose
+    UNREFINED = 1  # it has no matches: its priors alone give its pose
 
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """What a stage received, what it kept and why the rest was dropped."""
+    """Numbers of items that a stage received, kept and dropped, with the reasons."""
 
-    received: int  # things that came in
-    kept: int  # things that went on
-    unit: str  # what is counted: "frames", "matches", ...
-    dropped: Mapping[str, int] = field(default_factory=dict)  # reason -> how many
+    received: int  # items that came in
+    kept: int  # items that went on
+    unit: str  # name of the items: "frames", "matches", ...
+    dropped: Mapping[str, int] = field(default_factory=dict)  # reason -> number of items
 
 
 @dataclass(frozen=True, slots=True)
 class Fisheye:
-    """One lens of a raw pair (Kannala and Brandt, PAMI 2006), at an angle theta from its axis:
+    """Intrinsics and extrinsics of one fisheye lens (Kannala and Brandt, PAMI 2006).
 
-    r = focal (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9) pixels from `principal`.
+    A ray at an angle theta from the axis is seen r pixels from `principal`:
+    r = focal (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9).
     """
 
-    width: int  # pixels of its picture
+    width: int  # pixels of its image
     height: int  # pixels
     focal: float  # pixels per radian in the middle
     principal: tuple[float, float]  # pixels, corner origin
@@ -59,7 +60,7 @@ class FrameSet:
     """The captured frames on disk, in time order. No pixels are held.
 
     Raises:
-        ValueError: a name or a face that no file can be named after; exports are.
+        ValueError: a name or a face that cannot be a file name; exported files carry them.
     """
 
     names: tuple[str, ...]  # (F,) unique, without folder or extension
@@ -73,21 +74,17 @@ class FrameSet:
     width: int  # pixels of one image (panorama or face)
     height: int  # pixels
     mask_paths: tuple[Path | None, ...]  # (F,) ERP masks, white = use; None = use all
-    correction: tuple[float, ...] = ()  # of what stitching bends: coefficients of a
-    # factors.SphereField, radians; panoramas and masks are read as straightened by it
-    timed: bool = (
-        True  # whether timestamps are times; else nothing gave them, and only order counts
-    )
-    fisheyes: tuple[Fisheye, Fisheye] | None = None  # front and back, by which panoramas are cut
-    # out of "fisheye" frames
+    correction: tuple[float, ...] = ()  # stitching field: coefficients of a factors.SphereField,
+    # radians; panoramas and masks are read as corrected by it
+    timed: bool = True  # True = timestamps are times; False = they only give the order
+    fisheyes: tuple[Fisheye, Fisheye] | None = None  # front and back lens, with which "fisheye"
+    # frames are read as panoramas
     tracks: tuple[int, int] | None = None  # width and height, pixels, of either image of "eac"
     # frames; None = of another layout
-    lenses_nominal: bool = (
-        False  # whether these are but a start: plain lenses in image circles, the
-    )
-    # maker's calibration of another day, or a calibration that pictures contradict
-    fetched: tuple[bool, ...] = ()  # (F,) frames of a video that strengthen the map where those
-    # that were chosen left it weak: datasets go without them; () = none
+    lenses_nominal: bool = False  # True = `fisheyes` are initial values that need self-calibration:
+    # ideal lenses in the image circles, a factory calibration, or one that images contradict
+    fetched: tuple[bool, ...] = ()  # (F,) frames of a video that were added where the map of the
+    # chosen ones was weak: datasets leave them out; () = none
 
     def __post_init__(self) -> None:
         for name in self.names:
@@ -101,31 +98,31 @@ class FrameSet:
         return len(self.names)
 
     def chosen(self) -> np.ndarray:
-        """Frames (F',) int64 that datasets are made of: those that were not fetched."""
+        """Frames (F',) int64 that datasets hold: all that were not added later (`fetched`)."""
         return np.flatnonzero(~np.array(self.fetched or (False,) * len(self), bool))
 
     @property
     def panoramic(self) -> bool:
-        """Whether a frame is read as one equirectangular image, not as several faces."""
+        """True if a frame is read as one equirectangular image, not as several faces."""
         return self.layout != "cube"
 
     @property
     def lens_axes_known(self) -> bool:
-        """Whether lenses look along the rig's z, as no stabiliser has turned the images."""
+        """True if the lenses' axes are along the rig's z: no stabiliser has rotated the images."""
         return self.layout in ("fisheye", "eac")
 
     @property
     def panorama_width(self) -> int:
-        """Pixels across a panorama that is as dense as the frames."""
+        """Width in pixels of a panorama with the frames' angular resolution."""
         return self.width if self.panoramic else 4 * self.width
 
     @property
     def native_face_size(self) -> int:
-        """Pixels across a 90-degree face that is as dense as the frames."""
+        """Width in pixels of a 90-degree face with the frames' angular resolution."""
         return self.width // 4 if self.panoramic else self.width
 
     def taken(self, rows: np.ndarray, absolute: bool = False) -> "FrameSet":
-        """Some of the frames (F',), ascending; with absolute paths for other processes."""
+        """Frames `rows` (F',), ascending; `absolute` paths serve processes in other folders."""
         paths = tuple(self.paths[f] for f in rows)
         mask_paths = tuple(self.mask_paths[f] for f in rows)
         if absolute:
@@ -156,12 +153,12 @@ class CoarsePoses:
     world_T_rigs: np.ndarray  # (F, 4, 4) float64, map units
     sources: np.ndarray  # (F,) uint8, PoseSource
     time_offset: float  # seconds added to frame times to reach the trajectory's clock
-    segments: np.ndarray | None = None  # (F,) int32, piece of the trajectory that each frame's pose
-    # is of, ascending; pieces have worlds of their own until joined; None = there is one
+    segments: np.ndarray | None = None  # (F,) int32, trajectory piece of each frame, ascending;
+    # each piece has its own world until pieces are joined; None = there is one
 
     @property
     def absent(self) -> bool:
-        """Whether there is no trajectory."""
+        """True if there is no trajectory."""
         return bool((self.sources == PoseSource.NONE).all())
 
 
@@ -176,7 +173,7 @@ class StepNoise:
 
 @dataclass(frozen=True, slots=True)
 class GyroConstraints:
-    """How frames turn, as a gyro says: in the rig's axes."""
+    """Rotations between frames and rates, integrated from a gyro, rig axes."""
 
     steps: np.ndarray  # (F - 1, 3) float64, rotation vectors of f_R_next, radians
     step_sigmas: np.ndarray  # (F - 1,) float64, radians per axis; infinite = not known
@@ -210,17 +207,17 @@ class Keypoints:
     bearings_rig: np.ndarray  # (N, 3) float64, unit, rig frame
     sigmas_rad: np.ndarray  # (N,) float64, radians
     colors: np.ndarray  # (N, 3) uint8, RGB
-    sqrt_infos: np.ndarray | None = None  # (N, 2, 2) 1/rad on the bearings' tangent_basis: the
-    # square-root information where noise depends on the direction; None = 1 / sigmas_rad
-    origins_rig: np.ndarray | None = None  # (N, 3) float64, rig frame, map units: where each ray
-    # starts; None = the rig's centre
+    sqrt_infos: np.ndarray | None = None  # (N, 2, 2) 1/rad, square-root information on the
+    # bearings' tangent_basis, where noise is anisotropic; None = 1 / sigmas_rad
+    origins_rig: np.ndarray | None = None  # (N, 3) float64, rig frame, map units: origin of each
+    # ray; None = the rig's centre
 
     def origins_of(self, rows: np.ndarray) -> np.ndarray | None:
-        """Where the rays of some rows (O,) start, (O, 3); None = the rig's centre."""
+        """Origins (O, 3) of the rays of rows (O,), rig frame; None = the rig's centre."""
         return None if self.origins_rig is None else self.origins_rig[rows]
 
     def frames(self) -> np.ndarray:
-        """Frame (N,) of each."""
+        """Frame (N,) of each keypoint."""
         return np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
 
     def bearings_of(self, frame: int) -> np.ndarray:
@@ -246,7 +243,7 @@ class Matches:
 
     @classmethod
     def of_rows(cls, pairs: np.ndarray, rows: Sequence[np.ndarray]) -> "Matches":
-        """From the rows (m, 2) int32 of each pair (P, 2)."""
+        """Matches from the rows (m, 2) int32 of each pair (P, 2)."""
         keypoints = np.concatenate([np.zeros((0, 2), np.int32), *rows])
         return cls(pairs, np.cumsum([0, *map(len, rows)]), keypoints)
 
@@ -255,31 +252,31 @@ class Matches:
         return self.keypoints[self.offsets[pair] : self.offsets[pair + 1]]
 
     def taken(self, pairs: Sequence[int] | np.ndarray) -> "Matches":
-        """Those of some pairs, by their indices, in the order given."""
+        """Matches of pairs with these indices, in the given order."""
         rows = [self.of(int(p)) for p in pairs]
         return Matches.of_rows(self.pairs[list(pairs)].reshape(-1, 2), rows)
 
 
 @dataclass(frozen=True, slots=True)
 class VerifiedPairs:
-    """Pairs whose matches fit one relative pose that the trajectory does not contradict."""
+    """Pairs whose matches fit one relative pose within the trajectory's tolerance."""
 
     matches: Matches  # inliers only
     f0_T_f1s: np.ndarray  # (P, 4, 4) float64, translation of unit length
     direction_sigmas: np.ndarray  # (P,) float64, radians, of the translation's direction; infinite
-    # = the camera may have turned only
+    # = the motion may be a pure rotation
     counts: Counts  # of pairs
 
     @classmethod
     def none(cls) -> "VerifiedPairs":
-        """What guidance finds where there is no trajectory."""
+        """No pairs."""
         none = np.zeros((0, 2), np.int32)
         poses, sigmas = np.zeros((0, 4, 4)), np.zeros(0)
         return cls(Matches.of_rows(none, ()), poses, sigmas, Counts(0, 0, "pairs"))
 
     @classmethod
     def joined(cls, parts: Sequence["VerifiedPairs"]) -> "VerifiedPairs":
-        """All pairs of several sets, those of the closest frames first; counts of the first."""
+        """Pairs of several sets, by distance of their frames in time; counts of the first set."""
         pairs = np.concatenate([part.matches.pairs for part in parts])
         rows = [part.matches.of(p) for part in parts for p in range(len(part.matches.pairs))]
         poses = np.concatenate([part.f0_T_f1s for part in parts])
@@ -288,24 +285,24 @@ class VerifiedPairs:
         return every.taken(np.lexsort((pairs[:, 0], pairs[:, 1] - pairs[:, 0])).tolist())
 
     def taken(self, rows: Sequence[int]) -> "VerifiedPairs":
-        """Some of the pairs, by their indices, in the order given."""
+        """Pairs with these indices, in the given order."""
         chosen = np.asarray(rows, np.int64)
         poses, sigmas = self.f0_T_f1s[chosen], self.direction_sigmas[chosen]
         return VerifiedPairs(self.matches.taken(chosen), poses, sigmas, self.counts)
 
     def frames(self) -> set[tuple[int, int]]:
-        """The frames of each pair."""
+        """Frames (f0, f1) of each pair."""
         return {(int(f0), int(f1)) for f0, f1 in self.matches.pairs}
 
     def within(self, pieces: np.ndarray | None) -> "VerifiedPairs":
-        """Pairs whose frames are of one piece (F,) int; None = there is one."""
+        """Pairs whose two frames are of the same piece (F,) int; None = there is one."""
         if pieces is None:
             return self
         f0, f1 = self.matches.pairs.T
         return self.taken(np.flatnonzero(pieces[f0] == pieces[f1]).tolist())
 
     def missing(self, chosen: np.ndarray) -> np.ndarray:
-        """Those of some pairs (P, 2) that are not among these."""
+        """Pairs of `chosen` (P, 2) that this set lacks."""
         present = self.frames()
         rows = [pair for pair in chosen.tolist() if tuple(pair) not in present]
         return np.array(rows, np.int32).reshape(-1, 2)
@@ -315,8 +312,8 @@ class VerifiedPairs:
 class Tracks:
     """Observations of scene points, sorted by point, then by frame; every point has one.
 
-    What makes or filters tracks keeps to that. Whoever uses them takes a point that lost all its
-    observations nonetheless as one that no frame sees.
+    Functions that make or filter tracks keep this order. Functions that read tracks also accept
+    points without observations: no frame sees these.
     """
 
     points: np.ndarray  # (O,) int32, point index j, non-decreasing
@@ -328,21 +325,21 @@ class Tracks:
         return len(self.points)
 
     def hosts(self) -> np.ndarray:
-        """First frame (J,) that sees each point: the one it goes with; -1 = none sees it."""
+        """First frame (J,) that observes each point: the point moves with it; -1 = none."""
         first = np.flatnonzero(np.diff(self.points, prepend=-1))
         hosts = np.full(self.num_points, -1, self.frames.dtype)
         hosts[self.points[first]] = self.frames[first]
         return hosts
 
     def of(self, points: np.ndarray) -> "Tracks":
-        """Points `points (J,)` bool alone, renumbered, with all their observations."""
+        """Tracks of the points `points` (J,) bool, renumbered."""
         rows = points[self.points]
         numbers = (np.cumsum(points) - 1).astype(np.int32)[self.points[rows]]
         num = int(np.count_nonzero(points))
         return Tracks(numbers, self.frames[rows], self.keypoints[rows], num)
 
     def of_observations(self, rows: np.ndarray) -> "Tracks":
-        """Observations `rows (O,)` bool alone; points that keep none are left out."""
+        """Tracks of the observations `rows` (O,) bool; points without any are left out."""
         numbers = np.cumsum(np.diff(self.points[rows], prepend=-1) > 0) - 1
         num = int(numbers[-1]) + 1 if len(numbers) else 0
         return Tracks(numbers.astype(np.int32), self.frames[rows], self.keypoints[rows], num)
@@ -350,14 +347,14 @@ class Tracks:
 
 @dataclass(frozen=True, slots=True)
 class Landmarks:
-    """Scene points and the observations that agree with them."""
+    """Scene points and their inlier observations."""
 
     points_world: np.ndarray  # (J, 3) float64, map units
     tracks: Tracks  # their observations; point indices are rows of points_world
     counts: Counts  # of tracks
 
     def moved(self, scales: np.ndarray, moves: np.ndarray) -> "Landmarks":
-        """Each where its host frame's scale (F,) * R @ x + t, of moves (F, 4, 4), has it."""
+        """Points moved by the similarity of their host frames: scales (F,), moves (F, 4, 4)."""
         hosts = self.tracks.hosts()
         turned = np.einsum("jik,jk->ji", moves[hosts, :3, :3], self.points_world)
         points = scales[hosts, None] * turned + moves[hosts, :3, 3]
@@ -366,7 +363,7 @@ class Landmarks:
 
 @dataclass(frozen=True, slots=True)
 class Iteration:
-    """One attempted step. Iteration 0 is the start."""
+    """One attempted step of the solver. Iteration 0 is the start."""
 
     number: int
     cost: float  # total robust cost of the attempt
@@ -378,26 +375,26 @@ class Iteration:
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """One bundle adjustment and what was kept of it."""
+    """One bundle adjustment: its gate, its result and the decision about it."""
 
-    gate_sigmas: float  # observations further off were left out
+    gate_sigmas: float  # observations with larger residuals were left out
     noise: float  # estimated noise after the round, in units of the features' own sigmas
-    observations: int  # used
-    points: int  # used
-    support: int  # observations within the last gate of all tracks, under the round's poses
-    accepted: bool  # False: the poses before the round have more support and were kept
+    observations: int  # number used
+    points: int  # number used
+    support: int  # inliers of all tracks within the last gate, under the round's poses
+    accepted: bool  # False: the poses before the round have more inliers and were kept
     iterations: tuple[Iteration, ...]  # cost by family
     reason: str  # why the solver stopped
 
 
 @dataclass(frozen=True, slots=True)
 class FamilyVariables:
-    """Own variables of families of residuals, see `gsba.bundle.family_variables`."""
+    """Variables that belong to families of residuals, see `gsba.bundle.family_variables`."""
 
     keys: np.ndarray  # (V,) int64, GTSAM keys
     kinds: tuple[str, ...]  # (V) GTSAM type of each
-    counts: np.ndarray  # (V,) int64, numbers that each takes
-    data: np.ndarray  # (sum of counts,) float64, these numbers
+    counts: np.ndarray  # (V,) int64, parameters of each variable
+    data: np.ndarray  # (sum of counts,) float64, values of the parameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -408,16 +405,16 @@ class Solution:
     landmarks: Landmarks
     noise: float  # of observations, in units of the features' own sigmas
     rounds: tuple[Round, ...]
-    variables: FamilyVariables | None = None  # of families; None = they have none
+    variables: FamilyVariables | None = None  # of families; None = no family has any
 
     @property
     def counts(self) -> Counts:
-        """Of tracks."""
+        """Counts of tracks."""
         return self.landmarks.counts
 
     @classmethod
     def without_points(cls, world_T_rigs: np.ndarray) -> "Solution":
-        """Poses (F, 4, 4) to start from."""
+        """Solution with initial poses (F, 4, 4) and no points."""
         nothing = np.zeros(0, np.int32)
         tracks = Tracks(nothing, nothing, nothing, 0)
         return cls(
@@ -425,11 +422,11 @@ class Solution:
         )
 
     def observations(self) -> np.ndarray:
-        """How many each frame (F,) has."""
+        """Number of observations of each frame (F,)."""
         return np.bincount(self.landmarks.tracks.frames, minlength=len(self.world_T_rigs))
 
     def carries(self, before: "Solution", least: int) -> bool:
-        """Whether every frame with `least` observations in another solution has as many here."""
+        """True if every frame with `least` observations in `before` has as many here."""
         return bool(np.all((self.observations() >= least) | (before.observations() < least)))
 
     def median_depth(self) -> float:
@@ -439,7 +436,7 @@ class Solution:
         return float(np.median(np.linalg.norm(offsets, axis=1))) if len(offsets) else 0.0
 
     def points_by_keypoint(self, keypoints: Keypoints) -> "KnownPoints":
-        """For each frame (K_f, 3): its keypoints' points in its rig frame, NaN where unknown."""
+        """Points of each frame's keypoints (K_f, 3), rig frame, NaN where unknown."""
         frames = self.landmarks.tracks.frames
         order = np.argsort(frames, kind="stable")
         starts = np.searchsorted(frames[order], np.arange(len(self.world_T_rigs) + 1))
@@ -448,15 +445,15 @@ class Solution:
 
 @dataclass(frozen=True, slots=True)
 class KnownPoints:
-    """Points of the keypoints of each frame: made when they are asked for, not held."""
+    """Points of the keypoints of each frame, computed on access."""
 
     solved: Solution
-    sizes: np.ndarray  # (F,) keypoints
+    sizes: np.ndarray  # (F,) number of keypoints
     order: np.ndarray  # (O,) observations, frame by frame
-    starts: np.ndarray  # (F + 1,): frame f's are order[starts[f]:starts[f + 1]]
+    starts: np.ndarray  # (F + 1,) int: observations of frame f are order[starts[f]:starts[f + 1]]
 
     def __getitem__(self, frame: int) -> np.ndarray:
-        """Of one frame (K_f, 3), in its rig frame, NaN where unknown."""
+        """Points (K_f, 3) of one frame's keypoints, rig frame, NaN where unknown."""
         landmarks, world_T_rig = self.solved.landmarks, self.solved.world_T_rigs[frame]
         rows = self.order[self.starts[frame] : self.starts[frame + 1]]
         offsets = landmarks.points_world[landmarks.tracks.points[rows]] - world_T_rig[:3, 3]
@@ -467,30 +464,30 @@ class KnownPoints:
 
 @dataclass(frozen=True, slots=True)
 class Sighted:
-    """Observations made anew by aligning patches, former ones where that failed, their tracks."""
+    """Observations from aligned patches, or the former ones where alignment failed."""
 
     keypoints: Keypoints  # one for each observation
-    aligned: np.ndarray  # (N,) bool, which of them are new
+    aligned: np.ndarray  # (N,) bool, True = from an aligned patch
     tracks: Tracks
     counts: Counts  # of observations
-    normals_rig: np.ndarray | None = None  # (N, 3) float32, of the surface that each shows, zero =
-    # unknown; None = all are
+    normals_rig: np.ndarray | None = None  # (N, 3) float32, normal of each observed surface, zero =
+    # unknown; None = all are unknown
 
 
 @dataclass(frozen=True, slots=True)
 class JointErrors:
-    """What errors of several poses have in common; tangents as those of their covariances."""
+    """Joint distribution of pose errors x_f; tangents are those of the pose covariances."""
 
     neighbours: np.ndarray  # (F - 1, 6, 6) float64, E[x_f x_(f+1)^T], NaN = none
-    draws: np.ndarray  # (D, F, 6) float32, drawn from the joint distribution of all, NaN = none
+    draws: np.ndarray  # (D, F, 6) float32, samples of the joint distribution, NaN = none
 
     def scaled(self, factors: np.ndarray) -> "JointErrors":
-        """With each pose's errors times its factors (F, 6)."""
+        """Distribution of errors that are multiplied by factors (F, 6)."""
         neighbours = factors[:-1, :, None] * self.neighbours * factors[1:, None, :]
         return JointErrors(neighbours, (self.draws * factors).astype(np.float32))
 
     def taken(self, rows: np.ndarray) -> "JointErrors":
-        """Of some poses (F',), ascending; those between which others are left out are no more."""
+        """Distribution of poses `rows` (F',), ascending; NaN across poses that are left out."""
         near = (np.diff(rows) == 1)[:, None, None]
         neighbours = np.where(near, self.neighbours[rows[:-1]], np.nan)
         return JointErrors(neighbours, self.draws[:, rows])
@@ -498,7 +495,7 @@ class JointErrors:
 
 @dataclass(frozen=True, slots=True)
 class Reconstruction:
-    """Refined poses and cloud: what exports and reports are made from."""
+    """Refined poses and point cloud, from which exports and reports are made."""
 
     world_T_rigs: np.ndarray  # (F, 4, 4) float64, world of the SLAM trajectory, map units
     pose_covariances: np.ndarray  # (F, 6, 6) float64, [rotation rad, translation], NaN = none
@@ -510,30 +507,30 @@ class Reconstruction:
     observation_frames: np.ndarray  # (O,) int32
     observation_bearings: np.ndarray  # (O, 3) float64, unit, rig frame
     observation_sigmas: np.ndarray  # (O,) float64, radians
-    correction: tuple[float, ...] = ()  # of the frames, which these bearings have: see FrameSet
-    components: np.ndarray | None = None  # (F,) int32, map that each frame is in, 0 = the largest:
-    # nothing ties one map to another, each has a world of its own; None = there is one. Behind all
-    # maps each frame that is in none has a number of its own
-    joint_errors: JointErrors | None = None  # those whose own covariances are above; None = none
-    observation_origins: np.ndarray | None = None  # (O, 3) float64, rig frame, map units: where
-    # each ray starts; None = the rig's centre
-    lens_baseline: tuple[float, float] | None = None  # between two lenses, map units, and its
-    # standard deviation; None = there is one
-    fisheyes: tuple[Fisheye, Fisheye] | None = None  # of raw pairs, as found: see FrameSet
+    correction: tuple[float, ...] = ()  # stitching field applied to these bearings: see FrameSet
+    components: np.ndarray | None = None  # (F,) int32, map of each frame, 0 = the largest; each map
+    # has its own world; frames in no map have numbers of their own after those of the maps; None =
+    # there is one map
+    joint_errors: JointErrors | None = None  # joint distribution of pose_covariances; None = none
+    observation_origins: np.ndarray | None = None  # (O, 3) float64, rig frame, map units: origin of
+    # each ray; None = the rig's centre
+    lens_baseline: tuple[float, float] | None = None  # distance of the two lenses and its standard
+    # deviation, map units; None = one centre
+    fisheyes: tuple[Fisheye, Fisheye] | None = None  # self-calibrated lenses: see FrameSet
     vertical: np.ndarray | None = None  # (3,) float64, unit, up or down by an accelerometer; None =
     # there was none
-    map_scales: np.ndarray | None = None  # (C,) float64, by component: the length in its world of
-    # what is one unit long in the world of the largest map; None = there is one map
+    map_scales: np.ndarray | None = None  # (C,) float64, units of each component's world per unit
+    # of the largest map's; None = there is one map
 
     @property
     def num_maps(self) -> int:
-        """Number of maps. A frame alone is no map."""
+        """Number of maps; a single frame is no map."""
         if self.components is None:
             return 1
         return 1 + int(np.count_nonzero(np.bincount(self.components)[1:] > 1))
 
     def map_numbers(self) -> np.ndarray:
-        """Map (F,) int64 that each frame is in, 1 = the largest; 0 = in none."""
+        """Map (F,) int64 of each frame, 1 = the largest; 0 = none."""
         if self.components is None:
             return np.ones(len(self.world_T_rigs), np.int64)
         return np.where(self.components < self.num_maps, self.components + 1, 0)
@@ -543,7 +540,7 @@ class Reconstruction:
         return np.flatnonzero(self.map_numbers() == number)
 
     def largest_map(self) -> np.ndarray:
-        """Frames (F',) int64 of the largest map: those that are exported."""
+        """Frames (F',) int64 of the largest map, which is exported."""
         return self.frames_of_map(1)
 
     def of_map(self, number: int) -> "Reconstruction":
@@ -557,11 +554,11 @@ class Reconstruction:
         return replace(found, vertical=None)  # it is known in the world of the largest map
 
     def map_scale(self, number: int) -> float:
-        """Length in the world of a map of what is one unit long in the largest map's."""
+        """Units of a map's world per unit of the largest map's."""
         return 1.0 if self.map_scales is None else float(self.map_scales[number - 1])
 
     def taken(self, rows: np.ndarray) -> "Reconstruction":
-        """What some frames (F',), ascending, hold of it: their poses and the points they see."""
+        """Reconstruction of frames `rows` (F',), ascending: their poses and observed points."""
         if len(rows) == len(self.world_T_rigs):
             return self
         number = np.full(len(self.world_T_rigs), -1)

@@ -1,4 +1,4 @@
-"""The typer application: how commands are registered and how they fail."""
+"""The typer application: registration of commands, and their failures in one line."""
 
 import gc
 import logging
@@ -19,16 +19,16 @@ from gsba.version import __version__
 
 P = ParamSpec("P")
 
-_SOURCE = Path(__file__).parents[1]  # not what lies beside it where packages are installed
-_MOST_SHOWN = 1000  # characters of a message
-_MEMORY_OF = {  # settings that the memory of a stage follows, by the beginning of its name
+_SOURCE = Path(__file__).parents[1]  # folder of gsba's own code
+_MAX_MESSAGE_LENGTH = 1000  # characters
+_MEMORY_SETTINGS = {  # first letters of a stage's name -> settings that lower its memory
     "features": "cubemap.max_face_size, features.max_per_face or solver.num_threads",
     "align": "patches.max_width or solver.num_threads",
     "photometric": "photometric.max_width or photometric.targets",
     "splat": "splat.sizes or splat.max_gaussians",
     "export": "export.face_size",
 }
-_FEWER_POINTS = "features.max_per_face"  # what all other stages follow
+_DEFAULT_MEMORY_SETTING = "features.max_per_face"  # of all other stages
 
 app = typer.Typer(
     help="Pixel-true camera poses for 360-degree video, from frames and a SLAM trajectory.",
@@ -41,7 +41,7 @@ app = typer.Typer(
 
 @contextmanager
 def _expected_failures() -> Iterator[None]:
-    """One line on stderr and an exit code for whatever is no bug of ours."""
+    """End failures with one line on stderr and an exit code, without a traceback."""
     try:
         yield
     except GsbaError as error:
@@ -55,73 +55,77 @@ def _expected_failures() -> Iterator[None]:
         where = f"{error.filename}: " if error.filename else ""
         _fail(f"{where}{error.strerror or error}")
     except MemoryError as error:
-        _fail(_out_of_memory(error))
+        _fail(_memory_message(error))
     except (typer.Exit, typer.Abort):
         raise
     except Exception as error:
         if _Call.debug:
             raise
-        _fail(_unforeseen(error))
+        _fail(_bug_message(error))
 
 
 class _Call:
-    """Options of the running call that commands do not see."""
+    """Global options of the running call."""
 
     debug = False
 
 
-def _out_of_memory(error: MemoryError) -> str:
-    """What ran out of memory, and which settings lower it."""
+def _memory_message(error: MemoryError) -> str:
+    """Message of a stage that ran out of memory, with the settings that lower its use."""
     stage = next(iter(getattr(error, "__notes__", ())), "")
-    told = "; ".join(filter(None, (stage and f"stage {stage}", str(error))))
+    details = "; ".join(filter(None, (stage and f"stage {stage}", str(error))))
     kind = stage.removeprefix("first-")
-    lower = next((s for name, s in _MEMORY_OF.items() if kind.startswith(name)), _FEWER_POINTS)
+    lower = next(
+        (settings for name, settings in _MEMORY_SETTINGS.items() if kind.startswith(name)),
+        _DEFAULT_MEMORY_SETTING,
+    )
     advice = f"lower {lower}" if stage else "give smaller input"
-    return f"out of memory{f' ({told})' if told else ''}: {advice}, or use a machine with more"
+    where = f" ({details})" if details else ""
+    return f"out of memory{where}: {advice}, or use a machine with more memory"
 
 
-def _unforeseen(error: Exception) -> str:
-    """One line on what nobody foresaw: what, where in our code, and how to report it."""
+def _bug_message(error: Exception) -> str:
+    """Message of a bug: the error, its line in our code, and how to report it."""
     frames = traceback.extract_tb(error.__traceback__)
     ours = [f for f in frames if Path(f.filename).is_relative_to(_SOURCE)] or frames
     where = f"{Path(ours[-1].filename).name}:{ours[-1].lineno}"
     return (
-        f"unforeseen {type(error).__name__} at {where} ({brief(str(error), 200)}): a fault of gsba "
-        f"{__version__}; please report this line, and what `gsba --debug` before the same command "
-        "shows"
+        f"unforeseen {type(error).__name__} at {where} ({brief(str(error), 200)}): a bug in gsba "
+        f"{__version__}; please report this line, and the traceback that `gsba --debug` before the "
+        "same command shows"
     )
 
 
 def _fail(message: str, code: int = 1) -> NoReturn:
-    """End with one line that any terminal can show, of a length that people read."""
+    """Print one line of limited length that any terminal can show, and exit."""
     line = " ".join(message.splitlines()).encode("utf-8", "backslashreplace").decode()
-    typer.echo(f"error: {brief(line, _MOST_SHOWN)}", err=True)
+    typer.echo(f"error: {brief(line, _MAX_MESSAGE_LENGTH)}", err=True)
     raise typer.Exit(code)
 
 
 class _Command(TyperCommand):
     def get_help(self, ctx: typer.Context) -> str:  # type: ignore[override]
-        """The help without Python's notation for an argument that may be repeated."""
+        """Help text without Python's notation for repeatable arguments."""
         shown = "<list[Path]>"
         return super().get_help(ctx).replace(shown, "<path>".ljust(len(shown)))
 
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """For heavy imports: no garbage is looked for in what stays, now, later or at the end."""
+    """Import heavy packages without garbage collection, and exempt them from it for good."""
     collected = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        if gc.get_freeze_count() == 0:  # once: what is frozen is never collected
+        if gc.get_freeze_count() == 0:  # once: frozen objects are never collected
             gc.freeze()
         if collected:
             gc.enable()
 
 
 def command(function: Callable[P, None]) -> Callable[P, None]:
-    """Register a command whose expected failures end in one line."""
+    """Register a command whose failures end in one line."""
 
     @wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -143,7 +147,7 @@ def _options(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show warnings only.")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show every detail.")] = False,
     debug: Annotated[
-        bool, typer.Option("--debug", help="Show the traceback of a failure nobody foresaw.")
+        bool, typer.Option("--debug", help="Show the traceback of an unforeseen error.")
     ] = False,
     version: Annotated[
         bool,
@@ -153,5 +157,5 @@ def _options(
     ] = False,
 ) -> None:
     _Call.debug = debug
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what cannot be read is said in our line
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # our own line names unreadable files
     show_log(logging.WARNING if quiet else logging.DEBUG if verbose else logging.INFO)

@@ -1,4 +1,4 @@
-"""Looking at the installation itself: `doctor`."""
+"""The command `doctor`, which checks the installation."""
 
 import json
 from typing import Annotated
@@ -12,9 +12,9 @@ from gsba.cli.app import command
 def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="As JSON, for reports.")] = False,
 ) -> None:
-    """Say what is installed, what of it works, and what to do about the rest.
+    """Check the installation and suggest repairs.
 
-    The exit code is 0 where all works that a run needs, else 1; extras do not count.
+    The exit code is 0 if everything that a run needs works, else 1; extras do not count.
     """
     from gsba.doctor import examine
 

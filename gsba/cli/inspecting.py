@@ -1,4 +1,4 @@
-"""Looking at footage before a run: `info`."""
+"""The command `info`, which describes footage before a run."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,10 @@ def info(
     files: Annotated[list[Path], typer.Argument(help="Videos, folders of frames, pictures.")],
     as_json: Annotated[bool, typer.Option("--json", help="As JSON, for programs.")] = False,
 ) -> None:
-    """Say what footage is: camera, layout, times, gyro, GPS, lenses, and the line to refine it."""
+    """Describe footage and print the command that refines it.
+
+    The description names camera, layout, times, gyro, GPS and lenses.
+    """
     from gsba.inspection import inspect
 
     found = [inspect(path) for path in files]

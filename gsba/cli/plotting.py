@@ -1,4 +1,4 @@
-"""Figures of runs: `plot`."""
+"""The command `plot`, which draws figures of runs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,11 +15,12 @@ def plot(
         typer.Argument(help="Folders of finished runs, or trajectory files.", metavar="RUN..."),
     ],
     out: Annotated[
-        Path, typer.Option(help="Folder, or one file: PNG, SVG, PDF.", metavar="DIR|FILE")
+        Path,
+        typer.Option(help="Folder or one file to write: PNG, SVG, PDF.", metavar="DIR|FILE"),
     ],
     truth: Annotated[Path | None, typer.Option(help="True trajectory (TUM).")] = None,
 ) -> None:
-    """Draw trajectories, errors and residuals of several runs side by side."""
+    """Plot trajectories, errors and residuals of several runs."""
     from gsba.plot import draw, load
     from gsba.trajectory.files import read_trajectory
 

@@ -12,48 +12,57 @@ from gsba.log import GsbaError
 @command
 def extract(
     video: Annotated[Path, typer.Argument(help="Video: 2:1, .360, or raw of two fisheyes.")],
-    out: Annotated[Path, typer.Option(help="Folder of the frames.", metavar="FRAMES")],
-    fps: Annotated[float | None, typer.Option(help="Frames kept per second; 1 if unsaid.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder to write the frames to.", metavar="FRAMES")],
+    fps: Annotated[
+        float | None, typer.Option(help="Frames to keep per second; default: 1.")
+    ] = None,
     every: Annotated[
         str | None,
         typer.Option(
-            help="Keep one frame of so many; auto: sharp frames at steps that suit what they show, "
-            "by the video's own odometry.",
+            help="Keep one of N frames. auto: keep sharp frames with baselines that suit the "
+            "scene's depth, which odometry on the video estimates.",
             metavar="N|auto",
         ),
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(help="With --every auto: frames to keep at most.")
+        int | None, typer.Option(help="With --every auto: largest number of frames to keep.")
     ] = None,
     at: Annotated[
-        Path | None, typer.Option(help="Keep the frames at its times.", metavar="TRAJECTORY")
+        Path | None,
+        typer.Option(help="Keep the frames at the times of this file.", metavar="TRAJECTORY"),
     ] = None,
     sharpest: Annotated[
-        bool, typer.Option("--sharpest", help="Keep the sharpest of each stretch, not the first.")
+        bool,
+        typer.Option("--sharpest", help="Keep the sharpest frame of each interval, not the first."),
     ] = False,
     from_s: Annotated[float | None, typer.Option("--from", help="Seconds to start at.")] = None,
     to_s: Annotated[float | None, typer.Option("--to", help="Seconds to end at.")] = None,
-    width: Annotated[int | None, typer.Option(help="Pixels across a frame.")] = None,
+    width: Annotated[
+        int | None, typer.Option(help="Width of a frame in pixels; default: as the video.")
+    ] = None,
     keep_standing: Annotated[
-        bool, typer.Option("--keep-standing", help="Keep frames while the camera stands, too.")
+        bool, typer.Option("--keep-standing", help="Also keep frames while the camera stands.")
     ] = False,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Replace another extraction.")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Replace an earlier extraction.")] = False,
 ) -> None:
-    """Write frames of a video with their exact times; the same call again resumes."""
+    """Extract frames of a video with their exact times.
+
+    The same call again resumes.
+    """
     from gsba.config_file import validated
     from gsba.video import extract as write
 
     if sum(choice is not None for choice in (fps, every, at)) > 1:
-        raise GsbaError("--fps, --every and --at each say which frames to keep: pass one")
+        raise GsbaError("--fps, --every and --at exclude each other: pass one")
     if from_s is not None and to_s is not None and to_s <= from_s:
         raise GsbaError(f"--to {to_s:g} must be later than --from {from_s:g}")
     if frames is not None and every != "auto":
-        raise GsbaError("--frames limits what --every auto chooses: pass that too")
+        raise GsbaError("--frames needs --every auto: pass that, too")
     if every == "auto":
         every, at = None, _chosen_by_odometry(video, out, frames, fresh, (from_s, to_s))
-    asked = {"fps": fps, "every": every, "at": None if at is None else str(at)}
-    asked |= {"from_s": from_s, "to_s": to_s, "width": width}
-    chosen = {key: value for key, value in asked.items() if value is not None}
+    options = {"fps": fps, "every": every, "at": None if at is None else str(at)}
+    options |= {"from_s": from_s, "to_s": to_s, "width": width}
+    chosen = {key: value for key, value in options.items() if value is not None}
     chosen |= {"sharpest": sharpest} | ({"standing_deg": 0.0} if keep_standing else {})
     counts = write(video, out, validated({"video": chosen}).video, fresh)
     why = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
@@ -67,7 +76,7 @@ def _chosen_by_odometry(
     fresh: bool,
     part: tuple[float | None, float | None],
 ) -> Path:
-    """The file, beside the folder of frames, of the poses of frames that odometry chooses."""
+    """Trajectory file beside the folder of frames, with the poses of frames that odometry chose."""
     from gsba import odometry
     from gsba.config_file import validated
     from gsba.odometry.files import write_chosen
@@ -80,8 +89,8 @@ def _chosen_by_odometry(
     found = odometry.track_panoramas(panoramas)
     if not found.usable():
         raise GsbaError(
-            f"{video}: its odometry does not tell where the camera went ({found.summary()}): "
-            "choose frames by --fps or --every N"
+            f"{video}: its odometry has too few poses to choose frames by ({found.summary()}): "
+            "choose them by --fps or --every N"
         )
     write_chosen(found, odometry.choose_frames(found, settings), path)
     return path
@@ -92,22 +101,26 @@ def mask(
     frames: Annotated[
         Path, typer.Argument(help="Folder of 2:1 panoramas, tracks or raw fisheyes.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder of the masks.", metavar="DIR")],
+    out: Annotated[Path, typer.Option(help="Folder to write the masks to.", metavar="DIR")],
     masks: Annotated[
-        Path | None, typer.Option(help="Masks of your own, merged with what is found.")
+        Path | None, typer.Option(help="Masks of your own, merged with the carrier's.")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Of the lenses of raw fisheyes.", metavar="FILE")
+        Path | None,
+        typer.Option(help="Calibration of the lenses of raw fisheyes.", metavar="FILE"),
     ] = None,
 ) -> None:
-    """Find what carries the camera and write it as a mask to look at and to use."""
+    """Find the carrier of the camera and write its mask.
+
+    The carrier is whoever or whatever holds the camera and stays in the same place of every image.
+    """
     from gsba.frames.scan import scan
     from gsba.masks.carrier import find_carrier, write_carrier
 
     found_frames = scan(frames, masks=masks, order_suffices=True, calibration=calibration)
     carrier = find_carrier(found_frames)
     written = write_carrier(carrier, found_frames, out)
-    what = carrier.reason or f"the carrier is {100 * carrier.share:.1f}% of the picture"
+    result = carrier.reason or f"the carrier covers {100 * carrier.share:.1f}% of the image"
     if carrier.turns.any():
-        what += ", turning below it: a mask for each frame"
-    typer.echo(f"{what}: {written[0]}" + (f", {out / 'merged'}" if len(written) > 2 else ""))
+        result += " and rotates in it: each frame has its own mask"
+    typer.echo(f"{result}: {written[0]}" + (f", {out / 'merged'}" if len(written) > 2 else ""))

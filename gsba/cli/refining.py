@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from gsba.demo.two_lenses import TwoLenses
     from gsba.pipeline import RunResult
 
-PARTIAL = 3  # exit code of a run that is exported with less than nine tenths of its frames
+PARTIAL = 3  # exit code of a run whose exported map has less than nine tenths of its frames
 
 Config = Annotated[Path | None, typer.Option(help="TOML file of settings.", metavar="FILE")]
 Overrides = Annotated[
@@ -26,8 +26,8 @@ Overrides = Annotated[
 Factors = Annotated[
     str | None,
     typer.Option(
-        help="Families, commas between: bearing, reprojection, gps, photometric, splat, and those "
-        "that packages provide, as NAME or NAME:ARGUMENT; list names all that are installed."
+        help="Families of residuals, separated by commas: bearing, reprojection, gps, photometric, "
+        "splat, and those of packages, as NAME or NAME:ARGUMENT; list: name all that are installed."
     ),
 ]
 Weights = Annotated[
@@ -57,77 +57,85 @@ Frames = Annotated[
 Trajectories = Annotated[
     list[Path] | None,
     typer.Argument(
-        help="TUM, KITTI or stella_vslam map.msg; several are pieces of one run; without one "
-        "a video is followed by our own odometry, and stills start from pairs of images."
+        help="TUM, KITTI or stella_vslam map.msg; several files are pieces of one trajectory. "
+        "Default: odometry on a video; pairs of images of stills."
     ),
 ]
 Out = Annotated[
     Path | None,
     typer.Option(
-        help="Folder of the run; default: the name of the video, or FRAMES-run.", metavar="RUN"
+        help="Folder of the run; default: named after the video, or FRAMES-run.", metavar="RUN"
     ),
 ]
 NoTrajectory = Annotated[
     bool,
     typer.Option(
         "--no-trajectory",
-        help="Start from pairs of images; of a video, without its own odometry.",
+        help="Start from pairs of images, for a video without odometry, too.",
     ),
 ]
-Times = Annotated[Path | None, typer.Option(help="Times of the frames.", metavar="FILE")]
+Times = Annotated[
+    Path | None, typer.Option(help="File with the times of the frames.", metavar="FILE")
+]
 Fps = Annotated[
     float | None,
     typer.Option(
-        help="Frames per second, from time 0; of a video: frames kept per second, in place of "
-        "frames chosen by what they show."
+        help="Frame rate of a folder, from time 0. Of a video: frames to keep per second; default: "
+        "odometry chooses them."
     ),
 ]
 Keyframes = Annotated[
-    Path | None, typer.Option(help="Keyframe trajectory of the same run.", metavar="FILE")
+    Path | None,
+    typer.Option(help="Keyframe trajectory of the same SLAM run.", metavar="FILE"),
 ]
 Masks = Annotated[
     list[Path] | None,
     typer.Option(
-        help="One mask for all frames, or a folder; white = use. auto: find what carries the "
-        "camera (the default; carrier: or refuse); distractors: find what moves; none. Repeatable.",
+        help="One mask for all frames, or a folder of masks; white = use. auto (default): mask the "
+        "carrier of the camera where it is found; carrier: fail where it is not; distractors: mask "
+        "moving objects; none. Repeatable.",
         metavar="PATH",
     ),
 ]
 Camera = Annotated[
     str | None,
-    typer.Option(help="Its name, for what is said of it: insta360-x5, ...", metavar="NAME"),
+    typer.Option(
+        help="Camera model, e.g. insta360-x5: sets priors for lens distance and readout time.",
+        metavar="NAME",
+    ),
 ]
 Calibration = Annotated[
-    Path | None, typer.Option(help="Of the lenses of raw fisheyes.", metavar="FILE")
+    Path | None, typer.Option(help="Calibration of the lenses of raw fisheyes.", metavar="FILE")
 ]
 Circle = Annotated[
     list[str] | None,
     typer.Option(
-        help="Image circle of raw fisheyes where none is found: centre and radius, pixels of one "
-        "lens's picture. Repeatable: front, then back; one value is for both.",
+        help="Image circle of raw fisheyes where none is found: centre and radius in pixels of one "
+        "lens's image. Repeatable: front, then back; one value is for both.",
         metavar="X,Y,R",
     ),
 ]
 Imu = Annotated[
     Path | None,
     typer.Option(
-        help="Gyro and accelerometer that rode along: t, gyro x y z [rad/s], accelerometer x y z "
-        "[m/s^2]; or a maker's recording.",
+        help="Recording of a gyro and an accelerometer on the camera: t [s], gyro x y z [rad/s], "
+        "accelerometer x y z [m/s^2]; or a camera maker's file.",
         metavar="FILE",
     ),
 ]
 Gps = Annotated[
     str | None,
     typer.Option(
-        help="GPS positions as factors against drift: CSV, GPX, a video, or exif (of the frames).",
+        help="GPS positions that limit drift, as factors: CSV, GPX, a video, or exif (of the "
+        "frames).",
         metavar="FILE",
     ),
 ]
 Cluster = Annotated[
     str | None,
     typer.Option(
-        help="Dask scheduler whose workers do what can be shared out: tcp://HOST:PORT, its "
-        "FILE.json, local:N, slurm:N, ...",
+        help="Dask scheduler whose workers share the work of frames and pairs: tcp://HOST:PORT, "
+        "its FILE.json, local:N, slurm:N, ...",
         metavar="ADDRESS",
     ),
 ]
@@ -135,12 +143,15 @@ AllowPartial = Annotated[
     bool,
     typer.Option(
         "--allow-partial",
-        help="Exit with 0 also where less than nine tenths of the frames are in one map.",
+        help="Exit with 0 even if less than nine tenths of the frames are in one map.",
     ),
 ]
 Segment = Annotated[
     str | None,
-    typer.Option(help="Your own masks of faces: called with IMAGES MASKS.", metavar="COMMAND"),
+    typer.Option(
+        help="Command that makes masks of cube faces: called with two folders, IMAGES MASKS.",
+        metavar="COMMAND",
+    ),
 ]
 
 
@@ -172,12 +183,12 @@ def refine(
 ) -> None:
     """Refine the pose of every frame; the same call again resumes.
 
-    The exit code is 3 where less than nine tenths of the frames are in the map that is exported.
+    The exit code is 3 if less than nine tenths of the frames are in the exported map.
     """
     if trajectory and no_trajectory:
         raise GsbaError("a TRAJECTORY and --no-trajectory exclude each other: leave one out")
     if keyframes is not None and not trajectory:
-        raise GsbaError("--keyframes go with the TRAJECTORY of the same run")
+        raise GsbaError("--keyframes needs the TRAJECTORY of the same SLAM run: pass that, too")
     out = out or _run_folder(frames)
     overrides = [*_networks(weights, accept_noncommercial, download), *(overrides or ())]
     if camera is not None:
@@ -209,7 +220,7 @@ def _run_folder(frames: Path) -> Path:
 
 
 def _conclude(results: "Sequence[RunResult]", allow_partial: bool) -> None:
-    """Print what finished runs come down to; exit with PARTIAL where one of them is partial."""
+    """Print the outcome of finished runs; exit with PARTIAL if one of them is partial."""
     from gsba.report.maps import MIN_SHARE_IN_ONE_MAP, format_outcome
 
     for result in results:
@@ -217,8 +228,8 @@ def _conclude(results: "Sequence[RunResult]", allow_partial: bool) -> None:
     if allow_partial or not any(result.partial for result in results):
         return
     typer.echo(
-        f"less than {MIN_SHARE_IN_ONE_MAP:.0%} of the frames are in the map that was exported: "
-        f"exit code {PARTIAL}, or 0 with --allow-partial",
+        f"less than {MIN_SHARE_IN_ONE_MAP:.0%} of the frames are in the exported map: "
+        f"exit code {PARTIAL}; --allow-partial makes it 0",
         err=True,
     )
     raise typer.Exit(PARTIAL)
@@ -232,49 +243,54 @@ def demo(
     heading: Annotated[str, typer.Option(help="locked or forward.")] = "locked",
     out: Annotated[Path, typer.Option(help="Folder for the walk and its run.")] = Path("gsba-demo"),
     frames: Annotated[
-        int | None, typer.Option(help="Frames of the walk; 40 if unsaid, of a video 240.")
+        int | None, typer.Option(help="Frames of the walk; default: 40, of a video 240.")
     ] = None,
     width: Annotated[
-        int | None, typer.Option(help="Pixels across a panorama; 1024 if unsaid, of a video 720.")
+        int | None,
+        typer.Option(help="Width of a panorama in pixels; default: 1024, of a video 720."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the walk's wobble, noise and drift.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the walk's wobble, noise and drift.")] = 0,
     camera: Annotated[
-        str, typer.Option(help="ideal, or two-lens: as those on sale, rows read one after another.")
+        str,
+        typer.Option(help="ideal: one centre; two-lens: two lenses with a rolling shutter."),
     ] = "ideal",
     mesh: Annotated[
         Path | None,
-        typer.Option(help="Walk through this instead: OBJ, GLB or PLY with colours."),
+        typer.Option(help="Mesh to walk through in place of the gallery: OBJ, GLB or PLY."),
     ] = None,
     video: Annotated[
         bool,
         typer.Option(
             "--video",
-            help="Film the walk, and refine the video without any trajectory; eight frames a "
-            "second, fewer --frames end on the way.",
+            help="Render the walk as a video of eight frames a second and refine it without a "
+            "trajectory.",
         ),
     ] = False,
     allow_partial: AllowPartial = False,
 ) -> None:
-    """Render a walk with exact truth, spoil its trajectory as SLAM would, refine and compare."""
+    """Render a walk with exact truth, refine it and compare.
+
+    The trajectory to refine has the noise and drift of SLAM.
+    """
     if video:
         if mesh is not None:
-            raise GsbaError("--video films the gallery: leave out --mesh")
-        asked = {"num_frames": frames, "width": width}
-        asked = {name: value for name, value in asked.items() if value is not None}
+            raise GsbaError("--video renders the gallery, not a mesh: leave out --mesh")
+        options = {"num_frames": frames, "width": width}
+        options = {name: value for name, value in options.items() if value is not None}
         _demo_of_video(
-            out, allow_partial, path=path, heading=heading, seed=seed, camera=camera, **asked
+            out, allow_partial, path=path, heading=heading, seed=seed, camera=camera, **options
         )
     else:
         frames, width = 40 if frames is None else frames, 1024 if width is None else width
         _demo_of_frames(out, allow_partial, path, heading, frames, width, seed, camera, mesh)
 
 
-def _demo_of_video(out: Path, allow_partial: bool, **asked: Any) -> None:
-    """Film a walk, refine the video without a trajectory, and print the errors of both poses.
+def _demo_of_video(out: Path, allow_partial: bool, **options: Any) -> None:
+    """Film a walk, refine the video, and print the errors of odometry and of the refined poses.
 
     Args:
         out: folder for the walk and its run.
-        asked: arguments of `gsba.demo.make_film`.
+        options: arguments of `gsba.demo.make_film`.
     """
     from gsba.demo import make_film
     from gsba.evaluate.trajectory import evaluate as compare
@@ -283,7 +299,7 @@ def _demo_of_video(out: Path, allow_partial: bool, **asked: Any) -> None:
     from gsba.trajectory.files import read_trajectory
     from gsba.types import Trajectory
 
-    film, run = make_film(out / "walk", **asked), out / "run"
+    film, run = make_film(out / "walk", **options), out / "run"
     from gsba import pipeline
 
     result = pipeline.refine(film.video_path, None, run, fresh=True)
@@ -315,7 +331,7 @@ def _demo_of_frames(
     camera: str,
     mesh: Path | None,
 ) -> None:
-    """Render a walk, refine it from a spoiled trajectory, and print errors before and after."""
+    """Render a walk, refine it from a drifting trajectory, and print errors before and after."""
     from gsba.config import CameraSettings, RefineSettings
     from gsba.demo import make_mesh_walk, make_walk
     from gsba.evaluate.trajectory import evaluate as compare
@@ -324,7 +340,7 @@ def _demo_of_frames(
 
     if mesh is not None:
         if (heading, camera) != ("locked", "ideal"):
-            raise GsbaError("--mesh is walked by an ideal camera: leave out --heading and --camera")
+            raise GsbaError("--mesh needs an ideal camera: leave out --heading and --camera")
         given = None if path == "rectangle" else Path(path)
         walk = make_mesh_walk(out / "walk", mesh, given, frames, width, seed)
     else:
@@ -351,7 +367,7 @@ def _demo_of_frames(
     where = f"the run with its model in {run}"
     if walk.lenses is not None:
         typer.echo(_found_lenses(report["camera"], rows["two lenses"].scale, walk.lenses))
-        where += f", as seen from one centre in {central}"
+        where += f", the run with one centre in {central}"
     typer.echo(f"Frames, trajectories and truth in {out / 'walk'}, {where}.")
     _conclude(
         [result for result in results if len(result.maps) > 1 or result.partial], allow_partial
@@ -359,11 +375,12 @@ def _demo_of_frames(
 
 
 def _found_lenses(found: dict[str, Any], scale: float, lenses: "TwoLenses") -> str:
-    """One line on what a run found of its camera, beside what that is.
+    """Line with the estimated baseline and readout time, beside their true values.
 
     Args:
         found: `camera` of report.json.
-        scale: units of the truth, metres, per map unit.
+        scale: metres, the unit of the truth, per map unit.
+        lenses: the true camera.
     """
     if not found["taken"]:
         return f"Two lenses were not found: {found['reason']}."
@@ -371,7 +388,7 @@ def _found_lenses(found: dict[str, Any], scale: float, lenses: "TwoLenses") -> s
     line = f"Found: lenses {apart:.2f} mm apart (sigma {sigma:.2f}; true {1e3 * lenses.baseline:g})"
     readout = found["readout"]
     if not readout["taken"]:
-        return f"{line}, no rows read one after another: {readout['reason']}."
+        return f"{line}, no rolling shutter: {readout['reason']}."
     return (
         f"{line}, rows read in {readout['ms']:.2f} ms (sigma {readout['ms_sigma']:.2f}; "
         f"true {1e3 * lenses.readout_s:g})."
@@ -382,14 +399,14 @@ def _found_lenses(found: dict[str, Any], scale: float, lenses: "TwoLenses") -> s
 def show_config(
     config: Config = None, overrides: Overrides = None, factors: Factors = None
 ) -> None:
-    """Print all settings as TOML, with what is allowed."""
+    """Print all settings as TOML, with their allowed values."""
     from gsba.config_file import to_toml
 
     typer.echo(to_toml(_settings(config, overrides, factors)), nl=False)
 
 
 def _with_gps(factors: str | None) -> str:
-    """Families with that of GPS, which --gps asks for."""
+    """Families of residuals with that of GPS, which --gps adds."""
     families = factors or "bearing"
     named = [family.strip() for family in families.split(",")]
     return families if "gps" in named else f"{families},gps"
@@ -401,16 +418,17 @@ def _circle(text: str) -> tuple[float, float, float]:
         x, y, radius = (float(part) for part in text.split(","))
     except ValueError:
         raise GsbaError(
-            f"--circle {text}: give X,Y,R: a centre and a radius, three numbers with commas between"
+            f"--circle {text}: give a centre and a radius as three numbers X,Y,R"
         ) from None
     return x, y, radius
 
 
 def _networks(weights: list[Path] | None, accept_noncommercial: bool, download: bool) -> list[str]:
-    """Overrides for what the options on learned networks say.
+    """Overrides of settings from the options of learned networks.
 
-    A folder is for both the extractor and the matcher; a file goes before it, and is for the
-    matcher if its name says so (LightGlue, LighterGlue, SuperGlue), else for the extractor.
+    A folder is for both the extractor and the matcher. A file has precedence over a folder; it is
+    for the matcher if its name holds "glue" (LightGlue, LighterGlue, SuperGlue), else for the
+    extractor.
     """
     changes = []
     for path in sorted(weights or (), key=Path.is_file):

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Length = Annotated[
     str | None,
     typer.Option(
-        help="Metres between the two of --between; lens: by the distance between the lenses.",
+        help="Metres between the two ends of --between; lens: scale from the lens distance.",
         metavar="LENGTH",
     ),
 ]
@@ -41,9 +41,9 @@ Millimetres = Annotated[
 Images = Annotated[
     str,
     typer.Option(
-        help="cube: six faces of one centre; lenses: ten of one lens each, where two were found; "
-        "fisheye: raw ones as they are; panorama: two lenses stitched at the map's depth, else the "
-        "frames; auto: lenses of raw fisheyes, else cube.",
+        help="cube: six faces of one centre; lenses: ten faces of one lens each, where two lenses "
+        "were found; fisheye: the raw fisheyes; panorama: two lenses stitched at the map's depth, "
+        "else the frames; auto: lenses for raw fisheyes, else cube.",
         metavar="auto|cube|lenses|fisheye|panorama",
     ),
 ]
@@ -54,30 +54,38 @@ Between = Annotated[
 Gps = Annotated[
     str | None,
     typer.Option(
-        help="CSV, GPX, a GoPro video, or exif (of the frames): metres east, north, up.",
+        help="GPS positions: CSV, GPX, a GoPro video, or exif (of the frames); export in metres "
+        "east, north, up.",
         metavar="FILE",
     ),
 ]
 GpsSigma = Annotated[
     float | None,
-    typer.Option(help="With --gps: metres across that no fix is better than (3).", metavar="M"),
+    typer.Option(
+        help="With --gps: smallest horizontal sigma of a fix in metres; default: 3.", metavar="M"
+    ),
 ]
 AlignScan = Annotated[
     str | None,
-    typer.Option(help="PLY, PCD, LAS, LAZ, OBJ or GLB: its world and unit.", metavar="SCAN"),
+    typer.Option(
+        help="Scan to align with: PLY, PCD, LAS, LAZ, OBJ or GLB; export in its world and unit.",
+        metavar="SCAN",
+    ),
 ]
 MapNumber = Annotated[
     int,
     typer.Option(
         "--map",
-        help="Which map of a run, as its report numbers them; 1: the largest.",
+        help="Number of the map to export, as in the run's report; 1: the largest.",
         metavar="NUMBER",
     ),
 ]
 Pairs = Annotated[
     str | None,
     typer.Option(
-        help="With --align-scan: lines of a frame or x,y,z, and X,Y,Z of the scan.", metavar="FILE"
+        help="With --align-scan: point pairs, one a line: a frame or x,y,z of the run, and X,Y,Z "
+        "of the scan.",
+        metavar="FILE",
     ),
 ]
 
@@ -93,28 +101,31 @@ def export(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder to write; by default RUN/FORMAT, RUN/FORMAT-map2 of map 2."),
+        typer.Option(help="Folder to write; default: RUN/FORMAT, of map 2 RUN/FORMAT-map2."),
     ] = None,
-    face_size: Annotated[int | None, typer.Option(help="Pixels of a cube face.")] = None,
+    face_size: Annotated[int | None, typer.Option(help="Width of a cube face in pixels.")] = None,
     images: Images = "auto",
-    up: Annotated[str, typer.Option(help="auto: turn the world upright; none: leave it.")] = "none",
+    up: Annotated[
+        str, typer.Option(help="auto: rotate the world upright; none: keep its rotation.")
+    ] = "none",
     scale: Length = None,
     baseline: Millimetres = None,
     between: Between = None,
     gps: Gps = None,
     gps_sigma: GpsSigma = None,
     align: Annotated[
-        str | None, typer.Option(help="True poses: their world and unit.", metavar="TRUTH.tum")
+        str | None,
+        typer.Option(help="True poses: export in their world and unit.", metavar="TRUTH.tum"),
     ] = None,
     align_scan: AlignScan = None,
     pairs: Pairs = None,
     link: Annotated[
-        bool, typer.Option("--link", help="Hard links to unchanged frames, not copies.")
+        bool, typer.Option("--link", help="Make hard links to unchanged frames, not copies.")
     ] = False,
     map_number: MapNumber = 1,
     cluster: Cluster = None,
 ) -> None:
-    """Write a finished run as a dataset for another program, placed where you want it."""
+    """Write a finished run as a dataset for another program."""
     from gsba.config_file import validated
     from gsba.export import ExportFormat
     from gsba.export import export as write
@@ -122,10 +133,10 @@ def export(
 
     if to not in list(ExportFormat):
         raise GsbaError(f"--to {to} is not known: use one of {', '.join(ExportFormat)}")
-    asked = {"up": up, "length": _length(scale), "between": between, "gps": gps, "align": align}
-    asked |= {"scan": align_scan, "pairs": pairs}
+    world = {"up": up, "length": _length(scale), "between": between, "gps": gps, "align": align}
+    world |= {"scan": align_scan, "pairs": pairs}
     dataset = {"face_size": face_size, "images": images, "formats": [to]}
-    settings = validated({"placement": asked, "export": dataset}).placement
+    settings = validated({"placement": world, "export": dataset}).placement
     from gsba.placement.placement import place
     from gsba.store.cluster import connected, hired
     from gsba.store.finished import load_run
@@ -133,9 +144,9 @@ def export(
     reconstruction, frames, *_ = load_run(run, map_number)
     lenses = _lenses(run, reconstruction, frames, images, map_number)
     folder = out or run / (to if map_number == 1 else f"{to}-map{map_number}")
-    said = _baseline(run, baseline) if scale == "lens" else None
+    known_baseline = _baseline(run, baseline) if scale == "lens" else None
     noise = _gps_noise(run, gps_sigma) if gps is not None else None
-    placed = place(reconstruction, frames, settings, said, noise)
+    placed = place(reconstruction, frames, settings, known_baseline, noise)
     placement = replace(placed, map_number=map_number)
     given = reconstruction, frames, folder, ExportFormat(to), face_size, placement, link, lenses
     with connected(cluster) as client, hired(client, folder, frames) as workers:
@@ -148,7 +159,7 @@ def export(
 def _lenses(
     run: Path, reconstruction: "Reconstruction", frames: "FrameSet", images: str, map_number: int
 ) -> "Lenses":
-    """What images are cut as seen from: one centre, or the lenses that the run found."""
+    """Lenses that exported images are rendered from: one centre, or the run's two lenses."""
     from gsba.camera.lens import ONE_CENTRE
     from gsba.export import of_one_lens
 
@@ -158,12 +169,12 @@ def _lenses(
 
     lenses = load_lenses(run, reconstruction, map_number)
     if not lenses and images not in ("auto", "panorama"):
-        raise GsbaError(f"{run}: no two lenses were found: export it without --images {images}")
+        raise GsbaError(f"{run}: the run has one centre: export it without --images {images}")
     return lenses
 
 
 def _baseline(run: Path, millimetres: float | None) -> tuple[float, float] | None:
-    """Metres between the lenses and their standard deviation: as given, or as the run was told."""
+    """Baseline of the lenses and its standard deviation, metres: `millimetres`, or the run's."""
     from gsba.config_file import load_config, validated
 
     if millimetres is None:
@@ -172,7 +183,7 @@ def _baseline(run: Path, millimetres: float | None) -> tuple[float, float] | Non
 
 
 def _gps_noise(run: Path, sigma: float | None) -> "GpsSettings":
-    """How well GPS knows positions: as given, with as much more up, or as the run was told."""
+    """GPS noise of the run's settings; `sigma` (metres) scales its horizontal and vertical part."""
     from gsba.config_file import load_config, validated
 
     known = load_config(run / "config.toml").gps.model_copy(update={"file": None})
@@ -185,7 +196,7 @@ def _gps_noise(run: Path, sigma: float | None) -> "GpsSettings":
 
 
 def _length(text: str | None) -> float | str | None:
-    """A length as it is given; what is no number is left to the settings to refuse."""
+    """Length as a number where it is one; settings refuse other texts."""
     try:
         return None if text is None else float(text)
     except ValueError:
@@ -193,21 +204,28 @@ def _length(text: str | None) -> float | str | None:
 
 
 ScanFile = Annotated[
-    Path | None, typer.Option(help="A scan of the place: how far the run's points are off it.")
+    Path | None,
+    typer.Option(help="Scan of the place, to measure the run's points against.", metavar="FILE"),
 ]
 ScanPairs = Annotated[
     Path | None,
-    typer.Option(help="With --scan: points picked in both, to look there.", metavar="FILE"),
+    typer.Option(help="With --scan: point pairs that start the alignment.", metavar="FILE"),
 ]
 ScanGps = Annotated[
-    str | None, typer.Option(help="With --scan: positions, or exif, to look there.", metavar="FILE")
+    str | None,
+    typer.Option(
+        help="With --scan: GPS positions, or exif, that start the alignment.", metavar="FILE"
+    ),
 ]
 ScanUp = Annotated[
-    str | None, typer.Option(help="With --scan: auto = it is upright.", metavar="auto")
+    str | None, typer.Option(help="With --scan: auto = the scan is upright.", metavar="auto")
 ]
 Depth = Annotated[
     Path | None,
-    typer.Option(help="True depth maps: also say how far pixels are moved.", metavar="DIR"),
+    typer.Option(
+        help="True depth maps: also measure by how many pixels pose errors move points.",
+        metavar="DIR",
+    ),
 ]
 
 
@@ -217,18 +235,22 @@ def evaluate(
     truth: Annotated[Path | None, typer.Option(help="True trajectory (TUM).")] = None,
     depth: Depth = None,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the numbers here too.", metavar="FILE")
+        Path | None,
+        typer.Option("--json", help="File to write the numbers to as well.", metavar="FILE"),
     ] = None,
     scan: ScanFile = None,
     pairs: ScanPairs = None,
     gps: ScanGps = None,
     up: ScanUp = None,
     splat: Annotated[
-        bool, typer.Option("--splat", help="Train splats on poses, and measure held-out frames.")
+        bool,
+        typer.Option("--splat", help="Train splats on the poses and measure held-out frames."),
     ] = False,
     against: Annotated[
         list[Path] | None,
-        typer.Option(help="With --splat: other poses; repeatable.", metavar="FILE"),
+        typer.Option(
+            help="With --splat: trajectory to compare the run's with; repeatable.", metavar="FILE"
+        ),
     ] = None,
     iterations: Iterations = None,
     face_size: FaceSize = None,
@@ -236,7 +258,10 @@ def evaluate(
     backend: BackendName = "auto",
     lpips: LpipsWeights = None,
 ) -> None:
-    """Compare a run or a trajectory with the truth, or what its poses are worth to a splat."""
+    """Compare a run or a trajectory with true poses or a scan.
+
+    With --splat it compares poses by the splats that are trained on them.
+    """
     if splat:
         settings = splat_settings(iterations, face_size, backend, max_gaussians)
         evaluate_splat(estimate, against or [], settings, lpips or [])
@@ -244,7 +269,7 @@ def evaluate(
     if scan is not None:
         _against_scan(estimate, scan, known, json_file if truth is None else None)
     elif known:
-        raise GsbaError("--pairs, --gps and --up tell where to look in a scan: give --scan FILE")
+        raise GsbaError("--pairs, --gps and --up start the alignment to a scan: give --scan FILE")
     if truth is None:
         if not splat and scan is None:
             raise GsbaError("nothing to compare with: give --truth FILE, --scan FILE, or --splat")
@@ -253,7 +278,7 @@ def evaluate(
 
 
 def _against_truth(estimate: Path, truth: Path, depth: Path | None, json_file: Path | None) -> None:
-    """Compare a run or a trajectory with a true one: a table, and how far pixels are moved."""
+    """Compare a run or a trajectory with a true one: pose errors and induced pixel errors."""
     from gsba.disk import write_text
     from gsba.evaluate.pixels import depth_maps, induced_errors
     from gsba.evaluate.trajectory import evaluate as compare
@@ -281,7 +306,7 @@ def _against_truth(estimate: Path, truth: Path, depth: Path | None, json_file: P
     typer.echo(format_table({estimate.name: errors}))
     if induced is not None:
         typer.echo(
-            f"induced error, in pixels of a panorama four times as wide as the depth maps: median "
+            "induced error, in pixels of a panorama four times as wide as the depth maps: median "
             f"{induced.median_px:.4f}, 95th percentile {induced.percentile95_px:.4f}"
         )
     if judged:
@@ -289,10 +314,15 @@ def _against_truth(estimate: Path, truth: Path, depth: Path | None, json_file: P
 
 
 def _against_scan(run: Path, path: Path, known: dict[str, str], json_file: Path | None) -> None:
-    """Measure a run on a scan: a table, RUN/scan.json, and its cloud in colours of distance.
+    """Measure the distances of a run's points to a scan.
+
+    Prints a table and writes RUN/scan.json and RUN/scan.ply, a cloud coloured by distance.
 
     Args:
-        known: settings of its placement, that tell where to look.
+        run: folder of the run.
+        path: file of the scan.
+        known: placement settings that start the alignment.
+        json_file: another file for the numbers.
     """
     from gsba.config_file import validated
     from gsba.disk import write_json
@@ -310,7 +340,9 @@ def _against_scan(run: Path, path: Path, known: dict[str, str], json_file: Path 
     before = run / "coarse.tum"
     coarse = read_trajectory(before).world_T_rigs if before.exists() else None
     if coarse is not None and len(coarse) != len(frames):
-        raise GsbaError(f"{before}: is of other frames: refine again")
+        raise GsbaError(
+            f"{before} has {len(coarse)} poses, the run {len(frames)} frames: refine again"
+        )
     surfaces = read_scan(path)
     guess, _ = guess_in_scan(reconstruction, frames, settings, surfaces)
     with in_file(path):
@@ -328,7 +360,7 @@ def _against_scan(run: Path, path: Path, known: dict[str, str], json_file: Path 
 
 
 def _consistency(run: Path, truth: "Trajectory") -> "tuple[Consistency | None, str]":
-    """How the covariances of a run compare with its errors, and that or why not in words."""
+    """Consistency of a run's covariances with its errors, and a text; None where unknown."""
     from gsba.evaluate.consistency import consistency_of, format_consistency
     from gsba.store.finished import load_run
 
@@ -336,5 +368,5 @@ def _consistency(run: Path, truth: "Trajectory") -> "tuple[Consistency | None, s
         reconstruction, frames = load_run(run)
         found = consistency_of(reconstruction, frames.timestamps, truth)
     except GsbaError as error:
-        return None, f"covariances cannot be judged: {error}"
+        return None, f"covariances cannot be checked: {error}"
     return found, "\ncovariances\n" + format_consistency(found, frames.names.__getitem__)

@@ -13,15 +13,16 @@ if TYPE_CHECKING:
     from gsba.config import SplatSettings
 
 Run = Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")]
-Iterations = Annotated[int | None, typer.Option(help="Views shown, one at a time.")]
-FaceSize = Annotated[int | None, typer.Option(help="Pixels of a cube face.")]
+Iterations = Annotated[int | None, typer.Option(help="Training steps of one view each.")]
+FaceSize = Annotated[int | None, typer.Option(help="Width of a cube face in pixels.")]
 LpipsWeights = Annotated[
     list[Path] | None, typer.Option("--lpips", help="Weights of LPIPS; repeatable.", metavar="FILE")
 ]
 MaxGaussians = Annotated[
-    int | None, typer.Option(help="At most; by default as pixels and memory allow.", metavar="N")
+    int | None,
+    typer.Option(help="Most Gaussians; default: set by pixels and memory.", metavar="N"),
 ]
-BackendName = Annotated[str, typer.Option(help="auto, gsplat or cpu.")]
+BackendName = Annotated[str, typer.Option(help="Renderer: auto, gsplat or cpu.")]
 
 
 @command
@@ -33,7 +34,10 @@ def train(
     backend: BackendName = "auto",
     lpips: LpipsWeights = None,
 ) -> None:
-    """Train a splat on a run's refined poses; the same call again resumes."""
+    """Train a splat on a run's refined poses.
+
+    The same call again resumes.
+    """
     settings = splat_settings(iterations, face_size, backend, max_gaussians)
     results = _compare(run, {}, settings, run / "splat", lpips or [])
     mean = results["refined"].mean
@@ -48,12 +52,16 @@ def render(
     splat: Annotated[Path, typer.Argument(help="point_cloud.ply.", metavar="SPLAT")],
     run: Run,
     frame: Annotated[str, typer.Option(help="Frame of the run, by name.", metavar="NAME")],
-    out: Annotated[Path | None, typer.Option(help="Folder; RUN/renderings by default.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write; default: RUN/renderings.")
+    ] = None,
     face_size: FaceSize = None,
     backend: BackendName = "auto",
 ) -> None:
-    """Render a splat at the refined pose of a frame: its faces, as `train` has them, and a panorama
-    of one centre."""
+    """Render a splat at the refined pose of a frame.
+
+    It writes the faces that `train` compares with, and a panorama of one centre.
+    """
     import numpy as np
 
     from gsba.camera.optics import Optics
@@ -67,7 +75,7 @@ def render(
     settings = splat_settings(None, face_size, backend)
     reconstruction, frames = load_run(run)
     if frame not in frames.names:
-        raise GsbaError(f"no frame {frame!r} in {run}: its first is {frames.names[0]!r}")
+        raise GsbaError(f"{run} has no frame {frame!r}: its first is {frames.names[0]!r}")
     gaussians, renderer = read_ply(splat), choose_backend(settings.backend)
     near = scene.near_of(reconstruction.world_T_rigs, settings)
     optics = Optics.of(load_lenses(run, reconstruction), reconstruction)
@@ -86,7 +94,7 @@ def render(
 def evaluate_splat(
     run: Path, against: Sequence[Path], settings: "SplatSettings", lpips: Sequence[Path]
 ) -> None:
-    """Train and measure a splat on the run's poses and on others."""
+    """Train splats on the run's poses and on others, and compare their held-out frames."""
     from gsba.evaluate.splats import format_table
     from gsba.trajectory.files import read_trajectory
 
@@ -101,13 +109,13 @@ def evaluate_splat(
         others[name] = read_trajectory(path)
     results = _compare(run, others, settings, out, lpips)
     typer.echo(format_table(results))
-    typer.echo(f"Splats, pictures, curves and numbers in {out}.")
+    typer.echo(f"Splats, images, curves and numbers are in {out}.")
 
 
 def _compare(
     run: Path, others, settings: "SplatSettings", out: Path, lpips_weights: Sequence[Path]
 ):
-    """Results of the run's own poses and of others."""
+    """Results of splats on the run's poses ("refined") and on others, by name."""
     from gsba.camera.optics import Optics
     from gsba.evaluate.splats import compare, poses_for
     from gsba.splat.backend import choose_backend
@@ -129,7 +137,7 @@ def _compare(
 def splat_settings(
     iterations: int | None, face_size: int | None, backend: str, max_gaussians: int | None = None
 ) -> "SplatSettings":
-    """Settings with what the command line asks for.
+    """Settings with the options of the command line.
 
     Raises:
         GsbaError: a value out of range.
@@ -138,10 +146,10 @@ def splat_settings(
 
     from gsba.config import SplatSettings
 
-    asked = {"iterations": iterations, "face_size": face_size, "backend": backend}
-    asked["max_gaussians"] = max_gaussians
+    options = {"iterations": iterations, "face_size": face_size, "backend": backend}
+    options["max_gaussians"] = max_gaussians
     try:
-        return SplatSettings.model_validate({k: v for k, v in asked.items() if v is not None})
+        return SplatSettings.model_validate({k: v for k, v in options.items() if v is not None})
     except ValidationError as error:
         first = error.errors()[0]
         option = str(first["loc"][0]).replace("_", "-")

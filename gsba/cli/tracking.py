@@ -29,7 +29,8 @@ Poses = Annotated[
     ),
 ]
 Width = Annotated[
-    int | None, typer.Option(help="Pixels across the panoramas that are followed; 800 if unsaid.")
+    int | None,
+    typer.Option(help="Width in pixels of the panoramas that odometry uses; default: 800."),
 ]
 
 
@@ -47,20 +48,19 @@ def track(
     report: Report = None,
     masks: Annotated[
         str,
-        typer.Option(help="auto: find what carries the camera; none; or a mask, white = use."),
+        typer.Option(help="auto: mask the carrier of the camera; none; or a mask, white = use."),
     ] = "auto",
     width: Width = None,
-    fps: Annotated[
-        float | None, typer.Option(help="Frames per second of a folder without times.")
-    ] = None,
+    fps: Annotated[float | None, typer.Option(help="Frame rate of a folder without times.")] = None,
     timestamps: Annotated[
-        Path | None, typer.Option(help="Times of a folder's frames.", metavar="FILE")
+        Path | None, typer.Option(help="File with the times of a folder's frames.", metavar="FILE")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Of the lenses of raw fisheyes.", metavar="FILE")
+        Path | None,
+        typer.Option(help="Calibration of the lenses of raw fisheyes.", metavar="FILE"),
     ] = None,
 ) -> None:
-    """Follow the camera through a video without any other program: a pose for every frame."""
+    """Estimate a pose for every frame by visual odometry."""
     from gsba import odometry
     from gsba.config_file import validated
     from gsba.odometry.files import write_odometry
@@ -72,7 +72,9 @@ def track(
     mask = None if masks in ("auto", "none") else Path(masks)
     if is_video(frames):
         if fps is not None or timestamps is not None:
-            raise GsbaError("a video has times of its own: leave --fps and --timestamps out")
+            raise GsbaError(
+                "a video holds the times of its frames: leave out --fps and --timestamps"
+            )
         panoramas = odometry.of_video(frames, width, calibration)
     else:
         from gsba.frames.scan import scan

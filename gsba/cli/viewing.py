@@ -1,4 +1,4 @@
-"""Looking at finished runs: `view`."""
+"""The command `view`, which shows finished runs in the browser."""
 
 import time
 from pathlib import Path
@@ -12,9 +12,12 @@ from gsba.cli.app import command
 @command
 def view(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
-    port: Annotated[int, typer.Option(help="Of 127.0.0.1; 0: any that is free.")] = 8080,
+    port: Annotated[int, typer.Option(help="Port of 127.0.0.1; 0: any free one.")] = 8080,
 ) -> None:
-    """Walk around in a run, in the browser: cloud, rigs, pictures, trajectories, splats."""
+    """Show a run in the browser.
+
+    The scene holds the point cloud, rigs, images, trajectories and splats.
+    """
     from gsba.view import load_scene, serve
 
     shown = serve(load_scene(run), port)

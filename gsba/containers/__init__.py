@@ -1,7 +1,7 @@
-"""What cameras append to their files, beside pictures: lenses, gyro, exposures, positions.
+"""Metadata that cameras append to their files: lenses, gyro, exposures, positions.
 
-Takes a file as a camera wrote it.
-Gives what its maker's records hold, in seconds, radians and metres, and notes on what is damaged.
+Takes an original file of a camera.
+Gives the records of its maker, in seconds, radians and metres, and notes on damaged ones.
 """
 
 from gsba.containers.insta360 import Insta360Trailer, read_trailer

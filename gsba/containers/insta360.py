@@ -1,14 +1,14 @@
-"""The trailer that Insta360 cameras append to their videos (`.insv`) and pictures (`.insp`).
+"""Trailer that Insta360 cameras append to their videos (`.insv`) and images (`.insp`).
 
 It is read from the end of the file: 32 bytes of signature, before them the size of the trailer and
-its version (u32 each), before these 32 bytes of no known meaning. Records lie before that header,
+its version (u32 each), before these 32 bytes of unknown meaning. Records lie before that header,
 each followed by its format (u8), its number (u8) and its size (u32); some cameras leave gaps
 between records and list them in a directory, record 0. All numbers are little-endian.
 
 Layout, fields and units follow public descriptions: OpenSpeleo/insta360-rs, docs/INSV_FORMAT.md;
 AdrianEddy/telemetry-parser, src/insta360; and Insta360's description of its SDK, which gives rates
-in rad/s and accelerations in g. Tested on one real file, of a ONE R: rates of the stated range turn
-gravity as the accelerometer does, in the same right-handed axes.
+in rad/s and accelerations in g. They were tested on one real file, of a ONE R: rates of the stated
+range rotate gravity as the accelerometer measures it, in the same right-handed axes.
 """
 
 import os
@@ -37,12 +37,12 @@ _DIRECTORY, _METADATA, _GYRO, _EXPOSURES, _GPS, _BACK_EXPOSURES = 0, 1, 3, 4, 7,
 _SERIAL, _MODEL, _FIRMWARE, _CREATED = 1, 2, 3, 7  # fields of the metadata
 _SIZE, _FIRST_FRAME, _READOUT_MS, _WINDOW, _GYRO_DELAY_MS = 19, 24, 25, 27, 28
 _RAW_GYRO, _GYRO_RANGES, _TRACK_ORDER = 62, 65, 80
-_LENSES = 111, 54, 53, 5, 112, 56, 55, 17  # best first: present ones, then those of the factory
+_LENSES = 111, 54, 53, 5, 112, 56, 55, 17  # best first: current ones, then factory ones
 _BACK_TRACK_FIRST = 1  # value of _TRACK_ORDER
 
 _RAW = np.dtype([("time", "<i8"), ("values", "<u2", 6)])  # microseconds; 32768 is zero
 _SCALED = np.dtype([("time", "<i8"), ("values", "<f8", 6)])  # milliseconds; g, rad/s
-_SHUTTER = np.dtype([("time", "<i8"), ("duration", "<f8")])  # seconds; time as of the gyro
+_SHUTTER = np.dtype([("time", "<i8"), ("duration", "<f8")])  # ticks of the gyro's clock; seconds
 _FIX = np.dtype(
     [
         *(("seconds", "<i8"), ("milliseconds", "<u2"), ("state", "S1")),
@@ -50,24 +50,24 @@ _FIX = np.dtype(
         *(("speed", "<f8"), ("course", "<f8"), ("altitude", "<f8")),
     ]
 )
-_RAW_ZERO, _RAW_FULL = 32768, 32768  # of a raw value; what stands for the end of the range
+_RAW_ZERO, _RAW_FULL = 32768, 32768  # raw value of zero; difference of the end of the range
 _RANGE_DEG_S = 2000.0  # of gyros whose range is not stated
-_RANGES_G = 8, 16, 32  # of accelerometers, one of which shows about 1 g where none is stated
+_RANGES_G = 8, 16, 32  # of accelerometers; if not stated, the one that gives about 1 g is taken
 _STANDARD_GRAVITY = 9.80665
 _MAX_RATE = 70.0  # rad/s: twice what gyros of 2000 deg/s measure
 _MIN_RATE_HZ, _MAX_RATE_HZ = 10.0, 20_000.0  # of gyro readings
-_MIN_USABLE = 0.5  # share of a record's rows without which the record is damaged
+_MIN_USABLE_SHARE = 0.5  # of a record's rows; a record with fewer is damaged
 _MAX_TICK = 1 << 53  # of the camera's clock: exact as float64
-_MAX_SPAN = 4.0  # of readings, by how long they would last without a pause
+_MAX_SPAN_RATIO = 4.0  # of the readings' time span to their number times the median step
 _MAX_EXPOSURE_S = 100.0
 _YEAR_2100 = 4_102_444_800  # s since 1970: a larger creation time is in milliseconds
 
 
 @dataclass(frozen=True, slots=True)
 class GyroRecord:
-    """Readings of a gyro and an accelerometer in the axes of their chip, as the camera wrote them.
+    """Uncorrected readings of a gyro and an accelerometer in the axes of their chip.
 
-    The bias is not taken out, and how the chip lies in the camera is not known.
+    They contain the bias, and the chip's orientation in the camera is unknown.
     """
 
     times: np.ndarray  # (N,) float64, s on the clock of `Insta360Trailer`, strictly increasing
@@ -76,13 +76,13 @@ class GyroRecord:
 
     @property
     def rate_hz(self) -> float:
-        """Readings per second, by the median step; NaN where there is one reading."""
+        """Readings per second, by the median step; NaN for a single reading."""
         return 1 / float(np.median(np.diff(self.times))) if len(self.times) > 1 else float("nan")
 
 
 @dataclass(frozen=True, slots=True)
 class ExposureRecord:
-    """How long the rows of frames were exposed; of one lens. The sensor's gain is not recorded."""
+    """Exposure times of one lens's frames; the sensor's gain is not recorded."""
 
     times: np.ndarray  # (N,) float64, s on the clock of `Insta360Trailer`
     durations: np.ndarray  # (N,) float64, s
@@ -95,51 +95,51 @@ class GpsRecord:
     unix_times: np.ndarray  # (N,) float64, s since 1970, UTC
     latitudes: np.ndarray  # (N,) float64, degrees, north positive
     longitudes: np.ndarray  # (N,) float64, degrees, east positive
-    altitudes: np.ndarray  # (N,) float64, m; above which surface the file does not state
+    altitudes: np.ndarray  # (N,) float64, m; the file does not state their reference surface
     speeds: np.ndarray  # (N,) float64, m/s
     courses: np.ndarray  # (N,) float64, degrees from north, clockwise
 
 
 @dataclass(frozen=True, slots=True)
 class SensorWindow:
-    """Part of one lens's sensor that is recorded, scaled to the size of the pictures."""
+    """Recorded part of one lens's sensor, which is scaled to the size of the images."""
 
     source: tuple[int, int]  # width and height of the sensor, pixels of the sensor
     size: tuple[int, int]  # width and height of the part, pixels of the sensor
-    shift: tuple[int, int]  # from the middle of the sensor to that of the part, pixels right, down
+    shift: tuple[int, int]  # from the sensor's middle to the part's middle, pixels right, down
 
 
 @dataclass(frozen=True, slots=True)
 class Insta360Trailer:
-    """What an Insta360 camera appended to a file.
+    """Metadata and sensor records that an Insta360 camera appended to a file.
 
-    Times are seconds since the first frame where `has_frame_clock`, else since the first reading.
+    Times are seconds since the first frame if `has_frame_clock`, else since the first reading.
     """
 
     version: int  # of the trailer's layout
-    serial: str  # "" = not stated; so are the following two
-    model: str  # e.g. "Insta360 X4"
-    firmware: str
+    serial: str  # "" = not stated
+    model: str  # e.g. "Insta360 X4"; "" = not stated
+    firmware: str  # "" = not stated
     lens_strings: tuple[str, ...]  # calibrations by the maker, best first; see gsba.camera
     window: SensorWindow | None  # None = not stated
-    picture_size: tuple[int, int] | None  # width and height of one lens's picture, pixels
-    back_track_first: bool  # whether the first of two video tracks is the back lens's
+    picture_size: tuple[int, int] | None  # width and height of one lens's image, pixels
+    back_track_first: bool  # True = the first of two video tracks is the back lens's
     first_frame_s: float | None  # time of the first frame on the camera's clock, s; None = unknown
     created_unix_s: float | None  # s since 1970; None = not stated
     readout_s: float | None  # from the first row of a frame to its last; None = not stated
-    gyro: GyroRecord | None  # None = none, or not asked for; so are the following three
-    exposures: ExposureRecord | None  # of the front lens
-    back_exposures: ExposureRecord | None  # of the back lens
-    gps: GpsRecord | None
-    notes: tuple[str, ...]  # what is damaged or left out, one line each
+    gyro: GyroRecord | None  # None = none, or not read
+    exposures: ExposureRecord | None  # of the front lens; None = none, or not read
+    back_exposures: ExposureRecord | None  # of the back lens; None = none, or not read
+    gps: GpsRecord | None  # None = none, or not read
+    notes: tuple[str, ...]  # damaged and left-out parts, one line each
 
     @property
     def has_frame_clock(self) -> bool:
-        """Whether times count from the first frame."""
+        """True if times count from the first frame."""
         return self.first_frame_s is not None
 
     def summary(self) -> list[str]:
-        """Lines for people: camera, gyro, exposures, positions, calibration, and notes."""
+        """Lines of text on camera, gyro, exposures, positions, calibration, and notes."""
         lines = [f"camera: {self.model or 'Insta360'}, firmware {self.firmware or 'not stated'}"]
         if self.gyro is None:
             lines.append("gyro: none")
@@ -164,16 +164,16 @@ class Insta360Trailer:
 
 
 def read_trailer(path: Path, telemetry: bool = True) -> Insta360Trailer | None:
-    """What an Insta360 camera appended to a file; None = the file has no such trailer.
+    """Trailer of an Insta360 camera's file; None = the file has none.
 
-    Only the trailer is read. What is damaged is left out, with a note.
+    Only the trailer is read. Damaged parts are left out, with a note.
 
     Args:
-        path: video or picture.
-        telemetry: whether gyro, exposures and GPS are read; the metadata is small and always is.
+        path: video or image.
+        telemetry: also read gyro, exposures and GPS; the metadata is always read.
 
     Raises:
-        GsbaError: the file cannot be read, or nothing of its trailer can.
+        GsbaError: the file cannot be read, or no record of its trailer can.
     """
     try:
         with path.open("rb") as file:
@@ -184,7 +184,7 @@ def read_trailer(path: Path, telemetry: bool = True) -> Insta360Trailer | None:
 
 @dataclass(slots=True)
 class _Contents:
-    """Records of a trailer as they are found; grows while they are read."""
+    """Records of a trailer that were read so far, and notes on damaged ones."""
 
     records: dict[int, bytes] = field(default_factory=dict)  # number -> content
     notes: list[str] = field(default_factory=list)
@@ -198,7 +198,9 @@ def _read(path: Path, file: BinaryIO, telemetry: bool) -> Insta360Trailer | None
     if signature != _SIGNATURE:
         return None
     if version != _VERSION:
-        raise GsbaError(f"{path}: its Insta360 trailer is of version {version}; 3 is read")
+        raise GsbaError(
+            f"{path}: its Insta360 trailer has version {version}; only version {_VERSION} is known"
+        )
     contents, start = _Contents(), length - size
     if not _HEADER.size <= size <= length:
         start = 0
@@ -214,25 +216,25 @@ def _read(path: Path, file: BinaryIO, telemetry: bool) -> Insta360Trailer | None
 
 
 def _bytes_at(file: BinaryIO, start: int, count: int) -> bytes:
-    """Exactly so many bytes of a file, from a place in it."""
+    """Exactly `count` bytes of a file from offset `start`."""
     file.seek(start)
     found = file.read(count)
     if len(found) != count:
-        raise OSError(0, "it became shorter while it was read")
+        raise OSError(0, "the file became shorter while it was read")
     return found
 
 
 def _find_records(
     file: BinaryIO, start: int, end: int, wanted: set[int], contents: _Contents
 ) -> None:
-    """Read records that are wanted: backwards from the end, or where a directory says they are.
+    """Read wanted records backwards from the end, or at the offsets of a directory.
 
     Args:
-        file: at least `end` bytes long.
-        start: of the trailer in the file.
-        end: of its last record.
+        file: file of at least `end` bytes.
+        start: offset of the trailer in the file.
+        end: offset of the end of its last record.
         wanted: numbers of records.
-        contents: is filled.
+        contents: receives the records and notes.
     """
     at = end
     for _ in range(_MAX_RECORDS):
@@ -246,7 +248,7 @@ def _find_records(
             break
         is_directory = (form, number) == (_BINARY, _DIRECTORY) and size and not size % _ENTRY.size
         if is_directory and _read_listed(file, start, first, size, wanted, contents):
-            return  # gaps between records are usual then, so that others are not looked for
+            return  # such files have gaps between records, which cannot be read backwards
         if number in wanted:
             _add(file, first, size, number, contents)
         at = first
@@ -256,7 +258,7 @@ def _find_records(
 def _read_listed(
     file: BinaryIO, start: int, at: int, size: int, wanted: set[int], contents: _Contents
 ) -> bool:
-    """Read records that a directory of `size` bytes at `at` lists; whether all lie as it says."""
+    """Read records that a directory of `size` bytes at offset `at` lists; True if all are valid."""
     before = len(contents.notes)
     listed = _bytes_at(file, at, min(size, _MAX_RECORDS * _ENTRY.size))
     for number, form, count, offset in _ENTRY.iter_unpack(listed):
@@ -274,7 +276,7 @@ def _read_listed(
 
 
 def _add(file: BinaryIO, start: int, size: int, number: int, contents: _Contents) -> None:
-    """Read a record, unless one of its number was read."""
+    """Read a record, unless one with this number was read before."""
     if number in contents.records or not size:
         return
     if size > (_MAX_METADATA_BYTES if number == _METADATA else _MAX_RECORD_BYTES):
@@ -284,7 +286,7 @@ def _add(file: BinaryIO, start: int, size: int, number: int, contents: _Contents
 
 
 def _trailer(version: int, contents: _Contents) -> Insta360Trailer:
-    """What records say."""
+    """Trailer from its records."""
     records, notes = contents.records, contents.notes
     values, whole = read_message(records.get(_METADATA, b""))
     if not whole:
@@ -329,7 +331,7 @@ class _Ticks:
     """Readings of a gyro, on the camera's clock."""
 
     ticks: np.ndarray  # (N,) int64, strictly increasing
-    milliseconds: bool  # whether ticks are milliseconds, else microseconds
+    milliseconds: bool  # True = ticks are milliseconds, else microseconds
     rates: np.ndarray  # (N, 3) float64, rad/s
     accelerations: np.ndarray  # (N, 3) float64, m/s^2
 
@@ -337,7 +339,8 @@ class _Ticks:
 def _gyro(
     record: bytes, raw: bool | None, values: Mapping[int, Any], notes: list[str]
 ) -> _Ticks | None:
-    """Readings of a record, in the layout that the metadata states, or else in the other one."""
+    """Readings of a record, in the layout that the metadata states, or in the other one if that
+    fails."""
     if not record:
         return None
     ranges = read_message(values.get(_GYRO_RANGES, b""))[0]
@@ -352,7 +355,7 @@ def _gyro(
         later = np.maximum.accumulate(np.where(fine, ticks, -1))
         fine[1:] &= ticks[1:] > later[:-1]
         kept, step_s = int(fine.sum()), 1e-6 if is_raw else 1e-3
-        if kept < max(2, _MIN_USABLE * len(rows)):
+        if kept < max(2, _MIN_USABLE_SHARE * len(rows)):
             continue
         rate_hz = 1 / (float(np.median(np.diff(ticks[fine]))) * step_s)
         if not _MIN_RATE_HZ <= rate_hz <= _MAX_RATE_HZ:
@@ -361,21 +364,22 @@ def _gyro(
             notes.append(f"gyro: {len(rows) - kept:,} of {len(rows):,} readings are damaged")
         forces = forces[fine] * _force_unit(forces[fine], is_raw)
         return _Ticks(ticks[fine], not is_raw, turns[fine].astype(np.float64), forces)
-    notes.append(f"gyro: {len(record):,} bytes of no known layout")
+    notes.append(f"gyro: {len(record):,} bytes of an unknown layout")
     return None
 
 
 def _near_others(ticks: np.ndarray) -> np.ndarray:
-    """Whether times (N,) int64 lie as near to the middle one as so many steps reach; (N,) bool."""
+    """Plausible times (N,) bool: within a multiple of the readings' total duration of their
+    median; times (N,) int64."""
     sound = (ticks >= 0) & (ticks < _MAX_TICK)
     if sound.sum() < 2:
         return sound
     step = float(np.median(abs(np.diff(ticks[sound]))))
-    return sound & (abs(ticks - np.median(ticks[sound])) <= _MAX_SPAN * len(ticks) * step)
+    return sound & (abs(ticks - np.median(ticks[sound])) <= _MAX_SPAN_RATIO * len(ticks) * step)
 
 
 def _row(is_raw: bool) -> int:
-    """Bytes of a reading."""
+    """Size of a reading in bytes."""
     return (_RAW if is_raw else _SCALED).itemsize
 
 
@@ -384,8 +388,8 @@ def _from_raw(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Accelerations (N, 3) in g and rates (N, 3) in rad/s of raw values.
 
-    Zero is 32768, and 32768 more is the end of the range, which the metadata states: 32 g are 1024
-    a g, 2000 deg/s are 16.384 for each.
+    A raw value of 32768 is zero, and 32768 more is the end of the range in the metadata: 1024 a g
+    for 32 g, 16.384 a deg/s for 2000 deg/s.
     """
     stated_g, stated_deg_s = (
         float(found) if isinstance(found := ranges.get(key), int) and 0 < found < 1e5 else None
@@ -402,7 +406,7 @@ def _from_raw(
 
 
 def _force_unit(forces: np.ndarray, is_raw: bool) -> float:
-    """m/s^2 for each unit of accelerations (N, 3): they are in g, unless they are far longer."""
+    """Unit of accelerations (N, 3) in m/s^2: g, unless they are far longer than 1."""
     length = float(np.median(np.linalg.norm(forces, axis=1)))
     return 1.0 if length > np.sqrt(_STANDARD_GRAVITY) and not is_raw else _STANDARD_GRAVITY
 
@@ -410,7 +414,7 @@ def _force_unit(forces: np.ndarray, is_raw: bool) -> float:
 def _exposures(
     record: bytes, start: Any, tick_s: float, lens: str, notes: list[str]
 ) -> ExposureRecord | None:
-    """Exposures of a record, on the clock that begins at `start` ticks; None = there are none."""
+    """Exposures of a record, with times since `start` ticks; None = there are none."""
     rows = np.frombuffer(record, _SHUTTER, len(record) // _SHUTTER.itemsize)
     with np.errstate(invalid="ignore"):
         fine = (rows["duration"] > 0) & (rows["duration"] < _MAX_EXPOSURE_S)
@@ -427,7 +431,7 @@ def _exposures(
 
 
 def _gps(record: bytes, notes: list[str]) -> GpsRecord | None:
-    """Fixes that are marked as valid and lie somewhere; None = there are none."""
+    """Fixes that are marked as valid and are not at 0, 0; None = there are none."""
     rows = np.frombuffer(record, _FIX, len(record) // _FIX.itemsize)
     rows = rows[rows["state"] == b"A"]
     latitudes, longitudes = abs(rows["latitude"]), abs(rows["longitude"])
@@ -451,14 +455,14 @@ def _gps(record: bytes, notes: list[str]) -> GpsRecord | None:
 
 
 def _text(values: Mapping[int, Any], key: int, most: int = 200) -> str:
-    """A field of text without what no terminal should show; "" = none."""
+    """Printable text of a field, at most `most` characters; "" = none."""
     found = values.get(key)
     text = found.decode("utf-8", "replace") if isinstance(found, bytes) else ""
     return "".join(filter(str.isprintable, text[:most])).strip()
 
 
 def _real(values: Mapping[int, Any], key: int) -> float | None:
-    """A field of a finite floating-point number."""
+    """Finite floating-point number of a field; None = none."""
     found = values.get(key)
     return found if isinstance(found, float) and np.isfinite(found) else None
 
@@ -469,7 +473,7 @@ def _flag(values: Mapping[int, Any], key: int) -> bool | None:
 
 
 def _size(values: Mapping[int, Any], key: int, across: int, down: int) -> tuple[int, int] | None:
-    """Width and height from two fields of a nested message."""
+    """Width and height from two fields of a nested message; None = not stated."""
     inner = read_message(values.get(key, b""))[0]
     width, height = inner.get(across), inner.get(down)
     if not isinstance(width, int) or not isinstance(height, int):
@@ -489,7 +493,7 @@ def _window(values: Mapping[int, Any]) -> SensorWindow | None:
 
 
 def _creation_time(values: Mapping[int, Any]) -> float | None:
-    """Seconds since 1970, of a field that holds seconds or milliseconds."""
+    """Creation time in seconds since 1970, of a field in seconds or milliseconds; None = none."""
     found = values.get(_CREATED)
     if not isinstance(found, int) or found <= 0 or found > 1000 * _YEAR_2100:
         return None

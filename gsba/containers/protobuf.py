@@ -9,13 +9,13 @@ from typing import Any
 
 
 def read_message(data: object) -> tuple[dict[int, Any], bool]:
-    """Fields of a protobuf message, the last of each number, and whether all could be read.
+    """Fields of a protobuf message, the last of each number; and True if all could be read.
 
     Args:
-        data: bytes; anything else is an empty message.
+        data: bytes; other types count as an empty message.
 
     Returns:
-        value by number: int of a varint, float of 8 or 4 bytes, bytes of everything else.
+        number -> value: int of a varint, float of 8 or 4 bytes, bytes of other fields.
     """
     values: dict[int, Any] = {}
     try:
@@ -27,10 +27,10 @@ def read_message(data: object) -> tuple[dict[int, Any], bool]:
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, Any]]:
-    """Number and value of each field.
+    """Yield number and value of each field.
 
     Raises:
-        IndexError, ValueError, struct.error: data that end early or are none.
+        IndexError, ValueError, struct.error: the data end early or are no message.
     """
     at = 0
     while at < len(data):
@@ -53,7 +53,7 @@ def _fields(data: bytes) -> Iterator[tuple[int, Any]]:
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
-    """A number of 7 bits a byte, two's complement of 64 bits, and the place behind it."""
+    """Integer of 7 bits a byte, two's complement of 64 bits, and the offset after it."""
     value = 0
     for shift in range(0, 70, 7):
         byte, at = data[at], at + 1

@@ -1,4 +1,4 @@
-"""Recordings whose telemetry `telemetry_parser` reads (extra `imu`): those of GoPro and others."""
+"""Telemetry of GoPro's and other makers' recordings, read by `telemetry_parser` (extra `imu`)."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -6,28 +6,28 @@ from typing import Any, Literal
 from gsba.log import GsbaError
 
 _EXTRA = "gsba[imu]"
-_PANIC = "PanicException"  # of libraries in Rust: no Exception, and nowhere to import it from
+_PANIC = "PanicException"  # of libraries in Rust: not an Exception, and cannot be imported
 
 
 def ask_telemetry_parser(
     path: Path, method: Literal["normalized_imu", "telemetry"], what: str, instead: str
 ) -> list[Any]:
-    """What a method of the library's parser gives of a recording.
+    """Result of a method of the library's parser for a recording.
 
     Args:
-        path: of the recording.
-        method: of `telemetry_parser.Parser`.
-        what: is asked for, for messages: "gyro".
-        instead: what a user can give in its place, for messages.
+        path: file of the recording.
+        method: method of `telemetry_parser.Parser`.
+        what: name of the data for messages, e.g. "gyro".
+        instead: alternative input for messages.
 
     Raises:
-        GsbaError: the library is not installed, or finds nothing.
+        GsbaError: the library is not installed, or finds no such data.
     """
     try:
         from telemetry_parser import Parser  # type: ignore[import-not-found]
     except ImportError:
         raise GsbaError(
-            f"{path}: its {what} is read by telemetry-parser: pip install '{_EXTRA}', or give "
+            f"{path}: reading its {what} needs telemetry-parser: pip install '{_EXTRA}', or give "
             f"{instead}"
         ) from None
     try:

@@ -1,7 +1,7 @@
-"""A synthetic walk with exact truth, and the SLAM-like trajectory made from it.
+"""Synthetic walks with exact truth and a SLAM-like trajectory.
 
 Takes a path, a heading and a seed.
-Gives frames or a video, the truth and a spoiled trajectory.
+Gives frames or a video, the truth and a trajectory with drift and noise.
 """
 
 from gsba.demo.degrade import degrade

@@ -1,4 +1,4 @@
-"""SLAM-like errors for an exact trajectory."""
+"""SLAM-like errors added to an exact trajectory."""
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 from gsba.geometry import inverse, pose
 from gsba.types import Trajectory
 
-SMOOTHING = 1.5  # frames, standard deviation: drift is smooth, jitter is apart
-MAX_GAP = 3  # frames lost in a row
+SMOOTHING = 1.5  # frames, standard deviation of the filter that smooths drift
+MAX_GAP = 3  # most successive frames that are lost
 
 
 def degrade(
@@ -23,24 +23,24 @@ def degrade(
     num_jumps: int = 0,
     num_lost: int = 0,
 ) -> Trajectory:
-    """A monocular SLAM trajectory of the same motion: drifting, its loop left open.
+    """Trajectory like that of monocular SLAM on the same motion: with drift, no loop closure.
 
-    Rotation, position and scale err by smooth random walks along the path; poses are expressed in
-    the world of the first one, which becomes the identity.
+    Errors of rotation, position and scale are smooth random walks along the path. The first pose
+    is the identity.
 
     Args:
         truth: N exact poses.
-        seed: of all draws.
+        seed: seed of all random numbers.
         scale: SLAM units per unit of `truth`.
         rotation_drift_deg: largest angle of the rotation's random walk.
-        translation_drift: largest offset by the position's own random walk, of the path length
-            (rotation and scale drift bend the path besides).
+        translation_drift: largest offset by the position's random walk, part of the path length;
+            rotation and scale drift bend the path further.
         scale_drift: largest relative change of scale.
-        jitter: standard deviation of each pose on its own, per axis: of the mean step length in
-            position, radians in rotation.
-        num_jumps: sudden displacements of all later poses, as by a bad relocalisation, each half
-            a step and half a degree.
-        num_lost: poses missing, in gaps of up to MAX_GAP, never the first or last.
+        jitter: standard deviation of each pose's independent error, per axis: part of the mean step
+            length in position, radians in rotation.
+        num_jumps: number of sudden displacements of all later poses, like wrong relocalisations,
+            of half a step and half a degree each.
+        num_lost: number of missing poses, in gaps of up to MAX_GAP, never the first or last.
 
     Returns:
         Trajectory of N - num_lost poses.
@@ -72,7 +72,7 @@ def degrade(
 def _random_walk(
     rng: np.random.Generator, lengths: np.ndarray, dimensions: int, largest: float
 ) -> np.ndarray:
-    """Smooth random walk (N, dimensions) over N - 1 path steps, from 0, of `largest` excursion."""
+    """Smooth random walk (N, dimensions) over N - 1 path steps, from 0, up to norm `largest`."""
     increments = np.sqrt(lengths)[:, None] * rng.standard_normal((len(lengths), dimensions))
     walk = np.concatenate([np.zeros((1, dimensions)), np.cumsum(increments, axis=0)])
     walk = gaussian_filter1d(walk, SMOOTHING, axis=0, mode="nearest")
@@ -86,7 +86,7 @@ def _unit(rng: np.random.Generator) -> np.ndarray:
 
 
 def _kept(rng: np.random.Generator, count: int, num_lost: int) -> np.ndarray:
-    """Mask (count,) of the poses kept; the first and last always are."""
+    """Mask (count,) bool of the kept poses, the first and last one among them."""
     kept = np.ones(count, dtype=bool)
     num_lost = min(num_lost, count - 3)
     while (left := num_lost - np.count_nonzero(~kept)) > 0:

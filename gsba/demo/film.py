@@ -27,7 +27,7 @@ from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory
 
 FPS = 8  # frames per second
-WHOLE_WALK = 240  # frames of a whole path: steps of about 0.11 units, in a room of 14 by 10
+WHOLE_WALK = 240  # frames of a whole path: steps of about 0.11 units in a room of 14 by 10 units
 _CODECS = (("libx264", {"crf": "14", "preset": "veryfast", "threads": "1"}), ("mpeg4", {"q": "2"}))
 
 logger = logging.getLogger(__name__)
@@ -35,11 +35,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class DemoFilm:
-    """Where a filmed walk lies on disk."""
+    """Files of a filmed walk."""
 
     video_path: Path  # MP4, 2:1 panoramas
     truth_path: Path  # TUM, exact poses of its frames, world of the gallery
-    lenses: TwoLenses | None  # the camera's; None = one centre, one instant
+    lenses: TwoLenses | None  # true camera; None = one centre and a global shutter
 
 
 def make_film(
@@ -51,17 +51,18 @@ def make_film(
     seed: int = 0,
     camera: Camera = "ideal",
 ) -> DemoFilm:
-    """Film a walk into `out`/walk.mp4, replacing a walk that is there.
+    """Film a walk into `out`/walk.mp4; an earlier walk in `out` is replaced.
 
     Args:
-        num_frames: at least 3; fewer than WHOLE_WALK end on the way, as the steps stay short.
-        path, heading, width, seed, camera: as of `gsba.demo.make_walk`.
+        out: folder to write.
+        num_frames: at least 3; with fewer than WHOLE_WALK the walk covers a part of the path.
+        path, heading, width, seed, camera: see `gsba.demo.make_walk`.
 
     Returns:
-        The video's file and that of its truth, times from 0 in steps of 1 / FPS seconds.
+        The files of the video and of its truth, with times from 0 in steps of 1 / FPS seconds.
 
     Raises:
-        GsbaError: an argument is out of range, `out` holds something else, or PyAV is missing.
+        GsbaError: an argument is out of range, `out` is not a walk's folder, or PyAV is missing.
     """
     from gsba.demo.gallery import build_gallery
 
@@ -89,7 +90,7 @@ def _pyav() -> Any:
 
 
 def _encode(av: Any, path: Path, pictures: Iterator[np.ndarray], width: int) -> None:
-    """Write pictures (width / 2, width, 3) uint8 BGR as a video: H.264 where PyAV has it."""
+    """Write images (width / 2, width, 3) uint8 BGR as a video, H.264 if PyAV can encode it."""
     codec, options = next(c for c in _CODECS if c[0] in av.codecs_available)
     with disk_errors(path), av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=Fraction(FPS), options=options)

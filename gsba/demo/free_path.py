@@ -1,4 +1,4 @@
-"""A round to walk in a space that nobody has described: free of surfaces, above a floor."""
+"""Closed path through the free space of an unknown scene, above its floor."""
 
 from collections.abc import Callable
 
@@ -7,12 +7,12 @@ from scipy.ndimage import gaussian_filter1d, label
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-_CELLS = 90  # of a level's longer side
-_LEVELS = 24  # heights that are tried
-_EYE = (0.25, 0.75)  # of the height from floor to ceiling, where eyes may be
-_MIN_CELLS = 60  # of a level that can be walked
-_STOPS = 6  # that a round passes
-_ROUND = 3.0  # cells, standard deviation of the smoothing that rounds corners
+_NUM_CELLS = 90  # along a level's longer side
+_NUM_LEVELS = 24  # heights that are tried
+_EYE_RANGE = (0.25, 0.75)  # of the camera's height, part of the height from floor to ceiling
+_MIN_CELLS = 60  # of a level with a path
+_NUM_STOPS = 6  # that the path visits
+_SMOOTHING_CELLS = 3.0  # standard deviation of the filter that rounds corners
 _DOWN = np.array([0.0, 1.0, 0.0])
 
 
@@ -23,27 +23,27 @@ def free_path(
     seen: Callable[[np.ndarray, np.ndarray], np.ndarray],
     num: int,
 ) -> tuple[np.ndarray | None, float]:
-    """Positions evenly along a closed way at one height, away from surfaces.
+    """Positions spaced evenly along a closed path at one height, away from surfaces.
 
-    Of all heights, the one with the largest connected room is taken: free, with a floor below that
-    most of the room shares. The way visits stops far from each other, by the shortest ways through
-    what is most open.
+    The height with the largest connected free room is taken, whose floor must be level in most of
+    the room. The path visits stops far from each other, by shortest paths weighted by clearance.
 
     Args:
         low, high: (3,) corners of the space; x right, y down, z forward.
-        clearance: distances (N,) of points (N, 3) to the next surface.
-        seen: distances (N,) from points (N, 3) along a direction (3,) to a surface; inf = none.
-        num: positions.
+        clearance: function from points (N, 3) to distances (N,) to the nearest surface.
+        seen: function from points (N, 3) and a direction (3,) to distances (N,) to the first
+            surface in that direction; inf = none.
+        num: number of positions.
 
     Returns:
-        (num, 3) positions, None where there is no room; and the median clearance.
+        (num, 3) positions, None if there is no free room; and the median clearance.
     """
-    edge = float(np.max((high - low)[[0, 2]])) / _CELLS
+    edge = float(np.max((high - low)[[0, 2]])) / _NUM_CELLS
     x = np.arange(low[0] + edge / 2, high[0], edge)
     z = np.arange(low[2] + edge / 2, high[2], edge)
     best, room = 0, None
     where = at = np.zeros((0, 0, 3))
-    for y in np.linspace(low[1], high[1], _LEVELS + 2)[1:-1]:
+    for y in np.linspace(low[1], high[1], _NUM_LEVELS + 2)[1:-1]:
         grid = np.stack(np.meshgrid(x, np.array([y]), z, indexing="ij"), axis=-1).reshape(-1, 3)
         free = clearance(grid)
         open_ = _walkable(free, seen(grid, _DOWN), seen(grid, -_DOWN), edge)
@@ -59,7 +59,7 @@ def free_path(
         return None, 0.0
     way = _round(room, at)
     points = where[way[:, 0], way[:, 1]]
-    points = gaussian_filter1d(points, _ROUND, axis=0, mode="wrap")
+    points = gaussian_filter1d(points, _SMOOTHING_CELLS, axis=0, mode="wrap")
     points = np.concatenate([points, points[:1]])
     length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
     stops = np.linspace(0, length[-1], num, endpoint=False)
@@ -68,23 +68,25 @@ def free_path(
 
 
 def _walkable(free: np.ndarray, below: np.ndarray, above: np.ndarray, edge: float) -> np.ndarray:
-    """Where (N,) eyes may be: clear of surfaces, above the floor that most of the place has."""
+    """Positions (N,) bool that a camera may take: clear of surfaces, above the prevailing floor."""
     part = np.where(np.isfinite(above), below / np.maximum(below + above, 1e-12), 0.5)
-    walkable = (free > 2.5 * edge) & np.isfinite(below) & (part > _EYE[0]) & (part < _EYE[1])
+    walkable = (
+        (free > 2.5 * edge) & np.isfinite(below) & (part > _EYE_RANGE[0]) & (part < _EYE_RANGE[1])
+    )
     if not walkable.any():
         return walkable
     return walkable & (np.abs(below - np.median(below[walkable])) < 2 * edge)
 
 
 def _rooms(walkable: np.ndarray) -> np.ndarray:
-    """Numbers (X, Z) of connected parts, 0 = none."""
+    """Number (X, Z) of the connected room of each cell, 0 = none."""
     found = label(walkable)
     assert isinstance(found, tuple)
     return found[0]
 
 
 def _round(room: np.ndarray, clearance: np.ndarray) -> np.ndarray:
-    """Cells (N, 2) of a closed way through a room (X, Z) bool, by stops far from each other."""
+    """Cells (N, 2) of a closed path through a room (X, Z) bool, by stops far from each other."""
     cells = np.argwhere(room)
     number = np.full(room.shape, -1)
     number[room] = np.arange(len(cells))
@@ -104,7 +106,7 @@ def _round(room: np.ndarray, clearance: np.ndarray) -> np.ndarray:
     ).tocsr()
     start = int(np.argmax(clearance[room]))
     stops = [int(np.argmax(dijkstra(graph, directed=False, indices=start)))]
-    for _ in range(_STOPS - 1):
+    for _ in range(_NUM_STOPS - 1):
         apart = dijkstra(graph, directed=False, indices=stops, min_only=True)
         stops.append(int(np.argmax(apart)))
     middle = cells.mean(axis=0)

@@ -16,7 +16,7 @@ SOUTH, NORTH, WEST, EAST = (0, 0, -1), (0, 0, 1), (-1, 0, 0), (1, 0, 0)
 
 
 def build_gallery(seed: int = 0) -> Scene:
-    """The gallery, floor at y = 0, centred on the y axis; other seeds change every texture."""
+    """Gallery with its floor at y = 0, centred on the y axis; the seed changes every texture."""
     rng = np.random.default_rng(seed)
     mesh = MeshBuilder(seed)
     _shell(mesh, rng)
@@ -31,7 +31,7 @@ def _texels(units: float) -> int:
 
 
 def _shell(mesh: MeshBuilder, rng: np.random.Generator) -> None:
-    """Floor, ceiling with beams and lamps, outer walls, two screens, columns."""
+    """Add floor, ceiling with beams and lamps, outer walls, two screens, columns."""
     wide, deep, tall = _texels(2 * HALF_X), _texels(2 * HALF_Z), _texels(HEIGHT)
     x, z = (-HALF_X, HALF_X), (-HALF_Z, HALF_Z)
     floor = mesh.texture(textures.terrazzo(rng, deep, wide), TEXELS)
@@ -70,7 +70,7 @@ def _shell(mesh: MeshBuilder, rng: np.random.Generator) -> None:
 
 
 def _inner_block(mesh: MeshBuilder, rng: np.random.Generator) -> None:
-    """Two masses with a passage between them, a lintel above it."""
+    """Add two blocks with a passage between them and a lintel above it."""
     tall = _texels(HEIGHT)
     bricks = mesh.texture(textures.brick(rng, tall, _texels(2 * BLOCK_X)), TEXELS)
     paint = mesh.texture(textures.plaster(rng, tall, 600, (176, 182, 172)), TEXELS)
@@ -81,7 +81,7 @@ def _inner_block(mesh: MeshBuilder, rng: np.random.Generator) -> None:
 
 
 def _hang_pictures(mesh: MeshBuilder, rng: np.random.Generator) -> None:
-    """Pictures of random sizes side by side along every wall, 3 cm thick."""
+    """Add pictures of random sizes along every wall, 3 cm thick."""
     dark = mesh.texture(np.full((8, 8, 3), 40, np.uint8))
     half_x, half_z = HALF_X - 0.5, HALF_Z - 0.5
     walls = (  # facing, distance of the wall along -facing, stretch of the wall to fill
@@ -124,7 +124,7 @@ def _hang_pictures(mesh: MeshBuilder, rng: np.random.Generator) -> None:
 
 
 def _furnish(mesh: MeshBuilder, rng: np.random.Generator) -> None:
-    """Benches, plinths with stones, a bookcase, crates and two rugs."""
+    """Add benches, plinths with stones, a bookcase, crates and two rugs."""
     oak = mesh.texture(textures.wood(rng, 200, 400, (152, 104, 62)), 140.0)
     walnut = mesh.texture(textures.wood(rng, 200, 400, (92, 62, 44)), 140.0)
     for x, z in (

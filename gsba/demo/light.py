@@ -5,11 +5,11 @@ import numpy as np
 from gsba.demo.raycast import Scene, coordinates, in_bands, kernel, nearest
 from gsba.demo.sampling import light_at
 
-OFFSET = 0.06  # units in front of a surface where its light is gathered
+OFFSET = 0.06  # units, of the points that gather light from their surface
 AMBIENT = 0.15  # light that reaches every surface
 NUM_BOUNCES = 2
 NUM_BOUNCE_RAYS = 48  # per light sample
-NUM_LAMP_POINTS = 3  # per axis of a glowing face, for its soft shadows
+NUM_LAMP_POINTS = 3  # per axis of an emitting face, for soft shadows
 
 
 def bake(scene: Scene) -> np.ndarray:
@@ -34,7 +34,7 @@ def bake(scene: Scene) -> np.ndarray:
 
 
 def _samples(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals (M, 3) of all light samples, a little inside their faces."""
+    """Points and normals (M, 3) of all light samples, slightly inside their faces."""
     points, normals = [], []
     for q, (_, columns, rows) in enumerate(scene.light_grids):
         a, b = np.meshgrid(np.linspace(0, 1, columns), np.linspace(0, 1, rows))
@@ -47,7 +47,7 @@ def _samples(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lamps(scene: Scene) -> np.ndarray:
-    """Points (P, 7) on the glowing faces: position, normal, radiance times area."""
+    """Points (P, 7) on the emitting faces: position, normal, radiance times area."""
     lamps = [np.empty((0, 7))]
     grid = (np.arange(NUM_LAMP_POINTS) + 0.5) / NUM_LAMP_POINTS
     a, b = np.meshgrid(grid, grid)

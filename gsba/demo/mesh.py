@@ -1,4 +1,4 @@
-"""Meshes of textured faces, made ready for the ray caster. World: x right, y down, z forward."""
+"""Builder of meshes of textured faces for the ray caster. World: x right, y down, z forward."""
 
 from collections.abc import Sequence
 
@@ -31,7 +31,8 @@ class MeshBuilder:
         """Add an image (H, W, 3) uint8 RGB; returns its handle.
 
         Args:
-            texels_per_unit: faces show a window of this resolution, at a random place where the
+            image: the texture.
+            texels_per_unit: faces show a window of this resolution, at a random position if the
                 texture is larger than the face; 0 stretches the whole image over each face.
         """
         self._images.append(image)
@@ -69,10 +70,14 @@ class MeshBuilder:
         texture: int,
         emission: float = 0.0,
     ) -> None:
-        """Add an upright rectangle around `center` whose front looks along the horizontal `facing`.
+        """Add an upright rectangle around `center` whose front faces along the horizontal `facing`.
 
         Args:
+            center: (3,) middle of the rectangle.
+            facing: (3,) horizontal direction.
             size: width and height in units.
+            texture: handle of its texture.
+            emission: radiance that it emits.
         """
         right = np.cross(DOWN, -np.asarray(facing, dtype=np.float64))
         edge_a, edge_b = size[0] * right / np.linalg.norm(right), size[1] * DOWN
@@ -129,7 +134,7 @@ class MeshBuilder:
             self.face(p, r - p, q - p, texture, triangle=True)
 
     def build(self) -> Scene:
-        """Sort the faces into a hierarchy, filter the textures, bake the light."""
+        """Build the scene: hierarchy of the faces, filtered textures, baked light."""
         corners, edges = np.array(self._corners), np.array(self._edges)
         order, nodes = _hierarchy(corners, edges)
         corners, edges = corners[order], edges[order]
@@ -209,7 +214,7 @@ def _hierarchy(corners: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, dict
 
 
 def _split(faces: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two parts of a set of boxes with the least sum of surface area times number."""
+    """Split a set of boxes into two with the smallest sum of surface area times number."""
 
     def costs(ranked: np.ndarray) -> np.ndarray:
         size = np.maximum.accumulate(high[ranked]) - np.minimum.accumulate(low[ranked])

@@ -1,4 +1,4 @@
-"""A walk through a mesh of the user's own, rendered by open3d's ray caster.
+"""Walk through a user's mesh, rendered by open3d's ray caster.
 
 The truth is in the mesh's world: y up for OBJ and glTF, z up for PLY.
 """
@@ -22,9 +22,9 @@ from gsba.types import Trajectory
 
 logger = logging.getLogger(__name__)
 
-_FINER = 2  # rays across a pixel, each way
-_REMAPPED = 8192  # pixels across what is looked up at once
-_SKY = np.array([150.0, 170, 200])  # where nothing is hit
+_RAYS_PER_PIXEL = 2  # along either axis
+_LOOKUP_WIDTH = 8192  # pixels of the images that OpenCV samples textures for
+_SKY_RGB = np.array([150.0, 170, 200])  # colour of rays that hit nothing
 _LEVEL = {  # rotation (3, 3) from x right, y down, z forward to a world with an axis up
     "y": np.diag([1.0, -1, -1]),
     "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
@@ -32,16 +32,16 @@ _LEVEL = {  # rotation (3, 3) from x right, y down, z forward to a world with an
 
 
 class MeshScene:
-    """A mesh ready for rays, in its own world."""
+    """Mesh for ray casting, in its own world."""
 
     def __init__(self, path: Path) -> None:
         """Read a mesh with colours.
 
         Raises:
-            GsbaError: it cannot be read, or has neither texture nor colours.
+            GsbaError: the mesh cannot be read, or has neither textures nor colours.
         """
         if path.suffix.lower() not in (".ply", *MESHES):
-            raise GsbaError(f"{path}: is no mesh: give one of .ply, {', '.join(MESHES)}")
+            raise GsbaError(f"{path} is no mesh: give a file of .ply, {', '.join(MESHES)}")
         if not path.is_file():
             raise GsbaError(f"{path}: no such file")
         mesh = read_mesh(path)
@@ -53,14 +53,15 @@ class MeshScene:
         self.colors = 255 * np.asarray(mesh.vertex_colors)
         if not textured and not len(self.colors):
             raise GsbaError(
-                f"{path}: has neither a texture nor vertex colours: there is nothing to match"
+                f"{path} has neither a texture nor vertex colours, so that frames of it cannot be "
+                "matched: export it with colours"
             )
         if not textured:
             self.textures = []
         if len(self.materials) != len(self.triangles) or len(self.textures) == 1:
             self.materials = np.zeros(len(self.triangles), np.int64)
         if self.textures and self.materials.max() >= len(self.textures):
-            raise GsbaError(f"{path}: has materials without a texture; bake them into one")
+            raise GsbaError(f"{path} has materials without a texture: bake them into one")
         o3d = open3d()
         vertices = np.asarray(mesh.vertices, np.float64)
         self.low, self.high = vertices.min(axis=0), vertices.max(axis=0)
@@ -72,30 +73,30 @@ class MeshScene:
         self._tensor = o3d.core.Tensor
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> dict[str, np.ndarray]:
-        """What rays (N, 3) meet: t_hit (N,), primitive_ids (N,), primitive_uvs (N, 2)."""
+        """First hits of rays (N, 3): t_hit (N,), primitive_ids (N,), primitive_uvs (N, 2)."""
         rays = np.concatenate([origins, directions], axis=1).astype(np.float32)
         found = self.caster.cast_rays(self._tensor(rays))
         return {name: found[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs")}
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """Distances (N,) of points (N, 3) to the next surface."""
+        """Distances (N,) of points (N, 3) to the nearest surface."""
         return self.caster.compute_distance(self._tensor(points.astype(np.float32))).numpy()
 
     def picture(self, world_T_rig: np.ndarray, width: int) -> np.ndarray:
-        """Panorama (width / 2, width, 3) float32, RGB, 0..255, of means over each pixel."""
-        wide, high = _FINER * width, _FINER * width // 2
+        """Panorama (width / 2, width, 3) float32, RGB, 0..255, averaged over each pixel."""
+        wide, high = _RAYS_PER_PIXEL * width, _RAYS_PER_PIXEL * width // 2
         u, v = np.meshgrid(np.arange(wide) + 0.5, np.arange(high) + 0.5)
         rays = bearings_from_erp(np.stack([u.ravel(), v.ravel()], axis=1), wide, high)
         origin = np.broadcast_to(world_T_rig[:3, 3], rays.shape)
         found = self.cast(origin, rays @ world_T_rig[:3, :3].T)
-        colors = np.broadcast_to(_SKY, rays.shape).copy()
+        colors = np.broadcast_to(_SKY_RGB, rays.shape).copy()
         hit = np.isfinite(found["t_hit"])
         colors[hit] = self._colors(found["primitive_ids"][hit], found["primitive_uvs"][hit])
         fine = colors.reshape(high, wide, 3).astype(np.float32)
         return cv2.resize(fine, (width, width // 2), interpolation=cv2.INTER_AREA)
 
     def _colors(self, faces: np.ndarray, at: np.ndarray) -> np.ndarray:
-        """Colours (N, 3) at places (N, 2) of triangles (N,)."""
+        """Colours (N, 3) at barycentric coordinates (N, 2) of triangles (N,)."""
         weights = np.column_stack([1 - at.sum(axis=1), at])
         if not self.textures:
             return np.einsum("nk,nkc->nc", weights, self.colors[self.triangles[faces]])
@@ -104,7 +105,7 @@ class MeshScene:
         for n, texture in enumerate(self.textures):
             mine = self.materials[faces] == n
             if mine.any():
-                colors[mine] = _looked_up(texture, uvs[mine])
+                colors[mine] = _texture_colors(texture, uvs[mine])
         return colors
 
 
@@ -116,34 +117,35 @@ def make_mesh_walk(
     width: int = 1024,
     seed: int = 0,
 ) -> DemoWalk:
-    """Render a walk through a mesh into the folder `out`, replacing a walk that is there.
+    """Render a walk through a mesh into the folder `out`; an earlier walk there is replaced.
 
     Args:
+        out: folder to write.
         mesh: OBJ, GLB, glTF or PLY with a texture or colours.
-        path: TUM file of the poses to render, in the mesh's world; None: a round through free
-            space is looked for.
-        num_frames: of a path that is looked for, at least 3.
+        path: TUM file of the poses to render, in the mesh's world; None = a closed path through
+            free space is computed.
+        num_frames: number of frames of a computed path, at least 3.
         width, seed: see `gsba.demo.make_walk`.
 
     Raises:
-        GsbaError: an argument is out of range, `out` holds something else, the mesh cannot be
-            used, or there is no room to walk in it.
+        GsbaError: an argument is out of range, `out` is not a walk's folder, the mesh cannot be
+            used, or it has no free room for a path.
     """
     check_walk(out, num_frames, width, seed)
     truth = None if path is None else read_trajectory(path)
     if truth is not None and len(truth.timestamps) < 3:
-        raise GsbaError(f"{path}: a walk of {len(truth.timestamps)} frames: at least 3 are needed")
+        raise GsbaError(f"{path} has {len(truth.timestamps)} poses: at least 3 are needed")
     scene = MeshScene(mesh)
     if truth is None:
-        truth = _found(scene, mesh, num_frames, seed)
+        truth = _free_walk(scene, mesh, num_frames, seed)
     logger.info("%s: %d triangles, %d frames", mesh, len(scene.triangles), len(truth.timestamps))
     with walk_folder(out, truth, seed) as partial:
         write_frames(partial, truth, _pictures(scene, truth, width), seed)
     return DemoWalk(out / "images", out / "groundtruth.tum", out / "slam.tum", None)
 
 
-def _found(scene: MeshScene, path: Path, num_frames: int, seed: int) -> Trajectory:
-    """A round through the mesh's free space, heading one way, in its world."""
+def _free_walk(scene: MeshScene, path: Path, num_frames: int, seed: int) -> Trajectory:
+    """Closed walk through the mesh's free space with a fixed heading, in its world."""
     world_R_level = _LEVEL[upwards(path)]
     corners = np.stack([scene.low, scene.high]) @ world_R_level
 
@@ -157,7 +159,7 @@ def _found(scene: MeshScene, path: Path, num_frames: int, seed: int) -> Trajecto
     low, high = corners.min(axis=0), corners.max(axis=0)
     positions, room = free_path(low, high, clearance, seen, num_frames)
     if positions is None:
-        raise GsbaError(f"{path}: no room to walk was found in it: give the way as --path FILE")
+        raise GsbaError(f"{path} has no free room for a path: give poses by --path FILE")
     level = held_by_hand(positions, 0.0, np.random.default_rng(seed), unit=min(room, 1.0))
     rotations = world_R_level @ level.world_T_rigs[:, :3, :3]
     return Trajectory(
@@ -170,18 +172,18 @@ def _pictures(scene: MeshScene, truth: Trajectory, width: int) -> Iterator[np.nd
 
 
 def _rgb(texture: np.ndarray) -> np.ndarray:
-    """A texture as (H, W, 3) float32, 0..255."""
+    """Texture as (H, W, 3) float32, 0..255."""
     image = texture.reshape(*texture.shape[:2], -1).astype(np.float32)
     return np.repeat(image, 3, axis=2)[..., :3] if image.shape[2] < 3 else image[..., :3].copy()
 
 
-def _looked_up(texture: np.ndarray, uvs: np.ndarray) -> np.ndarray:
-    """Colours (N, 3) at texture coordinates (N, 2), repeating.
+def _texture_colors(texture: np.ndarray, uvs: np.ndarray) -> np.ndarray:
+    """Colours (N, 3) at texture coordinates (N, 2), which repeat.
 
-    v counts from the first row: open3d turns pictures over as it reads them.
+    v counts from the first row, as open3d flips images when it reads them.
     """
     at = np.mod(uvs, 1.0) * texture.shape[1::-1] - 0.5
-    shape = -(-len(at) // _REMAPPED), _REMAPPED  # cv2 takes pictures, no lists
+    shape = -(-len(at) // _LOOKUP_WIDTH), _LOOKUP_WIDTH  # cv2 takes images, no lists
     x = np.resize(at[:, 0], shape).astype(np.float32)
     y = np.resize(at[:, 1], shape).astype(np.float32)
     found = cv2.remap(texture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)

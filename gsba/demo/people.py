@@ -1,6 +1,6 @@
-"""People who walk about in front of the camera: what no static scene explains, with exact masks.
+"""Synthetic people who move in front of the camera, with exact masks.
 
-Upright ellipsoids that wander around the rig, dressed in stripes and blots, traced exactly.
+They are upright ellipsoids with striped textures that move around the rig, and are ray-traced.
 """
 
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ from gsba.camera.sphere import bearings_from_erp
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """One person: where they stand when, and what they wear."""
+    """Positions, shape and texture of one person."""
 
-    positions_world: np.ndarray  # (F, 3) float64, the middle of the body at each frame
+    positions_world: np.ndarray  # (F, 3) float64, middle of the body in each frame
     radii: tuple[float, float]  # of the body across and along its axis, world units
     up_world: np.ndarray  # (3,) float64, unit
     clothes: np.ndarray  # (H, W, 3) float32 RGB, wrapped around the body
@@ -23,14 +23,14 @@ class Person:
 def make_people(
     world_T_rigs: np.ndarray, num: int, height: float, up_world: np.ndarray, seed: int = 0
 ) -> list[Person]:
-    """People who keep around the camera, each on a way of their own.
+    """People who stay near the camera, each on its own path.
 
     Args:
         world_T_rigs: (F, 4, 4) true poses.
-        num: people.
-        height: of a person, world units; they stand about as far off.
+        num: number of people.
+        height: height of a person, and about its distance from the camera, world units.
         up_world: (3,) unit.
-        seed: of their ways and looks.
+        seed: seed of their paths and textures.
     """
     rng = np.random.default_rng(seed)
     num_frames, up = len(world_T_rigs), np.asarray(up_world, dtype=np.float64)
@@ -51,16 +51,16 @@ def make_people(
 def paste_people(
     image: np.ndarray, world_T_rig: np.ndarray, people: list[Person], frame: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A panorama with people in front of it.
+    """Panorama with people rendered in front of it.
 
     Args:
         image: (H, 2H, 3) uint8 RGB.
         world_T_rig: (4, 4) its true pose.
         people: see `make_people`.
-        frame: which of their positions counts.
+        frame: row of their positions.
 
     Returns:
-        The panorama, and where people are, (H, 2H) bool.
+        The panorama, and the mask of people, (H, 2H) bool.
     """
     import cv2
 
@@ -85,9 +85,9 @@ def paste_people(
 
 
 def _hit(person: Person, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (N,) of the body along rays (N, 3), inf beside it, and where on it, (2, N) 0 to 1.
+    """Distance (N,) to the body along rays (N, 3), inf = not hit, and texture coordinates (2, N).
 
-    Both the rays and their origin (3,), which is outside, are seen from the middle of the body.
+    The rays' origin (3,), outside of the body, is relative to the middle of the body.
     """
     across, along = person.radii
     up = person.up_world
@@ -105,7 +105,7 @@ def _hit(person: Person, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarr
 
 
 def _clothes(rng: np.random.Generator) -> np.ndarray:
-    """Head, top and trousers with a pattern, (128, 256, 3) float32 RGB."""
+    """Texture of head, top and trousers with a pattern, (128, 256, 3) float32 RGB."""
     import cv2
 
     skin, top, legs = (np.array(c) for c in ((205, 160, 130), *rng.uniform(25, 190, (2, 3))))

@@ -31,7 +31,7 @@ def _discs(rng: np.random.Generator, image: np.ndarray, palette: Palette) -> Non
 
 
 def _blocks(rng: np.random.Generator, image: np.ndarray, palette: Palette) -> None:
-    """Rectangles cut again and again, in black lines."""
+    """Draw recursively divided rectangles with black outlines."""
 
     def cut(x0: int, y0: int, x1: int, y1: int, depth: int) -> None:
         w, h = x1 - x0, y1 - y0
@@ -62,7 +62,7 @@ def _strokes(rng: np.random.Generator, image: np.ndarray, palette: Palette) -> N
 
 
 def _landscape(rng: np.random.Generator, image: np.ndarray, palette: Palette) -> None:
-    """Ridges one before the other, with scattered trees and a sun."""
+    """Draw layered ridges with scattered trees and a sun."""
     height, width = image.shape[:2]
     sun = (int(rng.uniform(0.2, 0.8) * width), int(0.25 * height))
     cv2.circle(image, sun, height // 9, (246, 226, 150), -1, cv2.LINE_AA)
@@ -109,10 +109,12 @@ _STYLES: tuple[Callable[[np.random.Generator, np.ndarray, Palette], None], ...] 
 
 
 def picture(rng: np.random.Generator, height: int, width: int, style: int) -> np.ndarray:
-    """A framed picture, (height, width, 3) uint8 RGB.
+    """Framed picture, (height, width, 3) uint8 RGB.
 
     Args:
-        style: any integer; styles repeat, contents never do.
+        rng: random numbers of its content.
+        height, width: pixels.
+        style: any integer, modulo the number of styles; contents are random.
     """
     palette = np.array(_PALETTES[rng.integers(len(_PALETTES))], dtype=np.float64)
     frame, mat = 7, int(rng.choice([0, 12]))

@@ -1,4 +1,4 @@
-"""Rays against a mesh: a stackless bounding-volume hierarchy over triangles and parallelograms."""
+"""Ray casting by a stackless bounding-volume hierarchy over triangles and parallelograms."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +11,7 @@ import numpy as np
 from factors.compiled import kernel_and_part
 
 kernel, part = kernel_and_part(error_model="numpy")
-_BANDS = 64  # whatever the number of threads
+_NUM_BANDS = 64  # independent of the number of threads
 
 
 class Scene(NamedTuple):
@@ -42,7 +42,7 @@ class Scene(NamedTuple):
 
 @part
 def face_distance(scene, q, o, d, limit):
-    """Distance along the ray to face q, or `limit` where it is not hit before."""
+    """Distance along the ray to face q, or `limit` if it is not hit before that."""
     n, c, w = scene.normals, scene.corners, scene.duals
     along = n[q, 0] * d[0] + n[q, 1] * d[1] + n[q, 2] * d[2]
     x, y, z = c[q, 0] - o[0], c[q, 1] - o[1], c[q, 2] - o[2]
@@ -104,7 +104,7 @@ def in_bands(kernel: Callable[..., None], count: int, *args: object) -> None:
 
     The kernels release the GIL; plain threads spare them the compile time of parallel=True.
     """
-    bounds = np.unique(np.linspace(0, count, _BANDS + 1).astype(np.int64))
+    bounds = np.unique(np.linspace(0, count, _NUM_BANDS + 1).astype(np.int64))
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:
         list(pool.map(lambda band: kernel(*band, *args), pairwise(bounds.tolist())))
 

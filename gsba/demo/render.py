@@ -1,4 +1,4 @@
-"""Equirectangular pictures of a scene, anti-aliased, from one point or through a moving lens."""
+"""Anti-aliased equirectangular images of a scene, from one point or through a moving lens."""
 
 from typing import NamedTuple
 
@@ -7,50 +7,54 @@ import numpy as np
 from gsba.demo.raycast import Scene, coordinates, face_distance, in_bands, kernel, nearest, part
 from gsba.demo.sampling import albedo_at, light_at
 
-# Offsets from the pixel's centre, in pixels, of the rays where faces meet: a rotated grid, which
-# tells four levels of coverage apart along either axis.
+# Offsets of rays from the centre of a pixel at which faces meet, in pixels: a rotated grid, which
+# distinguishes four levels of coverage along either axis.
 EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))
 EXPOSURE = 1.1  # of the tone curve 1 - exp(-EXPOSURE * radiance)
-_MARGIN = 3  # pixels beyond what a lens shows whose faces are needed, or more
+_MARGIN = 3  # pixels beyond a lens's image for which faces are found, too
 
 
 class Eye(NamedTuple):
-    """What looks at the scene: rays in directions of the rig, each at the time of its row."""
+    """Rolling-shutter lens: rays in directions of the rig, each at the time of its row."""
 
     world_T_eyes: np.ndarray  # (K, 3, 4) float64, rotations of the rig and positions of the eye,
-    # evenly spaced from the first row's time to the last one's; one: all rows at one instant
-    facing: float = 1.0  # whose sensor it is: 1 looks along the rig's z, -1 the other way
-    sweep: tuple[float, float] = (-1.0, 0.0)  # rig's x and y, unit: the way in which rows are read
+    # evenly spaced from the first row's time to the last one's; one = a global shutter
+    facing: float = 1.0  # lens: 1 looks along the rig's z, -1 in the opposite direction
+    sweep: tuple[float, float] = (-1.0, 0.0)  # row direction: rig's x and y, unit
     half_fov: float = np.pi  # rad, from the axis to the first and to the last row
-    bend: tuple[float, float] = (0.0, 0.0)  # a point at angle a is a + bend[0] a^3 + bend[1] a^5
-    # from the picture's middle, up to scale
-    least: float = -2.0  # of facing * z of unit directions that are drawn; -2 draws all
+    bend: tuple[float, float] = (0.0, 0.0)  # distortion: a point at angle a from the axis is
+    # a + bend[0] a^3 + bend[1] a^5 from the image's middle, up to scale
+    least: float = -2.0  # smallest facing * z of rendered unit directions; -2 = all
 
 
 def render_erp(scene: Scene, world_T_rig: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Equirectangular picture of the scene from one point, filtered over each pixel.
+    """Equirectangular image of the scene from one point, filtered over each pixel.
 
     Args:
-        world_T_rig: (4, 4) float64, rotation and position of the panorama.
+        scene: the scene.
+        world_T_rig: (4, 4) float64, pose of the panorama.
         width, height: pixels, width = 2 height.
 
     Returns:
-        (height, width, 3) float32, RGB, 0..255, black where nothing is hit.
+        (height, width, 3) float32, RGB, 0..255, black for rays that hit nothing.
     """
     return render_eye(scene, Eye(world_T_rig[None, :3]), width, height)
 
 
 def render_eye(scene: Scene, eye: Eye, width: int, height: int) -> np.ndarray:
-    """What an eye contributes to an equirectangular picture, filtered over each pixel.
+    """Equirectangular image of an eye's part of the sphere, filtered over each pixel.
 
     Inside a face the texture filter covers the pixel; where faces meet, four rays with a quarter
-    of the filter each do.
+    of the filter each cover it.
 
     Args:
+        scene: the scene.
+        eye: the lens.
         width, height: pixels, width = 2 height.
 
     Returns:
-        (height, width, 3) float32, RGB, 0..255, black where nothing is hit or drawn.
+        (height, width, 3) float32, RGB, 0..255, black outside of the lens's part and for rays that
+        hit nothing.
     """
     eye = eye._replace(world_T_eyes=np.ascontiguousarray(eye.world_T_eyes, dtype=np.float64))
     faces = np.full((height, width), -1, dtype=np.int64)
@@ -62,7 +66,7 @@ def render_eye(scene: Scene, eye: Eye, width: int, height: int) -> np.ndarray:
 
 @kernel
 def _find_faces(start, stop, scene, eye, faces):
-    """Face at each pixel's centre, -1 for none, into rows of faces (H, W)."""
+    """Write the face at each pixel's centre, -1 = none, into rows of faces (H, W)."""
     height, width = faces.shape
     step = np.pi / height
     least = eye.least - _MARGIN * step
@@ -76,7 +80,7 @@ def _find_faces(start, stop, scene, eye, faces):
 
 @kernel
 def _shade(start, stop, scene, eye, faces, image):
-    """Colours of rows of image (H, W, 3)."""
+    """Write colours into rows of image (H, W, 3)."""
     height, width = faces.shape
     step = np.pi / height
     for row in range(start, stop):
@@ -132,14 +136,14 @@ def _pose(eye, x, y, z):
 
 @part
 def _radius(eye, angle):
-    """How far from the picture's middle an angle from the axis is seen, up to scale."""
+    """Distance from the image's middle of a ray at an angle from the axis, up to scale."""
     square = angle * angle
     return angle * (1 + square * (eye.bend[0] + square * eye.bend[1]))
 
 
 @part
 def _uniform(faces, row, column):
-    """Whether a pixel and its eight neighbours (wrapping around the seam) see one face."""
+    """True if a pixel and its eight neighbours, wrapped at the seam, see one face."""
     height, width = faces.shape
     for j in range(max(row - 1, 0), min(row + 2, height)):
         for i in range(column - 1, column + 2):

@@ -1,7 +1,7 @@
-"""What a ray sees on a face: filtered albedo and baked light.
+"""Filtered albedo and baked light at a ray's hit on a face.
 
-Trilinear texture look-ups with several taps along a stretched footprint, whose shape comes from
-exact ray differentials (Igehy, SIGGRAPH 1999).
+Textures are sampled trilinearly with several taps along an anisotropic footprint, whose shape comes
+from exact ray differentials (Igehy, SIGGRAPH 1999).
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ def bilinear(values, offset, width, height, x, y):
 
 @part
 def _texture(scene, texture, s, t, ds, dt, size, taps):
-    """Mean albedo (3), 0..255, of `taps` spots of `size` texels along (ds, dt) about (s, t)."""
+    """Mean albedo (3), 0..255, of `taps` samples of `size` texels along (ds, dt) about (s, t)."""
     top = scene.levels.shape[1] - 1
     level = min(max(np.log2(size), 0.0), float(top))
     low = int(level)

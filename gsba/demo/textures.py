@@ -25,7 +25,7 @@ def noise(rng: np.random.Generator, height: int, width: int, coarsest: float = 2
 
 
 def _tinted(field: np.ndarray, color: Color, amount: float) -> np.ndarray:
-    """A colour (3), modulated by (1 + amount * field); (H, W, 3) float32."""
+    """Colour (3) times (1 + amount * field), (H, W, 3) float32."""
     return np.asarray(color, np.float32) * (1 + amount * field[..., None])
 
 
@@ -34,7 +34,7 @@ def _to_uint8(image: np.ndarray) -> np.ndarray:
 
 
 def _polygon(rng: np.random.Generator, center: np.ndarray, radius: float) -> np.ndarray:
-    """Irregular convex-ish polygon, (n, 1, 2) int32 in 1/16 pixel for cv2's shift=4."""
+    """Irregular polygon, (n, 1, 2) int32 in 1/16 pixel for cv2's shift=4."""
     n = int(rng.integers(4, 8))
     angles = np.sort(rng.uniform(0, 2 * np.pi, n))
     radii = radius * rng.uniform(0.55, 1.0, n)
@@ -81,7 +81,7 @@ def plaster(rng: np.random.Generator, height: int, width: int, color: Color) -> 
 
 
 def brick(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """Hand-made bricks: no two alike, courses slightly uneven."""
+    """Bricks of random sizes and colours in slightly uneven courses."""
     image = _to_uint8(_tinted(noise(rng, height, width, 32), (176, 166, 152), 0.08))
     y = 0.0
     while y < height:

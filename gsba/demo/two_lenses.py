@@ -1,4 +1,4 @@
-"""The walk as a 360-degree camera takes it: two lenses, read row by row, stitched at infinity."""
+"""Rendering by a 360-degree camera: two lenses with a rolling shutter, stitched at infinity."""
 
 import json
 from dataclasses import dataclass
@@ -13,31 +13,31 @@ if TYPE_CHECKING:
     from gsba.demo.raycast import Scene
     from gsba.demo.render import Eye
 
-SWEEP = (-1.0, 0.0)  # rig's x and y: rows of either sensor, mounted on its side, are read that way
+SWEEP = (-1.0, 0.0)  # row direction of both sensors, rig's x and y: they are mounted sideways
 
 
 @dataclass(frozen=True, slots=True)
 class TwoLenses:
-    """Two fisheyes back to back along the rig's z, as an Insta360 X5 has them.
+    """Two fisheyes back to back along the rig's z, with values of an Insta360 X5.
 
-    The gallery's unit is a metre: its ceiling is 3.8 units high, and 1.3 of them are walked in a
+    The gallery's unit is a metre: its ceiling is 3.8 units high, and the walk covers 1.3 units a
     second.
     """
 
     baseline: float = 0.032  # units between the lenses' centres
     readout_s: float = 0.012  # from the first row to the last one
     gains: tuple[float, float] = (1.03, 0.97)  # exposure of the front and of the back lens
-    band_deg: float = 4.0  # from the seam, within which both pictures are blended
+    band_deg: float = 4.0  # from the seam: within it both lenses' images are blended
     half_fov_deg: float = 100.0  # from a lens's axis to the first and to the last row
     bend: tuple[float, float] = (-0.025, 0.0018)  # a point at angle a is a + bend[0] a^3 +
-    # bend[1] a^5 from the picture's middle, up to scale (Kannala-Brandt)
+    # bend[1] a^5 from the image's middle, up to scale (Kannala-Brandt)
 
     def write(self, path: Path) -> None:
-        """What its maker would know, as JSON."""
+        """Write a calibration like that of a camera's maker, as JSON."""
         lenses = {}
         for name, side, turn in (("front", 1.0, np.eye(3)), ("back", -1.0, np.diag([-1.0, 1, -1]))):
             rig_T_lens = np.eye(4)
-            # Rows are read along a lens's y, which is SWEEP.
+            # Rows are read along a lens's y, which is the direction SWEEP.
             rig_T_lens[:3, :3] = turn @ np.array([[0, -side, 0], [side, 0, 0], [0, 0, 1]])
             rig_T_lens[2, 3] = side * self.baseline / 2
             lenses[name] = {"rig_T_lens": rig_T_lens.tolist(), "k": list(self.bend)}
@@ -55,15 +55,17 @@ class TwoLenses:
 def render_stitched(
     scene: "Scene", world_T_rigs: np.ndarray, camera: TwoLenses, width: int, height: int
 ) -> np.ndarray:
-    """Equirectangular picture of what both lenses see, each in the directions that it faces.
+    """Equirectangular image stitched from both lenses, each in the half that it faces.
 
     Args:
+        scene: the scene.
         world_T_rigs: (K, 4, 4) float64, poses from the first row to the last one; the rig's centre
             is in the middle between the lenses.
+        camera: the two lenses.
         width, height: pixels, width = 2 height.
 
     Returns:
-        (height, width, 3) float32, RGB, 0..255 times the gains, black where nothing is hit.
+        (height, width, 3) float32, RGB, 0..255 times the gains, black for rays that hit nothing.
     """
     from gsba.demo.render import render_eye
 
@@ -79,7 +81,7 @@ def render_stitched(
 
 
 def _eye(world_T_rigs: np.ndarray, camera: TwoLenses, side: float) -> "Eye":
-    """The lens in front (side 1) or behind (-1)."""
+    """Front lens (side 1) or back lens (-1)."""
     from gsba.demo.render import Eye
 
     world_T_eyes = world_T_rigs[:, :3].copy()

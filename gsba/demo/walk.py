@@ -1,4 +1,4 @@
-"""A walk with a 360-degree camera through the gallery: frames, exact truth, SLAM-like poses."""
+"""Walk with a 360-degree camera through the gallery: frames, exact truth, SLAM-like poses."""
 
 import csv
 import logging
@@ -26,9 +26,9 @@ Camera = Literal["ideal", "two-lens"]
 
 FRAMES_PER_SECOND = 2.0
 EYE_HEIGHT = 1.5  # units above the floor
-CORNER_RADIUS = 0.45  # units, standard deviation of the smoothing that rounds corners
+CORNER_RADIUS = 0.45  # units, standard deviation of the filter that rounds corners
 WOBBLE_DEG = (1.5, 2.0, 1.5)  # pitch, yaw and roll of the hand, standard deviation
-WOBBLE_UNITS = 0.025  # of the position, per axis, standard deviation
+WOBBLE_UNITS = 0.025  # standard deviation of the hand's position, per axis
 EXPOSURE_SWING = 0.05  # relative
 NOISE = 2.0  # grey values, standard deviation
 JPEG_QUALITY = 95
@@ -39,12 +39,12 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class DemoWalk:
-    """Where a walk lies on disk."""
+    """Files of a walk."""
 
     frames_dir: Path  # NNNNNN.jpg and timestamps.csv
     truth_path: Path  # TUM, exact poses, world of the gallery
-    slam_path: Path  # TUM, degraded poses, world of the first frame and a scale of its own
-    lenses: TwoLenses | None  # what the camera is; None = one centre, one instant
+    slam_path: Path  # TUM, poses with drift, world of the first frame and another scale
+    lenses: TwoLenses | None  # true camera; None = one centre and a global shutter
 
 
 def make_walk(
@@ -57,22 +57,23 @@ def make_walk(
     depth: bool = False,
     camera: Camera = "ideal",
 ) -> DemoWalk:
-    """Render a walk into the folder `out`, replacing a walk that is there.
+    """Render a walk into the folder `out`; an earlier walk there is replaced.
 
     Args:
+        out: folder to write.
         path: "rectangle" and "oval" end one step before their start, "open" does not return.
-        heading: "locked" keeps looking one way, "forward" looks along the path.
+        heading: "locked" keeps one direction, "forward" follows the path.
         num_frames: at least 3.
-        width: of the equirectangular frames in pixels, an even number of at least 64.
-        seed: of the hand's wobble, the noise and the drift.
+        width: width of the equirectangular frames in pixels, an even number of at least 64.
+        seed: seed of the hand's wobble, the noise and the drift.
         depth: also write depth/NNNNNN.npz with `range`, (width / 8, width / 4) float32: distance
-            along the ray through each pixel of that size, 0 where nothing is hit.
-        camera: "ideal" sees all from one point at one instant, "two-lens" as the cameras on sale
-            do (`TwoLenses`; also writes calibration.json). Truth is the same: the middle of the
-            exposure, midway between the lenses.
+            along the ray through each pixel of that size, 0 = no surface.
+        camera: "ideal" has one centre and a global shutter, "two-lens" has two lenses with a
+            rolling shutter (`TwoLenses`; also writes calibration.json). True poses are those in
+            the middle of the readout, midway between the lenses.
 
     Raises:
-        GsbaError: an argument is out of range, or `out` holds something else.
+        GsbaError: an argument is out of range, or `out` is not a walk's folder.
     """
     from gsba.demo.gallery import build_gallery
 
@@ -93,7 +94,7 @@ def make_walk(
 
 @contextmanager
 def walk_folder(out: Path, truth: Trajectory, seed: int) -> Iterator[Path]:
-    """Folder to write a walk's images into; with its trajectories it takes the place of `out`."""
+    """Folder to write a walk's images into; adds its trajectories and replaces `out` at the end."""
     with replaced_folder(out) as partial:
         (partial / "images").mkdir()
         yield partial
@@ -103,7 +104,7 @@ def walk_folder(out: Path, truth: Trajectory, seed: int) -> Iterator[Path]:
 
 @contextmanager
 def replaced_folder(out: Path) -> Iterator[Path]:
-    """An empty folder to write into; once written without failure it takes the place of `out`."""
+    """Empty folder to write into; it replaces `out` at the end, unless an exception is raised."""
     partial = out.with_name(f".{out.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -116,7 +117,7 @@ def replaced_folder(out: Path) -> Iterator[Path]:
 def walk_poses(
     path: WalkPath, heading: Heading, num_frames: int, seed: int, fps: float = FRAMES_PER_SECOND
 ) -> Trajectory:
-    """Exact poses of a walk, evenly spaced along its path, held by hand.
+    """Exact poses of a walk, evenly spaced along its path, with a hand's wobble.
 
     World: x right, y down, z forward, floor at y = 0, in the gallery's units.
     """
@@ -134,11 +135,14 @@ def held_by_hand(
     unit: float = 1.0,
     fps: float = FRAMES_PER_SECOND,
 ) -> Trajectory:
-    """Poses around positions (N, 3) of a walk, headings in radians, swaying as a hand does.
+    """Poses at positions (N, 3) and headings of a walk, with a hand's wobble.
 
     Args:
-        unit: of the positions, in those of the gallery.
-        fps: poses per second; the hand sways as fast whatever it is.
+        positions: (N, 3) positions.
+        yaw: headings (N,), or one heading, radians.
+        rng: random numbers of the wobble.
+        unit: unit of the positions, in units of the gallery.
+        fps: poses per second; the wobble's frequency in Hz does not depend on it.
     """
     times = np.arange(len(positions)) / fps
     wobble = [_wobble(rng, times) for _ in range(6)]
@@ -200,7 +204,7 @@ def _arc_length(points: np.ndarray) -> np.ndarray:
 
 
 def _wobble(rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
-    """Irregular swing (N,) of unit variance at times (N,) in seconds, periods of 2 to 7 s."""
+    """Irregular oscillation (N,) of unit variance at times (N,), seconds, periods of 2 to 7 s."""
     phase = rng.uniform(0, 2 * np.pi, (3, 1))
     frequency = 2 * np.pi / rng.uniform(4, 14, (3, 1))
     steps = FRAMES_PER_SECOND * times
@@ -215,14 +219,16 @@ def _rotations(axis: int, angles: np.ndarray | float) -> np.ndarray:
 
 
 def write_frames(out: Path, truth: Trajectory, pictures: Iterator[np.ndarray], seed: int) -> None:
-    """Panoramas (H, W, 3), 0..255, as JPEGs with exposure and noise, and their times."""
+    """Write panoramas (H, W, 3), 0..255, as JPEGs with exposure and noise, and their times."""
     import cv2
 
     names = [f"{f:06d}.jpg" for f in range(len(truth.timestamps))]
     for name, bgr in zip(names, exposed(truth, pictures, seed), strict=True):
         quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
         if not cv2.imwrite(str(out / "images" / name), bgr, quality):
-            raise GsbaError(f"{out / 'images' / name}: cannot be written; is the disk full?")
+            raise GsbaError(
+                f"{out / 'images' / name} cannot be written: check that the disk is not full"
+            )
     with (out / "images" / "timestamps.csv").open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["name", "timestamp"])
@@ -230,7 +236,7 @@ def write_frames(out: Path, truth: Trajectory, pictures: Iterator[np.ndarray], s
 
 
 def exposed(truth: Trajectory, pictures: Iterator[np.ndarray], seed: int) -> Iterator[np.ndarray]:
-    """Pictures (H, W, 3) uint8 BGR as a sensor gives them: exposure and noise on RGB, 0..255."""
+    """Images (H, W, 3) uint8 BGR with a sensor's exposure and noise, from RGB, 0..255."""
     rng = np.random.default_rng([seed, 1])
     exposures = 1 + EXPOSURE_SWING * np.tanh(_wobble(rng, truth.timestamps - truth.timestamps[0]))
     frames = zip(pictures, exposures, strict=True)
@@ -243,7 +249,7 @@ def exposed(truth: Trajectory, pictures: Iterator[np.ndarray], seed: int) -> Ite
 def render_walk(
     scene, truth: Trajectory, width: int, seed: int, lenses: TwoLenses | None
 ) -> Iterator[np.ndarray]:
-    """Panoramas (width / 2, width, 3) float32 of the frames, one after another."""
+    """Yield panoramas (width / 2, width, 3) float32 of the frames."""
     from gsba.demo.gait import poses_during
     from gsba.demo.render import render_erp
     from gsba.demo.two_lenses import render_stitched
@@ -269,7 +275,7 @@ def _write_depth(folder: Path, scene, truth: Trajectory, width: int) -> None:
 
 
 def check_choices(path: str, heading: str, camera: str) -> None:
-    """Raise GsbaError for a path, heading or camera that no walk has."""
+    """Raise GsbaError for an unknown path, heading or camera."""
     choices = ((path, WalkPath, "path"), (heading, Heading, "heading"), (camera, Camera, "camera"))
     for value, allowed, what in choices:
         if value not in get_args(allowed):
@@ -277,7 +283,7 @@ def check_choices(path: str, heading: str, camera: str) -> None:
 
 
 def check_walk(out: Path, num_frames: int, width: int, seed: int) -> None:
-    """Raise GsbaError for numbers out of range, and a folder that holds something else."""
+    """Raise GsbaError for numbers out of range, and for a folder that is not a walk's."""
     if seed < 0:
         raise GsbaError(f"seed {seed}: must be 0 or more")
     if not 3 <= num_frames <= MOST_FRAMES:
@@ -285,4 +291,4 @@ def check_walk(out: Path, num_frames: int, width: int, seed: int) -> None:
     if not 64 <= width <= MOST_WIDTH or width % 2:
         raise GsbaError(f"frames {width} px wide: an even number of 64 to {MOST_WIDTH} is needed")
     if out.exists() and not (out / "groundtruth.tum").is_file() and any(out.iterdir()):
-        raise GsbaError(f"{out}: holds something else than a walk; name another folder")
+        raise GsbaError(f"{out} is not empty and not a walk's folder: choose another --out")

@@ -1,7 +1,7 @@
-"""What is installed, what of it works, and the one command for each part that does not.
+"""Check of the installation: packages, their faults, and one command that repairs each.
 
-Takes nothing: it looks at this machine and at this Python.
-Gives an examination, as data and as text; whatever is broken is a finding of it, never a failure.
+Takes nothing: it examines this machine and this Python.
+Gives an examination, as data and as text; a broken package is a finding, not an error.
 """
 
 from gsba.doctor.examination import Examination, Group, examine

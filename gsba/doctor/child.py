@@ -1,4 +1,4 @@
-"""What the process that tries packages does: it says what it begins, and how that went."""
+"""Process that imports packages and reports the start and the result of each import."""
 
 import json
 import os
@@ -8,34 +8,34 @@ from importlib import import_module
 from gsba.doctor import facts
 
 
-def answer(asked: str, modules: Sequence[str]) -> None:
-    """Import modules and find out facts, with a line of JSON on stdout before and after each.
+def answer(facts_name: str, modules: Sequence[str]) -> None:
+    """Import modules and collect facts, with a line of JSON on stdout before and after each.
 
     Args:
-        asked: name of a function of `gsba.doctor.facts`, or "".
-        modules: names.
+        facts_name: name of a function of `gsba.doctor.facts`, or "".
+        modules: names of the modules.
     """
     out = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what packages print is no answer
+    os.dup2(2, 1)  # output of packages goes to stderr
 
-    def say(**what: object) -> None:
-        out.write(json.dumps(what) + "\n")
+    def report(**content: object) -> None:
+        out.write(json.dumps(content) + "\n")
         out.flush()
 
     usable = True
     for module in modules:
-        say(module=module, state="begun")
+        report(module=module, state="begun")
         try:
             import_module(module)
-        except Exception as error:  # whatever an import may raise
+        except Exception as error:  # an import may raise any error
             usable = False
             absent = error.name if isinstance(error, ModuleNotFoundError) else None
             text = f"{type(error).__name__}: {error}"
-            say(module=module, state="failed", error=text, absent=absent)
+            report(module=module, state="failed", error=text, absent=absent)
         else:
-            say(module=module, state="done")
-    if asked and usable:
+            report(module=module, state="done")
+    if facts_name and usable:
         try:
-            say(facts=getattr(facts, asked)())
-        except Exception as error:  # of a package that can be imported, but no more
-            say(facts={"trouble": f"{type(error).__name__}: {error}"})
+            report(facts=getattr(facts, facts_name)())
+        except Exception as error:  # the package can be imported, but not used
+            report(facts={"trouble": f"{type(error).__name__}: {error}"})

@@ -1,4 +1,4 @@
-"""The examination: every group of packages tried, what follows from it, and its text."""
+"""Examination of every group of packages, with conclusions and text."""
 
 import os
 import shutil
@@ -13,37 +13,37 @@ from gsba.doctor.requirements import NEEDED, Requirement, requirements
 from gsba.log import brief
 from gsba.version import __version__
 
-_WHAT = {
+_PURPOSES = {  # extra -> its purpose
     NEEDED: "refine, export, evaluate",
     "video": "frames from video",
     "learned": "ALIKED, DISK, XFeat, SuperPoint, LightGlue",
     "splat": "splats on a GPU",
     "view": "a run in the browser",
     "plot": "figures",
-    "cluster": "work shared out to other processes or machines",
+    "cluster": "work on other processes or machines",
     "imu": "gyros of raw videos",
     "scan": "laser scans and meshes",
 }
 _OWN = Requirement("gsba", "gsba.pipeline.refine", "", NEEDED)
 _WORDS = {"works": "ok", "partly": "partly", "absent": "absent", "broken": "BROKEN"}
-_SMALL_DISK = 2 << 30  # bytes
-_MOST_SHOWN = 160  # characters of what a package says
+_SMALL_DISK_BYTES = 2 << 30
+_MAX_MESSAGE_LENGTH = 160  # characters of a package's message
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Packages of one purpose, and whether it can be served."""
+    """Packages of one purpose, and their status."""
 
-    name: str  # of the extra; "" = what every run needs
-    status: str  # "works", "partly", "absent" (not asked for) or "broken"
+    name: str  # name of the extra; "" = packages that every run needs
+    status: str  # "works", "partly", "absent" (an extra that is not installed) or "broken"
     packages: tuple[Package, ...]
-    notes: tuple[str, ...] = ()  # what it can and cannot do here
-    remedy: str = ""  # the command to run
+    notes: tuple[str, ...] = ()  # abilities and limits on this machine
+    remedy: str = ""  # command that repairs it
 
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """All that was found."""
+    """Findings on this machine and on all groups of packages."""
 
     version: str  # of gsba
     machine: machine.Machine
@@ -51,37 +51,37 @@ class Examination:
 
     @property
     def works(self) -> bool:
-        """Whether all is there that a run needs."""
+        """True if all packages that a run needs work."""
         return all(group.status == "works" for group in self.groups if group.name == NEEDED)
 
     def table(self) -> dict[str, Any]:
-        """Plain values, as JSON holds them."""
+        """Plain values for JSON."""
         return {"works": self.works, **asdict(self)}
 
     def text(self) -> str:
-        """What people read."""
+        """Text for the terminal."""
         found = self.machine
         lines = [
             f"gsba {self.version}, Python {found.python}, {found.system}",
             f"{found.usable_cores:g} of {found.cores} cores ({found.processor}), memory "
-            f"{_gb(found.memory_bytes)}, of it {_gb(found.free_memory_bytes)} free; "
-            f"{_gb(found.free_disk_bytes)} free on disk here",
+            f"{_gb(found.memory_bytes)}, {_gb(found.free_memory_bytes)} of it free; "
+            f"{_gb(found.free_disk_bytes)} free on this disk",
             "",
             *(line for group in self.groups for line in _lines(group)),
             "",
-            "What a run needs works."
+            "All packages that a run needs work."
             if self.works
-            else "What a run needs does not work: see what is BROKEN above.",
+            else "Some packages that a run needs do not work: see BROKEN above.",
         ]
-        if found.free_disk_bytes < _SMALL_DISK:
+        if found.free_disk_bytes < _SMALL_DISK_BYTES:
             lines.insert(
-                2, "little room on this disk: a run takes several times what its frames do"
+                2, "this disk is nearly full: a run takes several times the size of its frames"
             )
         return "\n".join(lines)
 
 
 def examine() -> Examination:
-    """Look at this machine and at every package that gsba asks for."""
+    """Examine this machine and every package that gsba requires."""
     wanted = requirements()
     names = list(dict.fromkeys(one.extra for one in wanted))
     groups = [[one for one in wanted if one.extra == name] for name in names]
@@ -91,9 +91,9 @@ def examine() -> Examination:
 
 
 def _group(name: str, wanted: Sequence[Requirement]) -> Group:
-    """A group of packages; what every run needs is gsba's own code, too."""
-    asked = name if hasattr(facts, name) else ""
-    packages, answers = look_at([*wanted, _OWN] if name == NEEDED else wanted, asked)
+    """Examined group of packages; the needed ones include gsba's own code."""
+    facts_name = name if hasattr(facts, name) else ""
+    packages, answers = look_at([*wanted, _OWN] if name == NEEDED else wanted, facts_name)
     faulty = [package for package in packages if not package.works]
     if not faulty:
         notes, remedy = _conclusions(answers)
@@ -104,37 +104,37 @@ def _group(name: str, wanted: Sequence[Requirement]) -> Group:
 
 
 def _remedy(faulty: Sequence[Package], wanted: Sequence[Requirement]) -> str:
-    """One command: for libraries of the system first, else for packages."""
+    """Command that installs missing system libraries, or else repairs packages."""
     libraries = dict.fromkeys(lib for package in faulty for lib in package.libraries)
     if libraries and shutil.which("apt-get"):
         return f"apt-get install {' '.join(dict.fromkeys(map(debian_package, libraries)))}"
     if libraries:
-        return f"install what holds {', '.join(libraries)}, by the system's packages"
+        return f"install the system packages that hold {', '.join(libraries)}"
     names = {package.name for package in faulty}
     ranges = [f"'{one.name}{one.range}'" for one in wanted if one.name in names]
-    if not ranges:  # all packages work, gsba's own code does not
+    if not ranges:  # all packages work, but gsba's own code does not
         no_place = any("cannot cache" in package.fault for package in faulty)
         return "export NUMBA_CACHE_DIR=/tmp/numba" if no_place else "gsba doctor --json"
     return f"pip install --force-reinstall {' '.join(ranges)}"
 
 
 def _conclusions(answers: dict[str, Any]) -> tuple[list[str], str]:
-    """Notes on what packages that work can do, and the command for what they cannot."""
+    """Notes on the abilities of working packages, and the command that adds missing ones."""
     notes, remedy = [], ""
     if "trouble" in answers:
-        notes.append(brief(answers["trouble"], _MOST_SHOWN))
+        notes.append(brief(answers["trouble"], _MAX_MESSAGE_LENGTH))
     if "codecs" in answers:
         able = [name for name, decodes in answers["codecs"].items() if decodes]
         lost = [name for name, decodes in answers["codecs"].items() if not decodes]
         notes.append(f"decodes {', '.join(able) or 'nothing'}")
         if lost:
-            notes.append(f"not {', '.join(lost)}")
+            notes.append(f"cannot decode {', '.join(lost)}")
             remedy = "pip install --force-reinstall --only-binary av av"
     if "weights" in answers:
         at_hand = ", ".join(answers["weights"])
         notes.append(f"weights of {at_hand}" if at_hand else "no weights yet: see --download")
     if "torch_cuda" in answers:
-        note, remedy = _on_gpu(answers)
+        note, remedy = _gpu_note(answers)
         notes.append(note)
     if "laz" in answers and not answers["laz"]:
         notes.append("reads LAS, not LAZ")
@@ -142,36 +142,37 @@ def _conclusions(answers: dict[str, Any]) -> tuple[list[str], str]:
     return notes, remedy
 
 
-def _on_gpu(answers: dict[str, Any]) -> tuple[str, str]:
-    """What splats run on, and the command for a GPU that cannot be used."""
+def _gpu_note(answers: dict[str, Any]) -> tuple[str, str]:
+    """Note on the device that splats run on, and the command that makes a GPU usable."""
     if not answers["driver"]:
         return "no NVIDIA device: splats run on the CPU", ""
     if answers["torch_cuda"] is None:
         return (
-            "a GPU is there, but this torch is for the CPU alone",
+            "there is a GPU, but this torch is built for the CPU only",
             "pip install --force-reinstall torch",
         )
     if not answers["devices"]:
-        return f"a GPU is there, but not for CUDA {answers['torch_cuda']}: update its driver", (
+        return f"the GPU's driver does not support CUDA {answers['torch_cuda']}: update it", (
             "nvidia-smi"
         )
     devices = f"{', '.join(answers['devices'])}, CUDA {answers['torch_cuda']}"
     if answers["kernels"]:
         return devices, ""
     if answers["compiler"]:
-        return f"{devices}; gsplat builds its kernels when they are first used", ""
+        return f"{devices}; gsplat builds its kernels on first use", ""
     return f"{devices}, but gsplat has no kernels and no nvcc to build them", (
         "apt-get install nvidia-cuda-toolkit"
     )
 
 
 def _lines(group: Group) -> list[str]:
-    """What is said of a group: one line, and one for each package that fails."""
+    """Lines of text on a group: one line, and one more for each broken package."""
     versions = [f"{p.name} {p.version}" for p in group.packages if p.version and p.name != "gsba"]
-    what = _WHAT.get(group.name, "")
-    head = f"{_WORDS[group.status]:<7} {group.name or 'needed'}" + (f" ({what})" if what else "")
-    told = "; ".join([", ".join(versions), *group.notes] if versions else group.notes)
-    lines = [f"{head}: {told}" if told and group.status != "absent" else head]
+    purpose = _PURPOSES.get(group.name, "")
+    head = f"{_WORDS[group.status]:<7} {group.name or 'needed'}"
+    head += f" ({purpose})" if purpose else ""
+    details = "; ".join([", ".join(versions), *group.notes] if versions else group.notes)
+    lines = [f"{head}: {details}" if details and group.status != "absent" else head]
     if group.status == "broken":
         lines += [f"        {p.name}: {p.fault}" for p in group.packages if not p.works]
     if group.remedy:

@@ -1,4 +1,4 @@
-"""What packages of the extras can do here; called in the process that has imported them."""
+"""Abilities of the extras' packages on this machine, found in the process that imported them."""
 
 import shutil
 from importlib.util import find_spec
@@ -9,7 +9,7 @@ CODECS = ("h264", "hevc", "av1", "vp9", "prores", "mjpeg")
 
 
 def video() -> dict[str, Any]:
-    """Which of the usual codecs PyAV can decode."""
+    """Common codecs, with True for those that PyAV can decode."""
     import av.codec
 
     return {"codecs": {name: _decodes(av.codec.Codec, name) for name in CODECS}}
@@ -23,12 +23,12 @@ def _decodes(codec: Any, name: str) -> bool:
 
 
 def splat() -> dict[str, Any]:
-    """What torch and gsplat can do on CUDA; kernels are not built for it."""
+    """CUDA support of torch and gsplat, without building kernels."""
     import torch  # pyright: ignore[reportMissingImports]
 
     usable = torch.cuda.is_available()
     return {
-        "torch_cuda": torch.version.cuda,  # None = built for the CPU alone
+        "torch_cuda": torch.version.cuda,  # None = built for the CPU only
         "devices": [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
         if usable
         else [],
@@ -39,14 +39,14 @@ def splat() -> dict[str, Any]:
 
 
 def learned() -> dict[str, Any]:
-    """Whose weights are in the caches."""
+    """Networks whose weights are in the caches."""
     from gsba.learned.weights import cached_weights
 
     return {"weights": sorted(cached_weights())}
 
 
 def scan() -> dict[str, Any]:
-    """Whether packed laser scans (LAZ) can be read."""
+    """True under "laz" if compressed laser scans (LAZ) can be read."""
     if find_spec("laspy") is None:
         return {}
     import laspy  # pyright: ignore[reportMissingImports]

@@ -1,4 +1,4 @@
-"""The machine that gsba runs on: processor, memory and disk, as far as it may use them."""
+"""Machine that gsba runs on: processor, memory and disk, with the limits of its container."""
 
 import os
 import platform
@@ -11,20 +11,20 @@ _CGROUP = Path("/sys/fs/cgroup")
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """What there is, and how much of it may be used."""
+    """Hardware and software, with the limits of the container."""
 
-    system: str
-    python: str
-    processor: str
+    system: str  # distribution, architecture and C library
+    python: str  # version
+    processor: str  # model
     cores: int
     usable_cores: float  # by affinity and by the container's quota
-    memory_bytes: int  # or the container's limit, where that is less
+    memory_bytes: int  # of the machine, or the container's limit if that is less
     free_memory_bytes: int
-    free_disk_bytes: int  # where the command was called
+    free_disk_bytes: int  # on the disk of the working folder
 
 
 def look() -> Machine:
-    """This machine."""
+    """Examine this machine."""
     total, free = _memory()
     return Machine(
         system=_system(),
@@ -55,7 +55,7 @@ def _processor() -> str:
 
 
 def _memory() -> tuple[int, int]:
-    """Bytes in all, and bytes that can be had now."""
+    """Total and available memory, bytes."""
     pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     fields = dict(line.split(":")[:2] for line in _text(Path("/proc/meminfo")).splitlines())
     free = int(fields.get("MemAvailable", "0 kB").split()[0]) * 1024 or pages
@@ -66,7 +66,7 @@ def _memory() -> tuple[int, int]:
 
 
 def _quota() -> float:
-    """Cores that the container may use."""
+    """Number of cores that the container may use; infinite without a quota."""
     quota, _, period = _text(_CGROUP / "cpu.max").strip().partition(" ")
     return int(quota) / int(period) if quota.isdigit() and period.isdigit() else float("inf")
 

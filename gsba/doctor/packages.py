@@ -1,4 +1,4 @@
-"""Whether packages can be imported, tried in a Python of its own: a crash is a finding, too."""
+"""Trial imports of packages in a separate process, so that a crash is a finding."""
 
 import json
 import os
@@ -18,8 +18,8 @@ from gsba.log import brief
 from gsba.version import __version__
 
 _TIMEOUT_S = 120.0
-_MOST_SHOWN = 160  # characters of what an import says
-_MOST_FILES = 300  # of a package that are looked through for libraries
+_MAX_MESSAGE_LENGTH = 160  # characters of an import's error
+_MAX_FILES = 300  # files of a package that are searched for missing libraries
 _LIBRARY = re.compile(r"([\w.+-]+\.so[\w.]*): cannot open shared object file")
 _DEBIAN = {"libglib-2.0.so.0": "libglib2.0-0", "libgthread-2.0.so.0": "libglib2.0-0"}
 _CHILD = "import sys; from gsba.doctor.child import answer; answer(sys.argv[1], sys.argv[2:])"
@@ -27,30 +27,30 @@ _CHILD = "import sys; from gsba.doctor.child import answer; answer(sys.argv[1], 
 
 @dataclass(frozen=True, slots=True)
 class Package:
-    """A package that gsba asks for, as it was found."""
+    """Package that gsba requires, and its state."""
 
     name: str
     version: str | None  # None = not installed
-    fault: str = ""  # why it cannot be used; "" = it can
-    libraries: tuple[str, ...] = ()  # shared ones of the system that it lacks
+    fault: str = ""  # reason why it cannot be used; "" = it can
+    libraries: tuple[str, ...] = ()  # missing shared libraries of the system
 
     @property
     def works(self) -> bool:
-        """Whether it is there and can be used."""
+        """True if it is installed and can be imported."""
         return self.version is not None and not self.fault
 
 
 def look_at(
     wanted: Sequence[Requirement], facts: str
 ) -> tuple[tuple[Package, ...], dict[str, Any]]:
-    """Import packages in a process of their own.
+    """Import packages in a separate process.
 
     Args:
-        wanted: tried in this order.
-        facts: name of what the process is asked besides, see `gsba.doctor.facts`; "" = nothing.
+        wanted: packages to import, in this order.
+        facts: name of a function of `gsba.doctor.facts` that the process also calls; "" = none.
 
     Returns:
-        as found, and the answers; none where a package that they need is missing.
+        state of each package, and the facts; no facts if a package is missing.
     """
     versions = {one.name: _version(one.name) for one in wanted}
     unfit = {one.name: _unfit(one, versions[one.name]) for one in wanted}
@@ -69,7 +69,7 @@ def look_at(
 
 
 def debian_package(library: str) -> str:
-    """Debian's package of a shared library, by how these are named: libX11.so.6 is in libx11-6."""
+    """Debian's package of a shared library, by Debian's naming rule: libX11.so.6 is in libx11-6."""
     if library in _DEBIAN:
         return _DEBIAN[library]
     name, _, number = library.lower().partition(".so")
@@ -79,7 +79,7 @@ def debian_package(library: str) -> str:
 
 def _version(name: str) -> str | None:
     if name == "gsba":
-        return __version__  # which may run from its source
+        return __version__  # gsba may run from its source
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -87,7 +87,7 @@ def _version(name: str) -> str | None:
 
 
 def _unfit(wanted: Requirement, version: str | None) -> str:
-    """Why a package need not be tried; "" = it is."""
+    """Reason why a package is not imported; "" = it is imported."""
     if version is None:
         return "is not installed"
     return "" if wanted.allows(version) else f"{wanted.range} is needed"
@@ -96,7 +96,8 @@ def _unfit(wanted: Requirement, version: str | None) -> str:
 def _imported(
     modules: Sequence[str], facts: str
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
-    """What became of each module, and answers; a module that ends the process is left out next."""
+    """Report of each module, and facts; after a crash the remaining modules are imported again in
+    a new process."""
     reports: dict[str, dict[str, Any]] = {}
     answers: dict[str, Any] = {}
     rest = list(modules)
@@ -108,8 +109,8 @@ def _imported(
                 reports[line["module"]] = line
         begun = next((m for m in rest if reports.get(m, {}).get("state") == "begun"), None)
         if begun is None:
-            untold = {"error": ended or "could not be tried"}
-            reports = dict.fromkeys(rest, untold) | reports
+            unknown = {"error": ended or "it could not be imported"}
+            reports = dict.fromkeys(rest, unknown) | reports
             break
         reports[begun] = {"error": ended}
         rest, facts = rest[rest.index(begun) + 1 :], ""
@@ -117,7 +118,7 @@ def _imported(
 
 
 def _child(facts: str, modules: Sequence[str]) -> tuple[list[dict[str, Any]], str]:
-    """Lines of a process that imports modules, and how it ended; "" = as it should."""
+    """Lines of a process that imports modules, and its failure; "" = none."""
     path = os.pathsep.join(filter(None, sys.path))
     environment = {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
     call = [sys.executable, "-c", _CHILD, facts, *modules]
@@ -143,23 +144,23 @@ def _fault(report: dict[str, Any], libraries: Sequence[str]) -> str:
         return f"lacks {', '.join(libraries)}"
     if report.get("absent"):
         return f"needs {report['absent']}, which is not installed"
-    return brief(" ".join(str(report["error"]).split()), _MOST_SHOWN)
+    return brief(" ".join(str(report["error"]).split()), _MAX_MESSAGE_LENGTH)
 
 
 def _missing_libraries(module: str, error: str) -> tuple[str, ...]:
-    """Shared libraries that a package lacks: the one its import tells of, and what `ldd` sees."""
-    told = _LIBRARY.findall(error)
-    if not told:
+    """Shared libraries that a package lacks: the one that its import names, and those of `ldd`."""
+    named = _LIBRARY.findall(error)
+    if not named:
         return ()
-    lacking = dict.fromkeys(told)
+    lacking = dict.fromkeys(named)
     bundled = {path.name for path in _shared_objects(module)}
-    for path in islice(_shared_objects(module), _MOST_FILES):
+    for path in islice(_shared_objects(module), _MAX_FILES):
         try:
             listed = subprocess.run(["ldd", path], capture_output=True, text=True, timeout=10)
         except (OSError, subprocess.TimeoutExpired):
             break
         lacking |= dict.fromkeys(re.findall(r"(\S+) => not found", listed.stdout))
-    return tuple(name for name in lacking if name in told or name not in bundled)
+    return tuple(name for name in lacking if name in named or name not in bundled)
 
 
 def _shared_objects(module: str) -> Iterator[Path]:

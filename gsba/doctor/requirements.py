@@ -1,4 +1,4 @@
-"""What gsba asks of other packages: names, ranges of versions, and the extra they belong to."""
+"""Packages that gsba requires: names, version ranges, and the extras that they belong to."""
 
 import re
 import tomllib
@@ -8,22 +8,22 @@ from pathlib import Path
 
 import gsba
 
-NEEDED = ""  # the extra of what every run needs
+NEEDED = ""  # in place of an extra: packages that every run needs
 _MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "pyyaml": "yaml"}
-_NOT_EXAMINED = ("all", "docs", "test", "dev")  # sums of others, and what developers need
+_NOT_EXAMINED = ("all", "docs", "test", "dev")  # unions of others, and extras for developers
 
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """A package that gsba asks for."""
+    """Package that gsba requires."""
 
     name: str  # of the distribution
-    module: str  # that is imported
-    range: str  # of versions, such as ">=5,<6"
+    module: str  # name of its module
+    range: str  # range of versions, such as ">=5,<6"
     extra: str  # "" = always needed
 
     def allows(self, version: str) -> bool:
-        """Whether a version is in the range; of versions that are no numbers, all are."""
+        """True if a version is in the range, or is no number."""
         found = _numbers(version)
         tests = {
             ">=": lambda bound: found >= bound,
@@ -38,9 +38,9 @@ class Requirement:
 
 
 def requirements() -> tuple[Requirement, ...]:
-    """All of them, those that are always needed first.
+    """All required packages, those that are always needed first.
 
-    Read from pyproject.toml where gsba runs from its source, else from what is installed.
+    They are read from pyproject.toml if gsba runs from its source, else from installed metadata.
     """
     project = Path(gsba.__file__).parents[1] / "pyproject.toml"
     if project.is_file():
@@ -58,7 +58,7 @@ def requirements() -> tuple[Requirement, ...]:
 
 
 def _requirement(line: str, extra: str) -> Requirement:
-    """Of a line such as `laspy[lazrs]>=2.5`."""
+    """Requirement from a line such as `laspy[lazrs]>=2.5`."""
     match = re.match(r"\s*([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*\(?([^;)]*)", line)
     assert match is not None
     name = match[1].lower()
@@ -66,7 +66,7 @@ def _requirement(line: str, extra: str) -> Requirement:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """(2, 13) of "2.13.0+cpu"."""
+    """Numbers of a version without trailing zeros: (2, 13) of "2.13.0+cpu"."""
     release = re.match(r"[0-9.]*", version)
     numbers = [int(part) for part in (release[0] if release else "").split(".") if part]
     while numbers and numbers[-1] == 0:

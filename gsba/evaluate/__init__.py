@@ -1,4 +1,4 @@
-"""How good a run is: against the truth, by its own covariances, and by splats trained on it.
+"""Accuracy of a run: errors against the truth, consistency of covariances, quality of splats.
 
 Takes trajectories, a finished run, depth, or held-out frames.
 Gives errors, their table, and JSON. `gsba.evaluate.splats` is imported by its own name.

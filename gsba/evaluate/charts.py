@@ -1,6 +1,6 @@
-"""How figures are drawn: by matplotlib (extra `plot`), in one style, with the same bytes each time.
+"""Figures by matplotlib (extra `plot`), in one style and with reproducible bytes.
 
-A user's own matplotlibrc has no say, and files hold no dates.
+A user's matplotlibrc is ignored, and files hold no dates.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -14,13 +14,13 @@ from gsba.log import GsbaError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-KINDS = {  # suffix -> what a file is not to hold
+KINDS = {  # suffix -> metadata that a file must not hold
     ".png": {"Software": None},
     ".svg": {"Date": None, "Creator": None},
     ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
 }
-BEFORE, AFTER, TRUE = "#d9822b", "#1769aa", "#1b1c1e"  # as in report.html
-ALONE = "#2e7d4f"  # a trajectory that is no run's
+BEFORE, AFTER, TRUE = "#d9822b", "#1769aa", "#1b1c1e"  # colours of report.html
+ALONE = "#2e7d4f"  # colour of a trajectory file that is of no run
 _COLORS = (AFTER, ALONE, "#b3383f", "#7d4fa3", "#8a6d1c", "#258a99")
 _STYLE = {
     "axes.grid": True,
@@ -38,7 +38,7 @@ _STYLE = {
 
 
 class NoMatplotlibError(GsbaError):
-    """Figures are wanted, and matplotlib is not installed."""
+    """A figure needs matplotlib, which is not installed."""
 
 
 def write(
@@ -47,13 +47,13 @@ def write(
     """Draw one figure, and write it to files, atomically.
 
     Args:
-        paths: with a suffix of KINDS each.
+        paths: files, each with a suffix of KINDS.
         size_in: width and height, inches.
-        fill: draws into the figure.
+        fill: function that draws into the figure.
 
     Raises:
-        NoMatplotlibError: it is not installed.
-        GsbaError: the disk refuses.
+        NoMatplotlibError: matplotlib is not installed.
+        GsbaError: the disk cannot be written.
     """
     try:
         from matplotlib import style
@@ -73,10 +73,10 @@ def write(
 
 
 def colors() -> Iterator[str]:
-    """A colour for each of several lines; after some of them they repeat."""
+    """Colours of lines, which repeat after the sixth."""
     return cycle(_COLORS)
 
 
 def plain(name: str) -> str:
-    """A name that matplotlib shows as it is: not as a formula, nor left out of legends."""
+    """Name escaped for matplotlib, which else takes `$` for a formula and hides `_` in legends."""
     return ("\u200b" if name.startswith("_") else "") + name.replace("$", r"\$")

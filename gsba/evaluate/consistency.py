@@ -1,16 +1,16 @@
-"""Whether covariances can be believed: errors against the truth in units of what they claim.
+"""Consistency of covariances: normalised errors against the truth, and NEES.
 
-An estimator is consistent where its errors are as large as its covariances say (Bar-Shalom, Li and
-Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4). Errors
-only compare with covariances in the gauge that these are of: the first pose and its distance to
-the position furthest from it are held, so the truth is moved, turned and scaled until exactly
-those agree. Along that distance the frame there has neither an error nor a variance, and five
-degrees of freedom are judged instead of six.
+An estimator is consistent if its errors are as large as its covariances (Bar-Shalom, Li and
+Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4). Errors are
+comparable with covariances only in the gauge of these: the first pose and its distance to the
+furthest position are fixed. The truth is therefore aligned by the similarity that makes exactly
+those agree. Along that distance the furthest frame has neither error nor variance, so that five of
+its degrees of freedom are tested instead of six.
 
-Were errors independent, six times the number of poses times the mean of their normalised squares
-would follow a chi-square distribution of as many degrees of freedom. Those of one path have most in
-common and scatter more. What is expected is therefore measured on errors that the run drew from the
-joint distribution of all its poses, of which each pose's covariance is a part.
+If errors were independent, six times the number of poses times the mean of their normalised squares
+would follow a chi-square distribution of as many degrees of freedom. Errors along one path are
+correlated and scatter more. The expected interval is therefore measured on samples that the run
+drew from the joint distribution of all its poses, whose marginals are the covariances.
 """
 
 from collections.abc import Callable
@@ -24,44 +24,44 @@ from gsba.similarity import Sim3
 from gsba.trajectory.association import matched_in_time
 from gsba.types import Reconstruction, Trajectory
 
-EXPECTED = 0.95  # share of drawn errors within the interval that is given
-_LEAST = 1e-12  # eigenvalue of a correlation matrix: less is rounding
+EXPECTED = 0.95  # share of sampled errors within the expected interval
+_MIN_EIGENVALUE = 1e-12  # of a correlation matrix: smaller ones are rounding errors
 
 
 @dataclass(frozen=True, slots=True)
 class Statistic:
-    """A measure of the errors, and where errors as the covariances claim have it."""
+    """Statistic of the errors, and its interval for errors distributed by the covariances."""
 
     value: float
-    low: float  # of EXPECTED of the draws
-    high: float
+    low: float  # lower end of the interval that holds EXPECTED of the samples
+    high: float  # its upper end
 
     @property
     def expected(self) -> bool:
-        """Whether the value is within the interval."""
+        """True if the value is within the interval."""
         return self.low <= self.value <= self.high
 
 
 @dataclass(frozen=True, slots=True)
 class Claims:
-    """What is left of the claims of some covariances."""
+    """Statistics of errors normalised by their covariances."""
 
-    num: int  # poses or steps that were judged
-    rotation: Statistic  # rms of error / sigma over them and the axes of the rig
-    position: Statistic  # the same
-    nees: Statistic  # normalised estimation error squared e^T P^-1 e, mean over them; 6 if all is
-    # right, but for the degree of freedom that the gauge takes
+    num: int  # number of poses or steps
+    rotation: Statistic  # rms of rotation error / sigma over these and the axes of the rig
+    position: Statistic  # rms of position error / sigma over these and the axes of the rig
+    nees: Statistic  # normalised estimation error squared e^T P^-1 e, mean over these; 6 if
+    # consistent, less the degree of freedom that the gauge takes
 
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """How errors compare with the covariances of poses, in the gauge of these."""
+    """Consistency of pose covariances with the errors of the poses, in the covariances' gauge."""
 
-    first: int  # frame whose pose is held
-    furthest: int  # frame whose distance from it is held
+    first: int  # frame whose pose the gauge fixes
+    furthest: int  # frame whose distance from it the gauge fixes
     absolute: Claims  # of each pose
-    consecutive: Claims | None  # of each frame in the axes of the one before; None = no two
-    # neighbours have a true pose
+    consecutive: Claims | None  # of each step from one frame to the next; None = no two neighbours
+    # have a true pose
 
     def to_json(self) -> dict:
         """Plain dict for json.dump."""
@@ -69,32 +69,33 @@ class Consistency:
 
 
 @dataclass(frozen=True, slots=True)
-class _Judge:
-    """Covariances of some errors, ready to weigh them."""
+class _NormalisedErrors:
+    """Covariances of errors, factored to normalise them."""
 
-    rows: np.ndarray  # (N,) of all errors
-    axes: np.ndarray  # (N, 6, 6) orthogonal: error = axes @ error in the rig's axes
-    kept: np.ndarray  # (N, 6) bool, of those: the others are held by the gauge
-    sigmas: np.ndarray  # (N, 6) along them
-    whiteners: np.ndarray  # (N, 6, 6) of errors along them in sigmas
+    rows: np.ndarray  # (N,) int, rows of these among all errors
+    axes: np.ndarray  # (N, 6, 6) orthogonal: rows are the axes, as tangents in the rig frame
+    kept: np.ndarray  # (N, 6) bool, axes that are tested; the gauge fixes the others
+    sigmas: np.ndarray  # (N, 6) standard deviations along the axes
+    whiteners: np.ndarray  # (N, 6, 6) whiten errors along the axes that are divided by sigmas
 
     @classmethod
-    def of(cls, rows: np.ndarray, covariances: np.ndarray, held: np.ndarray) -> "_Judge":
-        """Of errors with covariances (N, 6, 6), without positions along `held (N, 3)` unless 0."""
+    def of(cls, rows: np.ndarray, covariances: np.ndarray, held: np.ndarray) -> "_NormalisedErrors":
+        """Normaliser for covariances (N, 6, 6), without positions along `held` (N, 3) unless 0."""
         axes, kept = np.tile(np.eye(6), (len(rows), 1, 1)), np.ones((len(rows), 6), bool)
         for n in np.flatnonzero(held.any(axis=1)):
-            axes[n, 3:, 3:] = np.linalg.svd(held[n, None])[2]  # its first row is along
+            axes[n, 3:, 3:] = np.linalg.svd(held[n, None])[2]  # its first row is along `held`
             kept[n, 3] = False
         along = axes @ covariances @ np.swapaxes(axes, 1, 2)
         both = kept[:, :, None] & kept[:, None, :]
         along = np.where(both, along, np.eye(6))
         sigmas = np.sqrt(np.maximum(np.einsum("nii->ni", along), 1e-300))
         values, vectors = np.linalg.eigh(along / (sigmas[:, :, None] * sigmas[:, None, :]))
-        roots = vectors / np.sqrt(np.maximum(values, _LEAST))[:, None, :]
+        roots = vectors / np.sqrt(np.maximum(values, _MIN_EIGENVALUE))[:, None, :]
         return cls(rows, axes, kept, sigmas, roots @ np.swapaxes(vectors, 1, 2))
 
     def measures(self, errors: np.ndarray) -> np.ndarray:
-        """Rotation and position over sigma, and NEES: (..., 3) of errors (..., N, 6)."""
+        """Statistics (..., 3) of errors (..., N, 6): rms rotation / sigma, rms position / sigma,
+        and NEES."""
         scaled = np.einsum("nij,...nj->...ni", self.axes, errors) / self.sigmas * self.kept
         squares, counts = np.sum(scaled**2, axis=-2), self.kept.sum(axis=0)
         rms = [
@@ -105,7 +106,7 @@ class _Judge:
         return np.stack([*rms, np.sum(whitened**2, axis=(-2, -1)) / len(self.rows)], axis=-1)
 
     def claims(self, errors: np.ndarray, drawn: np.ndarray) -> Claims:
-        """What errors (N, 6) make of them, beside drawn ones (D, N, 6)."""
+        """Statistics of errors (N, 6), with intervals from sampled errors (D, N, 6)."""
         tails = (1 - EXPECTED) / 2
         found, spread = self.measures(errors), self.measures(drawn)
         lows, highs = np.quantile(spread, [tails, 1 - tails], axis=0)
@@ -122,13 +123,13 @@ def consistency_of(
     """Compare the covariances of a map's poses with the errors of these.
 
     Args:
-        reconstruction: one map, as `load_run` gives it.
-        timestamps: (F,) of its frames, seconds.
-        truth: in any world and scale; frames without a true pose are not judged.
-        tolerance_s: largest difference of time stamps, seconds.
+        reconstruction: one map, from `load_run`.
+        timestamps: (F,) times of its frames, seconds.
+        truth: true poses in any world and scale; frames without a true pose are not tested.
+        tolerance_s: largest difference of timestamps, seconds.
 
     Raises:
-        GsbaError: the run has no covariances, or the truth lacks the frames that hold its gauge.
+        GsbaError: the run has no covariances, or the truth lacks the frames that fix the gauge.
     """
     poses, covariances = reconstruction.world_T_rigs, reconstruction.pose_covariances
     known = np.flatnonzero(np.isfinite(covariances).all(axis=(1, 2)))
@@ -140,8 +141,8 @@ def consistency_of(
     for frame in (0, far):
         if not np.any(rows == frame):
             raise GsbaError(
-                f"no true pose within {tolerance_s:g} s of {timestamps[frame]:.3f} s, where the "
-                "gauge of the covariances is held"
+                f"no true pose is within {tolerance_s:g} s of {timestamps[frame]:.3f} s, the time "
+                "of a frame that fixes the gauge of the covariances"
             )
     true_T_rigs = np.full_like(poses, np.nan)
     true_T_rigs[rows] = truth.world_T_rigs[of_truth]
@@ -160,19 +161,19 @@ def consistency_of(
     sure = np.isfinite(of_steps).all(axis=(1, 2)) & np.isfinite(step_errors).all(axis=1)
     chosen = np.flatnonzero(sure)
     only = held[1:].copy()
-    only[1:] = 0  # a distance is held between neighbours only where the first step reaches there
+    only[1:] = 0  # the gauge fixes a step only if the furthest frame is the second one
     drawn = joint.draws.astype(np.float64)
-    found = _Judge.of(judged, covariances[judged], held[judged])
+    found = _NormalisedErrors.of(judged, covariances[judged], held[judged])
     absolute, consecutive = found.claims(errors[judged], drawn[:, judged]), None
     if len(chosen):
-        found = _Judge.of(chosen, of_steps[chosen], only[chosen])
+        found = _NormalisedErrors.of(chosen, of_steps[chosen], only[chosen])
         drawn = drawn[:, 1:] + np.einsum("fij,dfj->dfi", before, drawn[:, :-1])
         consecutive = found.claims(step_errors[chosen], drawn[:, chosen])
     return Consistency(0, far, absolute, consecutive)
 
 
 def format_consistency(found: Consistency, name: Callable[[int], str] = str) -> str:
-    """Text table; `name` says what a frame is called."""
+    """Text table of the statistics; `name` gives the name of a frame."""
     header = ["", "poses", "rotation error/σ", "position error/σ", "NEES"]
     rows = [header]
     for title, claims in (("absolute", found.absolute), ("consecutive", found.consecutive)):
@@ -188,29 +189,28 @@ def format_consistency(found: Consistency, name: Callable[[int], str] = str) -> 
         "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows
     ]
     first, far = name(found.first), name(found.furthest)
-    lines.append(f"with the pose of {first} and its distance to {far} held; in brackets what")
-    lines.append(f"{EXPECTED:.0%} of errors as these covariances claim would give.")
+    lines.append(f"in the gauge that fixes the pose of {first} and its distance to {far}; in")
+    lines.append(f"brackets: {EXPECTED:.0%} interval of errors distributed by these covariances.")
     return "\n".join(lines)
 
 
 def _in_gauge(true_T_rigs: np.ndarray, world_T_rigs: np.ndarray, far: int) -> np.ndarray:
-    """True poses with the first pose, and its distance to one frame, of the estimate."""
+    """True poses (N, 4, 4), moved to the estimate's first pose and scaled to its distance to frame
+    `far`."""
     scales = [
         np.linalg.norm(some[far, :3, 3] - some[0, :3, 3]) for some in (world_T_rigs, true_T_rigs)
     ]
     for owner, length in zip(("run", "truth"), scales, strict=True):
         if not length > 0:
-            raise GsbaError(f"the {owner} does not move: its positions leave the scale open")
+            raise GsbaError(f"the {owner} does not move: its positions determine no scale")
     scale = float(scales[0] / scales[1])
     local = Sim3.of(scale, np.eye(4)).poses(inverse(true_T_rigs[0]) @ true_T_rigs)
     return world_T_rigs[0] @ local
 
 
 def _errors(estimates: np.ndarray, truths: np.ndarray) -> np.ndarray:
-    """Tangents (N, 6) [rotation, translation] at estimates (N, 4, 4) that lead to the truths.
-
-    To first order: the translation is not that of the group's logarithm.
-    """
+    """Tangents (N, 6) [rotation, translation] from estimates (N, 4, 4) to truths, to first order:
+    the translation is that of the relative pose, not of the group's logarithm."""
     from scipy.spatial.transform import Rotation
 
     off = inverse(estimates) @ truths

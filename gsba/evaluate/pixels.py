@@ -1,4 +1,4 @@
-"""Induced pixel error: how far pose errors move what a frame shows in its neighbours' images."""
+"""Induced pixel error: shift of a frame's points in its neighbours' images by pose errors."""
 
 import zipfile
 import zlib
@@ -15,14 +15,14 @@ from gsba.store.records import HEADER_ERRORS
 from gsba.trajectory.association import matched_in_time
 from gsba.types import Trajectory
 
-STEPS = (1, 4)  # frames between a frame and the neighbours that look at its pixels
-_FURTHEST = 1e12  # truth units: beyond, nothing was measured
-_SPACING = 4  # pixels of a depth map between samples
+STEPS = (1, 4)  # frames from a frame to the neighbours into which its pixels are projected
+_MAX_RANGE = 1e12  # truth units: larger values mean that nothing was measured
+_SPACING_PX = 4  # pixels of a depth map between samples
 
 
 @dataclass(frozen=True, slots=True)
 class InducedErrors:
-    """Angles between true and estimated sightings of the same pixels, in panorama pixels."""
+    """Angles between true and estimated directions to the same points, in panorama pixels."""
 
     median_px: float
     percentile95_px: float
@@ -39,27 +39,29 @@ def induced_errors(
     steps: Sequence[int] = STEPS,
     tolerance_s: float = 0.01,
 ) -> InducedErrors:
-    """See every sampled pixel of each frame from its neighbours, under true and estimated poses.
+    """Project sampled pixels of each frame into its neighbours, under true and estimated poses.
 
-    A pixel goes out to its true depth, by the true and by the Sim(3)-aligned estimated pose, and
-    is seen from the neighbours `steps` frames before and after it by the same poses. The angle
-    between both directions is what a splat would be trained against.
+    A pixel is moved to its true depth, by the true and by the Sim(3)-aligned estimated pose, and is
+    projected into the neighbours `steps` frames before and after it by the same poses. The angle
+    between both directions is the error that a splat would be trained with.
 
     Args:
-        estimate: poses to judge, associated with the truth by time.
+        estimate: estimated poses, associated with the truth by time.
         truth: the true poses.
         depth_of: row of `truth` -> range (h, 2h) along the ray of each pixel of a panorama of
-            that size, truth units; 0 = nothing there.
-        width: of the full panorama, in whose pixels (at the equator) errors are given.
-        steps: frames between both.
-        tolerance_s: of the association.
+            that size, truth units; 0 = no surface.
+        width: width of the full panorama, in whose pixels (at the equator) errors are given.
+        steps: frames from a frame to its neighbours.
+        tolerance_s: largest difference of timestamps, seconds.
 
     Raises:
         GsbaError: fewer than three poses associate, or no frame has a neighbour.
     """
     rows_e, rows_t = matched_in_time(estimate, truth, tolerance_s)
     if len(rows_t) < 3:
-        raise GsbaError(f"only {len(rows_t)} poses associate with the truth; alignment needs 3")
+        raise GsbaError(
+            f"only {len(rows_t)} poses have a true pose within {tolerance_s:g} s; alignment needs 3"
+        )
     true_T_rigs = truth.world_T_rigs[rows_t]
     poses = estimate.world_T_rigs[rows_e]
     aligned = similarity(poses[:, :3, 3], true_T_rigs[:, :3, 3]).poses(poses)
@@ -78,8 +80,8 @@ def induced_errors(
     pooled = np.concatenate(list(found.values())) if found else np.zeros(0)
     if len(pooled) == 0:
         raise GsbaError(
-            "no frame with depth has a neighbour: induced errors need two frames one or four "
-            "apart, and maps that hold a distance somewhere"
+            "no frame with depth has a neighbour: induced errors need depth maps with a distance "
+            f"above 0, and two frames that are {' or '.join(map(str, steps))} apart"
         )
     return InducedErrors(
         float(np.median(pooled)),
@@ -94,11 +96,11 @@ def depth_maps(folder: Path, num: int) -> Callable[[int], np.ndarray]:
     """Reader of the depth maps `NAME.npz` with a `range` array (h, 2h), in name order.
 
     Args:
-        folder: of the maps.
-        num: poses of the truth, each of which has one.
+        folder: folder of the maps.
+        num: number of true poses, each of which has a map.
 
     Raises:
-        GsbaError: the folder holds another number; and from the reader, a map that is none.
+        GsbaError: the folder holds another number of maps; the reader raises it for an invalid map.
     """
     files = sorted(folder.glob("*.npz"))
     if len(files) != num:
@@ -113,31 +115,36 @@ def depth_maps(folder: Path, num: int) -> Callable[[int], np.ndarray]:
             with np.load(path, allow_pickle=False) as archive:
                 ranges = archive["range"]
         except (OSError, EOFError, ValueError, KeyError, TypeError, IndexError) as error:
-            raise GsbaError(f"{path}: no depth map with an array `range` ({error})") from None
+            raise GsbaError(f"{path} holds no array `range` of depths ({error})") from None
         except (zipfile.BadZipFile, zlib.error, NotImplementedError, *HEADER_ERRORS) as error:
             raise GsbaError(f"{path}: damaged depth map ({error})") from None
         if ranges.ndim != 2 or ranges.dtype.kind not in "fiu":
-            raise GsbaError(f"{path}: `range` is no image of numbers, but {ranges.shape}")
+            raise GsbaError(
+                f"{path}: `range` has the shape {ranges.shape} and the type {ranges.dtype}, but it "
+                "must be an image of numbers"
+            )
         if not 0 < 2 * ranges.shape[0] == ranges.shape[1]:
-            raise GsbaError(f"{path}: {ranges.shape[1]}x{ranges.shape[0]}, but a map is 2:1")
+            raise GsbaError(
+                f"{path}: `range` is {ranges.shape[1]}x{ranges.shape[0]}, but it must be 2:1"
+            )
         return ranges
 
     return read
 
 
 def _points(ranges: np.ndarray) -> np.ndarray:
-    """Points (N, 3) in the rig frame of every few pixels of a depth map that hit something."""
+    """Points (N, 3), rig frame, of a grid of pixels of a depth map that have a depth."""
     height, width = ranges.shape
-    rows = np.arange(_SPACING // 2, height, _SPACING)
-    columns = np.arange(_SPACING // 2, width, _SPACING)
+    rows = np.arange(_SPACING_PX // 2, height, _SPACING_PX)
+    columns = np.arange(_SPACING_PX // 2, width, _SPACING_PX)
     pixels = np.stack(np.meshgrid(columns + 0.5, rows + 0.5), axis=-1)
     depths = ranges[np.ix_(rows, columns)].astype(np.float64)
-    hit = (depths > 0) & (depths < _FURTHEST)
+    hit = (depths > 0) & (depths < _MAX_RANGE)
     return depths[hit][:, None] * bearings_from_erp(pixels[hit], width, height)
 
 
 def _seen(world_T_rig: np.ndarray, world_T_other: np.ndarray, points_rig: np.ndarray) -> np.ndarray:
-    """Points (N, 3) of one rig's frame in another's."""
+    """Points (N, 3) of one rig frame in another rig frame."""
     points_world = points_rig @ world_T_rig[:3, :3].T + world_T_rig[:3, 3]
     return (points_world - world_T_other[:3, 3]) @ world_T_other[:3, :3]
 

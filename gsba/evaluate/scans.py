@@ -1,4 +1,4 @@
-"""A run's cloud against a scan of the place: how far off its points are, and were before."""
+"""Distances of a run's points to a scan of the place, before and after refinement."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,28 +17,28 @@ from gsba.scans.types import Cloud, Scan, cloud_of
 from gsba.similarity import Sim3, pose_similarity
 from gsba.types import Reconstruction
 
-_BEFORE = 0.08  # of the cloud's size: how far off the cloud before may be
-_SHOWN = 0.9  # of the points before, that a histogram spans
-_STOPS = np.array(  # colours (C, 3) from no distance to the largest shown one
+_MAX_COARSE_OFFSET = 0.08  # largest offset of the unrefined cloud, part of the cloud's size
+_HISTOGRAM_QUANTILE = 0.9  # share of points whose distance a histogram spans
+_COLOR_STOPS = np.array(  # colours (C, 3) from distance 0 to the largest shown one
     [[38, 70, 140], [60, 160, 190], [120, 190, 110], [240, 200, 70], [200, 50, 40]], np.float64
 )
 
 
 @dataclass(frozen=True, slots=True)
 class ScanErrors:
-    """What a scan says of a run; lengths in its unit."""
+    """Distances of a run's points to a scan; lengths in the scan's unit."""
 
     registration: Registration  # of the refined cloud
-    after: Distances
-    before: Distances | None  # the same points under the poses before; None = there were none
-    cloud: np.ndarray  # (N, 3) float64, refined, world of the scan less its offset
-    rows: np.ndarray  # (N,) int64: which points of the reconstruction these are
+    after: Distances  # of the refined points
+    before: Distances | None  # of the points under the initial poses; None = there were none
+    cloud: np.ndarray  # (N, 3) float64, refined points, world of the scan less its offset
+    rows: np.ndarray  # (N,) int64, rows of these points in the reconstruction
 
     @property
     def furthest(self) -> float:
-        """How far histograms and colours reach."""
+        """Largest distance that histograms and colours show."""
         parts = [self.after.values] + ([] if self.before is None else [self.before.values])
-        return float(max(np.quantile(values, _SHOWN) for values in parts))
+        return float(max(np.quantile(values, _HISTOGRAM_QUANTILE) for values in parts))
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
@@ -49,14 +49,14 @@ class ScanErrors:
         }
 
     def colors(self) -> np.ndarray:
-        """Of the cloud's points, see `colors_of`."""
+        """Colours (N, 3) of the cloud's points by distance, see `colors_of`."""
         return colors_of(self.after.values, self.furthest)
 
 
 def colors_of(distances: np.ndarray, furthest: float) -> np.ndarray:
-    """Colours (N, 3) uint8 RGB of distances (N,): blue is near, red as far as `furthest`."""
-    at = np.clip(distances / max(furthest, 1e-12), 0, 1) * (len(_STOPS) - 1)
-    columns = [np.interp(at, np.arange(len(_STOPS)), stop) for stop in _STOPS.T]
+    """Colours (N, 3) uint8 RGB of distances (N,): blue at 0, red at `furthest` and beyond."""
+    at = np.clip(distances / max(furthest, 1e-12), 0, 1) * (len(_COLOR_STOPS) - 1)
+    columns = [np.interp(at, np.arange(len(_COLOR_STOPS)), stop) for stop in _COLOR_STOPS.T]
     return np.round(np.stack(columns, axis=1)).astype(np.uint8)
 
 
@@ -68,17 +68,17 @@ def scan_errors(
 ) -> ScanErrors:
     """Distances of a run's points to a scan, after its refinement and before.
 
-    Before, the same observations are triangulated under the poses before. Both clouds are laid on
-    the scan each by its own best similarity, so that neither's frame counts against it.
+    The points before are the same observations, triangulated under the initial poses. Each cloud is
+    aligned to the scan by its own best similarity: differences of their worlds do not count.
 
     Args:
-        reconstruction: refined.
-        scan: of the same place.
-        coarse_T_rigs: (F, 4, 4) poses of the frames before, of any world and scale.
+        reconstruction: the refined run.
+        scan: scan of the same place.
+        coarse_T_rigs: (F, 4, 4) initial poses of the frames, of any world and scale.
         guess: see `gsba.scans.registration`.
 
     Raises:
-        GsbaError: the cloud has no place in the scan, or several.
+        GsbaError: the cloud fits the scan in no place, or in several.
     """
     cloud = cloud_of(reconstruction, normals_of)
     found = register(cloud, scan, guess)
@@ -92,7 +92,7 @@ def scan_errors(
         )
         good = np.isfinite(placed).all(axis=1)
         coarse = cloud.taken(np.flatnonzero(good)).at(at.points_back(placed[good]))
-        width = _BEFORE * cloud.size * at.scale
+        width = _MAX_COARSE_OFFSET * cloud.size * at.scale
         near, sigma = approach(at, coarse, scan, width)
         fit = settle(near, coarse, scan, sigma)
         before = _distances(fit.similarity, coarse, scan, found.fit.noise)
@@ -107,7 +107,7 @@ def _distances(at: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> Distances:
 
 
 def format_scan(errors: ScanErrors) -> str:
-    """A table for people, and how distances are distributed."""
+    """Text with the registration and a table of median, 90th percentile and inlier ratio."""
     rows = {"before": errors.before, "after": errors.after}
     lines = [f"{errors.registration}", "", f"{'':8}{'median':>10}{'90 %':>10}{'on it':>9}"]
     for name, found in rows.items():

@@ -1,4 +1,4 @@
-"""How far a trajectory is from the truth: ATE, rotation, relative pose errors, all-pairs AUC."""
+"""Errors of a trajectory against the truth: ATE, rotation, relative pose errors, all-pairs AUC."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -12,13 +12,13 @@ from gsba.trajectory.association import matched_in_time
 from gsba.types import Trajectory
 
 AUC_THRESHOLDS_DEG = (0.1, 0.25, 0.5, 1.0, 5.0, 10.0)
-ZERO_BASELINE = 1e-6  # of the truth's extent; nearer pairs have no direction
-_BLOCK_PAIRS = 1 << 18  # pairs worked on at a time
+ZERO_BASELINE = 1e-6  # part of the truth's extent; pairs with less have no direction
+_PAIRS_AT_ONCE = 1 << 18
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorStatistics:
-    """Summary of one error over all its samples; NaN where there are none."""
+    """Summary of one error over all its samples; NaN if there are none."""
 
     rmse: float
     median: float
@@ -37,8 +37,8 @@ class ErrorStatistics:
 class TrajectoryErrors:
     """Errors of a trajectory against the truth."""
 
-    num_truth: int  # poses of the truth, all of them expected
-    num_matched: int  # those with an estimate; the others fail every pair they are in
+    num_truth: int  # number of true poses
+    num_matched: int  # number of these with an estimate; every pair with one of the others fails
     scale: float  # truth units per estimate unit, of the Sim(3) alignment
     ate: ErrorStatistics  # truth units, positions after Sim(3) alignment
     rotation_deg: ErrorStatistics  # degrees, after the best common rotation
@@ -57,17 +57,17 @@ class TrajectoryErrors:
 
 @dataclass(frozen=True, slots=True)
 class PoseErrors:
-    """How far each pose of a trajectory is from the truth, after alignment to it."""
+    """Errors of each pose of a trajectory, after alignment to the truth."""
 
-    rows: np.ndarray  # (M,) of the estimate
-    true_rows: np.ndarray  # (M,) of the truth, ascending
+    rows: np.ndarray  # (M,) int, rows of the estimate
+    true_rows: np.ndarray  # (M,) int, rows of the truth, ascending
     fit: Sim3  # from the estimate's world into the truth's, by positions
     positions: np.ndarray  # (M,) float64, truth units
     rotations: np.ndarray  # (M,) float64, radians, after the best common rotation
 
 
 def pose_errors(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01) -> PoseErrors:
-    """Errors of single poses; alignment, arguments and failures are those of `evaluate`."""
+    """Errors of single poses; for alignment, arguments and exceptions see `evaluate`."""
     rows_e, rows_t = matched_in_time(estimate, truth, tolerance_s)
     if len(rows_t) < 3:
         raise GsbaError(
@@ -79,7 +79,7 @@ def pose_errors(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.
     positions, true_positions = world_T_rigs[:, :3, 3], true_T_rigs[:, :3, 3]
     for owner, points in (("estimate", positions), ("truth", true_positions)):
         if np.ptp(points, axis=0).max() <= 1e-12 * (1 + np.abs(points).max()):
-            raise GsbaError(f"the {owner} does not move: its positions leave the scale open")
+            raise GsbaError(f"the {owner} does not move: its positions determine no scale")
     fit = similarity(positions, true_positions)
     common = nearest_rotation((true_rotations @ np.swapaxes(rotations, 1, 2)).sum(axis=0))
     residual = np.swapaxes(true_rotations, 1, 2) @ common @ rotations
@@ -90,19 +90,19 @@ def pose_errors(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.
 def evaluate(
     estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01
 ) -> TrajectoryErrors:
-    """Compare a trajectory with the truth, whatever its world frame and scale.
+    """Compare a trajectory of any world and scale with the truth.
 
-    Poses are associated by time: mutually nearest and within the tolerance. Positions are
-    aligned by the least-squares similarity, orientations by the rotation that is best for them
-    alone (so that a straight path, whose positions leave a roll open, is judged fairly).
+    Poses are associated by time: mutually nearest and within the tolerance. Positions are aligned
+    by the least-squares similarity, orientations by their own best rotation: the positions of a
+    straight path do not determine its roll.
 
     Args:
-        estimate: poses to judge; non-finite ones count as missing.
-        truth: the true poses; each one without an estimate is missing.
-        tolerance_s: largest difference of time stamps, seconds.
+        estimate: estimated poses; non-finite ones count as missing.
+        truth: the true poses; each one without an estimate counts as missing.
+        tolerance_s: largest difference of timestamps, seconds.
 
     Raises:
-        GsbaError: fewer than three poses matched_in_time, or their positions coincide.
+        GsbaError: fewer than three poses match in time, or their positions coincide.
     """
     errors = pose_errors(estimate, truth, tolerance_s)
     rows_t, scale = errors.true_rows, errors.fit.scale
@@ -135,9 +135,9 @@ def area_under_recall(
     the relative-pose literature (Sarlin et al., SuperGlue, CVPR 2020).
 
     Args:
-        errors: (P,) errors, P <= num_expected; the others of the expected never succeed.
-        num_expected: how many errors there should be.
-        thresholds: in the unit of the errors, positive.
+        errors: (P,) errors, P <= num_expected; missing ones count as infinite.
+        num_expected: number of expected errors.
+        thresholds: thresholds in the unit of the errors, positive.
 
     Returns:
         threshold -> area, 0..1.
@@ -162,8 +162,8 @@ def format_table(
 
     Args:
         rows: name -> errors.
-        extra: further columns, header -> a cell for each row; put the unit into the header.
-        length_unit: unit of the truth, "m" only where its scale is metric.
+        extra: further columns, header with unit -> cells of all rows.
+        length_unit: unit of the truth, "m" only if its scale is metric.
     """
     header = [
         ["", "poses", "ATE rmse", "median", "max", "rotation", "rel. rot.", "RPE"]
@@ -193,7 +193,7 @@ def format_table(
 def _step_errors(
     world_T_rigs: np.ndarray, true_T_rigs: np.ndarray, steps: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Translation (truth units) and rotation (radians) errors, (S,) each, of steps i -> i + 1."""
+    """Errors of steps i to i + 1: translation (S,), truth units, and rotation (S,), radians."""
     translations, rotations = [], []
     for poses, factor in ((world_T_rigs, scale), (true_T_rigs, 1.0)):
         rig_R_world = np.swapaxes(poses[steps, :3, :3], 1, 2)
@@ -207,9 +207,10 @@ def _step_errors(
 def _pair_errors(world_T_rigs: np.ndarray, true_T_rigs: np.ndarray) -> np.ndarray:
     """Errors (N (N - 1) / 2,) in radians of the relative poses of all pairs i < j.
 
-    The larger of two angles: of the relative rotation, and between true and estimated direction
-    to pose j, both in the axes of pose i. A true baseline under ZERO_BASELINE of the extent has
-    no direction: rotation alone counts. An estimate without baseline has the direction wrong.
+    The error is the larger of two angles: of the relative rotation, and between true and estimated
+    direction to pose j, both in the axes of pose i. A true baseline under ZERO_BASELINE of the
+    extent has no direction, so that the rotation alone counts. An estimate without baseline counts
+    as a direction that is off by pi.
     """
     num = len(true_T_rigs)
     rotations, true_rotations = world_T_rigs[:, :3, :3], true_T_rigs[:, :3, :3]
@@ -222,7 +223,7 @@ def _pair_errors(world_T_rigs: np.ndarray, true_T_rigs: np.ndarray) -> np.ndarra
     errors = []
     start = 0
     while start < num - 1:
-        rows = np.arange(start, min(num - 1, start + max(1, _BLOCK_PAIRS // (num - start))))
+        rows = np.arange(start, min(num - 1, start + max(1, _PAIRS_AT_ONCE // (num - start))))
         columns = np.arange(start + 1, num)
         q0, q1 = quaternions[rows, None], quaternions[None, columns]
         chord = np.minimum(np.linalg.norm(q0 - q1, axis=-1), np.linalg.norm(q0 + q1, axis=-1))

@@ -1,7 +1,7 @@
 """Datasets for other programs: COLMAP, nerfstudio, PLY, TUM.
 
-Takes a result, its frames, and where it is placed.
-Gives a folder that the consumer reads as it is.
+Takes a result, its frames, and its placement.
+Gives a folder that the other program reads without conversion.
 """
 
 from gsba.export.formats import ExportFormat, export, export_all

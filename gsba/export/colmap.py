@@ -1,17 +1,19 @@
-"""COLMAP models (4.x): rigs and frames, with images.bin consistent for readers that know neither.
+"""COLMAP models (4.x) with rigs and frames; images.bin also serves readers without these.
 
 Layouts:
 
 * `colmap`: PINHOLE faces in one rig, `images/front/NAME.jpg`, `masks/front/NAME.jpg.png`,
   `sparse/0`, and `rig_config.json` for COLMAP's own tools: six of one centre, or the ten of
   `gsba.camera.views` where two lenses are known.
-* `colmap-flat`: the same cameras, `images/NAME_front.jpg`. For trainers that resolve images by
-  their base name. `sparse/0/points3D.ply` is INRIA's start cloud, and `sparse/0/test.txt` lists all
-  faces of every eighth frame: holding out single faces would leave their siblings in the training.
-* both with raw fisheyes as they are (`--images fisheye`): two OPENCV_FISHEYE cameras and
-  `images/front`, `images/back`; masks leave out what is beyond the circles; rows are as they were.
-* `colmap-erp`: one EQUIRECTANGULAR camera and the panoramas themselves; of two lenses, as one in
-  the middle would have them (`gsba.camera.one_centre`).
+* `colmap-flat`: the cameras of `colmap`, `images/NAME_front.jpg`. For trainers that resolve images
+  by their base name. `sparse/0/points3D.ply` is INRIA's start cloud, and `sparse/0/test.txt` lists
+  all faces of every eighth frame: if single faces were held out, training would show the other
+  faces of the same panorama.
+* `colmap` and `colmap-flat` of raw fisheyes (`--images fisheye`): two OPENCV_FISHEYE cameras and
+  `images/front`, `images/back`; masks leave out pixels beyond the image circles; the rolling
+  shutter is not corrected.
+* `colmap-erp`: one EQUIRECTANGULAR camera and the panoramas; panoramas of two lenses are stitched
+  for one centre in the middle (`gsba.camera.one_centre`).
 
 A frame's pose is stored as rig_from_world, where COLMAP's rig frame is that of the first camera.
 Image f * C + c + 1 is face c of frame f, point j + 1 is point j.
@@ -37,7 +39,7 @@ from gsba.geometry import inverse, pose, quaternion_from_rotation
 from gsba.log import GsbaError
 from gsba.types import Fisheye, FrameSet, Reconstruction
 
-TEST_EVERY = 8  # frames, as the trainers' own hold-out
+TEST_EVERY = 8  # one frame of so many is held out, which is the trainers' own interval
 _BY_VIEW, _FLAT = "{view}/{name}{suffix}", "{name}_{view}{suffix}"  # names of images
 
 
@@ -48,9 +50,9 @@ class Sensor:
     model: str  # COLMAP's name
     width: int  # pixels
     height: int  # pixels
-    params: tuple[float, ...]  # as the model wants them, corner origin
+    params: tuple[float, ...]  # parameters of COLMAP's model, corner origin
     rig_T_sensor: np.ndarray  # (4, 4) float64
-    fisheye: Fisheye | None = None  # what it is, of OPENCV_FISHEYE
+    fisheye: Fisheye | None = None  # lens of an OPENCV_FISHEYE camera
 
 
 def write_colmap(
@@ -61,7 +63,7 @@ def write_colmap(
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
 ) -> FrameWriter:
-    """Write the rig layout into `partial`, all but the pictures."""
+    """Write the rig layout into `partial`, without images; returns their writer."""
     views = views_for(frames, face_size_for(frames, face_size), lenses)
     files = _files(partial, _BY_VIEW, [view.name for view in views], has_masks(frames))
     seen, sensors = seen_from_lenses(reconstruction, lenses), list(map(_pinhole, views))
@@ -79,7 +81,8 @@ def write_colmap_flat(
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
 ) -> FrameWriter:
-    """Write the layout with unique base names into `partial`, all but the pictures."""
+    """Write the layout with unique base names into `partial`, without images; returns their
+    writer."""
     views = views_for(frames, face_size_for(frames, face_size), lenses)
     files = _files(partial, _FLAT, [view.name for view in views], has_masks(frames))
     names, model = _names(files, frames), partial / "sparse" / "0"
@@ -101,8 +104,8 @@ def write_colmap_raw(
     flat: bool,
     link: bool = False,
 ) -> FrameWriter:
-    """Write the rig layout of the raw fisheyes themselves into `partial`, or the flat one, all but
-    the pictures."""
+    """Write the rig or the flat layout of raw fisheyes into `partial`, without images; returns
+    their writer."""
     sensors = _raw_sensors(frames, lenses)
     files = _files(partial, _FLAT if flat else _BY_VIEW, LENSES, masked=True)
     names, model = _names(files, frames), partial / "sparse" / "0"
@@ -126,7 +129,11 @@ def write_colmap_erp(
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
 ) -> FrameWriter:
-    """Write the equirectangular layout into `partial`, all but the pictures."""
+    """Write the equirectangular layout into `partial`, without images; returns their writer.
+
+    Raises:
+        GsbaError: the frames are cube faces.
+    """
     if not frames.panoramic:
         raise GsbaError("colmap-erp needs panoramas, these frames are cube faces: use colmap")
     size = (frames.width, frames.height)
@@ -145,7 +152,7 @@ def write_model(
     Args:
         folder: made, with its parents.
         reconstruction: poses, points and observations.
-        sensors: the cameras each frame is seen through.
+        sensors: the cameras of the rig.
         names: image names, by frame and sensor.
     """
     import pycolmap
@@ -197,7 +204,7 @@ def _rigid(a_T_b: np.ndarray):
 
 
 def _add_camera(model, sensor: Sensor, camera_id: int):
-    """Add a camera; returns its sensor id."""
+    """Add a camera to the model; returns its sensor id."""
     import pycolmap
 
     camera = pycolmap.Camera(
@@ -214,7 +221,7 @@ def _add_camera(model, sensor: Sensor, camera_id: int):
 def _add_points(
     model, reconstruction: Reconstruction, images: np.ndarray, rows: np.ndarray
 ) -> None:
-    """Add all points with their tracks; errors are COLMAP's own, mean pixels."""
+    """Add all points with their tracks; COLMAP computes their errors, mean pixels."""
     import pycolmap
 
     points = reconstruction.points_world
@@ -230,9 +237,9 @@ def _add_points(
 def _project(
     sensors: Sequence[Sensor], bearings: np.ndarray, origins: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sensor (O,) that sees each bearing (O, 3) from its origin, and the pixel (O, 2) there.
+    """Sensor (O,) that sees each bearing (O, 3) from its origin, and its pixel (O, 2) there.
 
-    Of those on the origin's side of the rig the one in which it is furthest from the border.
+    Among the sensors of the origin's lens it is the one with the pixel furthest from the border.
     """
     if sensors[0].fisheye is not None:
         return _project_raw(sensors, bearings, origins)
@@ -255,7 +262,7 @@ def _project(
 def _project_raw(
     sensors: Sequence[Sensor], bearings: np.ndarray, origins: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As `_project`, of the two lenses of raw pairs."""
+    """Sensor (O,) and pixel (O, 2) of each bearing (O, 3) in the two lenses of raw pairs."""
     ahead = bearings[:, 2] if origins is None else origins @ sensors[0].rig_T_sensor[:3, 3]
     which = (ahead < 0).astype(np.int64)
     pixels = np.empty((len(bearings), 2))
@@ -266,7 +273,7 @@ def _project_raw(
 
 
 def _raw_sensors(frames: FrameSet, lenses: Lenses) -> list[Sensor]:
-    """The lenses of raw pairs, front and back, as cameras of a rig."""
+    """Lenses of raw pairs, front and back, as cameras of the rig."""
     return [
         Sensor(
             "OPENCV_FISHEYE",
@@ -286,7 +293,7 @@ def _pinhole(view: View) -> Sensor:
 
 
 def _rig_config(sensors: Sequence[Sensor], names: Sequence[str]) -> list[dict]:
-    """The rig as `colmap rig_configurator` reads it; rotations are cam_from_rig, wxyz."""
+    """Rig in the format of `colmap rig_configurator`; rotations are cam_from_rig, wxyz."""
     configs = []
     for sensor, name in zip(sensors, names, strict=True):
         config: dict[str, object] = {"image_prefix": f"{name}/"}
@@ -302,7 +309,7 @@ def _rig_config(sensors: Sequence[Sensor], names: Sequence[str]) -> list[dict]:
 
 
 def _files(partial: Path, name: str, views: Sequence[str], masked: bool) -> Files:
-    """Pictures by the pattern of their names."""
+    """Files of images and masks by the pattern of their names."""
     return Files(partial, views, f"images/{name}", f"masks/{name}.png" if masked else "")
 
 

@@ -1,4 +1,4 @@
-"""An export's folder: written beside its final place, renamed when complete, never half there."""
+"""Folder of an export: written beside its final place and renamed when complete."""
 
 import json
 import os
@@ -19,24 +19,24 @@ MARKER = "export.json"  # {"gsba": version, "format": name, "wrote": top-level e
 def output_folder(out: Path, to: str, key: str) -> Iterator[Path]:
     """Folder to write an export into; it becomes `out` when the block ends without an exception.
 
-    An earlier export at `out` is replaced, and stays as it is until then. After an error nothing
-    is left behind. What an interrupt leaves is hidden beside `out`: the next call with the same
-    key gets the folder as it was, one with another key has it deleted.
+    An earlier export at `out` is replaced then. After an error the folder is deleted. After an
+    interrupt it stays hidden beside `out`: the next call with the same key continues in it, a call
+    with another key deletes it.
 
     Args:
         out: final folder; missing parents are made.
         to: name of the format, for the marker.
-        key: of all that pictures in the folder depend on.
+        key: hash of everything that images in the folder depend on.
     Raises:
-        GsbaError: `out` is something else than an earlier export, is being written by another
-            process, or the disk refuses.
+        GsbaError: `out` is not an earlier export, another process writes it, or the disk cannot be
+            written.
     """
     out = out.resolve()
     with disk_errors(out):
         _require_replaceable(out)
         out.parent.mkdir(parents=True, exist_ok=True)
         partial = out.with_name(f".{out.name}.partial-{key[:16]}")
-        refuse_links(partial, below=True)  # a stranger may have left it
+        refuse_links(partial, below=True)  # the folder may come from elsewhere
         partial.mkdir(exist_ok=True)
         lock = hold_folder(partial)
         remove_unheld(set(out.parent.glob(f".{out.name}.partial-*")) - {partial})
@@ -47,7 +47,7 @@ def output_folder(out: Path, to: str, key: str) -> Iterator[Path]:
             (partial / MARKER).write_text(json.dumps(marker, indent=1) + "\n")
             _require_replaceable(out)
             _swap_in(partial, out)
-            remove_temporaries(out)  # of workers that were killed
+            remove_temporaries(out)  # left by workers that were killed
         except StoppedError:
             raise
         except Exception:
@@ -58,7 +58,7 @@ def output_folder(out: Path, to: str, key: str) -> Iterator[Path]:
 
 
 def _require_replaceable(out: Path) -> None:
-    """Refuse anything whose replacement would lose what gsba has not written."""
+    """Refuse a folder with files that gsba has not written, as replacing it would lose these."""
     if not out.exists():
         return
     if not out.is_dir():
@@ -69,9 +69,10 @@ def _require_replaceable(out: Path) -> None:
     except (OSError, ValueError, TypeError, KeyError):
         wrote = set()
     if entries - wrote:
-        kind = "an export and" if wrote else "no export but"
+        strange = repr(min(entries - wrote))
         raise GsbaError(
-            f"{out} holds {kind} {min(entries - wrote)!r}: choose another --out, or move it away"
+            f"{out} holds {strange}, which gsba's export did not write: choose another --out, or "
+            "move that away"
         )
 
 

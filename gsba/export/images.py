@@ -1,11 +1,11 @@
 """Images and masks of an export, a few frames in memory at a time.
 
-Faces are cut with bicubic sampling, low-passed first where they are much coarser than the
-panorama. They are written with 8 bits and three colours: as PNG where the frame is PNG or TIFF,
-else as JPEG of quality 95. Images that leave unchanged (panoramas; faces that came as faces of the
-same size; if every trainer reads them as we do) are copies, which share their place on disk with
-the original where the file system can (reflinks): an export may be moved and edited. On request
-they are hard links: then an edit of one is an edit of the other.
+Faces are cut with bicubic sampling, after a low pass if they are much coarser than the panorama.
+They are written with 8 bits and three colours: as PNG if the frame is PNG or TIFF, else as JPEG of
+quality 95. Images that are exported unchanged (panoramas, and input faces of the exported size, in
+formats that every trainer reads correctly) are copies. Copies share blocks with the original on
+file systems that can (reflinks), so that an export may be moved and edited. On request they are
+hard links: then an edit of one is an edit of the other.
 """
 
 import fcntl
@@ -35,16 +35,19 @@ from gsba.store.shards import Threads, Workers
 from gsba.types import FACES, FrameSet
 
 MIN_FACE_SIZE = 16  # pixels
-_FICLONE = 0x40049409  # of Linux: a file that shares another's blocks until one is written to
-_AT_ONCE = 4  # frames at most: an 8K panorama, a face and what is encoded take 130 MB
+_FICLONE = 0x40049409  # ioctl of Linux that clones a file; both share blocks until one is written
+_MAX_FRAMES_AT_ONCE = 4  # an 8K panorama, a face and encoded images take 130 MB
 
 
 def face_size_for(frames: FrameSet, face_size: int | None) -> int:
-    """Pixels of an exported face: as asked, else as many around the horizon as the frame has.
+    """Pixels of an exported face: `face_size`, or by default a quarter of the panorama's width.
 
-    That is a quarter of a panorama's width, rounded to an even number: the mean resolution is
-    kept (a face centre is sampled 1.27 times coarser than the panorama, an edge 1.57 times
-    finer). Frames that come as faces keep their size.
+    The default is rounded to an even number and keeps the mean resolution: a face centre is sampled
+    1.27 times coarser than the panorama, an edge 1.57 times finer. Frames that are cube faces keep
+    their size.
+
+    Raises:
+        GsbaError: `face_size` is too small.
     """
     if face_size is None:
         return 2 * round(frames.width / 8) if frames.panoramic else frames.width
@@ -54,14 +57,14 @@ def face_size_for(frames: FrameSet, face_size: int | None) -> int:
 
 
 def of_one_lens(images: str, frames: FrameSet) -> bool:
-    """Whether two lenses are told apart where they are known, as `export.images` says it."""
+    """True if the setting `images` (`export.images`) gives images of one lens each."""
     return images in ("lenses", "fisheye", "panorama") or (
         images == "auto" and frames.fisheyes is not None
     )
 
 
 def has_masks(frames: FrameSet) -> bool:
-    """Whether any frame has a mask; then every exported image gets one."""
+    """True if any frame has a mask; then every exported image gets one."""
     return any(path is not None for path in frames.mask_paths)
 
 
@@ -73,15 +76,15 @@ def view_writer(
     link: bool = False,
     scenes: Scenes | None = None,
 ) -> FrameWriter:
-    """Writes every view of a frame, and its mask where the frames have masks.
+    """Writer of every view of a frame, and of its mask if the frames have masks.
 
     Args:
-        files: where they go.
-        frames: panoramas, or faces of which the missing ones stay missing.
-        views: of `gsba.camera.views.views_for`.
-        lenses: of these frames.
-        link: hard links to images that leave unchanged.
-        scenes: what these frames see: how far things are.
+        files: files of the images.
+        frames: panoramas, or cube faces, of which missing ones are not written.
+        views: views of `gsba.camera.views.views_for`.
+        lenses: lenses of these frames.
+        link: make hard links to images that are exported unchanged.
+        scenes: depths of the scene around these frames.
     """
     if lenses and frames.panoramic:
         return _LensFaces(files, lenses, scenes, views)
@@ -126,7 +129,7 @@ class _CubeFaces(FrameWriter):
 @dataclass(frozen=True, slots=True)
 class _OfLenses(FrameWriter):
     lenses: Lenses
-    scenes: Scenes | None  # None = all is far
+    scenes: Scenes | None  # None = everything is far
 
     def taken(self, rows: np.ndarray) -> FrameWriter:
         scenes = self.scenes and self.scenes.taken(rows)
@@ -162,18 +165,18 @@ class _LensFaces(_OfLenses):
 def write_pictures(
     frames: FrameSet, writers: Sequence[FrameWriter], workers: Workers | None = None
 ) -> None:
-    """Write what all datasets of an export show, frame by frame.
+    """Write the images of all datasets of an export, frame by frame.
 
     Args:
-        frames: what they show.
-        writers: of the datasets, whose folders are there.
-        workers: who do it, on a disk that they share; None = threads here.
+        frames: frames of the export.
+        writers: writers of the datasets, whose folders exist.
+        workers: workers that share the disk; None = threads of this process.
     """
     if not writers:
         return
     for writer in writers:
         writer.files.make_folders(frames)
-    workers = (workers or Threads(os.cpu_count() or 1)).at_most(_AT_ONCE)
+    workers = (workers or Threads(os.cpu_count() or 1)).at_most(_MAX_FRAMES_AT_ONCE)
     workers.must_see([writer.files.folder for writer in writers])
     give_back_freed_memory(0)
     for _ in workers.map_shards(Pictures(frames, writers)):
@@ -187,17 +190,17 @@ def panorama_writer(
     lenses: Lenses = ONE_CENTRE,
     scenes: Scenes | None = None,
 ) -> FrameWriter:
-    """Copies the panorama of a frame, and writes its mask where the frames have masks.
+    """Writer that copies the panorama of a frame, and writes its mask if the frames have masks.
 
     Panoramas that are corrected, those of raw pairs and of cube maps, and images that trainers
-    misread are written anew; those of two lenses are stitched by `gsba.camera.one_centre`.
+    misread are encoded again. Those of two lenses are stitched by `gsba.camera.one_centre`.
 
     Args:
-        files: where they go.
+        files: files of the images.
         frames: panoramas.
-        link: hard links instead of copies.
-        lenses: of these frames.
-        scenes: what these frames see: how far things are.
+        link: make hard links instead of copies.
+        lenses: lenses of these frames.
+        scenes: depths of the scene around these frames.
     """
     return _Stitched(files, lenses, scenes) if lenses else _Panoramas(files, link)
 
@@ -245,9 +248,9 @@ class _Stitched(_OfLenses):
 
 
 def pass_on(source: Path, path: Path, link: bool) -> None:
-    """Give `path` the content of `source`; without a second one on disk where that can be."""
+    """Copy `source` to `path`, sharing its blocks on disk if the file system can."""
     if not source.is_file():
-        raise GsbaError(f"{source}: is gone; it was there when the run began")
+        raise GsbaError(f"{source} is missing; it existed when the run began: restore it")
     atomic_write(path, lambda temporary: _pass_on(source, temporary, link), parents=False)
 
 

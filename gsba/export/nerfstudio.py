@@ -1,20 +1,20 @@
-"""nerfstudio datasets: pinhole faces in transforms.json, panoramas in transforms_erp.json; or, as
-`export.images` asks, panoramas alone or raw fisheyes alone in transforms.json.
+"""nerfstudio datasets: pinhole faces in transforms.json, panoramas in transforms_erp.json; or,
+by the setting `export.images`, panoramas alone or raw fisheyes alone in transforms.json.
 
-nerfstudio's cameras have OpenGL axes (y up, z backward) and its world has z up, so the world
-is turned by NERFSTUDIO_R_WORLD, which `applied_transform` states and the cloud shares. Base names
-are unique, because nerfstudio looks for down-scaled images by base name. Every eighth panorama is
-held out with all its faces: a face left in for training would give its siblings away. Splat
+nerfstudio's cameras have OpenGL axes (y up, z backward) and its world has z up, so the world and
+the cloud are rotated by NERFSTUDIO_R_WORLD, which `applied_transform` states. Base names are
+unique, because nerfstudio looks for down-scaled images by base name. Every eighth panorama is held
+out with all its faces: a face in the training would show what the other faces are tested on. Splat
 trainers need the faces; the panoramas are for models that take equirectangular rays:
-`ns-train nerfacto --data OUT/transforms_erp.json`. nerfstudio takes what stands above the frames
-for all of them: lengths that differ stand with each frame alone.
+`ns-train nerfacto --data OUT/transforms_erp.json`. nerfstudio applies top-level intrinsics to all
+frames, so that intrinsics that differ are in each frame's entry.
 
-Raw fisheyes are OPENCV_FISHEYE with masks. Where the motion during the readout is known, each frame
-has, as instant-ngp reads them, `transform_matrix_start` and `transform_matrix_end` beside the pose
-of the middle, of the top and of the bottom edge of the picture, and `rolling_shutter` is
-[0, 0, 1, 0]: a pixel's pose is that share of the way from one to the other which its row is of the
-height. That is gsplat's ROLLING_TOP_TO_BOTTOM, with the inverses (in axes y down, z forward) as
-`viewmats` and `viewmats_rs`, and k1 to k4 as `radial_coeffs`.
+Raw fisheyes are OPENCV_FISHEYE with masks. If the motion during the readout is known, each frame
+also has `transform_matrix_start` and `transform_matrix_end`, the poses of the top and the bottom
+edge of the image in the format of instant-ngp, and `rolling_shutter` is [0, 0, 1, 0]: the pose of a
+pixel is interpolated between them by its row over the height. That is gsplat's
+ROLLING_TOP_TO_BOTTOM, with the inverses (in axes y down, z forward) as `viewmats` and
+`viewmats_rs`, and k1 to k4 as `radial_coeffs`.
 """
 
 import json
@@ -37,8 +37,8 @@ from gsba.types import Fisheye, FrameSet, Reconstruction
 NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 _CV_R_GL = np.diag([1.0, -1, -1])  # OpenGL camera axes in our camera axes
 _CLOUD = "points3D.ply"
-_SEEN_DEG = 90.0  # from a fisheye's axis: gsplat draws nothing beyond, where the other lens sees
-_HOLD_OUT_EVERY = 8  # panoramas, as in the benchmarks of splat trainers
+_MAX_AXIS_ANGLE_DEG = 90.0  # of used fisheye pixels: gsplat renders nothing beyond
+_HOLD_OUT_EVERY = 8  # one panorama of so many, which is the interval of splat benchmarks
 
 
 def write_nerfstudio(
@@ -50,10 +50,16 @@ def write_nerfstudio(
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
 ) -> list[FrameWriter]:
-    """Write cloud and transforms.json of faces into `partial`; for panoramas the ERP variant too;
-    all but the pictures.
+    """Write cloud and transforms.json of faces into `partial`, of panoramas transforms_erp.json,
+    too, without images; returns their writers.
 
-    A world whose z points up already is not turned.
+    Args:
+        partial: folder to write.
+        reconstruction, frames: poses and cloud, and their frames.
+        face_size: pixels of a cube face; None = see `gsba.export.images.face_size_for`.
+        z_up: the world's z points up, so that it is not rotated.
+        link: make hard links to images that are exported unchanged.
+        lenses: lenses of the frames.
     """
     out_R_world = _write_cloud(partial, reconstruction, z_up)
     views = views_for(frames, face_size_for(frames, face_size), lenses)
@@ -75,7 +81,8 @@ def write_nerfstudio_erp(
     z_up: bool = False,
     link: bool = False,
 ) -> list[FrameWriter]:
-    """Write cloud and transforms.json of panoramas into `partial`, all but the pictures."""
+    """Write cloud and transforms.json of panoramas into `partial`, without images; returns their
+    writers."""
     out_R_world = _write_cloud(partial, reconstruction, z_up)
     return [_write_erp_dataset(partial, reconstruction, frames, lenses, out_R_world, link, "")]
 
@@ -88,7 +95,8 @@ def write_nerfstudio_raw(
     z_up: bool = False,
     link: bool = False,
 ) -> list[FrameWriter]:
-    """Write cloud and transforms.json of raw fisheyes into `partial`, all but the pictures."""
+    """Write cloud and transforms.json of raw fisheyes into `partial`, without images; returns
+    their writers."""
     pair = raw_lenses(frames)
     out_R_world = _write_cloud(partial, reconstruction, z_up)
     files = _files(partial, LENSES, masked=True)
@@ -109,11 +117,11 @@ def write_nerfstudio_raw(
     if moving:
         camera["rolling_shutter"] = [0, 0, 1, 0]
     _write_transforms(partial / "transforms.json", camera, entries, len(frames), out_R_world)
-    return [RawPictures(files, link, _SEEN_DEG)]
+    return [RawPictures(files, link, _MAX_AXIS_ANGLE_DEG)]
 
 
 def _write_cloud(partial: Path, reconstruction: Reconstruction, z_up: bool) -> np.ndarray:
-    """Write the cloud as nerfstudio's world has it; returns out_R_world (3, 3)."""
+    """Write the cloud in nerfstudio's world; returns out_R_world (3, 3)."""
     out_R_world = np.eye(3) if z_up else NERFSTUDIO_R_WORLD
     points = reconstruction.points_world @ out_R_world.T
     write_splat_points(partial / _CLOUD, points, reconstruction.point_colors)
@@ -131,7 +139,7 @@ def _write_face_dataset(
     scenes: Scenes,
 ) -> FrameWriter:
     files = _files(partial, [view.name for view in views], has_masks(frames))
-    # OPENCV without distortion is a pinhole, under the one name that all readers know.
+    # OPENCV without distortion is a pinhole, by the only name that all readers know.
     camera = {"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
     if not lenses:
         camera |= _intrinsics(views[0])
@@ -140,7 +148,7 @@ def _write_face_dataset(
         images, masks = files.images(frames, f), files.masks(frames, f)
         for number, view in enumerate(views):
             entry = _entry(images[number], out_R_world, world_T_rig @ view.rig_T_view)
-            if lenses:  # views differ
+            if lenses:  # views have different intrinsics
                 entry |= _intrinsics(view)
             if masks:
                 entry["mask_path"] = masks[number]
@@ -176,7 +184,7 @@ def _write_erp_dataset(
 
 
 def _files(partial: Path, views: Sequence[str], masked: bool) -> Files:
-    """Pictures with unique base names."""
+    """Files of images and masks with unique base names."""
     mask = "masks/{name}_{view}.png" if masked else ""
     return Files(partial, views, "images/{name}_{view}{suffix}", mask)
 
@@ -195,12 +203,12 @@ def _fisheye(lens: Fisheye) -> dict[str, Any]:
 
 
 def _entry(file_path: str, out_R_world: np.ndarray, world_T_camera: np.ndarray) -> dict[str, Any]:
-    """A frame of transforms.json."""
+    """Entry of a frame in transforms.json."""
     return {"file_path": file_path, "transform_matrix": _matrix(out_R_world, world_T_camera)}
 
 
 def _matrix(out_R_world: np.ndarray, world_T_camera: np.ndarray) -> list[list[float]]:
-    """From OpenGL camera axes to nerfstudio's world, (4, 4)."""
+    """Pose (4, 4) of a camera with OpenGL axes in nerfstudio's world."""
     matrix = np.eye(4)
     matrix[:3, :3] = out_R_world @ world_T_camera[:3, :3] @ _CV_R_GL
     matrix[:3, 3] = out_R_world @ world_T_camera[:3, 3]

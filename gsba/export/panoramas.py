@@ -1,5 +1,7 @@
-"""Poses in a file, and the panoramas that they are of in a folder: what programs without a format
-of their own take, and `gsba refine OUT/images OUT/trajectory.tum` reads back."""
+"""Trajectory file and folder of panoramas, for programs without a format of their own.
+
+`gsba refine OUT/images OUT/trajectory.tum` reads them back.
+"""
 
 import csv
 from pathlib import Path
@@ -25,8 +27,8 @@ def write_with_poses(
     lenses: Lenses,
     link: bool = False,
 ) -> FrameWriter:
-    """Write `trajectory.tum`, and `timestamps.csv` in `images`, into `partial`; what goes beside it
-    and into `masks` is to be written frame by frame."""
+    """Write `trajectory.tum` and `images/timestamps.csv` into `partial`; returns the writer of the
+    images and masks."""
     write_poses(partial, reconstruction, frames)
     images = partial / "images"
     images.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Pictures that the datasets of one export show of a frame: read once, cut once, encoded once."""
+"""Images of a frame for all datasets of an export: each is read, cut and encoded once."""
 
 import threading
 from collections import Counter
@@ -18,32 +18,32 @@ from gsba.frames.pixels import load_padded
 from gsba.store.shards import even_blocks
 from gsba.types import FrameSet
 
-_INSTEAD = {".insp": ".jpg", ".webp": ".jpg", ".tif": ".png", ".tiff": ".png"}
+_EXPORTED_SUFFIX = {".insp": ".jpg", ".webp": ".jpg", ".tif": ".png", ".tiff": ".png"}
 
 
 @dataclass(frozen=True, slots=True)
 class Files:
-    """Where a dataset has its pictures.
+    """Files of a dataset's images and masks.
 
     Patterns are filled with the `name` of a frame, the `suffix` of its exported images, and the
     `view`.
     """
 
-    folder: Path  # of the dataset, absolute
-    views: Sequence[str]  # pictures of a frame; one "" where the pattern has none
-    image: str  # pattern of paths in the folder
-    mask: str  # the same of masks (PNG, 0 = ignore, 255 = use); "" = there are none
+    folder: Path  # folder of the dataset, absolute
+    views: Sequence[str]  # views of a frame; one "" if the pattern has no view
+    image: str  # pattern of the images' paths in the folder
+    mask: str  # pattern of the masks' paths (PNG, 0 = ignore, 255 = use); "" = there are none
 
     def images(self, frames: FrameSet, f: int) -> list[str]:
-        """Paths in the folder of a frame's images, by view."""
+        """Paths of a frame's images in the folder, by view."""
         return self._filled(self.image, frames, f)
 
     def masks(self, frames: FrameSet, f: int) -> list[str]:
-        """The same of its masks; [] = there are none."""
+        """Paths of a frame's masks in the folder, by view; [] = there are none."""
         return self._filled(self.mask, frames, f) if self.mask else []
 
     def make_folders(self, frames: FrameSet) -> None:
-        """Make all that pictures go to."""
+        """Make the folders of all images and masks."""
         for path in {*self.images(frames, 0), *self.masks(frames, 0)}:
             (self.folder / path).parent.mkdir(parents=True, exist_ok=True)
 
@@ -53,42 +53,42 @@ class Files:
 
 
 def suffix_of(frames: FrameSet, f: int) -> str:
-    """Suffix of the exported images of a frame: that of the input, or a kind that all can read."""
+    """Suffix of a frame's exported images: that of the input, or one that all programs read."""
     suffix = frames.paths[f][0].suffix
-    return _INSTEAD.get(suffix.lower(), suffix)
+    return _EXPORTED_SUFFIX.get(suffix.lower(), suffix)
 
 
 @dataclass(frozen=True, slots=True)
 class FrameWriter:
-    """Writes what a dataset shows of a frame."""
+    """Writes a frame's images and masks of a dataset."""
 
     files: Files
 
     def __call__(self, shown: "Shown") -> None:
-        """Write it, into folders that are there."""
+        """Write images and masks into existing folders."""
         raise NotImplementedError
 
     def taken(self, rows: np.ndarray) -> "FrameWriter":
-        """What writes some frames (F',), renumbered; it can be pickled."""
+        """Writer of frames `rows` (F',), renumbered; it can be pickled."""
         return self
 
     def images(self, shown: "Shown") -> list[Path]:
-        """Where the images of a frame go."""
+        """Files of the frame's images."""
         return [self.files.folder / name for name in self.files.images(shown.frames, shown.f)]
 
     def masks(self, shown: "Shown") -> list[Path]:
-        """Where its masks go; [] = there are none."""
+        """Files of the frame's masks; [] = there are none."""
         return [self.files.folder / name for name in self.files.masks(shown.frames, shown.f)]
 
     def wrote(self, shown: "Shown") -> bool:
-        """Whether an export that was stopped has written all of this frame."""
+        """True if an interrupted export has written all files of this frame."""
         return all(path.exists() for path in (*self.images(shown), *self.masks(shown)))
 
 
 class Pictures:
-    """The job of writing what several datasets show of each frame.
+    """Job that writes the images of each frame for several datasets.
 
-    A thread holds one panorama, in memory that it uses for the next frame again.
+    A thread holds one panorama, and reuses its memory for the next frame.
     """
 
     title = "writing images"
@@ -101,7 +101,7 @@ class Pictures:
         self._masks: dict[Hashable, list[bytes]] = {}
         self._lock = threading.Lock()
 
-    def __reduce__(self) -> tuple[object, ...]:  # memory and masks are made anew
+    def __reduce__(self) -> tuple[object, ...]:  # buffers and masks are not pickled
         return Pictures, (self.frames, self._writers)
 
     def __len__(self) -> int:
@@ -122,19 +122,19 @@ class Pictures:
         return Pictures(self.frames.taken(rows, absolute=True), writers)
 
     def same_mask(self, f: int) -> bool:
-        """Whether another frame has the mask of frame f."""
+        """True if another frame has the mask file of frame f."""
         return self._uses[self.frames.mask_paths[f]] > 1
 
     def masks(self, key: Hashable, make: Callable[[], list[bytes]]) -> list[bytes]:
-        """Files as the first frame that asks by this key has them made."""
-        with self._lock:  # so that no other thread makes them too
+        """Encoded masks under a key, made by the first frame that needs them."""
+        with self._lock:  # so that only one thread makes them
             if key not in self._masks:
                 self._masks[key] = make()
             return self._masks[key]
 
 
 class Shown:
-    """One frame of an export, for the datasets that show it."""
+    """Pixels and encoded images of one frame, shared by all datasets of an export."""
 
     def __init__(self, pictures: Pictures, f: int) -> None:
         self.f, self.frames = f, pictures.frames
@@ -156,19 +156,19 @@ class Shown:
 
     @property
     def mask(self) -> np.ndarray:
-        """Where the panorama may be used, (h, 2 h) bool."""
+        """Mask of the panorama (h, 2 h) bool, True = use."""
         found = load_mask(self.frames, self.f)
         size = self.frames.height, self.frames.width
         return np.ones(size, bool) if found is None else found
 
     def room(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        """Memory for pictures of one kind, until the thread's next frame."""
+        """Buffer for images of one kind, until the thread's next frame."""
         return self._pictures.buffers.array(name, shape)
 
     def write(
         self, key: Hashable, paths: Sequence[Path], make: Callable[[], Iterable[np.ndarray]]
     ) -> None:
-        """Write pictures, one to each path: as made for the first dataset that asks by this key."""
+        """Write images, one to each path; `make` is called once for all datasets with this key."""
         key = key, tuple(path.suffix for path in paths)
         if key in self._files:
             _write(paths, self._files[key])
@@ -182,7 +182,7 @@ class Shown:
     def write_masks(
         self, key: Hashable, paths: Sequence[Path], make: Callable[[], Iterable[np.ndarray]]
     ) -> None:
-        """As `write`, of masks (h, w) bool that rest on the frame's own and on the key alone."""
+        """Write masks (h, w) bool that depend only on the frame's mask file and on the key."""
 
         def encode() -> list[bytes]:
             pairs = zip(make(), paths, strict=True)

@@ -12,13 +12,13 @@ _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 
 
 def write_points(path: Path, reconstruction: Reconstruction) -> None:
-    """Write the cloud with what is known of each point, in the world of the trajectory.
+    """Write the cloud with residuals and track lengths, in the world of the trajectory.
 
     Properties: x y z (map units), red green blue, error_deg (mean angular residual, degrees),
     track_length (number of observations).
 
     Raises:
-        GsbaError: the disk refuses.
+        GsbaError: the disk cannot be written.
     """
     num_points = len(reconstruction.points_world)
     columns = {
@@ -42,7 +42,7 @@ def write_splat_points(path: Path, points: np.ndarray, colors: np.ndarray) -> No
         colors: (J, 3) uint8, RGB.
 
     Raises:
-        GsbaError: the disk refuses.
+        GsbaError: the disk cannot be written.
     """
     columns = {
         **_vectors("x y z", points, "<f4"),
@@ -57,7 +57,7 @@ def _vectors(names: str, values: np.ndarray, dtype: str) -> dict[str, np.ndarray
 
 
 def _write(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Write one vertex element; columns are equally long, little-endian."""
+    """Write a PLY file with one vertex element; columns have one length and are little-endian."""
     vertices = np.empty(
         len(next(iter(columns.values()))), dtype=[(name, c.dtype) for name, c in columns.items()]
     )

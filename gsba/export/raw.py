@@ -1,4 +1,4 @@
-"""Raw fisheyes of an export, as they are, with masks of what their circles hold."""
+"""Export of raw fisheyes, with masks of their image circles."""
 
 from dataclasses import dataclass
 
@@ -15,15 +15,15 @@ from gsba.log import GsbaError
 from gsba.types import Fisheye, FrameSet
 
 LENSES = ("front", "back")
-_BAND = 256  # rows of which coordinates are held in double precision
-SEEN_DEG = 95.0  # from a lens's axis: further out, circles end and calibrations with them
+_ROWS_AT_ONCE = 256  # image rows whose coordinates are held in double precision
+SEEN_DEG = 95.0  # largest angle from a lens's axis: image circles and calibrations end there
 
 
 def raw_lenses(frames: FrameSet) -> Pair:
-    """The lenses of raw pairs.
+    """Lenses of raw pairs.
 
     Raises:
-        GsbaError: the frames are none.
+        GsbaError: the frames are no raw pairs.
     """
     if frames.fisheyes is None:
         raise GsbaError("--images fisheye is for runs on raw fisheyes: these frames are stitched")
@@ -32,13 +32,13 @@ def raw_lenses(frames: FrameSet) -> Pair:
 
 @dataclass(frozen=True, slots=True)
 class RawPictures(FrameWriter):
-    """Copies both pictures of a frame, and writes masks of where they show something.
+    """Copies both fisheye images of a frame, and writes masks of their image circles.
 
-    Pictures side by side in one image, and those that trainers misread, are written anew.
+    Images side by side in one file, and those that trainers misread, are encoded again.
     """
 
-    link: bool = False  # hard links instead of copies
-    seen_deg: float = SEEN_DEG  # from a lens's axis, beyond which masks leave its picture out
+    link: bool = False  # make hard links instead of copies
+    seen_deg: float = SEEN_DEG  # largest angle from a lens's axis that masks keep
 
     def __call__(self, shown: Shown) -> None:
         f, frames, paths = shown.f, shown.frames, self.images(shown)
@@ -63,12 +63,12 @@ class RawPictures(FrameWriter):
 def _circle(
     lens: Fisheye, seen_deg: float, width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where a lens's picture is to be used, (h, w) bool, and which of a panorama's pixels, counted
-    row by row, are there, (h, w) int32."""
+    """Mask (h, w) bool of a lens's image, True within `seen_deg`; and the panorama's pixel that
+    each pixel shows, (h, w) int32, counted row by row."""
     seen = np.empty((lens.height, lens.width), bool)
     pixels = np.empty((lens.height, lens.width), np.int32)
-    for top in range(0, lens.height, _BAND):
-        rows = np.arange(top, min(top + _BAND, lens.height)) + 0.5
+    for top in range(0, lens.height, _ROWS_AT_ONCE):
+        rows = np.arange(top, min(top + _ROWS_AT_ONCE, lens.height)) + 0.5
         grid = np.meshgrid(np.arange(lens.width) + 0.5, rows)
         directions = unproject(lens, np.stack(grid, axis=-1))
         part = slice(top, top + len(rows))

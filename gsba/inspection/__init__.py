@@ -1,7 +1,7 @@
-"""What a camera's file or folder is, before it is refined: layout, times, sensors, lenses.
+"""Inspection of footage before a run: layout, times, sensors, lenses.
 
-Takes a path.
-Gives an inspection, as data and as text, with the `refine` line to type or why it would be refused.
+Takes a path of a video, an image or a folder.
+Gives facts, as data and as text, with the `refine` command or the reason why it would be refused.
 """
 
 from gsba.inspection.inspection import Inspection, inspect

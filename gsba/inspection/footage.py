@@ -1,4 +1,4 @@
-"""What a video is: camera, layout, tracks, times, gyro, positions, lenses."""
+"""Facts about a video: camera, layout, tracks, times, gyro, positions, lenses."""
 
 from pathlib import Path
 
@@ -13,11 +13,11 @@ from gsba.video.extraction import refuse_darkness
 from gsba.video.recording import Recording, read_recording
 from gsba.video.timeline import container_tags
 
-_STEADY = 1.5  # longest step over the median one, up to which a frame rate is constant
+_MAX_INTERVAL_RATIO = 1.5  # longest over median frame interval of a constant frame rate
 
 
 def of_video(path: Path) -> Found:
-    """Facts about a video; those that can be found out of one that would be refused."""
+    """Facts about a video; fewer facts and the problem if it would be refused."""
     trailer = read_trailer(path)
     try:
         recording = read_recording(path)
@@ -38,7 +38,7 @@ def of_video(path: Path) -> Found:
 
 
 def _camera(path: Path, trailer: Insta360Trailer | None) -> Facts:
-    """Maker, model and firmware, and when the recording was made."""
+    """Maker, model and firmware, and the recording's date."""
     if trailer is not None:
         firmware = f", firmware {trailer.firmware}" if trailer.firmware else ""
         return (("camera", f"{trailer.model or 'Insta360'}{firmware}"),)
@@ -50,7 +50,7 @@ def _camera(path: Path, trailer: Insta360Trailer | None) -> Facts:
 
 
 def _layout(recording: Recording) -> str:
-    """How pictures lie in the frames."""
+    """Layout of the frames."""
     line = recording.timelines[0]
     if recording.cube:
         return f"equi-angular cube map, two tracks of {line.width}x{line.height}"
@@ -61,10 +61,10 @@ def _layout(recording: Recording) -> str:
 
 
 def _frames(recording: Recording) -> str:
-    """Number, rate and duration."""
+    """Number of frames, rate and duration."""
     times, num = recording.times, int(np.count_nonzero(recording.shown))
     steps = np.diff(times)
-    varying = len(steps) and steps.max() > _STEADY * np.median(steps)
+    varying = len(steps) and steps.max() > _MAX_INTERVAL_RATIO * np.median(steps)
     rate = 1 / recording.timelines[0].interval_s
     end = float(times[-1]) + recording.timelines[0].interval_s
     about = "about " if varying else ""
@@ -72,7 +72,7 @@ def _frames(recording: Recording) -> str:
 
 
 def _sensors(path: Path, trailer: Insta360Trailer | None) -> Facts:
-    """Gyro, positions, and what the maker states of exposures and lenses."""
+    """Gyro, positions, and the maker's data on exposures and lenses."""
     facts = [("gyro", _gyro(path)), ("GPS", _gps(path))]
     if trailer is None:
         return tuple(facts)
@@ -81,7 +81,9 @@ def _sensors(path: Path, trailer: Insta360Trailer | None) -> Facts:
         facts.append(("exposures", f"{len(times):,}, {times.min():.3g} to {times.max():.3g} ms"))
     if trailer.readout_s is not None:
         facts.append(("readout", f"{1e3 * trailer.readout_s:.4g} ms, by the maker"))
-    known = "by the maker, a start for the images" if trailer.lens_strings else "none in the file"
+    known = "none in the file"
+    if trailer.lens_strings:
+        known = "by the maker, refined from the images"
     return (*facts, ("calibration", known), *(("note", note) for note in trailer.notes))
 
 
@@ -104,5 +106,5 @@ def _gps(path: Path) -> str:
 
 
 def _reason(path: Path, error: GsbaError) -> str:
-    """What an error says beside the path, which stands above."""
+    """Message of an error without the path, which the output names above."""
     return str(error).removeprefix(f"{path}: ")

@@ -1,4 +1,4 @@
-"""What a file or folder is, in facts for people and programs, and the `refine` line for it."""
+"""Inspection of a file or folder: facts as text and as data, and the `refine` command."""
 
 import shlex
 from dataclasses import asdict, dataclass
@@ -14,19 +14,19 @@ from gsba.log import GsbaError
 
 @dataclass(frozen=True, slots=True)
 class Inspection:
-    """What a path holds."""
+    """Facts about a path, and the command that refines it."""
 
-    path: str  # as it was given
+    path: str  # the given path
     facts: Facts  # name and text of each
-    problem: str  # why `refine` would refuse it, one line; "" = it would not
-    command: str  # the line to type; "" where it would be refused
+    problem: str  # reason why `refine` would refuse it, one line; "" = it would not
+    command: str  # command that refines it; "" if it would be refused
 
     def table(self) -> dict[str, Any]:
-        """Plain values, as JSON holds them."""
+        """Plain values for JSON."""
         return asdict(self) | {"facts": dict(self.facts)}
 
     def text(self) -> str:
-        """Lines for people."""
+        """Lines of text for the terminal."""
         width = max((len(name) for name, _ in self.facts), default=0)
         lines = [f"  {name.ljust(width)}  {text}" for name, text in self.facts]
         end = f"  refused: {self.problem}" if self.problem else f"  {self.command}"
@@ -34,7 +34,7 @@ class Inspection:
 
 
 def inspect(path: Path) -> Inspection:
-    """Find out what a video, a picture or a folder of pictures is.
+    """Collect facts about a video, an image or a folder of images.
 
     Raises:
         GsbaError: there is no such file or folder, or it is none of these.
@@ -46,7 +46,7 @@ def inspect(path: Path) -> Inspection:
     elif is_image(path):
         found = pictures.of_picture(path)
     elif path.exists():
-        raise GsbaError(f"{path}: is no video, picture or folder of pictures")
+        raise GsbaError(f"{path} is no video, image or folder of images")
     else:
         raise GsbaError(f"{path}: no such file or folder")
     command = "" if found.problem else shlex.join(["gsba", "refine", str(path)])

@@ -1,4 +1,4 @@
-"""What pictures are: one of them, or a folder of frames."""
+"""Facts about an image, or about a folder of frames."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ _LAYOUTS = {
     "erp": "stitched panoramas",
     "fisheye": "raw, two fisheyes a frame",
     "cube": "faces of a cube",
-    "eac": "equi-angular cube map, two pictures a frame",
+    "eac": "equi-angular cube map, two images a frame",
 }
 
 
@@ -30,11 +30,11 @@ def of_folder(folder: Path) -> Found:
 
 
 def of_picture(path: Path) -> Found:
-    """Facts about one picture, which is no capture."""
+    """Facts about one image, which alone cannot be refined."""
     width, height = image_size(path)
     tags = _tags(path)
     facts = (*_camera([tags] if tags else []), ("size", f"{width}x{height}"))
-    return Found(facts, f"{path}: one picture; give the folder of all pictures of the place")
+    return Found(facts, f"{path} is one image: give the folder of all images of the place")
 
 
 def _about(frames: FrameSet) -> Facts:
@@ -48,7 +48,7 @@ def _about(frames: FrameSet) -> Facts:
         step = float(np.median(np.diff(frames.timestamps)))
         facts.append(("frames", f"{count}, one every {step:.3g} s, {spoken_seconds(span)}"))
     else:
-        facts.append(("frames", f"{count}, in the order of their names: nothing says when"))
+        facts.append(("frames", f"{count}, in the order of their names: they have no times"))
     for name, lens in zip(("front lens", "back lens"), frames.fisheyes or (), strict=False):
         x, y = lens.principal
         at = f"focal length {lens.focal:.1f} px, principal point ({x:.1f}, {y:.1f})"
@@ -59,7 +59,7 @@ def _about(frames: FrameSet) -> Facts:
 def _tags(path: Path) -> ExifTags | None:
     try:
         return read_exif(path)
-    except ValueError:  # damaged tags say nothing
+    except ValueError:  # damaged tags
         return None
 
 

@@ -1,7 +1,7 @@
-"""Learned keypoints and matchers (extra `learned`), behind the same interfaces as our own.
+"""Learned keypoints and matchers (extra `learned`), with the interfaces of SIFT and guided search.
 
-Takes weights, which are their authors', under their own licences: nothing is bundled.
-Gives an extractor or a matcher; networks come from kornia and transformers, imported when used.
+Takes weights, which their authors publish under their own licences: none are bundled.
+Gives an extractor or a matcher; networks come from kornia and transformers, imported on use.
 """
 
 from gsba.learned.extractor import LearnedExtractor, make_extractor

@@ -1,4 +1,4 @@
-"""Keypoints by kornia: ALIKED, DISK and XFeat, in the layouts their authors publish."""
+"""Keypoints by kornia: ALIKED, DISK and XFeat, with weights in their authors' layouts."""
 
 from pathlib import Path
 
@@ -11,12 +11,12 @@ from gsba.learned.weights import load_into, read_state
 
 
 def to_tensor(image: np.ndarray) -> torch.Tensor:
-    """(1, 3, N, N) float32 in [0, 1] of an image (N, N, 3) uint8."""
+    """Tensor (1, 3, N, N) float32 in [0, 1] of an image (N, N, 3) uint8."""
     return torch.from_numpy(np.moveaxis(image, -1, 0).astype(np.float32) / 255)[None]
 
 
 def aliked(weights: Path, num: int) -> Detector:
-    """ALIKED-N(16) (Zhao et al., TIM 2023); keypoints between pixels."""
+    """ALIKED-N(16) (Zhao et al., TIM 2023), with subpixel keypoints."""
     model = kornia.feature.ALIKED("aliked-n16", max_num_keypoints=num)
     model = load_into(model, read_state(weights), "aliked", weights)
 
@@ -29,7 +29,7 @@ def aliked(weights: Path, num: int) -> Detector:
 
 
 def disk(weights: Path, num: int) -> Detector:
-    """DISK (Tyszkiewicz et al., NeurIPS 2020); keypoints on pixels."""
+    """DISK (Tyszkiewicz et al., NeurIPS 2020), with keypoints at whole pixels."""
     state = read_state(weights)
     model = load_into(kornia.feature.DISK(), state.get("extractor", state), "disk", weights)
 
@@ -42,7 +42,7 @@ def disk(weights: Path, num: int) -> Detector:
 
 
 def xfeat(weights: Path, num: int) -> Detector:
-    """XFeat (Potje et al., CVPR 2024); keypoints on pixels."""
+    """XFeat (Potje et al., CVPR 2024), with keypoints at whole pixels."""
     model = kornia.feature.XFeat(top_k=num).eval()
     load_into(model.net, read_state(weights), "xfeat", weights)
 

@@ -1,4 +1,4 @@
-"""One extractor for all learned networks: padding, masks, pixel conventions, selection."""
+"""Extractor for all learned networks: padding, masks, pixel conventions, selection."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -11,17 +11,17 @@ from gsba.features.detection import Extractor, FaceKeypoints, SiftExtractor
 from gsba.learned.interfaces import Detector
 from gsba.learned.weights import missing_library
 
-SIGMA_PX = 0.5  # per-axis noise of any; what matters is that all keypoints have the same
-_STEP = 32  # pixels; the networks halve the image several times
+SIGMA_PX = 0.5  # per-axis noise of all keypoints; only equal weights matter
+_SIZE_MULTIPLE_PX = 32  # of network inputs, which are halved several times
 
 
 def make_extractor(
     settings: FeatureSettings, weights: Mapping[str, Path]
 ) -> Callable[[], Extractor]:
-    """What makes an extractor for each frame: our own SIFT, or a learned one.
+    """Factory of the extractor for each frame: SIFT, or a learned network.
 
     Args:
-        settings: `extractor` and what it needs.
+        settings: `extractor` and its settings.
         weights: files of learned networks (`find_weights`).
     """
     if settings.extractor == "sift":
@@ -30,14 +30,14 @@ def make_extractor(
 
 
 class LearnedExtractor:
-    """ALIKED, DISK, XFeat or SuperPoint on one face, at the face's own size and aspect.
+    """ALIKED, DISK, XFeat or SuperPoint on one face, without rescaling.
 
     Args:
         settings: `extractor` names the network.
-        weights: its file.
+        weights: file of its weights.
 
     Raises:
-        GsbaError: weights of another network, or a library is not installed.
+        GsbaError: the weights are of another network, or a library is not installed.
     """
 
     def __init__(self, settings: FeatureSettings, weights: Path) -> None:
@@ -46,10 +46,10 @@ class LearnedExtractor:
 
     def __call__(self, face_rgb: np.ndarray, mask: np.ndarray | None) -> FaceKeypoints:
         size = face_rgb.shape[0]
-        side = -(-size // _STEP) * _STEP
+        side = -(-size // _SIZE_MULTIPLE_PX) * _SIZE_MULTIPLE_PX
         padded = np.pad(face_rgb, ((0, side - size), (0, side - size), (0, 0)), mode="edge")
         centred, scores, descriptors = self._detect(padded)
-        pixels = centred.astype(np.float64).reshape(-1, 2) + 0.5  # from the corner
+        pixels = centred.astype(np.float64).reshape(-1, 2) + 0.5  # corner origin
         allowed = (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
         columns, rows = np.minimum(np.maximum(pixels, 0), size - 1).astype(int).T
         if mask is not None:
@@ -66,8 +66,10 @@ class LearnedExtractor:
 
 @functools.lru_cache(maxsize=1)
 def _load(name: str, weights: Path, max_per_face: int) -> Detector:
-    """The network in inference mode; one for all threads. Twice the keypoints that are kept are
-    found, as masks and neighbouring faces take some."""
+    """Network in inference mode, shared by all threads.
+
+    It finds twice the number of kept keypoints, as masks and neighbouring faces remove some.
+    """
     try:
         if name == "superpoint":
             from gsba.learned.magicleap import superpoint as load

@@ -1,4 +1,4 @@
-"""What networks are asked for; `LearnedExtractor` and `FaceMatcher` do the rest."""
+"""Interfaces of networks that `LearnedExtractor` and `FaceMatcher` call."""
 
 from typing import Protocol
 
@@ -8,20 +8,20 @@ from gsba.features.detection import FaceKeypoints
 
 
 class Detector(Protocol):
-    """A network that finds and describes keypoints on one image."""
+    """Network that detects and describes keypoints on one image."""
 
     def __call__(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Keypoints of an image (N, N, 3) uint8, N a multiple of 32.
 
         Returns:
-            pixels (K, 2) (u, v) from the centre of the first pixel, scores (K,), and descriptors
-            (K, D) float32 of length one.
+            pixels (K, 2) (u, v), with the origin in the centre of the first pixel, scores (K,), and
+            descriptors (K, D) float32 of length one.
         """
         ...
 
 
 class FaceNetwork(Protocol):
-    """A network that matches the keypoints of two images of `size` by `size` pixels."""
+    """Network that matches the keypoints of two images of `size` by `size` pixels."""
 
     def __call__(
         self, first: FaceKeypoints, second: FaceKeypoints, size: int

@@ -1,4 +1,4 @@
-"""LightGlue (Lindenberger et al., ICCV 2023) by kornia, on keypoints that are already there."""
+"""LightGlue (Lindenberger et al., ICCV 2023) by kornia, on stored keypoints."""
 
 from pathlib import Path
 
@@ -9,18 +9,18 @@ import torch  # pyright: ignore[reportMissingImports]
 from gsba.features.detection import FaceKeypoints
 from gsba.learned.weights import load_into, read_state
 
-_MIN_SCORE = 0.1  # as published
+_MIN_SCORE = 0.1  # published value
 
 
 class LightGlue:
-    """Matches of two faces; all layers and all keypoints, so that a pair's matches are its own.
+    """Matcher of two faces with all layers and all keypoints, so that matches depend on these only.
 
     Args:
-        extractor: whose keypoints: aliked, disk, superpoint, or xfeat ("LighterGlue").
+        extractor: network of the keypoints: aliked, disk, superpoint, or xfeat ("LighterGlue").
         weights: file in the layout of its authors or of kornia.
 
     Raises:
-        GsbaError: weights of another network.
+        GsbaError: the weights are of another network.
     """
 
     def __init__(self, extractor: str, weights: Path) -> None:
@@ -50,7 +50,7 @@ class LightGlue:
 
 
 def _image(face: FaceKeypoints, size: int) -> dict[str, torch.Tensor]:
-    """A face as LightGlue takes it: pixels count from the centre of the first."""
+    """Input of LightGlue for a face, with pixels from the centre of the first."""
     pixels = np.clip(face.pixels - 0.5, 0, size - 1).astype(np.float32)
     return {
         "keypoints": torch.from_numpy(pixels)[None],

@@ -1,6 +1,6 @@
 """SuperPoint and SuperGlue by transformers; weights under Magic Leap's non-commercial licence.
 
-Files are taken in the authors' layout (`superpoint_v1.pth`, `superglue_outdoor.pth`) or in that of
+Files have the authors' layout (`superpoint_v1.pth`, `superglue_outdoor.pth`) or that of
 transformers (`model.safetensors`).
 """
 
@@ -23,8 +23,8 @@ from gsba.learned.interfaces import Detector
 from gsba.learned.weights import load_into, read_state
 
 _HEADS = 4  # of SuperGlue's attention
-_MIN_SCORE = 0.2  # SuperGlue's, as published
-_PLAIN = {
+_MIN_SCORE = 0.2  # published value of SuperGlue
+_HEAD_NAMES = {  # layer of superpoint_v1.pth -> layer of transformers
     "convPa": "keypoint_decoder.conv_score_a",
     "convPb": "keypoint_decoder.conv_score_b",
     "convDa": "descriptor_decoder.conv_descriptor_a",
@@ -33,7 +33,7 @@ _PLAIN = {
 
 
 def superpoint(weights: Path, num: int) -> Detector:
-    """SuperPoint (DeTone et al., CVPRW 2018); keypoints on pixels."""
+    """SuperPoint (DeTone et al., CVPRW 2018), with keypoints at whole pixels."""
     model = SuperPointForKeypointDetection(SuperPointConfig(max_keypoints=num))
     state = {_superpoint_name(name): value for name, value in read_state(weights).items()}
     model = load_into(model, state, "superpoint", weights)
@@ -42,19 +42,19 @@ def superpoint(weights: Path, num: int) -> Detector:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
         with torch.inference_mode():
             found = model(pixel_values=torch.from_numpy(grey)[None, None])
-        pixels = np.rint(found.keypoints[0].numpy() * image.shape[0])  # a fraction of the size
+        pixels = np.rint(found.keypoints[0].numpy() * image.shape[0])  # relative to the size
         return pixels, found.scores[0].numpy(), found.descriptors[0].numpy()
 
     return detect
 
 
 def _superpoint_name(name: str) -> str:
-    """Name in transformers of a tensor of superpoint_v1.pth; others stay."""
+    """Name in transformers of a tensor of superpoint_v1.pth; other names are kept."""
     layer, _, kind = name.partition(".")
     found = re.fullmatch(r"conv([1-4])([ab])", layer)
     if found:
         return f"encoder.conv_blocks.{int(found[1]) - 1}.conv_{found[2]}.{kind}"
-    return f"{_PLAIN[layer]}.{kind}" if layer in _PLAIN else name
+    return f"{_HEAD_NAMES[layer]}.{kind}" if layer in _HEAD_NAMES else name
 
 
 class SuperGlue:
@@ -64,12 +64,12 @@ class SuperGlue:
         weights: file of either layout.
 
     Raises:
-        GsbaError: weights of another network.
+        GsbaError: the weights are of another network.
     """
 
     def __init__(self, weights: Path) -> None:
         model = SuperGlueForKeypointMatching(SuperGlueConfig(matching_threshold=_MIN_SCORE))
-        model.keypoint_detector = torch.nn.Identity()  # keypoints are found once for each frame
+        model.keypoint_detector = torch.nn.Identity()  # keypoints are detected once per frame
         state = read_state(weights)
         if "kenc.encoder.0.weight" in state:
             state = dict(_superglue_tensor(*item) for item in state.items())
@@ -103,7 +103,7 @@ def _scores(face: FaceKeypoints) -> np.ndarray:
 
 
 def _together(first: np.ndarray, second: np.ndarray) -> torch.Tensor:
-    """(1, 2, n, ...) float32 of both faces' rows, the shorter one filled up with zeros."""
+    """Tensor (1, 2, n, ...) float32 of both faces' rows, the shorter one padded with zeros."""
     longest = max(len(first), len(second))
     both = np.zeros((1, 2, longest, *first.shape[1:]), np.float32)
     both[0, 0, : len(first)], both[0, 1, : len(second)] = first, second
@@ -113,8 +113,8 @@ def _together(first: np.ndarray, second: np.ndarray) -> torch.Tensor:
 def _superglue_tensor(name: str, value: Any) -> tuple[str, Any]:
     """Name and tensor in transformers of a tensor of superglue_outdoor.pth.
 
-    The authors' layers are convolutions over points, and their channels run through the heads
-    fastest; those of transformers are matrices whose channels run through the heads slowest.
+    The authors' layers are convolutions over points, and the head is the fastest index of their
+    channels; those of transformers are matrices with the head as the slowest index.
     """
     parts = name.split(".")
     if value.ndim == 3:
@@ -137,12 +137,12 @@ def _superglue_tensor(name: str, value: Any) -> tuple[str, Any]:
 
 
 def _in_stack(index: int, last: int, kind: str) -> str:
-    """Place of layer `index` of a stack of (linear, norm, ReLU) that ends in a linear one."""
+    """Name of layer `index` in a stack of (linear, norm, ReLU) that ends in a linear layer."""
     if index == last:
         return f"{index // 3}.{kind}"
     return f"{index // 3}.{('linear', 'batch_norm')[index % 3]}.{kind}"
 
 
 def _by_head(value: Any) -> Any:
-    """Rows in the order head, channel instead of channel, head."""
+    """Rows reordered from (channel, head) to (head, channel)."""
     return value.unflatten(0, (-1, _HEADS)).transpose(0, 1).flatten(0, 1)

@@ -1,4 +1,4 @@
-"""Learned matchers between the faces of two frames that see the same things."""
+"""Learned matchers between overlapping faces of two frames."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,13 +21,13 @@ from gsba.matching.guided_search import (
 )
 from gsba.types import FACES, Features
 
-_PARALLAX_RAD = np.deg2rad(10.0)  # that a pair of faces is expected to differ by
-_MIN_SHARE = 0.05  # of a face's keypoints that the other one must be expected to see
+_PARALLAX_RAD = np.deg2rad(10.0)  # assumed for near points, to find overlapping faces
+_MIN_OVERLAP = 0.05  # share of a face's keypoints that should be on the other one
 _MIN_KEYPOINTS = 8  # on either face
 
 
 def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: int) -> Matcher:
-    """The matcher that settings choose: our own search, or a learned one.
+    """Matcher that settings choose: guided search, or a learned network.
 
     Args:
         settings: `matching.matcher` and `features.extractor`.
@@ -35,7 +35,7 @@ def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: in
         size: pixels of a face.
 
     Raises:
-        GsbaError: weights of another network, or a library is not installed.
+        GsbaError: the weights are of another network, or a library is not installed.
     """
     name = settings.matching.matcher
     if name == "guided":
@@ -53,14 +53,13 @@ def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: in
 
 
 class FaceMatcher:
-    """A Matcher (`gsba.matching.guided_search`) that asks a network, face by face.
+    """Matcher (`gsba.matching.guided_search`) that applies a network to pairs of faces.
 
-    It takes the place of guided search wherever descriptors decide: between neighbours in time,
-    along epipolar lines, and at loops. The network sees only pairs of faces that the predicted
-    pose lets overlap, and of what it says only matches inside the gate are believed: what merely
-    repeats is refused here as in guided search, and then by two-view verification. Where the map
-    already knows a point to a fraction of a degree, and where nothing is predicted, `guided`
-    remains.
+    It replaces guided search between neighbours in time, along epipolar lines, and at loops. The
+    network gets only pairs of faces that overlap by the predicted pose, and only its matches inside
+    the gate are kept, so that the gate and then two-view verification remove matches of repetitive
+    structure. Known points with a gate of a fraction of a degree, and pairs without a predicted
+    pose, are matched by `guided`.
     """
 
     def __init__(self, network: FaceNetwork, size: int) -> None:
@@ -95,7 +94,7 @@ class FaceMatcher:
 
 
 def _on_face(features: Features, keypoints: np.ndarray) -> FaceKeypoints:
-    """Some keypoints of one face."""
+    """Keypoints `keypoints` (n,) of one face."""
     return FaceKeypoints(
         features.pixels[keypoints],
         features.sigmas_rad[keypoints],
@@ -107,10 +106,10 @@ def _on_face(features: Features, keypoints: np.ndarray) -> FaceKeypoints:
 def overlapping_faces(
     bearings0: np.ndarray, bearings1: np.ndarray, f0_T_f1: np.ndarray
 ) -> list[tuple[int, int]]:
-    """Pairs of faces, of frame 0 and frame 1, that should see the same things.
+    """Pairs of overlapping faces, of frame 0 and frame 1.
 
-    At least a twentieth of the keypoints of one must lie on the other, if far away or if near
-    enough to be seen 10 degrees off.
+    At least a twentieth of the keypoints of one must be on the other, for points at infinity or
+    with a parallax of 10 degrees.
 
     Args:
         bearings0, bearings1: (n, 3) keypoints of both frames, each in its own rig frame.
@@ -119,17 +118,17 @@ def overlapping_faces(
     rotation, motion = f0_T_f1[:3, :3], f0_T_f1[:3, 3]
     onto1 = _shares(bearings0, bearings0 @ rotation, -motion @ rotation)
     onto0 = _shares(bearings1, bearings1 @ rotation.T, motion)
-    overlap = np.maximum(onto1, onto0.T) >= _MIN_SHARE
+    overlap = np.maximum(onto1, onto0.T) >= _MIN_OVERLAP
     return [(int(face0), int(face1)) for face0, face1 in np.argwhere(overlap)]
 
 
 def _shares(bearings: np.ndarray, seen: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """Parts (6, 6) of each face's keypoints that may lie on each face of the other frame.
+    """Shares (6, 6) of each face's keypoints that may be on each face of the other frame.
 
     Args:
-        bearings: (n, 3) in their own frame.
-        seen: (n, 3) the same directions in the other frame.
-        towards: (3,) where bearings of near points are displaced to, in the other frame.
+        bearings: (n, 3) bearings in their own rig frame.
+        seen: (n, 3) these directions in the other rig frame.
+        towards: (3,) direction of the parallax of near points, in the other rig frame.
     """
     faces, length = owner_faces(bearings), np.linalg.norm(towards)
     places = [owner_faces(seen)]

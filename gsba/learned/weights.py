@@ -1,8 +1,8 @@
-"""Weights of learned networks: which files, whose, under which licence, and where they are.
+"""Weights of learned networks: files, authors, licences, and search paths.
 
-They are looked for where the settings say (a file, or a folder that holds the file under its
-official name), then where torch and Hugging Face cache what they download, and fetched only if the
-settings allow it. What a licence keeps from commercial use is used only if that is accepted.
+They are searched at the path of the settings (a file, or a folder that holds the file under its
+official name), then in the download caches of torch and Hugging Face. They are downloaded only if
+the settings allow it. Weights for non-commercial use are used only if that licence is accepted.
 """
 
 import logging
@@ -30,15 +30,15 @@ _NON_COMMERCIAL = "Magic Leap's licence: non-commercial research only"
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Where a network's weights come from."""
+    """Source of a network's weights."""
 
-    network: str
-    files: tuple[str, ...]  # names it is published or cached under, the usual one first
+    network: str  # name of the network
+    files: tuple[str, ...]  # published or cached file names, the most usual one first
     licence: str
-    place: str  # for people
-    urls: tuple[str, ...]  # tried in this order
+    place: str  # web address for messages
+    urls: tuple[str, ...]  # download addresses, tried in this order
     hub: tuple[str, ...] = ()  # Hugging Face repositories that hold one of the files
-    free: bool = True  # for commercial use too
+    free: bool = True  # True = the licence permits commercial use
 
 
 def _lightglue(extractor: str) -> Source:
@@ -127,8 +127,8 @@ def find_weights(settings: RefineSettings) -> dict[str, Path]:
     """Files of the learned networks that settings choose, by "features" and "matching".
 
     Raises:
-        GsbaError: weights that are neither there nor to be downloaded, or whose licence was not
-            accepted; says which file, its licence and where to get it.
+        GsbaError: weights are missing and may not be downloaded, or their licence was not accepted;
+            the message names the file, its licence and its source.
     """
     chosen, wanted = settings.features, {}
     if chosen.extractor != "sift":
@@ -148,31 +148,31 @@ def _check_licence(source: Source, accepted: bool) -> None:
         return
     if not accepted:
         raise GsbaError(
-            f"{source.network}'s weights are under {source.licence} ({source.place}); if that is "
-            "your use, say so: --accept-noncommercial (features.accept_noncommercial = true)"
+            f"{source.network}'s weights are under {source.licence} ({source.place}); if your use "
+            "is non-commercial, pass --accept-noncommercial (features.accept_noncommercial = true)"
         )
     logger.warning("%s's weights are under %s", source.network, source.licence)
 
 
 def _find(source: Source, given: str | None, setting: str, download: bool) -> Path:
-    how = f"get {source.files[0]} ({source.licence}) from {source.place}"
+    advice = f"get {source.files[0]} ({source.licence}) from {source.place}"
     folders = [*_torch_cache(), *_hub_cache(source.hub)]
     if given is not None:
         path = Path(given).expanduser()
         if path.is_file():
             return path
         if not path.is_dir():
-            raise GsbaError(f"{path}: no such weights file; {how}")
+            raise GsbaError(f"{path}: no such weights file; {advice}")
         folders.insert(0, path)
     at_hand = _held(source, folders)
     if at_hand is not None:
         return at_hand
     if download:
         return _download(source)
-    where = f"{given}: holds no weights of" if given else "no weights of"
+    where = f"{given} holds no weights of" if given else "no weights of"
     raise GsbaError(
-        f"{where} {source.network}; {how} and name it with --weights ({setting}), "
-        "or let --download fetch it"
+        f"{where} {source.network}; {advice} and pass it by --weights ({setting}), "
+        "or pass --download"
     )
 
 
@@ -186,13 +186,13 @@ def cached_weights() -> dict[str, Path]:
 
 
 def _held(source: Source, folders: Iterable[Path]) -> Path | None:
-    """A file of weights in one of several folders."""
+    """File of weights in the first of several folders that holds one; None = none does."""
     paths = (folder / name for folder in folders for name in source.files)
     return next((path for path in paths if path.is_file()), None)
 
 
 def _torch_cache() -> list[Path]:
-    """Where torch.hub, and with it kornia, keeps files."""
+    """Cache folder of torch.hub, which kornia uses."""
     cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     home = os.environ.get("TORCH_HOME") or f"{cache}/torch"
     return [Path(home).expanduser() / "hub" / "checkpoints"]
@@ -213,7 +213,7 @@ def _hub_cache(repositories: tuple[str, ...]) -> list[Path]:
 
 
 def _download(source: Source) -> Path:
-    """Fetch weights into torch's cache, where other programs find them too."""
+    """Download weights into torch's cache, where other programs find them, too."""
     path = _torch_cache()[0] / source.files[0]
     failures = []
     for url in source.urls:
@@ -222,11 +222,11 @@ def _download(source: Source) -> Path:
             with urllib.request.urlopen(url, timeout=_TIMEOUT_S) as reply:
                 atomic_write(path, lambda to, reply=reply: _copy(reply, to))
             return path
-        except (OSError, ValueError) as error:  # no network, no such page, a cut connection
+        except (OSError, ValueError) as error:  # no network, a missing page, or a lost connection
             failures.append(str(getattr(error, "reason", error)))
     raise GsbaError(
         f"could not download {path.name} ({failures[-1]}); get it ({source.licence}) from "
-        f"{source.place} and name it with --weights"
+        f"{source.place} and pass it by --weights"
     )
 
 
@@ -236,10 +236,10 @@ def _copy(reply: Any, to: Path) -> None:
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """Tensors by name of a file of weights; pickled code in it is not run.
+    """Tensors of a file of weights, by name; pickled code in it is not run.
 
     Raises:
-        GsbaError: not a file of weights.
+        GsbaError: the file holds no weights.
     """
     import torch  # pyright: ignore[reportMissingImports]
 
@@ -252,22 +252,22 @@ def read_state(path: Path) -> dict[str, Any]:
             state = torch.load(path, map_location="cpu", weights_only=True)
     except ImportError:
         raise missing_library("safetensors files") from None
-    except Exception as error:  # of pickle, zipfile, safetensors or torch, each in its own words
-        raise GsbaError(f"{path}: not a file of weights; get it again") from error
+    except Exception as error:  # pickle, zipfile, safetensors and torch raise many types
+        raise GsbaError(f"{path} is not a file of weights: get it again") from error
     return dict(state) if isinstance(state, dict) else {}
 
 
 def load_into(model: Any, state: dict[str, Any], key: str, path: Path) -> Any:
-    """Give a network its weights and put it into inference mode.
+    """Load weights into a network and put it into inference mode.
 
     Args:
         model: torch module.
         state: tensors by name.
-        key: of the network in SOURCES.
-        path: of the weights, for the message.
+        key: key of the network in SOURCES.
+        path: file of the weights, for the message.
 
     Raises:
-        GsbaError: the weights are another network's.
+        GsbaError: the weights are of another network.
     """
     needed = dict(model.named_parameters()) | {
         name: value for name, value in model.named_buffers() if "running" in name
@@ -279,11 +279,11 @@ def load_into(model: Any, state: dict[str, Any], key: str, path: Path) -> Any:
     )
     if not fits or state.keys() - known:
         usual = SOURCES[key].files[0]
-        raise GsbaError(f"{path}: weights of another network than {key} ({usual})")
+        raise GsbaError(f"{path} holds weights of another network than {key} ({usual})")
     model.load_state_dict({n: v for n, v in state.items() if n in known}, strict=False)
     return model.eval().requires_grad_(False)
 
 
 def missing_library(what: str) -> GsbaError:
-    """The one line for what is not installed."""
+    """Error for libraries that are not installed."""
     return GsbaError(f"{what} needs torch, kornia and transformers: pip install 'gsba[learned]'")

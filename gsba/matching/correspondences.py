@@ -41,7 +41,7 @@ def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
     neighbours = agreeing(found, estimates)
     scarce = np.diff(found.offsets) < settings.pairs.scarce_matches
     steps = chosen[:, 1] - chosen[:, 0] == 1
-    doubtful = steps & (_shares(found, neighbours) < settings.pairs.least_agreement)
+    doubtful = steps & (_shares(found, neighbours) < settings.pairs.min_inlier_ratio)
     rows = np.flatnonzero(scarce | doubtful)
     if len(rows) == 0:
         return neighbours

@@ -1,4 +1,4 @@
-"""Where the world of a run goes: upright, to scale, on the earth, onto true poses.
+"""Placement of a run's world: upright, metric, georeferenced, or aligned to true poses or a scan.
 
 Takes a finished result, and gravity, a length, GPS or a trajectory.
 Gives a `Placement`, which moves poses, points and covariances.

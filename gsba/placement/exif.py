@@ -1,4 +1,4 @@
-"""Positions that cameras write into pictures: the GPS directory of EXIF."""
+"""GPS positions in the EXIF data of images."""
 
 import logging
 import math
@@ -19,14 +19,14 @@ MIN_FIXES = 3
 
 
 def read_exif_gps(frames: FrameSet, settings: GpsSettings | None = None) -> GpsFixes:
-    """Fixes of the frames whose pictures have GPS tags, by name.
+    """Fixes of the frames whose images have GPS tags, by name.
 
-    A frame without a valid fix is passed over, and so is one that repeats an earlier frame's fix
-    (equal position and GPS time stamp). Where at least three have an altitude, frames without are
-    passed over too; else unknown altitudes are 0.
+    Frames without a valid fix are left out, and frames that repeat an earlier frame's fix (equal
+    position and GPS timestamp). If at least three fixes have an altitude, fixes without one are
+    left out, too; else unknown altitudes are 0.
 
     Raises:
-        GsbaError: fewer than three frames have one, or a picture cannot be read.
+        GsbaError: fewer than three frames have a fix, or an image cannot be read.
     """
     found: dict[str, GpsTag] = {}
     taken, damaged = set[tuple[float, float, float]](), 0
@@ -40,7 +40,7 @@ def read_exif_gps(frames: FrameSet, settings: GpsSettings | None = None) -> GpsF
             found[name] = tag
         taken.add(known)
     if damaged:
-        _log.warning("--gps exif: the EXIF data of %d pictures are damaged", damaged)
+        _log.warning("--gps exif: the EXIF data of %d images are damaged", damaged)
     if len(found) < MIN_FIXES:
         raise GsbaError(
             f"--gps exif: {len(found)} of {len(frames)} frames have GPS tags "
@@ -56,12 +56,12 @@ def read_exif_gps(frames: FrameSet, settings: GpsSettings | None = None) -> GpsF
 
 
 def gps_of(path: Path) -> tuple[float, float, float] | None:
-    """Latitude and longitude (degrees) and altitude (metres, NaN = unknown) of a picture.
+    """Latitude and longitude (degrees) and altitude (metres, NaN = unknown) of an image.
 
-    None where it has none, or the receiver says that it had lost the satellites.
+    None if it has no position, or if the receiver marked it as invalid.
 
     Raises:
-        ValueError: EXIF data that are damaged.
+        ValueError: the EXIF data are damaged.
         GsbaError: the file cannot be read.
     """
     tag = read_exif(path).gps
@@ -69,7 +69,7 @@ def gps_of(path: Path) -> tuple[float, float, float] | None:
 
 
 def _first_tag(paths: Sequence[Path]) -> tuple[GpsTag | None, int]:
-    """The position of the first picture of a frame that has one, and how many are damaged."""
+    """Position of the first image of a frame that has one, and the number of damaged images."""
     damaged = 0
     for path in paths:
         try:

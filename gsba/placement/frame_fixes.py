@@ -1,4 +1,4 @@
-"""GPS fixes of a run's frames: from whatever file holds them, at the times of the frames."""
+"""GPS fixes of a run's frames, from files of all kinds, interpolated at the frames' times."""
 
 from pathlib import Path
 
@@ -12,22 +12,22 @@ from gsba.placement.gps import GpsFixes, local_from_geodetic, read_gps
 from gsba.placement.gps_video import is_recording, read_video_gps
 from gsba.types import FrameSet
 
-EXIF = "exif"  # in place of a file of positions: those in the pictures
-_ACCELERATION = 1.0  # m/s^2, of people on foot: how far a path strays from the line between fixes
+EXIF = "exif"  # in place of a file: positions in the EXIF data of the images
+_ACCELERATION = 1.0  # m/s^2, of pedestrians: bounds the deviation from the line between fixes
 
 
 def read_fixes(
     source: str, frames: FrameSet | None = None, settings: GpsSettings | None = None
 ) -> GpsFixes | None:
-    """Fixes that `--gps` names: a CSV or GPX file, a video, or "exif" of the frames.
+    """Fixes of the source that `--gps` names: a CSV or GPX file, a video, or "exif" of the frames.
 
     Args:
         source: path of the file, or "exif".
-        frames: of the run; None = they are not known yet: then "exif" gives None.
-        settings: the least noise of a fix.
+        frames: frames of the run; None = not known yet, so that "exif" gives None.
+        settings: smallest noise of a fix.
 
     Raises:
-        GsbaError: what cannot be read, with the place.
+        GsbaError: the source cannot be read; the message names the line.
     """
     if source == EXIF:
         return None if frames is None else read_exif_gps(frames, settings)
@@ -40,17 +40,17 @@ def fixes_of_frames(
 ) -> FrameFixes:
     """Fixes of frames by name, or interpolated between the fixes before and after.
 
-    Between fixes that are `d` seconds apart a walker strays from the straight line by up to
-    `a d^2 / 8`, a = 1 m/s^2: that is added to the noise, and frames where it exceeds the noise of
-    the fixes have none.
+    Between fixes that are `d` seconds apart, a pedestrian deviates from the straight line by up to
+    `a d^2 / 8`, a = 1 m/s^2. This deviation is added to the noise; frames where it exceeds the
+    noise of the fixes have no fix.
 
     Args:
         source: see `read_fixes`.
-        frames: of the run; they need times unless fixes name frames.
-        settings: the least noise, and how long an error lasts.
+        frames: frames of the run; they need times unless fixes name frames.
+        settings: smallest noise, and correlation time of the errors.
 
     Raises:
-        GsbaError: what cannot be read, or fixes of another time.
+        GsbaError: the source cannot be read, or its times do not overlap with the frames'.
     """
     settings = settings or GpsSettings()
     fixes = read_fixes(source, frames, settings)
@@ -72,16 +72,19 @@ def fixes_of_frames(
 def _between(
     source: str, fixes: GpsFixes, frames: FrameSet
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Frames (G,) between fixes, their positions (G, 3) geodetic, and their noise (G, 3) metres."""
+    """Frames (G,) between fixes, their positions (G, 3) geodetic, and sigmas (G, 3) in metres."""
     times, entries = frames.timestamps, fixes.timestamps
     assert entries is not None
     if not frames.timed:
-        raise GsbaError(f"{source}: nothing says when frames were taken: refine with --timestamps")
+        raise GsbaError(
+            f"{source}: the frames have no times to interpolate positions at: refine with "
+            "--timestamps"
+        )
     inside = np.flatnonzero((times >= entries[0]) & (times <= entries[-1]))
     if not len(inside):
         raise GsbaError(
             f"{source}: no overlap in time: positions span {entries[0]:.3f} to {entries[-1]:.3f} "
-            f"s, frames {times[0]:.3f} to {times[-1]:.3f} s; put both on one clock"
+            f"s, frames {times[0]:.3f} to {times[-1]:.3f} s; give both on one clock"
         )
     after = np.clip(np.searchsorted(entries, times[inside]), 1, max(len(entries) - 1, 1))
     after = np.minimum(after, len(entries) - 1)

@@ -14,11 +14,11 @@ from gsba.config import GpsSettings
 from gsba.frames.times import read_lines, seconds, stem_of
 from gsba.log import GsbaError, brief
 
-_A, _F = 6_378_137.0, 1 / 298.257223563  # WGS 84: half axis in metres, flattening
-_E2 = _F * (2 - _F)
-_HIGHEST_M = 1e6  # no receiver works higher up
-_MIN_ALTITUDES = 3  # fixes with an altitude: then fixes without are left out
-_LEVEL_M = 20.0  # standard deviation of heights where no altitudes are known: taken for level
+_A, _F = 6_378_137.0, 1 / 298.257223563  # WGS 84: semi-major axis in metres, flattening
+_E2 = _F * (2 - _F)  # squared eccentricity
+_MAX_ALTITUDE_M = 1e6  # no receiver works higher up
+_MIN_ALTITUDES = 3  # with so many known altitudes, fixes without one are left out
+_UNKNOWN_HEIGHT_SIGMA_M = 20.0  # of heights that are set to 0, as no altitudes are known
 _COLUMNS = {
     "name": ("name", "frame", "image", "file", "filename"),
     "time": ("time", "timestamp", "t", "seconds"),
@@ -30,16 +30,16 @@ _COLUMNS = {
     "error": ("sigma", "accuracy", "horizontal_accuracy", "sigma_m"),
     "error_up": ("sigma_up", "vertical_accuracy", "sigma_up_m"),
 }
-_OF_NOISE = ("dop", "dop_up", "error", "error_up")
-_WANT = "want a header such as name,latitude,longitude,altitude or timestamp,lat,lon,alt"
+_NOISE_COLUMNS = ("dop", "dop_up", "error", "error_up")
+_HEADER_ADVICE = "give a header such as name,latitude,longitude,altitude or timestamp,lat,lon,alt"
 
 
 @dataclass(frozen=True, slots=True)
 class GpsFixes:
-    """Positions on the ellipsoid, each of a frame or of a time."""
+    """Positions on the ellipsoid, each with the name of a frame or with a time."""
 
-    names: tuple[str, ...] | None  # (G,) frames' names, or None: they are of times
-    timestamps: np.ndarray | None  # (G,) float64, seconds, ascending; None: they are of frames
+    names: tuple[str, ...] | None  # (G,) names of frames; None = fixes have times
+    timestamps: np.ndarray | None  # (G,) float64, seconds, ascending; None = fixes have names
     geodetic: np.ndarray  # (G, 3) float64: latitude, longitude (degrees), altitude (metres)
     sigmas: np.ndarray  # (G, 3) float64, standard deviations east, north and up, metres
 
@@ -50,16 +50,16 @@ def fixes_of(
     sigmas: np.ndarray | None = None,
     settings: GpsSettings | None = None,
 ) -> GpsFixes:
-    """Fixes of any source: in order of time, altitudes known for all or for none.
+    """Fixes sorted by time, with altitudes known for all or for none.
 
     Args:
         keys: (G,) times in seconds on the frames' clock, distinct, in any order; or frames' names.
         geodetic: (G, 3) latitude, longitude (degrees), altitude (metres, NaN = not known). Fixes
-            without an altitude are left out where at least three have one; else all altitudes are
-            0, and worth 20 m.
-        sigmas: (G, 3) standard deviations east, north and up, metres; None = the least that
+            without an altitude are left out if at least three have one; else all altitudes are 0,
+            with a sigma of 20 m.
+        sigmas: (G, 3) standard deviations east, north and up, metres; None = the smallest that
             settings allow, see `sigmas_of`.
-        settings: the least noise of a fix.
+        settings: smallest noise of a fix.
     """
     geodetic = np.array(geodetic, np.float64).reshape(-1, 3)
     sigmas = sigmas_of(settings or GpsSettings(), np.full(len(geodetic), np.nan), sigmas)
@@ -71,9 +71,9 @@ def fixes_of(
     if high.all() or high.sum() >= _MIN_ALTITUDES:
         order = order[high]
     else:
-        geodetic[:, 2], sigmas[:, 2] = 0.0, np.maximum(sigmas[:, 2], _LEVEL_M)
+        geodetic[:, 2], sigmas[:, 2] = 0.0, np.maximum(sigmas[:, 2], _UNKNOWN_HEIGHT_SIGMA_M)
     geodetic, sigmas = geodetic[order], sigmas[order]
-    geodetic[:, 1] = np.unwrap(geodetic[:, 1], period=360)  # the date line is no jump
+    geodetic[:, 1] = np.unwrap(geodetic[:, 1], period=360)  # no jump at the date line
     if named:
         return GpsFixes(tuple(str(keys[int(i)]) for i in order), None, geodetic, sigmas)
     return GpsFixes(None, np.array(keys, np.float64)[order], geodetic, sigmas)
@@ -90,13 +90,15 @@ def sigmas_of(
 ) -> np.ndarray:
     """Standard deviations (G, 3) of fixes east, north and up, metres, never below the settings'.
 
-    Across, the receiver's own error estimate, else the dilution of precision times the settings'
-    noise; up, the same of the vertical, else in proportion to that across.
+    The horizontal one is the receiver's error estimate, else the dilution of precision times the
+    settings' noise. The vertical one is computed likewise from vertical values, else in proportion
+    to the horizontal one. NaN is unknown in all arguments.
 
     Args:
-        dop, dop_up: (G,) dilution of precision, across (or of the position), and up.
-        given: (G, 3) known ones, metres, that only the settings bound from below.
-        error_m, error_up_m: (G,) the receiver's own estimates, metres. NaN is unknown in all.
+        settings: smallest noise of a fix.
+        dop, dop_up: (G,) dilution of precision: horizontal (or of the position), and vertical.
+        given: (G, 3) known standard deviations, metres; the settings bound them from below.
+        error_m, error_up_m: (G,) error estimates of the receiver, metres.
     """
     least = np.array([settings.sigma_m, settings.sigma_m, settings.sigma_up_m])
     if given is not None:
@@ -115,21 +117,21 @@ def read_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
     """Fixes of a CSV table (decimal degrees, metres) or of a GPX track.
 
     A table's header names its columns: latitude and longitude, altitude if known, either the
-    frame's name or the time in seconds on the frames' clock, and how noisy fixes are: `hdop`,
-    `vdop`, `pdop`, or `sigma`, `accuracy` and `sigma_up` in metres. A GPX track's times are UTC, as
-    Unix time; its `hdop`, `vdop` and `pdop` are read.
+    frame's name or the time in seconds on the frames' clock, and the noise of fixes: `hdop`,
+    `vdop`, `pdop`, or `sigma`, `accuracy` and `sigma_up` in metres. Times of a GPX track are UTC
+    and become Unix time; its `hdop`, `vdop` and `pdop` are read.
 
     Args:
         path: the file.
-        settings: the least noise of a fix.
+        settings: smallest noise of a fix.
 
     Raises:
-        GsbaError: with the line that cannot be used.
+        GsbaError: a line cannot be used; the message names it.
     """
     path, settings = Path(path), settings or GpsSettings()
     lines = read_lines(path)
     if not lines:
-        raise GsbaError(f"{path}: holds no positions")
+        raise GsbaError(f"{path} holds no positions")
     if lines[0][1].startswith("<"):
         return _read_gpx(path, settings)
     header = [cell.lower() for cell in _cells(path, *lines[0])]
@@ -139,22 +141,24 @@ def read_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
         if set(names) & set(header)
     }
     if not {"latitude", "longitude"} <= where.keys():
-        raise GsbaError(f"{path}: names no latitude and longitude; {_WANT}")
+        raise GsbaError(f"{path} has no columns of latitude and longitude; {_HEADER_ADVICE}")
     if not {"name", "time"} & where.keys():
-        raise GsbaError(f"{path}: says neither frame nor time of its positions; {_WANT}")
+        raise GsbaError(f"{path} has no column of frames' names or times; {_HEADER_ADVICE}")
     keys, rows, noise = [], [], []
     for number, line in lines[1:]:
         cells = _cells(path, number, line)
         if len(cells) != len(header):
-            raise GsbaError(f"{path}:{number}: {len(cells)} cells under {len(header)} columns")
+            raise GsbaError(
+                f"{path}:{number}: the line has {len(cells)} cells, the header {len(header)}"
+            )
         found = {key: cells[column] for key, column in where.items()}
         place = f"{path}:{number}"
         rows.append(_position(found["latitude"], found["longitude"], found.get("altitude"), place))
-        noise.append([_noise(found.get(key), key, place) for key in _OF_NOISE])
+        noise.append([_noise(found.get(key), key, place) for key in _NOISE_COLUMNS])
         named = "name" in where
         keys.append(stem_of(found["name"]) if named else _number(found["time"], "time", place))
     if not rows:
-        raise GsbaError(f"{path}: holds no positions")
+        raise GsbaError(f"{path} holds no positions")
     return _checked_fixes(path, keys, rows, noise, settings)
 
 
@@ -166,9 +170,9 @@ def _cells(path: Path, number: int, line: str) -> list[str]:
 
 
 def local_from_geodetic(geodetic: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Metres east, north and up (G, 3) of an origin (3,), of latitude, longitude, altitude (G, 3).
+    """Metres east, north and up (G, 3) from an origin (3,), both latitude, longitude, altitude.
 
-    Exact: by way of the earth-centred frame of WGS 84 (Torge and Mueller, Geodesy, 2012, 4.1).
+    Exact, through the earth-centred frame of WGS 84 (Torge and Mueller, Geodesy, 2012, 4.1).
     """
     latitude, longitude = np.deg2rad(origin[:2])
     s, c, sl, cl = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
@@ -190,7 +194,7 @@ def _read_gpx(path: Path, settings: GpsSettings) -> GpsFixes:
     try:
         root = ElementTree.parse(path).getroot()
     except (ElementTree.ParseError, LookupError, ValueError) as error:  # syntax, encoding
-        raise GsbaError(f"{path}: neither a CSV table nor a GPX track ({error})") from None
+        raise GsbaError(f"{path} is neither a CSV table nor a GPX track ({error})") from None
     times, rows, noise = [], [], []
     for number, point in enumerate(root.iterfind(".//{*}trkpt"), 1):
         place = f"{path}: track point {number}"
@@ -219,27 +223,29 @@ def _checked_fixes(
     noise: list[list[float]],
     settings: GpsSettings,
 ) -> GpsFixes:
-    """Fixes of a file; `noise` holds a row of `_OF_NOISE` for each."""
+    """Fixes of a file; `noise` holds a row of `_NOISE_COLUMNS` for each."""
     if not isinstance(keys[0], str) and len(set(keys)) < len(keys):
-        raise GsbaError(f"{path}: holds two positions at one time")
+        raise GsbaError(f"{path} holds two positions at one time")
     dop, dop_up, error, error_up = np.array(noise).T
     known = {"dop_up": dop_up, "error_m": error, "error_up_m": error_up}
     return fixes_of(keys, np.array(rows), sigmas_of(settings, dop, **known), settings)
 
 
 def _position(latitude: str, longitude: str, altitude: str | None, place: str) -> list[float]:
-    """Latitude and longitude, degrees, and altitude, metres; NaN where it is absent or empty."""
+    """Latitude and longitude, degrees, and altitude, metres; NaN if it is absent or empty."""
     values = [_number(latitude, "latitude", place), _number(longitude, "longitude", place)]
     if not (abs(values[0]) <= 90 and abs(values[1]) <= 360):
-        raise GsbaError(f"{place}: {values[0]}, {values[1]} is no latitude and longitude")
+        raise GsbaError(
+            f"{place}: latitude {values[0]}, longitude {values[1]} are out of range (degrees)"
+        )
     values.append(_number(altitude, "altitude", place) if altitude else math.nan)
-    if abs(values[2]) > _HIGHEST_M:
-        raise GsbaError(f"{place}: {values[2]:g} is no altitude in metres")
+    if abs(values[2]) > _MAX_ALTITUDE_M:
+        raise GsbaError(f"{place}: altitude {values[2]:g} is out of range (metres)")
     return values
 
 
 def _noise(text: str | None, what: str, place: str) -> float:
-    """A DOP or a standard deviation; NaN where it is absent, empty, or 0 for "unknown"."""
+    """Value of a DOP or a standard deviation; NaN if it is absent, empty, or 0 for "unknown"."""
     value = _number(text, what, place) if text and text.strip() else math.nan
     if value < 0:
         raise GsbaError(f"{place}: {what} {value:g} is negative")

@@ -1,4 +1,4 @@
-"""Where a map lies on the earth, by GPS fixes of its frames and what else is known of it."""
+"""Similarity of a map to local level metres, by GPS fixes, a known vertical and a known scale."""
 
 from dataclasses import dataclass
 
@@ -8,29 +8,29 @@ from scipy.spatial.transform import Rotation
 from gsba.bundle.fixes import FrameFixes
 from gsba.similarity import Sim3, level_similarity, robust_similarity, similarity
 
-_MEDIAN_LENGTH = 1.538  # of a 3-vector of independent unit normals
+_MEDIAN_LENGTH = 1.538  # median length of a 3-vector of independent unit normals
 _OUTLIER_SIGMAS = 4.6  # 99.99 % of such vectors are shorter
-_ROUNDS, _STEPS = 20, 20  # of choosing fixes, and of Gauss-Newton in each
-_SETTLED = 1e-10  # step in units of the unknowns' own scale
-_LEVEL = (0, 3, 4, 5, 6)  # unknowns that are free where up is known
-_FREE = tuple(range(7))
+_MAX_ROUNDS, _MAX_STEPS = 20, 20  # selections of inliers, and Gauss-Newton steps in each
+_MIN_STEP = 1e-10  # in units of the unknowns' own scale; a smaller one ends the fit
+_LEVEL_UNKNOWNS = (0, 3, 4, 5, 6)  # unknowns that are free if up is known
+_ALL_UNKNOWNS = tuple(range(7))
 
 
 @dataclass(frozen=True, slots=True)
 class GpsFit:
-    """A similarity onto local level metres, and how well the fixes determine it."""
+    """Similarity to local level metres with its covariance."""
 
     similarity: Sim3
-    used: np.ndarray  # (G,) bool, fixes that it rests on
-    centre: np.ndarray  # (3,) float64, map units: where `covariance` has the translation
-    covariance: np.ndarray  # (7, 7) float64: log scale; turn about east, north and up, radians;
-    # shift of the centre, metres. Its errors multiply and turn from the left
-    rms_m: float  # of the distances of the fixes used
-    misfit: float  # of residuals in their standard deviations, rms; above 1 covariances grow by it
+    used: np.ndarray  # (G,) bool, inlier fixes
+    centre: np.ndarray  # (3,) float64, map units: point whose shift `covariance` holds
+    covariance: np.ndarray  # (7, 7) float64: log scale; rotation about east, north and up, radians;
+    # shift of the centre, metres. Errors are applied from the left
+    rms_m: float  # RMS residual of the inliers
+    misfit: float  # RMS of residuals / sigma; if above 1, covariances are scaled by its square
 
     @property
     def scale_sigma(self) -> float:
-        """Standard deviation of the scale, as a part of it."""
+        """Relative standard deviation of the scale."""
         return float(np.sqrt(self.covariance[0, 0]))
 
     @property
@@ -40,7 +40,7 @@ class GpsFit:
 
     @property
     def tilt_sigma(self) -> float:
-        """Standard deviation of the vertical in its worst direction, radians."""
+        """Standard deviation of the vertical in its least certain direction, radians."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[1:3, 1:3])[-1]))
 
     def position_sigmas(self, points: np.ndarray) -> np.ndarray:
@@ -55,27 +55,28 @@ def fit_fixes(
     up_sigma: float | None = None,
     scale: tuple[float, float] | None = None,
 ) -> GpsFit:
-    """Most probable similarity of a map onto GPS fixes whose errors last, without false fixes.
+    """Maximum-likelihood similarity from a map to GPS fixes with correlated errors and outliers.
 
-    Least squares with the inverse covariance of all fixes (`gsba.bundle.fixes`), from a start
-    by `gsba.similarity.robust_similarity`. A fix is false where it is further off than 4.6 of its
-    standard deviations, or than as many of what the fixes scatter where that is more.
+    Least squares with the inverse covariance of all fixes (`gsba.bundle.fixes`), initialised by
+    `gsba.similarity.robust_similarity`. A fix is an outlier if its residual exceeds 4.6 standard
+    deviations, or 4.6 times the scatter of all fixes if that is larger.
 
     Args:
-        positions: (G, 3) frames of the fixes in the map, map units, not all on one point.
-        fixes: where GPS had them.
-        up_sigma: of the direction +z of the map, radians, which is up then and stays so.
-            None = up is not known.
-        scale: metres per map unit, known from elsewhere, and its standard deviation.
+        positions: (G, 3) positions of the fixes' frames, map units, not all on one point.
+        fixes: GPS fixes of these frames.
+        up_sigma: standard deviation of the direction +z of the map, radians, which is then kept as
+            up; None = up is not known.
+        scale: metres per map unit, known from other data, and its standard deviation.
 
     Raises:
-        NoSimilarityError: positions and fixes have little in common.
+        NoSimilarityError: positions and fixes are barely correlated.
     """
     solve, num = (similarity, 3) if up_sigma is None else (level_similarity, 2)
     fit, used, _ = robust_similarity(positions, fixes.positions, solve, num)
-    centre, free = positions[used].mean(axis=0), _FREE if up_sigma is None else _LEVEL
+    centre = positions[used].mean(axis=0)
+    free = _ALL_UNKNOWNS if up_sigma is None else _LEVEL_UNKNOWNS
     information = np.zeros((7, 7))
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         fit, information = _most_probable(fit, positions, fixes, used, centre, free, scale)
         distances = np.linalg.norm(_residuals(fit, positions, fixes) / fixes.sigmas, axis=1)
         wide = max(1.0, float(np.median(distances)) / _MEDIAN_LENGTH)
@@ -94,7 +95,7 @@ def fit_fixes(
 
 
 def _residuals(fit: Sim3, positions: np.ndarray, fixes: FrameFixes) -> np.ndarray:
-    """Fixes (G, 3) less where the map has their frames, metres."""
+    """Residuals (G, 3): fixes less the transformed positions of their frames, metres."""
     return fixes.positions - fit.points(positions)
 
 
@@ -118,10 +119,10 @@ def _most_probable(
     free: tuple[int, ...],
     scale: tuple[float, float] | None,
 ) -> tuple[Sim3, np.ndarray]:
-    """Gauss-Newton over the fixes used; the similarity and its information (7, 7)."""
+    """Similarity by Gauss-Newton over the inliers `used`, and its information (7, 7)."""
     chosen, some = fixes.taken(used), positions[used]
     information, rows = np.zeros((7, 7)), list(free)
-    for _ in range(_STEPS):
+    for _ in range(_MAX_STEPS):
         columns = chosen.whitened(_columns(fit, some - centre)).reshape(-1, 7)
         off = chosen.whitened(chosen.positions - fit.points(some)).ravel()
         information, right = columns.T @ columns, columns.T @ off
@@ -138,6 +139,6 @@ def _most_probable(
         placed = fit.points(centre[None])[0] + step[4:]
         fit = Sim3(grown, rotation, placed - grown * rotation @ centre)
         reach = np.array([1.0, 1, 1, 1, *[max(float(np.ptp(chosen.positions)), 1e-9)] * 3])
-        if np.all(np.abs(step) <= _SETTLED * reach):
+        if np.all(np.abs(step) <= _MIN_STEP * reach):
             break
     return fit, information

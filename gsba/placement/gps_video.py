@@ -1,8 +1,9 @@
 """GPS fixes that cameras record into their videos.
 
-Those of Insta360 are in the trailer of the file. Those of GoPro are unpacked by `telemetry_parser`:
-GPMF packets of about a second hold fixes as GPS5 (up to HERO10 and MAX, with one DOP and one state
-of the receiver) or as GPS9 (later, with one for each fix): see github.com/gopro/gpmf-parser.
+Fixes of Insta360 are in the trailer of the file. Fixes of GoPro are unpacked by `telemetry_parser`:
+GPMF packets of about a second hold them as GPS5 (up to HERO10 and MAX, with one DOP and one state
+of the receiver a packet) or as GPS9 (later, with one for each fix): see
+github.com/gopro/gpmf-parser.
 """
 
 from collections.abc import Mapping
@@ -22,26 +23,26 @@ _FIX, _DOP, _UTC = "0x47505346", "0x47505350", "0x47505355"  # GPSF, GPSP (DOP *
 _GPS9 = "0x47505339"
 _GPS9_HEADER = 8  # bytes of key, type, size and repeat before its records
 _GPS9_RECORD = np.dtype([("values", ">i4", 7), ("dop", ">u2"), ("fix", ">u2")])
-_FLAT, _FULL = 2, 3  # states of the receiver: position without and with an altitude
+_FIX_2D, _FIX_3D = 2, 3  # states of the receiver: position without and with an altitude
 _DAY_S = 86_400.0
-_PACKET_S = 1.0  # that the only packet of a video lasts
-_FIRST_FIX_S = -5.0, 3600.0  # after a recording began, between which its first fix comes
+_PACKET_S = 1.0  # duration of the packet, if a video has only one
+_FIRST_FIX_S = -5.0, 3600.0  # earliest and latest plausible first fix after the recording began
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is a video, by its name."""
+    """True if the file's suffix is that of a video."""
     return path.suffix.lower() in _RECORDINGS
 
 
 def read_video_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
-    """Fixes of a video of Insta360 or GoPro, at seconds on the video's clock.
+    """Fixes of a video of Insta360 or GoPro, with times in seconds on the video's clock.
 
     Args:
         path: the video.
-        settings: the least noise of a fix; where the file gives its DOP, that is read.
+        settings: smallest noise of a fix; the file's DOP is used if it has one.
 
     Raises:
-        GsbaError: it holds no positions, or `telemetry_parser` is needed and not installed.
+        GsbaError: the video holds no positions, or `telemetry_parser` is needed and not installed.
     """
     trailer = read_trailer(path)
     if trailer is None:
@@ -54,8 +55,8 @@ def read_video_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
 def _of_insta360(
     record: GpsRecord, created_unix_s: float | None, settings: GpsSettings | None
 ) -> GpsFixes:
-    """Fixes since the recording was created, to a second; since the first fix where that does not
-    fit."""
+    """Fixes with times since the creation of the recording, accurate to a second; since the first
+    fix if the creation time is implausible."""
     begin = float(record.unix_times[0])
     if created_unix_s is not None:
         low, high = _FIRST_FIX_S
@@ -65,10 +66,10 @@ def _of_insta360(
 
 
 def _of_gopro(path: Path, settings: GpsSettings | None) -> GpsFixes:
-    """Fixes at seconds after the first packet of GPS.
+    """Fixes with times in seconds after the first GPS packet.
 
-    Fixes of a packet are evenly spread until the next; packets are timed by the camera's own
-    counter (STMP), else by the receiver's UTC. Where the receiver had no fix, there is none.
+    The fixes of a packet are spread evenly until the next packet. Packets are timed by the camera's
+    counter (STMP), else by the receiver's UTC. Entries without a valid fix are left out.
 
     Raises:
         GsbaError: the library is not installed, or finds no positions.
@@ -83,7 +84,10 @@ def _of_gopro(path: Path, settings: GpsSettings | None) -> GpsFixes:
     starts -= starts[0]
     late = np.flatnonzero(~(np.diff(starts) > 0))
     if len(late):
-        raise GsbaError(f"{path}: the times of its GPS packets {late[0]} and {late[0] + 1} cross")
+        raise GsbaError(
+            f"{path}: its GPS packet {late[0] + 1} is not later than packet {late[0]}; give "
+            "positions as CSV or GPX"
+        )
     lengths = np.diff(starts)
     lengths = np.append(lengths, lengths[-1] if len(lengths) else _PACKET_S)
     times = np.concatenate(
@@ -93,17 +97,17 @@ def _of_gopro(path: Path, settings: GpsSettings | None) -> GpsFixes:
         ]
     )
     rows = np.concatenate([rows for _, rows in packets])
-    locked = rows[:, 4] >= _FLAT
+    locked = rows[:, 4] >= _FIX_2D
     locked &= np.isfinite(rows[:, :2]).all(axis=1) & (np.abs(rows[:, :2]) <= [90, 360]).all(axis=1)
     if not locked.any():
         raise GsbaError(f"{path}: its GPS receiver had no fix; give positions as CSV or GPX")
     settings, rows, times = settings or GpsSettings(), rows[locked], times[locked]
-    geodetic = np.where(np.arange(3) < np.where(rows[:, 4:] >= _FULL, 3, 2), rows[:, :3], np.nan)
+    geodetic = np.where(np.arange(3) < np.where(rows[:, 4:] >= _FIX_3D, 3, 2), rows[:, :3], np.nan)
     return fixes_of(times, geodetic, sigmas_of(settings, rows[:, 3]), settings)
 
 
 def _packet(groups: Mapping[str, Mapping[str, Any]]) -> tuple[float, np.ndarray] | None:
-    """Start in seconds and fixes (n, 5) of a packet; None = it has none.
+    """Start in seconds and fixes (n, 5) of a packet; None = it has no fixes.
 
     Columns are latitude, longitude (degrees), altitude (metres), DOP (NaN = unknown), and the state
     of the receiver.
@@ -122,7 +126,7 @@ def _packet(groups: Mapping[str, Mapping[str, Any]]) -> tuple[float, np.ndarray]
         else:
             rows = np.array(tags["Data"], np.float64).reshape(-1, 5) / scale
             dop = np.full(len(rows), float(tags.get(_DOP, np.nan)) / 100)
-            fix = np.full(len(rows), float(tags.get(_FIX, _FULL)))
+            fix = np.full(len(rows), float(tags.get(_FIX, _FIX_3D)))
         start = tags.get("TimestampUs")
         if start is not None:
             seconds = 1e-6 * float(start)

@@ -1,4 +1,4 @@
-"""Which way is up: by an accelerometer, or what rigs have in common, made exact by edges."""
+"""Direction of gravity by an accelerometer or the rigs' mean up axis, refined by vertical edges."""
 
 import logging
 from dataclasses import dataclass
@@ -13,45 +13,46 @@ from gsba.types import FACES, FrameSet, PoseStatus, Reconstruction
 
 logger = logging.getLogger(__name__)
 
-_MAX_FRAMES = 24  # whose edges are looked at
-_FACE = 640  # pixels
-_MIN_LENGTH = 40.0  # pixels of an edge
-_GATES_DEG = (8.0, 4.0, 2.0, 1.0, 0.6)  # around vertical, from the rigs' up axis to the edges'
-_MIN_EDGES = 40  # within the last gate, or the edges say nothing
+_MAX_FRAMES = 24  # frames in which edges are detected
+_FACE_PX = 640
+_MIN_LENGTH_PX = 40.0  # of an edge
+_GATES_DEG = (8.0, 4.0, 2.0, 1.0, 0.6)  # successive gates of edges around the vertical
+_MIN_EDGES = 40  # within the last gate; with fewer, edges are not used
 _MIN_SPREAD = 0.1  # of the edges' directions around the vertical: 0 = all in one plane, 1 = even
-_MAX_TURN_DEG = 10.0  # from the rigs' up axis; what is further off is no gravity
-_MAX_SPREAD_DEG = 30.0  # of the rigs' up axes; beyond, they have none in common
-_MAX_OFF_DEG = 2.0  # from an accelerometer's
+_MAX_RIG_ANGLE_DEG = 10.0  # largest angle of the edges' vertical to the rigs' up axis
+_MAX_SPREAD_DEG = 30.0  # of the rigs' up axes; above it, they have no common axis
+_MAX_FORCE_ANGLE_DEG = 2.0  # largest angle of the edges' vertical to the accelerometer's
 
 
 @dataclass(frozen=True, slots=True)
 class Gravity:
-    """Up in the world of a reconstruction."""
+    """Direction of up in the world of a reconstruction."""
 
     up: np.ndarray  # (3,) float64, unit
     by_rigs: np.ndarray  # (3,) float64, unit, the rigs' common up axis
     spread_deg: float  # median angle of a rig's up axis to the common one
-    num_edges: int  # vertical edges it rests on; 0 = on the rigs or the accelerometer alone
+    num_edges: int  # number of inlier edges; 0 = up is that of the rigs or the accelerometer
     by_forces: np.ndarray | None = None  # (3,) float64, unit, by an accelerometer; None = none
 
     @property
     def turn_deg(self) -> float:
-        """How far it is from the rigs' up axis."""
+        """Angle between `up` and the rigs' up axis."""
         return _degrees(self.up, self.by_rigs)
 
 
-def estimate(reconstruction: Reconstruction, frames: FrameSet) -> Gravity | None:
-    """Direction of up, or None where neither rigs nor edges tell.
+def estimate_gravity(reconstruction: Reconstruction, frames: FrameSet) -> Gravity | None:
+    """Direction of up; None if there is no accelerometer and the rigs have no common up axis.
 
-    An accelerometer is right to its bias, some tenths of a degree; without one, the geometric
-    median of the rigs' up axes to the degrees that people sway. Vertical edges (doors, walls,
-    posts) then decide: the plane through the camera and such an edge holds the vertical, so that
-    its normal is level. The normals' least principal axis is taken over edges from all around, in
-    gates that tighten (after Kosecka and Zhang, Video Compass, ECCV 2002).
+    The initial direction is that of an accelerometer, accurate to its bias of some tenths of a
+    degree, else the geometric median of the rigs' up axes, accurate to some degrees. Vertical edges
+    (doors, walls, posts) refine it: the plane through the camera and such an edge holds the
+    vertical, so that its normal is level. The refined direction is the smallest principal axis of
+    the normals of edges from all around, in tightening gates (after Kosecka and Zhang, Video
+    Compass, ECCV 2002).
 
     Args:
-        reconstruction: refined poses; unrefined ones have no say.
-        frames: whose pictures are read, a few of them.
+        reconstruction: refined poses; unrefined ones are not used.
+        frames: frames of the run; the images of a few are read.
     """
     good = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.REFINED)
     if not len(good):
@@ -60,23 +61,25 @@ def estimate(reconstruction: Reconstruction, frames: FrameSet) -> Gravity | None
     by_rigs, forces = median_direction(ups), reconstruction.vertical
     spread = float(np.degrees(np.median(np.arccos(np.clip(ups @ by_rigs, -1, 1)))))
     if forces is not None and forces @ by_rigs < 0 and spread <= _MAX_SPREAD_DEG:
-        forces = -forces  # makers differ in its sign
+        forces = -forces  # its sign differs between makers
     if spread > _MAX_SPREAD_DEG and forces is None:
-        logger.warning("the rigs agree on no up axis (%.0f degrees apart)", spread)
+        logger.warning("the rigs have no common up axis (median deviation %.0f degrees)", spread)
         return None
     chosen = good[np.unique(np.linspace(0, len(good) - 1, _MAX_FRAMES).astype(int))]
     found = [_edge_normals(frames, int(f), reconstruction.world_T_rigs[f]) for f in chosen]
     normals, weights = (np.concatenate(part) for part in zip(*found, strict=True))
-    start, most, what = by_rigs, _MAX_TURN_DEG, "rigs"
+    start, most, source = by_rigs, _MAX_RIG_ANGLE_DEG, "the rigs' up axis"
     if forces is not None:
-        start, most, what = forces, _MAX_OFF_DEG, "accelerometer"
+        start, most, source = forces, _MAX_FORCE_ANGLE_DEG, "the accelerometer"
     up, num_edges = _level_axis(normals, weights, start)
     gravity = Gravity(up, by_rigs, spread, num_edges, forces)
     if (off := _degrees(up, start)) > most:
-        logger.warning("vertical edges are %.1f degrees off the %s: ignored", off, what)
+        logger.warning(
+            "vertical edges are not used: they deviate by %.1f degrees from %s", off, source
+        )
         gravity = Gravity(start, by_rigs, spread, 0, forces)
     logger.info(
-        "up: %d vertical edges, %.2f degrees from the rigs' common axis (these %.2f degrees apart)",
+        "up: %d vertical edges, %.2f degrees from the rigs' up axis (median deviation %.2f)",
         gravity.num_edges,
         gravity.turn_deg,
         spread,
@@ -85,14 +88,14 @@ def estimate(reconstruction: Reconstruction, frames: FrameSet) -> Gravity | None
 
 
 def _degrees(one: np.ndarray, other: np.ndarray) -> float:
-    """Angle between two unit vectors."""
+    """Angle between two unit vectors, degrees."""
     return float(np.degrees(np.arccos(np.clip(one @ other, -1, 1))))
 
 
 def _edge_normals(
     frames: FrameSet, f: int, world_T_rig: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (E, 3) in the world of the planes through straight edges, and lengths (E,), rad."""
+    """Normals (E, 3), world, of the planes through straight edges, and their lengths (E,), rad."""
     images, masks = _side_faces(frames, f)
     rig = CubeRig(images.shape[1], np.pi / 2)
     detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD)
@@ -102,7 +105,9 @@ def _edge_normals(
         if lines is None:
             continue
         ends = lines.reshape(-1, 2, 2).astype(np.float64) + 0.5
-        long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= _MIN_LENGTH * rig.size / _FACE
+        long = (
+            np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= _MIN_LENGTH_PX * rig.size / _FACE_PX
+        )
         if masks is not None:
             middle = np.clip(ends.mean(axis=1).astype(int), 0, rig.size - 1)
             long &= masks[face][middle[:, 1], middle[:, 0]]
@@ -115,16 +120,17 @@ def _edge_normals(
 
 
 def _side_faces(frames: FrameSet, f: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """The four faces around the horizon (4, N, N, 3), and where they may be used (4, N, N)."""
+    """Four faces around the horizon (4, N, N, 3), and masks (4, N, N) bool, True = use."""
     assert FACES[:4] == ("front", "right", "back", "left")
-    images, masks = cubemap.load(frames, f, cubemap.native_rig(frames, _FACE))
+    images, masks = cubemap.load(frames, f, cubemap.native_rig(frames, _FACE_PX))
     return images[:4], None if masks is None else masks[:4]
 
 
 def _level_axis(
     normals: np.ndarray, weights: np.ndarray, start: np.ndarray
 ) -> tuple[np.ndarray, int]:
-    """Axis (3,) near `start` that most normals are square to, and how many are; 0 = unchanged."""
+    """Axis (3,) near `start` that is perpendicular to most normals, and the number of these; 0 =
+    `start`."""
     up, near = start, np.zeros(len(normals), bool)
     for gate in _GATES_DEG:
         for _ in range(5):

@@ -1,7 +1,7 @@
-"""Where an exported world is: turned upright, scaled to metres, or put where GPS or truth has it.
+"""Placement of an exported world: upright, metric, by GPS, by true poses or by a scan.
 
-A run stays in the world and scale of its SLAM trajectory. An export may be placed elsewhere by one
-similarity, which `transform.json` in it states together with its inverse.
+A run keeps the world and scale of its SLAM trajectory. One similarity transforms the world of an
+export; `transform.json` in it states the similarity and its inverse.
 """
 
 import dataclasses
@@ -39,33 +39,33 @@ from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
 
-_UP_WORLD = np.array([0.0, -1.0, 0.0])  # of an upright world: y down, as cameras have it
-UPS = {"z": np.array([0.0, 0, 1]), "y": np.array([0.0, 1, 0])}  # axes of scans that point up
-_TOLERANCE_S = 0.02  # of true poses around a frame
-_SCALES = (1e-12, 1e12)  # that a run may be placed at; others are slips
-_FURTHEST = 1e12  # from the origin, in the placed unit
-_FAR = 1e4  # coordinates beyond lose digits as float32: an offset is kept apart
-_STUCK_M = 1e-3  # extent of positions, metres: a receiver that works scatters by more
-_MOST_SIGMA = 0.1  # of a scale by the lenses, part of it
-_MOST_GPS_SCALE_SIGMA = 0.3  # of a scale by GPS, part of it
-_MOST_GPS_ANGLE_DEG = 25.0  # standard deviation of heading and tilt by GPS
-_SIGMA_BY_EDGES_DEG = 0.2  # of the way up by vertical edges, see docs/gyro.md
-_SIGMA_BY_FORCES_DEG = 0.5  # by an accelerometer, for its bias
-_SIGMA_BY_RIGS_DEG = 3.0  # by how rigs were held
-_LEVEL_SPREAD = 0.02  # of a path's second extent to its first: below, positions leave a roll open
+_UP_WORLD = np.array([0.0, -1.0, 0.0])  # up of an upright world, whose y points down
+UPS = {"z": np.array([0.0, 0, 1]), "y": np.array([0.0, 1, 0])}  # up axes of scans
+_TOLERANCE_S = 0.02  # largest time from a frame to its true pose
+_SCALE_RANGE = (1e-12, 1e12)  # of a placed run; others come from wrong input
+_MAX_COORDINATE = 1e12  # in the placed unit
+_MAX_FLOAT32_COORDINATE = 1e4  # larger ones lose digits as float32: an offset is split off
+_MIN_GPS_EXTENT_M = 1e-3  # of positions: a working receiver scatters by more
+_MAX_LENS_SCALE_SIGMA = 0.1  # relative, of a scale by the lenses
+_MAX_GPS_SCALE_SIGMA = 0.3  # relative, of a scale by GPS
+_MAX_GPS_ANGLE_SIGMA_DEG = 25.0  # of heading and tilt by GPS
+_SIGMA_BY_EDGES_DEG = 0.2  # of a vertical by edges, see docs/gyro.md
+_SIGMA_BY_FORCES_DEG = 0.5  # of a vertical by an accelerometer, for its bias
+_SIGMA_BY_RIGS_DEG = 3.0  # of a vertical by the rigs' up axes
+_MIN_EXTENT_RATIO = 0.02  # of a path's second extent to its first: less determines no roll
 
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where the world of a run goes: placed = similarity of the run; world = placed + offset."""
+    """Transform of a run's world: placed = similarity of the run; world = placed + offset."""
 
     similarity: Sim3 = field(default_factory=Sim3)
     unit: str = "map units"  # of the placed world
     up: str | None = None  # axis of the placed world that points up: "-y", "y", "z"; None = unknown
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,), unit of the placed
     origin: tuple[float, float, float] | None = None  # latitude, longitude, altitude of placed 0
-    grounds: dict[str, Any] = field(default_factory=dict)  # what it rests on, and how well
-    map_number: int = 1  # map of the run that is placed: each has a world of its own; 1 = largest
+    grounds: dict[str, Any] = field(default_factory=dict)  # data it was computed from, and sigmas
+    map_number: int = 1  # map of the run that is placed, 1 = the largest
 
     @property
     def matrix(self) -> np.ndarray:
@@ -81,9 +81,9 @@ class Placement:
         return pose(back, -back @ move.translation)
 
     def apply(self, reconstruction: Reconstruction) -> Reconstruction:
-        """A reconstruction in its place; angles, and what the images say, stay as they are."""
+        """Reconstruction in the placed world; bearings and rotation sigmas do not change."""
         poses, move = reconstruction.world_T_rigs, self.similarity
-        stretch = np.array([1.0, 1, 1, *[move.scale] * 3])  # rig axes do not turn
+        stretch = np.array([1.0, 1, 1, *[move.scale] * 3])  # tangents are in the rig frame
         joint, origins = reconstruction.joint_errors, reconstruction.observation_origins
         lenses = reconstruction.lens_baseline
         return dataclasses.replace(
@@ -122,10 +122,10 @@ class Placement:
 
 
 def read_placement(path: Path) -> Placement:
-    """Where an export is, by the transform.json in it.
+    """Placement of an export, from its transform.json.
 
     Raises:
-        GsbaError: no such file, or none that gsba wrote.
+        GsbaError: the file is missing, or gsba did not write it.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -146,7 +146,7 @@ def read_placement(path: Path) -> Placement:
     except OSError as error:
         raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
-        raise GsbaError(f"{path}: not a transform.json of gsba: export again") from None
+        raise GsbaError(f"{path} is not a transform.json of gsba: export again") from None
 
 
 def place(
@@ -156,32 +156,32 @@ def place(
     baseline: tuple[float, float] | None = None,
     gps: GpsSettings | None = None,
 ) -> Placement:
-    """Where the settings want the world of a run.
+    """Placement of a run's world by the settings.
 
     Args:
-        reconstruction: in the run's world.
-        frames: its frames; their pictures are read to find the vertical.
-        settings: `up` alone turns as little as it takes to make -y the way up. With `length`
+        reconstruction: the run, in its own world.
+        frames: its frames; their images are read to find the vertical.
+        settings: `up` alone applies the smallest rotation that makes -y point up. With `length`
             the unit becomes the metre. `gps` gives metres east, north and up; together with `up` it
-            decides heading, scale and place only, with a length of "lens" the scale is weighed with
-            that of the lenses; "exif" takes the positions in the pictures.
-            `align` gives the world of the true poses, `scan` that of a scan of the place; with
-            it, `up`, `gps` or `pairs` only tell where to look.
-        baseline: metres between the lenses and their standard deviation, for a length of "lens".
+            determines heading, scale and translation only; with a length of "lens" the scale is
+            the weighted mean of both; "exif" uses the positions in the images. `align` gives the
+            world of true poses, `scan` that of a scan of the place; with a scan, `up`, `gps` or
+            `pairs` only start the alignment.
+        baseline: distance of the lenses and its standard deviation, metres, for a length of "lens".
         gps: noise of GPS positions.
 
     Raises:
-        GsbaError: settings that exclude one another, or data that do not suffice.
+        GsbaError: settings exclude one another, or data do not determine the placement.
     """
     check(settings, baseline=baseline)
     placement = _placement(reconstruction, frames, settings, baseline, gps)
     placed = placement.similarity.points(reconstruction.world_T_rigs[:, :3, 3])
     far = np.abs(placed).max(initial=0)
     scale = placement.similarity.scale
-    if not (_SCALES[0] <= scale <= _SCALES[1] and far <= _FURTHEST):
+    if not (_SCALE_RANGE[0] <= scale <= _SCALE_RANGE[1] and far <= _MAX_COORDINATE):
         raise GsbaError(
-            f"the run would be placed at a scale of {scale:g}, up to {far:g} from the "
-            "origin: check what --scale, --between, --gps, --align or --align-scan say"
+            f"the placed run would have a scale of {scale:g} and coordinates up to {far:g}: check "
+            "the values of --scale, --between, --gps, --align or --align-scan"
         )
     return placement
 
@@ -193,7 +193,7 @@ def _placement(
     baseline: tuple[float, float] | None,
     gps: GpsSettings | None,
 ) -> Placement:
-    """What the settings ask for, however odd."""
+    """Placement by the settings, without a check of its range."""
     if settings.align is not None:
         return _aligned(reconstruction, frames, Path(settings.align))
     if settings.scan is not None:
@@ -214,7 +214,7 @@ def _placement(
         first, second = (_point(end, reconstruction, frames) for end in settings.between)
         distance = float(np.linalg.norm(second - first))
         if distance <= 1e-9 * (1 + np.abs(first).max()):
-            raise GsbaError(f"--between {' '.join(settings.between)}: both are at one place")
+            raise GsbaError(f"--between {' '.join(settings.between)}: both ends are at one point")
         scaled = dataclasses.replace(placement.similarity, scale=settings.length / distance)
         grounds = {**placement.grounds, "length": settings.length, "between": settings.between}
         placement = dataclasses.replace(placement, similarity=scaled, unit="m", grounds=grounds)
@@ -226,29 +226,35 @@ def check(
     frames: FrameSet | None = None,
     baseline: tuple[float, float] | None = None,
 ) -> None:
-    """Raise GsbaError for settings that exclude one another and for files that cannot be read.
+    """Check settings and the files that they name.
 
-    With `frames`, those of a run, also for pictures without the positions that are asked for.
+    Args:
+        settings: settings of the placement.
+        frames: frames of the run, whose EXIF positions are checked; None = not checked.
+        baseline: distance of the lenses and its standard deviation, metres; None = not known.
+
+    Raises:
+        GsbaError: settings exclude one another, or a file cannot be read.
     """
     if settings.length == "lens" and baseline is None:
         raise GsbaError(
-            "--scale lens needs to know how far apart the lenses are: refine with --camera NAME or "
+            "--scale lens needs the distance between the lenses: refine with --camera NAME or "
             "--set camera.baseline_mm=MM, or export with --baseline MM (an Insta360 X5 has 32)"
         )
     if isinstance(settings.length, float) != (settings.between is not None):
-        raise GsbaError("--scale LENGTH and --between A B need one another")
-    measured = isinstance(settings.length, float)  # that of the lenses is weighed with the fixes
+        raise GsbaError("--scale LENGTH and --between A B need each other: pass both")
+    measured = isinstance(settings.length, float)  # a scale by the lenses combines with GPS
     ways = [measured, settings.gps is not None, settings.align is not None]
     if sum(ways) > 1 or (settings.length is not None and settings.align is not None):
         raise GsbaError(
-            "--scale, --gps and --align each decide the scale: pass one, or --scale lens with --gps"
+            "--scale, --gps and --align each set the scale: pass one, or --scale lens with --gps"
         )
     if settings.scan is not None and (settings.length is not None or settings.align is not None):
-        raise GsbaError("--align-scan decides the scale: leave out --scale and --align")
+        raise GsbaError("--align-scan sets the scale: leave out --scale and --align")
     if settings.pairs is not None and settings.scan is None:
-        raise GsbaError("--pairs are of a run and a scan: give --align-scan SCAN as well")
+        raise GsbaError("--pairs needs a scan: give --align-scan SCAN as well")
     if settings.align is not None and settings.up != "none":
-        raise GsbaError("--align decides which way is up: leave out --up auto")
+        raise GsbaError("--align sets the rotation of the world: leave out --up auto")
     if settings.gps is not None:
         read_fixes(settings.gps, frames)
     if settings.align is not None:
@@ -260,13 +266,13 @@ def check(
 
 
 def _upright(reconstruction: Reconstruction, frames: FrameSet) -> Placement:
-    from gsba.placement.gravity import estimate
+    from gsba.placement.gravity import estimate_gravity
 
-    gravity = estimate(reconstruction, frames)
+    gravity = estimate_gravity(reconstruction, frames)
     if gravity is None:
         raise GsbaError(
-            "--up auto: the frames agree on no way up; leave it out, or place the world by --gps "
-            "or --align"
+            "--up auto: the frames have no common up axis; leave it out, or place the world by "
+            "--gps or --align"
         )
     grounds = {
         "vertical_edges": gravity.num_edges,
@@ -283,11 +289,11 @@ def _upright(reconstruction: Reconstruction, frames: FrameSet) -> Placement:
 def metres_per_unit(
     lenses: tuple[float, float], baseline: tuple[float, float]
 ) -> tuple[float, float]:
-    """Metric scale and its standard deviation, by what lies between two lenses.
+    """Metric scale and its standard deviation, from the distance between two lenses.
 
     Args:
-        lenses: map units, and their standard deviation.
-        baseline: metres, and their standard deviation.
+        lenses: estimated distance and its standard deviation, map units.
+        baseline: published distance and its standard deviation, metres.
     """
     scale = baseline[0] / lenses[0]
     return scale, scale * float(np.hypot(lenses[1] / lenses[0], baseline[1] / baseline[0]))
@@ -299,7 +305,7 @@ def _scale_by_lenses(
     """Metric scale and its standard deviation by the lenses, and the entry of transform.json."""
     if reconstruction.lens_baseline is None:
         raise GsbaError(
-            "--scale lens: the run found no two lenses (report.json says why, under camera): "
+            "--scale lens: the run found no two lenses (for the reason see camera in report.json): "
             "scale it by --scale LENGTH --between A B"
         )
     assert baseline is not None  # see check
@@ -310,12 +316,13 @@ def _scale_by_lenses(
 def _by_lenses(
     reconstruction: Reconstruction, baseline: tuple[float, float] | None, placement: Placement
 ) -> Placement:
-    """Metres, by what the maker says is between the lenses."""
+    """Placement in metres, by the published distance between the lenses."""
     (scale, sigma), grounds = _scale_by_lenses(reconstruction, baseline)
-    if not sigma < _MOST_SIGMA * scale:
+    if not sigma < _MAX_LENS_SCALE_SIGMA * scale:
         raise GsbaError(
-            f"--scale lens: the distance between the lenses tells the scale to "
-            f"{100 * sigma / scale:.0f} % only; {100 * _MOST_SIGMA:.0f} % are needed"
+            "--scale lens: the scale by the distance between the lenses has a sigma of "
+            f"{100 * sigma / scale:.0f} %; less than {100 * _MAX_LENS_SCALE_SIGMA:.0f} % is "
+            "needed: scale it by --scale LENGTH --between A B"
         )
     return dataclasses.replace(
         placement,
@@ -326,9 +333,9 @@ def _by_lenses(
 
 
 def _least_turn(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Smallest rotation (3, 3) that carries one unit vector onto another."""
+    """Smallest rotation (3, 3) that maps one unit vector to another."""
     axis, cosine = np.cross(source, target), float(source @ target)
-    if cosine < -1 + 1e-12:  # opposite: half a turn around anything square to it
+    if cosine < -1 + 1e-12:  # opposite: half a turn around any perpendicular axis
         other = np.eye(3)[np.argmin(np.abs(source))]
         axis = np.cross(source, other)
         axis /= np.linalg.norm(axis)
@@ -339,17 +346,17 @@ def _least_turn(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _point(text: str, reconstruction: Reconstruction, frames: FrameSet) -> np.ndarray:
-    """Position (3,) in the run's world of a frame by name, or of "x,y,z"."""
+    """Position (3,), run's world, of a frame by name or of "x,y,z"."""
     if text in frames.names:
         return reconstruction.world_T_rigs[frames.names.index(text), :3, 3]
     try:
         point = np.array([float(part) for part in text.split(",")])
     except ValueError:
         point = np.zeros(0)
-    if len(point) != 3 or not (np.abs(point) <= _FURTHEST).all():
+    if len(point) != 3 or not (np.abs(point) <= _MAX_COORDINATE).all():
         raise GsbaError(
-            f"--between {brief(text)}: is neither a frame (such as {frames.names[0]}) nor a point "
-            "x,y,z"
+            f"--between {brief(text)}: this is neither a frame (such as {frames.names[0]}) nor a "
+            "point x,y,z"
         )
     return point
 
@@ -362,11 +369,13 @@ def _on_earth(
     scale: tuple[float, float] | None = None,
     settings: GpsSettings | None = None,
 ) -> Placement:
-    """East, north and up in metres around the middle of the fixes.
+    """Placement in metres east, north and up around the median of the fixes.
 
     Args:
-        upright: where up is known, the way up; it stays so.
-        scale: metres per map unit, known from elsewhere, and its standard deviation.
+        reconstruction, frames: the run.
+        source: see `read_fixes`.
+        upright: placement whose up, if known, is kept.
+        scale: metres per map unit, known from other data, and its standard deviation.
         settings: noise of the fixes.
     """
     fixes, path = fixes_of_frames(source, frames, settings), Path(source)
@@ -376,22 +385,27 @@ def _on_earth(
             f"{path}: {len(fixes)} of its positions are of refined frames; 3 are needed: check "
             "that they are of this recording and on the frames' clock"
         )
-    if np.ptp(fixes.positions, axis=0).max() < _STUCK_M:
-        raise GsbaError(f"{path}: all {len(fixes)} positions are the same: the receiver was stuck")
+    if np.ptp(fixes.positions, axis=0).max() < _MIN_GPS_EXTENT_M:
+        raise GsbaError(
+            f"{path}: all {len(fixes)} positions are equal: the receiver repeated one fix; leave "
+            "out --gps"
+        )
     positions, level, up_sigma = reconstruction.world_T_rigs[fixes.frames, :3, 3], np.eye(3), None
     if upright.up is not None:
         level = _least_turn(_UP_WORLD, np.array([0.0, 0, 1])) @ upright.similarity.rotation
         up_sigma = _up_sigma(upright)
-    elif extents(positions)[1] <= _LEVEL_SPREAD:
-        raise GsbaError(f"{path}: the frames lie on a line: add --up auto")
+    elif extents(positions)[1] <= _MIN_EXTENT_RATIO:
+        raise GsbaError(
+            f"{path}: the frames lie on a line, which determines no roll: add --up auto"
+        )
     with naming(path):
         found = fit_fixes(positions @ level.T, fixes, up_sigma, scale)
     _require_determined(path, found, fixes)
     fit = dataclasses.replace(found.similarity, rotation=found.similarity.rotation @ level)
     grounds = {**upright.grounds, "gps": {"file": str(path), **_claims(found, positions @ level.T)}}
     logger.info(
-        "--gps %s: %d of %d positions agree to %.3g m; scale known to %.2g %%, heading to %.2g "
-        "degrees, tilt to %.2g degrees, place to %.2g m",
+        "--gps %s: %d of %d positions are inliers, with an RMS residual of %.3g m; sigmas: scale "
+        "%.2g %%, heading %.2g degrees, tilt %.2g degrees, position %.2g m",
         path,
         found.used.sum(),
         len(fixes),
@@ -406,9 +420,9 @@ def _on_earth(
 
 
 def _claims(found: GpsFit, positions: np.ndarray) -> dict[str, Any]:
-    """Entries of transform.json on a fit: how many fixes it rests on, and standard deviations.
+    """Entries of transform.json on a fit: numbers of fixes, and standard deviations.
 
-    Those of the position are east, north and up, the medians over the frames that have a fix.
+    Those of the position are east, north and up, medians over the frames with a fix.
     """
     return {
         "fixes": len(found.used),
@@ -423,30 +437,30 @@ def _claims(found: GpsFit, positions: np.ndarray) -> dict[str, Any]:
 
 
 def _require_determined(path: Path, found: GpsFit, fixes: FrameFixes) -> None:
-    """GsbaError for fixes that leave scale, heading or tilt open."""
+    """Raise GsbaError if the fixes do not determine scale, heading or tilt."""
     extent = float(np.linalg.norm(np.ptp(fixes.positions[found.used], axis=0)[:2]))
     noise = float(np.median(fixes.sigmas[:, 0]))
-    known = f"they spread over {extent:.3g} m, and are known to {noise:.2g} m"
-    if not found.scale_sigma < _MOST_GPS_SCALE_SIGMA:
+    known = f"they spread over {extent:.3g} m with a sigma of {noise:.2g} m"
+    if not found.scale_sigma < _MAX_GPS_SCALE_SIGMA:
         raise GsbaError(
-            f"{path}: its positions tell the scale to {100 * found.scale_sigma:.0f} % only "
+            f"{path}: its positions determine the scale only to {100 * found.scale_sigma:.0f} % "
             f"({known}): add --scale lens, or place the run by --scale LENGTH --between A B"
         )
-    if not np.degrees(found.heading_sigma) < _MOST_GPS_ANGLE_DEG:
+    if not np.degrees(found.heading_sigma) < _MAX_GPS_ANGLE_SIGMA_DEG:
         raise GsbaError(
-            f"{path}: its positions tell where north is to "
-            f"{np.degrees(found.heading_sigma):.0f} degrees only ({known}): leave out --gps, or "
-            "give positions of a longer walk or of a better receiver"
+            f"{path}: its positions determine north only to "
+            f"{np.degrees(found.heading_sigma):.0f} degrees ({known}): leave out --gps, or give "
+            "positions of a longer walk or of a better receiver"
         )
-    if not np.degrees(found.tilt_sigma) < _MOST_GPS_ANGLE_DEG:
+    if not np.degrees(found.tilt_sigma) < _MAX_GPS_ANGLE_SIGMA_DEG:
         raise GsbaError(
-            f"{path}: its positions tell the way up to {np.degrees(found.tilt_sigma):.0f} degrees "
-            "only: add --up auto"
+            f"{path}: its positions determine the vertical only to "
+            f"{np.degrees(found.tilt_sigma):.0f} degrees: add --up auto"
         )
 
 
 def _up_sigma(upright: Placement) -> float:
-    """Standard deviation of a way up, radians, by what it rests on."""
+    """Standard deviation of the vertical, radians, by the data that determined it."""
     gravity = upright.grounds.get("gravity", {})
     if gravity.get("vertical_edges"):
         degrees = _SIGMA_BY_EDGES_DEG
@@ -458,7 +472,7 @@ def _up_sigma(upright: Placement) -> float:
 
 
 def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Placement:
-    """The world of true poses; large coordinates are kept apart."""
+    """Placement in the world of true poses; an offset is split off large coordinates."""
     truth = read_trajectory(path)
     _require_times(path, frames)
     run = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
@@ -472,14 +486,15 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
         )
     true_T_rigs = truth.world_T_rigs[of_truth].copy()
     middle = np.median(true_T_rigs[:, :3, 3], axis=0)
-    offset = np.round(middle, -2) if np.abs(middle).max() > _FAR else np.zeros(3)
+    large = np.abs(middle).max() > _MAX_FLOAT32_COORDINATE
+    offset = np.round(middle, -2) if large else np.zeros(3)
     true_T_rigs[:, :3, 3] -= offset
     world_T_rigs = reconstruction.world_T_rigs[rows]
     source, target = world_T_rigs[:, :3, 3], true_T_rigs[:, :3, 3]
     with naming(path):
-        if extents(source)[1] > _LEVEL_SPREAD:
+        if extents(source)[1] > _MIN_EXTENT_RATIO:
             fit, used, sigma = robust_similarity(source, target, similarity, 3)
-        else:  # a straight path leaves a roll open that orientations know
+        else:  # the positions of a straight path determine no roll, but orientations do
             fit = pose_similarity(world_T_rigs, true_T_rigs)
             residuals = residuals_of(fit, source, target)
             used, sigma = np.ones(len(rows), bool), float(np.sqrt(np.mean(residuals**2)))
@@ -491,7 +506,7 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
 def _in_scan(
     reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings
 ) -> Placement:
-    """The world of a scan, what is known of the run's beforehand telling where to look."""
+    """Placement in the world of a scan; `pairs`, `gps` or `up` start the alignment."""
     assert settings.scan is not None
     path = Path(settings.scan)
     scan = read_scan(path)
@@ -508,17 +523,18 @@ def _in_scan(
 def guess_in_scan(
     reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings, scan: Scan
 ) -> tuple[Guess, dict[str, Any]]:
-    """Where to look for a run in a scan, by `pairs`, else `gps`, else `up`.
+    """Initial guess of a run's placement in a scan, by `pairs`, else `gps`, else `up`.
 
     Args:
-        reconstruction, frames: of the run.
-        settings: `scan` names the file of the scan.
+        reconstruction, frames: the run.
+        settings: placement settings; `scan` names the file of the scan.
+        scan: the scan.
 
     Returns:
-        The guess, in the scan's world less its offset, and what it rests on.
+        The guess, in the scan's world less its offset, and entries of transform.json on it.
 
     Raises:
-        GsbaError: files that cannot be used, or frames that say no way up.
+        GsbaError: files cannot be used, or the frames have no common up axis.
     """
     axis = UPS[upwards(Path(settings.scan or ""))]
     if settings.pairs is not None:
@@ -537,15 +553,17 @@ def guess_in_scan(
 
 
 def _by_pairs(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Guess:
-    """A similarity by picked pairs, in the world of the scan's file."""
+    """Guess from picked pairs, in the world of the scan's file."""
     ends, target = read_pairs(path)
     source = np.array([_point(end, reconstruction, frames) for end in ends])
-    if extents(source)[1] <= _LEVEL_SPREAD:
-        raise GsbaError(f"{path}: its points lie on a line: pick one beside it")
+    if extents(source)[1] <= _MIN_EXTENT_RATIO:
+        raise GsbaError(f"{path}: its points lie on a line: add a point off that line")
     with naming(path):
         return Guess(similarity=similarity(source, target))
 
 
 def _require_times(path: Path, frames: FrameSet) -> None:
     if not frames.timed:
-        raise GsbaError(f"{path}: nothing says when frames were taken: refine with --timestamps")
+        raise GsbaError(
+            f"{path}: the frames have no times to match true poses with: refine with --timestamps"
+        )

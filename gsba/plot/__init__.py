@@ -1,7 +1,7 @@
-"""Figures of several runs side by side: trajectories, errors against the truth, residuals.
+"""Figures of several runs: trajectories, errors against the truth, residuals.
 
 Takes folders of finished runs, or trajectory files, and the truth if there is one.
-Gives PNG, SVG or PDF, the same bytes for the same runs.
+Gives PNG, SVG or PDF with reproducible bytes.
 """
 
 from gsba.plot.figures import draw

@@ -1,4 +1,4 @@
-"""The figures: what each shows, and where it is written."""
+"""Figures of trajectories, errors and residuals, and their files."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-_WIDTH, _ROW = 7.2, 2.7  # inches: the text width of a paper, a row of panels
-_MOST_BESIDE = 3  # trajectories in a row
-_MOST_POINTS = 2000  # of a curve of shares
+_WIDTH_IN, _ROW_HEIGHT_IN = 7.2, 2.7  # text width of a paper; height of a row of panels
+_MAX_PANELS_PER_ROW = 3
+_MAX_CURVE_POINTS = 2000  # of a cumulative distribution
 
 Fill = Callable[["SubFigure | Figure"], None]
 
@@ -27,12 +27,13 @@ Fill = Callable[["SubFigure | Figure"], None]
 def draw(shown: Sequence[Shown], out: Path, truth: Trajectory | None = None) -> list[Path]:
     """Write the figures of several runs.
 
-    Trajectories from above, each run in a panel; with the truth, errors of every pose over time
-    and their distribution; of runs, angular residuals of frames over time and of all observations.
+    They show trajectories from above, each run in a panel; with the truth, errors of every pose
+    over time and their distribution; of runs, angular residuals of frames over time and of all
+    observations.
 
     Args:
-        shown: of `gsba.plot.load`, with the same truth.
-        out: a folder for trajectories, errors and residuals, each as PNG and SVG; or a file (PNG,
+        shown: runs from `gsba.plot.load`, with the same truth.
+        out: folder for trajectories, errors and residuals, each as PNG and SVG; or a file (PNG,
             SVG or PDF) for all of them in one figure.
         truth: true poses.
 
@@ -40,9 +41,10 @@ def draw(shown: Sequence[Shown], out: Path, truth: Trajectory | None = None) -> 
         the files.
 
     Raises:
-        GsbaError: matplotlib is not installed, a file of another kind, or the disk refuses.
+        GsbaError: matplotlib is not installed, the file's suffix is unknown, or the disk cannot be
+            written.
     """
-    rows = -(-len(shown) // _MOST_BESIDE)
+    rows = -(-len(shown) // _MAX_PANELS_PER_ROW)
     figures: dict[str, tuple[int, Fill]] = {
         "trajectories": (rows, lambda figure: _trajectories(figure, shown, truth))
     }
@@ -54,11 +56,11 @@ def draw(shown: Sequence[Shown], out: Path, truth: Trajectory | None = None) -> 
         files = []
         for name, (num_rows, fill) in figures.items():
             paths = [out / f"{name}.{kind}" for kind in ("png", "svg")]
-            charts.write(paths, (_WIDTH, num_rows * _ROW), fill)
+            charts.write(paths, (_WIDTH_IN, num_rows * _ROW_HEIGHT_IN), fill)
             files += paths
         return files
     if out.suffix.lower() not in charts.KINDS:
-        raise GsbaError(f"--out {out}: figures are .png, .svg or .pdf files; or name a folder")
+        raise GsbaError(f"--out {out}: give a .png, .svg or .pdf file, or a folder")
     heights = [num_rows for num_rows, _ in figures.values()]
 
     def fill_all(figure: "Figure") -> None:
@@ -66,15 +68,15 @@ def draw(shown: Sequence[Shown], out: Path, truth: Trajectory | None = None) -> 
         for part, (_, fill) in zip(parts, figures.values(), strict=True):
             fill(part)
 
-    charts.write([out], (_WIDTH, sum(heights) * _ROW), fill_all)
+    charts.write([out], (_WIDTH_IN, sum(heights) * _ROW_HEIGHT_IN), fill_all)
     return [out]
 
 
 def _trajectories(
     figure: "SubFigure | Figure", shown: Sequence[Shown], truth: Trajectory | None
 ) -> None:
-    """Walks from above, before and after; dots are the truth."""
-    beside = min(len(shown), _MOST_BESIDE)
+    """Draw trajectories from above, before and after; the truth is dotted."""
+    beside = min(len(shown), _MAX_PANELS_PER_ROW)
     rows = -(-len(shown) // beside)
     panels = figure.subplots(rows, beside, squeeze=False).ravel()
     common = shown[0].refined if truth is None else truth
@@ -82,15 +84,15 @@ def _trajectories(
     lines: dict[str, Any] = {}
     for one, axes in zip(shown, panels, strict=False):
         world, own = (one.refined, Sim3()) if one.placed is None else (common, one.placed)
-        looked = _Above(world)
+        plan = _TopView(world)
         if one.coarse is not None:
             before = one.coarse_errors.fit if one.coarse_errors is not None else own
-            lines["before"] = looked.line(axes, one.coarse, before, charts.BEFORE, "-")
-            lines["after"] = looked.line(axes, one.refined, own, charts.AFTER, "-")
+            lines["before"] = plan.line(axes, one.coarse, before, charts.BEFORE, "-")
+            lines["after"] = plan.line(axes, one.refined, own, charts.AFTER, "-")
         else:
-            lines["trajectory"] = looked.line(axes, one.refined, own, charts.ALONE, "-")
+            lines["trajectory"] = plan.line(axes, one.refined, own, charts.ALONE, "-")
         if truth is not None:
-            lines["truth"] = looked.line(axes, truth, Sim3(), charts.TRUE, ":")
+            lines["truth"] = plan.line(axes, truth, Sim3(), charts.TRUE, ":")
         axes.set_title(charts.plain(one.name))
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel("own units" if one.placed is None else unit)
@@ -99,8 +101,8 @@ def _trajectories(
     figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4)
 
 
-class _Above:
-    """The view from above on a walk: its two level axes, as report.html has them."""
+class _TopView:
+    """View from above on a trajectory, along the two level axes of report.html."""
 
     def __init__(self, world: Trajectory) -> None:
         finite = np.isfinite(world.world_T_rigs).all(axis=(1, 2))
@@ -109,14 +111,14 @@ class _Above:
         self._centre = np.median(poses[:, :3, 3], axis=0)
 
     def line(self, axes: "Axes", walk: Trajectory, placed: Sim3, color: str, style: str) -> object:
-        """Draw a walk, carried into this world; gaps where poses are missing."""
+        """Draw a trajectory, transformed by `placed`, with gaps at missing poses."""
         positions = placed.points(walk.world_T_rigs[:, :3, 3])
         across, up = ((positions - self._centre) @ self._axes[:2].T).T
         return axes.plot(across, up, color=color, linestyle=style)[0]
 
 
 def _errors(figure: "SubFigure | Figure", shown: Sequence[Shown]) -> None:
-    """Errors of every pose: of positions above, of rotations below; over time, and their shares."""
+    """Draw errors of positions (above) and rotations (below), over time and as distributions."""
     panels = figure.subplots(2, 2)
     lines: dict[str, Any] = {}
     start = min(float(one.refined.timestamps[0]) for one in shown)
@@ -128,18 +130,18 @@ def _errors(figure: "SubFigure | Figure", shown: Sequence[Shown]) -> None:
                 continue
             times = walk.timestamps[errors.rows] - start
             for row, off in enumerate((errors.positions, np.degrees(errors.rotations))):
-                how = {"color": color, "linestyle": style}
-                lines[label] = panels[row, 0].plot(times, off, **how)[0]
-                panels[row, 1].plot(*_shares(off), **how)
-    for row, what in enumerate(("position error, units of the truth", "rotation error, degrees")):
-        panels[row, 0].set(ylabel=what, yscale="log")
-        panels[row, 1].set(ylabel="share of frames", xscale="log", ylim=(0, 1), xlabel=what)
+                look = {"color": color, "linestyle": style}
+                lines[label] = panels[row, 0].plot(times, off, **look)[0]
+                panels[row, 1].plot(*_shares(off), **look)
+    for row, label in enumerate(("position error, units of the truth", "rotation error, degrees")):
+        panels[row, 0].set(ylabel=label, yscale="log")
+        panels[row, 1].set(ylabel="share of frames", xscale="log", ylim=(0, 1), xlabel=label)
     panels[1, 0].set_xlabel("time, s")
     figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4)
 
 
 def _residuals(figure: "SubFigure | Figure", shown: Sequence[Shown]) -> None:
-    """Angular residuals: the median of every frame over time, and shares of all observations."""
+    """Draw angular residuals: the median of every frame over time, and the distribution of all."""
     left, right = figure.subplots(1, 2)
     lines: dict[str, Any] = {}
     common = all(one.placed is not None for one in shown)
@@ -158,7 +160,9 @@ def _residuals(figure: "SubFigure | Figure", shown: Sequence[Shown]) -> None:
 
 
 def _shares(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values (P,) ascending and which share of all is no larger, at most so many points."""
+    """Cumulative distribution: values (P,) ascending, and the share of all that is not larger."""
     ordered = np.sort(values)
-    rows = np.unique(np.linspace(0, len(ordered) - 1, min(len(ordered), _MOST_POINTS)).astype(int))
+    rows = np.unique(
+        np.linspace(0, len(ordered) - 1, min(len(ordered), _MAX_CURVE_POINTS)).astype(int)
+    )
     return ordered[rows], (rows + 1) / max(len(ordered), 1)

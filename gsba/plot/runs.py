@@ -1,4 +1,4 @@
-"""What is drawn of runs, in the world of the truth or in that of the first run."""
+"""Runs for figures, in the world of the truth or in that of the first run."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,39 +15,39 @@ from gsba.trajectory.association import matched_in_time
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory
 
-_SAME_TIME_S = 0.01
-_LEAST_COMMON = 3  # poses of one time that lay two runs on each other
+_TOLERANCE_S = 0.01  # largest time between poses of two runs that correspond
+_MIN_COMMON_POSES = 3  # to align two runs
 
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """One run, or a trajectory alone."""
+    """Run, or trajectory file, for figures."""
 
     name: str
     refined: Trajectory
-    coarse: Trajectory | None = None  # in the world of `refined`; None = a trajectory alone
+    coarse: Trajectory | None = None  # in the world of `refined`; None = a trajectory file
     residuals_deg: np.ndarray | None = None  # (O,) of all observations, degrees, ascending
     frame_residuals_deg: np.ndarray | None = None  # (F,) median of each frame, NaN = none
     errors: PoseErrors | None = None  # None = there is no truth
     coarse_errors: PoseErrors | None = None
-    placed: Sim3 | None = None  # into the common world; None = it could not be laid there
+    placed: Sim3 | None = None  # similarity to the common world; None = it could not be aligned
 
 
 def load(paths: Sequence[Path], truth: Trajectory | None = None) -> tuple[Shown, ...]:
-    """Read runs, and lay them on the truth, or without one on the first of them.
+    """Read runs, and align them to the truth, or without a truth to the first run.
 
     Args:
         paths: folders of finished runs, or trajectory files.
         truth: true poses.
 
     Raises:
-        GsbaError: naming what cannot be read, or has too little in common with the truth.
+        GsbaError: a run cannot be read, or has too few poses in common with the truth.
     """
     names = _names(paths)
     found = [_read(name, path) for name, path in zip(names, paths, strict=True)]
     if truth is None:
-        return tuple(replace(one, placed=_onto(one, found[0])) for one in found)
-    return tuple(_judged(one, truth) for one in found)
+        return tuple(replace(one, placed=_aligned_to(one, found[0])) for one in found)
+    return tuple(_with_errors(one, truth) for one in found)
 
 
 def _read(name: str, path: Path) -> Shown:
@@ -64,8 +64,8 @@ def _read(name: str, path: Path) -> Shown:
     )
 
 
-def _judged(shown: Shown, truth: Trajectory) -> Shown:
-    """With its errors; those of the coarse trajectory where they can be told."""
+def _with_errors(shown: Shown, truth: Trajectory) -> Shown:
+    """Run with its errors, and those of its coarse trajectory if they can be computed."""
     try:
         errors = pose_errors(shown.refined, truth)
     except GsbaError as error:
@@ -77,10 +77,10 @@ def _judged(shown: Shown, truth: Trajectory) -> Shown:
     return replace(shown, errors=errors, coarse_errors=before, placed=errors.fit)
 
 
-def _onto(shown: Shown, first: Shown) -> Sim3 | None:
-    """Similarity that lays a run on the first one; None = they are of different walks."""
-    rows, others = matched_in_time(shown.refined, first.refined, _SAME_TIME_S)
-    if len(rows) < _LEAST_COMMON:
+def _aligned_to(shown: Shown, first: Shown) -> Sim3 | None:
+    """Similarity from a run to the first one; None = they are of different walks."""
+    rows, others = matched_in_time(shown.refined, first.refined, _TOLERANCE_S)
+    if len(rows) < _MIN_COMMON_POSES:
         return None
     try:
         return pose_similarity(shown.refined.world_T_rigs[rows], first.refined.world_T_rigs[others])
@@ -89,11 +89,11 @@ def _onto(shown: Shown, first: Shown) -> Sim3 | None:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Short names that differ: of the folder, with more of its parents where it must be."""
+    """Short distinct names: the folder's, with as many parents as needed."""
     parts = [path.resolve().parts for path in paths]
     if len(set(parts)) < len(parts):
         twice = next(path for k, path in enumerate(paths) if parts[k] in parts[:k])
-        raise GsbaError(f"{twice}: is named twice; name each run once")
+        raise GsbaError(f"{twice} is given twice: give each run once")
     depth = 1
     while len({of_path[-depth:] for of_path in parts}) < len(parts):
         depth += 1

@@ -1,7 +1,7 @@
-"""What a run did and how good it is: report.json, poses.csv, report.html.
+"""Reports of a run and of its accuracy: report.json, poses.csv, report.html.
 
-Takes the result, what was found on the way, and what stages cost.
-Gives plain values, and a page that explains itself.
+Takes the result, the findings of stages and their cost.
+Gives plain values, and a self-contained page.
 """
 
 from gsba.report.report import FrameQuality, build_report, frame_quality, write_poses

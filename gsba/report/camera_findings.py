@@ -1,4 +1,4 @@
-"""What was found of the camera, for report.json, and what to note of it."""
+"""Findings on the camera, for report.json, and notes for the user."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
 from gsba.placement.placement import metres_per_unit
 
-_CONTRADICTS = 3.0  # standard deviations between what is said of a camera and what images say
+_MAX_DEVIATION_SIGMAS = 3.0  # of the estimated readout time from the published one
 
 
 def of_camera(
@@ -26,21 +26,22 @@ def of_camera(
     settings: CameraSettings,
     timed: bool,
 ) -> tuple[dict[str, Any], list[str]]:
-    """Where the lenses are, where they look and how they are read.
+    """Baseline, axes, stitch radius and readout of two lenses.
 
     Args:
-        centres: as the map has them.
-        readout, axes, radius: the same; None = not looked for.
-        known: how well; None = one centre is as likely.
-        scale: of the map's unit in the world of the result.
-        settings: what is said of the camera.
-        timed: whether times of frames are known; if not, milliseconds are not.
+        centres: estimated centres of the lenses.
+        readout, axes, radius: further estimates; None = not estimated.
+        known: covariances of these; None = one centre is as likely.
+        scale: units of the result per map unit.
+        settings: published baseline and readout time.
+        timed: True if frames have times; else readout times in seconds are unknown.
 
     Returns:
-        Lengths are in map units of the result; `metres_per_unit` rests on what is said.
+        Content of report.json and notes. Lengths are in units of the result; `metres_per_unit`
+        follows from the published baseline.
     """
     length, sigma = baseline_of(centres, scale)
-    said = {
+    content = {
         "taken": bool(centres.lenses),
         "reason": centres.reason,
         "front_lens": scale * centres.found,
@@ -52,41 +53,44 @@ def of_camera(
     notes, baseline = [], settings.baseline()
     if not centres.lenses:
         if baseline is not None:
-            notes.append(f"two lenses were not found, and tell no scale: {centres.reason}")
-        return said, notes
-    notes.append(f"these frames are of two lenses {length:.5g} map units apart (sigma {sigma:.1g})")
+            notes.append(
+                f"two lenses were not found, so that the baseline gives no scale: {centres.reason}"
+            )
+        return content, notes
+    notes.append(f"the two lenses are {length:.5g} map units apart (sigma {sigma:.1g})")
     if baseline is not None:
         metres, of_metres = metres_per_unit((length, sigma), baseline)
-        said |= {"metres_per_unit": metres, "metres_per_unit_sigma": of_metres}
+        content |= {"metres_per_unit": metres, "metres_per_unit_sigma": of_metres}
         notes.append(_scale_note(metres, of_metres, baseline[0]))
     if axes is not None:
-        said["turned_below_panorama"] = centres.lenses.axes is not None
-        said["gain_of_axes"] = axes.gains
+        content["turned_below_panorama"] = centres.lenses.axes is not None
+        content["gain_of_axes"] = axes.gains
         if centres.lenses.axes is not None:
-            notes.append("the lenses turn below the panoramas: a stabiliser was on")
+            notes.append("the lenses rotate relative to the panoramas: a stabiliser was on")
     inverse_stitch_radius = centres.lenses.inverse_stitch_radius
     if radius is not None:
-        said["stitch_radius"] = _of_radius(radius, inverse_stitch_radius, known, scale)
+        content["stitch_radius"] = _stitch_radius_row(radius, inverse_stitch_radius, known, scale)
     if inverse_stitch_radius:
-        notes.append(
-            f"they are stitched for a radius of {scale / inverse_stitch_radius:.3g} map units"
-        )
+        notes.append(f"the stitch radius is {scale / inverse_stitch_radius:.3g} map units")
     if readout is not None:
-        said["readout"] = _of_readout(readout, timed)
+        content["readout"] = _readout_row(readout, timed)
         if timed:
             notes += _readout_notes(readout, settings)
-    return said, notes
+    return content, notes
 
 
 def of_lenses(
     lenses: Lenses, voted: SelfCalibration | None, known: CameraCovariances | None
 ) -> tuple[dict[str, Any], list[str]]:
-    """What the lenses of raw pairs are.
+    """Self-calibrated lenses of raw fisheye pairs.
 
     Args:
-        lenses: as the map has them.
-        voted: what features said of those that were given; None = they were found.
-        known: how well they are known.
+        lenses: lenses of the map.
+        voted: check of the given calibration by features; None = the lenses were estimated.
+        known: covariances of the lenses.
+
+    Returns:
+        Content of report.json and notes.
     """
     if lenses.fisheyes is None:
         reason = "" if voted is None else voted.reason
@@ -94,10 +98,10 @@ def of_lenses(
     sigmas = np.full(FREE, np.nan)
     if known is not None and known.lens_sigmas is not None:
         sigmas = known.lens_sigmas
-    said, notes = dict[str, Any](taken=True, reason=""), []
+    content, notes = dict[str, Any](taken=True, reason=""), []
     of_lens = sigmas[:OF_FRONT], sigmas[OF_FRONT:]
     for name, lens, own in zip(("front", "back"), lenses.fisheyes, of_lens, strict=True):
-        said[name] = {
+        content[name] = {
             "focal": lens.focal,
             "focal_sigma": lens.focal * own[0],
             "principal": lens.principal,
@@ -105,31 +109,31 @@ def of_lenses(
             "radial": lens.radial,
             "radial_sigmas": own[3:7],
         }
-    said["back"]["turn_sigmas_deg"] = np.rad2deg(of_lens[1][7:])
+    content["back"]["turn_sigmas_deg"] = np.rad2deg(of_lens[1][7:])
     loose = undetermined(sigmas)
-    said["hardly_determined"] = loose
+    content["hardly_determined"] = loose
     if loose:
         notes.append(
-            f"these frames hardly determine of the lenses: {', '.join(loose)} (they stay near what "
-            "lenses were taken for)"
+            f"these frames hardly determine some lens parameters: {', '.join(loose)} (they stay "
+            "near their initial values)"
         )
-    front, back = (said[name] for name in ("front", "back"))
+    front, back = (content[name] for name in ("front", "back"))
     notes.append(
-        f"the lenses were calibrated as found: focal lengths {front['focal']:.2f} and "
+        f"the lenses were self-calibrated: focal lengths {front['focal']:.2f} and "
         f"{back['focal']:.2f} pixels (sigmas {front['focal_sigma']:.1g} and "
-        f"{back['focal_sigma']:.1g}); calibration.json is for other runs of this camera"
+        f"{back['focal_sigma']:.1g}); for other runs of this camera use calibration.json"
     )
-    return said, notes
+    return content, notes
 
 
 def _scale_note(metres: float, sigma: float, baseline: float) -> str:
     return (
-        f"one map unit is {metres:.4g} m (sigma {100 * sigma / metres:.2g} %), the lenses "
+        f"one map unit is {metres:.4g} m (sigma {100 * sigma / metres:.2g} %), if the lenses are "
         f"{1e3 * baseline:g} mm apart"
     )
 
 
-def _of_radius(
+def _stitch_radius_row(
     radius: StitchRadius,
     inverse_stitch_radius: float,
     known: CameraCovariances | None,
@@ -145,7 +149,7 @@ def _of_radius(
     }
 
 
-def _of_readout(found: CameraEstimate, timed: bool) -> dict[str, Any]:
+def _readout_row(found: CameraEstimate, timed: bool) -> dict[str, Any]:
     taken = found.lenses.readout_motion is not None
     return {
         "taken": taken,
@@ -158,16 +162,19 @@ def _of_readout(found: CameraEstimate, timed: bool) -> dict[str, Any]:
 
 
 def _readout_notes(found: CameraEstimate, settings: CameraSettings) -> list[str]:
-    """What the images say of the readout, and whether it is what was said."""
+    """Notes on the estimated readout time, and on its deviation from the published one."""
     if found.lenses.readout_motion is None:
         return []
     notes = [
-        f"rows are read in {1e3 * found.readout_s:.1f} ms (sigma {1e3 * found.readout_sigma:.1g}), "
-        "frames moving meanwhile"
+        f"the readout time is {1e3 * found.readout_s:.1f} ms (sigma "
+        f"{1e3 * found.readout_sigma:.1g}); poses account for the camera's motion in it"
     ]
-    said = settings.readout()
-    if said is not None:
-        off = abs(found.readout_s - said[0])
-        if off > _CONTRADICTS * np.hypot(found.readout_sigma, said[1]):
-            notes.append(f"{1e3 * said[0]:g} ms were expected: is it the camera that is named?")
+    published = settings.readout()
+    if published is not None:
+        off = abs(found.readout_s - published[0])
+        if off > _MAX_DEVIATION_SIGMAS * np.hypot(found.readout_sigma, published[1]):
+            notes.append(
+                f"the settings give a readout time of {1e3 * published[0]:g} ms: check the name of "
+                "the camera (--camera)"
+            )
     return notes

@@ -1,4 +1,4 @@
-"""What a run found out: of its trajectory, its maps and its frames, in words and for the report."""
+"""Findings on a run's trajectory, maps and frames, for report.json, and notes for the user."""
 
 import logging
 from collections.abc import Sequence
@@ -16,8 +16,8 @@ from gsba.types import CoarsePoses, FrameSet, PoseSource, PoseStatus, Reconstruc
 
 logger = logging.getLogger(__name__)
 
-_NAMED = 5  # frames in a line of the log
-_MANY = 0.1  # part of a trajectory's steps: contradicted, the rest of it is in doubt, too
+_MAX_NAMED_FRAMES = 5  # frames whose names a line of the log lists
+_MAX_FALSE_SHARE = 0.1  # share of contradicted steps; above it, the other steps are in doubt, too
 
 
 def of_trajectory(
@@ -28,15 +28,15 @@ def of_trajectory(
     frames: FrameSet,
     absent: bool = False,
 ) -> tuple[dict[str, Any], list[str]]:
-    """What images say of the trajectory, for report.json, and what to note of it.
+    """Checks of the trajectory by images, for report.json, and notes.
 
     Args:
-        trust: its steps.
+        trust: checks of its steps.
         clock: its clock; None = not checked.
-        merged: parts of the map that were joined; None = it never was in parts.
-        joints: how its pieces were joined.
-        frames: of the run.
-        absent: there is no trajectory: images contradict none of its frames and steps.
+        merged: parts of the map that were joined; None = the map never was in parts.
+        joints: alignments of its pieces.
+        frames: frames of the run.
+        absent: True = there is no trajectory, so that images contradict none of its steps.
     """
     found, notes = _steps(trust, frames, absent)
     if clock is not None:
@@ -51,7 +51,7 @@ def of_trajectory(
 
 
 def _steps(trust: StepChecks, frames: FrameSet, absent: bool) -> tuple[dict[str, Any], list[str]]:
-    """The judgement by the names of frames, for the report, and what to note of it."""
+    """Contradicted and unseen steps by the names of their frames, for the report, and notes."""
     names = np.array(frames.names)
 
     def between(chosen: np.ndarray) -> list[Any]:
@@ -65,17 +65,25 @@ def _steps(trust: StepChecks, frames: FrameSet, absent: bool) -> tuple[dict[str,
     }
     notes = []
     if false:
-        notes.append(f"the images contradict the trajectory at {', '.join(false)}: not believed")
+        notes.append(
+            f"images contradict the trajectory at {named(false, 'trajectory.false_frames')}: its "
+            "poses there are not used"
+        )
     if trust.turning_only:
-        notes.append("no frame has parallax to the next: no depth can be had, rotations only")
+        notes.append(
+            "no two frames have parallax: only rotations are refined, and there are no points"
+        )
     if trust.held_steps.any():
-        steps = ", ".join(f"{a} to {b}" for a, b in between(trust.held_steps))
+        steps = [f"{a} to {b}" for a, b in between(trust.held_steps)]
         seen = ~trust.unseen_steps
         wrong, num = np.count_nonzero(trust.false_steps & seen), np.count_nonzero(seen)
-        doubt = (
-            f" (images contradict {wrong} of its other {num} steps)" if wrong > _MANY * num else ""
+        doubt = ""
+        if wrong > _MAX_FALSE_SHARE * num:
+            doubt = f" (images contradict {wrong} of its other {num} steps)"
+        notes.append(
+            f"no matches, the step comes from the trajectory{doubt}: "
+            f"{named(steps, 'trajectory.unseen_steps', 'steps')}"
         )
-        notes.append(f"no images in common, held by the trajectory alone{doubt}: {steps}")
     for note in notes:
         logger.warning(note)
     return judgement, notes
@@ -84,7 +92,7 @@ def _steps(trust: StepChecks, frames: FrameSet, absent: bool) -> tuple[dict[str,
 def _maps(
     registered: Registered | None, joints: tuple[SegmentAlignment, ...], frames: FrameSet
 ) -> tuple[dict[str, Any], list[str]]:
-    """Pieces, maps and registered frames by their names, for the report, and what to note."""
+    """Pieces, maps and registered frames by their names, for the report, and notes."""
     names, notes = np.array(frames.names), []
     pieces = [
         {
@@ -97,10 +105,10 @@ def _maps(
         for joint in joints
     ]
     for joint in joints:
-        told = f"joined by {joint.how}, scale {joint.scale:.4g}"
+        alignment = f"joined by {joint.how}, scale {joint.scale:.4g}"
         if joint.how == GUESS:
-            told = "no images tell how this piece lies to the others"
-        notes.append(f"the trajectory begins anew at {names[joint.first]}: {told}")
+            alignment = "no images show how this piece is aligned to the others"
+        notes.append(f"a new piece of the trajectory begins at {names[joint.first]}: {alignment}")
     judgement: dict[str, Any] = {"joints": pieces} if pieces else {}
     if registered is None:
         return judgement, notes
@@ -111,23 +119,29 @@ def _maps(
     judgement |= {"registered": alone, "not_registered": lost}
     judgement["maps"] = maps if count > 1 else []
     if alone:
-        notes.append(f"registered against the map: {', '.join(alone)}")
+        notes.append(
+            f"{len(alone)} frames were registered against the map's points: "
+            f"{named(alone, 'trajectory.registered')}"
+        )
     if lost:
-        notes.append(f"could not be registered, not exported: {', '.join(lost)}")
+        notes.append(
+            f"{len(lost)} frames could not be registered and are not exported: "
+            f"{named(lost, 'trajectory.not_registered')}"
+        )
     if count > 1:
         parts = "; ".join(
             f"map {n} from {m[0]} to {m[-1]} ({len(m)} frames)" for n, m in enumerate(maps[1:], 2)
         )
         notes.append(
-            f"nothing ties {count} places together: each is a map of its own, and map 1 with its "
-            f"{len(maps[0])} frames is exported; the others are in poses.csv, and are exported by "
-            f"gsba export --map NUMBER: {parts}"
+            f"images do not connect {count} places: each is a map with its own world and scale. "
+            f"Map 1 with {len(maps[0])} frames is exported; gsba export --map NUMBER exports the "
+            f"others, whose poses are in poses.csv: {parts}"
         )
     return judgement, notes
 
 
 def _clock(estimate: ClockEstimate) -> dict[str, Any]:
-    """The estimate for the report: seconds, and degrees of a step's rotation."""
+    """Clock estimate for the report: seconds, and degrees of a step's rotation."""
     return {
         "verdict": estimate.verdict,
         "offset_s": estimate.clock.offset,
@@ -143,7 +157,7 @@ def _clock(estimate: ClockEstimate) -> dict[str, Any]:
 
 
 def of_field(found: Stitching) -> dict[str, Any]:
-    """What report.json says of a field that stitching bends."""
+    """Content of report.json on the stitching field."""
     field = found.field
     rays = np.random.default_rng(0).normal(size=(2000, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -165,11 +179,15 @@ def of_frames(
     frame_weights: np.ndarray,
     max_scale_sigma: float,
 ) -> list[str]:
-    """What the user should know about a run; warnings of the log name few frames of many.
+    """Notes on the frames of a run; the log names only a few frames of a long list.
 
     Args:
-        frame_weights: (F,) of each frame's pixels, below 1 where they contradict the others.
-        max_scale_sigma: of a step's length over the one before it; above, a place is named.
+        frames: frames of the run.
+        coarse: their initial poses.
+        reconstruction: the result.
+        frame_weights: (F,) weight of each frame's pixels, below 1 if they contradict the others.
+        max_scale_sigma: relative sigma of the ratio of two successive baselines; frames above it
+            are listed.
     """
     absent = coarse.sources == PoseSource.NONE
     filled = np.flatnonzero((coarse.sources != PoseSource.SLAM) & ~absent)
@@ -183,39 +201,46 @@ def of_frames(
     )
     notes = []
     if absent.all():
-        notes.append("no trajectory: started from the images alone, in units of their own")
+        notes.append("no trajectory: poses come from images alone, and the unit is arbitrary")
     if coarse.time_offset:
         notes.append(f"frame times were shifted by {coarse.time_offset:.6f} s")
     for note in notes:
         logger.warning(note)
     fetched = (
-        "frames of the video that were fetched where the map was weak, left out of datasets unless "
-        "export.fetched = true"
+        "frames of the video that were added where the map was weak; datasets leave them out "
+        "unless export.fetched = true"
     )
-    for what, rows in (
+    for finding, rows in (
         (fetched, np.flatnonzero(frames.fetched)),
-        ("no SLAM pose, started between neighbours", filled),
+        ("no SLAM pose, the initial pose is interpolated", filled),
         ("no matches, the pose comes from the trajectory", lost),
         ("pixels fit badly and were weighted down", doubted),
         (uncertain, weak),
     ):
         if len(rows):
             names = [frames.names[f] for f in rows]
-            notes.append(f"{what}: {', '.join(names)}")
-            logger.warning("%s: %s", what, _brief(names, len(frames)))
+            notes.append(f"{finding}: {', '.join(names)}")
+            logger.warning("%s: %s", finding, _brief(names, len(frames)))
     return notes
 
 
 def _weak_places(reconstruction: Reconstruction, max_scale_sigma: float) -> np.ndarray:
-    """Frames at which images hand the scale on poorly, even after a closer look."""
+    """Frames at which the ratio of successive baselines is uncertain, after all keypoints."""
     poses, joint = reconstruction.world_T_rigs, reconstruction.joint_errors
     if joint is None or len(poses) < 3:
         return np.zeros(0, np.intp)
     return 1 + np.flatnonzero(scale_sigmas(poses, joint.draws) > max_scale_sigma)
 
 
-def _brief(names: Sequence[str], num_frames: int) -> str:
-    """The names of a few frames; of more, how many they are and where all are listed."""
-    if len(names) <= _NAMED:
+def named(names: Sequence[str], key: str, unit: str = "frames") -> str:
+    """Names of a few frames or steps; of more, their number and the key in report.json."""
+    if len(names) <= _MAX_NAMED_FRAMES:
         return ", ".join(names)
-    return f"{len(names)} of {num_frames} frames, listed in report.json"
+    return f"{len(names)} {unit}, listed in report.json under {key}"
+
+
+def _brief(names: Sequence[str], num_frames: int) -> str:
+    """Names of a few frames; of more, their number, and where they are listed."""
+    if len(names) <= _MAX_NAMED_FRAMES:
+        return ", ".join(names)
+    return f"{len(names)} of {num_frames} frames, listed in the notes of report.json"

@@ -1,4 +1,4 @@
-"""What GPS factors had to say, for report.json, and what to note of it."""
+"""Findings on GPS factors, for report.json, and notes for the user."""
 
 import logging
 from typing import Any
@@ -7,32 +7,34 @@ import numpy as np
 
 from gsba.bundle.fixes import FrameFixes
 from gsba.bundle.gps_factors import Anchors
+from gsba.report.findings import named
 from gsba.types import FrameSet
 
 logger = logging.getLogger(__name__)
-
-_MOST_NAMED = 20  # frames of false fixes that are named
 
 
 def of_gps(
     fixes: FrameFixes, anchors: Anchors | None, world_T_rigs: np.ndarray, frames: FrameSet
 ) -> tuple[dict[str, Any], list[str]]:
-    """How many fixes held the poses, how far off they are, and which were false.
+    """Used and false fixes, and their residuals.
 
     Args:
-        fixes: of the frames.
-        anchors: the same in the world of the poses; None = they do not lie as the frames do.
+        fixes: fixes of the frames.
+        anchors: fixes in the world of the poses; None = they are not correlated with the poses.
         world_T_rigs: (F, 4, 4) refined poses.
-        frames: their names.
+        frames: frames of the run, for their names.
+
+    Returns:
+        Content of report.json and notes.
     """
-    said: dict[str, Any] = {"fixes": len(fixes), "taken": anchors is not None}
+    content: dict[str, Any] = {"fixes": len(fixes), "taken": anchors is not None}
     if anchors is None:
         note = (
-            f"GPS had no say: its {len(fixes)} positions and the frames' have nothing in common; "
-            "check the clock, and that the walk is longer than positions are wrong"
+            f"GPS was not used: its {len(fixes)} positions and the frames' are not correlated; "
+            "check its clock, and that the path is longer than the error of the positions"
         )
         logger.warning(note)
-        return said | {"used": 0}, [note]
+        return content | {"used": 0}, [note]
     used = np.flatnonzero(anchors.used)
     off = np.empty((len(used), 3))
     for number, fit in anchors.level_from_map.items():
@@ -42,7 +44,7 @@ def of_gps(
     false = [frames.names[f] for f in fixes.frames[~anchors.used]]
     lengths = np.linalg.norm(off, axis=1)
     typical = np.sqrt(np.mean(off**2, axis=0))
-    said |= {
+    content |= {
         "used": len(used),
         "false_fixes": false,
         "residual_m": {"median": np.median(lengths), "most": lengths.max()},
@@ -52,10 +54,9 @@ def of_gps(
     }
     across, claimed = np.hypot(typical[0], typical[1]), np.median(fixes.sigmas[:, 0])
     note = (
-        f"GPS held {len(used)} of {len(frames)} frames: they are {across:.2g} m off across and "
-        f"{typical[2]:.2g} m up (rms; positions are taken to be right to {claimed:.2g} m per axis)"
+        f"GPS held {len(used)} of {len(frames)} frames: residuals are {across:.2g} m horizontally "
+        f"and {typical[2]:.2g} m vertically (rms; the assumed sigma is {claimed:.2g} m per axis)"
     )
     if false:
-        more = "" if len(false) <= _MOST_NAMED else f", ... {len(false) - _MOST_NAMED} more"
-        note += f"; {len(false)} false: {', '.join(false[:_MOST_NAMED])}{more}"
-    return said, [note]
+        note += f"; {len(false)} fixes are outliers: {named(false, 'gps.false_fixes')}"
+    return content, [note]

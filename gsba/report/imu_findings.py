@@ -1,4 +1,4 @@
-"""What was found of a gyro that rode along, for report.json, and what to note of it."""
+"""Findings on the gyro, for report.json, and notes for the user."""
 
 import logging
 from typing import Any
@@ -11,7 +11,7 @@ from gsba.types import GyroConstraints
 
 logger = logging.getLogger(__name__)
 
-_LOST = 3.0  # standard deviations beyond which a step of the gyro has next to no say
+_MAX_RESIDUAL_SIGMAS = 3.0  # of a gyro step; beyond it, the robust loss suppresses the step
 
 
 def of_gyro(
@@ -20,15 +20,18 @@ def of_gyro(
     readout: CameraEstimate | None,
     world_T_rigs: np.ndarray,
 ) -> tuple[dict[str, Any], list[str]]:
-    """Clock, bias and axes of a gyro, and how much of what it says was used.
+    """Clock, bias and axes of a gyro, and the share of its steps that agree with the poses.
 
     Args:
-        found: how it belongs to the frames.
-        turning: what it says of them; None = it was not believed.
-        readout: how frames are read; None = at one instant.
+        found: alignment of the gyro with the frames.
+        turning: its constraints on the frames; None = it was not used.
+        readout: estimated readout of the frames; None = a global shutter.
         world_T_rigs: (F, 4, 4) refined poses.
+
+    Returns:
+        Content of report.json and notes.
     """
-    said: dict[str, Any] = {
+    content: dict[str, Any] = {
         "taken": turning is not None,
         "reason": found.reason,
         "offset_s": found.clock.offset,
@@ -42,33 +45,33 @@ def of_gyro(
         "turns_explained": found.explained,
     }
     if turning is None:
-        note = f"the gyro was left alone: {found.reason}"
+        note = f"the gyro was not used: {found.reason}"
         logger.warning(note)
-        return said, [note]
+        return content, [note]
     steps = _steps_used(turning, world_T_rigs)
     during = (
         None if readout is None or readout.lenses.readout_motion is None else bool(readout.by_gyro)
     )
-    said |= {"steps_used": steps, "during_readout": during}
+    content |= {"steps_used": steps, "during_readout": during}
     bias = ", ".join(f"{value:.3g}" for value in np.rad2deg(found.sensor.bias))
     notes = [
-        f"the gyro has a say on {100 * steps:.0f} % of the steps between frames, each known to "
-        f"{np.rad2deg(found.noise):.2g} degrees; its clock is {found.clock.offset:.4f} s ahead "
-        f"(sigma {found.offset_sigma:.1g}), its bias {bias} degrees per second, "
-        f"its axes are known to {np.rad2deg(found.axes_sigma):.2g} degrees"
+        f"the gyro agrees with {100 * steps:.0f} % of the steps between frames (sigma "
+        f"{np.rad2deg(found.noise):.2g} degrees); its clock is {found.clock.offset:.4f} s ahead "
+        f"(sigma {found.offset_sigma:.1g}), its bias is {bias} degrees per second, and the sigma "
+        f"of its axes is {np.rad2deg(found.axes_sigma):.2g} degrees"
     ]
     if during is not None:
-        how = "as the gyro says" if during else "otherwise than the gyro says, and by images alone"
-        notes.append(f"frames turn while they are read {how}")
-    return said, notes
+        source = "the gyro" if during else "images, which contradict the gyro"
+        notes.append(f"rotations during the readout come from {source}")
+    return content, notes
 
 
 def _steps_used(turning: GyroConstraints, world_T_rigs: np.ndarray) -> float:
-    """Part of all steps about which refined poses agree with the gyro."""
+    """Share of all steps whose refined rotation agrees with the gyro."""
     from scipy.spatial.transform import Rotation
 
     rotations = world_T_rigs[:, :3, :3]
     found = Rotation.from_matrix(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
     off = (found.inv() * Rotation.from_rotvec(turning.steps)).as_rotvec()
-    near = np.linalg.norm(off, axis=1) < _LOST * np.sqrt(3) * turning.step_sigmas
+    near = np.linalg.norm(off, axis=1) < _MAX_RESIDUAL_SIGMAS * np.sqrt(3) * turning.step_sigmas
     return float(np.mean(near & np.isfinite(turning.step_sigmas)))

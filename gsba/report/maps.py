@@ -1,4 +1,4 @@
-"""The maps of a run, as its report lists them: frames in one world each, the largest exported."""
+"""Maps of a run in its report; each has its own world, and the largest one is exported."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,8 +8,8 @@ import numpy as np
 
 from gsba.types import FrameSet, PoseStatus, Reconstruction
 
-MIN_SHARE_IN_ONE_MAP = 0.9  # of a run's frames: a run with fewer in its largest map is partial
-_SHOWN_SPANS = 3  # of a map's frames, in a line of the table for people
+MIN_SHARE_IN_ONE_MAP = 0.9  # of a run's frames; a run with fewer in its largest map is partial
+_MAX_SHOWN_SPANS = 3  # spans of a map's frames in a line of the table
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,18 +23,19 @@ class MapSummary:
     points: int  # number of scene points
     extent: float  # map units, diagonal of the box around its frames' positions
     spans: tuple[tuple[str, str], ...]  # names of the first and last frame of each run of frames
-    reason: str | None  # why it was not joined to a larger map; None = largest map, or not known
+    reason: str | None  # reason why it is not joined to a larger map; None = largest, or unknown
 
 
 def summarize_maps(
     reconstruction: Reconstruction, frames: FrameSet, reasons: Sequence[str | None] = ()
 ) -> tuple[MapSummary, ...]:
-    """The maps of a reconstruction, the largest first. Frames that are in no map are left out.
+    """Summaries of a reconstruction's maps, the largest first; frames in no map are left out.
 
     Args:
         reconstruction: all maps of a run.
         frames: its frames.
-        reasons: why each map was not joined to a larger one, the largest first; may be shorter.
+        reasons: reason why each map is not joined to a larger one, the largest map first; there may
+            be fewer reasons than maps.
     """
     found = []
     for number in range(1, reconstruction.num_maps + 1):
@@ -59,19 +60,19 @@ def summarize_maps(
 
 
 def is_partial(maps: Sequence[MapSummary], num_frames: int) -> bool:
-    """Whether too few of a run's frames are in its largest map for the run to have succeeded."""
+    """True if less than `MIN_SHARE_IN_ONE_MAP` of a run's frames are in its largest map."""
     return maps[0].frames < MIN_SHARE_IN_ONE_MAP * num_frames
 
 
 def format_outcome(report: Mapping[str, Any], run: object) -> str:
-    """What a finished run comes down to, for a terminal.
+    """Outcome of a finished run, for a terminal.
 
-    The first line counts the frames of the map that is exported, and then those of other maps. Of
-    several maps a table follows.
+    The first line counts the frames of the exported map, and then those of other maps. A table
+    follows if there are several maps.
 
     Args:
         report: content of report.json.
-        run: folder of the run, as it is shown.
+        run: folder of the run.
     """
     summary, maps = report["summary"], report["maps"]
     residual, found = summary["median_residual_deg"], "rotations only, no points"
@@ -83,7 +84,7 @@ def format_outcome(report: Mapping[str, Any], run: object) -> str:
 
 
 def _apart(summary: Mapping[str, Any]) -> str:
-    """The frames that are not exported, to follow the number of those that are; "" = none.
+    """Numbers of frames that are not exported, in brackets; "" = none.
 
     Args:
         summary: `summary` of report.json.
@@ -91,18 +92,18 @@ def _apart(summary: Mapping[str, Any]) -> str:
     others = summary["maps"] - 1
     where = "another map" if others == 1 else f"{others} other maps"
     counts = {where: summary["frames_in_other_maps"], "no map": summary["frames_in_no_map"]}
-    told = [f"{count} in {name}" for name, count in counts.items() if count]
-    return f" ({', '.join(told)})" if told else ""
+    parts = [f"{count} in {name}" for name, count in counts.items() if count]
+    return f" ({', '.join(parts)})" if parts else ""
 
 
 def _table(maps: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Lines that list maps, in columns."""
+    """Table of maps in aligned columns, as lines."""
     names = ("map", "frames", "steps", "points")
     rows = [[*names, "extent", "first to last frame", "why it was not joined"]]
     for one in maps:
         spans = [a if a == b else f"{a} to {b}" for a, b in one["spans"]]
-        more = [f"{len(spans) - _SHOWN_SPANS} more"] if len(spans) > _SHOWN_SPANS else []
-        where = ", ".join([*spans[:_SHOWN_SPANS], *more])
+        more = [f"{len(spans) - _MAX_SHOWN_SPANS} more"] if len(spans) > _MAX_SHOWN_SPANS else []
+        where = ", ".join([*spans[:_MAX_SHOWN_SPANS], *more])
         counts = [str(one[name]) for name in names]
         rows.append([*counts, f"{one['extent']:.4g}", where, one["reason"] or ""])
     if not any(row[-1] for row in rows[1:]):

@@ -1,7 +1,7 @@
-"""Scans of the place by other means: read, and registered with a run's cloud.
+"""Scans of the place: reading, and registration of a run's point cloud with them.
 
 Takes a finished result, and a cloud or mesh from a file.
-Gives the similarity between both, what speaks for it, and distances.
+Gives the similarity from one to the other with its evidence, and distances.
 """
 
 from gsba.scans.distances import Distances, distances_to

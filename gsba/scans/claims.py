@@ -1,7 +1,7 @@
-"""How many points a scan's file claims to hold, beside what its size allows.
+"""Check of the number of points that a scan's header claims against the size of the file.
 
-Parsers ask for the memory of all that are claimed, or crash where these end, before anything is
-read.
+Parsers allocate memory for all claimed points, or crash beyond the end of the file, before they
+read any.
 """
 
 import struct
@@ -9,23 +9,22 @@ from pathlib import Path
 
 from gsba.log import GsbaError
 
-_LASER_HEADER = 227  # bytes, of LAS 1.0 to 1.2; 375 of 1.4
-_LAS_14 = 375
-_VLR, _EVLR = 54, 60  # bytes of the head of a variable-length record
-_PACKED = 0.2  # bytes at least that LAZ needs for a point: equal ones in a row take .3
-_UNPACKED = 255  # times that PCD's compression can make of its bytes
-_PCD_HEADER = 1 << 16  # bytes in which a header must end
+_LAS_HEADER_BYTES = 227  # of LAS 1.0 to 1.2; 375 of 1.4
+_VLR_BYTES, _EVLR_BYTES = 54, 60  # of the header of a variable-length record
+_MIN_LAZ_POINT_BYTES = 0.2  # of a compressed point: equal ones in a row take 0.3
+_MAX_PCD_RATIO = 255  # of uncompressed to compressed bytes in PCD
+_MAX_PCD_HEADER_BYTES = 1 << 16
 
 
 def check_claims(path: Path) -> None:
-    """Refuse LAS, LAZ and PCD files that claim more than their size allows; others pass.
+    """Refuse LAS, LAZ and PCD files that claim more points than their size allows.
 
     Raises:
-        GsbaError: with both numbers, or the header is damaged.
+        GsbaError: the file claims too many points, or its header is damaged.
     """
     suffix, size = path.suffix.lower(), path.stat().st_size
     with path.open("rb") as file:
-        head = file.read(_PCD_HEADER)
+        head = file.read(_MAX_PCD_HEADER_BYTES)
     try:
         if suffix in (".las", ".laz"):
             _check_laser(head, size)
@@ -33,7 +32,7 @@ def check_claims(path: Path) -> None:
             _check_pcd(head, size)
     except _TooMuch as claim:
         raise GsbaError(
-            f"{path}: claims {claim}, more than its {size} bytes can hold: it is truncated or "
+            f"{path} claims {claim}, more than its {size} bytes can hold: it is truncated or "
             "damaged; copy or export it again"
         ) from None
     except (struct.error, ValueError, IndexError, KeyError):
@@ -43,11 +42,14 @@ def check_claims(path: Path) -> None:
 
 
 class _TooMuch(Exception):
-    """What is claimed."""
+    """A header claims more than the file can hold; the message is the claim."""
 
 
 def _check_laser(head: bytes, size: int) -> None:
-    """LAS 1.4, revision 15, section 2.4; LAZ marks its point format with the highest bits."""
+    """Check the header of LAS or LAZ (LAS 1.4, revision 15, section 2.4).
+
+    LAZ sets the highest bits of the point format.
+    """
     if head[:4] != b"LASF":
         raise ValueError
     head_size, first, num_records, kind, length, num = struct.unpack_from("<HIIBHI", head, 94)
@@ -55,17 +57,17 @@ def _check_laser(head: bytes, size: int) -> None:
     if head[25] >= 4:
         late, num_late, more = struct.unpack_from("<QIQ", head, 235)
         num = max(num, more)
-    if head_size < _LASER_HEADER or not length:
+    if head_size < _LAS_HEADER_BYTES or not length:
         raise ValueError
-    if head_size + _VLR * num_records > size or late + _EVLR * num_late > size:
+    if head_size + _VLR_BYTES * num_records > size or late + _EVLR_BYTES * num_late > size:
         raise _TooMuch(f"{num_records} and {num_late} variable-length records")
-    each = _PACKED if kind & 0xC0 else length
+    each = _MIN_LAZ_POINT_BYTES if kind & 0xC0 else length
     if num and first + each * num > size:
         raise _TooMuch(f"{num} points")
 
 
 def _check_pcd(head: bytes, size: int) -> None:
-    """The header of a PCD file: lines of a word and numbers, DATA being the last."""
+    """Check the header of a PCD file: lines of a word and numbers, of which DATA is the last."""
     fields: dict[str, list[str]] = {}
     at = 0
     while "DATA" not in fields:
@@ -85,13 +87,13 @@ def _check_pcd(head: bytes, size: int) -> None:
     length = sum(a * b for a, b in zip(sizes, counts, strict=True))
     form, left = fields["DATA"][0], size - at
     if form == "ascii":
-        least = 2 * sum(counts) * num  # a digit, and what parts it from the next
+        least = 2 * sum(counts) * num  # a digit and a separator
         room = left + 1
     elif form == "binary":
         least, room = length * num, left
     else:
         packed, unpacked = struct.unpack_from("<II", head, at)
-        least, room = max(length * num, unpacked), _UNPACKED * min(packed, left - 8)
+        least, room = max(length * num, unpacked), _MAX_PCD_RATIO * min(packed, left - 8)
         if packed > left - 8:
             raise _TooMuch(f"{packed} bytes of points")
     if least > room or width * height < num:

@@ -1,4 +1,4 @@
-"""How far a run's cloud lies off a scan."""
+"""Distances of a run's cloud to a scan."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,35 +7,34 @@ import numpy as np
 
 from gsba.scans.types import Scan
 
-_BINS = 30  # of a histogram
-_ENOUGH = 0.98  # of the cloud, that the histogram spans
+_NUM_BINS = 30  # of a histogram
 
 
 @dataclass(frozen=True, slots=True)
 class Distances:
-    """Of a cloud's points to the surfaces of a scan."""
+    """Distances of a cloud's points to the surfaces of a scan."""
 
     values: np.ndarray  # (N,) float64, unit of the scan
     explained: float  # share of points on a surface, see `gsba.scans.judge`
 
     @property
     def median(self) -> float:
-        """Half of the points are nearer."""
+        """Median distance."""
         return float(np.median(self.values))
 
     @property
     def percentile90(self) -> float:
-        """Nine in ten are nearer."""
+        """90th percentile of the distances."""
         return float(np.quantile(self.values, 0.9))
 
     def histogram(self, furthest: float) -> tuple[np.ndarray, np.ndarray]:
-        """Counts (B + 1,), the last one of what is further off, and the edges (B + 1,) of bins."""
-        edges = np.linspace(0, furthest, _BINS + 1)
+        """Counts (B + 1,), the last one of distances beyond `furthest`, and edges (B + 1,)."""
+        edges = np.linspace(0, furthest, _NUM_BINS + 1)
         counts = np.histogram(self.values, edges)[0]
         return np.append(counts, np.sum(self.values > furthest)), edges
 
     def to_json(self, furthest: float) -> dict[str, Any]:
-        """Plain values; the histogram spans distances up to `furthest`."""
+        """Plain values for JSON; the histogram spans distances up to `furthest`."""
         counts, edges = self.histogram(furthest)
         return {
             "points": len(self.values),
@@ -49,8 +48,8 @@ class Distances:
 def distances_to(scan: Scan, points: np.ndarray) -> np.ndarray:
     """Distances (N,) of points (N, 3) to a scan's surfaces.
 
-    To the plane of the nearest point as far as its neighbours reach, so that the scan's spacing
-    adds nothing; else to the point itself.
+    The distance is to the plane of the nearest scan point if its foot is within the range of that
+    point's neighbours, so that the scan's spacing adds no error; else to the scan point.
     """
     gaps, nearest = scan.tree.query(points)
     off = np.einsum("ni,ni->n", scan.normals[nearest], points - scan.points[nearest])

@@ -1,6 +1,6 @@
-"""Scans from their files: clouds and meshes by open3d, LAS and LAZ by laspy; normals and features.
+"""Reading of scans: clouds and meshes by open3d, LAS and LAZ by laspy; normals of clouds.
 
-The one module that imports open3d.
+Only this module imports open3d.
 """
 
 import logging
@@ -21,19 +21,19 @@ logger = logging.getLogger(__name__)
 
 CLOUDS, MESHES, LASER = (".pcd",), (".obj", ".glb", ".gltf"), (".las", ".laz")
 SUFFIXES = (".ply", *CLOUDS, *LASER, *MESHES)
-_MOST_POINTS = 400_000  # of a thinned scan
-_SAMPLES = 1_000_000  # on a mesh, before it is thinned
-_FURTHEST = 1e9  # units from the origin of a file that a scan may be
-_FAR = 1e4  # coordinates beyond lose digits as float32: an offset is kept apart
+_MAX_POINTS = 400_000  # of a thinned scan
+_NUM_MESH_SAMPLES = 1_000_000  # points sampled on a mesh, before it is thinned
+_MAX_COORDINATE = 1e9  # in a scan's file
+_MAX_FLOAT32_COORDINATE = 1e4  # larger ones lose digits as float32: an offset is split off
 _MIN_POINTS = 1000
 _MIN_PAIRS = 3
 
 
 def open3d() -> ModuleType:
-    """The library, if it is there and its system libraries are.
+    """Import open3d.
 
     Raises:
-        GsbaError: with what to install.
+        GsbaError: open3d or a system library is missing; the message has the install command.
     """
     try:
         import open3d  # pyright: ignore[reportMissingImports]
@@ -44,24 +44,24 @@ def open3d() -> ModuleType:
     except (ImportError, OSError) as error:
         raise GsbaError(
             f"open3d cannot be loaded ({error}): apt-get install libx11-6 libgl1 libegl1 "
-            "libgomp1 libusb-1.0-0, or what your system calls them"
+            "libgomp1 libusb-1.0-0, or the same libraries of your system"
         ) from None
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d
 
 
 def upwards(path: Path) -> str:
-    """Which axis of a scan's world points up: y of OBJ and glTF, z of all others."""
+    """Up axis of a scan's world: y for OBJ and glTF, z for all other formats."""
     return "y" if path.suffix.lower() in MESHES else "z"
 
 
 def read_pairs(path: Path) -> tuple[list[str], np.ndarray]:
-    """Picked pairs: what names a point of the run, and points (N, 3) of the scan's file.
+    """Picked point pairs: texts that name points of the run, and points (N, 3) of the scan's file.
 
-    Lines of two columns: a frame, or x,y,z in the run's world; X,Y,Z of the scan.
+    Lines have two columns: a frame, or x,y,z in the run's world; X,Y,Z of the scan.
 
     Raises:
-        GsbaError: with the line that cannot be used, or there are fewer than three.
+        GsbaError: a line cannot be used, or there are fewer than three pairs.
     """
     ends, points = [], []
     for number, line in read_lines(path):
@@ -72,21 +72,25 @@ def read_pairs(path: Path) -> tuple[list[str], np.ndarray]:
             point = []
         if len(point) != 3 or not np.isfinite(point).all():
             raise GsbaError(
-                f"{path}:{number}: {brief(line)}: want a frame or x,y,z, and then X,Y,Z of the scan"
+                f"{path}:{number}: {brief(line)}: give a frame or x,y,z, and then X,Y,Z of the scan"
             )
         ends.append(end)
         points.append(point)
     if len(ends) < _MIN_PAIRS:
-        raise GsbaError(f"{path}: holds {len(ends)} pairs; {_MIN_PAIRS} are needed")
+        raise GsbaError(f"{path} holds {len(ends)} pairs; {_MIN_PAIRS} are needed")
     return ends, np.array(points)
 
 
 def check_scan(path: Path) -> None:
-    """Raise GsbaError where a scan cannot be one: by its name, or what reads it is missing."""
+    """Check the suffix and access of a scan's file, and the libraries that read it.
+
+    Raises:
+        GsbaError: the suffix is unknown, the file cannot be read, or a library is missing.
+    """
     if path.suffix.lower() not in SUFFIXES:
-        raise GsbaError(f"{path}: is no scan: give one of {', '.join(SUFFIXES)}")
+        raise GsbaError(f"{path} is no scan: give a file of {', '.join(SUFFIXES)}")
     if path.exists() and not path.is_file():
-        raise GsbaError(f"{path}: cannot be read (it is no file)")
+        raise GsbaError(f"{path}: cannot be read (it is not a file)")
     try:
         with path.open("rb"):
             pass
@@ -98,13 +102,13 @@ def check_scan(path: Path) -> None:
 
 
 def read_scan(path: Path) -> Scan:
-    """A scan's surfaces, thinned to some 400,000 points with normals.
+    """Surfaces of a scan, thinned to some 400,000 points with normals.
 
-    Meshes are sampled evenly over their surfaces. Of clouds, each point left is the mean of a cell,
-    laid on the plane through its neighbours, see `gsba.scans.surfaces`.
+    Meshes are sampled evenly over their surfaces. Clouds are thinned to the mean point of each
+    cell, projected to the plane through its neighbours, see `gsba.scans.surfaces`.
 
     Raises:
-        GsbaError: no such file, none that is understood, or too little in it.
+        GsbaError: the file is missing, of an unknown format or damaged, or holds too few points.
     """
     check_scan(path)
     try_in_process(path)
@@ -114,7 +118,7 @@ def read_scan(path: Path) -> Scan:
         offset = _offset(vertices)
         mesh.vertices = o3d.utility.Vector3dVector(vertices - offset)
         o3d.utility.random.seed(0)
-        cloud = mesh.sample_points_uniformly(_SAMPLES, use_triangle_normal=True)
+        cloud = mesh.sample_points_uniformly(_NUM_MESH_SAMPLES, use_triangle_normal=True)
     else:
         offset = _offset(points)
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points - offset))
@@ -129,7 +133,9 @@ def read_scan(path: Path) -> Scan:
     lengths = np.linalg.norm(normals, axis=1)
     good = np.isfinite(lengths) & (lengths > 0.1)
     if good.sum() < _MIN_POINTS:
-        raise GsbaError(f"{path}: has {good.sum()} points on surfaces; a scan has {_MIN_POINTS}")
+        raise GsbaError(
+            f"{path} has {good.sum()} points on surfaces; registration needs {_MIN_POINTS}"
+        )
     light = np.array(cloud.colors).mean(axis=1)[good] if cloud.has_colors() else None
     if light is not None and np.ptp(light) == 0:
         light = None
@@ -141,58 +147,61 @@ def read_scan(path: Path) -> Scan:
 
 
 def read_mesh(path: Path) -> Any:
-    """Triangles of a mesh file with what colours them, as open3d's TriangleMesh.
+    """Triangles of a mesh file with colours or textures, as open3d's TriangleMesh.
 
     Raises:
-        GsbaError: it cannot be read, or holds no triangles.
+        GsbaError: the file cannot be read, or holds no triangles.
     """
     try_in_process(path)
     mesh = _mesh(path)
     if mesh is None:
-        raise GsbaError(f"{path}: holds no triangles that open3d can read")
+        raise GsbaError(f"{path} holds no triangles that open3d can read")
     return mesh
 
 
 def read_on_trial(path: str) -> None:
-    """Read a scan or mesh in this process, which ends with that; see `gsba.scans.trial`."""
+    """Read a scan or mesh and end this process; see `gsba.scans.trial`."""
     open3d()
     limited(Path(path), _content)
 
 
 def _content(path: Path) -> tuple[Any, np.ndarray, np.ndarray | None]:
-    """The mesh of a file, or None; points and colours (M, 3) of a cloud, or None.
+    """Mesh of a file, or None; else the points (M, 3) of its cloud, and their colours or None.
 
     Raises:
-        GsbaError: it cannot be read, or holds neither.
+        GsbaError: the file cannot be read, or holds neither a mesh nor a cloud.
     """
     suffix = path.suffix.lower()
     mesh = _mesh(path) if suffix in MESHES or suffix == ".ply" else None
     if mesh is not None:
         return mesh, np.zeros((0, 3)), None
     if suffix in MESHES:
-        raise GsbaError(f"{path}: holds no triangles that open3d can read")
+        raise GsbaError(f"{path} holds no triangles that open3d can read")
     check_claims(path)
     points, colors = (_of_laser if suffix in LASER else _of_cloud)(path)
-    good = (np.abs(points) < _FURTHEST).all(axis=1)
+    good = (np.abs(points) < _MAX_COORDINATE).all(axis=1)
     return None, points[good], None if colors is None else colors[good]
 
 
 def _mesh(path: Path) -> Any:
-    """A file's triangles; None where there are none.
+    """Triangles of a file; None if it has none.
 
     Raises:
-        GsbaError: they have corners that are not there, or at no place.
+        GsbaError: corners of triangles are missing or not finite.
     """
     mesh = open3d().io.read_triangle_mesh(str(path), enable_post_processing=True)
     triangles, vertices = np.asarray(mesh.triangles), np.asarray(mesh.vertices)
     if not len(triangles):
         return None
     if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise GsbaError(f"{path}: has triangles whose corners are not there; export it again")
-    if not (np.abs(vertices) < _FURTHEST).all():
-        raise GsbaError(f"{path}: has corners that are no numbers or beyond {_FURTHEST:g} units")
+        raise GsbaError(f"{path} has triangles whose corners are missing: export it again")
+    if not (np.abs(vertices) < _MAX_COORDINATE).all():
+        raise GsbaError(
+            f"{path} has corners that are not finite or beyond {_MAX_COORDINATE:g} units: export "
+            "it again"
+        )
     if not mesh.get_surface_area() > 0:
-        raise GsbaError(f"{path}: its triangles have no surface")
+        raise GsbaError(f"{path}: the area of its triangles is 0: export it again")
     return mesh
 
 
@@ -224,36 +233,37 @@ def _of_laser(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     try:
         file = laspy.read(path)
         names = set(file.point_format.dimension_names)
-        with np.errstate(all="ignore"):  # what is no number then is left out
+        with np.errstate(all="ignore"):  # points that are not finite are left out later
             points = np.array(file.xyz, np.float64)
         seen = ("red", "green", "blue") if {"red", "green", "blue"} <= names else ("intensity",) * 3
         colors = np.stack([np.asarray(file[name], np.float64) for name in seen], axis=1)
-    except Exception as error:  # of the parser, each in its own words
-        why = " ".join(str(error).split()) or "damaged, or cut short"
-        raise GsbaError(f"{path}: cannot be read ({why})") from None
+    except Exception as error:  # the parser raises errors of many types
+        why = " ".join(str(error).split()) or "damaged or truncated"
+        raise GsbaError(f"{path}: cannot be read ({why}): copy or export it again") from None
     return points, colors / max(colors.max(initial=0), 1.0)
 
 
 def _offset(points: np.ndarray) -> np.ndarray:
-    """What is kept apart of large coordinates (3,)."""
+    """Offset (3,) that is split off large coordinates; 0 for others."""
     if not len(points):
         return np.zeros(3)
     middle = np.median(points, axis=0)
-    return np.round(middle, -2) if np.abs(middle).max() > _FAR else np.zeros(3)
+    large = np.abs(middle).max() > _MAX_FLOAT32_COORDINATE
+    return np.round(middle, -2) if large else np.zeros(3)
 
 
 def _thinned(cloud: Any, path: Path) -> Any:
-    """At most so many points, one for each cell that has some, and no two at one place.
+    """Cloud of at most `_MAX_POINTS` points, one for each occupied cell, without duplicates.
 
     Raises:
-        GsbaError: too few are left.
+        GsbaError: too few points are left.
     """
     points = np.asarray(cloud.points)
     cell = float(np.ptp(points, axis=0).max()) / 1000 if len(points) else 0.0
-    while cell and len(cloud.points) > _MOST_POINTS:
+    while cell and len(cloud.points) > _MAX_POINTS:
         cloud, cell = cloud.voxel_down_sample(cell), cell * 1.3
     cloud = cloud.remove_duplicated_points()
     num = len(cloud.points)
     if num < _MIN_POINTS:
-        raise GsbaError(f"{path}: holds {num} points at different places; a scan has {_MIN_POINTS}")
+        raise GsbaError(f"{path} holds {num} distinct points; registration needs {_MIN_POINTS}")
     return cloud

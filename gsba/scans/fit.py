@@ -1,4 +1,4 @@
-"""Point to plane with scale: a cloud onto a scan, robust, with covariance."""
+"""Point-to-plane alignment of a cloud to a scan: a similarity by a robust loss, with covariance."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -9,24 +9,24 @@ from gsba.scans.noise import LEAST_SIGMA, Noise, noise_of, residuals_of
 from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3
 
-_TIGHTER = 0.7  # of the width, from round to round
-_SETTLED = 1e-6  # of the size: a smaller step ends a round
-_FEW_STEPS, _MAX_STEPS = 3, 6  # of a width
-_LAST = 6  # rounds of the whole cloud, the width being what the residuals scatter by
-_SOME = 1200  # points before
-_CELLS = (8, 4, 2, 1)  # of a cloud's size: within, errors count as one
-_MEDIAN_NORMAL = 0.6745  # of |x|, x unit normal
+_WIDTH_RATIO = 0.7  # of the loss's width, from round to round
+_MIN_STEP = 1e-6  # part of the cloud's size; a smaller step ends a round
+_FEW_STEPS, _MAX_STEPS = 3, 6  # Gauss-Newton steps at one width, at first and at the end
+_NUM_FINAL_ROUNDS = 6  # rounds with the whole cloud and the estimated noise
+_NUM_COARSE_POINTS = 1200  # points of the cloud in the rounds before
+_CELLS_PER_SIZE = (8, 4, 2, 1)  # cell edges, as divisors of the cloud's size, for the covariance
+_MEDIAN_ABS_NORMAL = 0.6745  # median of |x|, x unit normal
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A similarity that carries a cloud onto a scan."""
+    """Similarity from a cloud to a scan, with noise and covariance."""
 
     similarity: Sim3  # scan = similarity of the cloud
     noise: Noise
-    covariance: np.ndarray  # (7, 7): turn (radians, axes of the scan), shift of the middle (unit of
-    # the scan), log scale
-    middle: np.ndarray  # (3,) float64, scan: what the turn and the scale leave in place
+    covariance: np.ndarray  # (7, 7): rotation (radians, axes of the scan), translation of `middle`
+    # (unit of the scan), log scale
+    middle: np.ndarray  # (3,) float64, scan: fixed point of the covariance's rotation and scale
 
     @property
     def sigmas(self) -> np.ndarray:
@@ -35,61 +35,65 @@ class Fit:
 
 
 def approach(start: Sim3, cloud: Cloud, scan: Scan, width: float) -> tuple[Sim3, float]:
-    """Some of the cloud onto the scan, and what the distances left scatter by.
+    """Align a part of the cloud to the scan; returns the similarity and the residuals' sigma.
 
-    Least squares of distances to the planes at the nearest points by Gauss-Newton, under
-    Geman-McClure's loss; it tightens from `width` to the scatter, so that what only one of both
-    shows loses its say.
+    Gauss-Newton minimises the distances to the planes at the nearest points under Geman-McClure's
+    loss. The loss narrows from `width` to the residuals' sigma, so that surfaces which only one of
+    both shows are outliers.
 
     Args:
-        start: near the answer: within some widths.
-        width: of the loss at first, unit of the scan.
+        start: initial similarity, within some widths of the result.
+        cloud, scan: point cloud and scan.
+        width: initial width of the loss, unit of the scan.
     """
     least = LEAST_SIGMA * scan.spacing
-    fit, some = start, cloud.taken(np.arange(0, len(cloud.points), -(-len(cloud.points) // _SOME)))
+    fit, some = (
+        start,
+        cloud.taken(np.arange(0, len(cloud.points), -(-len(cloud.points) // _NUM_COARSE_POINTS))),
+    )
     while True:
         fit = _settle(fit, some, scan, Noise(width), _FEW_STEPS)
         sigma = max(scatter(fit, some, scan, width), least)
         if width <= 1.5 * sigma:
             return fit, sigma
-        width = max(_TIGHTER * width, 1.2 * sigma)
+        width = max(_WIDTH_RATIO * width, 1.2 * sigma)
 
 
 def settle(start: Sim3, cloud: Cloud, scan: Scan, sigma: float) -> Fit:
-    """The whole cloud onto the scan, from nearby; see `approach`."""
+    """Align the whole cloud to the scan, from a start by `approach` with its `sigma`."""
     fit = start
-    for _ in range(_LAST):
+    for _ in range(_NUM_FINAL_ROUNDS):
         noise = noise_of(fit, cloud, scan, sigma)
         fit, sigma = _settle(fit, cloud, scan, noise, _MAX_STEPS), noise.sigma
     return _with_covariance(fit, cloud, scan, noise)
 
 
 def _settle(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise, most: int) -> Sim3:
-    """Steps of one width, until they no longer move anything."""
+    """Gauss-Newton steps at one noise, at most `most`, until they are negligible."""
     for _ in range(most):
         fit, moved = _step(fit, cloud, scan, noise)
-        if moved < _SETTLED * cloud.size * fit.scale:
+        if moved < _MIN_STEP * cloud.size * fit.scale:
             break
     return fit
 
 
 def scatter(fit: Sim3, cloud: Cloud, scan: Scan, width: float) -> float:
-    """Standard deviation of the distances to the planes, of points within three widths."""
+    """Robust standard deviation of the distances to the planes, of points within three widths."""
     _, nearest, off, gaps = residuals_of(fit, cloud, scan, 3 * width + scan.reach)
     near = (np.abs(off) < 3 * width) & (gaps < 3 * width + scan.reaches[nearest])
     near &= Noise(0.0).variances(fit, cloud, scan, nearest) < width**2
-    return float(np.median(np.abs(off[near])) / _MEDIAN_NORMAL) if near.sum() > 20 else width
+    return float(np.median(np.abs(off[near])) / _MEDIAN_ABS_NORMAL) if near.sum() > 20 else width
 
 
 class _Weighted(NamedTuple):
-    """A step's equations."""
+    """Weighted equations of a Gauss-Newton step."""
 
-    jacobians: np.ndarray  # (N, 7)
-    off: np.ndarray  # (N,) residuals
-    variances: np.ndarray  # (N,)
-    weights: np.ndarray  # (N,)
-    carried: np.ndarray  # (N, 3)
-    middle: np.ndarray  # (3,)
+    jacobians: np.ndarray  # (N, 7), of residuals by the step
+    off: np.ndarray  # (N,) residuals, unit of the scan
+    variances: np.ndarray  # (N,) of residuals
+    weights: np.ndarray  # (N,) of the robust loss, over variances
+    carried: np.ndarray  # (N, 3) transformed points of the cloud
+    middle: np.ndarray  # (3,) weighted mean of these
 
 
 def _weighted(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> _Weighted:
@@ -107,7 +111,7 @@ def _weighted(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> _Weighted:
 
 
 def _step(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> tuple[Sim3, float]:
-    """One step of Gauss-Newton, and how far it moves points at most."""
+    """Similarity after a Gauss-Newton step, and a bound of the points' motion by it."""
     jacobians, off, _, weights, _, middle = _weighted(fit, cloud, scan, noise)
     size = cloud.size * fit.scale
     units = np.array([1 / size] * 3 + [1.0] * 3 + [1 / size])
@@ -122,7 +126,8 @@ def _step(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> tuple[Sim3, floa
 
 
 def moved_by(fit: Sim3, step: np.ndarray, middle: np.ndarray) -> Sim3:
-    """The similarity followed by a turn (3), shift (3) and log scale around a point (3,)."""
+    """Similarity followed by a step (7,) around a point `middle` (3,): rotation vector, translation
+    and log scale."""
     from scipy.spatial.transform import Rotation
 
     turn, stretch = Rotation.from_rotvec(step[:3]).as_matrix(), float(np.exp(step[6]))
@@ -131,11 +136,11 @@ def moved_by(fit: Sim3, step: np.ndarray, middle: np.ndarray) -> Sim3:
 
 
 def _with_covariance(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> Fit:
-    """With the sandwich of clustered errors (Liang and Zeger, Biometrika 73, 1986).
+    """Fit with the sandwich covariance of clustered errors (Liang and Zeger, Biometrika 73, 1986).
 
-    What neighbours have in common (a piece of wall, a mistaken normal) is no independent evidence:
-    residuals of a cell count as one. How large cells must be is found by making them larger, as
-    Flyvbjerg and Petersen do (J. Chem. Phys. 91, 1989): the largest variances are taken.
+    Errors of neighbours (of a piece of wall, by a wrong normal) are correlated, so that the
+    residuals of a cell form one cluster. The size of cells is chosen as by Flyvbjerg and Petersen
+    (J. Chem. Phys. 91, 1989): of several sizes, the one with the largest variances is taken.
     """
     jacobians, off, variances, weights, carried, middle = _weighted(fit, cloud, scan, noise)
     gradients = jacobians * (weights * off)[:, None]
@@ -143,7 +148,7 @@ def _with_covariance(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> Fit:
     hessian = (jacobians * slopes[:, None]).T @ jacobians
     inverse = np.linalg.pinv(hessian, rcond=1e-14, hermitian=True)
     found = []
-    for part in _CELLS:
+    for part in _CELLS_PER_SIZE:
         cells = cells_of(carried, fit.scale * cloud.size / part)
         sums = np.zeros((cells.max() + 1, 7))
         np.add.at(sums, cells, gradients)
@@ -152,6 +157,6 @@ def _with_covariance(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> Fit:
 
 
 def cells_of(points: np.ndarray, edge: float) -> np.ndarray:
-    """Number (N,) of the cube of an edge that each point is in, from 0 on."""
+    """Number (N,), from 0, of the cubic cell with this edge that holds each point (N, 3)."""
     cubes = np.floor(points / edge).astype(np.int64)
     return np.unique(cubes, axis=0, return_inverse=True)[1].reshape(-1)

@@ -1,7 +1,7 @@
-"""Whether a cloud is where a similarity puts it in a scan: what is there, and what is in between.
+"""Evidence of a scan for and against a cloud's placement: surfaces at points and along rays.
 
-A point with a surface of the scan at it is explained. One whose ray meets a surface before it, or
-close behind it, is contradicted; one of which the scan shows nothing says nothing.
+A point on a surface of the scan is explained. A point is contradicted if its ray crosses a surface
+before it, or close behind it. Points where the scan has no surface are neutral.
 """
 
 from dataclasses import dataclass
@@ -14,51 +14,51 @@ from gsba.scans.noise import Noise, reach_of, residuals_of
 from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3
 
-SIGMAS = 3.0  # from its surface that an explained point may be
-_CELLS_ALONG = 400  # of the scan's grid along its extent, at most
-_BEYOND = 1.0  # of a cloud's size: how far behind a point surfaces contradict it
-_LEAST_SINE = 0.15  # of a ray to a surface that it crosses
-_LEAST_ALIKE = 100  # near points whose brightness can be compared
-_CELLS = (2, 4)  # to a cloud's size: points within share their luck
+SIGMAS = 3.0  # largest distance of an explained point from its surface, standard deviations
+_MAX_GRID_CELLS = 400  # along the scan's extent
+_MAX_BEHIND = 1.0  # part of the cloud's size: surfaces so far behind a point contradict it
+_MIN_SINE = 0.15  # of the angle between a ray and a surface that it crosses
+_MIN_BRIGHTNESS_POINTS = 100  # near points that a comparison of brightness needs
+_CELLS_PER_SIZE = (2, 4)  # cell edges, as divisors of the cloud's size, for the sign test
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What a scan says of a cloud's points, at a similarity."""
+    """Evidence of a scan on a cloud's points, at one similarity."""
 
-    explained: np.ndarray  # (N,) bool
-    contradicted: np.ndarray  # (N,) bool
-    told: np.ndarray  # (N,) bool: beside a surface, or hidden by one
-    logs: np.ndarray  # (N,) float64, of likelihoods of their distances over those of any others
-    cells: tuple[np.ndarray, ...]  # each (N,) int64: points nearby, in the cloud's own world
+    explained: np.ndarray  # (N,) bool, points on a surface
+    contradicted: np.ndarray  # (N,) bool, points that surfaces contradict
+    informed: np.ndarray  # (N,) bool, points with evidence: near a surface, or hidden by one
+    logs: np.ndarray  # (N,) float64, log likelihood ratios of their distances over uniform ones
+    cells: tuple[np.ndarray, ...]  # each (N,) int64: cell of each point, in the cloud's world
 
     @property
     def share(self) -> float:
-        """Of the cloud that is explained."""
+        """Share of the cloud's points that are explained."""
         return float(self.explained.mean())
 
     @property
     def agreement(self) -> float:
-        """Explained, of all that the scan says something about."""
-        said = self.explained.sum() + self.contradicted.sum()
-        return float(self.explained.sum() / max(said, 1))
+        """Share of explained points among explained and contradicted ones."""
+        known = self.explained.sum() + self.contradicted.sum()
+        return float(self.explained.sum() / max(known, 1))
 
     def doubt(self, other: "Verdict") -> float:
-        """P value of the lead over another placement: its chance, were the other as good.
+        """P value of the lead over another placement, if the other were as good.
 
-        Of Wilcoxon's signed ranks (Biometrics Bulletin 1, 1945) of log likelihood ratios by cell:
-        no piece of furniture has more than one say, however many points it has. Points are those
-        that both placements are told of, as what is missing in the scan at one place and not at
-        the other tells nothing. The largest for some sizes of cells is taken, as a lead that large
-        cells do not show may come from errors that small ones share.
+        It is by Wilcoxon's signed-rank test (Biometrics Bulletin 1, 1945) of log likelihood ratios,
+        summed by cell, so that a piece of furniture with many points counts once. Only points with
+        evidence in both placements count, as the scan may miss surfaces at one of them. The largest
+        p value over several sizes of cells is taken: a lead that large cells do not show may come
+        from errors that small cells share.
         """
-        both = self.told & other.told
+        both = self.informed & other.informed
         gains = (self.logs - other.logs)[both]
         return max(_chance(np.bincount(c[both], gains)) for c in self.cells)
 
 
 def _chance(gains: np.ndarray) -> float:
-    """P value of gains (C,) being no better than symmetric around zero."""
+    """P value of gains (C,) under a distribution that is symmetric around zero."""
     from scipy.stats import wilcoxon
 
     gains = gains[gains != 0]
@@ -68,12 +68,12 @@ def _chance(gains: np.ndarray) -> float:
 
 
 class Grid:
-    """Surfaces of a scan by cell: one point and normal in each."""
+    """Grid of a scan's surfaces: one point with its normal in each occupied cell."""
 
     def __init__(self, scan: Scan) -> None:
         extent = float(np.ptp(scan.points, axis=0).max())
-        self.edge = max(extent / _CELLS_ALONG, 5 * scan.spacing)
-        self.low = scan.points.min(axis=0) - 1.5 * self.edge  # around it nothing
+        self.edge = max(extent / _MAX_GRID_CELLS, 5 * scan.spacing)
+        self.low = scan.points.min(axis=0) - 1.5 * self.edge  # empty cells surround the scan
         self.shape = np.ceil((np.ptp(scan.points, axis=0)) / self.edge).astype(int) + 4
         self.rows = np.full(self.shape, -1, np.int32)
         at = self._cells(scan.points)
@@ -84,14 +84,14 @@ class Grid:
         return np.clip(((points - self.low) / self.edge).astype(np.int64), 0, self.shape - 1)
 
     def first_crossings(self, eyes: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Part (N,) of each way from an eye to an end at which it first crosses a surface.
+        """Part (N,) of each segment from an eye to an end at its first crossing of a surface.
 
-        Infinite where it crosses none.
+        Infinite for segments that cross none.
         """
         ways = ends - eyes
         lengths = np.linalg.norm(ways, axis=1)
         first = np.full(len(eyes), np.inf)
-        steps = int(min(np.ceil(lengths.max(initial=0) / (0.7 * self.edge)), 4 * _CELLS_ALONG))
+        steps = int(min(np.ceil(lengths.max(initial=0) / (0.7 * self.edge)), 4 * _MAX_GRID_CELLS))
         for k in range(1, steps + 1):
             part = np.minimum(k * 0.7 * self.edge / np.maximum(lengths, 1e-12), 1.0)
             open_ = np.flatnonzero(np.isinf(first) & (k * 0.7 * self.edge <= lengths))
@@ -101,7 +101,7 @@ class Grid:
             normals = self.scan.normals[rows]
             along = np.einsum("ni,ni->n", normals, ways[met])
             before = np.einsum("ni,ni->n", normals, self.scan.points[rows] - eyes[met])
-            steep = np.abs(along) > _LEAST_SINE * lengths[met]
+            steep = np.abs(along) > _MIN_SINE * lengths[met]
             met, crossing = met[steep], before[steep] / along[steep]
             here = np.abs(crossing - part[met]) * lengths[met] <= 2 * self.edge
             first[met[here]] = crossing[here]
@@ -109,10 +109,12 @@ class Grid:
 
 
 def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: Grid, noise: Noise) -> Verdict:
-    """What a scan says of a cloud.
+    """Evidence of a scan on a cloud.
 
     Args:
-        noise: of distances from explained points to their surface.
+        fit: similarity from the cloud to the scan.
+        cloud, scan, grid: point cloud, scan and the scan's grid.
+        noise: noise of distances from explained points to their surface.
     """
     carried, nearest, off, gaps = residuals_of(fit, cloud, scan)
     variances = noise.variances(fit, cloud, scan, nearest)
@@ -123,8 +125,8 @@ def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: Grid, noise: Noise) -> Ve
     eyes = fit.points(cloud.eyes)
     ways = carried - eyes
     lengths = np.maximum(np.linalg.norm(ways, axis=1), 1e-12)[:, None]
-    first = grid.first_crossings(eyes, carried + _BEYOND * size * ways / lengths)
-    first *= 1 + _BEYOND * size / lengths[:, 0]  # of the way to the point
+    first = grid.first_crossings(eyes, carried + _MAX_BEHIND * size * ways / lengths)
+    first *= 1 + _MAX_BEHIND * size / lengths[:, 0]  # relative to the distance of the point
     margins = (SIGMAS * sigmas + 2 * grid.edge) / lengths[:, 0]
     hidden = first < 1 - margins
     behind = (first > 1 + margins) & np.isfinite(first)
@@ -132,19 +134,20 @@ def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: Grid, noise: Noise) -> Ve
     near = here & (np.abs(off) <= reach)
     contradicted = ~explained & (hidden | behind | near)
     logs = np.where(near, noise.logs(off, variances, reach), np.log(1 - noise.inliers))
-    logs += _alike(cloud, scan, nearest, near)
-    told = near | hidden
-    cells = tuple(cells_of(cloud.points, cloud.size / part) for part in _CELLS)
-    return Verdict(explained, contradicted, told, np.where(told, logs, 0.0), cells)
+    logs += _brightness_logs(cloud, scan, nearest, near)
+    informed = near | hidden
+    cells = tuple(cells_of(cloud.points, cloud.size / part) for part in _CELLS_PER_SIZE)
+    return Verdict(explained, contradicted, informed, np.where(informed, logs, 0.0), cells)
 
 
-def _alike(cloud: Cloud, scan: Scan, nearest: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Log likelihood ratio (N,) of how alike near points and their surfaces are in brightness.
+def _brightness_logs(cloud: Cloud, scan: Scan, nearest: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Log likelihood ratio (N,) of the correlation of near points and surfaces in brightness.
 
-    Ranks of both, made normal, either are of one bivariate normal distribution or independent.
+    Ranks of both are transformed to normal scores. The hypotheses are a bivariate normal
+    distribution with their correlation, and independence.
     """
     logs = np.zeros(len(near))
-    if scan.brightness is None or near.sum() < _LEAST_ALIKE:
+    if scan.brightness is None or near.sum() < _MIN_BRIGHTNESS_POINTS:
         return logs
     a, b = _normal(cloud.brightness[near]), _normal(scan.brightness[nearest[near]])
     rho = float(np.clip(np.mean(a * b), 0.0, 0.95))
@@ -154,7 +157,7 @@ def _alike(cloud: Cloud, scan: Scan, nearest: np.ndarray, near: np.ndarray) -> n
 
 
 def _normal(values: np.ndarray) -> np.ndarray:
-    """Values (N,) made normal by their ranks, those alike sharing theirs."""
+    """Normal scores (N,) of values by their ranks; ties share their mean rank."""
     from scipy.stats import rankdata  # takes long to import
 
     return ndtri((rankdata(values) - 0.5) / len(values))

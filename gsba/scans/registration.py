@@ -1,4 +1,4 @@
-"""A cloud onto a scan: all that may be its place is tried, and what the scan says decides."""
+"""Registration of a cloud with a scan: all candidate placements are aligned and compared."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -19,37 +19,38 @@ from gsba.similarity import Sim3
 
 logger = logging.getLogger(__name__)
 
-_TRIED = 16  # candidates that are laid on the scan
-_JUDGED = 6  # of them, the likeliest, with all of the cloud
-_WIDTH = 0.08  # of the cloud's size: of the loss at first
-_STRAY = 1.2  # of a scale, from candidate to fit: more is a collapse
-_SAME = 0.05  # of the cloud's size: fits nearer than this are one
-_RIVALS = 0.8  # of the best one's share: placements that explain less are none
-_LEAST_SHARE = 0.25  # of the cloud, explained
-_LEAST_AGREEMENT = 0.75  # explained, of what the scan says something about
-_MOST_DOUBT = 0.01  # chance that a placement leads although another is as good, over all others
+_NUM_CANDIDATES = 16  # that are aligned to the scan
+_NUM_FINALISTS = 6  # best candidates, which are aligned with the whole cloud
+_INITIAL_WIDTH = 0.08  # of the loss, part of the cloud's size
+_MAX_SCALE_RATIO = 1.2  # of fit to candidate: a larger change is a collapse
+_MIN_DISTANCE = 0.05  # of distinct fits, part of the cloud's size
+_MIN_RIVAL_SHARE = 0.8  # of a rival's explained share to the best one's
+_MIN_SHARE = 0.25  # of explained points in the cloud
+_MIN_AGREEMENT = 0.75  # of explained points among explained and contradicted ones
+_MAX_DOUBT = 0.01  # largest p value of the lead over all rivals
 
 
 class NoPlacementError(GsbaError):
-    """A cloud has no place in a scan, or several."""
+    """A cloud fits a scan in no place, or in several."""
 
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Where a cloud is in a scan, and what speaks for it."""
+    """Placement of a cloud in a scan, and the evidence for it."""
 
     fit: Fit
     verdict: Verdict
-    rivals: int  # other placements that explain about as much
-    doubt: float  # p value of the lead over the nearest of them; 0 = there is none
-    rival: Sim3 | None = None  # that one
+    rivals: int  # number of other placements that explain about as much
+    doubt: float  # p value of the lead over the strongest rival; 0 = there is none
+    rival: Sim3 | None = None  # the strongest rival
 
     def __str__(self) -> str:
         found, sigmas = self.fit.similarity, self.fit.sigmas
-        lead = f", before the next at p = {self.doubt:.2g}" if self.rivals else ""
+        lead = f", better than the next placement at p = {self.doubt:.2g}" if self.rivals else ""
         return (
-            f"{100 * self.verdict.share:.0f} % of the cloud explained{lead}; scale "
-            f"{found.scale:.6g} to {100 * sigmas[6]:.2g} %, place to {max(sigmas[3:6]):.2g} units"
+            f"{100 * self.verdict.share:.0f} % of the cloud's points are on the scan{lead}; scale "
+            f"{found.scale:.6g} (sigma {100 * sigmas[6]:.2g} %), sigma of the position "
+            f"{max(sigmas[3:6]):.2g} units"
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -70,7 +71,7 @@ class Registration:
 
 @contextmanager
 def in_file(path: Path) -> Iterator[None]:
-    """Say which file a cloud has no place in."""
+    """Name the file in the message if registration fails."""
     try:
         yield
     except NoPlacementError as error:
@@ -78,35 +79,36 @@ def in_file(path: Path) -> Iterator[None]:
 
 
 def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registration:
-    """The similarity that carries a cloud onto a scan, if there is one and one only.
+    """Unique similarity from a cloud to a scan.
 
     Args:
-        guess: what is known beforehand; nothing else is tried.
+        cloud, scan: point cloud and scan.
+        guess: prior knowledge; only placements within it are tried.
 
     Raises:
         NoPlacementError: no placement explains enough, or several do about as well.
     """
     guess, grid = guess or Guess(), Grid(scan)
-    fits = _likeliest(cloud, scan, guess, grid, _JUDGED)
+    fits = _likeliest(cloud, scan, guess, grid, _NUM_FINALISTS)
     if not fits:
-        raise NoPlacementError("nothing in it resembles the run: " + _ADVICE)
-    noise = fits[0].noise  # one for all, so that their likelihoods compare
+        raise NoPlacementError("no part of the scan resembles the run: " + _ADVICE)
+    noise = fits[0].noise  # one for all, so that their likelihoods are comparable
     verdicts = [verdict(fit.similarity, cloud, scan, grid, noise) for fit in fits]
     doubts = np.array([[a.doubt(b) for b in verdicts] for a in verdicts])
-    shares = np.array([said.share for said in verdicts])
-    able = shares >= _RIVALS * shares.max()
+    shares = np.array([one.share for one in verdicts])
+    able = shares >= _MIN_RIVAL_SHARE * shares.max()
     worst = np.max(doubts, axis=1, where=able & ~np.eye(len(fits), dtype=bool), initial=0.0)
     best = int(np.argmin(np.where(able, worst, 2.0)))
     rivals = able & (np.arange(len(fits)) != best)
     next_ = int(np.argmax(np.where(rivals, doubts[best], -1.0)))
     rival = fits[next_].similarity if rivals.any() else None
     found = Registration(fits[best], verdicts[best], int(rivals.sum()), float(worst[best]), rival)
-    for n, (fit, said) in enumerate(zip(fits, verdicts, strict=True)):
+    for n, (fit, evidence) in enumerate(zip(fits, verdicts, strict=True)):
         logger.debug(
-            "scale %.5g: %.3f explained, %.3f contradicted, %.2g to be as good as the best",
+            "scale %.5g: %.3f explained, %.3f contradicted, p = %.2g of the best one's lead",
             fit.similarity.scale,
-            said.share,
-            said.contradicted.mean(),
+            evidence.share,
+            evidence.contradicted.mean(),
             doubts[best, n],
         )
     _check(found)
@@ -117,8 +119,8 @@ def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registrati
 
 
 def _likeliest(cloud: Cloud, scan: Scan, guess: Guess, grid: Grid, most: int) -> list[Fit]:
-    """Placements that explain most of a cloud, the best first."""
-    near = _laid(candidates(cloud, scan, guess, _TRIED), cloud, scan)
+    """Fits of the placements that explain most of a cloud, the best first, at most `most`."""
+    near = _aligned(candidates(cloud, scan, guess, _NUM_CANDIDATES), cloud, scan)
     noises = [noise_of(fit, cloud, scan, sigma) for fit, sigma in near]
     shares = [
         verdict(fit, cloud, scan, grid, noise).share
@@ -128,55 +130,58 @@ def _likeliest(cloud: Cloud, scan: Scan, guess: Guess, grid: Grid, most: int) ->
     return [settle(near[n][0], cloud, scan, noises[n].sigma) for n in order]
 
 
-_ADVICE = "check that it is of the same place, or tell where: --pairs, --gps or --up auto"
+_ADVICE = (
+    "check that it is of the same place, or start the alignment by --pairs, --gps or --up auto"
+)
 
 
 def _check(found: Registration) -> None:
-    said = found.verdict
-    if said.share < _LEAST_SHARE or said.agreement < _LEAST_AGREEMENT:
+    """Refuse a placement that explains too little."""
+    evidence = found.verdict
+    if evidence.share < _MIN_SHARE or evidence.agreement < _MIN_AGREEMENT:
         raise NoPlacementError(
-            f"no placement explains the run: the best has {100 * said.share:.0f} % of its points "
-            f"on the scan's surfaces, and {100 * said.contradicted.mean():.0f} % contradict it: "
-            + _ADVICE
+            f"no placement explains the run: in the best, {100 * evidence.share:.0f} % of its "
+            f"points are on the scan's surfaces, and {100 * evidence.contradicted.mean():.0f} % "
+            "contradict it: " + _ADVICE
         )
 
 
 def _check_handed(found: Registration, cloud: Cloud, scan: Scan, guess: Guess, grid: Grid) -> None:
-    """Refuse a scan that the cloud in a mirror fits better: it cannot be of the same place."""
+    """Refuse a scan that the mirrored cloud fits better: it cannot be of the same place."""
     twin, axis = cloud.mirrored(), guess.axis
     if axis is not None:
         axis = axis[0] * [-1, 1, 1], axis[1]
     for fit in _likeliest(twin, scan, Guess(scale=guess.scale, axis=axis), grid, 1):
-        said = verdict(fit.similarity, twin, scan, grid, found.fit.noise)
-        doubt = said.doubt(found.verdict)
-        logger.debug("in a mirror: %.3f explained, %.2g that it leads by chance", said.share, doubt)
-        if said.share > found.verdict.share and doubt < _MOST_DOUBT:
+        evidence = verdict(fit.similarity, twin, scan, grid, found.fit.noise)
+        doubt = evidence.doubt(found.verdict)
+        logger.debug("mirrored: %.3f explained, p = %.2g of its lead", evidence.share, doubt)
+        if evidence.share > found.verdict.share and doubt < _MAX_DOUBT:
             raise NoPlacementError(
-                "the run in a mirror fits better: the scan is of another building, or its world is "
+                "the mirrored run fits better: the scan is of another building, or its world is "
                 "left-handed: change the sign of one of its axes"
             )
 
 
 def _check_alone(found: Registration) -> None:
-    """Refuse a place that others explain as well."""
-    if found.rival is not None and found.doubt > _MOST_DOUBT / found.rivals:
+    """Refuse a placement whose lead over a rival is not significant."""
+    if found.rival is not None and found.doubt > _MAX_DOUBT / found.rivals:
         best = found.fit.similarity
         cosine = (np.trace(best.rotation.T @ found.rival.rotation) - 1) / 2
         turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         raise NoPlacementError(
-            f"several placements explain the run about equally: the best leads another, turned by "
-            f"{turn:.0f} deg at {found.rival.scale / best.scale:.3g} times the scale, at p = "
-            f"{found.doubt:.2g} only: tell where by --pairs or --gps, or by --up auto if one of "
-            "them is not upright; or give a scan with colours"
+            "several placements explain the run about equally: the lead of the best over another, "
+            f"rotated by {turn:.0f} deg at {found.rival.scale / best.scale:.3g} times the scale, "
+            f"has p = {found.doubt:.2g}: start the alignment by --pairs or --gps, or by --up auto "
+            "if one of them is not upright; or give a scan with colours"
         )
 
 
-def _laid(starts: Sequence[Sim3], cloud: Cloud, scan: Scan) -> list[tuple[Sim3, float]]:
-    """Distinct similarities that candidates lead to, and what distances scatter by at each."""
+def _aligned(starts: Sequence[Sim3], cloud: Cloud, scan: Scan) -> list[tuple[Sim3, float]]:
+    """Distinct similarities that candidates converge to, with the residuals' sigma at each."""
     near: list[tuple[Sim3, float]] = []
     for start in starts:
-        fit, sigma = approach(start, cloud, scan, _WIDTH * cloud.size * start.scale)
-        same = (distance(fit, other, cloud) < _SAME for other, _ in near)
-        if 1 / _STRAY < fit.scale / start.scale < _STRAY and not any(same):
+        fit, sigma = approach(start, cloud, scan, _INITIAL_WIDTH * cloud.size * start.scale)
+        same = (distance(fit, other, cloud) < _MIN_DISTANCE for other, _ in near)
+        if 1 / _MAX_SCALE_RATIO < fit.scale / start.scale < _MAX_SCALE_RATIO and not any(same):
             near.append((fit, sigma))
     return near

@@ -1,8 +1,8 @@
-"""Where a cloud may be in a scan, roughly: by directions that surfaces share, and by features.
+"""Candidate placements of a cloud in a scan, by the main axes of their surfaces.
 
-Rooms are told by their planes: both have the same axes, along which the profiles of surfaces
-correlate at one scale and shift. All ways to lay axes on axes are tried, so that rooms which look
-the same turned show it. What has no such planes is told by features.
+The planes of rooms give both the same main axes, along which the profiles of surfaces correlate at
+one scale and shift. All rotations that map axes to axes are tried, so that rooms with a symmetry
+give several candidates.
 """
 
 from collections.abc import Iterator
@@ -14,37 +14,37 @@ import numpy as np
 from gsba.scans.types import Cloud, Scan, size_of
 from gsba.similarity import Sim3
 
-_SCALES = (0.125, 2.5)  # of the ratio of both sizes: a cloud is rarely larger than its scan
-_STEP = 1.012  # from scale to scale
+_SCALE_RANGE = (0.125, 2.5)  # of the ratio of both sizes: a cloud is rarely larger than its scan
+_SCALE_STEP = 1.012  # ratio of successive scales
 _BINS = 512  # of a profile, over the scan's extent
-_AXIS_DEG = 12.0  # of normals from an axis that they are of
-_PEAKS = 4  # of a correlation, that are tried
-_KEPT = 150  # candidates by profiles, for each way to lay axes on axes
-_NEAR = 0.03  # of the cloud's size: how close a point must come to count for a candidate
-_POINTS = (80, 400)  # of the cloud that judge candidates, and then the better ones
-_TELLING = 300  # better ones
-_APART = 0.15  # of the cloud's size: nearer candidates are one
+_MAX_NORMAL_DEG = 12.0  # largest angle of a surface's normal to the axis of its profile
+_PEAKS = 4  # maxima of a correlation that are tried
+_CANDIDATES_PER_ROTATION = 150  # by profiles, for each rotation that maps axes to axes
+_MAX_SCORE_DISTANCE = 0.03  # of a scored point to a surface, part of the cloud's size
+_NUM_SCORE_POINTS = (80, 400)  # points of the cloud in the first and in the second scoring
+_NUM_SCORED = 300  # candidates that each scoring keeps
+_MIN_DISTANCE = 0.15  # of distinct candidates, part of the cloud's size
 
 
 @dataclass(frozen=True, slots=True)
 class Guess:
-    """What is known of a similarity beforehand; None = nothing."""
+    """Prior knowledge of a similarity; None = unknown."""
 
-    similarity: Sim3 | None = None  # near the answer in all
-    scale: float | None = None  # within a tenth
-    axis: tuple[np.ndarray, np.ndarray] | None = None  # unit vectors (3,), cloud and scan: one
-    # is carried to the other, to some degrees
-    rotation: np.ndarray | None = None  # (3, 3), to some degrees
+    similarity: Sim3 | None = None  # initial similarity, near the result
+    scale: float | None = None  # scale, known to a tenth
+    axis: tuple[np.ndarray, np.ndarray] | None = None  # unit vectors (3,) of cloud and scan: the
+    # similarity maps one to the other, to some degrees
+    rotation: np.ndarray | None = None  # (3, 3), known to some degrees
 
     def without(self, offset: np.ndarray) -> "Guess":
-        """For a scan whose offset (3,) is kept apart."""
+        """Guess for a scan whose offset (3,) is split off."""
         if self.similarity is None:
             return self
         near = self.similarity
         return replace(self, similarity=replace(near, translation=near.translation - offset))
 
     def allows(self, candidate: Sim3, turn_deg: float = 15.0) -> bool:
-        """Whether a similarity is none that is known to be wrong."""
+        """True if a similarity agrees with the known scale, axis and rotation."""
         least = np.cos(np.radians(turn_deg))
         if self.scale is not None and not 1 / 1.1 < candidate.scale / self.scale < 1.1:
             return False
@@ -56,16 +56,16 @@ class Guess:
 
 
 def candidates(cloud: Cloud, scan: Scan, guess: Guess, most: int) -> list[Sim3]:
-    """The likeliest similarities of a cloud and a scan, the best first, none twice."""
+    """Distinct candidate similarities from a cloud to a scan, the best first, at most `most`."""
     if guess.similarity is not None:
         return [guess.similarity]
     found = list(_by_axes(cloud, scan, guess))
-    for points in _POINTS:
+    for points in _NUM_SCORE_POINTS:
         scores = np.array([score(fit, cloud, scan, points) for fit in found])
-        found = [found[n] for n in np.argsort(-scores, kind="stable")[:_TELLING]]
+        found = [found[n] for n in np.argsort(-scores, kind="stable")[:_NUM_SCORED]]
     distinct: list[Sim3] = []
     for fit in found:
-        if all(distance(fit, other, cloud) > _APART for other in distinct):
+        if all(distance(fit, other, cloud) > _MIN_DISTANCE for other in distinct):
             distinct.append(fit)
         if len(distinct) == most:
             break
@@ -73,16 +73,16 @@ def candidates(cloud: Cloud, scan: Scan, guess: Guess, most: int) -> list[Sim3]:
 
 
 def distance(first: Sim3, second: Sim3, cloud: Cloud) -> float:
-    """How far two similarities carry the cloud's points apart at most, of the first's sizes."""
+    """Distance of two similarities: 90th percentile over the cloud's points, part of its size."""
     some = _some(cloud.points, 50)
     apart = np.linalg.norm(first.points(some) - second.points(some), axis=1)
     return float(np.quantile(apart, 0.9)) / (min(first.scale, second.scale) * cloud.size)
 
 
 def score(fit: Sim3, cloud: Cloud, scan: Scan, points: int = 400) -> float:
-    """Share of some of the cloud's points that have a surface of their normal nearby."""
+    """Mean score, 0 to 1, of a sample of the cloud's points near surfaces with similar normals."""
     rows = _rows(len(cloud.points), points)
-    reach = _NEAR * cloud.size * fit.scale
+    reach = _MAX_SCORE_DISTANCE * cloud.size * fit.scale
     gaps, nearest = scan.tree.query(fit.points(cloud.points[rows]), distance_upper_bound=reach)
     found = gaps < reach
     normals = scan.normals[np.asarray(nearest)[found]]
@@ -92,7 +92,7 @@ def score(fit: Sim3, cloud: Cloud, scan: Scan, points: int = 400) -> float:
 
 
 def _rows(num: int, most: int) -> np.ndarray:
-    """Some of so many, evenly (at random, by one seed)."""
+    """Random sample, with a fixed seed, of at most `most` rows of `num`, ascending."""
     return np.sort(np.random.default_rng(0).permutation(num)[:most])
 
 
@@ -101,7 +101,8 @@ def _some(points: np.ndarray, most: int) -> np.ndarray:
 
 
 def main_axes(normals: np.ndarray) -> np.ndarray:
-    """Rows (3, 3) of a right-handed frame: the direction most normals share, and the next."""
+    """Right-handed frame as rows (3, 3): the most frequent direction of normals, the most frequent
+    one perpendicular to it, and their cross product."""
     some = _some(normals, 4000)
     tried = _half_sphere(1500)
     votes = _votes(some, tried)
@@ -119,7 +120,7 @@ def _votes(normals: np.ndarray, tried: np.ndarray) -> np.ndarray:
 
 
 def _centred(normals: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """An axis moved to the middle of the normals around it."""
+    """Axis (3,) moved to the mean direction of the normals around it."""
     for _ in range(10):
         near = normals[np.abs(normals @ axis) > np.cos(np.radians(8))]
         if not len(near):
@@ -129,7 +130,7 @@ def _centred(normals: np.ndarray, axis: np.ndarray) -> np.ndarray:
 
 
 def _half_sphere(num: int) -> np.ndarray:
-    """Directions (num, 3) evenly over half the sphere (Fibonacci's lattice)."""
+    """Directions (num, 3) spread evenly over half the sphere (Fibonacci's lattice)."""
     z = (np.arange(num) + 0.5) / num
     turn = np.pi * (1 + np.sqrt(5)) * np.arange(num)
     flat = np.sqrt(1 - z * z)
@@ -137,7 +138,7 @@ def _half_sphere(num: int) -> np.ndarray:
 
 
 def _turns() -> Iterator[np.ndarray]:
-    """The 24 rotations (3, 3) that carry axes to axes."""
+    """Yield the 24 rotations (3, 3) that map axes to axes."""
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         turn = np.zeros((3, 3))
         turn[range(3), order] = signs
@@ -146,16 +147,16 @@ def _turns() -> Iterator[np.ndarray]:
 
 
 def _by_axes(cloud: Cloud, scan: Scan, guess: Guess) -> Iterator[Sim3]:
-    """Candidates whose profiles along common axes correlate best, so many for each turn of them."""
+    """Yield candidates whose profiles along common axes correlate best, for each rotation."""
     of_cloud, of_scan = main_axes(cloud.normals), main_axes(scan.normals)
     here, there = cloud.points @ of_cloud.T, scan.points @ of_scan.T
     middle, low = np.median(here, axis=0), there.min(axis=0)
     width = float(np.ptp(there, axis=0).max()) * 1.02 / _BINS
     if guess.scale is None:
-        low_scale, high_scale = np.array(_SCALES) * size_of(scan.points) / cloud.size
+        low_scale, high_scale = np.array(_SCALE_RANGE) * size_of(scan.points) / cloud.size
     else:
         low_scale, high_scale = guess.scale / 1.1, guess.scale * 1.1
-    scales = np.exp(np.arange(np.log(low_scale), np.log(high_scale), np.log(_STEP)))
+    scales = np.exp(np.arange(np.log(low_scale), np.log(high_scale), np.log(_SCALE_STEP)))
     profiles = [_profile(there[:, j] - low[j], scan.normals @ of_scan[j], width) for j in range(3)]
     spectra = np.fft.rfft(profiles, 2 * _BINS)
     values = np.zeros((3, 2, 3, len(scales), _PEAKS))  # by axis, its sign, and axis of the scan
@@ -173,7 +174,7 @@ def _by_axes(cloud: Cloud, scan: Scan, guess: Guess) -> Iterator[Sim3]:
         flips = (turn[range(3), axes] < 0).astype(int)
         x, y, z = (values[axes[j], flips[j], j] for j in range(3))
         sums = x[:, :, None, None] + y[:, None, :, None] + z[:, None, None, :]
-        for at in np.argsort(-sums, axis=None, kind="stable")[:_KEPT]:
+        for at in np.argsort(-sums, axis=None, kind="stable")[:_CANDIDATES_PER_ROTATION]:
             n, *peaks = (int(k) for k in np.unravel_index(at, sums.shape))
             shift = [shifts[axes[j], flips[j], j, n, peaks[j]] for j in range(3)]
             moved = of_scan.T @ np.array(shift) - scales[n] * rotation @ (of_cloud.T @ middle)
@@ -184,7 +185,7 @@ def _by_axes(cloud: Cloud, scan: Scan, guess: Guess) -> Iterator[Sim3]:
 
 
 def _peaks(correlated: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The highest maxima (A, _PEAKS) of cyclic correlations (A, 2 _BINS), and their shifts."""
+    """Highest maxima (A, _PEAKS) of cyclic correlations (A, 2 _BINS), and their shifts in bins."""
     higher = np.maximum(np.roll(correlated, 1, axis=1), np.roll(correlated, -1, axis=1))
     tops = np.where(correlated >= higher, correlated, -1.0)
     at = np.argsort(-tops, axis=1, kind="stable")[:, :_PEAKS]
@@ -192,8 +193,8 @@ def _peaks(correlated: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _profile(along: np.ndarray, cosines: np.ndarray, width: float) -> np.ndarray:
-    """Where along an axis surfaces square to it are (_BINS,), of unit length and mean zero."""
-    facing = np.abs(cosines) > np.cos(np.radians(_AXIS_DEG))
+    """Density (_BINS,) along an axis of surfaces perpendicular to it, of length 1 and mean 0."""
+    facing = np.abs(cosines) > np.cos(np.radians(_MAX_NORMAL_DEG))
     bins = (along[facing] / width).astype(np.int64)
     counts = np.bincount(bins[(bins >= 0) & (bins < _BINS)], minlength=_BINS).astype(np.float64)
     smooth = np.convolve(counts, [0.25, 0.5, 1, 0.5, 0.25], "same")

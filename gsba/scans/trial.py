@@ -1,6 +1,6 @@
-"""Scans read on trial by a process of its own, as damaged files crash the libraries that read them.
+"""Trial reading of scans in a separate process, as damaged files crash the reading libraries.
 
-What passes is read again by the process that wants it.
+The calling process reads a file again that passed.
 """
 
 import json
@@ -15,20 +15,20 @@ from pathlib import Path
 
 from gsba.log import GsbaError
 
-_FIRST_S, _BYTES_PER_S = 20.0, 1e6  # processor time that is enough, by the file's size
-_FIRST_MEMORY, _MEMORY_PER_BYTE = 2 << 30, 100  # bytes beside what the libraries take
+_BASE_CPU_S, _BYTES_PER_CPU_S = 20.0, 1e6  # limit of processor time, by the file's size
+_BASE_MEMORY_BYTES, _MEMORY_PER_BYTE = 2 << 30, 100  # limit of memory besides that of libraries
 _CHILD = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1])\n"
     "from gsba.scans.files import read_on_trial; read_on_trial(sys.argv[2])"
 )
-_REFUSED = 3  # exit code after a message
+_REFUSED = 3  # exit code of the process after it has printed a message
 
 
 def try_in_process(path: Path) -> None:
-    """Have another process read a scan, see `limited`.
+    """Read a scan in another process, see `limited`.
 
     Raises:
-        GsbaError: what it says of the file, or how it ended.
+        GsbaError: the file cannot be read, or the process crashed.
     """
     found = subprocess.run(
         [sys.executable, "-P", "-c", _CHILD, json.dumps(sys.path), str(path.absolute())],
@@ -36,45 +36,47 @@ def try_in_process(path: Path) -> None:
         capture_output=True,
     )
     torn = re.search(rb"RPly: [^\n]*", found.stderr)
-    if torn:  # of which open3d gives the part that it could read
-        said = torn[0].decode("ascii", "replace")
-        raise GsbaError(f"{path}: cannot be read to its end ({said}): copy or export it again")
+    if torn:  # open3d returns the part that it could read
+        cause = torn[0].decode("ascii", "replace")
+        raise GsbaError(f"{path}: cannot be read to its end ({cause}): copy or export it again")
     if found.returncode == 0:
         return
     if found.returncode == _REFUSED:
         raise GsbaError(found.stdout.decode("utf-8", "replace"))
-    how = f"exit {found.returncode}"
+    cause = f"exit {found.returncode}"
     if found.returncode < 0:
-        how = signal.Signals(-found.returncode).name
+        cause = signal.Signals(-found.returncode).name
         if -found.returncode == signal.SIGXCPU:
-            how = "too long for a file of this size"
+            cause = "it took too long for a file of this size"
     raise GsbaError(
-        f"{path}: cannot be read: the library that reads it crashed or was stopped ({how}); it is "
-        "damaged: copy or export it again"
+        f"{path}: cannot be read: the library that reads it crashed or was stopped ({cause}); the "
+        "file is damaged: copy or export it again"
     )
 
 
 def limited(path: Path, read: Callable[[Path], object]) -> None:
-    """Read a scan within the memory and processor time that its size allows, and end the process.
+    """Read a scan with limits on memory and processor time by its size, and end the process.
 
     Args:
-        path: of the scan.
-        read: called with it.
+        path: file of the scan.
+        read: function that is called with the path.
     """
     size, mapped = path.stat().st_size, int(Path("/proc/self/statm").read_text().split()[0])
-    memory = mapped * os.sysconf("SC_PAGE_SIZE") + _FIRST_MEMORY + _MEMORY_PER_BYTE * size
+    memory = mapped * os.sysconf("SC_PAGE_SIZE") + _BASE_MEMORY_BYTES + _MEMORY_PER_BYTE * size
     spent = sum(os.times()[:2])
     _lower(resource.RLIMIT_AS, memory)
-    _lower(resource.RLIMIT_CPU, int(spent + _FIRST_S + size / _BYTES_PER_S))
+    _lower(resource.RLIMIT_CPU, int(spent + _BASE_CPU_S + size / _BYTES_PER_CPU_S))
     _lower(resource.RLIMIT_CORE, 0)
-    code, said = 0, ""
+    code, message = 0, ""
     try:
         read(path)
     except GsbaError as error:
-        code, said = _REFUSED, str(error)
-    except BaseException as error:  # Rust's panics are no Exception
-        code, said = _REFUSED, f"{path}: cannot be read ({' '.join(str(error).split())})"
-    os.write(1, said.encode("utf-8", "replace"))
+        code, message = _REFUSED, str(error)
+    except BaseException as error:  # panics of Rust are no Exception
+        kind = "out of memory" if isinstance(error, MemoryError) else type(error).__name__
+        cause = " ".join(str(error).split()) or kind
+        code, message = _REFUSED, f"{path}: cannot be read ({cause}): copy or export it again"
+    os.write(1, message.encode("utf-8", "replace"))
     os._exit(code)
 
 

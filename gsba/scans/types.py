@@ -1,4 +1,4 @@
-"""What is registered: a run's cloud, and a scan of the same place."""
+"""Point cloud of a run, and scan of the same place, for registration."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -10,11 +10,11 @@ from scipy.spatial import KDTree
 from gsba.log import GsbaError
 from gsba.types import Reconstruction
 
-NEIGHBOURS = 24  # of a scan's point, that tell of the surface around it
+NEIGHBOURS = 24  # of a scan's point, through which its plane is fitted
 MIN_POINTS = 300  # of a cloud that can be registered
-_CHUNK = 50_000  # points looked up at once
-_RAYS = 3  # of a point: two meet anywhere
-_SURE = 0.02  # of the cloud's size: standard deviation of a point beyond which it is left out
+_POINTS_AT_ONCE = 50_000
+_MIN_RAYS = 3  # of a point: two wrong rays may also meet
+_MAX_POINT_SIGMA = 0.02  # of a used point, part of the cloud's size
 
 
 @dataclass(frozen=True)
@@ -25,59 +25,59 @@ class Scan:
     normals: np.ndarray  # (M, 3) float64, unit, of either sign
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) float64
     brightness: np.ndarray | None = None  # (M,) float64, of any scale; None = it has no colours
-    scatters: np.ndarray | None = None  # (M,) float64, standard deviations of neighbours about the
-    # plane of a point where they share none, else 0; None = 0 everywhere
+    scatters: np.ndarray | None = None  # (M,) float64, standard deviation of neighbours about a
+    # point's plane if they share none, else 0; None = 0 everywhere
 
     @cached_property
     def tree(self) -> KDTree:
-        """Of the points."""
+        """Tree of the points."""
         return KDTree(self.points)
 
     @cached_property
     def reaches(self) -> np.ndarray:
-        """How far (M,) around each point its plane holds: as far as its neighbours are."""
-        parts = np.array_split(self.points, -(-len(self.points) // _CHUNK))
+        """Radius (M,) of the plane around each point: the distance of its furthest neighbour."""
+        parts = np.array_split(self.points, -(-len(self.points) // _POINTS_AT_ONCE))
         some = min(NEIGHBOURS, len(self.points))
         return np.concatenate([self.tree.query(part, some)[0][:, -1] for part in parts])
 
     @cached_property
     def reach(self) -> float:
-        """That of all but the few sparsest places."""
+        """99th percentile of `reaches`."""
         return float(np.quantile(self.reaches, 0.99))
 
     def variances(self, rows: np.ndarray) -> np.ndarray:
-        """Of the planes at points, by index (N,), along their normals: where there is none."""
+        """Variances (N,) along the normal of the planes at points `rows` (N,)."""
         return np.zeros(len(rows)) if self.scatters is None else self.scatters[rows] ** 2
 
     @cached_property
     def spacing(self) -> float:
-        """Median distance of a point to its next."""
+        """Median distance of a point to its nearest neighbour."""
         some = self.points[:: max(1, len(self.points) // 5000)]
         return float(np.median(self.tree.query(some, 2)[0][:, 1]))
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """A run's points that rays determine well."""
+    """Points of a run with small covariances."""
 
     points: np.ndarray  # (N, 3) float64, map units
-    covariances: np.ndarray  # (N, 3, 3) float64, squared map units, poses being exact
-    eyes: np.ndarray  # (N, 3) float64: where a frame that sees each point was
-    rows: np.ndarray  # (N,) int64: which points of the reconstruction they are
+    covariances: np.ndarray  # (N, 3, 3) float64, squared map units, for exact poses
+    eyes: np.ndarray  # (N, 3) float64, position of a frame that observes each point, map units
+    rows: np.ndarray  # (N,) int64, rows of these points in the reconstruction
     normals: np.ndarray  # (N, 3) float64, unit, of either sign
     brightness: np.ndarray  # (N,) float64, of any scale
 
     @cached_property
     def size(self) -> float:
-        """See `size_of`."""
+        """Size of the cloud, see `size_of`."""
         return size_of(self.points)
 
     def at(self, points: np.ndarray) -> "Cloud":
-        """The same with its points elsewhere (N, 3)."""
+        """Cloud with its points moved to (N, 3)."""
         return replace(self, points=points)
 
     def mirrored(self) -> "Cloud":
-        """The same with x the other way: of a place that no turn makes into this one."""
+        """Cloud mirrored along x, which no rotation maps to this one."""
         flip = np.array([-1.0, 1, 1])
         return replace(
             self,
@@ -88,13 +88,13 @@ class Cloud:
         )
 
     def taken(self, rows: np.ndarray) -> "Cloud":
-        """Some of the points, by index (N',)."""
+        """Cloud of the points `rows` (N',)."""
         parts = ("points", "covariances", "eyes", "rows", "normals", "brightness")
         return replace(self, **{name: getattr(self, name)[rows] for name in parts})
 
 
 def size_of(points: np.ndarray) -> float:
-    """Root mean square distance of points (N, 3) from their middle, but for the outermost."""
+    """RMS distance of points (N, 3) from their median, without the 5 % furthest."""
     off = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     return float(np.sqrt(np.mean(off[off <= np.quantile(off, 0.95)] ** 2)))
 
@@ -102,16 +102,17 @@ def size_of(points: np.ndarray) -> float:
 def cloud_of(
     reconstruction: Reconstruction, normals_of: Callable[[np.ndarray], np.ndarray]
 ) -> Cloud:
-    """The points that rays determine to a fiftieth of the cloud's size.
+    """Cloud of the points whose sigma is below a fiftieth of the cloud's size.
 
-    A point's information is the sum over its rays of what is square to them, the noise of the
-    observation times the distance being the standard deviation.
+    A point's information is summed over its rays: each adds that of its two perpendicular
+    directions, with the noise of the observation times the distance as standard deviation.
 
     Args:
-        normals_of: unit normals (N, 3) of points (N, 3), by their neighbours.
+        reconstruction: the run.
+        normals_of: computes unit normals (N, 3) of points (N, 3) from their neighbours.
 
     Raises:
-        GsbaError: too few such points.
+        GsbaError: there are too few such points.
     """
     result, owners = reconstruction, reconstruction.observation_points
     centres = result.world_T_rigs[result.observation_frames, :3, 3]
@@ -127,7 +128,7 @@ def cloud_of(
     covariances = np.einsum("nij,nj,nkj->nik", axes, 1 / values, axes)
     first = np.searchsorted(owners, np.arange(len(result.points_world)))
     counts = np.bincount(owners, minlength=len(result.points_world))
-    seen = counts >= _RAYS
+    seen = counts >= _MIN_RAYS
     middle = np.minimum(first + counts // 2, max(len(owners) - 1, 0))
     every = np.flatnonzero(seen)
     cloud = Cloud(
@@ -139,10 +140,10 @@ def cloud_of(
         result.point_colors[every].mean(axis=1),
     )
     if len(every) >= MIN_POINTS:
-        cloud = cloud.taken(1 / np.sqrt(values[every, 0]) <= _SURE * cloud.size)
+        cloud = cloud.taken(1 / np.sqrt(values[every, 0]) <= _MAX_POINT_SIGMA * cloud.size)
     if len(cloud.points) < MIN_POINTS:
         raise GsbaError(
-            f"the run has {len(cloud.points)} points that its rays determine well; a scan needs "
-            f"{MIN_POINTS}"
+            f"the run has {len(cloud.points)} points with a sigma below "
+            f"{100 * _MAX_POINT_SIGMA:.0f} % of its size; alignment to a scan needs {MIN_POINTS}"
         )
     return replace(cloud, normals=normals_of(cloud.points))

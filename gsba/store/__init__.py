@@ -1,7 +1,7 @@
-"""A run's folder: results of stages under their keys, resumed, never half-written.
+"""Run folder: results of stages stored under keys, resumed, never half-written.
 
-Takes what a stage computes and all it depends on.
-Gives the stored result where that has not changed; a finished run, read back.
+Takes a stage's computation and all its inputs.
+Gives the stored result if no input has changed; a finished run, read back.
 """
 
 from gsba.store.finished import load_run

@@ -1,9 +1,8 @@
-"""Workers of a Dask scheduler, for `gsba.store.shards`: who they are, and what may happen to them.
+"""Workers of a Dask scheduler, for `gsba.store.shards`, and recovery from their failures.
 
-Workers get paths only, and share the run's disk. A shard's result is a file that is written beside
-its place and renamed into it, and is the same whoever makes it: a worker that dies, is lost from
-sight or is slow costs time, and nothing else. The scheduler is asked for a window of shards at a
-time, however many a job has.
+Workers get paths only, and share the run's disk. A shard's result is a file that is written
+atomically and does not depend on the worker, so that a worker that dies, disconnects or is slow
+costs only time. The scheduler gets a window of a job's shards at a time.
 """
 
 import importlib
@@ -46,25 +45,25 @@ _QUEUES = {  # kind of address -> module and class that starts workers
     "kubernetes": ("dask_kubernetes.operator", "KubeCluster"),
 }
 _ADDRESS = re.compile(r"(tcp|tls|wss?|ucx)://[^\s/:][^\s/]*")
-_AHEAD = 3  # shards for each thread that are written and asked for before they are needed
-_ATTEMPTS = 5  # at a shard that workers died on
-_LATE = 4.0  # times as long as others: a shard is given to another worker as well
-_LEAST_LATE_S = 60.0
-_LOOK_S = 5.0  # between looks at what is late
-_ANSWER_S = 20.0  # for a scheduler to answer at all
-_MOST_LOCAL, _MOST_QUEUED = 256, 100_000  # workers that may be asked for
-_SIGHT_S = 30.0  # for a disk shared by machines to show what another one has written
+_SHARDS_AHEAD_PER_THREAD = 3  # shards that are written and submitted before they are needed
+_MAX_ATTEMPTS = 5  # workers that may die on a shard
+_LATE_RATIO = 4.0  # of a shard's time over the median; a late shard is also given to another worker
+_MIN_LATE_S = 60.0  # shortest time after which a shard is late
+_POLL_S = 5.0  # between checks for late shards
+_SCHEDULER_TIMEOUT_S = 20.0  # for a scheduler's first answer
+_MAX_LOCAL, _MAX_QUEUED = 256, 100_000  # workers that may be requested
+_DISK_TIMEOUT_S = 30.0  # until a shared disk shows a file that another machine has written
 
 
 def hire(
     client: "Client | None", frames: Path, settings: RefineSettings
 ) -> Callable[[Path], Workers]:
-    """What makes the workers of a run, given the folder of its shards.
+    """Function that makes the workers of a run from the folder of its shards.
 
     Args:
-        client: of a scheduler; None = threads here.
-        frames: of the run, which workers read.
-        settings: of the run.
+        client: client of a scheduler; None = threads of this process.
+        frames: frames of the run, which workers read.
+        settings: settings of the run.
     """
 
     def make(folder: Path) -> Workers:
@@ -77,19 +76,19 @@ def hire(
 
 @contextmanager
 def hired(client: "Client | None", out: Path, frames: FrameSet) -> Iterator["Cluster | None"]:
-    """Workers who write what goes to `out`, with their shards beside it meanwhile.
+    """Workers that write to `out`; the folder of their shards lies beside it within this context.
 
     Args:
-        client: of a scheduler; None = nobody is hired.
-        out: a folder on a disk that workers share; it need not be there.
-        frames: which they read.
+        client: client of a scheduler; None = no workers.
+        out: folder on a disk that workers share; may be missing.
+        frames: frames that workers read.
     """
     if client is None:
         yield None
         return
     out = out.resolve()
     with disk_errors(out):
-        remove_unheld(out.parent.glob(f".{out.name}.shards-*"))  # of exports that were killed
+        remove_unheld(out.parent.glob(f".{out.name}.shards-*"))  # left by exports that were killed
         folder = out.with_name(f".{out.name}.shards-{uuid.uuid4().hex[:8]}")
         folder.mkdir(parents=True)
         lock = hold_folder(folder)
@@ -102,8 +101,7 @@ def hired(client: "Client | None", out: Path, frames: FrameSet) -> Iterator["Clu
 
 @contextmanager
 def connected(address: str | None) -> Iterator["Client | None"]:
-    """`connect` for as long as it lasts, workers that were started for it included; None for
-    none."""
+    """Client of the scheduler at an address; closed with the workers it started; None for None."""
     if address is None:
         yield None
         return
@@ -112,14 +110,14 @@ def connected(address: str | None) -> Iterator["Client | None"]:
     try:
         yield client
     finally:
-        with suppress(Exception):  # whatever is left of them
+        with suppress(Exception):  # workers or scheduler may have ended before
             client.close()
             if cluster is not None:
                 cluster.close()
 
 
 def connect(address: str) -> "Client":
-    """A client of the scheduler at an address, whose workers are started if they must be.
+    """Client of the scheduler at an address; starts workers for addresses with a number.
 
     Args:
         address: `tcp://HOST:PORT` (or `tls://`), a scheduler's file (`FILE.json`), `local:N` for N
@@ -127,7 +125,7 @@ def connect(address: str) -> "Client":
             `kubernetes:N` for N jobs as Dask's own configuration describes them.
 
     Raises:
-        GsbaError: no such scheduler, or a package that is not installed.
+        GsbaError: no scheduler answers, or a package is not installed.
     """
     try:
         from distributed import Client
@@ -135,15 +133,15 @@ def connect(address: str) -> "Client":
         raise GsbaError("--cluster needs Dask: pip install 'gsba[cluster]'") from None
     kind, _, count = address.partition(":")
     if kind == "local" or kind in _QUEUES:
-        most = _MOST_LOCAL if kind == "local" else _MOST_QUEUED
+        most = _MAX_LOCAL if kind == "local" else _MAX_QUEUED
         if not count.isdecimal() or len(count) > 9 or not 0 < int(count) <= most:
             raise GsbaError(
-                f"--cluster {address}: say how many workers, 1 to {most}, as in {kind}:8"
+                f"--cluster {address}: give the number of workers, 1 to {most}, as in {kind}:8"
             )
         return Client(_local(int(count)) if kind == "local" else _queued(kind, int(count)))
     try:
-        return Client(_scheduler_address(address), timeout=_ANSWER_S)
-    except Exception as error:  # of sockets, certificates and plugins, each in its own words
+        return Client(_scheduler_address(address), timeout=_SCHEDULER_TIMEOUT_S)
+    except Exception as error:  # sockets, certificates and plugins raise errors of their own types
         reason = brief(" ".join(str(error).split()) or type(error).__name__, 200)
         raise GsbaError(
             f"--cluster {address}: no scheduler answers there ({reason}); pass tcp://HOST:PORT, "
@@ -152,10 +150,10 @@ def connect(address: str) -> "Client":
 
 
 def _scheduler_address(address: str) -> str:
-    """Where a scheduler listens: as given, or as its file says.
+    """Address that a scheduler listens at: `address`, or the one in its file.
 
     Raises:
-        OSError, ValueError: there is no such file, or neither holds an address.
+        OSError, ValueError: the file is missing, or there is no valid address.
     """
     found: Any = address
     if address.endswith(".json"):
@@ -192,31 +190,31 @@ def _queued(kind: str, num: int) -> Any:
     try:
         cluster = make()
         cluster.scale(num)
-    except Exception as error:  # whatever a site's configuration lacks
+    except Exception as error:  # a site's configuration may be incomplete in many ways
         raise GsbaError(f"--cluster {kind}:{num}: {error}") from error
     return cluster
 
 
 @dataclass(slots=True)
 class _Shard:
-    """A part of a job on its way."""
+    """Part of a job that was submitted."""
 
     path: Path
     digest: str  # SHA-256 of its content
-    items: str  # what it holds, for people
-    futures: list["Future"]  # one, or twins of one that is late; none once it is finished
+    items: str  # title and range of its items, for messages
+    futures: list["Future"]  # one; two if the first is late; none once the shard is finished
 
 
 class Cluster:
     """Workers of a Dask scheduler that see the run's folder and its frames.
 
     Args:
-        client: of the scheduler.
-        folder: of shards, in the run's folder.
-        frames: of the run.
+        client: client of the scheduler.
+        folder: folder of shards, in the run's folder.
+        frames: frames of the run.
 
     Raises:
-        GsbaError: workers that do not see these, or have another version of gsba.
+        GsbaError: a worker does not see these, or has another version of gsba.
     """
 
     def __init__(self, client: "Client", folder: Path, frames: Path) -> None:
@@ -237,13 +235,15 @@ class Cluster:
         return Spent(self._cpu_seconds, dict(self._done))
 
     def at_most(self, num: int) -> "Cluster":
-        """Nothing is done in this process."""
+        """These workers: the limit is for this process, which does none of the work."""
         return self
 
     def must_see(self, paths: Sequence[Path]) -> None:
-        """See `gsba.store.shards.Workers`; versions are compared as well."""
+        """See `gsba.store.shards.Workers`; also compares versions of gsba."""
 
-        def ask(paths: list[str]) -> tuple[str, list[str]]:  # as text: gsba may be another there
+        def ask(
+            paths: list[str],
+        ) -> tuple[str, list[str]]:  # strings: gsba's types may differ there
             import os
 
             try:
@@ -266,25 +266,25 @@ class Cluster:
                 )
 
     def _results(self, job: Job[R]) -> Iterator[R]:
-        """Results of all items in order, a window of shards at work ahead of them."""
+        """Results of all items in order; a window of shards is submitted ahead of them."""
         blocks = list(job.blocks())
-        window = max(2, _AHEAD * sum(self._client.nthreads().values()))
-        asked: dict[int, _Shard] = {}
+        window = max(2, _SHARDS_AHEAD_PER_THREAD * sum(self._client.nthreads().values()))
+        submitted: dict[int, _Shard] = {}
         lasted: list[float] = []
         try:
             for n in range(len(blocks)):
                 for ahead in range(n, min(n + window, len(blocks))):
-                    if ahead not in asked:
-                        asked[ahead] = self._ask(job, *blocks[ahead])
-                yield from self._wait(asked[n], job.returns, lasted)
-                del asked[n]
+                    if ahead not in submitted:
+                        submitted[ahead] = self._submitted(job, *blocks[ahead])
+                yield from self._wait(submitted[n], job.returns, lasted)
+                del submitted[n]
         finally:
-            left = [future for shard in asked.values() for future in shard.futures]
-            with suppress(Exception):  # the scheduler may be what is lost
+            left = [future for shard in submitted.values() for future in shard.futures]
+            with suppress(Exception):  # the scheduler may be lost
                 self._client.cancel(left, force=True)
 
-    def _ask(self, job: Job[Any], start: int, stop: int) -> _Shard:
-        """A shard, asked for unless it is finished."""
+    def _submitted(self, job: Job[Any], start: int, stop: int) -> _Shard:
+        """Shard of items `start` to `stop`, submitted unless its result is stored."""
         part = job.part(start, stop)
         path, digest = shards.write_shard(part, self._folder)
         shard = _Shard(path, digest, f"{job.title}, {start} to {stop - 1}", [])
@@ -299,17 +299,19 @@ class Cluster:
         )
 
     def _wait(self, shard: _Shard, returns: Any, lasted: list[float]) -> tuple[Any, ...]:
-        """Results of a shard's items, whatever becomes of its workers.
+        """Results of a shard's items; replaces workers that die or are late.
 
         Args:
-            lasted: seconds that shards took so far; this one's is added.
+            shard: the shard.
+            returns: type of an item's result.
+            lasted: seconds that earlier shards took; this one's time is appended.
         """
         from distributed import wait
 
         began, died = time.monotonic(), 0
         while shard.futures:
             with suppress(TimeoutError):
-                wait(shard.futures, timeout=_LOOK_S, return_when="FIRST_COMPLETED")
+                wait(shard.futures, timeout=_POLL_S, return_when="FIRST_COMPLETED")
             for future in [future for future in shard.futures if future.done()]:
                 shard.futures.remove(future)
                 manifest = self._outcome(future, shard)
@@ -321,21 +323,21 @@ class Cluster:
                     lasted.append(manifest.seconds)
                     break
                 died += 1
-                if died == _ATTEMPTS:
+                if died == _MAX_ATTEMPTS:
                     raise StoppedError(
-                        f"every worker dies on {shard.items}: look for what ends it in its log; "
-                        "too little memory is the usual cause"
+                        f"{died} workers died on {shard.items}: look for the cause in their logs; "
+                        "too little memory is the usual one"
                     )
-                logger.warning("a worker died on %s: again", shard.items)
+                logger.warning("a worker died on %s: another one repeats it", shard.items)
                 shard.futures.append(self._submit(shard, None))
             self._help_if_late(shard, time.monotonic() - began, lasted)
         return self._load(shard, returns)
 
     def _outcome(self, future: "Future", shard: _Shard) -> Manifest | None:
-        """What a worker says of a shard; None = it died.
+        """Manifest of a shard from its worker; None = the worker died.
 
         Raises:
-            Exception: what went wrong on the worker, or with the scheduler.
+            Exception: the error of the worker or of the scheduler.
         """
         from distributed import KilledWorker
 
@@ -347,40 +349,40 @@ class Cluster:
         if error is not None:
             raise error
         raise StoppedError(
-            f"lost the scheduler during {shard.items}: run again; what is finished is kept"
+            f"lost the scheduler during {shard.items}: run again; finished work is kept"
         )
 
     def _help_if_late(self, shard: _Shard, seconds: float, lasted: list[float]) -> None:
-        """Give a shard that takes far longer than others to another worker as well."""
+        """Submit a shard that takes far longer than others to a second worker as well."""
         usual = statistics.median(lasted) if lasted else 0.0
-        if len(shard.futures) != 1 or seconds < max(_LEAST_LATE_S, _LATE * usual):
+        if len(shard.futures) != 1 or seconds < max(_MIN_LATE_S, _LATE_RATIO * usual):
             return
         if not self._client.nthreads():
-            logger.warning("no workers are left: waiting for new ones")
+            logger.warning("the scheduler has no workers left: waiting for new ones")
             return
         has = {worker for worker, keys in self._client.processing().items()
                if shard.futures[0].key in keys}  # fmt: skip
         others = [worker for worker in self._client.nthreads() if worker not in has]
         if has and others:
-            logger.warning("%s is late: given to another worker as well", shard.items)
+            logger.warning("%s is late: another worker computes it as well", shard.items)
             shard.futures.append(self._submit(shard, others))
 
     def _load(self, shard: _Shard, returns: Any) -> tuple[Any, ...]:
-        """What a worker has stored, as soon as this machine sees it."""
-        end = time.monotonic() + _SIGHT_S
+        """Results that a worker has stored, once this machine sees the file."""
+        end = time.monotonic() + _DISK_TIMEOUT_S
         while True:
             found = shards.load_shard(shard.path, returns)
             if found is not None:
                 return found
             if time.monotonic() > end:
                 raise GsbaError(
-                    f"{shards.result_path(shard.path)} is not here though a worker wrote it: put "
-                    "the run on a disk that workers share with this machine"
+                    f"a worker wrote {shards.result_path(shard.path)}, but this machine does not "
+                    "see it: put the run on a disk that workers share with this machine"
                 )
             time.sleep(0.2)
 
     def _check(self, frames: Path) -> None:
-        """Refuse workers that could not work, before any does."""
+        """Refuse workers that do not see the run's folder or frames, before they start."""
         if not self._client.nthreads():
             logger.info("waiting for workers")
             self._client.wait_for_workers(1)
@@ -391,7 +393,7 @@ class Cluster:
 
 
 def _leave_task() -> None:
-    """Give up the slot of the worker that this is called in, if any: shards may need it."""
+    """Leave the thread pool of the worker that calls this, if any: shards may need its slot."""
     from distributed import get_worker, secede
 
     try:
@@ -402,11 +404,11 @@ def _leave_task() -> None:
 
 
 def _prepare(client: "Client") -> None:
-    """Make workers, and those that join later, do as a run needs."""
+    """Configure memory and threads of all workers, those that join later included."""
     from distributed import WorkerPlugin
 
     class Settings(WorkerPlugin):
-        """No pauses for memory that belongs to compiled code; no threads within threads."""
+        """Turns off memory limits, which compiled code exceeds, and threads within threads."""
 
         name = "gsba"
 

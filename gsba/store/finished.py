@@ -1,4 +1,4 @@
-"""The result of a finished run, read back."""
+"""Reading of a finished run's result."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +12,11 @@ from gsba.types import FrameSet, Reconstruction
 
 
 def load_run(out: Path, map_number: int = 1) -> tuple[Reconstruction, FrameSet]:
-    """Result of a finished run and the frames it was made from, those of one map.
+    """One map of a finished run and its frames.
 
     Args:
         out: folder of the run.
-        map_number: which of its maps, 1 = the largest.
+        map_number: number of the map, 1 = the largest.
 
     Raises:
         GsbaError: `out` is no finished run, or was edited; there is no such map.
@@ -29,16 +29,22 @@ def load_run(out: Path, map_number: int = 1) -> tuple[Reconstruction, FrameSet]:
     frames = replace(frames, correction=reconstruction.correction, fisheyes=fisheyes)
     main, shown = one_map(reconstruction, frames, map_number, str(out))
     if not (np.isfinite(main.world_T_rigs).all() and np.isfinite(main.points_world).all()):
-        raise GsbaError(f"{out}: its poses or points are no numbers: refine again with --fresh")
+        raise GsbaError(f"{out}: its poses or points are not finite: refine again with --fresh")
     if not (np.isfinite(shown.timestamps).all() and (np.diff(shown.timestamps) > 0).all()):
-        raise GsbaError(f"{out}: its frames are in no order of time: refine again with --fresh")
+        raise GsbaError(f"{out}: its timestamps do not increase: refine again with --fresh")
     return main, shown
 
 
 def one_map(
     reconstruction: Reconstruction, frames: FrameSet, map_number: int, name: str
 ) -> tuple[Reconstruction, FrameSet]:
-    """A map of a reconstruction, 1 = the largest, and its frames; `name` it in a refusal.
+    """Map of a reconstruction, 1 = the largest, and its frames.
+
+    Args:
+        reconstruction: all maps.
+        frames: all frames.
+        map_number: number of the map.
+        name: name of the run in the message.
 
     Raises:
         GsbaError: there is no such map.
@@ -46,20 +52,20 @@ def one_map(
     num = reconstruction.num_maps
     if not 1 <= map_number <= num:
         raise GsbaError(
-            f"{name} has no map {map_number}: it has {num}, numbered from the largest, 1"
+            f"{name} has no map {map_number}: it has {num}, numbered from 1, the largest"
         )
     return reconstruction.of_map(map_number), frames.taken(reconstruction.frames_of_map(map_number))
 
 
 def load_lenses(out: Path, main: Reconstruction, map_number: int = 1) -> Lenses:
-    """What the frames of a finished run's map are stitched from, in that map's unit.
+    """Lenses of the frames of a finished run's map, in that map's unit; one centre if not two.
 
     Args:
         out: folder of the run.
         main, map_number: the map, as `load_run` gives it.
 
     Raises:
-        GsbaError: the run found two lenses, and does not hold them.
+        GsbaError: the run found two lenses, but their file is missing.
     """
     if main.lens_baseline is None:
         return ONE_CENTRE
@@ -71,12 +77,12 @@ def load_lenses(out: Path, main: Reconstruction, map_number: int = 1) -> Lenses:
 
 
 def lenses_of_map(lenses: Lenses, whole: Reconstruction, map_number: int) -> Lenses:
-    """The lenses of all frames, in the largest map's unit, for one map's frames, in its unit."""
+    """Lenses of one map's frames in its unit, from those of all frames in the largest map's."""
     return lenses.taken(whole.frames_of_map(map_number)).scaled(whole.map_scale(map_number))
 
 
 def _fit_together(reconstruction: Reconstruction, frames: FrameSet) -> bool:
-    """Whether arrays have the lengths that others speak of."""
+    """True if the lengths of arrays match, and indices are within these."""
     result, num = reconstruction, len(frames.names)
     points, seen = (sum(a.shape[:1]) for a in (result.points_world, result.observation_points))
     shapes = (
@@ -105,7 +111,7 @@ def _fit_together(reconstruction: Reconstruction, frames: FrameSet) -> bool:
 
 
 def _numbered(components: np.ndarray | None, scales: np.ndarray | None, num: int) -> bool:
-    """Whether each of `num` frames has a component, counted from 0, and each of these a scale."""
+    """True if each of `num` frames has a component, counted from 0, and each of these a scale."""
     if components is None:
         return scales is None
     numbers = np.unique(components)

@@ -1,7 +1,7 @@
-"""Who a run folder belongs to, who holds it, and which files in it are gsba's.
+"""Run folders: their inputs, their lock, and the list of files that gsba wrote.
 
-`RUN/gsba.json` names the inputs the run is about and lists the files gsba wrote, so that a folder
-of something else is refused and `--fresh` deletes nothing but our own.
+`RUN/gsba.json` names the inputs of the run and lists the files that gsba wrote, so that a folder
+of other content is refused and `--fresh` deletes only files of gsba.
 """
 
 import json
@@ -29,17 +29,17 @@ STAGES = "stages"  # subfolder of intermediate results; all of it is gsba's
 
 
 def open_run_folder(root: Path, origin: Mapping[str, Path], fresh: bool) -> int:
-    """Make or take over a run folder and hold it against other processes.
+    """Make or reopen a run folder and lock it against other processes.
 
     Args:
         root: the folder, made if missing.
-        origin: what the run is about, e.g. `{"frames": path, "trajectory": path}`.
-        fresh: delete what gsba wrote for an earlier run, whatever that was about.
+        origin: inputs of the run, e.g. `{"frames": path, "trajectory": path}`.
+        fresh: delete the files that gsba wrote for an earlier run of any inputs.
     Returns:
-        File descriptor of the lock: closing it (or dying) releases the folder.
+        File descriptor of the lock: closing it, or the end of the process, releases the folder.
     Raises:
-        GsbaError: the folder belongs to another run, to something else, or to a live process; it
-            holds links or pipes.
+        GsbaError: the folder is of another run, is no run, is locked by another process, or holds
+            links or pipes.
     """
     resolved = {name: str(path.resolve()) for name, path in origin.items()}
     with disk_errors(root):
@@ -67,7 +67,7 @@ def open_run_folder(root: Path, origin: Mapping[str, Path], fresh: bool) -> int:
 
 
 def is_run_folder(root: Path) -> bool:
-    """Whether gsba has ever taken this folder for a run."""
+    """True if the folder holds gsba's marker file of a run."""
     return (root / MARKER).is_file()
 
 
@@ -78,7 +78,7 @@ def refuse_foreign(root: Path) -> None:
 
 
 def claim(root: Path, path: Path) -> None:
-    """Note a file, or all files of a folder, as written by gsba into the run folder `root`."""
+    """List a file, or all files of a folder, as written by gsba into the run folder `root`."""
     marker = read_marker(root)
     files = (entry for entry in path.rglob("*") if entry.is_file()) if path.is_dir() else [path]
     names = {entry.relative_to(root).as_posix() for entry in files}
@@ -86,7 +86,7 @@ def claim(root: Path, path: Path) -> None:
 
 
 def read_marker(root: Path) -> dict[str, Any]:
-    """`gsba.json` as {"gsba": version, "origin": {...}, "wrote": [...]}; {} where there is none."""
+    """`gsba.json` as {"gsba": version, "origin": {...}, "wrote": [...]}; {} if missing."""
     path = root / MARKER
     try:
         marker = json.loads(path.read_text())
@@ -116,7 +116,7 @@ def _require_ours_or_empty(root: Path) -> None:
 
 
 def _remove_claimed(root: Path, marker: Mapping[str, Any]) -> None:
-    """Delete the files gsba wrote, then the folders this left empty."""
+    """Delete the files that gsba wrote, and then the folders that are empty."""
     with disk_errors(root):
         if (root / STAGES).exists():
             shutil.rmtree(root / STAGES)

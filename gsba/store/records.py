@@ -1,10 +1,10 @@
-"""Records on disk: one uncompressed `.npz` per record, typed on the way back, never pickled.
+"""Records on disk: one uncompressed `.npz` per record, checked against a type, never pickled.
 
 A record is any value built from numpy arrays, numbers, strings, paths, enums, None, tuples, string
 mappings and dataclasses of these. Arrays become members named after their place in the record
-(`points.npy`), everything else a JSON tree in `manifest.json`. Reading is driven by the type that
-the caller expects, so a file can neither name code to run nor smuggle in another type; the zip
-checksums reveal truncated or flipped bytes.
+(`points.npy`); all other values are a JSON tree in `manifest.json`. The type that the caller
+expects drives the reading, so that a file can neither name code to run nor have another type. The
+zip checksums reveal truncated or flipped bytes.
 """
 
 import json
@@ -37,11 +37,11 @@ class RecordError(Exception):
 
 
 def save_record(path: Path, value: object, info: Mapping[str, Any]) -> None:
-    """Store a record atomically, with a JSON-able `info` (key, timing) beside it.
+    """Store a record atomically, with a JSON-able `info` (key, timing).
 
     Raises:
-        TypeError: `value` holds something that is not record material.
-        GsbaError: the disk refuses.
+        TypeError: `value` holds a type that records cannot hold.
+        GsbaError: the disk cannot be written.
     """
     arrays: dict[str, np.ndarray] = {}
     manifest = {"format": FORMAT, "info": dict(info), "value": _encode(value, "", arrays)}
@@ -57,7 +57,7 @@ def save_record(path: Path, value: object, info: Mapping[str, Any]) -> None:
 
 
 def read_info(path: Path) -> dict[str, Any]:
-    """The `info` a record was saved with; RecordError where there is no readable one."""
+    """The `info` that a record was saved with; RecordError if it cannot be read."""
     with _reading(path) as archive:
         info = _manifest(archive)["info"]
         _require(isinstance(info, dict), info, dict)
@@ -82,7 +82,7 @@ def _reading(path: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(path) as archive:
             if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
-                raise ValueError("compressed, as no record is: it may unpack to any size")
+                raise ValueError("it is compressed, which no record is: it may unpack to any size")
             yield archive
     except (OSError, EOFError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise RecordError(f"{path}: {error}") from error  # trees and arrays of another shape
@@ -98,7 +98,7 @@ def _manifest(archive: zipfile.ZipFile) -> dict[str, Any]:
 
 
 def _encode(value: object, place: str, arrays: dict[str, np.ndarray]) -> Any:
-    """JSON tree of `value`; arrays go to `arrays` and leave their member name behind."""
+    """JSON tree of `value`, in which arrays are names of members; the arrays go to `arrays`."""
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, np.generic):
@@ -129,10 +129,10 @@ def _join(place: str, name: str) -> str:
 
 
 def typed(tree: Any, returns: type[T]) -> T:
-    """A record without arrays from its JSON tree.
+    """Record without arrays from its JSON tree.
 
     Raises:
-        RecordError: it is of another type.
+        RecordError: the tree is of another type.
     """
     try:
         return _decode(tree, returns, None)
@@ -141,7 +141,7 @@ def typed(tree: Any, returns: type[T]) -> T:
 
 
 def _decode(tree: Any, hint: Any, archive: zipfile.ZipFile | None) -> Any:
-    """Value of type `hint` from its JSON tree; RecordError where both disagree."""
+    """Value of type `hint` from its JSON tree; RecordError if the tree is of another type."""
     origin = get_origin(hint)
     if archive is not None and (hint is np.ndarray or origin is np.ndarray):
         with archive.open(tree) as member:
@@ -216,7 +216,7 @@ def _decode_dataclass(tree: Any, cls: type[T], archive: zipfile.ZipFile | None) 
 
 
 def _has_default(entry: Field) -> bool:
-    """Whether records written before the field was there can be read."""
+    """True if the field has a default, so that records from before it was added can be read."""
     return entry.default is not MISSING or entry.default_factory is not MISSING
 
 

@@ -1,9 +1,9 @@
-"""Work shared out by the frame: one interface, threads here or processes elsewhere.
+"""Parallel work on frames: one interface for threads of this process and remote workers.
 
-A job is items that can be worked on alone and in any order. What workers elsewhere get is a part
-of one: the path of a file in the run's folder that holds a block of items with what they need. They
-write what they found beside it, and send back who they are and what it cost. A part is named after
-its content, so that a block that is finished is never worked on again, whoever asks.
+A job is a set of items that are computed independently, in any order. Remote workers get a shard:
+the path of a file in the run's folder that holds a block of items with their inputs. They write the
+results beside it, and send back their name and the cost. A shard is named after its content, so
+that a finished block is never computed again.
 """
 
 import hashlib
@@ -33,19 +33,19 @@ from gsba.version import __version__
 R = TypeVar("R")
 R_co = TypeVar("R_co", covariant=True)
 
-BLOCK = 32  # consecutive frames that a worker elsewhere gets at a time
-ITEMS = 256  # pairs of frames at most
+BLOCK = 32  # consecutive frames in a shard
+ITEMS = 256  # most items, e.g. pairs of frames, in a shard
 
 
 class Job(Protocol[R_co]):
-    """Items that can be worked on alone and in any order, from any thread.
+    """Items that any thread can compute independently, in any order.
 
-    What is to travel can be pickled, and holds arrays, settings and paths, no pixels.
+    Parts for remote workers can be pickled, and hold arrays, settings and paths, no pixels.
     """
 
     @property
     def title(self) -> str:
-        """Beside the progress bar."""
+        """Text beside the progress bar."""
         ...
 
     @property
@@ -56,46 +56,46 @@ class Job(Protocol[R_co]):
     def __len__(self) -> int: ...
 
     def __call__(self, item: int, /) -> R_co:
-        """Work on one item, without threads of its own."""
+        """Result of one item, computed in the calling thread."""
         ...
 
     def blocks(self) -> Sequence[tuple[int, int]]:
-        """Runs of items, from start to before stop, that one worker should do."""
+        """Ranges of items, from start to before stop, each for one worker."""
         ...
 
     def part(self, start: int, stop: int, /) -> "Job[R_co]":
-        """These items alone, numbered from 0, with what they need."""
+        """Job of these items alone, numbered from 0, with their inputs."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Spent:
-    """What workers elsewhere have done so far."""
+    """Work that remote workers have done so far."""
 
     cpu_seconds: float = 0.0
-    shards: Mapping[str, int] = field(default_factory=dict)  # of each worker
+    shards: Mapping[str, int] = field(default_factory=dict)  # worker -> number of its shards
 
 
 class Workers(Protocol):
-    """Who works on jobs."""
+    """Threads or remote workers that compute jobs."""
 
     def map_shards(self, job: Job[R]) -> Iterator[R]:
-        """Result of each item, in order; the same to the byte whoever works."""
+        """Result of each item, in order; its bytes do not depend on the worker."""
         ...
 
     def spent(self) -> Spent:
-        """So far, elsewhere."""
+        """Work of remote workers so far."""
         ...
 
     def at_most(self, num: int) -> "Workers":
-        """The same, at so many items at a time in this process."""
+        """Workers that compute at most `num` items at a time in this process."""
         ...
 
     def must_see(self, paths: Sequence[Path]) -> None:
-        """Refuse workers that do not see these.
+        """Refuse workers that do not see these paths.
 
         Raises:
-            GsbaError: one does not.
+            GsbaError: a worker does not see a path.
         """
         ...
 
@@ -112,12 +112,12 @@ class Threads:
             running = deque(pool.submit(job, item) for item in range(len(job)))
             try:
                 for _ in track(range(len(job)), job.title):
-                    yield running.popleft().result()  # held no longer than it is used
+                    yield running.popleft().result()  # not kept after use
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)
 
     def spent(self) -> Spent:
-        """Nothing is done elsewhere."""
+        """No work: there are no remote workers."""
         return Spent()
 
     def at_most(self, num: int) -> "Threads":
@@ -125,47 +125,47 @@ class Threads:
         return Threads(min(self.num_threads, num))
 
     def must_see(self, paths: Sequence[Path]) -> None:
-        """This process sees them."""
+        """Accept all paths: this process sees them."""
 
 
 def blocks_of_frames(frames: np.ndarray) -> list[tuple[int, int]]:
-    """Runs of at most `ITEMS` items whose frames (N,), ascending, are of the same `BLOCK`."""
+    """Ranges of at most `ITEMS` items whose frames (N,), ascending, are of the same `BLOCK`."""
     cuts = np.flatnonzero(np.diff(frames // BLOCK)) + 1
     bounds = pairwise([0, *cuts.tolist(), len(frames)])
     return [(start, min(start + ITEMS, b)) for a, b in bounds for start in range(a, b, ITEMS)]
 
 
 def even_blocks(num: int, size: int = BLOCK) -> list[tuple[int, int]]:
-    """Runs of so many items."""
+    """Ranges of `size` items; the last may be shorter."""
     return [(start, min(start + size, num)) for start in range(0, num, size)]
 
 
 @dataclass(frozen=True, slots=True)
 class StoredRecords(Generic[R]):
-    """Records of frames, by number, as they lie in the run's folder."""
+    """Stored records of frames in the run's folder, by number."""
 
-    paths: Mapping[int, Path]
-    keys: Mapping[int, str]  # that they were saved with
-    returns: type[R]
+    paths: Mapping[int, Path]  # file of each record
+    keys: Mapping[int, str]  # key that each was saved with
+    returns: type[R]  # type of the records
 
     def __call__(self, number: int) -> R:
-        """One of them.
+        """Record of one frame.
 
         Raises:
-            GsbaError: it is not there, or is another one.
+            GsbaError: the file is missing, or has another key.
         """
         path = self.paths[number]
         try:
             if read_info(path).get("key") == self.keys[number]:
                 return load_record(path, self.returns)
         except RecordError as error:
-            raise GsbaError(f"{error}: run again to have it made anew") from error
+            raise GsbaError(f"{error}: run again to compute it again") from error
         raise GsbaError(f"{path} has changed while a run used it: run again")
 
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """What a worker sends back for a shard."""
+    """Answer of a worker that has computed a shard."""
 
     worker: str  # host and process
     seconds: float  # wall clock
@@ -177,11 +177,11 @@ def write_shard(job: Job[R], folder: Path) -> tuple[Path, str]:
 
     Args:
         job: the part.
-        folder: of shards, on a disk that workers share.
+        folder: folder of shards, on a disk that workers share.
 
     Returns:
-        Its file, whose result goes to `result_path` of it, and the SHA-256 of its content, which
-        `run_shard` is to be told by other ways than this disk.
+        Its file, whose result goes to `result_path` of it, and the SHA-256 of its content. The
+        digest must reach `run_shard` by another way than this disk.
     """
     content = f"{__version__}\n".encode() + _pickled(job)
     digest = hashlib.sha256(content).hexdigest()
@@ -191,23 +191,23 @@ def write_shard(job: Job[R], folder: Path) -> tuple[Path, str]:
 
 
 def result_path(shard: Path) -> Path:
-    """Where the result of a shard is."""
+    """File of a shard's result."""
     return shard.with_suffix(".npz")
 
 
 def run_shard(path: str, digest: str) -> Manifest:
-    """Work on a shard, and store what is found beside it; what a worker elsewhere calls.
+    """Compute a shard on a remote worker and store its results beside it.
 
-    A job can run any code, so that none is loaded but what the caller has made: anybody may have
-    written into the folder of a run that was copied from elsewhere.
+    Unpickling a job can run any code. The digest makes sure that the caller has written the job:
+    others may have written into the folder of a run that was copied.
 
     Args:
-        path: of the shard.
-        digest: SHA-256 of its content, as `write_shard` gave it to the caller.
+        path: file of the shard.
+        digest: SHA-256 of its content from `write_shard`.
 
     Raises:
-        GsbaError: a file that this worker does not see, one of another version of gsba, or one
-            that the caller has not written.
+        GsbaError: this worker does not see the file, the file is of another version of gsba, or
+            the caller has not written it.
     """
     shard, worker = Path(path), f"{socket.gethostname()}:{os.getpid()}"
     if not shard.exists():
@@ -215,19 +215,19 @@ def run_shard(path: str, digest: str) -> Manifest:
     wall, cpu = time.perf_counter(), time.thread_time()
     content = shard.read_bytes()
     if not hmac.compare_digest(hashlib.sha256(content).hexdigest(), digest):
-        raise GsbaError(f"{path} is not what this run wrote there: end what else writes to it")
+        raise GsbaError(f"{path} was changed after this run wrote it: end the other writer")
     version, _, pickled = content.partition(b"\n")
     if version != __version__.encode():
         raise GsbaError(f"worker {worker} has gsba {__version__}, the run has {version.decode()}")
     job = pickle.loads(pickled)
-    with freed_memory_kept():  # Dask has workers return it at once
+    with freed_memory_kept():  # Dask makes workers return freed memory at once
         results = tuple(job(item) for item in range(len(job)))
     save_record(result_path(shard), results, {"key": shard.stem})
     return Manifest(worker, time.perf_counter() - wall, time.thread_time() - cpu)
 
 
 def load_shard(shard: Path, returns: Any) -> tuple[Any, ...] | None:
-    """Results of a shard's items; None where there are none that can be used."""
+    """Results of a shard's items; None if there is no usable result."""
     try:
         path = result_path(shard)
         if read_info(path).get("key") == shard.stem:
@@ -238,7 +238,7 @@ def load_shard(shard: Path, returns: Any) -> tuple[Any, ...] | None:
 
 
 class _Pickler(pickle.Pickler):
-    """Values alone: equal ones give equal bytes, however they share their parts."""
+    """Pickler that gives equal values equal bytes, whether or not they share objects."""
 
     def reducer_override(self, obj: object) -> Any:
         if isinstance(obj, np.ndarray):
@@ -253,7 +253,7 @@ def _pickled(value: object) -> bytes:
 
 
 def content_digest(*values: object) -> str:
-    """SHA-256 of values that can be pickled, by what they hold."""
+    """SHA-256 of the content of values that can be pickled."""
     total = hashlib.sha256()
     _pickle(values, SimpleNamespace(write=total.update))
     return total.hexdigest()
@@ -261,7 +261,7 @@ def content_digest(*values: object) -> str:
 
 def _pickle(value: object, file: Any) -> None:
     pickler = _Pickler(file, protocol=5)
-    pickler.fast = True  # no references to what was seen before
+    pickler.fast = True  # no references to earlier objects
     pickler.dump(value)
 
 

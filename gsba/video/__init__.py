@@ -1,7 +1,7 @@
-"""360-degree video to frames: exact presentation times, the sharpest of each window.
+"""Extraction of frames from 360-degree video, with exact presentation times.
 
 Takes a video: 2:1, GoPro's `.360`, or raw of two fisheyes in two tracks, two files or side by side.
-Gives a folder of frames with their times, of raw videos one of each lens or track.
+Gives a folder of frames with their times; of raw videos, a folder for each lens or track.
 """
 
 from gsba.video.extraction import extract

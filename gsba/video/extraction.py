@@ -1,12 +1,12 @@
-"""Choose frames of a video and write them as images with their exact times.
+"""Extraction of chosen frames of a video as images with their exact times.
 
 `FRAMES/NNNNNN.jpg` is frame NNNNNN of the video, counted from 0; `timestamps.csv` gives the seconds
 since the first one. Of raw recordings, `FRAMES/front/NNNNNN.jpg` and `FRAMES/back/NNNNNN.jpg` are
-what the two lenses saw at one instant, chosen together, and NNNNNN counts frames of the front one;
-`factory_lenses.json` is their calibration by the maker, where the video holds one. Of GoPro's
-`.360`, `FRAMES/track0/NNNNNN.jpg` and `FRAMES/track5/NNNNNN.jpg` are both tracks alike.
-`extract.json` says what was asked for, so that the same call resumes and another one does not mix
-its frames in.
+the images of both lenses at one instant, and NNNNNN counts frames of the front one;
+`factory_lenses.json` is the maker's calibration, if the video holds one. Of GoPro's `.360`,
+`FRAMES/track0/NNNNNN.jpg` and `FRAMES/track5/NNNNNN.jpg` are the images of both tracks.
+`extract.json` holds the key of the settings, so that the same call resumes and another one does not
+mix its frames in.
 """
 
 import csv
@@ -52,45 +52,45 @@ logger = logging.getLogger(__name__)
 
 MARKER = "extract.json"
 TIMES = "timestamps.csv"
-_JOURNAL = "extract.partial.csv"  # what is there so far; gone when all is
+_JOURNAL = "extract.partial.csv"  # frames written so far; deleted when all are written
 _JPEG_QUALITY = 95
-_BLACK = 16  # grey value that a hundredth of the pixels exceeds unless lenses were covered
+_MAX_BLACK_LEVEL = 16  # grey value; 99 % of the pixels of a black image are at or below it
 
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    """A frame that was written."""
+    """Frame that was written."""
 
     name: str  # file name
     timestamp: float  # seconds since the first frame of the video
-    index: int  # of the frame in the video
-    standing: int  # windows left out by then because the camera stood
+    index: int  # number of the frame in the video
+    standing: int  # number of earlier windows that were left out because the camera stood
 
 
 def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = False) -> Counts:
-    """Write frames of a 360-degree video to a folder that `gsba.frames.scan` understands.
+    """Write frames of a 360-degree video to a folder that `gsba.frames.scan` reads.
 
-    Times count from the first frame shown; they are the container's presentation times, whatever
-    the frame rate does. A call that was interrupted goes on where it stopped.
+    Times are the container's presentation times since the first frame, also for variable frame
+    rates. An interrupted call resumes.
 
     Args:
-        video: H.264, H.265 or whatever else FFmpeg decodes: 2:1, GoPro's `.360`, or raw of two
+        video: H.264, H.265 or another codec that FFmpeg decodes: 2:1, GoPro's `.360`, or raw of two
             lenses (see `gsba.video.recording`), either file of a pair.
         out: folder of the frames, made if missing.
-        settings: which frames, and at what size (of raw recordings: of one lens's picture).
-        replace: put up with another extraction in `out`, and replace it.
+        settings: choice and size of the frames (of raw recordings: size of one lens's image).
+        replace: replace another extraction in `out`.
 
     Returns:
-        Frames in the asked range, those kept, and why the others were not.
+        Numbers of frames in the range, of kept frames, and of dropped ones by reason.
 
     Raises:
-        GsbaError: the video or the folder cannot be used; no frame is in the range.
+        GsbaError: the video or the folder cannot be used, or no frame is in the range.
     """
     trajectory = None if settings.at is None else Path(settings.at)
     if settings.at is not None and settings.sharpest:
-        raise GsbaError("--at names the very frames to keep: leave out --sharpest")
+        raise GsbaError("--at names the frames to keep: leave out --sharpest")
     if video.is_dir():
-        raise GsbaError(f"{video}: is a folder; give a video (frames need no extraction)")
+        raise GsbaError(f"{video} is a folder: give a video (frames need no extraction)")
     if not video.is_file():
         raise GsbaError(f"{video}: no such file")
     key = digest(__version__, settings, fingerprint([*files_of(video), trajectory]))
@@ -118,42 +118,42 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
     after, standing = _extract(recording, windows, out, settings, before)
     kept = before + after
     if not kept:
-        raise GsbaError(f"{video}: none of its pictures could be decoded; copy it again")
+        raise GsbaError(f"{video}: none of its frames could be decoded; copy it again")
     counts = _counts(received, windows, kept, standing)
     _write_times(out, kept)
     _write_marker(out, video, key, counts, recording.folders)
     (out / _JOURNAL).unlink(missing_ok=True)
-    why = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
-    logger.info("%s: kept %d of %d frames (%s)", out, counts.kept, received, why or "all")
+    dropped = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
+    logger.info("%s: kept %d of %d frames (%s)", out, counts.kept, received, dropped or "all")
     return counts
 
 
 def refuse_darkness(video: Path, recording: Recording, instants: Sequence[int]) -> None:
-    """Refuse a video of black pictures: the middle one, the first and the last are looked at.
+    """Refuse a video whose middle, first and last frames are black.
 
     Args:
         video: the file, for the message.
-        recording: what it shows.
-        instants: ascending, those that are `shown`.
+        recording: the recording.
+        instants: instants that are `shown`, ascending.
 
     Raises:
-        GsbaError: all that can be decoded of these are black.
+        GsbaError: all of these frames that can be decoded are black.
     """
     level = -1
     for row in dict.fromkeys([len(instants) // 2, 0, len(instants) - 1]):
         for _, pictures in shots(recording, [instants[row]]):
             level = max(level, *(int(np.percentile(each.luma(), 99)) for each in pictures))
-        if level > _BLACK:
+        if level > _MAX_BLACK_LEVEL:
             return
     if level >= 0:
         raise GsbaError(
-            f"{video}: its pictures are black (99 % of their pixels at or below {level} of 255): "
-            "was a lens covered? Nothing can be matched in them"
+            f"{video}: its frames are black (99 % of their pixels at or below {level} of 255) and "
+            "cannot be matched: check that the lenses were not covered"
         )
 
 
 def _keep_calibration(recording: Recording, out: Path) -> None:
-    """Write the maker's calibration that a video holds beside its frames."""
+    """Write the maker's calibration beside the frames, if the video holds one."""
     found = factory_calibration_of(recording)
     if found is not None:
         write_factory_calibration(out, found)
@@ -162,7 +162,7 @@ def _keep_calibration(recording: Recording, out: Path) -> None:
 def _windows(
     video: Path, recording: Recording, settings: VideoSettings
 ) -> tuple[list[np.ndarray], int]:
-    """Groups of frame indices of which one each is kept, and how many frames are in the range."""
+    """Groups of frame indices, of which one each is kept; and the number of frames in the range."""
     times = recording.times
     low, high = settings.from_s or 0.0, np.inf if settings.to_s is None else settings.to_s
     within = (times >= low - EXACT_S) & (times <= high + EXACT_S)
@@ -182,7 +182,7 @@ def _windows(
 
 
 def _nearest_to(path: Path, times: np.ndarray, inside: np.ndarray) -> list[np.ndarray]:
-    """The frame nearest to each time of a trajectory, where there is one within half a frame."""
+    """Frame nearest to each time of a trajectory, if it is within half a frame interval."""
     entries = read_trajectory(path).timestamps
     interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     after = np.clip(np.searchsorted(times[inside], entries), 1, max(len(inside) - 1, 1))
@@ -197,7 +197,7 @@ def _nearest_to(path: Path, times: np.ndarray, inside: np.ndarray) -> list[np.nd
             f"frame (0 to {times[-1]:.3f} s): give a trajectory on the video's clock"
         )
     if not met.all():
-        logger.warning("%s: %d of %d times meet no frame", path, np.sum(~met), len(met))
+        logger.warning("%s: %d of %d times have no frame", path, np.sum(~met), len(met))
     return [np.array([index]) for index in np.unique(nearest[met])]
 
 
@@ -209,8 +209,8 @@ def _check_end(video: Path, recording: Recording, to_s: float | None) -> None:
     if all(timeline.is_cut_short for timeline in recording.timelines):
         claimed = recording.timelines[0].claimed_s
         raise GsbaError(
-            f"{video}: claims to last {claimed:.1f} s, but its pictures end at "
-            f"{last:.3f} s: truncated; copy it again, or pass --to {last:.3f} to use what is there"
+            f"{video} claims to last {claimed:.1f} s, but its frames end at {last:.3f} s: it is "
+            f"truncated; copy it again, or pass --to {last:.3f} to use the part that exists"
         )
 
 
@@ -221,10 +221,10 @@ def _extract(
     settings: VideoSettings,
     before: list[_Kept],
 ) -> tuple[list[_Kept], int]:
-    """Decode, choose and write what comes after the frames kept `before`.
+    """Decode, choose and write the frames after those kept `before`.
 
     Returns:
-        the frames kept, and how many of all windows were left out because the camera stood.
+        the kept frames, and the number of all windows left out because the camera stood.
     """
     times, kept, last = recording.times, list[_Kept](), None
     standing = before[-1].standing if before else 0
@@ -252,7 +252,7 @@ def _extract(
 def _best_of_each(
     frames: Iterable[tuple[int, tuple[Picture, ...]]], windows: list[np.ndarray], sharpest: bool
 ) -> Iterator[tuple[int, tuple[Picture, ...]]]:
-    """The sharpest, or only, decoded frame of each window; of two lenses, by the mean of both."""
+    """Yield the sharpest, or only, decoded frame of each window, by the mean over its images."""
     window_of = {int(index): w for w, window in enumerate(windows) for index in window}
     for _, group in groupby(frames, key=lambda item: window_of[item[0]]):
         yield max(group, key=lambda item: _sharpness(item[1]) if sharpest else 0.0)
@@ -263,14 +263,16 @@ def _sharpness(pictures: tuple[Picture, ...]) -> float:
 
 
 def _small(pictures: tuple[Picture, ...], cube: bool) -> np.ndarray:
-    """Miniature of a panorama, of two lenses side by side, or of two tracks, one below the other:
-    all are about as many degrees across."""
+    """Miniature of a panorama, of two lenses side by side, or of two tracks one below the other.
+
+    All have about the same angular width.
+    """
     return miniature(np.concatenate([p.luma() for p in pictures], axis=0 if cube else 1))
 
 
 def _motion_deg(before: np.ndarray, after: np.ndarray, recording: Recording) -> float:
-    looked_at = lens_interior(after.shape[0]) if recording.lenses else None
-    return apparent_motion_deg(before, after, looked_at)
+    used = lens_interior(after.shape[0]) if recording.lenses else None
+    return apparent_motion_deg(before, after, used)
 
 
 def _flat(windows: list[np.ndarray]) -> list[int]:
@@ -278,7 +280,7 @@ def _flat(windows: list[np.ndarray]) -> list[int]:
 
 
 def _encoded(picture: Picture, width: int | None) -> bytes:
-    """A decoded picture as JPEG, narrower if asked."""
+    """JPEG of a decoded image, scaled to `width` if given."""
     import cv2
 
     pixels = picture.bgr()
@@ -299,7 +301,7 @@ def _counts(received: int, windows: list[np.ndarray], kept: list[_Kept], standin
 
 
 def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
-    """Make `out` ready; the counts of an equal extraction that is complete, else None."""
+    """Prepare `out`; counts of a complete extraction with the same key, else None."""
     if out.exists() and not out.is_dir():
         raise GsbaError(f"{out} is a file: choose another --out")
     with disk_errors(out):
@@ -315,7 +317,7 @@ def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
         lenses = next((names for names in known if list(names) == marker["lenses"]), LENSES[:0])
         same = marker["key"] == key
     except (OSError, ValueError, TypeError, KeyError, RecursionError, RecordError):
-        raise GsbaError(f"{out} is not empty and no extraction: choose another --out") from None
+        raise GsbaError(f"{out} is not empty and not an extraction: choose another --out") from None
     written = _read_times(out)
     folders = _folders(out, lenses)
     if same and (counts is None or all((f / n).is_file() for f in folders for n in written)):
@@ -334,7 +336,7 @@ def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
 
 
 def _folders(out: Path, lenses: Sequence[str]) -> list[Path]:
-    """Where the pictures of one instant go."""
+    """Folders of the images of one instant."""
     return [out / lens for lens in lenses] or [out]
 
 
@@ -344,9 +346,9 @@ def _remove_images(out: Path, lenses: Sequence[str], names: Sequence[str]) -> No
             (folder / Path(name).name).unlink(missing_ok=True)
     for folder in (out / lens for lens in lenses):
         for path in list(folder.glob("*.jpg")):
-            if re.fullmatch(r"\d{6,}", path.stem):  # of one lens alone, when a call was killed
+            if re.fullmatch(r"\d{6,}", path.stem):  # of one lens only, if a call was killed
                 path.unlink()
-        with suppress(OSError):  # missing, or of use to somebody
+        with suppress(OSError):  # the folder is missing, or holds other files
             folder.rmdir()
 
 
@@ -367,7 +369,7 @@ def _append(path: Path, kept: _Kept) -> None:
 
 
 def _read_journal(out: Path, lenses: Sequence[str]) -> list[_Kept]:
-    """Frames an interrupted call has written; a row cut off by a crash is none."""
+    """Frames that an interrupted call has written; a truncated row is ignored."""
     try:
         text = (out / _JOURNAL).read_text(encoding="utf-8")
     except FileNotFoundError:

@@ -1,16 +1,16 @@
-"""How sharp a panorama or a fisheye is, and whether it shows anything the one before did not."""
+"""Sharpness of panoramas and fisheyes, and apparent motion between successive ones."""
 
 import cv2
 import numpy as np
 
-_BAND = (0.2, 0.8)  # part of the height: neither poles, nor what holds the camera
-_SMALL = 512  # pixels across a miniature
-_CIRCLE = 0.44  # radius of what is surely within a fisheye's image circle, heights
-_EDGES = 0.2  # part of a miniature's pixels: those with the steepest gradient
+_BAND = (0.2, 0.8)  # used part of the height: without the poles and the carrier
+_MINIATURE_WIDTH = 512  # pixels
+_SAFE_RADIUS = 0.44  # of a disc within every fisheye's image circle, part of the height
+_EDGE_SHARE = 0.2  # of a miniature's pixels: those with the steepest gradient
 
 
 def sharpness(grey: np.ndarray) -> float:
-    """Mean squared Laplacian of a picture (H, W) uint8, lightly smoothed against noise."""
+    """Mean squared Laplacian of an image (H, W) uint8, slightly smoothed against noise."""
     height = len(grey)
     band = grey[int(_BAND[0] * height) : int(_BAND[1] * height)]
     fine = cv2.Laplacian(cv2.GaussianBlur(band, (3, 3), 0), cv2.CV_32F, ksize=1)
@@ -18,36 +18,40 @@ def sharpness(grey: np.ndarray) -> float:
 
 
 def miniature(grey: np.ndarray) -> np.ndarray:
-    """A panorama, or two fisheyes side by side, (H, 2H) uint8 `_SMALL` pixels across, float32."""
-    width = min(_SMALL, grey.shape[1])
+    """Miniature, float32, of a panorama or of two fisheyes side by side, (H, 2H) uint8."""
+    width = min(_MINIATURE_WIDTH, grey.shape[1])
     small = cv2.resize(grey, (width, width // 2), interpolation=cv2.INTER_AREA)
     return cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.0)
 
 
 def lens_interior(height: int) -> np.ndarray:
-    """Pixels (H, 2H) bool of two fisheyes side by side that are well within the image circles."""
+    """Pixels (H, 2H) bool of two fisheyes side by side that are within every image circle."""
     v, u = np.ogrid[:height, : 2 * height]
-    return np.hypot(u % height + 0.5 - height / 2, v + 0.5 - height / 2) < _CIRCLE * height
+    return np.hypot(u % height + 0.5 - height / 2, v + 0.5 - height / 2) < _SAFE_RADIUS * height
 
 
 def apparent_motion_deg(
-    before: np.ndarray, after: np.ndarray, looked_at: np.ndarray | None = None
+    before: np.ndarray, after: np.ndarray, used: np.ndarray | None = None
 ) -> float:
-    """Median normal flow between two miniatures, degrees: how far edges moved across themselves.
+    """Median normal flow between two miniatures, degrees.
 
-    Brightness constancy at the steepest pixels (Horn and Schunck, Artificial Intelligence 17,
-    1981), so that what moves before a standing camera, being the minority, does not count. Only
-    good for telling none from some: beyond a pixel it falls short. Two fisheyes side by side are
-    about as many degrees across as a panorama, of which `looked_at` (H, W) bool says where to look.
+    It follows from brightness constancy at the steepest pixels (Horn and Schunck, Artificial
+    Intelligence 17, 1981). By the median, objects that move before a standing camera do not count.
+    It only distinguishes motion from rest: flow of more than a pixel is underestimated. Two
+    fisheyes side by side have about the angular width of a panorama.
+
+    Args:
+        before, after: miniatures (H, W).
+        used: (H, W) bool, pixels to use; None = all.
     """
     height, width = before.shape
     rows = slice(int(_BAND[0] * height), int(_BAND[1] * height))
     gx = np.roll(before, -1, axis=1) - np.roll(before, 1, axis=1)
     gy = np.gradient(before, axis=0) * 2
     steepness = np.hypot(gx, gy)[rows] / 2
-    inside = np.ones(steepness.shape, bool) if looked_at is None else looked_at[rows]
+    inside = np.ones(steepness.shape, bool) if used is None else used[rows]
     steepness = np.where(inside, steepness, 0.0)
-    edges = steepness >= max(float(np.quantile(steepness, 1 - _EDGES)), 1e-6)
+    edges = steepness >= max(float(np.quantile(steepness, 1 - _EDGE_SHARE)), 1e-6)
     if not edges.any():
         return 0.0
     gain = float(np.median(((after[rows] + 1) / (before[rows] + 1))[inside]))  # of the exposure

@@ -1,11 +1,12 @@
-"""What a recording shows at each instant: a panorama, what each of two lenses saw, or a cube map.
+"""Layout of a recording: panoramas, images of two lenses, or a cube map at each instant.
 
-Raw recordings of two fisheyes come as one file with a track for each lens, as two files with `_00_`
-and `_10_` (GoPro Fusion: `GPFR` and `GPBK`) in their names, or as one track with both circles side
-by side, perhaps squeezed to 16:9. These layouts follow public descriptions (OpenSpeleo/insta360-rs,
-docs/INSV_FORMAT.md; insta.pk360.de on file types); two real files were at hand, one of them black.
-The first track, `_00_` and the left circle are taken for the front lens; pictures stay turned as
-the camera stores them. GoPro's `.360` holds two tracks of a cube map, see `gsba.video.cube_tracks`.
+Raw recordings of two fisheyes are one file with a track for each lens, two files with `_00_` and
+`_10_` (GoPro Fusion: `GPFR` and `GPBK`) in their names, or one track with both circles side by
+side, perhaps squeezed to 16:9. These layouts follow public descriptions (OpenSpeleo/insta360-rs,
+docs/INSV_FORMAT.md; insta.pk360.de on file types); they were tested on two real files, one of them
+black. The first track, `_00_` and the left circle are taken for the front lens; images keep the
+rotation in which the camera stores them. GoPro's `.360` holds two tracks of a cube map, see
+`gsba.video.cube_tracks`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,19 +27,19 @@ from gsba.video.timeline import Timeline, Track, bgr, decode, luma, read_timelin
 LENSES = ("front", "back")
 EXACT_S = 1e-6  # closer times are equal
 
-_RAW_SUFFIX = ".insv"  # of videos that show fisheyes even where no circle is seen
+_RAW_SUFFIX = ".insv"  # of videos that hold fisheyes even if no image circle is detected
 _STITCH = "stitch it in the camera's app and export an equirectangular (2:1) video"
-_NEARLY = 1.1  # longer side over the shorter, up to which a picture is nearly square
-_SHORT = 0.1  # part of the longer track's duration that the shorter may lack
+_MAX_SQUARE_RATIO = 1.1  # of the longer to the shorter side of a nearly square image
+_MAX_MISSING_SHARE = 0.1  # of the longer track's duration that the shorter one may lack
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A panorama, or what one lens saw; converted when asked for."""
+    """Panorama, or image of one lens; converted on access."""
 
     frame: Any  # av.VideoFrame
-    place: tuple[slice, slice]  # rows and columns of it in the frame
-    height: int | None = None  # pixels, to which squeezed rows are unsqueezed; None = as they are
+    place: tuple[slice, slice]  # its rows and columns in the frame
+    height: int | None = None  # pixels, to which a squeezed image is stretched; None = not squeezed
 
     def luma(self) -> np.ndarray:
         """Brightness (H, W) uint8."""
@@ -58,17 +59,18 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A video, or two, as instants: numbered and timed as the frames of the first track are."""
+    """One or two videos as instants, with numbers and times of the first track's frames."""
 
     tracks: tuple[Track, ...]  # (1), or (2) of front and back lens
     timelines: tuple[Timeline, ...]  # of the tracks
-    places: tuple[tuple[slice, slice], ...]  # of a panorama in a frame, or of two lenses' pictures
-    width: int  # pixels across a picture
+    places: tuple[tuple[slice, slice], ...]  # rows and columns of the panorama, or of both lenses'
+    # images, in a frame
+    width: int  # pixels across an image
     shown: np.ndarray  # (N,) bool, instants of which every track has a frame
     partners: np.ndarray  # (N,) int64, frame of the last track at instants that are `shown`
-    notes: tuple[str, ...] = ()  # what the video was taken for, and what of it is left out
-    cube: bool = False  # whether these are two tracks of an equi-angular cube map, not two lenses
-    height: int | None = None  # pixels, to which squeezed pictures are unsqueezed; None = none are
+    notes: tuple[str, ...] = ()  # recognised layout, and left-out parts
+    cube: bool = False  # True = two tracks of an equi-angular cube map, not two lenses
+    height: int | None = None  # pixels, to which squeezed images are stretched; None = not squeezed
 
     @property
     def times(self) -> np.ndarray:
@@ -77,20 +79,20 @@ class Recording:
 
     @property
     def lenses(self) -> tuple[str, ...]:
-        """Names of the lenses whose pictures these are; () for panoramas and cube maps."""
+        """Names of the lenses; () for panoramas and cube maps."""
         return LENSES if len(self.places) > 1 and not self.cube else ()
 
     @property
     def folders(self) -> tuple[str, ...]:
-        """Names of the pictures of an instant, where there are two."""
+        """Folders of the two images of an instant; () for panoramas."""
         return TRACKS if self.cube else self.lenses
 
 
 def files_of(video: Path) -> tuple[Path, ...]:
-    """The files of a recording of which one is given: it alone, or the front and the back lens's.
+    """Files of the recording that `video` is of: that file, or those of the front and back lens.
 
     Raises:
-        GsbaError: no video, or of a layout that is not read.
+        GsbaError: the file is no video, or has an unknown layout.
     """
     pair = lens_files(video)
     if pair is None or not all(path.is_file() for path in pair):
@@ -100,11 +102,11 @@ def files_of(video: Path) -> tuple[Path, ...]:
 
 
 def read_recording(video: Path) -> Recording:
-    """Find out what a video shows, and when.
+    """Recognise the layout of a video and read its times.
 
     Raises:
-        GsbaError: no video, no panorama, cube map or recording of two lenses, or one of lenses or
-            tracks that do not match.
+        GsbaError: the file is no video, holds neither panoramas nor a cube map nor two lenses, or
+            its lenses or tracks do not match.
     """
     files = files_of(video)
     size, *others = track_sizes(files[0])
@@ -127,15 +129,16 @@ def read_recording(video: Path) -> Recording:
 
 
 def factory_calibration_of(recording: Recording) -> FactoryCalibration | None:
-    """The maker's calibration that the files of a raw recording hold; None = there is none."""
+    """Maker's calibration in the files of a raw recording; None = there is none."""
     files = [track.path for track in recording.tracks]
     return factory_calibration(files, two_tracks=len(files) == 2 and files[0] == files[1])
 
 
 def shots(recording: Recording, chosen: Sequence[int]) -> Iterator[tuple[int, tuple[Picture, ...]]]:
-    """Yield (instant, its pictures) of chosen instants in order; damaged ones are left out.
+    """Yield (instant, its images) of chosen instants in order; damaged ones are left out.
 
     Args:
+        recording: the recording.
         chosen: ascending instants that are `shown`.
     """
     frames = decode(recording.tracks[0], recording.timelines[0], chosen)
@@ -159,13 +162,13 @@ def shots(recording: Recording, chosen: Sequence[int]) -> Iterator[tuple[int, tu
 
 
 def check_lengths(recording: Recording) -> None:
-    """Refuse lenses, or tracks, of which one was recorded for a clearly shorter time.
+    """Refuse a recording with one lens, or track, that is clearly shorter than the other.
 
     Raises:
-        GsbaError: so it is.
+        GsbaError: one is shorter.
     """
     lasting = [float(line.times[-1]) + line.interval_s for line in recording.timelines]
-    if min(lasting) >= (1 - _SHORT) * max(lasting):
+    if min(lasting) >= (1 - _MAX_MISSING_SHARE) * max(lasting):
         return
     short, long = int(np.argmin(lasting)), int(np.argmax(lasting))
     end = recording.times[recording.shown][-1]
@@ -175,53 +178,52 @@ def check_lengths(recording: Recording) -> None:
         ours, theirs = f"the {LENSES[short]} lens's pictures", f"the {LENSES[long]} one's"
     raise GsbaError(
         f"{recording.tracks[short].path}: {ours} last {lasting[short]:.3f} s, {theirs} "
-        f"{lasting[long]:.3f} s: one is cut short; copy it again, or pass --to {end:.3f} to use "
-        "what both show"
+        f"{lasting[long]:.3f} s: one is truncated; copy it again, or pass --to {end:.3f} to use "
+        "the part of both"
     )
 
 
 def _is_nearly_square(size: tuple[int, int]) -> bool:
-    return 0 < max(size) <= _NEARLY * min(size)
+    return 0 < max(size) <= _MAX_SQUARE_RATIO * min(size)
 
 
 def _check_pair(files: tuple[Path, ...], size: tuple[int, int]) -> None:
-    """Refuse two files that are no two lenses."""
+    """Refuse two files that are not of two lenses."""
     front, back = files
     if (sizes := track_sizes(back)) != [size]:
         shapes = " and ".join(f"{width}x{height}" for width, height in sizes)
         raise GsbaError(
-            f"{back}: is {shapes}, but {front.name}, the front lens's file, {size[0]}x{size[1]}: "
-            f"no pair; copy both again from the camera, or {_STITCH}"
+            f"{back} is {shapes}, but {front.name}, the front lens's file, is {size[0]}x{size[1]}: "
+            f"they are no pair; copy both again from the camera, or {_STITCH}"
         )
 
 
 def _check_tracks(video: Path, sizes: list[tuple[int, int]]) -> None:
-    """Refuse several tracks that are no two lenses."""
+    """Refuse several tracks that are not of two lenses."""
     (width, height), shapes = sizes[0], " and ".join(f"{w}x{h}" for w, h in sizes)
     if len(sizes) > 2:
         raise GsbaError(
-            f"{video}: holds {len(sizes)} video tracks, {shapes}; of two lenses there are two: "
-            f"{_STITCH}"
+            f"{video} holds {len(sizes)} video tracks, {shapes}; a recording of two lenses has "
+            f"two: {_STITCH}"
         )
     if sizes[0] != sizes[1]:
         raise GsbaError(
-            f"{video}: holds video tracks of {shapes}; those of two lenses are of one size: "
-            f"{_STITCH}"
+            f"{video} holds video tracks of {shapes}; those of two lenses have one size: {_STITCH}"
         )
     if width == 2 * height:
         raise GsbaError(
-            f"{video}: holds two video tracks that are 2:1 each ({shapes}), so stitched twice: "
-            f"keep one (ffmpeg -i {video.name} -map 0:v:0 -c copy ONE.mp4)"
+            f"{video} holds two stitched video tracks of 2:1 ({shapes}): keep one "
+            f"(ffmpeg -i {video.name} -map 0:v:0 -c copy ONE.mp4)"
         )
     if not _is_nearly_square(sizes[0]):
         raise GsbaError(
-            f"{video}: holds two video tracks of {width}x{height}, neither fisheyes (square) nor "
-            f"a panorama (2:1): {_STITCH}"
+            f"{video} holds two video tracks of {width}x{height}, which are neither fisheyes "
+            f"(square) nor panoramas (2:1): {_STITCH}"
         )
 
 
 def _check_panorama(video: Path, size: tuple[int, int]) -> None:
-    """Refuse what is not 2:1."""
+    """Refuse a video that is not 2:1."""
     width, height = size
     if width == 2 * height and height > 0:
         return
@@ -229,31 +231,31 @@ def _check_panorama(video: Path, size: tuple[int, int]) -> None:
     if pair is not None:
         other = pair[0] if video.name == pair[1].name else pair[1]
         raise GsbaError(
-            f"{video}: is {width}x{height}, one lens of a raw dual-fisheye recording, but "
+            f"{video} is {width}x{height}, one lens of a raw dual-fisheye recording, but "
             f"{other.name} is not beside it: copy the other lens's file there, or {_STITCH}"
         )
     if width == height and height > 0:
         raise GsbaError(
-            f"{video}: is {width}x{height}, square: one lens of a raw dual-fisheye recording, or "
+            f"{video} is {width}x{height}, square: one lens of a raw dual-fisheye recording, or "
             f"a stereo pair; {_STITCH}"
         )
     raise GsbaError(
-        f"{video}: is {width}x{height}; an equirectangular video is 2:1. If it is raw "
-        f"dual-fisheye or a flat cut of the recording, {_STITCH}"
+        f"{video} is {width}x{height}; an equirectangular video is 2:1. If it is raw "
+        f"dual-fisheye or a reframed cut of the recording, {_STITCH}"
     )
 
 
 def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
-    """Panoramas, or two lenses side by side.
+    """Recording of panoramas, or of two lenses side by side.
 
     Raises:
-        GsbaError: neither.
+        GsbaError: the track holds neither.
     """
     timeline = read_timeline(track)
     num, (width, height) = len(timeline.ticks), size
     found = _find_circles(track, timeline, size)
     if found.lens_size is None and track.path.suffix.lower() == _RAW_SUFFIX and may_hold_two(size):
-        note = f"{track.path}: raw, two fisheyes side by side, as its name says"
+        note = f"{track.path}: raw, two fisheyes side by side, by its suffix"
         found = SideBySide(lens_sizes(size)[0], (note,))
     everything = np.ones(num, bool), np.arange(num)
     if found.lens_size is None:
@@ -273,7 +275,7 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
 def _of_two_tracks(
     tracks: tuple[Track, Track], size: tuple[int, int], note: str, cube: bool = False
 ) -> Recording:
-    """Pair the frames of two lenses, or of the tracks of a cube map, by when they are shown."""
+    """Recording of two lenses, or of two tracks of a cube map, whose frames are paired by time."""
     one, other = TRACKS if cube else LENSES
     kind = "track" if cube else "lens"
     front, back = read_timeline(tracks[0]), read_timeline(tracks[1])
@@ -287,31 +289,31 @@ def _of_two_tracks(
     if not shown.any():
         raise GsbaError(
             f"{where}: the {'tracks' if cube else 'lenses'} share no times ({one} 0 to "
-            f"{ours[-1]:.3f} s, {other} {theirs[0]:.3f} to {theirs[-1]:.3f} s): not one "
-            "recording; copy it again from the camera"
+            f"{ours[-1]:.3f} s, {other} {theirs[0]:.3f} to {theirs[-1]:.3f} s): they are not of "
+            "one recording; copy it again from the camera"
         )
     notes, num = [note], int(shown.sum())
     if num < max(len(ours), len(theirs)):
         notes.append(
-            f"{where}: {len(ours) + len(theirs) - 2 * num} instants left out that one {kind} alone "
-            f"shows ({len(ours) - num} {one}, {len(theirs) - num} {other})"
+            f"{where}: {len(ours) + len(theirs) - 2 * num} instants are left out, which only one "
+            f"{kind} has ({len(ours) - num} {one}, {len(theirs) - num} {other})"
         )
     places, lines = ((slice(None), slice(None)),) * 2, (front, back)
     return Recording(tracks, lines, places, size[0], shown, nearest, tuple(notes), cube=cube)
 
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Index of the nearest of ascending times to each that is wanted, the earlier of two."""
+    """Index of the ascending time that is nearest to each wanted one, the earlier of two."""
     after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
     before = np.maximum(after - 1, 0)
     return np.where(np.abs(wanted - times[before]) <= np.abs(times[after] - wanted), before, after)
 
 
 def _find_circles(track: Track, timeline: Timeline, size: tuple[int, int]) -> SideBySide:
-    """Whether frames are two image circles side by side."""
+    """Layout of frames: two image circles side by side, or not."""
     num = len(timeline.ticks)
     middle = num // 2
     others = {(2 * i + 1) * num // (2 * LOOKED_AT) for i in range(LOOKED_AT)} - {middle}
-    parts = [middle], sorted(others)  # the middle one settles it for most panoramas
+    parts = [middle], sorted(others)  # for most panoramas the middle frame suffices
     greys = (luma(frame) for part in parts for _, frame in decode(track, timeline, part))
     return recognise(greys, size, track.path)

@@ -1,8 +1,8 @@
-"""A track of a video file: is it usable, when is each frame shown, and its frames in order.
+"""Track of a video file: its codec, its presentation times, and its decoded frames.
 
-PyAV decodes what FFmpeg does. The presentation times of all frames are read from the packets
-before a picture is decoded, so that frames are chosen on the exact timeline and only those groups
-of pictures are decoded in which one was chosen.
+PyAV decodes all formats of FFmpeg. The presentation times of all frames are read from the packets
+before a frame is decoded, so that frames are chosen on the exact timeline and only groups of
+pictures with a chosen frame are decoded.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,27 +18,27 @@ from gsba.log import GsbaError
 
 _SUFFIXES = {".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".ts", ".insv", ".360", ".lrv"}
 _UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
-_SLACK_S = 1.0  # a container may claim to be this much longer than its pictures
+_MAX_EXCESS_S = 1.0  # of the duration that a container claims over that of its frames
 
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """One of the video tracks of a file."""
+    """Video track of a file."""
 
     path: Path
-    number: int = 0  # among those that `track_sizes` gives
+    number: int = 0  # index in `track_sizes`
 
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """When the frames of a track are shown."""
+    """Presentation times of a track's frames."""
 
     ticks: np.ndarray  # (N,) int64, ascending presentation times in units of `tick_s`
     tick_s: Fraction  # seconds
     width: int  # pixels
     height: int  # pixels
     keyframes: np.ndarray  # (G,) int64, ascending ticks at which decoding can begin
-    seek_to: np.ndarray  # (G,) int64, where to seek for each of them, ticks of decoding time
+    seek_to: np.ndarray  # (G,) int64, seek position of each keyframe, ticks of decoding time
     claimed_s: float  # seconds from the first frame to the end that the container claims
 
     @property
@@ -49,18 +49,18 @@ class Timeline:
 
     @property
     def interval_s(self) -> float:
-        """Seconds between frames, the median; 1 where there is but one."""
+        """Median seconds between frames; 1 for a single frame."""
         return float(np.median(np.diff(self.times))) if len(self.ticks) > 1 else 1.0
 
     @property
     def is_cut_short(self) -> bool:
-        """Whether the pictures end clearly before the container claims: a truncated copy."""
+        """True if the frames end clearly before the duration that the container claims."""
         last = float((self.ticks[-1] - self.ticks[0]) * self.tick_s)
-        return self.claimed_s - last > max(_SLACK_S, 3 * last / len(self.ticks))
+        return self.claimed_s - last > max(_MAX_EXCESS_S, 3 * last / len(self.ticks))
 
 
 def is_video(path: Path) -> bool:
-    """Whether a path is a file with a video's suffix."""
+    """True if a path is a file with a video's suffix."""
     return path.suffix.lower() in _SUFFIXES and path.is_file()
 
 
@@ -68,28 +68,29 @@ def track_sizes(video: Path) -> list[tuple[int, int]]:
     """Width and height, pixels, of the video tracks of a file that can be decoded.
 
     Raises:
-        GsbaError: no video, or no decoder for it.
+        GsbaError: the file is no video, or there is no decoder for it.
     """
     with _opened(video) as (_, streams):
         return [(stream.width, stream.height) for stream in streams]
 
 
 def claimed_duration_s(video: Path) -> float | None:
-    """Seconds that the first track of a video claims to last; None = it does not state them.
+    """Duration that the first track of a video claims, seconds; None = not stated.
 
     Raises:
-        GsbaError: no video, or no decoder for it.
+        GsbaError: the file is no video, or there is no decoder for it.
     """
     with _opened(video) as (container, streams):
         return _claimed_end(container, streams[0])
 
 
 def container_tags(video: Path) -> dict[str, str]:
-    """Tags of a video's container by the last word of their names in small letters: QuickTime's
-    "com.apple.quicktime.model" is "model".
+    """Tags of a video's container by the last word of their names in lower case.
+
+    QuickTime's "com.apple.quicktime.model" is "model".
 
     Raises:
-        GsbaError: no video.
+        GsbaError: the file is no video.
     """
     with _opened(video) as (container, _):
         return {key.lower().rpartition(".")[2]: text for key, text in container.metadata.items()}
@@ -99,7 +100,7 @@ def read_timeline(track: Track) -> Timeline:
     """Presentation times of all frames of a track, from its packets alone.
 
     Raises:
-        GsbaError: no video, no decoder for it, or no pictures.
+        GsbaError: the file is no video, there is no decoder for it, or it holds no frames.
     """
     video = track.path
     with _opened(video) as (container, streams):
@@ -111,7 +112,7 @@ def read_timeline(track: Track) -> Timeline:
         ]
         packets = [(pts, dts, key) for pts, dts, key in packets if pts is not None]
         if not packets:
-            raise GsbaError(f"{video}: holds no pictures; copy or export it again")
+            raise GsbaError(f"{video} holds no frames: copy or export it again")
         ticks = np.unique([pts for pts, _, _ in packets])
         starts = sorted((pts, pts if dts is None else dts) for pts, dts, key in packets if key)
         last = float((ticks[-1] - ticks[0]) * stream.time_base)
@@ -129,6 +130,7 @@ def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[
     """Yield (index, av.VideoFrame) of chosen frames in order; damaged ones are left out.
 
     Args:
+        track, timeline: the track and its times.
         chosen: ascending indices into `timeline.ticks`.
     """
     av = _pyav()
@@ -147,7 +149,7 @@ def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[
                 try:
                     pictures = packet.decode()
                 except av.error.InvalidDataError:
-                    continue  # damaged: shows as a frame that never comes
+                    continue  # damaged: its frame is missing
                 for frame in pictures:
                     if frame.pts in wanted and not frame.is_corrupt:
                         yield wanted.pop(frame.pts), frame
@@ -161,7 +163,7 @@ def luma(frame: Any) -> np.ndarray:
 
 
 def bgr(frame: Any) -> np.ndarray:
-    """Colours (H, W, 3) uint8 BGR of an av.VideoFrame; what names no matrix is taken for BT.709."""
+    """Colours (H, W, 3) uint8 BGR of an av.VideoFrame; the default colour matrix is BT.709."""
     from av.video.reformatter import Colorspace
 
     matrix = Colorspace.ITU709 if int(frame.colorspace) == _UNSPECIFIED else None
@@ -182,16 +184,16 @@ def _pyav() -> Any:
 
 @contextmanager
 def _opened(video: Path) -> Iterator[tuple[Any, list[Any]]]:
-    """Container and its video streams; every failure of FFmpeg is one line."""
+    """Container and its video streams; errors of FFmpeg become GsbaError."""
     av = _pyav()
     try:
         with av.open(str(video), metadata_errors="replace") as container:
             streams = [s for s in container.streams.video if not _is_cover(s)]
             if not streams:
-                raise GsbaError(f"{video}: holds no video stream")
+                raise GsbaError(f"{video} holds no video stream")
             if streams[0].codec_context is None:
                 raise GsbaError(
-                    f"{video}: no decoder for its pictures; convert it to H.264 or H.265"
+                    f"{video}: there is no decoder for its codec; convert it to H.264 or H.265"
                 )
             yield container, [s for s in streams if s.codec_context is not None]
     except av.error.FFmpegError as error:
@@ -204,12 +206,12 @@ def _opened(video: Path) -> Iterator[tuple[Any, list[Any]]]:
 
 
 def _is_cover(stream: Any) -> bool:
-    """A still picture stored with the video."""
+    """True for a still image that is stored with the video."""
     return bool(stream.disposition & type(stream.disposition).attached_pic)
 
 
 def _claimed_end(container: Any, stream: Any) -> float | None:
-    """Seconds the container claims its pictures last."""
+    """Duration that the container claims for its frames, seconds; None = not stated."""
     if stream.duration is not None:
         return float(stream.duration * stream.time_base)
     return None if container.duration is None else container.duration / 1e6

@@ -1,4 +1,4 @@
-"""A finished run to walk around in, in the browser.
+"""Interactive 3D view of a finished run in the browser.
 
 Takes the folder of a run.
 Gives a page on a local port, until it is stopped.

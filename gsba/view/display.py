@@ -1,4 +1,4 @@
-"""What a browser shows of a scene, and the controls that change it."""
+"""Nodes of a scene in the browser, and the controls that change them."""
 
 import io
 from contextlib import redirect_stdout
@@ -17,23 +17,23 @@ from gsba.view.scene import Scene, faces_of, views_of
 if TYPE_CHECKING:
     import viser  # pyright: ignore[reportMissingImports]
 
-_BEFORE, _AFTER, _BAD = (217, 130, 43), (23, 105, 170), (192, 57, 43)  # as in report.html
+_BEFORE, _AFTER, _BAD = (217, 130, 43), (23, 105, 170), (192, 57, 43)  # colours of report.html
 _SEEN = (46, 125, 79)
 _JPEG_QUALITY = 85
 
 
 class View:
-    """A scene on a running server: what is shown, and the controls that change it.
+    """View of a scene on a running server, with its nodes and controls.
 
-    Nodes lie in the scene's world times `scale`, so that steps are about 1 where the world has no
-    unit of its own: viewers have fixed ideas of near and far.
+    Nodes are in the scene's world times `scale`, so that steps are about 1 if the world is not
+    metric: viewers have fixed near and far planes.
     """
 
     def __init__(self, server: "viser.ViserServer", scene: Scene, address: str) -> None:
         self.server, self.scene, self.address = server, scene, address
         self.scale = 1.0 if scene.unit == "m" else 1.0 / scene.step
-        self.size = self.scale * scene.step  # of a rig, as drawn
-        self.frame = -1  # shown one
+        self.size = self.scale * scene.step  # of a drawn rig
+        self.frame = -1  # shown frame
         self.nodes: dict[str, Any] = {}  # handles by name of the scene node
         self.controls: dict[str, Any] = {}  # handles by label
         self._faces: dict[str, Any] = {}
@@ -50,7 +50,7 @@ class View:
         self.show(0)
 
     def show(self, f: int) -> None:
-        """Put the pictures of a frame, and the points it sees, where the frame was."""
+        """Show the images of a frame at its pose, and the points that it observes."""
         with self._lock:
             masked = bool(self.controls["Masks"].value)
             if (f, masked) == (self.frame, self._masked):
@@ -65,8 +65,8 @@ class View:
                 self.controls["about"].content = self._about(f, problem)
 
     def stop(self) -> None:
-        """End the server, quietly."""
-        with redirect_stdout(io.StringIO()):  # viser says good-bye
+        """Stop the server without output."""
+        with redirect_stdout(io.StringIO()):  # viser prints a message
             self.server.stop()
 
     def _add_cloud(self) -> None:
@@ -94,7 +94,7 @@ class View:
             )
 
     def _add_paths(self) -> None:
-        """Lines through the poses before and after, and a pyramid that looks ahead in each rig."""
+        """Add lines through the poses before and after, and a forward-facing pyramid per rig."""
         world_T_rigs = self.scene.reconstruction.world_T_rigs
         coarse = self.scene.coarse_T_rigs
         self._add_line("/refined", world_T_rigs, _AFTER)
@@ -159,13 +159,13 @@ class View:
             self.controls["Number"] = slider
             self.controls["about"] = gui.add_markdown("")
             inside = gui.add_button(
-                "Stand inside", hint="Look out of the frame, into its pictures."
+                "Stand inside", hint="Move to the frame and look at its images from inside."
             )
             inside.on_click(lambda event: self._stand_inside(event.client))
-            whole = gui.add_button("See the whole run")
+            whole = gui.add_button("Show the whole run")
             whole.on_click(lambda event: self._stand_outside(event.client))
-            self._add_switch("Pictures", "/frame")
-            self._add_switch("Points it sees", "/seen")
+            self._add_switch("Images", "/frame")
+            self._add_switch("Observed points", "/seen")
             masks = gui.add_checkbox("Masks", False, visible=_has_masks(scene))
             masks.on_update(lambda _: self.show(self.frame))
             self.controls["Masks"] = masks
@@ -182,7 +182,7 @@ class View:
                 self._add_switch(f"Splat {splat.name}", f"/splat/{splat.name}")
 
     def _add_switch(self, label: str, name: str) -> None:
-        """A box that shows and hides a node; none where there is no such node."""
+        """Add a checkbox that shows and hides a node, if the node exists."""
         if name in ("/frame", "/seen"):  # made with the first frame
             visible = name == "/frame"
         elif name in self.nodes:
@@ -194,7 +194,7 @@ class View:
         self.controls[label] = box
 
     def _place_frame(self, f: int, faces: dict[str, np.ndarray]) -> None:
-        """Pictures around the rig, and the points that have observations in it."""
+        """Place images around the rig of a frame, and the points that it observes."""
         add, found = self.server.scene, self.scene.reconstruction
         world_T_rig = found.world_T_rigs[f]
         position = self.scale * world_T_rig[:3, 3]
@@ -213,11 +213,11 @@ class View:
             point_shape="circle",
             point_shading="flat",
             precision="float32",
-            visible=bool(self.controls["Points it sees"].value),
+            visible=bool(self.controls["Observed points"].value),
         )
 
     def _place_face(self, f: int, view: Face, image: np.ndarray | None) -> None:
-        """A picture where its view of a frame is; none where there is none."""
+        """Place the image of a view at its pose; remove it if `image` is None."""
         name, axes = view.name, self.scene.optics.lenses.axes
         if image is None:
             if name in self._faces:
@@ -235,7 +235,7 @@ class View:
             f"/frame/{name}",
             2 * np.arctan(tall),
             wide / tall,
-            scale=0.5 * self.size * np.cbrt(wide * tall),  # all pictures as far from their lens
+            scale=0.5 * self.size * np.cbrt(wide * tall),  # one distance from the lens for all
             thickness=0.006 * self.size,
             color=_AFTER,
             image=image,
@@ -259,15 +259,15 @@ class View:
             )
         if scene.coarse_T_rigs is not None:
             shift = scene.reconstruction.world_T_rigs[f, :3, 3] - scene.coarse_T_rigs[f, :3, 3]
-            rows.append(f"moved {np.linalg.norm(shift):.3g} {scene.unit} by refining")
-        return "\n\n".join([*rows, *([f"No picture: {problem}"] if problem else [])])
+            rows.append(f"moved {np.linalg.norm(shift):.3g} {scene.unit} by the refinement")
+        return "\n\n".join([*rows, *([f"No image: {problem}"] if problem else [])])
 
     def _where(self) -> str:
         return f"{self.scene.grounds} ({self.scene.unit})"
 
     def _select(self, f: int | None) -> None:
         if f is not None:
-            self.controls["Number"].value = int(f)  # which shows it
+            self.controls["Number"].value = int(f)  # its callback shows the frame
 
     def _resize_points(self, factor: float) -> None:
         self.nodes["/cloud"].point_size = 0.02 * self.size * factor
@@ -277,7 +277,7 @@ class View:
         camera.up, camera.position, camera.look_at = tuple(self.scene.up), position, centre
 
     def _outside(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where to stand to see the whole path, and its middle."""
+        """Camera position from which the whole path is visible, and the middle of the path."""
         positions = self.scale * self.scene.reconstruction.world_T_rigs[:, :3, 3]
         centre = (positions.min(axis=0) + positions.max(axis=0)) / 2
         extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), 2 * self.size)
@@ -311,7 +311,7 @@ def _has_masks(scene: Scene) -> bool:
 def _pyramid(length: float) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (5, 3) and triangles (4, 3) of a pyramid from the origin along z, without a base.
 
-    Who stands in its apex looks right through it.
+    A camera in its apex looks through it.
     """
     half = 0.6 * length
     corners = [[-half, -half, length], [half, -half, length], [half, half, length]]

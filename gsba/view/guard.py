@@ -1,9 +1,9 @@
-"""Who may talk to the server of a scene: the browser that was given its address, nobody else.
+"""Access control of a scene's server: only browsers that know the printed address get answers.
 
-Any web page that is open in the same browser can send requests to 127.0.0.1, and a name of its own
-that it lets point there makes it read the answers (DNS rebinding). So requests must name this
-machine as their host, must not come from a page of another origin, and must know the token that is
-part of the printed address.
+Any web page that is open in the same browser can send requests to 127.0.0.1, and can read the
+answers if its own host name resolves to that address (DNS rebinding). Requests must therefore name
+this machine as their host, must not come from a page of another origin, and must hold the token of
+the printed address.
 """
 
 import hmac
@@ -22,12 +22,12 @@ _HINT = "Forbidden: open the address that gsba view printed.\n"
 
 @contextmanager
 def guarded(token: str) -> Iterator[list[str]]:
-    """Servers that viser starts meanwhile answer only requests that know the token.
+    """Make servers that viser starts in this context answer only requests with the token.
 
-    viser offers no handler of requests, so that of its web server is wrapped.
+    viser has no hook for requests, so that the handler of its web server is wrapped.
 
     Yields:
-        the hosts of the servers that were started.
+        hosts of the servers that were started, filled within the context.
     """
     from websockets.asyncio import server
 
@@ -48,7 +48,7 @@ def guarded(token: str) -> Iterator[list[str]]:
 
 
 def allowed(hosts: list[str], origins: list[str], path: str, token: str) -> bool:
-    """Whether a request may be answered, by its headers `Host` and `Origin` and its path."""
+    """True if a request with these headers `Host` and `Origin` and this path may be answered."""
     if len(hosts) != 1 or len(origins) > 1 or _name(hosts[0]) not in _LOCAL:
         return False
     if origins and origins[0].lower() != f"http://{hosts[0].lower()}":
@@ -57,7 +57,7 @@ def allowed(hosts: list[str], origins: list[str], path: str, token: str) -> bool
 
 
 def _checked(token: str, process_request: Callable[..., Any] | None) -> Callable[..., Any]:
-    """A request handler of websockets that passes on what is allowed, without the token."""
+    """Request handler of websockets that passes allowed requests on, without the token."""
 
     def process(connection: "ServerConnection", request: "Request") -> "Response | None":
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
@@ -71,13 +71,13 @@ def _checked(token: str, process_request: Callable[..., Any] | None) -> Callable
 
 
 def _parted(path: str) -> tuple[str, str]:
-    """First part of a path, and the rest from its slash on."""
+    """First component of a path, and the rest from its slash on."""
     first, slash, rest = path.partition("?")[0].removeprefix("/").partition("/")
     return first, slash + rest or "/"
 
 
 def _name(host: str) -> str | None:
-    """Name of a `Host`, with any port: a tunnel may have another."""
+    """Host name of a `Host` header with any port, as a tunnel may have another; None = invalid."""
     try:
         parts = urlsplit(f"//{host}")
         return parts.hostname if parts.netloc == host and parts.username is None else None

@@ -1,4 +1,4 @@
-"""What there is to see of a finished run, as arrays in one world."""
+"""Scene of a finished run: its poses, points, images and splats in one world."""
 
 import json
 import logging
@@ -25,14 +25,14 @@ from gsba.types import FACES, FrameSet, Reconstruction
 
 logger = logging.getLogger(__name__)
 
-_MAX_FACE = 768  # pixels of a shown cube face
-_MASKED = np.array([192, 57, 43])  # what masks leave out is tinted in this colour
-_TINT = 0.6  # its share there
+_MAX_FACE_PX = 768  # of a shown cube face
+_MASK_RGB = np.array([192, 57, 43])  # colour of masked pixels
+_MASK_SHARE = 0.6  # of that colour in masked pixels
 
 
 @dataclass(frozen=True, slots=True)
 class Splat:
-    """Gaussians as viewers want them: without harmonics beyond the constant one."""
+    """Gaussians for a viewer, with the constant spherical harmonic only."""
 
     name: str
     means: np.ndarray  # (N, 3) float32, world of the scene
@@ -43,31 +43,30 @@ class Splat:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A run and what has been made of it, in one world."""
+    """Run with its splats and its comparison to a scan, in one world."""
 
     name: str
     frames: FrameSet
     reconstruction: Reconstruction  # refined poses and cloud
-    coarse_T_rigs: np.ndarray | None  # (F, 4, 4) float64 poses before; None = there were none
+    coarse_T_rigs: np.ndarray | None  # (F, 4, 4) float64 initial poses; None = there were none
     splats: tuple[Splat, ...]
     up: np.ndarray  # (3,) float64, unit
     unit: str  # of the world: "map units", "m", ...
-    grounds: str  # what places the world, for people
-    step: float  # median distance of neighbouring frames, > 0: how large to draw things
+    grounds: str  # source of the world's placement, for the terminal
+    step: float  # median distance of successive frames, > 0: size of drawn rigs
     optics: Optics = ONE_EYE  # of the frames, unit of the world
     judged: tuple[np.ndarray, np.ndarray] | None = None  # points (N, 3) and colours (N, 3) uint8
-    # by their distance to a scan; None = compared with none
+    # by their distance to a scan; None = not compared
 
 
 def load_scene(run: Path) -> Scene:
-    """Everything of a finished run that can be shown.
+    """Scene of a finished run's largest map.
 
-    Of several maps the largest is shown. Its world is that of the run's last export which placed it
-    elsewhere (upright, in metres, by GPS or truth), or else the run's own; splats in RUN/splat are
-    carried along.
+    Its world is that of the run's last export with a placement (upright, in metres, by GPS or
+    truth), or else the run's own. Splats in RUN/splat are transformed to it.
 
     Raises:
-        GsbaError: no finished run, or a splat or transform.json that cannot be read.
+        GsbaError: the folder is no finished run, or a splat or transform.json cannot be read.
     """
     reconstruction, frames = load_run(run)
     placement, grounds = _latest_placement(run)
@@ -96,7 +95,7 @@ def load_scene(run: Path) -> Scene:
 
 
 def _judged(run: Path, placed: Reconstruction) -> tuple[np.ndarray, np.ndarray] | None:
-    """What `gsba evaluate --scan` has found of the run's points, if they are still these."""
+    """Points and colours from `gsba evaluate --scan`; None if there are none for this cloud."""
     path = run / "scan.json"
     if not path.exists():
         return None
@@ -104,7 +103,7 @@ def _judged(run: Path, placed: Reconstruction) -> tuple[np.ndarray, np.ndarray] 
         found = json.loads(path.read_text(encoding="utf-8"))["points"]
         rows, distances = np.array(found["rows"], np.int64), np.array(found["distances"])
         if found["of"] != len(placed.points_world):
-            logger.warning("%s is of an earlier run: its colours are left out", path)
+            logger.warning("%s is of an earlier run, and is not shown: evaluate again", path)
             return None
         return placed.points_world[rows], colors_of(distances, found["furthest"])
     except (OSError, ValueError, KeyError, TypeError, IndexError):
@@ -117,20 +116,20 @@ _UPS = {"-y": np.array([0.0, -1, 0]), "y": np.array([0.0, 1, 0]), "z": np.array(
 def faces_of(
     frames: FrameSet, f: int, masked: bool, optics: Optics = ONE_EYE
 ) -> dict[str, np.ndarray]:
-    """The faces of a frame, by the names of the views that `views_of` has, uint8 RGB.
+    """Face images of a frame, uint8 RGB, by the names of the views of `views_of`.
 
     Args:
-        frames: panoramas or cube faces; faces that were never taken are left out.
-        f: the frame.
-        masked: tint what its mask leaves out.
-        optics: of the frames.
+        frames: panoramas or cube faces; missing faces are left out.
+        f: number of the frame.
+        masked: tint masked pixels.
+        optics: optics of the frames.
 
     Raises:
-        GsbaError: pictures that have vanished or changed since the run.
+        GsbaError: images are missing or have changed since the run.
     """
     if optics:
         return _lens_faces(frames, f, masked, optics)
-    rig = cubemap.native_rig(frames, _MAX_FACE)
+    rig = cubemap.native_rig(frames, _MAX_FACE_PX)
     images, use = cubemap.load(frames, f, rig)
     if masked and use is not None and frames.mask_paths[f] is not None:
         images = _tinted(images, use)
@@ -139,8 +138,8 @@ def faces_of(
 
 
 def views_of(frames: FrameSet, optics: Optics) -> tuple[View, ...]:
-    """What the shown pictures of a frame are."""
-    return optics.views(min(frames.native_face_size, _MAX_FACE))
+    """Views of a frame's shown images."""
+    return optics.views(min(frames.native_face_size, _MAX_FACE_PX))
 
 
 def _lens_faces(frames: FrameSet, f: int, masked: bool, optics: Optics) -> dict[str, np.ndarray]:
@@ -154,19 +153,20 @@ def _lens_faces(frames: FrameSet, f: int, masked: bool, optics: Optics) -> dict[
 
 
 def _tinted(image: np.ndarray, use: np.ndarray) -> np.ndarray:
-    """Pictures (..., 3) with what is not used (...) bool in another colour."""
-    tinted = np.round((1 - _TINT) * image + _TINT * _MASKED).astype(np.uint8)
+    """Images (..., 3) whose pixels outside of the mask `use` (...) bool are tinted."""
+    tinted = np.round((1 - _MASK_SHARE) * image + _MASK_SHARE * _MASK_RGB).astype(np.uint8)
     return np.where(use[..., None], image, tinted)
 
 
 def _shrunk(image: np.ndarray) -> np.ndarray:
-    if len(image) <= _MAX_FACE:
+    if len(image) <= _MAX_FACE_PX:
         return image
-    return cv2.resize(image, (_MAX_FACE, _MAX_FACE), interpolation=cv2.INTER_AREA)
+    return cv2.resize(image, (_MAX_FACE_PX, _MAX_FACE_PX), interpolation=cv2.INTER_AREA)
 
 
 def _latest_placement(run: Path) -> tuple[Placement, str]:
-    """Where the run's latest export that moved it has put the world; else nowhere else."""
+    """Placement of the run's latest export of map 1 that has one, else the identity; and its
+    source."""
     files = sorted(run.glob("*/transform.json"), key=lambda path: path.stat().st_mtime_ns)
     for path in reversed(files):
         placement = read_placement(path)
@@ -178,19 +178,19 @@ def _latest_placement(run: Path) -> tuple[Placement, str]:
 
 
 def _coarse(run: Path, placement: Placement, num_frames: int) -> np.ndarray | None:
-    """Poses (F, 4, 4) before, where the scene is; None where there were none."""
+    """Initial poses (F, 4, 4) in the scene's world; None if there were none."""
     path = run / "coarse.tum"
     if not path.exists():
         return None
     world_T_rigs = read_trajectory(path).world_T_rigs
     if len(world_T_rigs) != num_frames:
-        logger.warning("%s is of other frames: it is not shown", path)
+        logger.warning("%s has another number of frames, and is not shown", path)
         return None
     return placement.similarity.poses(world_T_rigs)
 
 
 def _placed_splat(name: str, gaussians: Gaussians, placement: Placement) -> Splat:
-    """Gaussians moved to their place; colours are those of the constant harmonic."""
+    """Splat in the placed world, with the colours of the constant harmonic."""
     if not len(gaussians):
         raise GsbaError(f"the splat {name!r} holds no Gaussians: train it again")
     unit = gaussians.quaternions / np.linalg.norm(gaussians.quaternions, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The server of a scene: viser's, for this machine and one browser alone."""
+"""Server of a scene by viser, for browsers of this machine that know its address."""
 
 import io
 import logging
@@ -18,41 +18,44 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-HOST = "127.0.0.1"  # nobody else's business
+HOST = "127.0.0.1"  # not reachable from other machines
 
 
 def serve(scene: Scene, port: int) -> View:
     """Show a scene at an address of this machine until the view is stopped; returns at once.
 
-    Only who knows the address, `view.address`, gets anything: see `gsba.view.guard`.
+    Only browsers that know `view.address` get answers: see `gsba.view.guard`.
 
     Args:
         scene: see `load_scene`.
-        port: 1 to 65535, or 0 for any that is free (`view.server.get_port()`).
+        port: 1 to 65535, or 0 for any free one (`view.server.get_port()`).
 
     Raises:
-        GsbaError: viser is missing, or the port is not to be had.
+        GsbaError: viser is missing, or the port is in use or reserved.
     """
     open_server = _server_class()
     _require_free(port)
     token = secrets.token_urlsafe(16)
-    with redirect_stdout(io.StringIO()), guarded(token) as started:  # its banner: less than ours
+    with redirect_stdout(io.StringIO()), guarded(token) as started:  # viser prints a banner
         server = open_server(host=HOST, port=port, label=f"gsba: {scene.name}", verbose=False)
     if not started:
         server.stop()
-        raise GsbaError("this viser cannot be kept from other web pages: pip install 'viser<1.2'")
-    if port and server.get_port() != port:  # viser takes the next one rather than fail
+        raise GsbaError(
+            "this version of viser cannot be protected from other web pages: "
+            "pip install 'viser<1.2'"
+        )
+    if port and server.get_port() != port:  # viser takes the next free port without an error
         with redirect_stdout(io.StringIO()):
             server.stop()
         raise GsbaError(_IN_USE.format(port=port))
     return View(server, scene, f"http://{HOST}:{server.get_port()}/{token}/")
 
 
-_IN_USE = "port {port} of 127.0.0.1 is in use: pass another --port, or 0 for any that is free"
+_IN_USE = "port {port} of 127.0.0.1 is in use: pass another --port, or 0 for any free one"
 
 
 def _server_class() -> "Callable[..., viser.ViserServer]":
-    """viser's server without its door to the world."""
+    """Class of viser's server without public addresses."""
     try:
         import viser  # pyright: ignore[reportMissingImports]
     except ImportError as error:
@@ -61,10 +64,10 @@ def _server_class() -> "Callable[..., viser.ViserServer]":
         ) from None
 
     class LocalServer(viser.ViserServer):
-        """Never asks for a public address, whatever page in the browser wants one."""
+        """Server that refuses requests of the browser for a public address."""
 
         def request_share_url(self, verbose: bool = True) -> str | None:
-            logger.warning("a public address was asked for and refused")
+            logger.warning("a request for a public address was refused")
             return None
 
     return LocalServer

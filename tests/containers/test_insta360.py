@@ -178,7 +178,9 @@ def test_other_files_have_no_trailer(tmp_path: Path, content: bytes) -> None:
 def test_another_version_is_named(tmp_path: Path) -> None:
     path = tmp_path / "v.insv"
     path.write_bytes(made.trailer(made.usual_records(), version=2))
-    with pytest.raises(GsbaError, match=r"v\.insv: its Insta360 trailer is of version 2; 3 is"):
+    with pytest.raises(
+        GsbaError, match=r"v\.insv: its Insta360 trailer has version 2; only version 3"
+    ):
         read_trailer(path)
 
 

@@ -47,7 +47,7 @@ def test_what_gsba_asks_for_is_what_its_project_says() -> None:
         if one.extra == NEEDED:
             assert importlib.util.find_spec(one.module) is not None, one
         assert one.range, one
-    assert extras <= examination._WHAT.keys()
+    assert extras <= examination._PURPOSES.keys()
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_what_a_run_needs_decides_the_exit_code(
     extra = Requirement("unheard_of", "unheard_of", ">=1", "view")
     text, table = _examined(monkeypatch, fine, extra)
     assert text.exit_code == table.exit_code == 0
-    assert "What a run needs works." in text.stdout and "fine 1.2.3" in text.stdout
+    assert "All packages that a run needs work." in text.stdout and "fine 1.2.3" in text.stdout
     assert "absent  view" in text.stdout and "$ pip install 'gsba[view]'" in text.stdout
     found = json.loads(table.stdout)
     assert found["works"] and [group["status"] for group in found["groups"]] == ["works", "absent"]
@@ -177,8 +177,8 @@ def test_gsbas_own_kernels_need_a_place(monkeypatch: pytest.MonkeyPatch) -> None
     ("changed", "told", "remedy"),
     [
         ({"driver": False}, "no NVIDIA device", ""),
-        ({"torch_cuda": None}, "for the CPU alone", "pip install --force-reinstall torch"),
-        ({"devices": []}, "update its driver", "nvidia-smi"),
+        ({"torch_cuda": None}, "for the CPU only", "pip install --force-reinstall torch"),
+        ({"devices": []}, "driver does not support CUDA", "nvidia-smi"),
         ({"kernels": True}, "H200, CUDA 12.6", ""),
         ({"compiler": "/usr/bin/nvcc"}, "builds its kernels", ""),
         ({}, "no kernels and no nvcc", "apt-get install nvidia-cuda-toolkit"),
@@ -193,7 +193,7 @@ def test_what_a_gpu_is_good_for(changed: dict, told: str, remedy: str) -> None:
 def test_notes_on_extras() -> None:
     codecs = dict.fromkeys(facts.CODECS, True) | {"av1": False}
     notes, remedy = examination._conclusions({"codecs": codecs})
-    assert notes[1] == "not av1" and remedy.startswith("pip install")
+    assert notes[1] == "cannot decode av1" and remedy.startswith("pip install")
     assert examination._conclusions({"weights": []})[0] == ["no weights yet: see --download"]
     assert examination._conclusions({"weights": ["disk"]}) == (["weights of disk"], "")
     assert examination._conclusions({"laz": False}) == (["reads LAS, not LAZ"], "pip install lazrs")

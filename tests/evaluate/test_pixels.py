@@ -73,7 +73,7 @@ def test_nothing_to_compare_is_one_clear_line(tmp_path: Path) -> None:
     with pytest.raises(GsbaError, match="no frame with depth"):
         induced_errors(TRUTH, TRUTH, lambda _: np.zeros((64, 128)), WIDTH)
     for many in (np.full((64, 128), np.nan), np.full((64, 128), 1e300)):
-        with pytest.raises(GsbaError, match="hold a distance somewhere"):
+        with pytest.raises(GsbaError, match="a distance above 0"):
             induced_errors(TRUTH, TRUTH, lambda _, many=many: many, WIDTH)
     with pytest.raises(GsbaError, match="0 depth maps for 3 true poses"):
         depth_maps(tmp_path, 3)
@@ -98,16 +98,16 @@ def _savez_text(path: Path, header: str) -> None:
     [
         (lambda path: path.write_bytes(path.read_bytes()[:-40]), "(no|damaged) depth map"),
         (lambda path: path.write_bytes(path.read_bytes()[:60] + b"x" * 90), "depth map"),
-        (lambda path: path.write_bytes(b""), "no depth map with an array"),
-        (lambda path: path.write_text("range"), "no depth map with an array"),
-        (lambda path: np.save(path.open("wb"), np.ones((2, 4))), "no depth map with an array"),
-        (lambda path: np.savez(path, depth=np.ones((2, 4))), "no depth map with an array"),
-        (lambda path: np.savez(path, range=np.array([{}, None])), "no depth map with an array"),
+        (lambda path: path.write_bytes(b""), "holds no array `range`"),
+        (lambda path: path.write_text("range"), "holds no array `range`"),
+        (lambda path: np.save(path.open("wb"), np.ones((2, 4))), "holds no array `range`"),
+        (lambda path: np.savez(path, depth=np.ones((2, 4))), "holds no array `range`"),
+        (lambda path: np.savez(path, range=np.array([{}, None])), "holds no array `range`"),
         (lambda path: _savez_text(path, "{'descr': '<f8', 'shape': (2, 4"), "damaged depth map"),
-        (lambda path: np.savez(path, range=np.array([["a"]])), "no image of numbers"),
-        (lambda path: np.savez(path, range=np.ones(8)), "no image of numbers"),
-        (lambda path: np.savez(path, range=np.ones((0, 0))), "0x0, but a map is 2:1"),
-        (lambda path: np.savez(path, range=np.ones((4, 4))), "4x4, but a map is 2:1"),
+        (lambda path: np.savez(path, range=np.array([["a"]])), "must be an image of numbers"),
+        (lambda path: np.savez(path, range=np.ones(8)), "must be an image of numbers"),
+        (lambda path: np.savez(path, range=np.ones((0, 0))), "0x0, but it must be 2:1"),
+        (lambda path: np.savez(path, range=np.ones((4, 4))), "4x4, but it must be 2:1"),
     ],
 )
 def test_damaged_depth_maps_are_named(
@@ -115,5 +115,5 @@ def test_damaged_depth_maps_are_named(
 ) -> None:
     np.savez(tmp_path / "0.npz", range=np.ones((2, 4)))
     spoil(tmp_path / "0.npz")
-    with pytest.raises(GsbaError, match=rf"0\.npz: .*{message}|0\.npz: {message}"):
+    with pytest.raises(GsbaError, match=rf"0\.npz:? .*{message}|0\.npz:? {message}"):
         depth_maps(tmp_path, 1)(0)

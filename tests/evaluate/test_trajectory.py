@@ -88,7 +88,7 @@ def test_auc_is_that_of_the_pairs_one_by_one(monkeypatch):
     estimate = _disturbed(truth)
     reference = _reference_auc(estimate, truth)
     assert evaluate(estimate, truth).auc == pytest.approx(reference, rel=1e-9)
-    monkeypatch.setattr("gsba.evaluate.trajectory._BLOCK_PAIRS", 70)  # several uneven blocks
+    monkeypatch.setattr("gsba.evaluate.trajectory._PAIRS_AT_ONCE", 70)  # several uneven blocks
     assert evaluate(estimate, truth).auc == pytest.approx(reference, rel=1e-9)
 
 

@@ -231,7 +231,7 @@ def test_what_others_wrote_is_refused_and_kept(tmp_path, frames):
     folder = tmp_path / "out"
     folder.mkdir()
     (folder / "thesis.tex").write_text("years of work")
-    with pytest.raises(GsbaError, match=r"no export but 'thesis.tex'"):
+    with pytest.raises(GsbaError, match=r"holds 'thesis.tex', which gsba's export did not write"):
         export(reconstruction(), frames, folder, ExportFormat.TUM)
     assert _entries(folder) == ["thesis.tex"]
     file = tmp_path / "file"
@@ -244,6 +244,6 @@ def test_what_others_wrote_is_refused_and_kept(tmp_path, frames):
 def test_a_training_beside_an_earlier_export_is_refused_and_kept(tmp_path, frames):
     export(reconstruction(), frames, tmp_path / "out", ExportFormat.PLY)
     (tmp_path / "out" / "output").mkdir()
-    with pytest.raises(GsbaError, match="an export and 'output'"):
+    with pytest.raises(GsbaError, match="holds 'output', which gsba's export did not write"):
         export(reconstruction(), frames, tmp_path / "out", ExportFormat.PLY)
     assert _entries(tmp_path / "out") == ["export.json", "output", "points3D.ply", "transform.json"]

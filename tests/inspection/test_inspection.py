@@ -58,7 +58,7 @@ def test_raw_pairs_and_their_lenses(tmp_path: Path) -> None:
             cv2.imwrite(str(path), np.ascontiguousarray(picture(lens)[..., ::-1]))
     facts = _facts(inspect(tmp_path))
     assert facts["layout"] == "raw, two fisheyes a frame, files of 240x240"
-    assert facts["frames"] == "3, in the order of their names: nothing says when"
+    assert facts["frames"] == "3, in the order of their names: they have no times"
     lenses = scan(tmp_path, order_suffices=True).fisheyes
     assert lenses is not None
     for name, lens in zip(("front lens", "back lens"), lenses, strict=True):
@@ -70,12 +70,12 @@ def test_what_would_be_refused_says_why(tmp_path: Path) -> None:
     assert "at least 3 are needed" in two.problem and not two.command
     assert "refused: " in two.text()
     one = inspect(tmp_path / "two/pano0.jpg")
-    assert _facts(one)["size"] == f"{WIDTH}x{WIDTH // 2}" and "one picture" in one.problem
+    assert _facts(one)["size"] == f"{WIDTH}x{WIDTH // 2}" and "is one image" in one.problem
 
 
 def test_neither_footage_nor_there(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("hello")
-    for name, why in (("notes.txt", "no video, picture or folder"), ("nowhere", "no such file")):
+    for name, why in (("notes.txt", "no video, image or folder"), ("nowhere", "no such file")):
         with pytest.raises(GsbaError, match=why):
             inspect(tmp_path / name)
 

@@ -170,8 +170,8 @@ def test_wrong_weights_are_one_line(weights: dict[str, Path], name: str, tmp_pat
     torch.save([1, 2, 3], tmp_path / "list.pth")
     other = weights["disk" if name == "aliked" else "aliked"]
     for path, message in (
-        (tmp_path / "bad.pth", r"bad\.pth: not a file of weights"),
-        (tmp_path / "bad.safetensors", r"bad\.safetensors: not a file of weights"),
+        (tmp_path / "bad.pth", r"bad\.pth is not a file of weights"),
+        (tmp_path / "bad.safetensors", r"bad\.safetensors is not a file of weights"),
         (tmp_path / "list.pth", f"weights of another network than {name}"),
         (other, f"weights of another network than {name}"),
     ):
@@ -277,7 +277,7 @@ def test_weights_are_fetched_only_when_asked(
         return source.open("rb")
 
     monkeypatch.setattr(module.urllib.request, "urlopen", urlopen)
-    with pytest.raises(GsbaError, match="or let --download fetch it"):
+    with pytest.raises(GsbaError, match="or pass --download"):
         find_weights(_settings("aliked"))
     assert not asked
     found = find_weights(_settings("aliked", download=True))["features"]

@@ -186,7 +186,7 @@ def test_command_writes_what_can_be_looked_at(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "own.png"), own)
     arguments = ["mask", frames.paths[0][0].parent, "--out", tmp_path / "m"]
     result = CliRunner().invoke(app, [*map(str, arguments), "--masks", str(tmp_path / "own.png")])
-    assert result.exit_code == 0 and "% of the picture" in result.stdout
+    assert result.exit_code == 0 and "% of the image" in result.stdout
     found = cv2.imread(str(tmp_path / "m/carrier.png"), cv2.IMREAD_UNCHANGED)
     assert set(np.unique(found)) == {0, 255} and _overlap(found == 0, _outline()) >= 0.9
     assert cv2.imread(str(tmp_path / "m/carrier_check.jpg")).shape == (HEIGHT, WIDTH, 3)

@@ -84,9 +84,9 @@ def test_look_alikes_at_a_distance_close_no_loop(loop_deg: float, fooled: bool) 
     assert len(found.matches.pairs) - len(rows) == 3  # 0-3, 0-4 and 1-4 are what they seem
 
 
-@pytest.mark.parametrize(("least_agreement", "misled"), [(0.5, False), (0.0, True)])
+@pytest.mark.parametrize(("min_inlier_ratio", "misled"), [(0.5, False), (0.0, True)])
 def test_all_keypoints_decide_where_the_strongest_disagree(
-    least_agreement: float, misled: bool
+    min_inlier_ratio: float, misled: bool
 ) -> None:
     """The strongest see a pattern that repeats, or nothing in common; the many others are right."""
     rng = np.random.default_rng(3)
@@ -103,7 +103,7 @@ def test_all_keypoints_decide_where_the_strongest_disagree(
             bearings[lost] = with_noise(bearings[lost], np.deg2rad(1), rng)
         by_face = np.argsort(owner_faces(bearings), kind="stable")
         frames.append(features_of(bearings[by_face], descriptors[by_face]))
-    settings = RefineSettings(pairs=PairSettings(window=2, least_agreement=least_agreement))
+    settings = RefineSettings(pairs=PairSettings(window=2, min_inlier_ratio=min_inlier_ratio))
     all_, strongest = (SearchableFrames(frames.__getitem__, n) for n in (None, 40))
     context = MatchContext(all_, strongest, detection.gather(frames), settings, Threads(1))
     world_T_rigs = pose(np.tile(np.eye(3), (2, 1, 1)), np.stack([np.zeros(3), true]))

@@ -87,7 +87,7 @@ def test_what_is_no_input_is_refused_in_one_line(folder: Path, video: Path, tmp_
     for arguments, said in (
         ((tmp_path / "none.mp4", "--out", out), "none.mp4"),
         ((folder, "--out", tmp_path), "is a folder"),
-        ((video, "--out", out, "--fps", 3), "times of its own"),
+        ((video, "--out", out, "--fps", 3), "holds the times of its frames"),
         ((video, "--out", out, "--width", 801), "width"),
     ):
         result = _run("track", *arguments)
@@ -116,7 +116,7 @@ def test_a_video_is_refined_from_its_own_odometry(
     result = _run("refine", video, "--masks", "none", "--out", out, *light)
     assert result.exit_code == 0, result.output
     assert (out / "odometry/walk.tum").is_file() and (out / "odometry/poses.csv").is_file()
-    assert "Where the video's own odometry had the camera" in (out / "report.html").read_text()
+    assert "Camera path by the odometry on the video" in (out / "report.html").read_text()
     assert '"odometry":{"summary":' in (out / "report.html").read_text()
     chosen = read_trajectory(out / "odometry/chosen.tum")
     assert len(list((out / "frames").glob("*.jpg"))) == len(chosen.timestamps)

@@ -223,7 +223,7 @@ def test_a_small_panorama_has_fewer_levels(case: Case) -> None:
 
 
 def test_the_family_needs_another() -> None:
-    with pytest.raises(GsbaError, match="photometric starts from bearing or reprojection"):
+    with pytest.raises(GsbaError, match="photometric needs bearing or reprojection"):
         load_config(None, ['factors=["photometric"]'])
 
 

@@ -105,7 +105,7 @@ def test_positions_elsewhere_have_no_say(case: Case, without: Path, tmp_path: Pa
     out = tmp_path / "run"
     report = case.refine(out, _with_gps(table)).report
     assert not report["gps"]["taken"]
-    assert any(note.startswith("GPS had no say") for note in report["notes"])
+    assert any(note.startswith("GPS was not used") for note in report["notes"])
     assert _apart(out, without) < 1e-4
 
 

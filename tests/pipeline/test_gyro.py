@@ -61,8 +61,8 @@ def test_a_gyro_is_aligned_and_frames_turn_as_it_says(
     np.testing.assert_allclose(np.deg2rad(said["bias_deg_per_s"]), BIAS, atol=2e-3)
     off = Rotation.from_matrix(np.array(said["rig_R_imu"]) @ IMU_R_RIG).magnitude()
     assert np.rad2deg(off) < 2
-    assert any("the gyro has a say on 100 %" in note for note in report["notes"])
-    assert "the gyro has a say on 100 %" in (out / "report.html").read_text()
+    assert any("the gyro agrees with 100 %" in note for note in report["notes"])
+    assert "the gyro agrees with 100 %" in (out / "report.html").read_text()
     turned = [case.errors(run).rpe_rotation_deg.rmse for run in (out, without)]
     assert turned[0] < 0.9 * turned[1]
     vertical, found = result.reconstruction.vertical, result.reconstruction.world_T_rigs
@@ -106,7 +106,7 @@ def test_readings_of_another_walk_change_nothing(
     )
     said = json.loads((out / "report.json").read_text())["gyro"]
     assert not said["taken"] and said["reason"]
-    assert f"the gyro was left alone: {said['reason']}" in caplog.text
+    assert f"the gyro was not used: {said['reason']}" in caplog.text
     for name in ("trajectory.tum", "poses.csv", "points.ply"):
         assert (out / name).read_bytes() == (without / name).read_bytes()
 

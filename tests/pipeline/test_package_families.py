@@ -46,7 +46,7 @@ def test_a_package_s_family_is_made_from_frames_and_its_argument() -> None:
 
 def test_what_is_not_installed_is_refused_with_what_is() -> None:
     with pytest.raises(
-        GsbaError, match=r'"list" is none of those installed: "bearing".*"barometer"'
+        GsbaError, match=r'"list" is not installed; installed are "bearing".*"barometer"'
     ):
         load_config(None, ['factors=["bearing", "list"]'])
 

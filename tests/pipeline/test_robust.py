@@ -31,7 +31,7 @@ def test_a_displaced_frame_is_named_and_repaired(case: Case, tmp_path: Path) -> 
     poses[4] = poses[4] @ pose(turn, np.array([0.4, 0.3, 0.0]))
     result = _refine(case, tmp_path, Trajectory(slam.timestamps, poses))
     assert result.report["trajectory"]["false_frames"] == ["000004"]
-    assert any("000004" in note and "not believed" in note for note in result.report["notes"])
+    assert any("000004" in note and "not used" in note for note in result.report["notes"])
     case.assert_as_good(tmp_path / "run")
 
 

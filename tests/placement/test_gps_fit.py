@@ -152,11 +152,11 @@ def test_what_fixes_leave_open_is_refused(tmp_path: Path, upright: PlacementSett
     poor = GpsSettings(sigma_m=60.0, sigma_up_m=100.0)
     file = _table(tmp_path / "gps.csv", frames, true)
     settings = upright.model_copy(update={"gps": file})
-    with pytest.raises(GsbaError, match=r"tell the scale to .* % only .*: add --scale lens"):
+    with pytest.raises(GsbaError, match=r"determine the scale only to .* % .*: add --scale lens"):
         place(_result(true @ Y_DOWN), frames, settings, gps=poor)
     known = dataclasses.replace(_result(true @ Y_DOWN), lens_baseline=(0.032, 3e-4))
     lens = settings.model_copy(update={"length": "lens"})
-    with pytest.raises(GsbaError, match=r"tell where north is to .* degrees only"):
+    with pytest.raises(GsbaError, match=r"determine north only to .* degrees"):
         place(known, frames, lens, (0.032, 3e-4), poor)
     placed = place(known, frames, lens, (0.032, 3e-4))
     assert placed.similarity.scale == pytest.approx(1, rel=0.01)
@@ -164,7 +164,9 @@ def test_what_fixes_leave_open_is_refused(tmp_path: Path, upright: PlacementSett
     flat = true * [1, 1, 0] + [0, 0, 1.5]
     file = _table(tmp_path / "flat.csv", frames, flat)
     low = GpsSettings(sigma_up_m=150.0)
-    with pytest.raises(GsbaError, match=r"tell the way up to .* degrees only: add --up auto"):
+    with pytest.raises(
+        GsbaError, match=r"determine the vertical only to .* degrees: add --up auto"
+    ):
         place(_result(flat), frames, PlacementSettings(gps=file), gps=low)
 
 

@@ -172,7 +172,7 @@ def test_names_are_shown_as_they_are(tmp_path: Path) -> None:
         [out], (2, 2), lambda figure: figure.subplots().set_title(charts.plain("_x$1$")) and None
     )
     assert "_x$1$" in out.read_text()  # as a comment beside the glyphs
-    with pytest.raises(GsbaError, match="is named twice"):
+    with pytest.raises(GsbaError, match="is given twice"):
         load([paths[0], tmp_path / "b" / ".." / "a" / "_x$1$.tum"])
 
 
@@ -198,7 +198,7 @@ def test_the_command_says_what_it_wrote_or_why_not(
         tmp_path / "late.tum", Trajectory(_walk().timestamps + 99, _walk().world_T_rigs)
     )
     for arguments, message in (
-        ((walk, "--out", tmp_path / "a.jpg"), "figures are .png, .svg or .pdf files"),
+        ((walk, "--out", tmp_path / "a.jpg"), "give a .png, .svg or .pdf file, or a folder"),
         ((tmp_path, "--out", tmp_path / "x"), str(tmp_path)),
         ((walk, late, "--out", tmp_path / "x", "--truth", walk), "late.tum: only 0 of 30 true"),
     ):

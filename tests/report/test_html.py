@@ -281,8 +281,8 @@ def test_several_maps_are_listed_and_the_largest_is_drawn(tmp_path: Path) -> Non
     )
     write_html(path, frames.taken(rows), own, result.of_map(1), report)
     *_, apart, maps = _run_script(path)
-    assert apart == "1 held by the trajectory, 2 in other maps, 1 in no map"
-    assert maps[0][0] == "Map" and maps[0][-1] == "Why it was not joined"
+    assert apart == "1 with poses of the trajectory, 2 in other maps, 1 in no map"
+    assert maps[0][0] == "Map" and maps[0][-1] == "Reason why it was not joined"
     names = frames.names
     assert maps[1][:4] == ["1", "6", "5", "4"] and maps[2][:4] == ["2", "2", "2", "1"]
     assert maps[1][-2:] == [f"{names[0]} to {names[4]}, {names[8]}", ""]
@@ -291,7 +291,7 @@ def test_several_maps_are_listed_and_the_largest_is_drawn(tmp_path: Path) -> Non
 
 def test_script_runs(page: Path) -> None:
     tiles, title, worst, rows, note, apart, maps = _run_script(page)
-    assert apart == "1 held by the trajectory" and maps is None
+    assert apart == "1 with poses of the trajectory" and maps is None
     assert (tiles, title, worst, rows) == (6, page.parent.name, pictures.NUM_PICTURES, 2)
     assert note == ["a note with <b>markup</b> & </script>"]  # a text, not markup
 
@@ -308,7 +308,7 @@ def test_distances_to_a_scan_are_added(page: Path, tmp_path: Path) -> None:
         assert _run_script(path)[0] == 6
     add_scan(tmp_path / "none.html", {})  # no page, nothing to do
     path.write_text("<html>")
-    with pytest.raises(GsbaError, match="is no page of a run"):
+    with pytest.raises(GsbaError, match="is not the report page of a run"):
         add_scan(path, {})
 
 

@@ -44,7 +44,7 @@ def test_clouds(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize("suffix", ["obj", "glb", "ply"])
 def test_meshes(tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch) -> None:
     o3d = _open3d()
-    monkeypatch.setattr(files, "_SAMPLES", 20_000)
+    monkeypatch.setattr(files, "_NUM_MESH_SAMPLES", 20_000)
     box = o3d.geometry.TriangleMesh.create_box(4.0, 3.0, 2.0)
     path = tmp_path / f"scan.{suffix}"
     if suffix == "glb":  # open3d writes none that it can read

@@ -121,7 +121,7 @@ def test_a_run_with_all_families(case: Case, tmp_path: Path) -> None:
 
 
 def test_settings_are_checked() -> None:
-    with pytest.raises(GsbaError, match="splat starts from bearing or reprojection"):
+    with pytest.raises(GsbaError, match="splat needs bearing or reprojection"):
         load_config(None, ['factors=["splat"]'])
     with pytest.raises(GsbaError, match="16"):
         load_config(None, ["splat.sizes=[8]"])

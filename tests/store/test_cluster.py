@@ -85,19 +85,19 @@ def test_a_worker_lost_from_sight_is_replaced(tmp_path: Path) -> None:
 
 
 def test_a_late_shard_is_given_to_another_worker(client, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(workers, "_LEAST_LATE_S", 1.0)
-    monkeypatch.setattr(workers, "_LOOK_S", 0.2)
+    monkeypatch.setattr(workers, "_MIN_LATE_S", 1.0)
+    monkeypatch.setattr(workers, "_POLL_S", 0.2)
     job = _squares(tmp_path, "is_slow", 4)
     _assert_squares(list(_cluster(client, tmp_path).map_shards(job)))
     assert job.done().count(4) >= 2
 
 
 def test_a_shard_that_kills_every_worker_is_named(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(workers, "_ATTEMPTS", 2)
+    monkeypatch.setattr(workers, "_MAX_ATTEMPTS", 2)
     job = Squares(np.arange(9), tmp_path / "log", "always dies", 4)
     with (
         some_workers(distributed__scheduler__allowed_failures=0) as client,
-        pytest.raises(GsbaError, match="every worker dies on squares, 4 to 5"),
+        pytest.raises(GsbaError, match="2 workers died on squares, 4 to 5"),
     ):
         list(_cluster(client, tmp_path).map_shards(job))
 
@@ -196,16 +196,16 @@ def test_workers_are_started_and_let_go(tmp_path: Path) -> None:
         ("{folder}/empty.json", r"empty\.json: no scheduler answers there \(no address"),
         ("{folder}/list.json", r"list\.json: no scheduler answers there"),
         ("{folder}/text.json", r"text\.json: no scheduler answers there"),
-        ("local:many", "say how many workers, 1 to 256, as in local:8"),
-        ("local:1000000000", "say how many workers, 1 to 256, as in local:8"),
-        ("slurm:0", "say how many workers, 1 to 100000, as in slurm:8"),
+        ("local:many", "give the number of workers, 1 to 256, as in local:8"),
+        ("local:1000000000", "give the number of workers, 1 to 256, as in local:8"),
+        ("slurm:0", "give the number of workers, 1 to 100000, as in slurm:8"),
         ("oar:4", "needs dask-jobqueue: pip install dask-jobqueue"),
     ],
 )
 def test_addresses_that_lead_nowhere(
     address: str, message: str, tmp_path: Path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(workers, "_ANSWER_S", 0.5)
+    monkeypatch.setattr(workers, "_SCHEDULER_TIMEOUT_S", 0.5)
     monkeypatch.setitem(sys.modules, "dask_jobqueue", None)
     for name, content in (("empty", "{}"), ("list", "[" * 100_000), ("text", "\udcff")):
         (tmp_path / f"{name}.json").write_text(content, errors="surrogateescape")

@@ -76,7 +76,7 @@ def test_no_job_runs_but_what_the_caller_wrote(tmp_path: Path) -> None:
     assert mark.exists()  # the plant works
     mark.unlink()
     path.write_bytes(planted)
-    with pytest.raises(GsbaError, match=r"\.job is not what this run wrote there"):
+    with pytest.raises(GsbaError, match=r"\.job was changed after this run wrote it"):
         shards.run_shard(str(path), digest)
     assert not mark.exists()
     assert shards.write_shard(job, tmp_path) == (path, digest)  # replaces it

@@ -158,11 +158,11 @@ def test_files_that_hold_no_cube_map_are_refused(tmp_path: Path) -> None:
     def plain(width: int, height: int, num: int = 5) -> tuple[list[np.ndarray], list[int]]:
         return [np.full((height, width, 3), 90, np.uint8)] * num, _steady(num)
 
-    refused([plain(WIDTH, SIZE)], f"holds one video track of {WIDTH}x{SIZE}, and a .360 recording")
+    refused([plain(WIDTH, SIZE)], f"holds one video track of {WIDTH}x{SIZE}, but a .360 recording")
     refused([plain(WIDTH, SIZE), plain(WIDTH - 8, SIZE)], "has two of one size, three squares wide")
     refused([plain(320, 180), plain(160, 90)], "holds video tracks of 320x180 and 160x90")
     short = [plain(WIDTH, SIZE, 20), plain(WIDTH, SIZE, 10)]
-    refused(short, "pictures of track5 last 0.333 s, those of track0 0.667 s: one is cut short")
+    refused(short, "pictures of track5 last 0.333 s, those of track0 0.667 s: one is truncated")
     early = [plain(WIDTH, SIZE), (plain(WIDTH, SIZE)[0], [90_000 + t for t in _steady(5)])]
     refused(early, "the tracks share no times (track0 0 to 0.133 s, track5 1.000 to 1.133 s)")
 

@@ -101,7 +101,7 @@ def test_its_name_says_that_it_is_raw_where_no_circle_shows(
     video = _video(tmp_path / "v.insv", plain, trailer=TRAILER)
     caplog.set_level(logging.INFO)
     extract(video, tmp_path / "frames", EVERY)
-    assert "raw, two fisheyes side by side, as its name says" in caplog.text
+    assert "raw, two fisheyes side by side, by its suffix" in caplog.text
     assert scan(tmp_path / "frames").layout == "fisheye"
     extract(video.rename(tmp_path / "v.mp4"), tmp_path / "panoramas", EVERY)
     assert not (tmp_path / "panoramas/front").exists()
@@ -147,7 +147,7 @@ def test_a_damaged_trailer_loses_no_pictures(tmp_path: Path, spoiled: str) -> No
 def test_black_pictures_are_refused_in_one_line(tmp_path: Path) -> None:
     black = np.zeros((SIDE, 2 * SIDE, 3), np.uint8)
     video = _video(tmp_path / "v.insv", black, trailer=TRAILER)
-    with pytest.raises(GsbaError, match=r"v\.insv: its pictures are black .*lens covered"):
+    with pytest.raises(GsbaError, match=r"v\.insv: its frames are black .*lenses were not covered"):
         extract(video, tmp_path / "frames", EVERY)
     assert not list((tmp_path / "frames").iterdir())
 
@@ -157,5 +157,5 @@ def test_a_real_file_is_refused_for_its_darkness_and_its_gyro_is_listed(tmp_path
     asked = ["refine", made.REAL, "--no-trajectory", "--out", tmp_path / "run"]
     result = CliRunner().invoke(app, list(map(str, asked)))
     lines = result.output.strip().splitlines()
-    assert result.exit_code == 1 and "its pictures are black" in lines[-1]
+    assert result.exit_code == 1 and "its frames are black" in lines[-1]
     assert any("sample.insv: gyro, 1178 readings at 1000 Hz" in line for line in lines)

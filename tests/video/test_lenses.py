@@ -151,7 +151,7 @@ def test_tracks_out_of_step(tmp_path: Path, caplog: pytest.LogCaptureFixture) ->
     np.testing.assert_allclose(
         list(_times(tmp_path / "frames").values()), np.array(both) / 30, atol=1e-9
     )
-    assert "4 instants left out that one lens alone shows (3 front, 1 back)" in caplog.text
+    assert "4 instants are left out, which only one lens has (3 front, 1 back)" in caplog.text
     assert "two tracks of 96x96: front lens, back lens" in caplog.text
 
 
@@ -361,8 +361,11 @@ def _of_size(width: int, height: int, num: int = 4) -> Track:
     ("tracks", "message"),
     [
         ([_of_size(96, 96), _of_size(64, 64)], "tracks of 96x96 and 64x64; those of two lenses"),
-        ([_of_size(128, 64), _of_size(128, 64)], "2:1 each (128x64 and 128x64), so stitched twice"),
-        ([_of_size(160, 64), _of_size(160, 64)], "neither fisheyes (square) nor a panorama (2:1)"),
+        (
+            [_of_size(128, 64), _of_size(128, 64)],
+            "two stitched video tracks of 2:1 (128x64 and 128x64)",
+        ),
+        ([_of_size(160, 64), _of_size(160, 64)], "neither fisheyes (square) nor panoramas (2:1)"),
         ([_of_size(96, 96)] * 3, "holds 3 video tracks"),
     ],
 )
@@ -380,7 +383,7 @@ def test_lenses_that_do_not_match_are_refused(tmp_path: Path) -> None:
     video = _encode(tmp_path / "short.mp4", front, _seen("back", range(17), ticks))
     result = _gsba("extract", video, *out)
     _fails(
-        result, "the back lens's pictures last 0.567 s, the front one's 0.667 s: one is cut short"
+        result, "the back lens's pictures last 0.567 s, the front one's 0.667 s: one is truncated"
     )
     _fails(result, "pass --to 0.533")
     assert _gsba("extract", video, *out, "--to", 0.533, "--every", 4).exit_code == 0
@@ -394,10 +397,8 @@ def test_files_that_do_not_match_are_refused(tmp_path: Path) -> None:
     _encode(front, _seen("front", range(20), _steady(20)), container_format="mp4")
     _fails(_gsba("extract", front, *out), "v_10_1.insv is not beside it: copy the other lens's")
     _encode(back, _of_size(64, 64, 20), container_format="mp4")
-    _fails(
-        _gsba("extract", front, *out), "v_10_1.insv: is 64x64, but v_00_1.insv, the front lens's"
-    )
-    _fails(_gsba("extract", back, *out), "v_10_1.insv: is 64x64, but v_00_1.insv, the front lens's")
+    _fails(_gsba("extract", front, *out), "v_10_1.insv is 64x64, but v_00_1.insv, the front lens's")
+    _fails(_gsba("extract", back, *out), "v_10_1.insv is 64x64, but v_00_1.insv, the front lens's")
     _encode(back, _seen("back", range(10), _steady(20)), container_format="mp4")
     _fails(_gsba("extract", front, *out), "v_10_1.insv: the back lens's pictures last 0.333 s")
     back.write_bytes(b"no video")

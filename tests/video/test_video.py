@@ -209,17 +209,17 @@ def test_frames_of_two_extractions_do_not_mix(film: Path, tmp_path: Path) -> Non
     assert json.loads((out / "extract.json").read_text())["counts"]["kept"] == 5
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos/holiday.jpg").write_bytes(b"mine")
-    with pytest.raises(GsbaError, match="not empty and no extraction"):
+    with pytest.raises(GsbaError, match="not empty and not an extraction"):
         extract(film, tmp_path / "photos", VideoSettings(), replace=True)
 
 
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("extract.json", "[]", "no extraction"),
-        ("extract.json", '{"counts": {"received": []}, "key": 1}', "no extraction"),
-        ("extract.json", '{"counts": [3], "key": 1}', "no extraction"),
-        ("extract.json", "[" * 99_999, "no extraction"),
+        ("extract.json", "[]", "not an extraction"),
+        ("extract.json", '{"counts": {"received": []}, "key": 1}', "not an extraction"),
+        ("extract.json", '{"counts": [3], "key": 1}', "not an extraction"),
+        ("extract.json", "[" * 99_999, "not an extraction"),
         ("extract.json", '{"counts": null, "key": 1}', "another extraction"),
         ("extract.partial.csv", "000000.jpg\n", "damaged"),
         ("extract.partial.csv", "000000.jpg,x,y,z\n", "damaged"),
@@ -284,7 +284,7 @@ def test_bad_options(film: Path, tmp_path: Path) -> None:
     _fails(_gsba("extract", film, *out, "--fps", -1), "video.fps = -1.0 is not allowed")
     _fails(_gsba("extract", film, *out, "--width", 999), "video.width")
     _fails(_gsba("extract", film, *out, "--width", 99999), "use an even integer >= 64")
-    _fails(_gsba("extract", tmp_path, *out), "is a folder; give a video")
+    _fails(_gsba("extract", tmp_path, *out), "is a folder: give a video")
     _fails(_gsba("extract", film, *out, "--width", 512), "has only 256 pixels")
     _fails(_gsba("extract", film, *out, "--from", 2, "--to", 1), "later than --from")
     _fails(_gsba("extract", film, *out, "--from", 20), "no frame between 20 and inf s")
@@ -313,7 +313,7 @@ def test_broken_files_are_one_line(film: Path, tmp_path: Path) -> None:
         _fails(result, f"{name}: cannot be read as video")
     odd = tmp_path / "odd.mp4"
     odd.write_bytes(data.replace(b"avc1", b"zzzz").replace(b"avcC", b"zzzC"))
-    _fails(_gsba("extract", odd, "--out", tmp_path / "f"), "no decoder for its pictures")
+    _fails(_gsba("extract", odd, "--out", tmp_path / "f"), "there is no decoder for its codec")
 
 
 def test_names_of_another_encoding_do_not_matter(film: Path, tmp_path: Path) -> None:

@@ -202,7 +202,7 @@ def test_a_frame_whose_picture_is_gone_says_so(scene: view.Scene) -> None:
     shown = view.serve(replace(scene, frames=replace(scene.frames, paths=gone)), 0)
     try:
         shown.show(NUM_FRAMES - 1)
-        assert "No picture: nowhere.jpg" in shown.controls["about"].content
+        assert "No image: nowhere.jpg" in shown.controls["about"].content
         assert not shown._faces
         shown.show(0)
         assert len(shown._faces) == 6
@@ -276,7 +276,7 @@ def test_a_viser_that_cannot_be_guarded_is_refused(
 ) -> None:
     pytest.importorskip("viser", reason="viser is not installed: pip install 'gsba[view]'")
     monkeypatch.setattr("gsba.view.server.guarded", lambda token: nullcontext([]))
-    with pytest.raises(GsbaError, match="cannot be kept from other web pages"):
+    with pytest.raises(GsbaError, match="cannot be protected from other web pages"):
         view.serve(scene, 0)
 
 
@@ -317,7 +317,7 @@ def test_a_port_in_use_is_one_line(run: Path) -> None:
         port = taken.getsockname()[1]
         line = _view_fails(run, "--port", port)
     assert line == (
-        f"error: port {port} of 127.0.0.1 is in use: pass another --port, or 0 for any that is free"
+        f"error: port {port} of 127.0.0.1 is in use: pass another --port, or 0 for any free one"
     )
     assert "out of range" in _view_fails(run, "--port", 70000)
 

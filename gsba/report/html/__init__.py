@@ -1,7 +1,7 @@
-"""report.html: a run as one self-contained page.
+"""report.html: the report of a run as one self-contained page.
 
 Takes the report, the result and its frames.
-Gives one file with its figures and pictures inside.
+Gives one file that holds its figures and images.
 """
 
 from gsba.report.html.figures import residual_sphere

@@ -1,4 +1,4 @@
-"""What the page draws, as numbers: map, displacements, shared points, residuals on the sphere."""
+"""Data of the page's figures: map, displacements, shared points, residuals on the sphere."""
 
 from typing import Any
 
@@ -8,21 +8,21 @@ from gsba.camera.sphere import bearings_from_erp
 from gsba.geometry import moved_to, rotation_angle
 from gsba.types import CoarsePoses, Reconstruction
 
-_MAX_POINTS = 4000  # of the cloud, on the map
-_MAX_CELLS = 240  # of the match matrix, along a side
+_MAX_POINTS = 4000  # points of the cloud on the map
+_MAX_CELLS = 240  # cells along a side of the match matrix
 _SPHERE_CELL_DEG = 5.0
-_MIN_IN_CELL = 5  # observations, or a cell says nothing
+_MIN_IN_CELL = 5  # observations; cells with fewer stay empty
 
 
 def world_map(coarse: CoarsePoses, reconstruction: Reconstruction) -> dict[str, Any]:
-    """Positions and a thinned cloud in axes fit for looking at: two level ones, then up.
+    """Positions and a thinned cloud in viewing axes: two level ones, then up.
 
-    Up is the mean up axis of the rigs, or, if they agree on none, where the path extends least.
-    The first level axis is where it extends most.
+    Up is the mean up axis of the rigs, or, if they agree on none, the direction of the path's
+    smallest extent. The first level axis is the direction of its largest extent.
 
     Returns:
-        "before", "after" (F, 3), "points" (P, 3), "colors" (P, 3) and "up", how upright the rigs
-        are: the length of the mean up axis, 0..1.
+        "before", "after" (F, 3), "points" (P, 3), "colors" (P, 3), and "up", the length of the
+        rigs' mean up axis, 0..1.
     """
     positions = reconstruction.world_T_rigs[:, :3, 3]
     axes, upright = viewing_axes(reconstruction.world_T_rigs)
@@ -43,7 +43,7 @@ def world_map(coarse: CoarsePoses, reconstruction: Reconstruction) -> dict[str, 
 
 
 def viewing_axes(world_T_rigs: np.ndarray) -> tuple[np.ndarray, float]:
-    """Rows: two level axes and up, right-handed, in the world; and how far the rigs agree on up."""
+    """Two level axes and up as rows (3, 3), world; and the length, 0..1, of the rigs' mean up."""
     positions = world_T_rigs[:, :3, 3] - world_T_rigs[:, :3, 3].mean(axis=0)
     mean_up = -world_T_rigs[:, :3, 1].mean(axis=0)
     upright = float(np.linalg.norm(mean_up))
@@ -52,7 +52,7 @@ def viewing_axes(world_T_rigs: np.ndarray) -> tuple[np.ndarray, float]:
     else:
         up = np.linalg.svd(np.vstack([positions, np.zeros((3, 3))]))[2][2]
     level = positions - np.outer(positions @ up, up)
-    # A path without extent leaves the first axis open: any level one will do.
+    # A path without extent does not determine the first axis: any level one is used.
     anywhere = 1e-9 * (np.eye(3) - np.outer(up, up))
     first = np.linalg.svd(np.vstack([level, anywhere]))[2][0]
     first -= up * (first @ up)
@@ -63,7 +63,7 @@ def viewing_axes(world_T_rigs: np.ndarray) -> tuple[np.ndarray, float]:
 def displacements(
     coarse: CoarsePoses, reconstruction: Reconstruction
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How far each frame moved (F,), map units, and turned (F,), degrees."""
+    """Translation (F,), map units, and rotation (F,), degrees, of each frame by the refinement."""
     before, after = coarse.world_T_rigs, reconstruction.world_T_rigs
     moved = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
     turned = rotation_angle(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
@@ -71,10 +71,10 @@ def displacements(
 
 
 def match_matrix(reconstruction: Reconstruction) -> dict[str, Any]:
-    """Points that frames share, symmetric, binned where there are many frames.
+    """Numbers of points that pairs of frames share, summed over bins of many frames.
 
     Returns:
-        "cells" (N, N) int, "frames_per_cell"; the diagonal is 0.
+        "cells" (N, N) int, symmetric with diagonal 0, and "frames_per_cell".
     """
     from scipy.sparse import csr_array
 
@@ -93,7 +93,7 @@ def match_matrix(reconstruction: Reconstruction) -> dict[str, Any]:
 
 
 def residual_sphere(reconstruction: Reconstruction) -> dict[str, Any]:
-    """Residuals by direction in the rig: what is wrong with camera or stitching shows here.
+    """Residuals by direction in the rig: they show errors of lenses and stitching.
 
     Returns:
         "rows", "columns" of an equirectangular grid; "median_deg" (rows, columns), the median
@@ -122,9 +122,9 @@ def residual_sphere(reconstruction: Reconstruction) -> dict[str, Any]:
 
 
 def field_sphere(correction: tuple[float, ...]) -> dict[str, Any] | None:
-    """The field that frames were corrected by, on the grid of `residual_sphere`, and its names.
+    """Stitching field of the frames on the grid of `residual_sphere`, with the names of that.
 
-    "east_deg", "south_deg": from where a direction was observed to where it really points.
+    "east_deg" and "south_deg" are the offset from the observed to the corrected direction.
     """
     if not correction:
         return None
@@ -166,7 +166,7 @@ def tangent_residuals(reconstruction: Reconstruction) -> np.ndarray:
 
 
 def _medians(values: np.ndarray, cells: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Median of the values of each cell; NaN where there are fewer than `_MIN_IN_CELL`."""
+    """Median of the values of each cell; NaN for cells with fewer than `_MIN_IN_CELL`."""
     ordered = values[np.lexsort((values, cells))]
     starts = np.cumsum(count) - count
     enough = count >= _MIN_IN_CELL

@@ -5,7 +5,7 @@ function tiles() {
   const length = path => path.reduce((sum, p, i) => i ? sum + Math.hypot(...p.map((v, k) => v - path[i - 1][k])) : 0, 0);
   const seconds = D.report.stages.reduce((sum, stage) => sum + stage.seconds, 0);
   const px = degrees => degrees === null ? "–" : `${num(degrees * pxPerDeg)} px`;
-  const apart = [[s.exported - s.refined, "held by the trajectory"], [s.frames_in_other_maps, "in other maps"], [s.frames_in_no_map, "in no map"]]
+  const apart = [[s.exported - s.refined, "with poses of the trajectory"], [s.frames_in_other_maps, "in other maps"], [s.frames_in_no_map, "in no map"]]
     .filter(([count]) => count).map(([count, where]) => `${num(count)} ${where}`).join(", ");
   const rows = [
     ["Frames refined", `${num(s.refined)} / ${num(s.frames)}`, apart || "all of them"],
@@ -21,7 +21,7 @@ function tiles() {
 
 function maps() {
   const table = el("maps-table"), reasons = D.report.maps.some(m => m.reason);
-  const names = ["Map", "Frames", "Refined", "Steps", "Points", "Extent", "First to last frame", ...(reasons ? ["Why it was not joined"] : [])];
+  const names = ["Map", "Frames", "Refined", "Steps", "Points", "Extent", "First to last frame", ...(reasons ? ["Reason why it was not joined"] : [])];
   table.append(make("tr", {}, ...names.map((t, i) => make("th", i < 6 ? { class: "n" } : {}, t))));
   for (const m of D.report.maps) table.append(make("tr", {},
     ...[m.map, m.frames, m.refined, m.steps, m.points, m.extent].map(v => make("td", { class: "n" }, num(v))),
@@ -36,7 +36,7 @@ function mapLegend() {
     box.addEventListener("change", () => { layers[key] = box.checked; redraw(); });
     el("map-legend").append(make("label", {}, box, key === "points" ? null : make("i", { style: `background:var(--${key})` }), text));
   }
-  if (D.map.up < .5) el("map-legend").append(make("span", {}, "the rigs agree on no up: shown as the path lies"));
+  if (D.map.up < .5) el("map-legend").append(make("span", {}, "the rigs have no common up axis: up is the direction of the path's smallest extent"));
 }
 
 function scan() {
@@ -59,7 +59,7 @@ function worst() {
   const median = lengths[lengths.length >> 1] || 1;
   const times = Math.max(1, +(3 / median).toPrecision(1));  // a median residual becomes three degrees long
   el("worst-lead").textContent = D.worst.length
-    ? `The frames with the largest median residual. Lines run from where a point was seen to where the map has it, ${num(times)} times as long.`
+    ? `The frames with the largest median residual. Lines run from each observation to its reprojected point, ${num(times)} times as long.`
     : "No frame has observations.";
   for (const w of D.worst) {
     const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
@@ -136,13 +136,13 @@ function cost() {
     if (!step) return null;
     const r = step.where.round, costs = Object.entries(step.costs).map(([k, v]) => `${k} ${num(v, 5)}`).join("\n");
     return [`${step.where.stage}, round ${step.where.number}, iteration ${step.number}\n${costs || `rejected, cost ${num(step.cost, 5)}`}\n` +
-      `gate ${num(r.gate_sigmas)} σ · ${num(r.observations)} observations · noise ${num(r.noise)}\n${r.accepted ? r.reason : "round undone: it explained less"}`, -1];
+      `gate ${num(r.gate_sigmas)} σ · ${num(r.observations)} observations · noise ${num(r.noise)}\n${r.accepted ? r.reason : "round undone: it had fewer inliers"}`, -1];
   });
 }
 
 function stages() {
   const table = el("stages"), longest = Math.max(...D.report.stages.map(s => s.seconds), 1e-9);
-  table.append(make("tr", {}, ...["Stage", "Seconds", "", "Received", "Kept", "Dropped, and why"].map((t, i) => make("th", i === 1 || i === 3 || i === 4 ? { class: "n" } : {}, t))));
+  table.append(make("tr", {}, ...["Stage", "Seconds", "", "Received", "Kept", "Dropped, with reasons"].map((t, i) => make("th", i === 1 || i === 3 || i === 4 ? { class: "n" } : {}, t))));
   for (const stage of D.report.stages) {
     const counts = stage.counts.length ? stage.counts : [null];
     counts.forEach((c, i) => {
@@ -179,7 +179,7 @@ sphere(el("sphere"), el("sphere-scale"), D.sphere);
 if (D.field) sphere(el("field"), el("field-scale"), D.field);
 else el("field-card").remove();
 if (D.odometry) {
-  el("odometry-lead").textContent = `Where the video's own odometry had the camera, before refinement: ${D.odometry.summary}.`;
+  el("odometry-lead").textContent = `Camera path by the odometry on the video, before refinement: ${D.odometry.summary}.`;
   odometryMap(el("walk"), el("odometry-legend"));
 } else el("odometry").remove();
 if (D.scan) scan();

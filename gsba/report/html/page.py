@@ -1,4 +1,4 @@
-"""The page: style, script and data put into one file that needs no network."""
+"""The report page: style, script and data in one file that needs no network."""
 
 import json
 import logging
@@ -31,13 +31,13 @@ def write_html(
     reconstruction: Reconstruction,
     report: Mapping[str, Any],
 ) -> None:
-    """Write a run as a page that opens from disk: poses before and after, residuals, costs.
+    """Write the page of a run: poses before and after, residuals, costs.
 
     Args:
-        path: the page, replaced as a whole.
-        frames: pictures of the worst ones are read again and put into the page, small.
-        coarse: poses before.
-        reconstruction: poses after, cloud and observations.
+        path: file of the page, replaced as a whole.
+        frames: frames of the run; the page holds small images of the worst ones.
+        coarse: poses before refinement.
+        reconstruction: poses after it, cloud and observations.
         report: content of report.json.
     """
     data = {
@@ -57,14 +57,14 @@ def write_html(
 
 
 def add_scan(path: Path, content: Mapping[str, Any]) -> None:
-    """Show distances to a scan on a run's page.
+    """Add distances to a scan to a run's page.
 
     Args:
-        path: the page, written by `write_html`; without one nothing is done.
-        content: of scan.json.
+        path: the page, written by `write_html`; nothing is done if it is missing.
+        content: content of scan.json.
 
     Raises:
-        GsbaError: the page is none, or cannot be written.
+        GsbaError: the file is no page of a run, or cannot be written.
     """
     if path.exists():
         shown = {name: content[name] for name in ("scan", "before", "after") if name in content}
@@ -72,26 +72,26 @@ def add_scan(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def add_odometry(path: Path, found: Odometry) -> None:
-    """Show a video's odometry on a run's page: its maps from above, keyframes, loops, losses.
+    """Add a video's odometry to a run's page: maps from above, keyframes, loops, losses.
 
     Args:
         path: the page, written by `write_html`.
-        found: of the video that the run is about.
+        found: odometry of the run's video.
 
     Raises:
-        GsbaError: the page is none, or cannot be written.
+        GsbaError: the file is no page of a run, or cannot be written.
     """
     _add(path, "odometry", odometry_plan(found))
 
 
 def _add(path: Path, name: str, content: Mapping[str, Any]) -> None:
-    """Put further data into a page."""
+    """Add data to a page under a name."""
     try:
         text = path.read_text(encoding="utf-8")
         data = json.loads(text.partition(_BEFORE_DATA)[2].partition(_AFTER_DATA)[0])
         data[name] = content
     except (OSError, ValueError, KeyError, TypeError):
-        raise GsbaError(f"{path}: is no page of a run: refine again") from None
+        raise GsbaError(f"{path} is not the report page of a run: refine again") from None
     write_text(path, _assembled(_dumped(data)))
 
 
@@ -100,7 +100,7 @@ def _dumped(data: Mapping[str, Any]) -> str:
 
 
 def _assembled(data: str) -> str:
-    """The template with its parts; no `</` of the data can end the element that holds it."""
+    """Page from the template and its parts; `<` is escaped, so that data cannot end its element."""
     folder = files("gsba.report.html")
     text = (folder / "template.html").read_text(encoding="utf-8")
     for mark, names in _PARTS.items():
@@ -112,7 +112,7 @@ def _assembled(data: str) -> str:
 def _frames(
     frames: FrameSet, coarse: CoarsePoses, reconstruction: Reconstruction
 ) -> dict[str, Any]:
-    """Columns over the frames."""
+    """Values of all frames, by column."""
     quality = frame_quality(reconstruction)
     moved, turned = figures.displacements(coarse, reconstruction)
     return {
@@ -130,11 +130,11 @@ def _frames(
 
 
 def _worst(frames: FrameSet, reconstruction: Reconstruction) -> list[dict[str, Any]]:
-    """Pictures of the worst frames; one that has vanished meanwhile is left out."""
+    """Images of the worst frames; unreadable files are left out with a warning."""
     found = []
     for f in pictures.worst_frames(reconstruction):
         try:
             found.append(pictures.picture(frames, reconstruction, f))
         except GsbaError as error:
-            logger.warning("report.html: no picture of frame %s (%s)", frames.names[f], error)
+            logger.warning("report.html: no image of frame %s (%s)", frames.names[f], error)
     return found

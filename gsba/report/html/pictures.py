@@ -14,24 +14,24 @@ from gsba.report.report import frame_quality
 from gsba.types import FACES, FrameSet, Reconstruction
 
 NUM_PICTURES = 6
-_WIDTH = 720  # pixels across
+_WIDTH = 720  # pixels across an image
 _JPEG_QUALITY = 72
-_MAX_VECTORS = 350  # in a picture
+_MAX_VECTORS = 350  # residuals in an image
 
 
 def worst_frames(reconstruction: Reconstruction) -> list[int]:
-    """Frames with the largest median residual first; frames without observations have none."""
+    """Frames by falling median residual, at most `NUM_PICTURES`, without unobserved ones."""
     residuals = frame_quality(reconstruction).median_residuals_deg
     order = np.argsort(-np.nan_to_num(residuals, nan=-1.0), kind="stable")
     return [int(f) for f in order[:NUM_PICTURES] if np.isfinite(residuals[f])]
 
 
 def picture(frames: FrameSet, reconstruction: Reconstruction, f: int) -> dict[str, Any]:
-    """A frame as JPEG (base64), and where its observations are and should be.
+    """Frame as JPEG (base64) with the residuals of its observations.
 
     Returns:
-        "frame", "jpeg", "width", "height" in pixels, and "vectors" (N, 4): place of the
-        observation as parts of width and height, and predicted minus observed direction in
+        "frame", "jpeg", "width", "height" in pixels, and "vectors" (N, 4): position of the
+        observation relative to width and height, and predicted minus observed direction in
         degrees of longitude and latitude.
     """
     rows = np.flatnonzero(reconstruction.observation_frames == f)
@@ -52,7 +52,7 @@ def picture(frames: FrameSet, reconstruction: Reconstruction, f: int) -> dict[st
 
 
 def _of_rows(reconstruction: Reconstruction, rows: np.ndarray) -> np.ndarray:
-    """Tangent residuals (N, 2) of some observations."""
+    """Tangent residuals (N, 2) of observations `rows` (N,), radians."""
     origins = reconstruction.observation_origins
     chosen = dataclasses.replace(
         reconstruction,
@@ -65,7 +65,7 @@ def _of_rows(reconstruction: Reconstruction, rows: np.ndarray) -> np.ndarray:
 
 
 def _small_panorama(frames: FrameSet, f: int) -> np.ndarray:
-    """(H, W, 3) uint8 RGB; put together from the faces where there are faces only."""
+    """Panorama (H, W, 3) uint8 RGB of a frame, assembled from cube faces if it has faces only."""
     import cv2
 
     if frames.panoramic:
