@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsba.camera.calibration import fitted, read_calibration
+from gsba.camera.calibration import read_calibration, scaled_to_size
 from gsba.camera.fisheye import Pair
 from gsba.frames.files import decode, image_size, is_image
 from gsba.frames.image_circles import CircleSearch, ImageCircle, find_circle
@@ -146,7 +146,7 @@ def lenses_of(
     """
     rows = np.unique(np.linspace(0, len(pairs) - 1, _LOOKS).astype(int))
     if calibration is not None:
-        known = fitted(read_calibration(calibration), size, calibration)
+        known = scaled_to_size(read_calibration(calibration), size, calibration)
         return _checked(folder, known, [pairs[f] for f in rows], size, calibration)
     looks = [decode_pair(pairs[f], size, gray=True) for f in rows]
     front_circle, back_circle = _given(circles, size) or _found(folder, pairs[0], looks)

@@ -439,7 +439,7 @@ def test_a_calibration_of_another_shape_or_size(tmp_path: Path, layout: str) -> 
     for lens in tree["lenses"].values():
         lens["height"] = 270
     (tmp_path / "c.json").write_text(json.dumps(tree))
-    message = r"c\.json: is of pictures of 480x270, but these are 240x240: of another shape"
+    message = r"c\.json: calibrates pictures of 480x270, but these are 240x240: another aspect"
     with pytest.raises(GsbaError, match=message):
         scan(root, fps=1, calibration=tmp_path / "c.json")
 
