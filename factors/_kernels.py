@@ -113,7 +113,7 @@ def whitened_residual(obs, o, dx, dy, dz):
 
 @_part
 def _seen_residual(obs, o, x, y, z):
-    """As `whitened_residual`, the point being at (x, y, z) as seen from the rig's own centre."""
+    """Like `whitened_residual`, the point being at (x, y, z) as seen from the rig's own centre."""
     origin = obs.origins[o]
     return whitened_residual(obs, o, x - origin[0], y - origin[1], z - origin[2])
 

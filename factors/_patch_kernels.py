@@ -204,7 +204,7 @@ def _sum_inside(coefficients, before, weights, out):
 
 @_part
 def _is_usable(mask, nodes):
-    """Whether all nodes of the last patch lie where the mask (H, W) allows; an empty one does."""
+    """True if all nodes of the last patch lie where the mask (H, W) allows; an empty one does."""
     height, width = mask.shape
     usable = True
     for i in range(3 if height else 0):

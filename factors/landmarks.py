@@ -127,7 +127,7 @@ class LandmarkBlock:
     def eliminate(
         self, values: gtsam.Values
     ) -> tuple[SchurComplement, np.ndarray, dict[str, float]]:
-        """As `linearize`, the Hessian not written out: it, the gradient (F, 6), and costs."""
+        """Like `linearize`, the Hessian not written out: it, the gradient (F, 6), and costs."""
         self._poses = pose_rows(values, self.keys)
         complement, gradient, costs, self._point_costs = complement_of(
             self._obs, self._visits, self._points, self._poses, len(self.families),
@@ -350,7 +350,7 @@ def complement_of(
     num_families: int,
     num_threads: int,
 ) -> tuple[SchurComplement, np.ndarray, np.ndarray, np.ndarray]:
-    """As `eliminate_points`, the system kept as products.
+    """Like `eliminate_points`, the system kept as products.
 
     Returns:
         It, the gradient (F, 6); robust costs of families (T,) and of landmarks (J,).

@@ -89,7 +89,7 @@ class ReducedSystem:
         self._held: dict[int, list[GroupVisits]] = {}  # of blocks that are not written out
         self._coarse: Coarse | None = None  # of some system met before, where some are not
         self._cholesky: BlockCholesky | None = None
-        self._factorized = False  # whether the Cholesky factor is of some system met before
+        self._factorized = False  # True if the Cholesky factor is of some system met before
         landmarks = [block for block in self._blocks if isinstance(block, LandmarkBlock)]
         can_hold = len(landmarks) > 0 and (len(landmarks) == len(self._blocks) or not pairs)
         most = _MOST_OF_INVERSE if pairs else _MOST_OPERATIONS

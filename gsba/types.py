@@ -76,14 +76,14 @@ class FrameSet:
     correction: tuple[float, ...] = ()  # of what stitching bends: coefficients of a
     # factors.SphereField, radians; panoramas and masks are read as straightened by it
     timed: bool = (
-        True  # whether timestamps are times; else nothing gave them, and only order counts
+        True  # True if timestamps are times; else nothing gave them, and only order counts
     )
     fisheyes: tuple[Fisheye, Fisheye] | None = None  # front and back, by which panoramas are cut
     # out of "fisheye" frames
     tracks: tuple[int, int] | None = None  # width and height, pixels, of either image of "eac"
     # frames; None = of another layout
     lenses_nominal: bool = (
-        False  # whether these are but a start: plain lenses in image circles, the
+        False  # True if these are but a start: plain lenses in image circles, the
     )
     # maker's calibration of another day, or a calibration that pictures contradict
     fetched: tuple[bool, ...] = ()  # (F,) frames of a video that strengthen the map where those
@@ -106,12 +106,12 @@ class FrameSet:
 
     @property
     def panoramic(self) -> bool:
-        """Whether a frame is read as one equirectangular image, not as several faces."""
+        """True if a frame is read as one equirectangular image, not as several faces."""
         return self.layout != "cube"
 
     @property
     def lens_axes_known(self) -> bool:
-        """Whether lenses look along the rig's z, as no stabiliser has turned the images."""
+        """True if lenses look along the rig's z, as no stabiliser has turned the images."""
         return self.layout in ("fisheye", "eac")
 
     @property
@@ -161,7 +161,7 @@ class CoarsePoses:
 
     @property
     def absent(self) -> bool:
-        """Whether there is no trajectory."""
+        """True if there is no trajectory."""
         return bool((self.sources == PoseSource.NONE).all())
 
 
@@ -429,7 +429,7 @@ class Solution:
         return np.bincount(self.landmarks.tracks.frames, minlength=len(self.world_T_rigs))
 
     def carries(self, before: "Solution", least: int) -> bool:
-        """Whether every frame with `least` observations in another solution has as many here."""
+        """True if every frame with `least` observations in another solution has as many here."""
         return bool(np.all((self.observations() >= least) | (before.observations() < least)))
 
     def median_depth(self) -> float:

@@ -230,7 +230,7 @@ def _turned(readings: Readings, sensor: Sensor, spans: np.ndarray) -> np.ndarray
 def _judged(
     best: _Guess, others: list[_Guess], timestamps: np.ndarray, counts: Counts
 ) -> Alignment:
-    """Whether the best is believed."""
+    """True if the best is believed."""
     fit, parameters, turns = best.fit, best.parameters, best.turns
     sigma = noise(fit.residuals(parameters))
     turning = np.linalg.norm(turns.rotvecs, axis=1) > _TURNING * sigma

@@ -51,7 +51,7 @@ class Readings:
         return Readings(self.timestamps[first:last], self.rates[first:last], forces)
 
     def covers(self, times: np.ndarray) -> np.ndarray:
-        """Whether spans of time (n, 2) lie within the readings (n,), without a gap."""
+        """True if spans of time (n, 2) lie within the readings (n,), without a gap."""
         late = np.diff(self.timestamps, append=np.inf) > _MOST_GAP
         gaps = np.concatenate([[0], np.cumsum(late)])
         first = np.searchsorted(self.timestamps, times[:, 0], side="right") - 1

@@ -74,7 +74,7 @@ def write_chosen(found: Odometry, rows: np.ndarray, path: Path) -> None:
 
 
 def _holds(path: Path, trajectory: Trajectory) -> bool:
-    """Whether a file has a trajectory's times and, as far as they are written, its poses."""
+    """True if a file has a trajectory's times and, as far as they are written, its poses."""
     try:
         written = read_trajectory(path)
     except GsbaError:

@@ -132,7 +132,7 @@ def _judged(
 
 
 def _plausible(proposal: Proposal, places: Places, unseen: np.ndarray) -> bool:
-    """Whether a loop asks for no more than the path between its places can have drifted."""
+    """True if a loop asks for no more than the path between its places can have drifted."""
     if abs(np.log(proposal.move.scale)) > np.log(_MAX_SCALE_DRIFT):
         return False
     (f, g), poses = proposal.frames, places.solved.world_T_rigs

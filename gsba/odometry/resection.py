@@ -113,7 +113,7 @@ def retracted(world_T_rig: np.ndarray, tangent: np.ndarray) -> np.ndarray:
 
 
 def _significant(bearings: np.ndarray, inliers: np.ndarray, sigma: float) -> bool:
-    """Whether chance does not explain the inliers among features that are independent."""
+    """True if chance does not explain the inliers among features that are independent."""
     num = witnesses(bearings, _CELLS) if len(bearings) else 0
     agreeing = witnesses(bearings[inliers], _CELLS) if inliers.any() else 0
     chance = min((_GATE * sigma / _CHANCE_SPAN) ** 2, 0.5)

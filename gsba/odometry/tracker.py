@@ -461,7 +461,7 @@ class Tracker:
     def _confirmed(
         self, grey: np.ndarray, key: _Keyframe, features: _Features, tried: _Attempt
     ) -> bool:
-        """Whether features lead back to a pose from another near it.
+        """True if features lead back to a pose from another near it.
 
         What optical flow finds of features that are not there lies where they were expected, and
         agrees with any pose that they were expected from.

@@ -58,7 +58,7 @@ def start_map(
         turn: of the bearings.
         sigma: radians, of bearings per axis.
         seed: of the sampling.
-        fading: whether features are being lost, so that little parallax has to do.
+        fading: True if features are being lost, so that little parallax has to do.
     """
     moved = _MOVED_LITTLE if fading else _MOVED
     if len(ids) < _MIN_POINTS or np.quantile(turn.parallaxes, 0.75) < moved:

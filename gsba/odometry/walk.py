@@ -77,7 +77,7 @@ class Odometry:
         return found & np.isin(self.maps, large)
 
     def usable(self) -> bool:
-        """Whether most frames are posed, and the camera moved enough to tell where it went."""
+        """True if most frames are posed, and the camera moved enough to tell where it went."""
         found = self.posed() & np.isfinite(self.distances)
         return bool(np.count_nonzero(found) > 0.5 * len(self))
 

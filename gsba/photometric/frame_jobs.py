@@ -36,7 +36,7 @@ def cut(
         hosts: (J,) frame of each template.
         origins (J, 3), spreads (J, 3, 2): plane patches, rig frame of the host.
         settings: sizes and limits.
-        workers: who do it.
+        workers: threads or processes that run it.
     """
     patches = _room(len(hosts), settings)
     rows = _by_frame(hosts, greys.num_frames)

@@ -129,7 +129,7 @@ def capture(frames: FrameSet, which: np.ndarray, size: int, optics: Optics = ONE
 
 
 def _capture_of_lenses(frames: FrameSet, which: np.ndarray, size: int, optics: Optics) -> Captured:
-    """As `capture`, faces of one lens each, squares around those that are rendered.
+    """Like `capture`, faces of one lens each, squares around those that are rendered.
 
     What is blended or of the other lens has no weight.
     """

@@ -44,7 +44,7 @@ class Gaussians:
         return Gaussians(*(array[rows] for array in self.arrays()))
 
     def is_finite(self) -> bool:
-        """Whether every parameter is a number."""
+        """True if every parameter is a number."""
         return all(bool(np.isfinite(array).all()) for array in self.arrays())
 
 

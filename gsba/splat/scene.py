@@ -111,7 +111,7 @@ def cut_faces(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, n
 def cut_lens_faces(
     frames: FrameSet, frame: int, views: Sequence[View], optics: Optics
 ) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
-    """As `cut_faces`, of one lens each: images as large as the views, and masks or None."""
+    """Like `cut_faces`, of one lens each: images as large as the views, and masks or None."""
     times = int(np.clip(-(-frames.width / (2 * np.pi) // views[0].focal), 1, _MAX_TIMES))
     finer = tuple(view.finer(times) for view in views)
     cutter = optics.cutter(finer, frame)

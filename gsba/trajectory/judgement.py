@@ -24,9 +24,8 @@ _ROUGH = 3.0  # standard deviations of the prior: a step further off starts from
 _MAX_RUN = 12  # false frames in a row that are told from a jump
 _BREAK = 1.5  # price of a jump in frames named
 _QUIET = 0.25  # part of the steps that no outlier spoils: the quantile that noise is read from
-_NOISE = (
-    4.0  # times that quantile: of a drifting trajectory's steps, one in a thousand is further off
-)
+# Times that quantile: of a drifting trajectory's steps, one in a thousand is further off.
+_NOISE = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +48,7 @@ class StepChecks:
 
     @property
     def sound(self) -> bool:
-        """Whether every step of the trajectory was confirmed."""
+        """True if every step of the trajectory was confirmed."""
         return not (self.false_steps.any() or self.unseen_steps.any())
 
     @property
@@ -253,7 +252,7 @@ def false_frames(
 
 
 def _agree(theirs: np.ndarray, images: np.ndarray, a: int, b: int, limits: OutlierLimits) -> bool:
-    """Whether a trajectory's relative pose of two frames fits the steps of the images."""
+    """True if a trajectory's relative pose of two frames fits the steps of the images."""
     one, other = inverse(theirs[a]) @ theirs[b], inverse(images[a]) @ images[b]
     turned = rotation_angle(one[:3, :3].T @ other[:3, :3])
     off, length = np.linalg.norm(one[:3, 3] - other[:3, 3]), np.linalg.norm(other[:3, 3])

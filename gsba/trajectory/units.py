@@ -1,4 +1,4 @@
-"""Whether the times of frames and of a trajectory can be of one clock, or what is wrong there."""
+"""True if the times of frames and of a trajectory can be of one clock, or what is wrong there."""
 
 import numpy as np
 
@@ -36,7 +36,7 @@ def refuse_other_unit(
     Args:
         frame_times: (F,) as given, ascending.
         entries: (N,) of the trajectory, as given, ascending.
-        senseless: whether times as they are make no sense; then less will do.
+        senseless: True if times as they are make no sense; then less will do.
 
     Raises:
         GsbaError: naming the unit and what to do.
