@@ -53,7 +53,7 @@ def inverse(a_T_b: np.ndarray) -> np.ndarray:
 
 
 def moved_to(world_T_rigs: np.ndarray, origins_rig: np.ndarray | None) -> np.ndarray:
-    """Poses (O, 4, 4) moved to where rays start, (O, 3) in the rig frame; None = as they are."""
+    """Poses (O, 4, 4) moved to the rays' origins (O, 3), rig frame; None = the rigs' centres."""
     if origins_rig is None:
         return world_T_rigs
     moved = world_T_rigs.copy()
@@ -84,7 +84,7 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 
 
 def median_direction(directions: np.ndarray) -> np.ndarray:
-    """Unit vector (3,) of least summed chord to unit vectors (N, 3) (Weiszfeld)."""
+    """Unit vector (3,) with the least summed distance to unit vectors (N, 3) (Weiszfeld)."""
     median = directions.mean(axis=0)
     for _ in range(50):
         distance = np.linalg.norm(directions - median, axis=1)
@@ -102,7 +102,7 @@ def furthest(positions: np.ndarray) -> tuple[int, float]:
 
 
 def adjoint(a_T_b: np.ndarray) -> np.ndarray:
-    """Adjoints (N, 6, 6) of poses (N, 4, 4): tangents of b in a."""
+    """Adjoints (N, 6, 6) of poses (N, 4, 4): they map tangents of b to a."""
     rotation, (x, y, z) = a_T_b[:, :3, :3], a_T_b[:, :3, 3].T
     zero = np.zeros_like(x)
     skew = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
@@ -129,7 +129,7 @@ def step_covariances(
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) at length one; 0 stays 0."""
+    """Vectors (..., 3) at unit length; zero stays zero."""
     lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.maximum(lengths, 1e-300)
 

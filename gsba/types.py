@@ -13,36 +13,37 @@ _NO_FILE_NAME = re.compile(r"[/\x00-\x1f\x7f-\x9f\ud800-\udfff]|^\.{0,2}$")
 
 
 class PoseSource(IntEnum):
-    """Where a frame's coarse pose came from."""
+    """Source of a frame's coarse pose."""
 
     SLAM = 0  # an entry of the trajectory file
     INTERPOLATED = 1  # between two entries
     EXTRAPOLATED = 2  # before the first or after the last entry
-    NONE = 3  # there is no trajectory: a placeholder
+    NONE = 3  # no trajectory: a placeholder
 
 
 class PoseStatus(IntEnum):
-    """What became of a frame."""
+    """Outcome of refinement for a frame."""
 
     REFINED = 0  # images constrain it
-    UNREFINED = 1  # matched nothing: carried by its priors alone
+    UNREFINED = 1  # no matches: its pose comes from its priors alone
 
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """What a stage received, what it kept and why the rest was dropped."""
+    """Numbers of things that a stage received, kept and dropped, with reasons."""
 
-    received: int  # things that came in
-    kept: int  # things that went on
-    unit: str  # what is counted: "frames", "matches", ...
-    dropped: Mapping[str, int] = field(default_factory=dict)  # reason -> how many
+    received: int  # things received
+    kept: int  # things passed on
+    unit: str  # unit of these numbers: "frames", "matches", ...
+    dropped: Mapping[str, int] = field(default_factory=dict)  # reason -> number dropped
 
 
 @dataclass(frozen=True, slots=True)
 class Fisheye:
-    """One lens of a raw pair (Kannala and Brandt, PAMI 2006), at an angle theta from its axis:
+    """Calibration of one lens of a raw pair (Kannala and Brandt, PAMI 2006).
 
-    r = focal (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9) pixels from `principal`.
+    At an angle theta from its axis, r = focal (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4
+    theta^9) pixels from `principal`.
     """
 
     width: int  # pixels of its picture
@@ -56,10 +57,10 @@ class Fisheye:
 
 @dataclass(frozen=True, slots=True)
 class FrameSet:
-    """The captured frames on disk, in time order. No pixels are held.
+    """The captured frames on disk, in time order, without pixels.
 
     Raises:
-        ValueError: a name or a face that no file can be named after; exports are.
+        ValueError: a name or face cannot be part of the name of an exported file.
     """
 
     names: tuple[str, ...]  # (F,) unique, without folder or extension
@@ -73,21 +74,17 @@ class FrameSet:
     width: int  # pixels of one image (panorama or face)
     height: int  # pixels
     mask_paths: tuple[Path | None, ...]  # (F,) ERP masks, white = use; None = use all
-    correction: tuple[float, ...] = ()  # of what stitching bends: coefficients of a
-    # factors.SphereField, radians; panoramas and masks are read as straightened by it
-    timed: bool = (
-        True  # True if timestamps are times; else nothing gave them, and only order counts
-    )
-    fisheyes: tuple[Fisheye, Fisheye] | None = None  # front and back, by which panoramas are cut
-    # out of "fisheye" frames
+    correction: tuple[float, ...] = ()  # coefficients of the stitching field, a
+    # factors.SphereField, radians; panoramas and masks are straightened by it when read
+    timed: bool = True  # True if timestamps are times; False = only their order is known
+    fisheyes: tuple[Fisheye, Fisheye] | None = None  # front and back calibration by which
+    # panoramas are cut out of "fisheye" frames
     tracks: tuple[int, int] | None = None  # width and height, pixels, of either image of "eac"
     # frames; None = of another layout
-    lenses_nominal: bool = (
-        False  # True if these are but a start: plain lenses in image circles, the
-    )
-    # maker's calibration of another day, or a calibration that pictures contradict
-    fetched: tuple[bool, ...] = ()  # (F,) frames of a video that strengthen the map where those
-    # that were chosen left it weak: datasets go without them; () = none
+    lenses_nominal: bool = False  # True if `fisheyes` are approximate: nominal lenses in image
+    # circles, the maker's calibration, or a calibration that pictures contradict
+    fetched: tuple[bool, ...] = ()  # (F,) True for frames extracted to strengthen a weak map,
+    # which datasets leave out; () = none
 
     def __post_init__(self) -> None:
         for name in self.names:
@@ -101,7 +98,7 @@ class FrameSet:
         return len(self.names)
 
     def chosen(self) -> np.ndarray:
-        """Frames (F',) int64 that datasets are made of: those that were not fetched."""
+        """Frames (F',) int64 of datasets: those without `fetched` ones."""
         return np.flatnonzero(~np.array(self.fetched or (False,) * len(self), bool))
 
     @property
@@ -111,17 +108,17 @@ class FrameSet:
 
     @property
     def lens_axes_known(self) -> bool:
-        """True if lenses look along the rig's z, as no stabiliser has turned the images."""
+        """True if lenses look along the rig's z: no stabiliser has rotated the images."""
         return self.layout in ("fisheye", "eac")
 
     @property
     def panorama_width(self) -> int:
-        """Pixels across a panorama that is as dense as the frames."""
+        """Width in pixels of a panorama as dense as the frames."""
         return self.width if self.panoramic else 4 * self.width
 
     @property
     def native_face_size(self) -> int:
-        """Pixels across a 90-degree face that is as dense as the frames."""
+        """Width in pixels of a 90-degree face as dense as the frames."""
         return self.width // 4 if self.panoramic else self.width
 
     def taken(self, rows: np.ndarray, absolute: bool = False) -> "FrameSet":
@@ -156,8 +153,8 @@ class CoarsePoses:
     world_T_rigs: np.ndarray  # (F, 4, 4) float64, map units
     sources: np.ndarray  # (F,) uint8, PoseSource
     time_offset: float  # seconds added to frame times to reach the trajectory's clock
-    segments: np.ndarray | None = None  # (F,) int32, piece of the trajectory that each frame's pose
-    # is of, ascending; pieces have worlds of their own until joined; None = there is one
+    segments: np.ndarray | None = None  # (F,) int32, ascending, piece of the trajectory that each
+    # frame's pose belongs to; pieces have worlds of their own until joined; None = one piece
 
     @property
     def absent(self) -> bool:
@@ -167,16 +164,16 @@ class CoarsePoses:
 
 @dataclass(frozen=True, slots=True)
 class StepNoise:
-    """Standard deviations of the trajectory's steps from frame to frame."""
+    """Standard deviations of the trajectory's steps between frames."""
 
     rotation: float  # radians, per axis
-    direction: float  # of motion, radians, per axis
-    length: float  # relative
+    direction: float  # of motion's direction, radians, per axis
+    length: float  # of the step's length, relative
 
 
 @dataclass(frozen=True, slots=True)
 class GyroConstraints:
-    """How frames turn, as a gyro says: in the rig's axes."""
+    """Rotations of the rig measured by a gyro, in the rig's axes."""
 
     steps: np.ndarray  # (F - 1, 3) float64, rotation vectors of f_R_next, radians
     step_sigmas: np.ndarray  # (F - 1,) float64, radians per axis; infinite = not known
@@ -186,13 +183,13 @@ class GyroConstraints:
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """Keypoints of one frame, face after face, the strongest of a face first."""
+    """Keypoints of one frame, face after face, the strongest of each face first."""
 
     pixels: np.ndarray  # (K, 2) float64, (u, v) on the owning face, corner origin
     faces: np.ndarray  # (K,) uint8, index into FACES
     bearings_rig: np.ndarray  # (K, 3) float64, unit, rig frame
     sigmas_rad: np.ndarray  # (K,) float64, radians, per-axis localisation noise
-    descriptors: np.ndarray  # (K, D) uint8 or float32, unit length up to one common factor
+    descriptors: np.ndarray  # (K, D) uint8 or float32, of unit length up to a common factor
     colors: np.ndarray  # (K, 3) uint8, RGB at the keypoint
     scores: np.ndarray | None = None  # (K,) float32, a network's confidence in each keypoint
 
@@ -212,15 +209,15 @@ class Keypoints:
     colors: np.ndarray  # (N, 3) uint8, RGB
     sqrt_infos: np.ndarray | None = None  # (N, 2, 2) 1/rad on the bearings' tangent_basis: the
     # square-root information where noise depends on the direction; None = 1 / sigmas_rad
-    origins_rig: np.ndarray | None = None  # (N, 3) float64, rig frame, map units: where each ray
-    # starts; None = the rig's centre
+    origins_rig: np.ndarray | None = None  # (N, 3) float64, rig frame, map units: origin of each
+    # ray; None = the rig's centre
 
     def origins_of(self, rows: np.ndarray) -> np.ndarray | None:
-        """Where the rays of some rows (O,) start, (O, 3); None = the rig's centre."""
+        """Ray origins (O, 3) of some rows (O,), rig frame; None = the rig's centre."""
         return None if self.origins_rig is None else self.origins_rig[rows]
 
     def frames(self) -> np.ndarray:
-        """Frame (N,) of each."""
+        """Frame (N,) of each keypoint."""
         return np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
 
     def bearings_of(self, frame: int) -> np.ndarray:
@@ -246,7 +243,7 @@ class Matches:
 
     @classmethod
     def of_rows(cls, pairs: np.ndarray, rows: Sequence[np.ndarray]) -> "Matches":
-        """From the rows (m, 2) int32 of each pair (P, 2)."""
+        """Matches, given the rows (m, 2) int32 of each pair (P, 2)."""
         keypoints = np.concatenate([np.zeros((0, 2), np.int32), *rows])
         return cls(pairs, np.cumsum([0, *map(len, rows)]), keypoints)
 
@@ -255,24 +252,24 @@ class Matches:
         return self.keypoints[self.offsets[pair] : self.offsets[pair + 1]]
 
     def taken(self, pairs: Sequence[int] | np.ndarray) -> "Matches":
-        """Those of some pairs, by their indices, in the order given."""
+        """Matches of some pairs, by their indices, in the order given."""
         rows = [self.of(int(p)) for p in pairs]
         return Matches.of_rows(self.pairs[list(pairs)].reshape(-1, 2), rows)
 
 
 @dataclass(frozen=True, slots=True)
 class VerifiedPairs:
-    """Pairs whose matches fit one relative pose that the trajectory does not contradict."""
+    """Pairs whose inliers fit one relative pose that the trajectory does not contradict."""
 
     matches: Matches  # inliers only
     f0_T_f1s: np.ndarray  # (P, 4, 4) float64, translation of unit length
     direction_sigmas: np.ndarray  # (P,) float64, radians, of the translation's direction; infinite
-    # = the camera may have turned only
+    # = the camera may have rotated only
     counts: Counts  # of pairs
 
     @classmethod
     def none(cls) -> "VerifiedPairs":
-        """What guidance finds where there is no trajectory."""
+        """An empty set, for runs without a trajectory."""
         none = np.zeros((0, 2), np.int32)
         poses, sigmas = np.zeros((0, 4, 4)), np.zeros(0)
         return cls(Matches.of_rows(none, ()), poses, sigmas, Counts(0, 0, "pairs"))
@@ -298,14 +295,14 @@ class VerifiedPairs:
         return {(int(f0), int(f1)) for f0, f1 in self.matches.pairs}
 
     def within(self, pieces: np.ndarray | None) -> "VerifiedPairs":
-        """Pairs whose frames are of one piece (F,) int; None = there is one."""
+        """Pairs within one piece (F,) int of the trajectory; None = one piece."""
         if pieces is None:
             return self
         f0, f1 = self.matches.pairs.T
         return self.taken(np.flatnonzero(pieces[f0] == pieces[f1]).tolist())
 
     def missing(self, chosen: np.ndarray) -> np.ndarray:
-        """Those of some pairs (P, 2) that are not among these."""
+        """Pairs (P, 2) of `chosen` that are not among these."""
         present = self.frames()
         rows = [pair for pair in chosen.tolist() if tuple(pair) not in present]
         return np.array(rows, np.int32).reshape(-1, 2)
@@ -315,8 +312,8 @@ class VerifiedPairs:
 class Tracks:
     """Observations of scene points, sorted by point, then by frame; every point has one.
 
-    What makes or filters tracks keeps to that. Whoever uses them takes a point that lost all its
-    observations nonetheless as one that no frame sees.
+    Functions that make or filter tracks guarantee that. Readers treat a point without observations
+    as one that no frame sees.
     """
 
     points: np.ndarray  # (O,) int32, point index j, non-decreasing
@@ -328,21 +325,21 @@ class Tracks:
         return len(self.points)
 
     def hosts(self) -> np.ndarray:
-        """First frame (J,) that sees each point: the one it goes with; -1 = none sees it."""
+        """First frame (J,) that observes each point, its host; -1 = none."""
         first = np.flatnonzero(np.diff(self.points, prepend=-1))
         hosts = np.full(self.num_points, -1, self.frames.dtype)
         hosts[self.points[first]] = self.frames[first]
         return hosts
 
     def of(self, points: np.ndarray) -> "Tracks":
-        """Points `points (J,)` bool alone, renumbered, with all their observations."""
+        """Points `points (J,)` bool only, renumbered, with all their observations."""
         rows = points[self.points]
         numbers = (np.cumsum(points) - 1).astype(np.int32)[self.points[rows]]
         num = int(np.count_nonzero(points))
         return Tracks(numbers, self.frames[rows], self.keypoints[rows], num)
 
     def of_observations(self, rows: np.ndarray) -> "Tracks":
-        """Observations `rows (O,)` bool alone; points that keep none are left out."""
+        """Observations `rows (O,)` bool only; points without observations are dropped."""
         numbers = np.cumsum(np.diff(self.points[rows], prepend=-1) > 0) - 1
         num = int(numbers[-1]) + 1 if len(numbers) else 0
         return Tracks(numbers.astype(np.int32), self.frames[rows], self.keypoints[rows], num)
@@ -350,14 +347,14 @@ class Tracks:
 
 @dataclass(frozen=True, slots=True)
 class Landmarks:
-    """Scene points and the observations that agree with them."""
+    """Scene points and their inlier observations."""
 
     points_world: np.ndarray  # (J, 3) float64, map units
     tracks: Tracks  # their observations; point indices are rows of points_world
     counts: Counts  # of tracks
 
     def moved(self, scales: np.ndarray, moves: np.ndarray) -> "Landmarks":
-        """Each where its host frame's scale (F,) * R @ x + t, of moves (F, 4, 4), has it."""
+        """Points moved with their hosts by scale (F,) * R @ x + t, of moves (F, 4, 4)."""
         hosts = self.tracks.hosts()
         turned = np.einsum("jik,jk->ji", moves[hosts, :3, :3], self.points_world)
         points = scales[hosts, None] * turned + moves[hosts, :3, 3]
@@ -366,25 +363,25 @@ class Landmarks:
 
 @dataclass(frozen=True, slots=True)
 class Iteration:
-    """One attempted step. Iteration 0 is the start."""
+    """One attempted solver step. Iteration 0 is the initial state."""
 
     number: int
     cost: float  # total robust cost of the attempt
-    costs: Mapping[str, float]  # family -> cost; empty where the step was rejected
-    damping: float  # lambda the step was solved with
+    costs: Mapping[str, float]  # family -> cost; empty if the step was rejected
+    damping: float  # lambda of the step
     accepted: bool
     seconds: float  # wall time of this attempt
 
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """One bundle adjustment and what was kept of it."""
+    """One bundle adjustment and the observations it kept."""
 
-    gate_sigmas: float  # observations further off were left out
+    gate_sigmas: float  # observations with larger residuals were left out
     noise: float  # estimated noise after the round, in units of the features' own sigmas
     observations: int  # used
     points: int  # used
-    support: int  # observations within the last gate of all tracks, under the round's poses
+    support: int  # observations of all tracks within the last gate, under the round's poses
     accepted: bool  # False: the poses before the round have more support and were kept
     iterations: tuple[Iteration, ...]  # cost by family
     reason: str  # why the solver stopped
@@ -392,32 +389,32 @@ class Round:
 
 @dataclass(frozen=True, slots=True)
 class FamilyVariables:
-    """Own variables of families of residuals, see `gsba.bundle.family_variables`."""
+    """Variables of families of residuals, see `gsba.bundle.family_variables`."""
 
     keys: np.ndarray  # (V,) int64, GTSAM keys
     kinds: tuple[str, ...]  # (V) GTSAM type of each
-    counts: np.ndarray  # (V,) int64, numbers that each takes
-    data: np.ndarray  # (sum of counts,) float64, these numbers
+    counts: np.ndarray  # (V,) int64, number of values of each
+    data: np.ndarray  # (sum of counts,) float64, these values
 
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Poses and points after the last good round."""
+    """Poses and points after the last accepted round."""
 
     world_T_rigs: np.ndarray  # (F, 4, 4) float64
     landmarks: Landmarks
     noise: float  # of observations, in units of the features' own sigmas
     rounds: tuple[Round, ...]
-    variables: FamilyVariables | None = None  # of families; None = they have none
+    variables: FamilyVariables | None = None  # of families; None = none
 
     @property
     def counts(self) -> Counts:
-        """Of tracks."""
+        """Counts of tracks."""
         return self.landmarks.counts
 
     @classmethod
     def without_points(cls, world_T_rigs: np.ndarray) -> "Solution":
-        """Poses (F, 4, 4) to start from."""
+        """A solution of poses (F, 4, 4) without points."""
         nothing = np.zeros(0, np.int32)
         tracks = Tracks(nothing, nothing, nothing, 0)
         return cls(
@@ -425,7 +422,7 @@ class Solution:
         )
 
     def observations(self) -> np.ndarray:
-        """How many each frame (F,) has."""
+        """Number (F,) of observations of each frame."""
         return np.bincount(self.landmarks.tracks.frames, minlength=len(self.world_T_rigs))
 
     def carries(self, before: "Solution", least: int) -> bool:
@@ -433,7 +430,7 @@ class Solution:
         return bool(np.all((self.observations() >= least) | (before.observations() < least)))
 
     def median_depth(self) -> float:
-        """Median distance of points from the frames that see them, map units; 0 without points."""
+        """Median distance of points from observing frames, map units; 0 without points."""
         tracks, points = self.landmarks.tracks, self.landmarks.points_world
         offsets = points[tracks.points] - self.world_T_rigs[tracks.frames, :3, 3]
         return float(np.median(np.linalg.norm(offsets, axis=1))) if len(offsets) else 0.0
@@ -448,15 +445,15 @@ class Solution:
 
 @dataclass(frozen=True, slots=True)
 class KnownPoints:
-    """Points of the keypoints of each frame: made when they are asked for, not held."""
+    """Points of the keypoints of each frame, computed on demand."""
 
     solved: Solution
     sizes: np.ndarray  # (F,) keypoints
     order: np.ndarray  # (O,) observations, frame by frame
-    starts: np.ndarray  # (F + 1,): frame f's are order[starts[f]:starts[f + 1]]
+    starts: np.ndarray  # (F + 1,): frame f has order[starts[f]:starts[f + 1]]
 
     def __getitem__(self, frame: int) -> np.ndarray:
-        """Of one frame (K_f, 3), in its rig frame, NaN where unknown."""
+        """Points (K_f, 3) of one frame's keypoints in its rig frame, NaN where unknown."""
         landmarks, world_T_rig = self.solved.landmarks, self.solved.world_T_rigs[frame]
         rows = self.order[self.starts[frame] : self.starts[frame + 1]]
         offsets = landmarks.points_world[landmarks.tracks.points[rows]] - world_T_rig[:3, 3]
@@ -467,30 +464,30 @@ class KnownPoints:
 
 @dataclass(frozen=True, slots=True)
 class Sighted:
-    """Observations made anew by aligning patches, former ones where that failed, their tracks."""
+    """Observations aligned by patches, former ones where alignment failed, and their tracks."""
 
     keypoints: Keypoints  # one for each observation
-    aligned: np.ndarray  # (N,) bool, which of them are new
+    aligned: np.ndarray  # (N,) bool, True = aligned by a patch
     tracks: Tracks
     counts: Counts  # of observations
-    normals_rig: np.ndarray | None = None  # (N, 3) float32, of the surface that each shows, zero =
-    # unknown; None = all are
+    normals_rig: np.ndarray | None = None  # (N, 3) float32, normals of the observed surfaces, zero
+    # = unknown; None = all unknown
 
 
 @dataclass(frozen=True, slots=True)
 class JointErrors:
-    """What errors of several poses have in common; tangents as those of their covariances."""
+    """Correlations of pose errors; tangents like those of the covariances."""
 
     neighbours: np.ndarray  # (F - 1, 6, 6) float64, E[x_f x_(f+1)^T], NaN = none
-    draws: np.ndarray  # (D, F, 6) float32, drawn from the joint distribution of all, NaN = none
+    draws: np.ndarray  # (D, F, 6) float32, draws from the joint distribution, NaN = none
 
     def scaled(self, factors: np.ndarray) -> "JointErrors":
-        """With each pose's errors times its factors (F, 6)."""
+        """Errors multiplied by factors (F, 6) of each pose."""
         neighbours = factors[:-1, :, None] * self.neighbours * factors[1:, None, :]
         return JointErrors(neighbours, (self.draws * factors).astype(np.float32))
 
     def taken(self, rows: np.ndarray) -> "JointErrors":
-        """Of some poses (F',), ascending; those between which others are left out are no more."""
+        """Errors of some poses (F',), ascending; `neighbours` is NaN across omitted poses."""
         near = (np.diff(rows) == 1)[:, None, None]
         neighbours = np.where(near, self.neighbours[rows[:-1]], np.nan)
         return JointErrors(neighbours, self.draws[:, rows])
@@ -498,7 +495,7 @@ class JointErrors:
 
 @dataclass(frozen=True, slots=True)
 class Reconstruction:
-    """Refined poses and cloud: what exports and reports are made from."""
+    """Refined poses and points: the input of exports and reports."""
 
     world_T_rigs: np.ndarray  # (F, 4, 4) float64, world of the SLAM trajectory, map units
     pose_covariances: np.ndarray  # (F, 6, 6) float64, [rotation rad, translation], NaN = none
@@ -510,30 +507,30 @@ class Reconstruction:
     observation_frames: np.ndarray  # (O,) int32
     observation_bearings: np.ndarray  # (O, 3) float64, unit, rig frame
     observation_sigmas: np.ndarray  # (O,) float64, radians
-    correction: tuple[float, ...] = ()  # of the frames, which these bearings have: see FrameSet
-    components: np.ndarray | None = None  # (F,) int32, map that each frame is in, 0 = the largest:
-    # nothing ties one map to another, each has a world of its own; None = there is one. Behind all
-    # maps each frame that is in none has a number of its own
-    joint_errors: JointErrors | None = None  # those whose own covariances are above; None = none
-    observation_origins: np.ndarray | None = None  # (O, 3) float64, rig frame, map units: where
-    # each ray starts; None = the rig's centre
-    lens_baseline: tuple[float, float] | None = None  # between two lenses, map units, and its
-    # standard deviation; None = there is one
-    fisheyes: tuple[Fisheye, Fisheye] | None = None  # of raw pairs, as found: see FrameSet
+    correction: tuple[float, ...] = ()  # stitching field applied to these bearings, see FrameSet
+    components: np.ndarray | None = None  # (F,) int32, map of each frame, 0 = the largest; maps are
+    # unconnected, each with a world of its own; None = one map. Frames in no map have numbers of
+    # their own after all maps
+    joint_errors: JointErrors | None = None  # correlations of the errors above; None = none
+    observation_origins: np.ndarray | None = None  # (O, 3) float64, rig frame, map units: origin of
+    # each ray; None = the rig's centre
+    lens_baseline: tuple[float, float] | None = None  # distance of two lenses, map units, and its
+    # standard deviation; None = one lens
+    fisheyes: tuple[Fisheye, Fisheye] | None = None  # estimated lenses of raw pairs, see FrameSet
     vertical: np.ndarray | None = None  # (3,) float64, unit, up or down by an accelerometer; None =
-    # there was none
-    map_scales: np.ndarray | None = None  # (C,) float64, by component: the length in its world of
-    # what is one unit long in the world of the largest map; None = there is one map
+    # unknown
+    map_scales: np.ndarray | None = None  # (C,) float64, length in the world of each component of
+    # one unit of the largest map's world; None = one map
 
     @property
     def num_maps(self) -> int:
-        """Number of maps. A frame alone is no map."""
+        """Number of maps. A single frame is no map."""
         if self.components is None:
             return 1
         return 1 + int(np.count_nonzero(np.bincount(self.components)[1:] > 1))
 
     def map_numbers(self) -> np.ndarray:
-        """Map (F,) int64 that each frame is in, 1 = the largest; 0 = in none."""
+        """Map (F,) int64 of each frame, 1 = the largest; 0 = none."""
         if self.components is None:
             return np.ones(len(self.world_T_rigs), np.int64)
         return np.where(self.components < self.num_maps, self.components + 1, 0)
@@ -543,7 +540,7 @@ class Reconstruction:
         return np.flatnonzero(self.map_numbers() == number)
 
     def largest_map(self) -> np.ndarray:
-        """Frames (F',) int64 of the largest map: those that are exported."""
+        """Frames (F',) int64 of the largest map, which is exported."""
         return self.frames_of_map(1)
 
     def of_map(self, number: int) -> "Reconstruction":
@@ -554,14 +551,16 @@ class Reconstruction:
         baseline, scale = self.lens_baseline, self.map_scale(number)
         if baseline is not None:
             found = replace(found, lens_baseline=(scale * baseline[0], scale * baseline[1]))
-        return replace(found, vertical=None)  # it is known in the world of the largest map
+        return replace(found, vertical=None)  # the vertical is known in the world of the largest
+        # map
 
     def map_scale(self, number: int) -> float:
-        """Length in the world of a map of what is one unit long in the largest map's."""
+        """Length in the world of a map of one unit of the largest map's world."""
         return 1.0 if self.map_scales is None else float(self.map_scales[number - 1])
 
     def taken(self, rows: np.ndarray) -> "Reconstruction":
-        """What some frames (F',), ascending, hold of it: their poses and the points they see."""
+        """The part of the reconstruction of some frames (F',), ascending: poses and observed
+        points."""
         if len(rows) == len(self.world_T_rigs):
             return self
         number = np.full(len(self.world_T_rigs), -1)
