@@ -515,7 +515,7 @@ class Reconstruction:
     observation_origins: np.ndarray | None = None  # (O, 3) float64, rig frame, map units: origin of
     # each ray; None = the rig's centre
     lens_baseline: tuple[float, float] | None = None  # distance of two lenses, map units, and its
-    # standard deviation; None = one lens
+    # standard deviation; None = one centre
     fisheyes: tuple[Fisheye, Fisheye] | None = None  # estimated lenses of raw pairs, see FrameSet
     vertical: np.ndarray | None = None  # (3,) float64, unit, up or down by an accelerometer; None =
     # unknown

@@ -1,7 +1,7 @@
 """Lens calibrations by Insta360, which its cameras write into their files, as starting lenses.
 
 A calibration is numbers with underscores between them: how many lenses, the numbers of each, then
-those of both. Four generations are known, told apart by how many numbers there are:
+those of both. Four generations are known, which differ in the number of numbers:
 
 1   radius, centre x y, angles; for both: width, height, kind
 2   radius, centre x y, angles, position x y z, coefficients c0 c1 c2 c3, width, height, kind

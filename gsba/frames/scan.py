@@ -112,7 +112,7 @@ def scan(
 def _check_times(timestamps: Path | None, fps: float | None) -> None:
     """Refuse two sources of times."""
     if timestamps is not None and fps is not None:
-        raise GsbaError("--timestamps and --fps both say when frames were taken; pass one")
+        raise GsbaError("--timestamps and --fps both give the times of frames; pass one")
 
 
 def _in_time_order(
@@ -166,7 +166,7 @@ def _side_by_side_size(
     for note in found.notes:
         _log.info(note)
     if found.lens_size is None and circles and may_hold_two(size):
-        _log.info("%s: taken for two fisheyes side by side, as --circle says", folder)
+        _log.info("%s: read as two fisheyes side by side, because of --circle", folder)
         return lens_sizes(size)[-1]
     if found.lens_size is None and size[0] != 2 * size[1]:
         raise _no_panorama(images[0], image_header(images[0]), "; nor are there two image circles")

@@ -104,7 +104,7 @@ def two_circles(greys: Iterable[np.ndarray], where: Path) -> tuple[bool, tuple[s
     if not seen:
         return False, ()
     if lit < min(_MIN_PICTURES, seen):
-        return False, (f"{where}: black corners, but around no circles: taken for a panorama",)
+        return False, (f"{where}: black corners, but around no circles: read as a panorama",)
     note = (
         f"{where}: raw, two fisheyes side by side, front left and back right: corners black "
         f"around circles that are not, in {lit} of {seen} frames looked at"

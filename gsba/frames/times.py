@@ -219,8 +219,8 @@ def _times_at_rate(names: Sequence[str], fps: float) -> np.ndarray:
     if 0 < len(skips) <= len(steps) / 2:  # counters are mostly even, with gaps
         before, after = names[skips[0]], names[skips[0] + 1]
         raise NoTimesError(
-            f"frame numbers skip between '{before}' and '{after}', so --fps alone does not say "
-            "when frames were taken; pass --timestamps FILE"
+            f"frame numbers skip between '{before}' and '{after}', so --fps alone does not give "
+            "their times; pass --timestamps FILE"
         )
     return np.arange(len(names)) / fps
 
@@ -255,9 +255,9 @@ def _times_from_exif(names: Sequence[str], pictures: Sequence[Sequence[Path]]) -
     tags = [_time_tags(files) for files in track(pictures, "reading EXIF")]
     why, taken = _why_exif_is_unusable(names, tags), [tag.taken for tag in tags if tag is not None]
     if not taken or why:
-        said = f"; EXIF times are not used: {why}" if why else ""
+        unused = f"; EXIF times are not used: {why}" if why else ""
         first = f"the frames ('{names[0]}', ...)"
-        raise NoTimesError(f"nothing says when {first} were taken{said}; {_ADVICE}")
+        raise NoTimesError(f"no source gives the times of {first}{unused}; {_ADVICE}")
     zoned = all(tag is not None and tag.zoned for tag in tags)
     what = "Unix time" if zoned else "local time, as no time zone is given"
     whole = "" if any(tag is not None and tag.subsecond for tag in tags) else ", in whole seconds"

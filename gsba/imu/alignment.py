@@ -177,8 +177,8 @@ def _sensor_and_axes(turns: Turns, turned: np.ndarray) -> tuple[Sensor, np.ndarr
         by_time = [np.sum(weights * spans * some, axis=0) / total for some in (seen, turned)]
         left = seen - spans * by_time[0], turned - spans * by_time[1]
         axes = nearest_rotation((weights * left[0]).T @ (left[1] * scales))
-        said = np.sum(weights * left[1] * (left[0] @ axes), axis=0) + (sigma / _SCALE_SIGMA) ** 2
-        scales = said / (np.sum(weights * left[1] ** 2, axis=0) + (sigma / _SCALE_SIGMA) ** 2)
+        moments = np.sum(weights * left[1] * (left[0] @ axes), axis=0) + (sigma / _SCALE_SIGMA) ** 2
+        scales = moments / (np.sum(weights * left[1] ** 2, axis=0) + (sigma / _SCALE_SIGMA) ** 2)
         bias = by_time[1] - axes.T @ by_time[0] / scales
         off = seen - scales * (turned - spans * bias) @ axes.T
         sigma = noise(off)

@@ -21,14 +21,11 @@ LOCAL = 12  # frames to either side of a meeting that are compared
 WIDER = 36  # frames to either side if the LOCAL ones leave it open
 _MAX_DISTANCE_DEPTHS = 2.0  # largest distance of two compared frames, local depths
 _NUM_NEAREST = 3  # nearest frames that each frame is compared with
-_MAX_PAIRS = 150
-# Frames apart: points are triangulated from matches of frames as close as that.
-_TRIANGULATION_GAP = 2
+_MAX_PAIRS = 150  # largest number of compared pairs of frames
+_TRIANGULATION_GAP = 2  # largest gap in frames between matches that make points
 _GATE_RAD = np.deg2rad(4.0)  # radius around a point's predicted bearing
-_SURFACE_CHORD = 2 * np.sin(
-    np.deg2rad(6.0) / 2
-)  # chord around the predicted bearing within which a
-# frame must know a surface
+# Chord around the predicted bearing within which a frame must know a surface.
+_SURFACE_CHORD = 2 * np.sin(np.deg2rad(6.0) / 2)
 _NUM_SURFACE_POINTS = 3  # points of the frame nearest to the bearing that represent the surface
 _MAX_SURFACE_RATIO = 1.25  # largest ratio of the distances of a surface and of a point on it
 # Edges of bins of the angle between two views.
@@ -37,7 +34,7 @@ _LOG_RATIO_EDGES = np.log([1.15, 1.35, 1.7])  # edges of bins of the ratio of di
 _NUM_BINS = (len(_ANGLE_EDGES_RAD) + 1) * (len(_LOG_RATIO_EDGES) + 1)
 _PRIOR_COUNT = 20.0  # prior count of points in each bin, found at the mean rate of all bins
 _DEFAULT_RATE = 0.3  # rate assumed if no two frames of one part can be compared
-# Rad about the vertical: predictions rotated by that are found by chance only.
+# Rotation about the vertical after which predictions are found by chance only.
 _CHANCE_ROTATION_RAD = 2.0
 _CELL_DEPTHS, _REGION_DEPTHS = 0.25, 1.0  # edges of cells of space, median depths
 _PRIOR_REGIONS = 1.0  # prior number of regions with nothing found, and of regions with all found

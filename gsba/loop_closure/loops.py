@@ -26,11 +26,8 @@ logger = logging.getLogger(__name__)
 _NUM_CANDIDATES = 3  # candidate places for each frame
 MIN_GROUP = 3  # least number of pairs that agree
 RIVAL = 1.5  # ratio by which a group must outweigh one that contradicts it
-_MAX_ROTATION_DEG, _UNSEEN_ROTATION_DEG = (
-    10.0,
-    45.0,
-)  # largest rotation error of the map between two frames;
-# the same for each unverified step
+# Largest rotation error of the map between two frames; of each step without matches besides.
+_MAX_ROTATION_DEG, _UNSEEN_ROTATION_DEG = 10.0, 45.0
 AGREE_DEG, AGREE = 2.0, 0.1  # between two pairs; relative to the median depth
 
 

@@ -297,8 +297,8 @@ class _Joining:
         (f, g), poses, settings = proposal.frames, self.poses, self.context.settings
         ends = {g: poses[g], f: proposal.move.poses(poses[f])}
         first, last = sorted(ends)
-        asked = inverse(ends[first]) @ ends[last]
-        loop = Loop(first, last, asked, proposal.support)
+        step = inverse(ends[first]) @ ends[last]
+        loop = Loop(first, last, step, proposal.support)
         solved = replace(self.solved, world_T_rigs=poses)
         even = abs(np.log(proposal.move.scale)) < np.log(settings.verify.max_length_ratio)
         return even and loops.within_drift(loop, solved, self.held, settings)

@@ -46,10 +46,10 @@ def propose(meetings: list[Meeting], poses: np.ndarray, depth: float, seed: int)
     """
     found = []
     for m in meetings:
-        asked = _similarity_of_meeting(m, seed)
-        if asked is None:
+        similarity = _similarity_of_meeting(m, seed)
+        if similarity is None:
             continue
-        move = carrying(asked, poses[m.f], poses[m.g])
+        move = carrying(similarity, poses[m.f], poses[m.g])
         support = sum(len(each.own) for each in _inliers_of(meetings, move, poses))
         found.append(Proposal(move, (m.f, m.g), support))
     distinct: list[Proposal] = []

@@ -9,14 +9,9 @@ from gsba.bundle.prior_factors import X
 from gsba.geometry import inverse
 from gsba.types import Solution
 
-_STEP_SIGMA_DEG, _STEP_SIGMA_LENGTHS = (
-    0.2,
-    0.02,
-)  # noise of a verified step: rotation; position, in typical lengths
-_LOOP_SIGMA_DEG, _LOOP_SIGMA_LENGTHS = (
-    0.3,
-    0.05,
-)  # noise of a loop: rotation; position, in typical lengths
+# Noise of a verified step, and of a loop: rotation; position in typical lengths of steps.
+_STEP_SIGMA_DEG, _STEP_SIGMA_LENGTHS = 0.2, 0.02
+_LOOP_SIGMA_DEG, _LOOP_SIGMA_LENGTHS = 0.3, 0.05
 # Rotation noise of a step without matches, whose position noise is its length.
 _UNSEEN_SIGMA_RAD = 0.5
 _INLIER_PROBABILITY = 0.99  # that a true loop is within its noise

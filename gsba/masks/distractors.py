@@ -390,6 +390,6 @@ class Look:
         return self.scene.find(self.numbers[name])
 
     def taken(self, names: Sequence[str]) -> "Look":
-        """What some frames need of it; see `gsba.store.store.Taken`."""
+        """The part that some frames need, see `gsba.store.store.Taken`."""
         scene, number = self.scene.taken([self.numbers[name] for name in names])
         return Look(scene, {name: number[self.numbers[name]] for name in names})

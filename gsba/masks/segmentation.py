@@ -159,8 +159,8 @@ def _call(words: list[str], values: dict[str, Path], command: str) -> None:
     except OSError as error:
         raise GsbaError(f"--segment {command}: cannot be run ({error.strerror})") from None
     if done.returncode:
-        said = (done.stderr.strip() or done.stdout.strip() or "it printed nothing").splitlines()[-1]
-        raise GsbaError(f"--segment {command}: failed with exit code {done.returncode}: {said}")
+        last = (done.stderr.strip() or done.stdout.strip() or "it printed nothing").splitlines()[-1]
+        raise GsbaError(f"--segment {command}: failed with exit code {done.returncode}: {last}")
 
 
 def _checked(mask: np.ndarray, size: int, where: str) -> np.ndarray:

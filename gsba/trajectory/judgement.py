@@ -25,7 +25,7 @@ _MAX_PRIOR_SIGMAS = 3.0  # standard deviations of the prior beyond which a step 
 _MAX_FALSE_RUN = 12  # largest number of consecutive false frames told apart from a jump
 _JUMP_COST = 1.5  # cost of a jump, in false frames
 _NOISE_QUANTILE = 0.25  # share of steps free of outliers: quantile from which noise is estimated
-# Times that quantile: of a drifting trajectory's steps, one in a thousand is further off.
+# Multiple of the quantile from which an error is an outlier: drift exceeds it once in 1000 steps.
 _OUTLIER_RATIO = 4.0
 
 

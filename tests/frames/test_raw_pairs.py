@@ -385,7 +385,7 @@ def test_panoramas_are_no_circles(
     with caplog.at_level(logging.INFO):
         assert scan(tmp_path, fps=1).layout == "erp"
     black = kind in ("black above and below", "night", "black")
-    assert ("around no circles: taken for a panorama" in caplog.text) == black
+    assert ("around no circles: read as a panorama" in caplog.text) == black
 
 
 def test_no_more_pictures_are_looked_at_than_needed() -> None:
