@@ -83,10 +83,7 @@ def scan(
     images, lens_size = [group[0] for group in paths], (width, height)
     factory = find_factory_lenses(Path(folder), images) if calibration is None else None
     known = calibration, circles, factory
-    if (
-        layout == "erp"
-        and (raw := _side_by_side_size(Path(folder), images, lens_size, *known)) is not None
-    ):
+    if layout == "erp" and (raw := _pair_size(Path(folder), images, lens_size, *known)) is not None:
         layout, lens_size = "fisheye", raw
         paths = tuple((path, path) for path in images)
     fisheyes, nominal = _lenses(Path(folder), layout, paths, lens_size, *known)
@@ -143,7 +140,7 @@ def _in_time_order(
     return tuple(names), times, timed
 
 
-def _side_by_side_size(
+def _pair_size(
     folder: Path,
     images: Sequence[Path],
     size: tuple[int, int],
@@ -212,7 +209,7 @@ def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
     _check_names(Path(folder), names)
     paths = tuple(found[name] for name in names)
     width, height = _common_size(paths, layout)
-    if _side_by_side_size(Path(folder), [path for (path,) in paths], (width, height)) is not None:
+    if _pair_size(Path(folder), [path for (path,) in paths], (width, height)) is not None:
         raise GsbaError(
             f"{folder}: holds raw fisheyes side by side; give a folder of equirectangular images"
         )

@@ -78,9 +78,7 @@ def recover(
     alone = _with_wider_pairs(context, alone).within(coarse.segments)
     alone = _with_consistent_scale(context, alone) if absent else alone
     steps = image_steps(alone, keypoints)
-    alone, guided = (
-        _without_repetitions(some, steps, keypoints, settings) for some in (alone, guided)
-    )
+    alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
     coarse, joints = joining.join(coarse)
     misread.refuse_misfit(coarse, steps, settings.verify)
     trust = _check_steps(alone, keypoints, coarse, settings)
@@ -88,9 +86,7 @@ def recover(
         return Recovered(guided, trust, coarse)
     again = _pairs_of_one_piece(_missing_two_apart(alone, steps, absent), coarse)
     over = _match_along(context, trust.world_T_rigs, again)
-    neighbours = VerifiedPairs.joined(
-        [alone, _without_repetitions(over, steps, keypoints, settings)]
-    )
+    neighbours = VerifiedPairs.joined([alone, _consistent(over, steps, keypoints, settings)])
     alike = judgement.confirmed(coarse, steps, settings.priors)
     doubtful = {
         (f0, f1)
@@ -313,7 +309,7 @@ def _frames_of_open_ratio(context: MatchContext, found: VerifiedPairs) -> tuple[
     return unknown | extreme, extreme
 
 
-def _without_repetitions(
+def _consistent(
     found: VerifiedPairs, steps: Steps, keypoints: Keypoints, settings: RefineSettings
 ) -> VerifiedPairs:
     """Pairs without those over two steps that repeated structure contradicts, see `off_steps`."""
