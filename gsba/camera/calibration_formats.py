@@ -53,7 +53,7 @@ def lens_of(
     width, height = (int(pixels) for pixels in size)
     (x, y), terms, f = (float(v) for v in principal), [float(k) for k in radial], float(focal)
     if len(terms) > 4 or not np.isfinite([f, x, y, *terms]).all() or min(f, width, height) <= 0:
-        raise ValueError("f, cx, cy, up to four k and the size are to be numbers, f above 0")
+        raise ValueError("f, cx, cy, up to four k and the size must be numbers, f above 0")
     if not (0 < x < width and 0 < y < height):
         raise ValueError(
             f"the principal point ({x:g}, {y:g}) is outside the picture of {width}x{height}"
@@ -133,7 +133,7 @@ def from_colmap_config(tree: Sequence[Any], path: Path) -> Pair:
         wxyz = np.array(camera.get("cam_from_rig_rotation", (1, 0, 0, 0)), dtype=np.float64)
         at = np.array(camera.get("cam_from_rig_translation", (0, 0, 0)), dtype=np.float64)
         if wxyz.shape != (4,) or at.shape != (3,) or not 0.9 < np.linalg.norm(wxyz) < 1.1:
-            raise ValueError("cam_from_rig of a quaternion wxyz and of three numbers is wanted")
+            raise ValueError("cam_from_rig must be a quaternion wxyz and three numbers")
         if name == "back" and "cam_from_rig_rotation" not in camera:
             raise KeyError("cam_from_rig_rotation")
         poses.append(pose(rotation_from_quaternion(wxyz / np.linalg.norm(wxyz)), at))
@@ -189,11 +189,11 @@ def _kalibr_lens(tree: Mapping[str, Any], where: str) -> Fisheye:
     wanted = {("pinhole", "equidistant"): 4, ("omni", "radtan"): 5}.get(kind)
     if wanted is None:
         raise GsbaError(
-            f"{where} is {kind[0]} with {kind[1]}; pinhole with equidistant is wanted (Kalibr's "
+            f"{where} is {kind[0]} with {kind[1]}; it must be pinhole with equidistant (Kalibr's "
             "model pinhole-equi): calibrate with that"
         )
     if len(numbers) != wanted or len(terms) != 4:
-        raise ValueError(f"{wanted} intrinsics and 4 distortion_coeffs are wanted")
+        raise ValueError(f"{wanted} intrinsics and 4 distortion_coeffs are needed")
     *xi, fu, fv, pu, pv = numbers
     size, focal, principal = tree["resolution"], _focal(fu, fv, where), (pu + 0.5, pv + 0.5)
     if kind[0] == "pinhole":
@@ -203,7 +203,7 @@ def _kalibr_lens(tree: Mapping[str, Any], where: str) -> Fisheye:
 
 def _colmap_lens(model: str, size: Sequence[Any], params: Sequence[Any], where: str) -> Fisheye:
     if model != _COLMAP_MODEL:
-        raise GsbaError(f"{where} is {model}; {_COLMAP_MODEL} is wanted: calibrate with that")
+        raise GsbaError(f"{where} is {model}, but must be {_COLMAP_MODEL}: calibrate with that")
     fx, fy, cx, cy, *terms = (float(v) for v in params)
     if len(terms) != 4:
         raise ValueError(f"{_COLMAP_MODEL} has fx, fy, cx, cy, k1, k2, k3, k4")
@@ -213,7 +213,7 @@ def _colmap_lens(model: str, size: Sequence[Any], params: Sequence[Any], where: 
 def _focal(across: float, down: float, where: str) -> float:
     """The geometric mean of two focal lengths that hardly differ, pixels."""
     if not (across > 0 and down > 0):
-        raise ValueError("focal lengths are to be above 0")
+        raise ValueError("focal lengths must be above 0")
     if abs(np.log(across / down)) > _MAX_LOG_RATIO:
         raise GsbaError(
             f"{where} has focal lengths {across:g} and {down:g}, more than "

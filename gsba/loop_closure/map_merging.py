@@ -216,7 +216,7 @@ class _Joining:
             return None
         best = max(weighed, key=lambda one: one.evidence.least)
         frames, why = best.proposal.frames, best.evidence
-        logger.info("a part of %d frames meets the map at frames %s: %s", len(rows), frames, why)
+        logger.info("a part of %d frames overlaps the map at frames %s: %s", len(rows), frames, why)
         if why.confirmed and not self.test.rivals(best, weighed):
             return best.proposal.move
         self.reasons[part] = "it fits two places" if why.confirmed else f"not certain: {why}"
@@ -246,7 +246,9 @@ class _Joining:
                 continue
             own, theirs = ends if f in rows else ends[::-1]
             evidence = self.test.weigh(own, theirs, best.move)[0]
-            logger.info("a part of %d frames goes on at a break: %s", len(rows), evidence)
+            logger.info(
+                "a part of %d frames continues the map across a break: %s", len(rows), evidence
+            )
             if not evidence.refuted:
                 return best.move
         return None

@@ -268,7 +268,7 @@ BAD_OURS = {
     "no lens": (lambda t: t["lenses"].pop("back"), "it has no 'back'"),
     "no focal length": (lambda t: t["lenses"]["back"].pop("f"), "it has no 'f'"),
     "of text": (lambda t: t["lenses"]["back"].update(f="wide"), "could not convert"),
-    "no number": (lambda t: t["lenses"]["back"].update(f=float("nan")), "are to be numbers"),
+    "no number": (lambda t: t["lenses"]["back"].update(f=float("nan")), "must be numbers"),
     "endless": (lambda t: t["lenses"]["back"].update(width=1e999), "OverflowError"),
     "negative": (lambda t: t["lenses"]["front"].update(f=-3), "f above 0"),
     "too many terms": (lambda t: t["lenses"]["front"].update(k=[0] * 5), "up to four k"),
@@ -318,7 +318,7 @@ BAD_KALIBR = {
     "three cameras": (lambda t: t.update(cam2=t["cam0"]), "holds cam0, cam1, cam2"),
     "radtan": (
         lambda t: t["cam0"].update(distortion_model="radtan"),
-        "cam0 is pinhole with radtan; pinhole with equidistant is wanted",
+        "cam0 is pinhole with radtan; it must be pinhole with equidistant",
     ),
     "double sphere": (lambda t: t["cam1"].update(camera_model="ds"), "cam1 is ds with equi"),
     "not square": (
@@ -365,7 +365,7 @@ BAD_RIG = {
     ),
     "pinhole": (
         lambda t: t[0]["cameras"][0].update(camera_model_name="PINHOLE"),
-        "front lens is PINHOLE; OPENCV_FISHEYE is wanted",
+        "front lens is PINHOLE, but must be OPENCV_FISHEYE",
     ),
     "no model": (lambda t: t[0]["cameras"][0].pop("camera_model_name"), "camera_model_name"),
     "few params": (lambda t: t[0]["cameras"][0]["camera_params"].pop(), "k1, k2, k3, k4"),
@@ -396,7 +396,7 @@ def test_refused_models(tmp_path: Path) -> None:
     _check_refused(tmp_path / "empty", "is no COLMAP model that can be read .*give the folder")
     _check_refused(_model(tmp_path / "alone", True, rig=False), "holds 2 cameras in 2 rigs")
     panoramas = _model(tmp_path / "erp", True, "EQUIRECTANGULAR")
-    _check_refused(panoramas, "front lens is EQUIRECTANGULAR; OPENCV_FISHEYE is wanted")
+    _check_refused(panoramas, "front lens is EQUIRECTANGULAR, but must be OPENCV_FISHEYE")
     damaged = _model(tmp_path / "damaged", False)
     (damaged / "cameras.bin").write_bytes((damaged / "cameras.bin").read_bytes()[:50])
     _check_refused(damaged, "is no COLMAP model that can be read")
