@@ -1,6 +1,6 @@
 """Compiled passes over panoramas: the spline's inverse filter, and samples with gradients.
 
-All of it is one file because numba renews a cached kernel when its file changes, not when a
+All passes share a file because numba renews a cached kernel when its file changes, not when a
 function it calls from another file does. Images are spline coefficients (H, 2H) float32; pixels
 (u, v) have the centre of the top-left one at (0.5, 0.5).
 """
@@ -9,8 +9,8 @@ import numpy as np
 
 from factors.compiled import kernel_and_part
 
-_POLE = np.sqrt(3.0) - 2.0  # of the cubic B-spline's inverse filter
-_TERMS = 16  # of its geometric series: the rest is below float32's resolution
+_POLE = np.sqrt(3.0) - 2.0  # pole of the cubic B-spline's inverse filter
+_NUM_TERMS = 16  # terms of its geometric series: further ones are below float32's resolution
 
 _kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 
@@ -23,14 +23,14 @@ def filter_rows(image):
     for r in range(num):
         row = image[r]
         start, power = np.float32(0.0), np.float32(1.0)
-        for k in range(_TERMS):
+        for k in range(_NUM_TERMS):
             start += power * row[-k % length]
             power *= pole
         row[0] = np.float32(6.0) * start
         for k in range(1, length):
             row[k] = np.float32(6.0) * row[k] + pole * row[k - 1]
         end, power = np.float32(0.0), -pole
-        for k in range(_TERMS):
+        for k in range(_NUM_TERMS):
             end += power * row[(length - 1 + k) % length]
             power *= pole
         row[length - 1] = end
@@ -45,7 +45,7 @@ def filter_columns(image):
     pole = np.float32(_POLE)
     ends = np.zeros_like(image[0])
     power = np.float32(1.0)
-    for k in range(_TERMS):
+    for k in range(_NUM_TERMS):
         ends += power * image[-k % length]
         power *= pole
     image[0] = np.float32(6.0) * ends
@@ -54,7 +54,7 @@ def filter_columns(image):
             image[k, c] = np.float32(6.0) * image[k, c] + pole * image[k - 1, c]
     ends[:] = 0.0
     power = -pole
-    for k in range(_TERMS):
+    for k in range(_NUM_TERMS):
         ends += power * image[(length - 1 + k) % length]
         power *= pole
     image[length - 1] = ends
@@ -73,7 +73,7 @@ def erp_pixel(x, y, z, width, height):
 
 @_part
 def _weights(t):
-    """Cubic B-spline weights of the four samples around a place t in [0, 1) after the second."""
+    """Cubic B-spline weights of the four samples around a position t in [0, 1) after the second."""
     s = np.float32(1.0) - t
     sixth = np.float32(1.0 / 6.0)
     w0, w3 = sixth * s * s * s, sixth * t * t * t
@@ -92,7 +92,7 @@ def _slopes(t):
 
 @_part
 def _tap(coefficients, row, column):
-    """Coefficient at any row and column: round the seam, and over the poles."""
+    """Coefficient at any row and column, continued across the seam and the poles."""
     height, width = coefficients.shape
     if row < 0:
         row, column = -1 - row, column + width // 2
@@ -127,13 +127,13 @@ def sample_gradient(coefficients, u, v):
 
 @_kernel
 def sample_vectors(coefficients, vectors, values, gradients):
-    """Values (N,) and gradients (N, 3) by the vector, of vectors (N, 3) of any length."""
+    """Values (N,) and gradients (N, 3) by the vector, at vectors (N, 3) of any length."""
     height, width = coefficients.shape
     for n in range(len(vectors)):
         x, y, z = vectors[n, 0], vectors[n, 1], vectors[n, 2]
         u, v = erp_pixel(x, y, z, width, height)
         value, by_u, by_v = sample_gradient(coefficients, u, v)
-        flat2 = max(x * x + z * z, 1e-18 * y * y)  # the pole's own longitude is any
+        flat2 = max(x * x + z * z, 1e-18 * y * y)  # at a pole any longitude will do
         flat, squared = np.sqrt(flat2), flat2 + y * y
         lon, lat = by_u * width / (2 * np.pi) / flat2, by_v * height / np.pi / squared
         values[n] = value

@@ -1,8 +1,8 @@
-"""Compiled passes over landmarks: eliminate, back-substitute and polish, residuals.
+"""Compiled passes over landmarks: elimination, back-substitution, polishing, residuals.
 
 Poses are rows `(12,)` = `[world_R_rig row-major (9), rig_in_world (3)]`. Each pass handles a range
-of landmarks and releases the GIL, so that threads share the work; what threads add up, each adds
-to arrays of its own. All of it is one file because numba renews a cached kernel when its file
+of landmarks and releases the GIL, so that threads share the work; each thread accumulates into
+arrays of its own. All passes share a file because numba renews a cached kernel when its file
 changes, not when a function it calls from another file does.
 """
 
@@ -12,7 +12,7 @@ from factors._observations import BEARING, MIN_DEPTH
 from factors.compiled import kernel_and_part
 
 _EPS = 1e-300  # guards divisions by a squared norm
-_LEAST_HESSIAN = 1e-12  # of a landmark's trace
+_MIN_RELATIVE_DAMPING = 1e-12  # least damping, part of the trace of a landmark's Hessian
 
 _kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
 
@@ -59,7 +59,7 @@ def _log_map(x, y, z):
     else:
         s = np.sqrt(s2)
         angle = np.arctan2(s, z)
-        if s2 < 1e-24 * n2:  # opposite: every direction is as good, none has a derivative
+        if s2 < 1e-24 * n2:  # opposite: the direction is undefined, and so is its derivative
             return angle, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         f = angle / s
         k = (z / n2 - f) / s2
@@ -68,13 +68,13 @@ def _log_map(x, y, z):
 
 @_part
 def whitened_residual(obs, o, dx, dy, dz):
-    """Whitened residual and Jacobian of observation o, its point being at d in the rig frame.
+    """Whitened residual and Jacobian of observation o, for its point at d in the rig frame.
 
     Returns:
         valid, r0, r1, then the Jacobian d r / d d by rows (6 values). A point behind the face, or
-        at the centre, is invalid: its Jacobian is zero and its residual a constant large one
-        (2 focal in u and v as in GTSAM's projection factor; half a turn), so that it moves
-        nothing and yet no step gains by sending points there.
+        at the centre, is invalid: its Jacobian is zero and its residual a large constant (2 focal
+        in u and v as in GTSAM's projection factor; pi), so that it moves nothing and yet no step
+        gains by sending points there.
     """
     measurement, whitener = obs.measurements[o], obs.whiteners[o]
     s00, s01, s11 = whitener[0], whitener[1], whitener[2]
@@ -112,15 +112,15 @@ def whitened_residual(obs, o, dx, dy, dz):
 
 
 @_part
-def _seen_residual(obs, o, x, y, z):
-    """As `whitened_residual`, the point being at (x, y, z) as seen from the rig's own centre."""
+def _residual_from_rig(obs, o, x, y, z):
+    """`whitened_residual` of a point at (x, y, z) relative to the rig's centre, rig frame."""
     origin = obs.origins[o]
     return whitened_residual(obs, o, x - origin[0], y - origin[1], z - origin[2])
 
 
 @_part
 def rig_vector(pose, point):
-    """Components of a world point seen from the rig, in the rig frame: world_R_rig^T (X - t)."""
+    """Vector from the rig to a world point, in the rig frame: world_R_rig^T (X - t)."""
     x, y, z = point[0] - pose[9], point[1] - pose[10], point[2] - pose[11]
     return (
         pose[0] * x + pose[3] * y + pose[6] * z,
@@ -134,10 +134,10 @@ def inverse_root(v, damping):
     """Lower triangle (6 values 00 10 20 11 21 22) whose square R^T R is the inverse of a symmetric
     3x3 (6 values 00 01 02 11 12 22), damped by its trace.
 
-    At least `_LEAST_HESSIAN` of the trace is added, so that a direction which no observation
+    At least `_MIN_RELATIVE_DAMPING` of the trace is added, so that a direction which no observation
     constrains (one ray, no parallax) stays finite and moves no pose.
     """
-    eps = (_LEAST_HESSIAN + damping) * (v[0] + v[3] + v[5]) + 1e-200
+    eps = (_MIN_RELATIVE_DAMPING + damping) * (v[0] + v[3] + v[5]) + 1e-200
     a, b, c, d, e, f = v[0] + eps, v[1], v[2], v[3] + eps, v[4], v[5] + eps
     l00 = np.sqrt(a)
     l10, l20 = b / l00, c / l00
@@ -152,7 +152,7 @@ def inverse_root(v, damping):
 
 @_part
 def squared_root(root):
-    """R^T R (6 values 00 01 02 11 12 22) of a lower triangle as of `inverse_root`."""
+    """R^T R (6 values 00 01 02 11 12 22) of a lower triangle of `inverse_root`."""
     i00, i10, i20, i11, i21, i22 = root
     return (
         i00 * i00 + i10 * i10 + i20 * i20, i10 * i11 + i20 * i21, i20 * i22,
@@ -162,7 +162,7 @@ def squared_root(root):
 
 @_part
 def invert_symmetric(v, damping):
-    """Inverse (6 values 00 01 02 11 12 22) of a symmetric 3x3 given so, see `inverse_root`."""
+    """Inverse (6 values 00 01 02 11 12 22) of a symmetric 3x3 in this form, see `inverse_root`."""
     return squared_root(inverse_root(v, damping))
 
 
@@ -205,7 +205,7 @@ def _point_normal(obs, j, point, poses, normal):
     for o in range(obs.offsets[j], obs.offsets[j + 1]):
         pose = poses[obs.frames[o]]
         dx, dy, dz = rig_vector(pose, point)
-        valid, r0, r1, a0, a1, a2, b0, b1, b2 = _seen_residual(obs, o, dx, dy, dz)
+        valid, r0, r1, a0, a1, a2, b0, b1, b2 = _residual_from_rig(obs, o, dx, dy, dz)
         rho, w = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)
         cost += rho
         if valid:
@@ -226,7 +226,7 @@ def _pose_row(j0, j1, j2, dx, dy, dz, out):
 
 @_part
 def _take_product(Y, W, B):
-    """B -= Y W; a row's six entries stand apart, so that they share instructions."""
+    """B -= Y W; the six entries of a row are independent, so that they are vectorised."""
     a0, a1, a2, a3, a4, a5 = W[0, 0], W[0, 1], W[0, 2], W[0, 3], W[0, 4], W[0, 5]
     b0, b1, b2, b3, b4, b5 = W[1, 0], W[1, 1], W[1, 2], W[1, 3], W[1, 4], W[1, 5]
     c0, c1, c2, c3, c4, c5 = W[2, 0], W[2, 1], W[2, 2], W[2, 3], W[2, 4], W[2, 5]
@@ -246,13 +246,13 @@ def linearize_range(
     first, last, obs, visits, points, poses, W, inverses, roots, shifts, diagonal, gradient,
     costs, point_costs,
 ):  # fmt: skip
-    """Add the poses' own part of landmarks first..last, and note what eliminates these.
+    """Add the poses' own part of landmarks first..last, and write the terms that eliminate these.
 
     Args:
-        visits: of a run of landmarks, these among them.
-        W (V, 3, 6): written, of each visit the Hessian between landmark and pose.
-        inverses (L, 6), roots (L, 6), shifts (L, 3): written, of each landmark of the run the
-            inverse of its Hessian, the root of that, and it times the gradient.
+        visits: visits of a run of landmarks that includes these.
+        W (V, 3, 6): written, Hessian between landmark and pose of each visit.
+        inverses (L, 6), roots (L, 6), shifts (L, 3): written, inverse of each landmark's Hessian,
+            the root of the inverse, and the inverse times the gradient.
         diagonal (F, 6, 6), gradient (F, 6), costs (T,): accumulated.
         point_costs (J,): written for the range.
     """
@@ -270,7 +270,7 @@ def linearize_range(
                 W[visit] = 0.0
             pose = poses[f]
             dx, dy, dz = rig_vector(pose, point)
-            valid, r0, r1, a0, a1, a2, b0, b1, b2 = _seen_residual(obs, o, dx, dy, dz)
+            valid, r0, r1, a0, a1, a2, b0, b1, b2 = _residual_from_rig(obs, o, dx, dy, dz)
             rho, w = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)
             costs[obs.families[o]] += rho
             cost += rho
@@ -300,9 +300,9 @@ def linearize_range(
 def eliminate_rows(
     first, last, visits, W, inverses, shifts, row_starts, columns, diagonal, off_diagonal, gradient
 ):  # fmt: skip
-    """Take the landmarks' Schur complement from the rows of frames first..last.
+    """Subtract the landmarks' Schur complement from the rows of frames first..last.
 
-    Row by row, so that each sum has one order and its blocks stay near.
+    Row by row, so that each sum has a fixed order and its blocks stay in the cache.
 
     Args:
         row_starts (F + 1,), columns (P,): covisible frame pairs i < k as sorted CSR rows.
@@ -330,7 +330,7 @@ def eliminate_rows(
 
 @_part
 def _span_of_point(by_point, lo, hi, damping, Q):
-    """Orthonormal columns Q of what a landmark can take up: its Jacobian's, three damping rows."""
+    """Orthonormal columns Q of the range of a landmark's Jacobian with three rows of damping."""
     rows, squares = 2 * (hi - lo), 1e-200
     for o in range(lo, hi):
         for i in range(2):
@@ -342,7 +342,7 @@ def _span_of_point(by_point, lo, hi, damping, Q):
         for c in range(3):
             Q[rows + r, c] = np.sqrt(damping * squares) if r == c else 0.0
     for c in range(3):
-        for _ in range(2):  # the second pass takes off what rounding left
+        for _ in range(2):  # the second pass removes rounding errors
             for d in range(c):
                 along = 0.0
                 for r in range(rows + 3):
@@ -359,7 +359,7 @@ def _span_of_point(by_point, lo, hi, damping, Q):
 
 @_part
 def _add_row(row, r, q, H, g, W):
-    """Add a row of a Jacobian: its normal equations, and its part in what the landmark takes up."""
+    """Add a row of a Jacobian to the normal equations and to its projection on the landmark."""
     for k in range(len(g)):
         a = row[k]
         g[k] += a * r
@@ -372,7 +372,7 @@ def _add_row(row, r, q, H, g, W):
 
 @_part
 def _add_linear(residuals, own, common, Q, H, g, T, W, shared, shared_gradient, V, b):
-    """Add an observation, by what its frame has and by what all have; returns its cost."""
+    """Add an observation's Jacobians by frame variables and by shared ones; returns its cost."""
     cost = 0.0
     for i in range(2):
         r, q = residuals[i], Q[i]
@@ -389,7 +389,7 @@ def _add_linear(residuals, own, common, Q, H, g, T, W, shared, shared_gradient, 
 
 @_part
 def _take_products(A, B, out):
-    """out -= A^T B, of A and B with three rows each."""
+    """out -= A^T B, for A and B with three rows each."""
     for k in range(A.shape[1]):
         x, y, z = A[0, k], A[1, k], A[2, k]
         for c in range(B.shape[1]):
@@ -410,13 +410,13 @@ def eliminate_linear_range(
 ):  # fmt: skip
     """Add landmarks first..last of a linear least-squares problem, eliminated; returns the cost.
 
-    What a landmark can take up is projected out with orthonormal columns: a landmark that its
-    observations hardly tell in some direction leaves no more error than they have themselves.
+    A landmark's range is projected out with orthonormal columns: a landmark that its observations
+    hardly constrain in some direction adds no more rounding error than they have themselves.
 
     Args:
-        offsets (J + 1,), frames (O,): observations by landmark, those of a frame side by side.
+        offsets (J + 1,), frames (O,): observations by landmark, those of a frame adjacent.
         residuals (O, 2), by_point (O, 2, 3), by_frame (O, 2, K), by_shared (O, 2, S): whitened.
-        damping: of a landmark, part of the sum of squares of its Jacobian.
+        damping: damping of a landmark, part of the sum of squares of its Jacobian.
         row_starts (F + 1,), columns (P,): covisible frame pairs i < k as sorted CSR rows.
         diagonal (F, K, K), off_diagonal (P, K, K), to_shared (F, K, S), shared (S, S),
         gradient (F, K), shared_gradient (S,): accumulated.
@@ -458,12 +458,12 @@ def eliminate_linear_range(
 
 @_part
 def _substituted_step(obs, j, point, poses, steps, normal):
-    """Gauss-Newton step of landmark j, negated, that goes with the pose steps (F, 6)."""
+    """Negated Gauss-Newton step of landmark j, given the pose steps (F, 6)."""
     normal[:] = 0.0
     for o in range(obs.offsets[j], obs.offsets[j + 1]):
         pose, step = poses[obs.frames[o]], steps[obs.frames[o]]
         dx, dy, dz = rig_vector(pose, point)
-        valid, r0, r1, a0, a1, a2, b0, b1, b2 = _seen_residual(obs, o, dx, dy, dz)
+        valid, r0, r1, a0, a1, a2, b0, b1, b2 = _residual_from_rig(obs, o, dx, dy, dz)
         if not valid:
             continue
         w = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)[1]
@@ -483,10 +483,10 @@ def polish_range(
 ):  # fmt: skip
     """Move landmarks first..last to (near) their optimum at `poses`.
 
-    With `substitute`, they first take the linear step that goes with pose `steps (F, 6)` from
-    `old_poses`; where that makes a landmark worse than its old cost, it starts from its old place
-    if that is better. Then up to `num_steps` damped Gauss-Newton steps that never raise the cost,
-    ended where the next would gain less than `tolerance` of it. Writes `trial_points (J, 3)` and
+    With `substitute`, they first take the linear step for pose `steps (F, 6)` from `old_poses`; if
+    that raises a landmark's cost, it starts from its old position if that is better. Then up to
+    `num_steps` damped Gauss-Newton steps that never raise the cost, ended when the next would gain
+    less than `tolerance` of it. Writes `trial_points (J, 3)` and
     `trial_costs (J,)`.
     """
     normal, trial_normal = np.empty(9), np.empty(9)
@@ -526,7 +526,7 @@ def residuals_range(first, last, obs, points, poses, residuals, valid):
     for j in range(first, last):
         for o in range(obs.offsets[j], obs.offsets[j + 1]):
             dx, dy, dz = rig_vector(poses[obs.frames[o]], points[j])
-            valid[o], residuals[o, 0], residuals[o, 1] = _seen_residual(obs, o, dx, dy, dz)[:3]
+            valid[o], residuals[o, 0], residuals[o, 1] = _residual_from_rig(obs, o, dx, dy, dz)[:3]
 
 
 @_part
@@ -542,12 +542,12 @@ def _random_bits(seed):
 def draw_run(obs, visits, points, poses, U, roots, seed, out):
     """Add to out (F, 6, R), R <= 21, vectors whose covariance is the Schur complement of a run.
 
-    J^T e of signs e that are as likely up as down: as good as normal ones where many are added.
-    What `invert_symmetric` adds to a landmark's Hessian counts as an observation of it.
+    Vectors are J^T e of random signs e: as good as normal ones when many are added. The damping by
+    `invert_symmetric` counts as an observation of the landmark.
 
     Args:
-        U (V, 3, 6): as `factors._schur_kernels.project_visits` leaves it.
-        roots (L, 6): as `linearize_range` does.
+        U (V, 3, 6): see `factors._schur_kernels.project_visits`.
+        roots (L, 6): see `linearize_range`.
         seed: uint64.
     """
     num = out.shape[2]
@@ -559,7 +559,7 @@ def draw_run(obs, visits, points, poses, U, roots, seed, out):
         for o in range(obs.offsets[j], obs.offsets[j + 1]):
             f = obs.frames[o]
             dx, dy, dz = rig_vector(poses[f], point)
-            valid, r0, r1, a0, a1, a2, b0, b1, b2 = _seen_residual(obs, o, dx, dy, dz)
+            valid, r0, r1, a0, a1, a2, b0, b1, b2 = _residual_from_rig(obs, o, dx, dy, dz)
             if not valid:
                 continue
             weight = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)[1]
@@ -576,7 +576,7 @@ def draw_run(obs, visits, points, poses, U, roots, seed, out):
                 for i in range(6):
                     out[f, i, r] += s0 * a[i] + s1 * b[i]
         root = roots[row]
-        least = np.sqrt(_LEAST_HESSIAN * (normal[0] + normal[3] + normal[5]))
+        least = np.sqrt(_MIN_RELATIVE_DAMPING * (normal[0] + normal[3] + normal[5]))
         bits = _random_bits(~(seed + np.uint64(j)))
         for r in range(num):
             for c in range(3):

@@ -1,4 +1,4 @@
-"""Observations of landmarks: families hand them in as terms, kernels read them sorted."""
+"""Observations of landmarks: families give them as terms, kernels read them sorted."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -10,7 +10,7 @@ from scipy.sparse import csr_matrix
 from factors.robust import RobustLoss
 
 BEARING, REPROJECTION = 0, 1  # kinds of measurement
-MIN_DEPTH = 1e-9  # of a unit direction: a point nearer to the face's plane counts as behind it
+MIN_DEPTH = 1e-9  # z of a unit direction below which a point counts as behind the face
 
 
 class Observations(NamedTuple):
@@ -19,7 +19,7 @@ class Observations(NamedTuple):
     offsets: np.ndarray  # (J + 1,) int64: landmark j owns rows offsets[j]:offsets[j + 1]
     frames: np.ndarray  # (O,) int32, row of the poses
     kinds: np.ndarray  # (O,) uint8, BEARING or REPROJECTION
-    families: np.ndarray  # (O,) uint8, whose cost it counts to
+    families: np.ndarray  # (O,) uint8, family whose cost it counts to
     measurements: np.ndarray  # (O, 3): unit bearing, rig frame | u, v in pixels, row of cameras
     whiteners: np.ndarray  # (O, 3): [s00, s01, s11] of the upper triangular 2x2 sqrt information
     origins: np.ndarray  # (O, 3): where the ray starts, rig frame, map units
@@ -29,14 +29,14 @@ class Observations(NamedTuple):
 
 
 class Visits(NamedTuple):
-    """Frames that see each of a run of landmarks, once each, and what each frame sees of them."""
+    """Visits of a run of landmarks by frames: one for each frame that observes a landmark."""
 
-    first: int  # landmark
+    first: int  # first landmark of the run
     offsets: np.ndarray  # (L + 1,) int64: landmark first + l owns visits offsets[l]:offsets[l + 1]
     frames: np.ndarray  # (V,) int32, ascending for each landmark
-    owners: np.ndarray  # (V,) int32, l
+    owners: np.ndarray  # (V,) int32, landmark l of each visit
     row_offsets: np.ndarray  # (F + 1,) int64: frame f owns entries of by_frame
-    by_frame: np.ndarray  # (V,) int32, visits by frame, then landmark
+    by_frame: np.ndarray  # (V,) int32, visits sorted by frame, then landmark
 
 
 class Term(Protocol):
@@ -71,7 +71,7 @@ class Term(Protocol):
         ...
 
     def cameras(self) -> np.ndarray:
-        """(C, 12) rows as in Observations, which the measurements count from 0."""
+        """(C, 12) rows as in Observations; measurements index them from 0."""
         ...
 
     @property
@@ -86,8 +86,8 @@ def sort_observations(
     """Order landmarks by first and last frame, observations by landmark and frame.
 
     Returns:
-        The observations; for each its row among the terms back to back, (O,) int32; for each
-        landmark the row it was given in, (J,).
+        The observations; the row of each among the terms back to back, (O,) int32; the original row
+        of each landmark, (J,).
     """
     lengths = [len(term.frames) for term in terms]
     frames = np.zeros(sum(lengths), dtype=np.int32)
@@ -142,7 +142,7 @@ def visits_of(offsets: np.ndarray, frames: np.ndarray, num_frames: int, most: in
     Args:
         offsets (J + 1,), frames (O,): observations by landmark.
         num_frames: F.
-        most: visits of a run, but for what its last landmark has more.
+        most: limit on a run's visits, exceeded by its last landmark only.
     """
     owners = np.repeat(np.arange(len(offsets) - 1, dtype=np.int32), np.diff(offsets))
     new = np.ones(len(frames), dtype=bool)
@@ -166,13 +166,13 @@ def visits_of(offsets: np.ndarray, frames: np.ndarray, num_frames: int, most: in
 def covisible_pairs(
     offsets: np.ndarray, frames: np.ndarray, num_frames: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Frame pairs f < g that see a landmark in common, as sorted CSR rows.
+    """Frame pairs f < g with a common landmark, as sorted CSR rows.
 
     Args:
         offsets (J + 1,), frames (O,): observations by landmark.
 
     Returns:
-        starts (F + 1,) and columns (P,), int64; how many landmarks each two share, (P,) float32.
+        starts (F + 1,) and columns (P,), int64; number of landmarks each two share, (P,) float32.
     """
     num_points = len(offsets) - 1
     owners = np.repeat(np.arange(num_points), np.diff(offsets))
@@ -188,17 +188,17 @@ def covisible_pairs(
 
 
 def check_term(term: Term, num_frames: int, num_points: int) -> None:
-    """Refuse a term that does not fit its block.
+    """Refuse a term that is inconsistent with its block.
 
     Raises:
-        ValueError: arrays of unequal length, indices out of range, values not finite.
+        ValueError: arrays have unequal lengths, indices are out of range, or values not finite.
     """
     frames, points = np.asarray(term.frames), np.asarray(term.points)
     rows = term.measurements()
     if not len(frames) == len(points) == len(rows):
         raise ValueError(
             f"term {term.name!r}: {len(frames)} frames, {len(points)} points and {len(rows)} "
-            "measurements must be equally many"
+            "measurements must be equal in number"
         )
     if len(frames) == 0:
         return

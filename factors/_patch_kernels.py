@@ -2,7 +2,7 @@
 
 A patch is a plane piece of scene: the rays origin + spread @ (x, y) of an n x n grid of unit
 spacing, row-major in (x, y), x and y from -reach to reach. Images are spline coefficients
-(H, 2H) float32. All of it is one file, the sampler included: see `factors.compiled`.
+(H, 2H) float32. All passes share a file, see `factors.compiled`.
 """
 
 import numpy as np
@@ -10,10 +10,12 @@ import numpy as np
 from factors._patch_records import ALIGNED, FAR, FLAT, MASKED, UNLIKE, UNSTEADY
 from factors.compiled import kernel_and_part
 
-_TRIAL_STEPS = 4  # after which a patch must look somewhat alike to go on
-_NEAR_POLE = 8.0  # half patches from a pole, within which each ray needs its own pixel
-_LEAST_CORNER = 1e-4  # determinant of the shift's information over its trace squared: no edge
-_LEAST_GREY = 1e-3  # variance in grey values squared, below which there is nothing
+_TRIAL_STEPS = 4  # steps after which a patch must correlate somewhat to go on
+_POLE_HALF_PATCHES = 8.0  # distance from a pole, in half patches, within which each ray needs its
+# own pixel
+_MIN_CORNER_DETERMINANT = 1e-4  # least determinant of the shift's information over its squared
+# trace: excludes edges
+_MIN_GREY_VARIANCE = 1e-3  # variance in grey values squared below which a patch is empty
 
 _kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 
@@ -30,7 +32,7 @@ def _ray_pixel(origin, spread, x, y, width, height):
 
 @_part
 def _weights(t):
-    """Cubic B-spline weights of the four samples around a place t in [0, 1) after the second."""
+    """Cubic B-spline weights of the four samples around a position t in [0, 1) after the second."""
     s = np.float32(1.0) - t
     sixth = np.float32(1.0 / 6.0)
     w0, w3 = sixth * s * s * s, sixth * t * t * t
@@ -40,7 +42,7 @@ def _weights(t):
 
 @_part
 def _tap(coefficients, row, column):
-    """Coefficient at any row and column: round the seam, and over the poles."""
+    """Coefficient at any row and column, continued across the seam and the poles."""
     height, width = coefficients.shape
     if row < 0:
         row, column = -1 - row, column + width // 2
@@ -51,7 +53,7 @@ def _tap(coefficients, row, column):
 
 @_part
 def _sample(coefficients, u, v):
-    """Value at pixel (u, v); u may lie any number of turns off, v up to a patch off the image."""
+    """Value at pixel (u, v); u may be off by any number of turns, v by a patch off the image."""
     height, width = coefficients.shape
     u, v = u - 0.5, v - 0.5
     column, row = int(np.floor(u)), int(np.floor(v))
@@ -82,7 +84,7 @@ def _pixel_map(origin, spread, half, width, height, nodes, quadratics):
         quadratics (2, 3, 3): of u and v; coefficient [i, j] is of (x / half)^i (y / half)^j.
 
     Returns:
-        False where a pole is too near for the polynomial: then each ray needs its own pixel.
+        False if a pole is too near for the polynomial: then each ray needs its own pixel.
     """
     for i in range(3):
         for j in range(3):
@@ -104,13 +106,14 @@ def _pixel_map(origin, spread, half, width, height, nodes, quadratics):
     size2 = 0.0  # two squared steps, at least the square of the longest
     for i in range(3):
         size2 += spread[i, 0] ** 2 + spread[i, 1] ** 2
-    return origin[0] ** 2 + origin[2] ** 2 > size2 * (_NEAR_POLE * half) ** 2
+    return origin[0] ** 2 + origin[2] ** 2 > size2 * (_POLE_HALF_PATCHES * half) ** 2
 
 
 @_part
 def _scratch(reach):
-    """Room for `_sample_grid`: nodes and quadratics as `_pixel_map` says; places (2, n * n) in half
-    patches, columns and rows (2, n * n) before them, weights (8, n * n) of the samples around."""
+    """Scratch for `_sample_grid`: nodes and quadratics, see `_pixel_map`; positions (2, n * n) in
+    half patches, columns and rows (2, n * n) before them, weights (8, n * n) of the samples
+    around."""
     n = 2 * reach + 1
     places = np.empty((2, n * n))
     for i in range(n):
@@ -123,7 +126,7 @@ def _scratch(reach):
 
 @_part
 def _sample_grid(coefficients, origin, spread, reach, shift_x, shift_y, scratch, out):
-    """Values (n * n,) of an n x n grid of unit spacing on the plane patch, off by a shift.
+    """Values (n * n,) of a shifted n x n grid of unit spacing on the plane patch.
 
     `out[i * n + j]` is at x = i - reach + shift_x, y = j - reach + shift_y, n = 2 reach + 1.
     """
@@ -156,9 +159,9 @@ def _sample_grid(coefficients, origin, spread, reach, shift_x, shift_y, scratch,
 
 @_part
 def _find_taps(quadratics, places, shift_x, shift_y, width, height, before, weights):
-    """Write columns and rows before places, and weights; False where samples lie beyond an edge.
+    """Write columns and rows before places, and weights; False if samples lie beyond an edge.
 
-    Without branches, and without arrays that might be what it writes to: so it runs in vectors.
+    Free of branches and of arrays that may alias its output, so that it is vectorised.
     """
     p, q = quadratics[0], quadratics[1]
     p00, p01, p02 = p[0, 0] - 0.5, p[0, 1], p[0, 2]
@@ -190,7 +193,7 @@ def _sum_inside(coefficients, before, weights, out):
     """Values at places whose samples all lie inside the image."""
     for k in range(len(out)):
         value = np.float32(0.0)
-        first = np.uint32(before[0, k] - 1)  # unsigned: no check for one that counts from the end
+        first = np.uint32(before[0, k] - 1)  # unsigned: no test for negative indices
         for i in range(4):
             c = coefficients[np.uint32(before[1, k] - 1 + i)]
             value += weights[4 + i, k] * (
@@ -204,7 +207,8 @@ def _sum_inside(coefficients, before, weights, out):
 
 @_part
 def _is_usable(mask, nodes):
-    """Whether all nodes of the last patch lie where the mask (H, W) allows; an empty one does."""
+    """True if the mask (H, W) is set at all nodes of the last patch; an empty mask counts as
+    set."""
     height, width = mask.shape
     usable = True
     for i in range(3 if height else 0):
@@ -229,7 +233,7 @@ def _statistics(window, values):
 
 @_part
 def _normal_matrix(templates, t, reach, normal):
-    """Write the normal matrix (8, 8) of a template; False where a shift is not determined."""
+    """Write the normal matrix (8, 8) of a template; False if it does not determine a shift."""
     n = 2 * reach + 1
     c = np.empty(8)
     normal[:] = 0.0
@@ -249,7 +253,7 @@ def _normal_matrix(templates, t, reach, normal):
     determinant = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
     for r in range(8):
         normal[r, r] += 1e-6 * normal[r, r] + (templates.prior if 2 <= r < 6 else 0.0)
-    return determinant > _LEAST_CORNER * trace * trace
+    return determinant > _MIN_CORNER_DETERMINANT * trace * trace
 
 
 @_kernel
@@ -324,7 +328,7 @@ def _judge(templates, t, values, mean, square, power, mass):
     for k in range(len(values)):
         cross += templates.window[k] * (values[k] - mean) * templates.grey[t, k]
     gain = max(cross / power, 1e-6)
-    rest = max(square - gain * cross, _LEAST_GREY * mass)
+    rest = max(square - gain * cross, _MIN_GREY_VARIANCE * mass)
     freedom = 1.0 - 8.0 / len(values)
     return cross / np.sqrt(square * power), rest / (gain * gain * mass * freedom)
 
@@ -333,14 +337,14 @@ def _judge(templates, t, values, mean, square, power, mass):
 def align_templates(coefficients, mask, rows, sightings, max_shift, steps, tolerance, templates):
     """Align templates to one frame by inverse-compositional Gauss-Newton.
 
-    The template's point q = (x, y) is looked for at origin + spread @ (shift + (1 + affine) q),
+    The template's point q = (x, y) is matched at origin + spread @ (shift + (1 + affine) q),
     with a gain and an offset. Baker & Matthews, "Lucas-Kanade 20 Years On", IJCV 56(3), 2004.
 
     Args:
         rows (R,): sightings in this frame; their warps, scores, variances and states are written.
-        max_shift: template pixels, beyond which a patch is given up.
-        steps: at most.
-        tolerance: on the shift's last step, template pixels.
+        max_shift: largest shift, template pixels; beyond it a patch fails.
+        steps: largest number of steps.
+        tolerance: of the shift's last step, template pixels.
     """
     window = templates.window
     reach = (int(np.round(np.sqrt(len(window)))) - 1) // 2
@@ -359,7 +363,7 @@ def align_templates(coefficients, mask, rows, sightings, max_shift, steps, toler
             _sample_grid(coefficients, origin, spread, reach, 0.0, 0.0, scratch, values)
             if number == 0 or settled:
                 mass, mean, square = _statistics(window, values)
-                if not square > _LEAST_GREY * mass:
+                if not square > _MIN_GREY_VARIANCE * mass:
                     state = FLAT
                     break
                 if settled:
@@ -396,7 +400,7 @@ def _place(sightings, o, origin, spread):
 
 @_part
 def _solve(templates, t, warp, b, step):
-    """Write the Gauss-Newton step (8,), the affine part being drawn to none."""
+    """Write the Gauss-Newton step (8,), with a zero prior on the affine part."""
     b[2:6] += templates.prior * warp[2:6]
     for r in range(8):
         total = 0.0
@@ -407,7 +411,7 @@ def _solve(templates, t, warp, b, step):
 
 @_part
 def _compose(warp, step):
-    """warp := warp after the inverse of the step's warp; False where that has none."""
+    """warp := warp after the inverse of the step's warp; False if the step is not invertible."""
     a, c, b, d = 1.0 + step[2], step[3], step[4], 1.0 + step[5]
     determinant = a * d - b * c
     if not determinant > 0.1:

@@ -1,16 +1,16 @@
-"""Patches and their sightings as arrays, as the kernels read and write them."""
+"""Arrays of patches and their sightings, as the kernels read and write them."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-# What became of a patch: aligned; without texture; masked; found too far off; no convergence in
-# the steps allowed; not alike at all.
+# States of a sighting: aligned; without texture; masked; shifted too far; not converged in the
+# allowed steps; uncorrelated.
 ALIGNED, FLAT, MASKED, FAR, UNSTEADY, UNLIKE = 0, 1, 2, 3, 4, 5
 
 
 class Templates(NamedTuple):
-    """Patches as their reference frames show them, and what aligning them needs."""
+    """Patches cut from their reference frames, and precomputed terms of their alignment."""
 
     window: np.ndarray  # (n * n,) float64, weight of each pixel, at most 1
     prior: float  # weight of a deviation of the affine part, in grey values squared
@@ -22,10 +22,11 @@ class Templates(NamedTuple):
 
 
 class Sightings(NamedTuple):
-    """Where templates should be seen, and what became of them."""
+    """Predicted sightings of templates, and the results of their alignment."""
 
     templates: np.ndarray  # (O,) int64, row of the template
-    origins: np.ndarray  # (O, 3) float64, the template's plane patch, rig frame of the seeing
+    origins: np.ndarray  # (O, 3) float64, the template's plane patch, rig frame of the observing
+    # frame
     spreads: np.ndarray  # (O, 3, 2) float64
     warps: np.ndarray  # (O, 6) float64, shift (2) and affine by columns (4): start, and result
     scores: np.ndarray  # (O,) float64, ZNCC

@@ -12,8 +12,8 @@ There is no division and nothing special at infinity. The tangent of an observat
 of theta, then of the pose of the host relative to the target: a rotation phi and a translation
 tau in the target's rig frame, `dd = phi x A(...) + theta . (1, x, y) tau + c (1, x, y) . dtheta`.
 
-The pass handles a range of patches and releases the GIL. One file, because numba renews a cached
-kernel when its own file changes only.
+The pass handles a range of patches and releases the GIL. All passes share a file, because numba
+renews a cached kernel when its own file changes only.
 """
 
 from typing import NamedTuple
@@ -27,7 +27,7 @@ _, _sums = kernel_and_part(error_model="numpy", fastmath={"contract", "reassoc"}
 
 CODE_SCALE = 28.0  # steps per grey value: spline coefficients of 8-bit images fit int16
 CODE_ZERO = 127.5  # grey value of code 0
-DIMS = 9  # of an observation's own tangent: plane (3), relative rotation (3), translation (3)
+DIMS = 9  # of an observation's tangent: plane (3), relative rotation (3), translation (3)
 
 
 class PatchData(NamedTuple):
@@ -35,11 +35,11 @@ class PatchData(NamedTuple):
 
     hosts: np.ndarray  # (P,) int32, row of the poses
     axes: np.ndarray  # (P, 3, 3) float64, rows bearing, e1, e2 in the host's frame
-    templates: np.ndarray  # (P, N) float32, normalised as observations are
+    templates: np.ndarray  # (P, N) float32, normalised like observations
     scales: np.ndarray  # (P,) float64, residual of a unit difference of normalised patches, sigmas
     offsets: np.ndarray  # (P + 1,) int64: patch p owns observations offsets[p]:offsets[p + 1]
     targets: np.ndarray  # (O,) int32, row of the poses, never the host, once per patch
-    weights: np.ndarray  # (O,) float64, of the observation's cost; 0 = left out
+    weights: np.ndarray  # (O,) float64, weight of the observation's cost; 0 = left out
     pixels: np.ndarray  # int16, spline coefficients of all windows
     starts: np.ndarray  # (O,) int64, first pixel of the observation's window
     windows: np.ndarray  # (O, 4) int32: first column and row on the sphere image, width, height
@@ -47,7 +47,8 @@ class PatchData(NamedTuple):
     width: int  # of the sphere image, pixels; its height is half of it
     floor: float  # grey values added to the contrast, in quadrature
     loss: int  # code of the robust loss
-    loss_scale: float  # root mean square of a patch's whitened residuals where it lets go
+    loss_scale: float  # root mean square of a patch's whitened residuals at which the loss turns
+    # flat
 
 
 @_part
@@ -84,7 +85,7 @@ def sample(pixels, start, column, row, columns, rows, width, x, y, z):
     pixel (column, row) of the equirectangular image, which is `width` wide.
 
     Returns:
-        inside (False where the window does not reach that far), value, gradient (3).
+        inside (False outside the window), value, gradient (3).
     """
     across = x * x + z * z
     n2 = across + y * y
@@ -152,9 +153,9 @@ def _relative(host, target, A, c):
 
 @_part
 def _look(data, p, o, plane, A, c, dims, Z):
-    """Rows of Z (10, N): derivatives by the tangent (the first `dims`), grey values (row 9).
+    """Write rows of Z (10, N): derivatives by the tangent (the first `dims`), grey values (row 9).
 
-    False where a pixel lies outside the window.
+    Returns False if a pixel lies outside the window.
     """
     axes, window = data.axes[p], data.windows[o]
     D = np.empty((3, 3))
@@ -245,12 +246,12 @@ def observe_range(
     """Model every observation of the patches first..last.
 
     Args:
-        planes (P, 3), host_poses (P, 12), target_poses (O, 12): where.
+        planes (P, 3), host_poses (P, 12), target_poses (O, 12): inverse-depth planes and poses.
         dims: 9 for the whole tangent, 3 for the plane alone, 0 for the errors alone.
         hessians (O, 9, 9), gradients (O, 9): written in their first `dims`, robust weights and
-            those of the observations included; zero for what is left out or lost.
-        errors (O,): mean square of whitened residuals; 2 scale^2 / N, that of an image which has
-            nothing to do with the template, where a window ends or an observation is left out.
+            those of the observations included; zero for observations left out or lost.
+        errors (O,): mean square of whitened residuals; 2 scale^2 / N, that of an image uncorrelated
+            with the template, outside a window or if an observation is left out.
     """
     num = len(data.grid)
     A, c, Z = np.empty((3, 3)), np.empty(3), np.empty((10, num))

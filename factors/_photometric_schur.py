@@ -9,7 +9,7 @@ _kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
 
 @_part
 def _to_poses(host, target, by_host, by_target):
-    """Rows (6, 6) that carry right steps of both poses into the tangent (phi, tau).
+    """Rows (6, 6) that map right perturbations of both poses into the tangent (phi, tau).
 
     phi = A w_host - w_target and tau = A v_host - v_target + c x w_target.
     """
@@ -33,7 +33,7 @@ def _to_poses(host, target, by_host, by_target):
 
 @_part
 def _through(view, J):
-    """Rows J (6, 6) by right steps of the pose of a lens, turned into rows by those of its rig.
+    """Map rows J (6, 6) by right perturbations of a lens's pose to those of its rig.
 
     A step (w, v) of the rig is (R^T w, R^T (v + w x t)) of a lens at view = [R | t].
     """
@@ -122,7 +122,7 @@ def _add_pair(f, g, block, row_starts, columns, off_diagonal):
 def _reduce(
     host, targets, W, inverse, down, row_starts, columns, diagonal, off_diagonal, gradient
 ):  # fmt: skip
-    """Take a patch's Schur complement from the host and the targets that see it."""
+    """Subtract a patch's Schur complement from its host and targets."""
     block, Y = np.empty((6, 6)), np.empty((6, 3))
     for i in range(len(targets) + 1):
         f = host if i == 0 else targets[i - 1]
@@ -154,16 +154,14 @@ def eliminate_range(
 ):  # fmt: skip
     """Add patches first..last, their planes eliminated, to a reduced pose system.
 
-    Args:
-        host_poses (P, 12), target_poses (O, 12): from which patches are seen, rows as poses are.
-        host_views (P, 12), target_views (O, 12): of those, in their rigs.
-        hessians (O, 9, 9), gradients (O, 9): models of the observations in their own tangents.
-        priors (P, 6): weights (3) on the plane, then its gradient (3).
-        row_starts (F + 1,), columns (Q,): frame pairs i < k as sorted CSR rows.
-        diagonal (F, 6, 6), off_diagonal (Q, 6, 6), gradient (F, 6): accumulated.
-        couplings (P + O, 3, 6): written, rows offsets[p] + p of the host, then of the targets.
-        inverses (P, 3, 3), plane_gradients (P, 3): written; with the couplings they give the
-            step of a plane, -inverse (gradient + sum of coupling @ pose step).
+    Args: host_poses (P, 12), target_poses (O, 12): lens poses that host and observe patches, as
+        pose rows. host_views (P, 12), target_views (O, 12): those lenses in their rigs. hessians
+        (O, 9, 9), gradients (O, 9): models of the observations in their own tangents. priors (P,
+        6): weights (3) on the plane, then its gradient (3). row_starts (F + 1,), columns (Q,):
+        frame pairs i < k as sorted CSR rows. diagonal (F, 6, 6), off_diagonal (Q, 6, 6), gradient
+        (F, 6): accumulated. couplings (P + O, 3, 6): written, rows offsets[p] + p of the host, then
+        of the targets. inverses (P, 3, 3), plane_gradients (P, 3): written; with the couplings they
+        give the step of a plane, -inverse (gradient + sum of coupling @ pose step).
     """
     by_host, by_target = np.empty((6, 6)), np.empty((6, 6))
     V, block = np.empty((3, 3)), np.empty((6, 6))

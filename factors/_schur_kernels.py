@@ -1,15 +1,15 @@
-"""Compiled passes over landmarks' Schur complement that is kept as products.
+"""Compiled passes over the landmarks' Schur complement in factored form.
 
-Of each visit of a landmark by a frame, U = R W (3, 6) is kept, where W is the Hessian between
-landmark and pose and R^T R the inverse of the landmark's own. The complement takes U_f^T U_g from
-the poses' Hessian wherever frames f and g see the landmark.
+For each visit of a landmark by a frame, U = R W (3, 6) is stored, where W is the Hessian between
+landmark and pose and R^T R the inverse of the landmark's own Hessian. The complement subtracts
+U_f^T U_g from the poses' Hessian wherever frames f and g observe the landmark.
 """
 
 import numpy as np
 
 from factors.compiled import kernel_and_part
 
-GROUP_DIM = 7  # directions in which a group of frames moves: a turn, a shift, a stretch
+GROUP_DIM = 7  # degrees of freedom of a group of frames: rotation, translation, scale
 
 _kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
 
@@ -25,11 +25,10 @@ def _take_squares(U, out):
 
 @_kernel
 def project_visits(visits, W, roots, shifts, diagonal, gradient):
-    """Take the landmarks of a run from the poses' own Hessian and gradient; W becomes U.
+    """Subtract the landmarks of a run from the poses' own Hessian and gradient; W becomes U.
 
     Args:
-        W (V, 3, 6), roots (L, 6), shifts (L, 3): as `factors._kernels.linearize_range` leaves
-            them.
+        W (V, 3, 6), roots (L, 6), shifts (L, 3): see `factors._kernels.linearize_range`.
         diagonal (F, 6, 6), gradient (F, 6): accumulated.
     """
     for j in range(len(visits.offsets) - 1):
@@ -72,14 +71,14 @@ def take_products(visits, U, x, out):
 
 @_kernel
 def sum_over_groups(visits, order, over, groups, bases, U, sums):
-    """What the frames of a group have in common with each landmark of a run.
+    """Sum the visits of each landmark of a run over the frames of each group.
 
     Args:
         order (V,): visits by landmark, then group.
         over: visits of the run's landmarks by groups.
         groups (F,): group of each frame.
         bases (F, 6, 7): motion of each frame when its group moves.
-        sums (E, 3, 7): written, of each visit by a group the sum of U B.
+        sums (E, 3, 7): written, the sum of U B over each visit by a group.
     """
     for j in range(len(visits.offsets) - 1):
         to, previous = over.offsets[j] - 1, -1
@@ -97,7 +96,7 @@ def sum_over_groups(visits, order, over, groups, bases, U, sums):
 
 @_kernel
 def take_groups(first, last, over, sums, target):
-    """Take the landmarks of a run from rows of groups first..last of target (7 G, 7 G), upper."""
+    """Subtract a run's landmarks from rows of groups first..last of target (7 G, 7 G), upper."""
     for g in range(first, last):
         rows = target[GROUP_DIM * g : GROUP_DIM * (g + 1)]
         for e in range(over.row_offsets[g], over.row_offsets[g + 1]):
@@ -116,7 +115,7 @@ def add_pairs_of_groups(pairs, blocks, groups, bases, target):
     """Add blocks (P, 6, 6) of pairs (P, 2) of variables to target (7 G, 7 G), upper.
 
     Args:
-        groups: (N,) of each variable, -1 where it moves on its own only.
+        groups: (N,) group of each variable, -1 = none.
         bases: (N, 6, 7).
     """
     moved = np.empty((6, GROUP_DIM))
@@ -145,7 +144,7 @@ def add_pairs_of_groups(pairs, blocks, groups, bases, target):
 
 @_kernel
 def merge_capped(rows, columns, most, labels, sizes):
-    """Merge by pairs, the first first, groups that stay within `most`; labels (N,) become roots."""
+    """Merge groups by pairs, in their order, up to a size of `most`; labels (N,) become roots."""
     for p in range(len(rows)):
         i, j = rows[p], columns[p]
         while labels[i] != i:

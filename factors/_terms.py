@@ -1,4 +1,4 @@
-"""What the observation families share: geometry of a sighting, whitening, the reference factor."""
+"""Functions shared by the observation families: geometry, whitening, the reference factor."""
 
 from collections.abc import Callable, Sequence
 
@@ -14,7 +14,7 @@ def rig_vectors(
     Args:
         world_T_rigs: (N, 4, 4) float64.
         points_world: (N, 3) float64, world.
-        origins_rig: (N, 3) rig frame, where each ray starts; None = the rig's centre. By these,
+        origins_rig: (N, 3) rig frame, origin of each ray; None = the rig's centre. By these,
             the Jacobian of d is minus one.
 
     Returns:
@@ -42,12 +42,12 @@ def pose_rows(values: gtsam.Values, keys: Sequence[int]) -> np.ndarray:
 
 
 def matrix_rows(a_T_bs: np.ndarray) -> np.ndarray:
-    """(N, 12) rows like those of poses, of transforms (N, 4, 4)."""
+    """Pose rows (N, 12) of transforms (N, 4, 4)."""
     return np.hstack([a_T_bs[:, :3, :3].reshape(-1, 9), a_T_bs[:, :3, 3]])
 
 
 def moved_rows(rows: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """Rows (N, 12) of poses, each followed by the transform of a row of views (N, 12)."""
+    """Rows (N, 12) of poses, each composed with the transform of a row of views (N, 12)."""
     turns, own = rows[:, :9].reshape(-1, 3, 3), views[:, :9].reshape(-1, 3, 3)
     moved = np.einsum("nij,nj->ni", turns, views[:, 9:]) + rows[:, 9:]
     return np.hstack([np.einsum("nij,njk->nik", turns, own).reshape(-1, 9), moved])
@@ -58,8 +58,8 @@ def whitener_rows(
 ) -> np.ndarray:
     """Upper triangles (O, 3) `[s00, s01, s11]` of 2x2 square-root information matrices.
 
-    Any square root S of the information is allowed; it is turned into the triangular one of the
-    same S^T S, which changes no cost.
+    Any square root S of the information is allowed; it is replaced by the triangular one with equal
+    S^T S, which changes no cost.
     """
     rows = np.zeros((num, 3))
     if sqrt_infos is None:

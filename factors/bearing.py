@@ -1,7 +1,8 @@
 """Bearing family: angle between a measured and a predicted direction, in the tangent plane.
 
 The residual is the log map on the sphere at the measured bearing, a tangent 2-vector whose length
-is the angle (0 to pi, never saturating). It knows no image, so no seam, pole or face.
+is the angle (0 to pi, never saturating). It does not depend on an image, so that it has no seam,
+pole or face.
 """
 
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import numpy as np
 from factors._observations import BEARING
 from factors._terms import custom_factor, rig_vectors, whitener_rows
 
-_SMALL = 1e-12  # of the sine of the angle: the residual's direction is not defined nearer to pi
+_MIN_SINE = 1e-12  # sine of the angle below which the residual's direction is undefined near pi
 
 
 def tangent_basis(bearings: np.ndarray) -> np.ndarray:
@@ -45,13 +46,13 @@ def bearing_residuals(
         world_T_rigs: (N, 4, 4) float64, pose that sees each observation.
         points_world: (N, 3) float64, world.
         bearings_rig: (N, 3) float64, unit, measured, rig frame.
-        origins_rig: (N, 3) float64, rig frame, where each ray starts; None = the rig's centre.
+        origins_rig: (N, 3) float64, rig frame, origin of each ray; None = the rig's centre.
             The Jacobian by them is minus that by the point, times world_R_rig.
 
     Returns:
         residuals (N, 2) in radians along `tangent_basis(bearings_rig)`, Jacobians by the pose
-        (N, 2, 6) and by the point (N, 2, 3). Zero Jacobians exactly opposite the measurement;
-        at the rig's centre, where there is no direction, also the residual (pi, 0).
+        (N, 2, 6) and by the point (N, 2, 3). Jacobians are zero exactly opposite the measurement;
+        at the rig's centre, where no direction exists, the residual is (pi, 0) besides.
     """
     d, d_pose, d_point = rig_vectors(world_T_rigs, points_world, origins_rig)
     axes = tangent_basis(bearings_rig)
@@ -62,7 +63,7 @@ def bearing_residuals(
     angle = np.arctan2(s, z)
     centre = length == 0
     n2 = np.where(centre, 1.0, squared)
-    regular = s > _SMALL * length
+    regular = s > _MIN_SINE * length
     safe_s = np.where(regular, s, 1.0)
     ahead = np.where(z > 0, z, np.inf)
     f = np.where(regular, angle / safe_s, 1.0 / ahead)
@@ -88,7 +89,7 @@ class BearingTerm:
     sigmas_rad: np.ndarray | float = 1.0  # () or (O,) radians, per axis
     sqrt_infos: np.ndarray | None = None  # (O, 2, 2) 1/rad on tangent_basis; replaces sigmas_rad
     name: str = "bearing"
-    origins_rig: np.ndarray | None = None  # (O, 3) map units, rig frame: where each ray starts,
+    origins_rig: np.ndarray | None = None  # (O, 3) map units, rig frame: origin of each ray,
     # the centre of its lens; None = the rig\'s own centre
 
     kind = BEARING
@@ -102,7 +103,7 @@ class BearingTerm:
         return whitener_rows(len(self.frames), self.sigmas_rad, self.sqrt_infos)
 
     def cameras(self) -> np.ndarray:
-        """No faces here: (0, 12)."""
+        """Empty: bearings have no faces, (0, 12)."""
         return np.zeros((0, 12))
 
 
@@ -135,14 +136,14 @@ def LensBearingFactor(
     noise_model: gtsam.noiseModel.Base,
     sign: float = 1.0,
 ) -> gtsam.CustomFactor:
-    """One bearing seen through a lens beside the rig's centre: the reference for lens centres.
+    """One bearing observed through a lens off the rig's centre: the reference for lens centres.
 
     Args:
         pose_key, point_key: keys of a Pose3 `world_T_rig` and of a Point3.
-        centre_key: of a Point3, the front lens in the rig frame, map units.
+        centre_key: key of a Point3, the front lens's centre in the rig frame, map units.
         bearing_rig: (3,) unit, rig frame.
         noise_model: of dimension 2, radians on `tangent_basis(bearing_rig)`, robust or not.
-        sign: 1 for the front lens, -1 for one as far behind the rig's centre.
+        sign: 1 for the front lens, -1 for the opposite one.
     """
     measured = np.asarray(bearing_rig, dtype=np.float64)[None]
 

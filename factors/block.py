@@ -1,4 +1,4 @@
-"""What the optimizer asks of a block of like factors."""
+"""The interface of a block of like factors to the optimizer."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ class PoseSystem:
 
 
 class Block(Protocol):
-    """Like factors held as arrays, on variables of at most six dimensions; it may have inner ones.
+    """Like factors held as arrays, on variables of at most six dimensions, perhaps with inner ones.
 
     The optimizer calls, in this order: `refresh` and `linearize` at accepted values, then any
-    number of `propose`, of which the last is followed by `accept` if its values were taken.
+    number of `propose`, of which the last is followed by `accept` if its values are accepted.
     """
 
     @property
@@ -40,7 +40,7 @@ class Block(Protocol):
         ...
 
     def refresh(self, values: gtsam.Values) -> None:
-        """Renew what depends on accepted values (renderings, patches); may do nothing."""
+        """Recompute data that depend on accepted values (renderings, patches); may do nothing."""
         ...
 
     def linearize(self, values: gtsam.Values) -> PoseSystem:
@@ -57,5 +57,5 @@ class Block(Protocol):
         ...
 
     def costs(self, values: gtsam.Values) -> dict[str, float]:
-        """Cost of each family, inner variables as they are."""
+        """Cost of each family, at the current inner variables."""
         ...

@@ -9,13 +9,13 @@ def jacobian_errors(
 ) -> dict[int, float]:
     """Largest disagreement between a factor's Jacobians and central differences.
 
-    The factor is linearized by GTSAM, so what is checked is what an optimizer gets: whitened and,
-    with a robust noise model, weighted. Give the factor a Gaussian noise model: robust weights
-    have no place in the derivative of a residual.
+    The factor is linearized by GTSAM, so that the check covers the optimizer's input: whitened
+    and, with a robust noise model, weighted. Give the factor a Gaussian noise model: robust weights
+    are no part of a residual's derivative.
 
     Args:
         factor: any nonlinear factor with a Gaussian noise model.
-        values: point to check at, with a value for each of its keys.
+        values: values of all its keys, at which it is checked.
         step: of the differences, in each variable's tangent space.
 
     Returns:

@@ -22,17 +22,17 @@ def _nothing() -> np.ndarray:
 
 @dataclass(slots=True)
 class _Front:
-    """A run of columns with the rows below it: where its entries lie, and its part of the factor.
+    """A run of columns with the rows below it: places of its entries, and its part of the factor.
 
-    Local places count blocks: first those of the columns, then those of the rows.
+    Local places are block indices: columns first, then rows.
     """
 
     first: int  # column
     width: int  # W columns
-    rows: np.ndarray  # (R,) places below
-    slots: np.ndarray  # (E,) pairs of the system in these columns
+    rows: np.ndarray  # (R,) places of the rows below
+    slots: np.ndarray  # (E,) pairs of the system that lie in these columns
     places: np.ndarray  # (E, 2) local row and column of each
-    flips: np.ndarray  # (E,) bool, where the pair's block is to be transposed
+    flips: np.ndarray  # (E,) bool, True if the pair's block is transposed
     above: np.ndarray  # (R,) local places of the rows in the parent's front
     lower: np.ndarray = field(
         default_factory=_nothing
@@ -96,12 +96,12 @@ class BlockCholesky:
 
     @property
     def num_entries(self) -> int:
-        """Of the factor."""
+        """Number of entries of the factor."""
         widths = [(DIM * f.width, DIM * len(f.rows)) for f in self._fronts]
         return sum(width * (width + 1) // 2 + width * rest for width, rest in widths)
 
     def factorize(self, diagonal: np.ndarray, off_diagonal: np.ndarray) -> bool:
-        """Factorize H; False (and unusable) where it is not positive definite.
+        """Factorize H; False (and unusable) if it is not positive definite.
 
         Args:
             diagonal: (N, 6, 6), symmetric blocks H[i, i].
@@ -157,10 +157,10 @@ class BlockCholesky:
         Chen, 1973.
 
         Args:
-            pairs: (Q, 2) int, of the pattern, either index first.
+            pairs: (Q, 2) int, pairs of the pattern, in either order.
 
         Returns:
-            (N, 6, 6) those on the diagonal, (Q, 6, 6) those [i, j] of the pairs.
+            (N, 6, 6) diagonal blocks, (Q, 6, 6) blocks [i, j] of the pairs.
         """
         pairs = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
         placed = np.sort(self._place[pairs], axis=1)
@@ -168,7 +168,7 @@ class BlockCholesky:
         inverse = np.empty((self.num_blocks, DIM, DIM))
         between = np.empty((len(pairs), DIM, DIM))
         waiting = np.bincount(self._parents[self._parents >= 0], minlength=len(self._fronts))
-        whole: dict[int, np.ndarray] = {}  # of fronts whose children are still to come
+        whole: dict[int, np.ndarray] = {}  # of fronts with unprocessed children
         for s in range(len(self._fronts) - 1, -1, -1):
             front, parent = self._fronts[s], int(self._parents[s])
             Z = self._inverse_of_front(front, whole.get(parent, _nothing()))
@@ -205,13 +205,13 @@ class BlockCholesky:
 
 
 def _local(places: np.ndarray, first: int, width: int, rows: np.ndarray) -> np.ndarray:
-    """Local places of a front of places that it has: its columns', then its rows'."""
+    """Local places of a front, given places that belong to it: its columns', then its rows'."""
     return np.where(places < first + width, places - first, width + np.searchsorted(rows, places))
 
 
 @_kernel
 def _fill(lower, below, diagonal, off_diagonal, slots, places, flips):
-    """Put the blocks of a system into a front, which is zero before."""
+    """Copy the blocks of a system into a front of zeros."""
     for k in range(len(diagonal)):
         for c in range(DIM):
             for r in range(DIM):
@@ -228,7 +228,7 @@ def _fill(lower, below, diagonal, off_diagonal, slots, places, flips):
 
 @_kernel
 def _extend(lower, below, rest, update, above):
-    """Add a child's update, of which the lower triangle counts, to a front."""
+    """Add a child's update, in its lower triangle, to a front."""
     width = lower.shape[0]
     for k in range(len(above)):
         for i in range(k, len(above)):

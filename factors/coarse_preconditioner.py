@@ -1,4 +1,4 @@
-"""About the inverse of H for conjugate gradients: each variable alone, and groups moved as one."""
+"""A two-level preconditioner for conjugate gradients: single variables, and groups moved as one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,9 +12,10 @@ from factors.cholesky import DIM
 from factors.pose_clusters import Groups
 from factors.schur_complement import GroupVisits, SchurComplement
 
-_LEAST_PART = 1e-10  # of its curvature, that is added to a motion of a group
+_RELATIVE_DAMPING = 1e-10  # part of its curvature added to a motion of a group
 
-Held = tuple[SchurComplement, np.ndarray, Sequence[GroupVisits]]  # of these variables, by groups
+Held = tuple[SchurComplement, np.ndarray, Sequence[GroupVisits]]  # complement, its variables,
+# visits by groups
 
 (potrf,) = get_lapack_funcs(("potrf",), dtype=np.float64)
 (trsm,) = get_blas_funcs(("trsm",), dtype=np.float64)
@@ -22,15 +23,15 @@ Held = tuple[SchurComplement, np.ndarray, Sequence[GroupVisits]]  # of these var
 
 @dataclass(frozen=True, slots=True)
 class Coarse:
-    """The exact solution for groups that turn, shift and stretch.
+    """The exact solution for groups that rotate, translate and scale.
 
-    With Jacobi's by variable it makes an additive preconditioner of two levels: that one corrects
-    what is local, this one what drifts, for which iterations that pass news from frame to frame
-    are slow. Nicolaides, "Deflation of conjugate gradients", 1987.
+    With Jacobi's preconditioner by variable it forms an additive one of two levels: Jacobi's
+    corrects local errors, this one drift, for which iterations between neighbouring frames converge
+    slowly. Nicolaides, "Deflation of conjugate gradients", 1987.
     """
 
-    motion: csr_matrix  # (6 N, 7 G) of the variables by that of groups, of unit curvature
-    lower: np.ndarray  # (7 G, 7 G) Cholesky factor of H as groups feel it
+    motion: csr_matrix  # (6 N, 7 G) motion of the variables by that of groups, of unit curvature
+    lower: np.ndarray  # (7 G, 7 G) Cholesky factor of H projected to groups
 
     def solve(self, residual: np.ndarray) -> np.ndarray:
         """Motion (N, 6, R) of groups under forces (N, 6, R)."""
@@ -48,13 +49,13 @@ def coarse_system(
     groups: Groups,
     bases: np.ndarray,
 ) -> Coarse | None:
-    """H as groups of variables feel it, factorized; None where it is not positive definite.
+    """H projected to groups of variables, factorized; None if it is not positive definite.
 
     Args:
-        written: (N, 6, 6) blocks H[i, i], but for what comes from what is held.
-        off_diagonal, pairs: (P, 6, 6), (P, 2) the rest of that part, i < j.
-        held: complements of landmarks, the variables (F,) of their poses, and their visits.
-        groups, bases: of the variables.
+        written: (N, 6, 6) blocks H[i, i], without the factored complements.
+        off_diagonal, pairs: (P, 6, 6), (P, 2) off-diagonal blocks of that part, i < j.
+        held: complements of landmarks in factored form, their variables (F,), and visits by groups.
+        groups, bases: groups of the variables and their motions.
     """
     num = GROUP_DIM * groups.num
     target = np.zeros((num, num))  # its upper triangle
@@ -72,7 +73,7 @@ def coarse_system(
     scale = np.where(curvature > 0, 1 / np.sqrt(np.where(curvature > 0, curvature, 1.0)), 1.0)
     target *= scale[:, None]
     target *= scale
-    np.einsum("ii->i", target)[:] = 1.0 + _LEAST_PART
+    np.einsum("ii->i", target)[:] = 1.0 + _RELATIVE_DAMPING
     lower, failed = potrf(target.T, lower=1, clean=0, overwrite_a=1)  # target.T: Fortran's order
     if failed:
         return None
@@ -80,7 +81,7 @@ def coarse_system(
 
 
 def _motion(groups: Groups, bases: np.ndarray) -> csr_matrix:
-    """Motion (6 N, 7 G) of the variables by that of groups."""
+    """Motion (6 N, 7 G) of the variables, given that of groups."""
     at = np.flatnonzero(groups.labels >= 0)
     rows = DIM * at[:, None, None] + np.arange(DIM)[:, None] + np.zeros(GROUP_DIM, np.int64)
     columns = GROUP_DIM * groups.labels[at][:, None, None] + np.arange(GROUP_DIM)

@@ -1,12 +1,12 @@
-"""How kernels are compiled: each one whole, with all its parts inlined.
+"""Compilation of kernels: each one as a whole, with all its parts inlined.
 
-A kernel that calls another compiled function is answered by whichever copy of that function was
-loaded first: the function's own while kernels are being compiled, the kernel's, or that of another
-kernel, once they come from the cache. Each copy is optimised where it stands, so they may round
-differently. Parts are therefore inlined, and kernels leave no sums or products of arrays to numpy.
-`tests/factors/test_compiled.py` holds both.
+A kernel that calls another compiled function uses the copy that was loaded first: the function's
+own while kernels are being compiled, but the kernel's own, or another kernel's, once they come from
+the cache. Copies are optimised in their context, so they may round differently. Parts are therefore
+inlined, and kernels leave no sums or products of arrays to numpy. `tests/factors/test_compiled.py`
+tests both.
 
-Compiling takes half a minute in all, in which nothing else seems to happen: the log says so.
+Compiling takes half a minute in all, which the log announces.
 """
 
 import logging
@@ -21,13 +21,13 @@ from numba.core import event
 
 logger = logging.getLogger(__name__)
 
-_PAUSE_S = 10.0  # between compilations that are announced apart
+_MIN_PAUSE_S = 10.0  # longest pause between compilations announced together
 
 
 def kernel_and_part(**options: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Decorators of one file's kernels, called from Python, and of the parts they are made of.
 
-    Both are cached and release the GIL. All parts of a kernel should be in its file: numba renews
+    Both are cached and release the GIL. All parts of a kernel must be in its file: numba renews
     a cached kernel when its own file changes, not when a part in another file does.
 
     Args:
@@ -39,13 +39,13 @@ def kernel_and_part(**options: Any) -> tuple[Callable[..., Any], Callable[..., A
 
 
 class _Announcer(event.Listener):
-    """Logs compilations, those close to one another once; kernels found on disk are none."""
+    """Logs compilations, nearby ones once; loading a kernel from disk is none."""
 
     latest = -math.inf  # seconds
 
     def on_start(self, event: Any) -> None:
         before, self.latest = self.latest, time.monotonic()
-        if self.latest - before > _PAUSE_S:
+        if self.latest - before > _MIN_PAUSE_S:
             logger.info("compiling kernels, once per machine: this takes a while")
 
     def on_end(self, event: Any) -> None:

@@ -23,14 +23,14 @@ def conjugate_gradients(
     Args:
         multiply: H applied to (N, 6, R), symmetric positive definite.
         right: (N, 6, R).
-        precondition: about H^-1 applied to (N, 6, R), symmetric positive definite.
-        tolerance: of each residual in the preconditioner's norm, part of what it is at x = 0.
-        max_iterations: products with H.
-        truncate: take what they have by then: less than asked, yet nearer than x = 0.
+        precondition: approximate H^-1 applied to (N, 6, R), symmetric positive definite.
+        tolerance: of each residual in the preconditioner's norm, relative to x = 0.
+        max_iterations: largest number of products with H.
+        truncate: return the last iterate even if the tolerance is not reached.
 
     Returns:
-        x (N, 6, R) and the residual right - H x; None where they do not get that far, or where H
-        turns out not to be positive definite.
+        x (N, 6, R) and the residual right - H x; None if the tolerance is not reached, or if H is
+        not positive definite.
     """
     x, residual = np.zeros_like(right), right.copy()
     better = precondition(residual)
@@ -57,7 +57,7 @@ def conjugate_gradients(
 
 
 def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Inner products (R,) of as many vectors each."""
+    """Inner products (R,) of two sets of R vectors."""
     return np.einsum("nir,nir->r", a, b)
 
 

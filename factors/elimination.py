@@ -1,4 +1,4 @@
-"""Landmarks eliminated from linearized observations, whatever variables their frames have."""
+"""Elimination of landmarks from linearized observations with any frame variables."""
 
 from dataclasses import dataclass
 
@@ -8,15 +8,15 @@ from scipy.sparse import block_array, bsr_array, csr_array
 from factors._kernels import eliminate_linear_range
 from factors._observations import covisible_pairs
 
-_DAMPING = 1e-12  # of a landmark, part of the sum of squares of its Jacobian
+_RELATIVE_DAMPING = 1e-12  # damping of a landmark, part of the sum of squares of its Jacobian
 
 
 @dataclass(frozen=True, slots=True)
 class LinearSystem:
-    """Normal equations over K variables of each frame, frame after frame, then S of all frames."""
+    """Normal equations over K variables of each frame, frame after frame, then S shared ones."""
 
-    cost: float  # where it was linearized
-    gradient: np.ndarray  # (F K + S,) there
+    cost: float  # at the linearization point
+    gradient: np.ndarray  # (F K + S,) at the linearization point
     hessian: csr_array  # (F K + S, F K + S)
 
 
@@ -33,11 +33,11 @@ def eliminate(
 
     Args:
         num_frames: F.
-        frames, points: (O,) of each observation, int.
+        frames, points: (O,) int, frame and landmark of each observation.
         residuals: (O, 2) whitened.
-        by_point: (O, 2, 3) their Jacobian by the landmark.
-        by_frame: (O, 2, K) that by the variables of the frame.
-        by_shared: (O, 2, S) that by the variables of all frames.
+        by_point: (O, 2, 3) Jacobian by the landmark.
+        by_frame: (O, 2, K) Jacobian by the variables of the frame.
+        by_shared: (O, 2, S) Jacobian by the shared variables.
     """
     own, common = by_frame.shape[2], by_shared.shape[2]
     order = np.lexsort((frames, points))
@@ -49,7 +49,7 @@ def eliminate(
     shared, shared_gradient = np.zeros((common, common)), np.zeros(common)
     cost = eliminate_linear_range(
         0, len(offsets) - 1, offsets, frames, residuals[order], by_point[order], by_frame[order],
-        by_shared[order], _DAMPING, int(np.diff(offsets).max(initial=0)), starts, columns,
+        by_shared[order], _RELATIVE_DAMPING, int(np.diff(offsets).max(initial=0)), starts, columns,
         diagonal, upper, to_shared, shared, gradient, shared_gradient,
     )  # fmt: skip
     size, rows = num_frames * own, np.arange(num_frames + 1)

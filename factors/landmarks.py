@@ -1,4 +1,4 @@
-"""Batched observations of shared landmarks, eliminated inside: the block and its two doors."""
+"""Batched observations of shared landmarks, eliminated inside: the block and its two interfaces."""
 
 import os
 from collections.abc import Sequence
@@ -30,22 +30,22 @@ from factors.robust import RobustLoss
 from factors.schur_complement import SchurComplement
 from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 
-_POLISH_TOLERANCE = 1e-12  # of a landmark's cost
+_POLISH_TOLERANCE = 1e-12  # part of a landmark's cost
 _HOST_POLISH_STEPS = 50  # at each evaluation: an error is a function of the poses alone
-_VISITS = 1 << 17  # of landmarks that are eliminated together: 19 MB
-_RANGE = 1 << 14  # least observations that a thread adds up on its own
-_PROPOSAL_TOLERANCE = 1e-6  # of a landmark's cost: further steps gain less than the poses do
+_MAX_VISITS_AT_ONCE = 1 << 17  # visits of landmarks that are eliminated together: 19 MB
+_MIN_THREAD_OBSERVATIONS = 1 << 14  # least observations that a thread accumulates on its own
+_PROPOSAL_TOLERANCE = 1e-6  # part of a landmark's cost below which further steps are skipped
 
 
 class LandmarkBlock:
     """All observations of a set of landmarks, by any number of families.
 
-    Implements `factors.block.Block` (the fast door); `factors()` opens the other one. Threads
+    Implements `factors.block.Block`; `factors()` gives ordinary GTSAM factors instead. Threads
     share the work when `num_threads` is above one.
 
     Attributes:
         keys: (F,) keys of the Pose3 variables `world_T_rig`.
-        shared: (P,) float32, how many landmarks each two of `pairs` have in common.
+        shared: (P,) float32, number of landmarks that each of `pairs` shares.
         points_world: (J, 3) float64, current landmarks in the order given.
     """
 
@@ -65,11 +65,11 @@ class LandmarkBlock:
             points_world: (J, 3) start values, world.
             terms: observations; frames index keys, points index points_world.
             loss: robust loss on each whitened residual norm; None is plain least squares.
-            num_threads: None takes the cores there are, at most 16.
+            num_threads: None = number of cores, at most 16.
             polish_steps: Gauss-Newton steps on the landmarks after each proposed pose step.
 
         Raises:
-            ValueError: indices out of range, values not finite, arrays of unequal length.
+            ValueError: indices are out of range, values not finite, or arrays of unequal length.
         """
         self.keys = [int(key) for key in keys]
         self.loss = loss or RobustLoss()
@@ -86,7 +86,9 @@ class LandmarkBlock:
             self.terms, len(self.keys), len(points), self.loss
         )
         self._points = points[self._point_order]
-        self._visits = visits_of(self._obs.offsets, self._obs.frames, len(self.keys), _VISITS)
+        self._visits = visits_of(
+            self._obs.offsets, self._obs.frames, len(self.keys), _MAX_VISITS_AT_ONCE
+        )
         self._row_starts, self._columns, self.shared = covisible_pairs(
             self._obs.offsets, self._obs.frames, len(self.keys)
         )
@@ -96,13 +98,13 @@ class LandmarkBlock:
 
     @property
     def pairs(self) -> np.ndarray:
-        """(P, 2) int64, rows f < g of keys that see a landmark in common."""
+        """(P, 2) int64, rows f < g of keys with a common landmark."""
         rows = np.repeat(np.arange(len(self.keys)), np.diff(self._row_starts))
         return np.column_stack([rows, self._columns])
 
     @property
     def visits(self) -> Sequence[Visits]:
-        """Of its landmarks by frames, in runs."""
+        """Visits of its landmarks by frames, in runs."""
         return self._visits
 
     @property
@@ -113,7 +115,7 @@ class LandmarkBlock:
         return out
 
     def refresh(self, values: gtsam.Values) -> None:
-        """Nothing depends on accepted values here."""
+        """Do nothing: no data depend on accepted values."""
 
     def linearize(self, values: gtsam.Values) -> PoseSystem:
         """Reduced pose system at `values`: robust weights, landmarks eliminated."""
@@ -127,7 +129,8 @@ class LandmarkBlock:
     def eliminate(
         self, values: gtsam.Values
     ) -> tuple[SchurComplement, np.ndarray, dict[str, float]]:
-        """As `linearize`, the Hessian not written out: it, the gradient (F, 6), and costs."""
+        """Factored Hessian, gradient (F, 6), and costs: the model of `linearize` in product
+        form."""
         self._poses = pose_rows(values, self.keys)
         complement, gradient, costs, self._point_costs = complement_of(
             self._obs, self._visits, self._points, self._poses, len(self.families),
@@ -136,7 +139,7 @@ class LandmarkBlock:
         return complement, gradient, self._named(costs)
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
-        """Robust cost at `values`, `steps (F, 6)` from the linearization, landmarks moved along."""
+        """Robust cost at `values`, `steps (F, 6)` from the linearization, with landmarks moved."""
         if self._poses is None:
             raise RuntimeError("propose() needs linearize() before it")
         poses, steps = pose_rows(values, self.keys), np.ascontiguousarray(steps)
@@ -180,13 +183,13 @@ class LandmarkBlock:
         return sum(self.costs(values).values())
 
     def factors(self) -> list[gtsam.CustomFactor]:
-        """The same cost as ordinary GTSAM factors on poses, one per first frame of landmarks.
+        """The cost as ordinary GTSAM factors on poses, one per first frame of landmarks.
 
-        The landmarks of a group are eliminated inside the callback, each at its best for the poses
-        asked about. Where derivatives are asked for too, they become the block's current ones.
+        The landmarks of a group are eliminated inside the callback, each optimised for the given
+        poses. If derivatives are requested too, these landmarks become the block's current ones.
         """
         offsets, frames = self._obs.offsets, self._obs.frames
-        seen = np.flatnonzero(np.diff(offsets))  # landmarks without observations say nothing
+        seen = np.flatnonzero(np.diff(offsets))  # landmarks without observations are left out
         hosts = frames[offsets[seen]]  # observations are sorted by frame: the first one
         bounds = np.flatnonzero(np.diff(hosts, prepend=-1))
         return [
@@ -214,7 +217,7 @@ class LandmarkBlock:
         pairs = np.stack(np.triu_indices(num, 1), axis=1)
         row_starts = np.concatenate([[0], np.cumsum(np.arange(num - 1, -1, -1))]).astype(np.int64)
         columns = pairs[:, 1].astype(np.int64)
-        visits = visits_of(local.offsets, local.frames, num, _VISITS)
+        visits = visits_of(local.offsets, local.frames, num, _MAX_VISITS_AT_ONCE)
 
         def evaluate(values: gtsam.Values, with_system: bool) -> tuple[float, PoseSystem | None]:
             poses = pose_rows(values, keys)
@@ -288,7 +291,7 @@ def eliminate_points(
     """Reduced pose system of observations: robust weights, landmarks eliminated.
 
     Args:
-        obs, visits: by landmark.
+        obs, visits: observations and visits by landmark.
         points: (J, 3) world.
         poses: (F, 12) as in `factors._kernels`.
         row_starts, columns: (F + 1,), (P,) covisible frame pairs i < k as sorted CSR rows.
@@ -323,7 +326,10 @@ def _eliminate_run(
     num = len(run.offsets) - 1
     inverses, roots, shifts = np.empty((num, 6)), np.empty((num, 6)), np.empty((num, 3))
     offsets = obs.offsets[run.first : run.first + num + 1]
-    ranges, rows = balanced_ranges(offsets - offsets[0], _RANGE), balanced_ranges(run.row_offsets)
+    ranges, rows = (
+        balanced_ranges(offsets - offsets[0], _MIN_THREAD_OBSERVATIONS),
+        balanced_ranges(run.row_offsets),
+    )
 
     def add(i: int) -> tuple[np.ndarray, ...]:
         sums = np.zeros_like(diagonal), np.zeros_like(gradient), np.zeros_like(costs)
@@ -350,10 +356,10 @@ def complement_of(
     num_families: int,
     num_threads: int,
 ) -> tuple[SchurComplement, np.ndarray, np.ndarray, np.ndarray]:
-    """As `eliminate_points`, the system kept as products.
+    """The system of `eliminate_points` in factored form.
 
     Returns:
-        It, the gradient (F, 6); robust costs of families (T,) and of landmarks (J,).
+        The complement, the gradient (F, 6); robust costs of families (T,) and of landmarks (J,).
     """
     num = len(poses)
     own, taken, gradient = np.zeros((num, 6, 6)), np.zeros((num, 6, 6)), np.zeros((num, 6))

@@ -1,7 +1,7 @@
-"""Patches of a sphere image seen again in others: what they are, and their pixels gathered.
+"""Patches of a sphere image observed in others: their table, and their pixels gathered.
 
-Frames are taken one at a time: of each, the templates of the patches that it hosts and a small
-window around every patch that it shows. Memory grows with observations, never with the images.
+Frames are processed one at a time: each gives the templates of its own patches and a small window
+around every patch that it shows. Memory grows with observations, never with the images.
 """
 
 from dataclasses import dataclass, replace
@@ -13,35 +13,36 @@ from factors.bearing import tangent_basis
 from factors.sphere_image import SphereImage
 
 PAD = 2  # coefficients beyond the border: the support of the spline
-_LEAST_COSINE = 0.15  # of the angle between a patch's normal and the ray that sees it
-_MOST_ZOOM = 2.0  # change of a patch's size between host and target, either way
+_MIN_VIEW_COSINE = 0.15  # least cosine between a patch's normal and its viewing ray
+_MAX_ZOOM = 2.0  # largest ratio of a patch's size between host and target, either way
 
 
 @dataclass(frozen=True, slots=True)
 class PatchViews:
-    """From where, and how turned, a rig's lenses have what its panorama shows of patches.
+    """Poses of the local views by which a rig's lenses show patches in its panorama.
 
-    Held while poses are solved: a patch that moves to the other lens is another observation.
+    They are fixed while poses are solved: a patch that moves to the other lens would differ.
     """
 
-    rig_T_hosts: np.ndarray  # (P, 4, 4) float64, what hosts show, as rays of their rigs
-    rig_T_targets: np.ndarray  # (O, 4, 4) float64, what targets show
+    rig_T_hosts: np.ndarray  # (P, 4, 4) float64, views of hosts in their rigs
+    rig_T_targets: np.ndarray  # (O, 4, 4) float64, views of targets in their rigs
 
     def of(self, rows: np.ndarray, observations: np.ndarray) -> "PatchViews":
-        """Those of some patches (p,) and of observations (O,) bool."""
+        """The views of some patches (p,) and of observations (O,) bool."""
         return PatchViews(self.rig_T_hosts[rows], self.rig_T_targets[observations])
 
 
 @dataclass(frozen=True, slots=True)
 class PatchTable:
-    """Patches and the frames that should show them."""
+    """Patches and the frames in which they should be visible."""
 
     hosts: np.ndarray  # (P,) int, frame whose pixels are the template
-    bearings_rig: np.ndarray  # (P, 3) float64, unit, centre in the host's rig frame, as pictured
+    bearings_rig: np.ndarray  # (P, 3) float64, unit, centre in the host's rig frame, as in its
+    # picture
     planes: np.ndarray  # (P, 3) float64, 1 / map units: inverse depth and slopes, see `planes_from`
-    plane_sigmas: np.ndarray  # (P, 3) float64, 1 / map units, of the prior on `planes`; inf = none
+    plane_sigmas: np.ndarray  # (P, 3) float64, 1 / map units, prior of `planes`; inf = none
     offsets: np.ndarray  # (P + 1,) int64: patch p owns targets[offsets[p]:offsets[p + 1]]
-    targets: np.ndarray  # (O,) int, frames, never the host and none twice for a patch
+    targets: np.ndarray  # (O,) int, frames, without the host and without repetition in a patch
     grid: np.ndarray  # (N, 2) float64, pixels on the tangent plane of the bearing
     views: "PatchViews | None" = None  # of rigs whose lenses have centres of their own
 
@@ -54,19 +55,19 @@ class PatchTable:
         return np.repeat(np.arange(len(self)), np.diff(self.offsets))
 
     def world_T_hosts(self, world_T_rigs: np.ndarray) -> np.ndarray:
-        """Poses (P, 4, 4) from which hosts see their patches."""
+        """Poses (P, 4, 4) of the views in which hosts show their patches."""
         world_T_hosts = world_T_rigs[self.hosts]
         return world_T_hosts if self.views is None else world_T_hosts @ self.views.rig_T_hosts
 
     def world_T_targets(self, world_T_rigs: np.ndarray) -> np.ndarray:
-        """Poses (O, 4, 4) from which targets see them."""
+        """Poses (O, 4, 4) of the views in which targets show them."""
         world_T_targets = world_T_rigs[self.targets]
         return world_T_targets if self.views is None else world_T_targets @ self.views.rig_T_targets
 
     def select(self, observations: np.ndarray) -> "tuple[PatchTable, np.ndarray]":
-        """The table of some observations (O,) bool, and the patches (p,) that have any.
+        """The table of some observations (O,) bool, and the patches (p,) with any of them.
 
-        Frames keep their numbers.
+        Frames keep their indices.
         """
         counts = np.bincount(self.owners[observations], minlength=len(self))
         rows = np.flatnonzero(counts)
@@ -83,11 +84,11 @@ class PatchTable:
         return part, rows
 
     def check(self, num_frames: int) -> None:
-        """Refuse arrays that do not fit one another.
+        """Refuse inconsistent arrays.
 
         Raises:
-            ValueError: unequal lengths, indices out of range, values not finite, a patch that
-                names its host or a frame twice as target.
+            ValueError: unequal lengths, indices out of range, values not finite, or a patch with
+                its host or a repeated frame as target.
         """
         num = len(self.hosts)
         wanted = {
@@ -138,14 +139,14 @@ def planes_from(
 ) -> np.ndarray:
     """Inverse-depth planes (P, 3) of patches at distances (P,), map units.
 
-    Along bearing + x e1 + y e2 the plane is met at 1 / (theta0 + x theta1 + y theta2) of that
-    vector's length.
+    Along bearing + x e1 + y e2 the plane is at 1 / (theta0 + x theta1 + y theta2) times the length
+    of that vector.
 
     Args:
         bearings_rig: (P, 3) unit.
         distances: (P,) positive.
-        normals_rig: (P, 3) of any length, either sign, not at right angles to the bearing; None
-            lays the planes at right angles to the bearings.
+        normals_rig: (P, 3) of any length, either sign, not orthogonal to the bearing; None = planes
+            orthogonal to the bearings.
     """
     inverse = 1.0 / np.asarray(distances, dtype=np.float64)
     planes = np.zeros((len(inverse), 3))
@@ -175,9 +176,9 @@ def covisible_frames(table: PatchTable, num_frames: int) -> tuple[np.ndarray, np
 def patch_spans(
     table: PatchTable, world_T_rigs: np.ndarray, planes: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
-    """Vectors (R, 3, 3), rows: to the centre, and per tangent along e1 and e2.
+    """Vectors (R, 3, 3), rows: to the patch's centre, and its derivatives along e1 and e2.
 
-    As the targets' panoramas show them, of observations `rows (R,)`, times the inverse depth.
+    They are in the views of targets, for observations `rows (R,)`, times the inverse depth.
     """
     owners = table.owners[rows]
     host = table.world_T_hosts(world_T_rigs)[owners]
@@ -191,10 +192,10 @@ def patch_spans(
 def poor_views(
     table: PatchTable, world_T_rigs: np.ndarray, planes: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Reason -> observations (O,) bool that show their patch too badly to count.
+    """Reason -> observations (O,) bool from which a patch cannot be aligned.
 
-    "behind": a pixel of the patch has no positive depth; "grazing": the target sees it from behind
-    or along its surface; "zoom": far larger or smaller than the host does.
+    "behind": a pixel of the patch has no positive depth; "grazing": the target sees the plane's
+    back or along its surface; "zoom": far larger or smaller than in the host.
     """
     owners = table.owners
     inverse_depths = np.column_stack([np.ones(len(table.grid)), table.grid]) @ planes.T
@@ -211,8 +212,8 @@ def poor_views(
     cosine = np.einsum("oi,oi->o", normals, rays) / length
     return {
         "behind": ~np.all(inverse_depths > 0, axis=0)[owners],
-        "grazing": ~(cosine > _LEAST_COSINE),
-        "zoom": ~((area < _MOST_ZOOM**2) & (area > _MOST_ZOOM**-2)),
+        "grazing": ~(cosine > _MIN_VIEW_COSINE),
+        "zoom": ~((area < _MAX_ZOOM**2) & (area > _MAX_ZOOM**-2)),
     }
 
 
@@ -225,7 +226,7 @@ def pixels_of(bearings: np.ndarray, width: int) -> np.ndarray:
 
 
 def over_poles(image: np.ndarray, rows: int) -> np.ndarray:
-    """An image (H, 2 H[, C]) with `rows` more beyond either pole, where the sphere goes on."""
+    """An image (H, 2 H[, C]) continued by `rows` rows beyond either pole on the sphere."""
     half = image.shape[1] // 2
     above = np.roll(image[:rows][::-1], half, axis=1)
     below = np.roll(image[-rows:][::-1], half, axis=1)
@@ -239,7 +240,7 @@ def coded(image: SphereImage) -> np.ndarray:
         (H + 2 PAD, 2 H + 2 PAD) int16, steps of 1 / CODE_SCALE grey values from CODE_ZERO.
 
     Raises:
-        ValueError: values that are not finite.
+        ValueError: the grey values are not finite.
     """
     tall = over_poles(image.coefficients, PAD)
     if not np.all(np.isfinite(tall)):
@@ -250,25 +251,25 @@ def coded(image: SphereImage) -> np.ndarray:
 
 
 class PatchPixels:
-    """Templates and windows of a table's patches, taken frame by frame.
+    """Templates and windows of a table's patches, filled frame by frame.
 
-    A window holds what the patch covers under the given poses and `margin` pixels around: that
-    far an observation may move before it is left out.
+    A window holds the patch under the given poses and `margin` pixels around: an observation that
+    moves further is left out.
     """
 
     def __init__(
         self, table: PatchTable, world_T_rigs: np.ndarray, width: int, margin: float = 6.0
     ) -> None:
-        """Nothing is sampled yet.
+        """Allocate templates; nothing is sampled yet.
 
         Args:
             table: patches; its frames index the poses.
-            world_T_rigs: (F, 4, 4) float64, where windows are looked for.
+            world_T_rigs: (F, 4, 4) float64, poses that place the windows.
             width: of the sphere images, pixels.
             margin: pixels of that image at the equator.
 
         Raises:
-            ValueError: the table does not fit itself or the poses.
+            ValueError: the table is inconsistent, or does not fit the poses.
         """
         table.check(len(world_T_rigs))
         self.table, self.width, self.margin = table, width, margin
@@ -285,7 +286,7 @@ class PatchPixels:
         return len(self._world_T_rigs)
 
     def take(self, frame: int, image: SphereImage) -> None:
-        """Cut what frame `frame` hosts and shows out of its image."""
+        """Cut templates and windows of frame `frame` out of its image."""
         width = image.coefficients.shape[1]
         if width != self.width:
             raise ValueError(f"image of {width} px where {self.width} px are expected")
@@ -308,7 +309,7 @@ class PatchPixels:
         self.windows[rows] = boxes
 
     def pixels(self) -> np.ndarray:
-        """(M,) int16: all windows back to back; they stay in one array from now on."""
+        """(M,) int16, all windows back to back in one array."""
         joined = np.concatenate([np.zeros(0, np.int16), *self._chunks])
         self._chunks = [joined]
         return joined

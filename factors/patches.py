@@ -1,4 +1,4 @@
-"""Patches of panoramas, aligned to other panoramas: sub-pixel sightings with their covariance."""
+"""Patches of panoramas aligned to other panoramas: sub-pixel sightings with covariances."""
 
 import copy
 
@@ -23,37 +23,37 @@ REASONS = {
     UNLIKE: "look different",
     FAR: "found too far off",
     UNSTEADY: "no convergence",
-}  # state of a sighting -> why it is none
+}  # state of a sighting -> reason of its rejection
 _NO_MASK = np.zeros((0, 0), dtype=np.bool_)
 
 
 class PatchSet:
     """Templates around scene points, cut from one panorama each and aligned to others.
 
-    A patch is a plane: the rays `origin + spread @ (x, y)` of an n x n grid of unit spacing. One
-    image is needed at a time; images may be worked on in threads, each with rows of its own.
+    A patch is a plane: the rays `origin + spread @ (x, y)` of an n x n grid of unit spacing. Images
+    are processed one at a time; threads may process several, each with rows of its own.
 
     Attributes:
-        templates: what was cut; `states` says which are usable.
+        templates: the patches; `states` marks usable ones.
     """
 
     def __init__(
         self, num: int, size: int, window: float, affine_sigma: float, grey_sigma: float
     ) -> None:
-        """Room for templates.
+        """Allocate templates.
 
         Args:
-            num: of templates, T.
+            num: number of templates, T.
             size: pixels across a patch, n, odd.
-            window: standard deviation of the Gaussian window, part of half a patch.
+            window: standard deviation of the Gaussian window, in half patches.
             affine_sigma: standard deviation of the affine part's deviation from the prediction.
-            grey_sigma: noise in grey values that it is weighed against.
+            grey_sigma: noise of grey values.
 
         Raises:
-            ValueError: an even size.
+            ValueError: the size is even.
         """
         if size % 2 == 0 or size < 3:
-            raise ValueError(f"a patch is an odd number of pixels across, not {size}")
+            raise ValueError(f"a patch's size must be an odd number of pixels, not {size}")
         offsets = (np.arange(size) - size // 2) / (window * size / 2)
         bell = np.exp(-0.5 * offsets**2)
         grey, by_x, by_y = (np.zeros((num, size * size), np.float32) for _ in range(3))
@@ -109,12 +109,12 @@ class PatchSet:
         max_steps: int,
         tolerance: float,
     ) -> None:
-        """Align to a panorama the sightings `rows (R,)` in it; fills in what became of them.
+        """Align the sightings `rows (R,)` of a panorama, and write their results.
 
         Args:
             mask: (H, 2H) bool, True = use.
-            max_shift, tolerance: of the shift and of its last step, template pixels.
-            max_steps: of Gauss-Newton.
+            max_shift, tolerance: limits of the shift and of its last step, template pixels.
+            max_steps: largest number of Gauss-Newton steps.
         """
         usable = _NO_MASK if mask is None else mask
         states = self.templates.states[sightings.templates[rows]]
@@ -129,18 +129,18 @@ class PatchSet:
         """Covariances (N, 2, 2) of shifts, template pixels squared.
 
         Args:
-            rows: (N,) of templates.
-            variances: (N,) of the residual, in the template's grey values.
+            rows: (N,) rows of templates.
+            variances: (N,) residual variances, in the template's grey values.
         """
         return self.templates.inverses[:, :2, :2][rows] * np.asarray(variances)[:, None, None]
 
 
 def expect(templates: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> Sightings:
-    """Sightings (O,) of templates where poses and depths put them, yet to be aligned.
+    """Predicted sightings (O,) of templates, not yet aligned.
 
     Args:
-        templates: (O,) row of each one's template.
-        origins (O, 3), spreads (O, 3, 2): the template's plane patch, rig frame of the seeing.
+        templates: (O,) row of each sighting's template. origins (O, 3), spreads (O, 3, 2): the
+        template's plane patch, rig frame of the observing frame.
     """
     num = len(templates)
     return Sightings(
@@ -155,7 +155,7 @@ def expect(templates: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> S
 
 
 def found_at(sightings: Sightings) -> tuple[np.ndarray, np.ndarray]:
-    """Where the templates' centres were found.
+    """Bearings of the aligned templates' centres.
 
     Returns:
         bearings (O, 3), unit, rig frame; their derivatives (O, 3, 2) by the shift in the

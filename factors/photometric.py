@@ -1,4 +1,5 @@
-"""Photometric family: patches of one frame seen in others, their planes eliminated, two doors."""
+"""Photometric family: patches of one frame observed in others, planes eliminated, two
+interfaces."""
 
 import os
 from collections.abc import Sequence
@@ -18,17 +19,17 @@ from factors.robust import RobustLoss
 from factors.threads import balanced_ranges, run_in_threads
 
 FAMILY = "photometric"
-_LEAST_SHARE = 0.2  # of its inverse depth is what one step leaves a patch at least
-_LEAST_RUN = 128  # observations that are worth a thread
-_LEAST_CONTRAST = 1.0  # grey values, standard deviation over a template
+_MIN_DEPTH_SHARE = 0.2  # least share of its inverse depth that a step leaves a patch
+_MIN_THREAD_OBSERVATIONS = 128  # least observations of a thread
+_MIN_CONTRAST = 1.0  # least standard deviation of a template's grey values
 
 
 class PhotometricBlock:
     """Patches of any number of frames, each with an inverse-depth plane of its own.
 
-    Implements `factors.block.Block`; `factors()` opens the other door. Which observations count
-    is settled by `refresh`, at accepted values only: those that see a patch from behind or at a
-    grazing angle, far larger or smaller, or beyond their window are left out and counted. A plane
+    Implements `factors.block.Block`; `factors()` gives ordinary GTSAM factors instead. `refresh`
+    selects observations at accepted values: those that see a patch's back or at a grazing angle,
+    far larger or smaller, or beyond their window are left out and counted. A plane
     never leaves the front of its host: no step takes more than 80% of an inverse depth.
 
     Attributes:
@@ -54,16 +55,16 @@ class PhotometricBlock:
         Args:
             keys: (F,) keys of Pose3 variables.
             pixels: templates and windows, of all frames that the table names.
-            sigmas: (P,) or one, grey values of a pixel in the host: noise of a residual.
+            sigmas: (P,) or one, noise of a residual, grey values of a pixel in the host.
             loss: robust loss on the root mean square of a patch's whitened residuals, times the
                 number of its pixels; None is plain least squares.
-            weights: (O,) of the observations' costs, 0 leaves one out; None is 1.
-            num_threads: None takes the cores there are, at most 16.
+            weights: (O,) weights of observations, 0 leaves one out; None = 1.
+            num_threads: None = number of cores, at most 16.
             polish_steps: Gauss-Newton steps on the planes after each proposed pose step.
             floor: grey values added to every contrast in quadrature.
 
         Raises:
-            ValueError: frames that are no poses, sigmas or weights that are none.
+            ValueError: frames are no poses, or sigmas or weights are invalid.
         """
         table = pixels.table
         self.keys = [int(key) for key in keys]
@@ -81,7 +82,7 @@ class PhotometricBlock:
         self._weights = base
         values = pixels.templates.astype(np.float64)
         values -= values.mean(axis=1, keepdims=True)
-        self._flat = values.std(axis=1) < _LEAST_CONTRAST
+        self._flat = values.std(axis=1) < _MIN_CONTRAST
         norms = np.sqrt(np.einsum("pn,pn->p", values, values) + values.shape[1] * floor**2)
         self._data = PatchData(
             table.hosts.astype(np.int32), patch_axes(table.bearings_rig),
@@ -105,10 +106,10 @@ class PhotometricBlock:
         self._weights = self._weights * weights
 
     def refresh(self, values: gtsam.Values) -> None:
-        """Settle which observations count."""
+        """Select the observations that count."""
         self._data.weights[:] = self._weights
         _, errors = self._observe(pose_rows(values, self.keys), self.planes, 0)
-        flags = self._blemishes(values, errors)
+        flags = self._rejections(values, errors)
         left = self._weights > 0
         self.dropped = {}
         for reason, flag in flags.items():
@@ -129,7 +130,7 @@ class PhotometricBlock:
         diagonal, gradient = np.zeros((num_f, 6, 6)), np.zeros((num_f, 6))
         off_diagonal = np.zeros((len(self._columns), 6, 6))
         eliminate_range(
-            0, num_p, data.hosts, data.offsets, data.targets, *self._seen_from(poses), *self._views,
+            0, num_p, data.hosts, data.offsets, data.targets, *self._view_rows(poses), *self._views,
             hessians, gradients, priors, self._row_starts, self._columns, diagonal, off_diagonal,
             gradient, couplings, inverses, downs,
         )  # fmt: skip
@@ -137,7 +138,7 @@ class PhotometricBlock:
         return PoseSystem(diagonal, off_diagonal, gradient, {FAMILY: float(self._costs.sum())})
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
-        """Robust cost at `values`, `steps (F, 6)` from the linearization, planes moved along."""
+        """Robust cost at `values`, `steps (F, 6)` from the linearization, with planes moved."""
         if self._schur is None:
             raise RuntimeError("propose() needs linearize() before it")
         couplings, inverses, downs = self._schur
@@ -167,7 +168,7 @@ class PhotometricBlock:
         return float(self._costs.sum())
 
     def costs(self, values: gtsam.Values) -> dict[str, float]:
-        """Robust cost at the current planes, priors on these included."""
+        """Robust cost at the current planes, including priors on these."""
         errors = self.errors(values)
         return {FAMILY: float(self._patch_costs(self.planes, errors).sum())}
 
@@ -187,13 +188,13 @@ class PhotometricBlock:
 
     @property
     def counted(self) -> np.ndarray:
-        """(O,) bool, observations that the last `refresh` let count."""
+        """(O,) bool, observations selected by the last `refresh`."""
         return self.weights > 0
 
     def subset(self, rows: np.ndarray) -> "PhotometricBlock":
-        """A block of some patches (rows, ascending, all observed) on the frames they touch.
+        """A block of some patches (rows, ascending, all observed) on their frames.
 
-        It has the planes and the observations' standing of this moment, and shares the pixels.
+        It copies the current planes and selection of observations, and shares the pixels.
         """
         chosen = np.zeros(len(self.table), bool)
         chosen[rows] = True
@@ -226,14 +227,14 @@ class PhotometricBlock:
         return part
 
     def factors(self) -> list[gtsam.CustomFactor]:
-        """The same cost as ordinary GTSAM factors on poses, one per host frame.
+        """The cost as ordinary GTSAM factors on poses, one per host frame.
 
-        The planes of a host's patches are eliminated inside the callback, each at its best for the
-        poses asked about, from where the block has them. Observations count as the last `refresh`
-        left them.
+        The planes of a host's patches are eliminated inside the callback, each optimised for the
+        given poses, starting at the block's planes. The selection of observations is that of the
+        last `refresh`.
         """
         hosts = self.table.hosts
-        observed = np.diff(self.table.offsets) > 0  # the others say nothing
+        observed = np.diff(self.table.offsets) > 0  # patches without observations are left out
         groups = [np.flatnonzero(observed & (hosts == host)) for host in np.unique(hosts)]
         return [self._host_factor(rows) for rows in groups if len(rows)]
 
@@ -251,8 +252,8 @@ class PhotometricBlock:
 
         return reduced_factor(part.keys, part.pairs, evaluate)
 
-    def _blemishes(self, values: gtsam.Values, errors: np.ndarray) -> dict[str, np.ndarray]:
-        """Reason -> observations (O,) bool that cannot count, at the current planes."""
+    def _rejections(self, values: gtsam.Values, errors: np.ndarray) -> dict[str, np.ndarray]:
+        """Reason -> observations (O,) bool to leave out, at the current planes."""
         world_T_rigs = np.array([values.atPose3(key).matrix() for key in self.keys])
         owners = self.table.owners
         lost = 2 * self._data.scales[owners] ** 2 / len(self.table.grid)
@@ -268,7 +269,10 @@ class PhotometricBlock:
         size = num_o if dims else 0
         hessians, gradients = np.empty((size, DIMS, DIMS)), np.empty((size, DIMS))
         errors = np.empty(num_o)
-        ranges, seen_from = balanced_ranges(self.table.offsets, _LEAST_RUN), self._seen_from(poses)
+        ranges, seen_from = (
+            balanced_ranges(self.table.offsets, _MIN_THREAD_OBSERVATIONS),
+            self._view_rows(poses),
+        )
 
         def work(i: int) -> None:
             observe_range(
@@ -279,7 +283,7 @@ class PhotometricBlock:
         return (hessians, gradients), errors
 
     def _patch_costs(self, planes: np.ndarray, errors: np.ndarray) -> np.ndarray:
-        """Robust cost (P,) of each patch, the prior on its plane included."""
+        """Robust cost (P,) of each patch, including the prior on its plane."""
         num = len(self.table.grid)
         losses = num * self._data.weights * self.loss.rho(errors)
         off = planes - self.table.planes
@@ -289,7 +293,8 @@ class PhotometricBlock:
     def _better(
         self, poses: np.ndarray, new: np.ndarray, old: np.ndarray, least: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """For each patch the better of two planes; the old are only tried where above `least`."""
+        """The better of two planes for each patch; the old ones are only evaluated above
+        `least`."""
         costs = self._patch_costs(new, self._observe(poses, new, 0)[1])
         worse = ~(costs <= least)
         if np.any(worse):
@@ -328,20 +333,20 @@ class PhotometricBlock:
         return planes, costs
 
     def _stepped(self, planes: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """Planes after steps that are shortened where they would lead behind the host."""
-        room = (1 - _LEAST_SHARE) * planes[:, 0]
+        """Planes after steps, shortened if they would lead behind the host."""
+        room = (1 - _MIN_DEPTH_SHARE) * planes[:, 0]
         share = np.minimum(1.0, room / np.maximum(-steps[:, 0], 1e-300))
         return planes + share[:, None] * np.where(np.isfinite(steps), steps, 0.0)
 
-    def _seen_from(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Poses (P, 12) that patches are hosted from, (O, 12) that they are observed from."""
+    def _view_rows(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (P, 12) of the views that host patches, (O, 12) of those that observe them."""
         seen_from = poses[self._data.hosts], poses[self._data.targets]
         if self.table.views is None:
             return seen_from
         return moved_rows(seen_from[0], self._views[0]), moved_rows(seen_from[1], self._views[1])
 
     def _set_views(self) -> None:
-        """Those of `table.views` as rows, or rows that do nothing."""
+        """Pose rows of `table.views`, or identities."""
         views, table = self.table.views, self.table
         if views is None:
             nothing = matrix_rows(np.eye(4)[None])
@@ -352,7 +357,7 @@ class PhotometricBlock:
             self._views = matrix_rows(views.rig_T_hosts), matrix_rows(views.rig_T_targets)
 
     def _set_pairs(self) -> None:
-        """Frame pairs that share a patch, and a state without a linearization."""
+        """Frame pairs that share a patch, without a linearization."""
         self._row_starts, self._columns = covisible_frames(self.table, len(self.keys))
         rows = np.repeat(np.arange(len(self.keys)), np.diff(self._row_starts))
         self.pairs = np.column_stack([rows, self._columns]).astype(np.int64)

@@ -1,7 +1,7 @@
 """Photometric family, one observation at a time: the reference for the block.
 
-A patch of one frame, its grey values less their mean over their contrast, is compared with the
-same patch of another frame, normalised alike: gain and offset between both drop out.
+A patch of one frame, its grey values without mean over their contrast, is compared with the
+patch in another frame, normalised likewise: gain and offset between both cancel.
 """
 
 from typing import Protocol
@@ -11,7 +11,7 @@ import numpy as np
 
 
 class Sampled(Protocol):
-    """An image on the sphere: a `SphereImage`, or what is sampled like one."""
+    """An image on the sphere: a `SphereImage`, or one with its interface."""
 
     def sample(self, vectors_rig: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values (...) and gradients (..., 3) along vectors (..., 3)."""
@@ -22,7 +22,7 @@ def normalised(values: np.ndarray, floor: float) -> tuple[np.ndarray, float]:
     """Grey values (N,) without mean over their contrast, and that contrast's norm.
 
     Args:
-        floor: grey values added to the contrast in quadrature: what has none stays near zero.
+        floor: grey values added to the contrast in quadrature, so that flat patches stay near zero.
     """
     centred = values - values.mean()
     norm = float(np.sqrt(centred @ centred + len(values) * floor**2))
@@ -51,7 +51,7 @@ def photometric_residuals(
         template: (N,) grey values in the host.
         image: the target's.
         floor: see `normalised`.
-        rig_T_host, rig_T_target: (4, 4) of the lens that sees the patch; None = the rig itself.
+        rig_T_host, rig_T_target: (4, 4) of the lens that shows the patch; None = the rig itself.
 
     Returns:
         residuals (N,), Jacobians by the host's pose (N, 6), the target's pose (N, 6), both right

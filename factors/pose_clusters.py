@@ -1,4 +1,4 @@
-"""Groups of frames that see the same, and how each moves as one."""
+"""Groups of covisible frames, and their motions as one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,23 +7,25 @@ import numpy as np
 
 from factors._schur_kernels import GROUP_DIM, merge_capped
 
-_LEAST_SIZE = 4  # frames of a group
-_MOST_GROUPS = 640  # whose dense system is then factorized within seconds
-_PAIRS = 24  # the strongest of a frame, on average: the others tie no group
+_MIN_GROUP_SIZE = 4  # least frames of a group
+_MAX_GROUPS = 640  # number of groups whose dense system is factorized within seconds
+_MEAN_PAIRS = 24  # strongest pairs of a frame that are used, on average
 
 
 @dataclass(frozen=True, slots=True)
 class Groups:
     """Variables that move together."""
 
-    labels: np.ndarray  # (N,) int64, group of each; -1 = it moves on its own only
+    labels: np.ndarray  # (N,) int64, group of each; -1 = none
     num: int  # G
 
     def bases(self, poses: np.ndarray) -> np.ndarray:
-        """Motion (N, 6, 7) of each variable when its group turns, shifts, stretches in the world.
+        """Motion (N, 6, 7) of each variable when its group rotates, translates, scales in the
+        world.
 
         Args:
-            poses: (N, 12) rows [world_R_rig row-major, rig_in_world]; of others than poses any.
+            poses: (N, 12) rows [world_R_rig row-major, rig_in_world]; arbitrary for other
+                variables.
         """
         there = self.labels >= 0
         labels = self.labels[there]
@@ -45,25 +47,25 @@ class Groups:
 
 
 def covisible_groups(num: int, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Groups:
-    """Groups of variables that share the most, none much larger than another.
+    """Groups of the most covisible variables, none much larger than another.
 
     Pairs join groups, the strongest first (Kruskal's algorithm), as long as they stay small.
 
     Args:
         num: N variables.
-        pairs: rows (P, 2) of variables, and what each two share (P,), compared with what all pairs
-            of either share. Variables without a pair stay alone.
+        pairs: rows (P, 2) of variables, and the number (P,) that each two share, normalised by the
+            sums over either variable's pairs. Variables without a pair stay alone.
     """
     rows = np.concatenate([p for p, _ in pairs])
     shared = np.concatenate([s for _, s in pairs]).astype(np.float64)
     totals = np.bincount(rows.ravel(), np.repeat(shared, 2), minlength=num)
     weights = shared / np.sqrt(totals[rows[:, 0]] * totals[rows[:, 1]])
-    most = _PAIRS * num
+    most = _MEAN_PAIRS * num
     if len(weights) > most:
         least = np.partition(weights, len(weights) - most)[len(weights) - most]
         rows, weights = rows[weights >= least], weights[weights >= least]
     rows = rows[np.argsort(-weights, kind="stable")].astype(np.int64)
-    size = max(_LEAST_SIZE, -(-num // _MOST_GROUPS))
+    size = max(_MIN_GROUP_SIZE, -(-num // _MAX_GROUPS))
     labels, sizes = np.arange(num), np.ones(num, np.int64)
     merge_capped(rows[:, 0].copy(), rows[:, 1].copy(), size, labels, sizes)
     labels[totals == 0] = -1

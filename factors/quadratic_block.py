@@ -12,9 +12,9 @@ from factors.cholesky import DIM
 
 
 class QuadraticBlock:
-    """c + g^T x + x^T H x / 2 over steps x of variables, from where it was linearized.
+    """c + g^T x + x^T H x / 2 over steps x of variables, from the linearization point.
 
-    A variable takes six coordinates, of which one of fewer dimensions uses the first.
+    A variable takes six coordinates; one of fewer dimensions uses the first of them.
     """
 
     def __init__(
@@ -35,10 +35,10 @@ class QuadraticBlock:
         )
 
     def refresh(self, values: gtsam.Values) -> None:
-        """Nothing: it stays as it is."""
+        """Do nothing: the function is fixed."""
 
     def linearize(self, values: gtsam.Values) -> PoseSystem:
-        """The function itself, whatever the values."""
+        """The function itself, at any values."""
         system = self._system
         return replace(system, off_diagonal=system.off_diagonal.copy())
 
@@ -48,8 +48,8 @@ class QuadraticBlock:
         return self._cost + float(x @ (self._gradient + 0.5 * (self._hessian @ x)))
 
     def accept(self) -> None:
-        """Nothing: there are no inner variables."""
+        """Do nothing: there are no inner variables."""
 
     def costs(self, values: gtsam.Values) -> dict[str, float]:
-        """Cost where it was linearized."""
+        """Cost at the linearization point."""
         return {"quadratic": self._cost}

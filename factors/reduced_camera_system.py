@@ -1,4 +1,4 @@
-"""The reduced system of a graph and its blocks: assembled in 6x6 blocks, damped, solved."""
+"""The reduced camera system of a graph and its blocks: assembled in 6x6 blocks, damped, solved."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -20,28 +20,33 @@ from factors.schur_complement import GroupVisits, group_visits
 _kernel, _ = kernel_and_part()
 
 GRAPH = "graph"  # family under which the cost of the native and user factors is reported
-_MIN_DIAGONAL = 1e-6  # least curvature that damping is proportional to, per sigma
-_STEP_TOLERANCE = 1e-2  # of a step by conjugate gradients: the next step is from there anyway
-_OPERATIONS_PER_BYTE = 4.0  # that a core does on dense blocks while it reads one from memory
-_LEAST_ITERATIONS = 10  # of conjugate gradients that must be cheaper than half a factorization
-_MOST_OPERATIONS = 4e9  # of a factorization: landmarks that fill in more are kept as products
-_MOST_OF_INVERSE = 1.5e11  # the same of one for covariances, which takes as long as many steps
-_TIED = 1e-3  # landmarks that a native factor counts for where groups are found
-_HELD_ITERATIONS = 300  # of conjugate gradients on these; they take ten or twenty
-_DRAW_TOLERANCE = 1e-3  # of errors that are drawn: no single motion of thousands may be missed
-_LEAST_DRAWS = 200  # whose spread is taken for a covariance
-_DRAWN_AT_ONCE = 20
+_MIN_DIAGONAL = 1e-6  # least curvature that damping is relative to, per sigma
+_STEP_TOLERANCE = 1e-2  # tolerance of a step by conjugate gradients: the next linearization
+# corrects the rest
+_OPERATIONS_PER_BYTE = 4.0  # operations of a core on dense blocks in the time of reading a byte
+_MIN_ITERATIONS = 10  # conjugate-gradient iterations that must be cheaper than half a
+# factorization
+_MAX_OPERATIONS = 4e9  # largest number of operations of a factorization: beyond, landmarks stay in
+# factored form
+_MAX_INVERSE_OPERATIONS = 1.5e11  # largest number of operations of the factorization for selected
+# inversion (covariances)
+_NATIVE_FACTOR_WEIGHT = 1e-3  # landmarks that a native factor counts for when groups are formed
+_MAX_ITERATIONS = 300  # largest number of conjugate-gradient iterations in factored form; ten or
+# twenty suffice
+_DRAW_TOLERANCE = 1e-3  # tolerance of drawn errors: no motion of thousands of frames may be missed
+_MIN_DRAWS = 200  # least number of draws whose spread gives a covariance
+_DRAWS_AT_ONCE = 20
 
 
 class ReducedSystem:
     """Normal equations over all variables that a graph and blocks name.
 
-    Every variable takes whole 6x6 blocks: a Pose3 one, smaller ones are filled up with an
-    identity that stays apart, larger ones are split. `first_block` maps a key to its first block.
+    Every variable takes whole 6x6 blocks: a Pose3 takes one, smaller ones are padded by an
+    uncoupled identity, larger ones are split. `first_block` maps a key to its first block.
 
-    Where frames see so much in common that a factorization would fill in, what landmarks say of
-    them is not written out, but kept as products; steps and covariances are then found by
-    iterations (`factors.coarse_preconditioner`).
+    If covisibility would fill in a factorization, the landmarks' Schur complement is kept in
+    factored form; steps and covariances are then computed by conjugate gradients
+    (`factors.coarse_preconditioner`).
     """
 
     def __init__(
@@ -57,7 +62,7 @@ class ReducedSystem:
             graph: native and user factors.
             blocks: batched ones.
             values: of all variables.
-            pairs: keys of two variables each, whose common block `covariances` is to give.
+            pairs: keys of two variables each, whose joint block `covariances` returns.
 
         Raises:
             ValueError: a variable has no value.
@@ -86,14 +91,15 @@ class ReducedSystem:
         self._set_columns(all_dims)
         blocks_of = dict(zip(self.keys, counts, strict=True))
         self._factor_pairs = self._pairs_of([*factor_keys, *map(list, pairs)], blocks_of)
-        self._held: dict[int, list[GroupVisits]] = {}  # of blocks that are not written out
-        self._coarse: Coarse | None = None  # of some system met before, where some are not
+        self._held: dict[int, list[GroupVisits]] = {}  # visits by groups, of blocks in factored
+        # form
+        self._coarse: Coarse | None = None  # of an earlier system
         self._cholesky: BlockCholesky | None = None
-        self._factorized = False  # whether the Cholesky factor is of some system met before
+        self._factorized = False  # True if the Cholesky factor is of an earlier system
         landmarks = [block for block in self._blocks if isinstance(block, LandmarkBlock)]
         can_hold = len(landmarks) > 0 and (len(landmarks) == len(self._blocks) or not pairs)
-        most = _MOST_OF_INVERSE if pairs else _MOST_OPERATIONS
-        # At least, a factorization takes the squares of how full rows are.
+        most = _MAX_INVERSE_OPERATIONS if pairs else _MAX_OPERATIONS
+        # A factorization takes at least the squares of the rows' fill.
         fullest = max((len(block.shared) for block in landmarks), default=0)
         fills_in = can_hold and DIM**3 * fullest**2 > most * self._num
         if not fills_in:
@@ -110,14 +116,15 @@ class ReducedSystem:
         return self._cholesky
 
     def _set_cholesky(self) -> None:
-        """Choose between factorizations, and iterations that former ones precondition."""
+        """Choose between factorizations, and conjugate gradients preconditioned by an earlier
+        factor."""
         cholesky = self._factor()
         bytes_read = 8 * (2 * cholesky.num_entries + DIM * DIM * len(self._pairs))
         cheaper = cholesky.num_operations / (2 * _OPERATIONS_PER_BYTE * max(bytes_read, 1))
-        self._max_iterations = int(cheaper) if cheaper >= _LEAST_ITERATIONS else 0
+        self._max_iterations = int(cheaper) if cheaper >= _MIN_ITERATIONS else 0
 
     def _hold_landmarks(self) -> None:
-        """Leave what landmarks say as products, by groups of frames that share the most."""
+        """Keep landmarks in factored form, with visits by groups of covisible frames."""
         landmarks = {
             i: block for i, block in enumerate(self._blocks) if isinstance(block, LandmarkBlock)
         }
@@ -128,7 +135,9 @@ class ReducedSystem:
         for i in landmarks:
             poses[self._block_rows[i]] = True
         tied = self._factor_pairs[poses[self._factor_pairs].all(axis=1)]
-        self._groups = covisible_groups(self._num, [*shares, (tied, np.full(len(tied), _TIED))])
+        self._groups = covisible_groups(
+            self._num, [*shares, (tied, np.full(len(tied), _NATIVE_FACTOR_WEIGHT))]
+        )
         self._cholesky = None
         for i, block in landmarks.items():
             labels = self._groups.labels[self._block_rows[i]]
@@ -139,7 +148,7 @@ class ReducedSystem:
         """Assemble H and the gradient at `values`; returns the cost of each family."""
         self._diagonal = np.zeros((self._num, DIM, DIM))
         self._gradient = np.zeros((self._num, DIM))
-        self._off_diagonal = np.zeros((0, DIM, DIM))  # frees that of before
+        self._off_diagonal = np.zeros((0, DIM, DIM))  # frees the previous blocks
         self._jacobian = csr_matrix((0, len(self._column_blocks)))  # of the graph
         costs: dict[str, float] = {}
         parts, self._complements = [], []
@@ -160,7 +169,7 @@ class ReducedSystem:
             self._add_graph(values)
             _add_costs(costs, {GRAPH: self._graph.error(values)})
         self._diagonal[self._padding[0], self._padding[1], self._padding[1]] = 1.0
-        self._written = self._diagonal  # all of it, but for landmarks that are held
+        self._written = self._diagonal  # without landmarks in factored form
         if self._held:
             self._diagonal = self._written.copy()
             for complement, rows, _ in self._complements:
@@ -174,8 +183,8 @@ class ReducedSystem:
     def solve(self, damping: float) -> np.ndarray | None:
         """Step (N, 6) of the system damped by `damping` times its diagonal; None if singular.
 
-        Where much fills in, the Cholesky factor of a system before it preconditions conjugate
-        gradients; it is renewed when they take longer than that would.
+        If fill-in is large, the Cholesky factor of an earlier system preconditions conjugate
+        gradients; it is renewed when they would take longer than a factorization.
         """
         curvature = np.einsum("nii->ni", self._diagonal)
         added = damping * np.maximum(curvature, _MIN_DIAGONAL)
@@ -197,12 +206,12 @@ class ReducedSystem:
         added: np.ndarray,
         right: np.ndarray,
         tolerance: float,
-        max_iterations: int = _HELD_ITERATIONS,
+        max_iterations: int = _MAX_ITERATIONS,
         truncate: bool = False,
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Solutions (N, 6, R) with `added (N, 6)` to the diagonal, and what they leave of `right`.
+        """Solutions (N, 6, R) with `added (N, 6)` on the diagonal, and the residuals of `right`.
 
-        None where they take too long by the groups' system as it is, or there is no inverse.
+        None if they take too many iterations, or the groups' system is singular.
         """
         diagonal, written = self._diagonal.copy(), self._written.copy()
         for blocks in (diagonal, written):
@@ -233,7 +242,7 @@ class ReducedSystem:
         )
 
     def _step_held(self, added: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Step by the groups' system of one before, unless a new one would have taken less."""
+        """Step preconditioned by an earlier groups' system, or by a new one if that is faster."""
         right = -self._gradient[..., None]
         if self._coarse is not None:
             found = self._solve_held(added, right, _STEP_TOLERANCE, self._max_iterations)
@@ -245,7 +254,7 @@ class ReducedSystem:
         return found
 
     def _solve_by_iterations(self, damped: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Step and what it leaves of the gradient; None where a factorization is cheaper."""
+        """Step and residual of the gradient; None if a factorization is cheaper."""
         if not self._factorized or not self._max_iterations:
             return None
         factor = self._factor()
@@ -262,7 +271,7 @@ class ReducedSystem:
         )
 
     def _solve_directly(self, damped: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Step, leaving nothing; None if singular."""
+        """Step and zero residual; None if singular."""
         self._factorized = self._factor().factorize(damped, self._off_diagonal)
         if not self._factorized:
             return None
@@ -270,7 +279,7 @@ class ReducedSystem:
         return (steps, np.zeros_like(steps)) if np.all(np.isfinite(steps)) else None
 
     def predicted_decrease(self) -> float:
-        """Decrease of the cost that the undamped model expects of the last step."""
+        """Decrease of the cost that the undamped model predicts for the last step."""
         return self._predicted
 
     def retract(self, values: gtsam.Values, steps: np.ndarray) -> gtsam.Values:
@@ -283,8 +292,8 @@ class ReducedSystem:
         return values.retract(delta)
 
     def _gathered(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Off-diagonal blocks (P, 6, 6) of all; those of one block of factors that has them all,
-        gigabytes of many laps, are not copied."""
+        """Off-diagonal blocks (P, 6, 6) of all factors; a single block of factors that has them
+        all, which may be gigabytes, is not copied."""
         if len(parts) == 1:
             slots, flip = self._block_slots[0]
             if len(slots) == len(self._pairs) and not flip.any():
@@ -315,17 +324,17 @@ class ReducedSystem:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Blocks of H^-1 at the linearization point, and draws from it; None if singular.
 
-        A block that nothing constrains is NaN and does not count. Where landmarks are kept as
-        products, a gauge that nothing fixes goes unnoticed: its errors are merely enormous.
+        An unconstrained block is NaN and is left out. With landmarks in factored form, a free gauge
+        is not detected: its errors are merely enormous.
 
         Args:
-            num_draws: D.
-            rng: of these.
+            num_draws: number of draws, D.
+            rng: generator of the draws.
             damping: part of the diagonal that is added to it.
 
         Returns:
-            (N, 6, 6) those on the diagonal, (P, 6, 6) those between the first blocks of `pairs`,
-            and vectors (D, N, 6) of covariance H^-1.
+            (N, 6, 6) diagonal blocks, (P, 6, 6) blocks between the first blocks of `pairs`, and
+            vectors (D, N, 6) of covariance H^-1.
         """
         idle = np.logical_not(np.any(self._diagonal, axis=(1, 2)))
         diagonal = np.where(idle[:, None, None], np.eye(DIM), self._diagonal)
@@ -351,13 +360,14 @@ class ReducedSystem:
     def _drawn(
         self, added: np.ndarray, num_draws: int, rng: np.random.Generator
     ) -> np.ndarray | None:
-        """Vectors (D, N, 6) of covariance (H + added)^-1: the same of J^T e, e of all factors."""
+        """Vectors (D, N, 6) of covariance (H + added)^-1: that inverse times J^T e, e of all
+        factors."""
         draws, self._coarse = [], None
-        for _ in range(0, max(num_draws, _LEAST_DRAWS), _DRAWN_AT_ONCE):
-            right = np.sqrt(added)[..., None] * rng.normal(size=(*added.shape, _DRAWN_AT_ONCE))
+        for _ in range(0, max(num_draws, _MIN_DRAWS), _DRAWS_AT_ONCE):
+            right = np.sqrt(added)[..., None] * rng.normal(size=(*added.shape, _DRAWS_AT_ONCE))
             for complement, rows, _ in self._complements:
-                right[rows] += complement.draw(int(rng.integers(1 << 62)), _DRAWN_AT_ONCE)
-            errors = rng.normal(size=(len(self._jacobian.indptr) - 1, _DRAWN_AT_ONCE))
+                right[rows] += complement.draw(int(rng.integers(1 << 62)), _DRAWS_AT_ONCE)
+            errors = rng.normal(size=(len(self._jacobian.indptr) - 1, _DRAWS_AT_ONCE))
             np.add.at(right, (self._column_blocks, self._column_offsets), self._jacobian.T @ errors)
             found = self._solve_held(added, right, _DRAW_TOLERANCE)
             if found is None:
@@ -366,7 +376,7 @@ class ReducedSystem:
         return np.concatenate(draws)
 
     def _padded_entries(self, counts: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """(block, coordinate) of the entries that belong to no variable."""
+        """(block, coordinate) of the padding entries."""
         pads = [
             (self.first_block[key] + count - 1, coordinate)
             for key, dim, count in zip(self.keys, self._dims, counts, strict=True)
@@ -376,7 +386,7 @@ class ReducedSystem:
         return table[:, 0], table[:, 1]
 
     def _pairs_of(self, factor_keys: list[list[int]], counts: dict[int, int]) -> np.ndarray:
-        """Pairs (P, 2) of blocks that factors of these keys tie, ascending."""
+        """Pairs (P, 2) of blocks coupled by factors of these keys, ascending."""
         shared = {
             pair
             for keys in factor_keys
@@ -388,7 +398,8 @@ class ReducedSystem:
         return np.array(sorted(shared), dtype=np.int64).reshape(-1, 2)
 
     def _set_pairs(self) -> None:
-        """Pattern of the off-diagonal blocks, and where those of what is written out lie in it."""
+        """Pattern of the off-diagonal blocks, and the slots in it of blocks that are written
+        out."""
         placed = [self._factor_pairs]
         placed += [
             rows[block.pairs].reshape(-1, 2)

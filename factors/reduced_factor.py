@@ -1,4 +1,4 @@
-"""What a block eliminates inside as one ordinary GTSAM factor on its poses."""
+"""A block's reduced system as one ordinary GTSAM factor on its poses."""
 
 from collections.abc import Callable, Sequence
 
@@ -19,9 +19,9 @@ def reduced_factor(
     """A factor whose error is a robust cost, and whose linearization is that cost's model.
 
     Args:
-        keys: (F,) of Pose3 variables.
+        keys: (F,) keys of Pose3 variables.
         pairs: (P, 2) rows f < g of keys, of the model's off-diagonal blocks.
-        evaluate: cost at values, inner variables at their best for them; and, if asked for, the
+        evaluate: cost at values, with inner variables optimised for them; and, if requested, the
             model there.
     """
     num, columns = len(keys), np.asarray(pairs).reshape(-1, 2)
@@ -49,7 +49,7 @@ def _square_root(H, gradient):
     """Upper R with R^T R = H in place, from H's upper triangle, and e with R^T e = gradient.
 
     H is positive semidefinite (the gauge is free): a direction without curvature gets a zero row,
-    and carries no gradient either.
+    and has no gradient either.
     """
     num = len(H)
     e = np.zeros(num)

@@ -39,7 +39,7 @@ def reprojection_residuals(
         points_world: (N, 3) float64, world.
         pixels: (N, 2) float64, measured (u, v), corner origin.
         faces: (N,) int, row of `cameras`.
-        origins_rig: (N, 3) float64, rig frame, where each ray starts; None = the rig's centre.
+        origins_rig: (N, 3) float64, rig frame, origin of each ray; None = the rig's centre.
 
     Returns:
         residuals (N, 2) pixels, Jacobians by the pose (N, 2, 6) and by the point (N, 2, 3), and
@@ -75,7 +75,7 @@ class ReprojectionTerm:
     sigmas_px: np.ndarray | float = 1.0  # () or (O,) pixels, per axis
     sqrt_infos: np.ndarray | None = None  # (O, 2, 2) 1/pixel; replaces sigmas_px
     name: str = "reprojection"
-    origins_rig: np.ndarray | None = None  # (O, 3) map units, rig frame: where each ray starts,
+    origins_rig: np.ndarray | None = None  # (O, 3) map units, rig frame: origin of each ray,
     # the centre of its lens; None = the rig\'s own centre
 
     kind = REPROJECTION

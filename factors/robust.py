@@ -12,7 +12,7 @@ _CODES: dict[str, int] = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3
 
 @dataclass(frozen=True, slots=True)
 class RobustLoss:
-    """A loss and the whitened residual norm (sigmas) at which it starts to let go."""
+    """A loss and the whitened residual norm (sigmas) at which it departs from least squares."""
 
     kind: LossKind = "none"
     scale: float = 1.0
@@ -25,7 +25,7 @@ class RobustLoss:
 
     @property
     def code(self) -> int:
-        """The loss as the kernels know it."""
+        """The loss's code in the kernels."""
         return _CODES[self.kind]
 
     def noise_model(self, gaussian: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:

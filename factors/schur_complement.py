@@ -1,4 +1,4 @@
-"""The Schur complement of landmarks over poses, kept as products: H x without H written out."""
+"""The Schur complement of landmarks over poses in factored form: H x without assembling H."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class GroupVisits:
 
 
 def group_visits(runs: Sequence[Visits], labels: np.ndarray, num_groups: int) -> list[GroupVisits]:
-    """Of each run, which groups of frames `labels (F,)` visit its landmarks."""
+    """Visits of each run's landmarks by groups of frames `labels (F,)`."""
     out = []
     for run in runs:
         groups = labels[run.frames]
@@ -38,11 +38,11 @@ def group_visits(runs: Sequence[Visits], labels: np.ndarray, num_groups: int) ->
 class SchurComplement:
     """H = own - the sum over landmarks of U^T U, see `factors._schur_kernels`."""
 
-    own: np.ndarray  # (F, 6, 6) of the poses alone
+    own: np.ndarray  # (F, 6, 6) blocks of the poses alone
     diagonal: np.ndarray  # (F, 6, 6) blocks H[f, f]
     runs: Sequence[Visits]
     projected: Sequence[np.ndarray]  # (V, 3, 6) U of each run's visits
-    draw: Callable[[int, int], np.ndarray]  # vectors (F, 6, R) of covariance H: of a seed, and R
+    draw: Callable[[int, int], np.ndarray]  # vectors (F, 6, R) of covariance H, given a seed and R
     num_threads: int
 
     def times(self, x: np.ndarray) -> np.ndarray:
@@ -65,13 +65,13 @@ class SchurComplement:
         visits: Sequence[GroupVisits],
         target: np.ndarray,
     ) -> None:
-        """Add H as groups of the poses feel it.
+        """Add H projected to groups of poses.
 
         Args:
             labels: (F,) group of each pose.
-            bases: (F, 6, 7) its motion when its group moves.
-            visits: by groups, of each run.
-            target: (7 G, 7 G), of which the upper triangle counts.
+            bases: (F, 6, 7) motion of each pose when its group moves.
+            visits: visits by groups of each run.
+            target: (7 G, 7 G), only the upper triangle is written.
         """
         for run, projected, by_group in zip(self.runs, self.projected, visits, strict=True):
             over = by_group.over
@@ -81,7 +81,7 @@ class SchurComplement:
 
 
 def _take_run(over: Visits, sums: np.ndarray, target: np.ndarray, num_threads: int) -> None:
-    """Take the landmarks of a run from what groups feel, some rows of these at a time."""
+    """Subtract the landmarks of a run from the projected system, by ranges of its rows."""
     rows = balanced_ranges(over.row_offsets)
 
     def work(i: int) -> None:

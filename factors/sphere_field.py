@@ -1,8 +1,8 @@
 """A smooth displacement field on the sphere: vector spherical harmonics, without rotations.
 
-What a 360-degree camera's calibration and stitching leave is fixed to its directions. The field
+Residual errors of a 360-degree camera's calibration and stitching depend on direction. The field
 is a sum of gradients and curls of real spherical harmonics from degree 1 on, orthonormal over the
-sphere. The curls of degree 1 are left out: they are rotations, which poses hold already.
+sphere. The curls of degree 1 are left out: they are rotations, which poses already contain.
 """
 
 from dataclasses import dataclass
@@ -13,22 +13,23 @@ import numpy as np
 from factors.bearing import tangent_basis
 from factors.compiled import kernel_and_part
 
-_MOST_STEPS = 20  # fixed-point steps that undo a field; each gains the field's slope as a factor
-_SETTLED = 1e-12  # of a direction: a step this short is the last
+_MAX_STEPS = 20  # fixed-point steps that invert a field; each reduces the error by the field's
+# slope
+_CONVERGED_STEP = 1e-12  # step of a direction below which iteration ends
 
 _kernel, _part = kernel_and_part(error_model="numpy")
 
 
 def num_harmonics(degree: int) -> int:
-    """Coefficients of a field up to a degree."""
+    """Number of coefficients of a field up to a degree."""
     return max(2 * degree * (degree + 2) - 3, 0)
 
 
 def degree_of(num: int) -> int:
-    """Degree of a field with so many coefficients.
+    """Degree of a field with `num` coefficients.
 
     Raises:
-        ValueError: no degree has so many.
+        ValueError: no degree has that many.
     """
     degree = 0
     while num_harmonics(degree) < num:
@@ -49,11 +50,11 @@ def harmonics(bearings: np.ndarray, degree: int) -> np.ndarray:
 
     Args:
         bearings: (N, 3) float64, unit.
-        degree: highest.
+        degree: highest degree.
 
     Returns:
-        (N, 3, K) float64, by degree, in each the gradients before the curls; orthonormal over
-        the sphere. Solid harmonics by their Cartesian recurrences, which know no pole.
+        (N, 3, K) float64, by degree, gradients before curls within each; orthonormal over
+        the sphere. Solid harmonics by their Cartesian recurrences, which have no pole.
     """
     flat = np.ascontiguousarray(bearings, dtype=np.float64)
     out = np.zeros((len(flat), 3, num_harmonics(degree)))
@@ -64,13 +65,13 @@ def harmonics(bearings: np.ndarray, degree: int) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class SphereField:
-    """Displacements of directions, in the rig frame."""
+    """Smooth displacements of directions, in the rig frame."""
 
     coefficients: np.ndarray  # (K,) float64, radians, of `harmonics`; K = 0: no field
 
     @classmethod
     def none(cls) -> "SphereField":
-        """The field that moves nothing."""
+        """The zero field."""
         return cls(np.zeros(0))
 
     def __bool__(self) -> bool:
@@ -91,19 +92,20 @@ class SphereField:
         return out.reshape(np.shape(bearings))
 
     def corrected(self, bearings: np.ndarray) -> np.ndarray:
-        """Where observed bearings (..., 3), unit, really point: along the field's arcs."""
+        """True directions of observed unit bearings (..., 3), along the field's arcs."""
         return _moved(bearings, self.displacements(bearings)) if self else bearings
 
     def observed(self, directions: np.ndarray) -> np.ndarray:
-        """Bearings (..., 3) under which directions (..., 3), unit, are observed: the inverse."""
+        """Observed bearings (..., 3) of true unit directions (..., 3): the inverse of
+        `corrected`."""
         if not self:
             return directions
         found = directions
-        for _ in range(_MOST_STEPS):
+        for _ in range(_MAX_STEPS):
             off = directions - self.corrected(found)
             found = found + off
             found = found / np.linalg.norm(found, axis=-1, keepdims=True)
-            if np.abs(off).max(initial=0.0) < _SETTLED:
+            if np.abs(off).max(initial=0.0) < _CONVERGED_STEP:
                 break
         return found
 
@@ -112,7 +114,7 @@ class SphereField:
 
         Args:
             bearings: (N, 3) observed.
-            roots: (N, 2, 2) on their tangent bases.
+            roots: (N, 2, 2) on the tangent bases of the observed bearings.
         """
         if not self:
             return roots
@@ -123,7 +125,7 @@ class SphereField:
 def field_residuals(
     bearings: np.ndarray, directions: np.ndarray, degree: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals that a field of zero leaves, and their Jacobian by its coefficients.
+    """Residuals under a zero field, and their Jacobian by its coefficients.
 
     The residual is the log map of the direction at the observed bearing, less the displacement
     there: to first order in both, that of `bearing_residuals` at the corrected bearing.
@@ -131,7 +133,7 @@ def field_residuals(
     Args:
         bearings: (N, 3) observed, unit.
         directions: (N, 3) expected, unit.
-        degree: of the field.
+        degree: degree of the field.
 
     Returns:
         residuals (N, 2), radians on `tangent_basis(bearings)`; Jacobian (N, 2, K).
@@ -151,7 +153,7 @@ def _moved(bearings: np.ndarray, tangents: np.ndarray) -> np.ndarray:
 
 
 def _norms(degree: int) -> np.ndarray:
-    """(degree + 1, degree + 1) factors [l, m] that make gradients orthonormal."""
+    """Factors [l, m], (degree + 1, degree + 1), that normalise gradients."""
     out = np.zeros((degree + 1, degree + 1))
     for n in range(1, degree + 1):
         for m in range(n + 1):
@@ -168,7 +170,7 @@ def _start_of(n):
 
 @_part
 def _put(n, column, norm, value, gx, gy, gz, x, y, z, out):
-    """Write a harmonic's gradient, tangent part of the solid one's, and its curl."""
+    """Write a harmonic's gradient, the tangent part of the solid harmonic's, and its curl."""
     gx, gy, gz = (
         norm * (gx - n * value * x),
         norm * (gy - n * value * y),

@@ -18,17 +18,17 @@ class SphereImage:
 
     @classmethod
     def of(cls, grey: np.ndarray, smooth: bool = False) -> "SphereImage":
-        """Fit the spline that passes through all pixels, or one that smooths them.
+        """Fit the spline through all pixels, or one that smooths them.
 
         Unser, "Splines: a perfect fit for signal and image processing", IEEE SPM 16(6), 1999.
 
         Args:
             grey: (H, 2H) any real type, equirectangular, H at least 2.
-            smooth: take pixel values for coefficients, which blurs by 0.58 pixels (standard
-                deviation per axis) alike at all places between pixels, and calms noise.
+            smooth: use pixel values as coefficients, which blurs by 0.58 pixels (standard deviation
+                per axis) equally at all positions between pixels, and reduces noise.
 
         Raises:
-            ValueError: another shape.
+            ValueError: the image has another shape.
         """
         height, width = grey.shape
         if width != 2 * height or height < 2:

@@ -1,9 +1,9 @@
-"""Direct alignment of captured panoramas to what a splat renders at their poses.
+"""Direct alignment of captured panoramas to renderings of a splat at their poses.
 
 A rendering at the last accepted pose, colour and expected depth, is a cloud of points with grey
-values. At another pose each point falls elsewhere in the captured frame; the residual is what the
-frame shows there less what the rendering has, after one gain and one offset per frame. So the
-rasteriser is never differentiated, and all faces of a frame together give one 6x6 block. After
+values. At another pose each point projects elsewhere in the captured frame; the residual is the
+captured grey value there minus the rendered one, after one gain and one offset per frame. So the
+rasteriser is never differentiated, and all faces of a frame give one 6x6 block. After
 Newcombe et al., DTAM, ICCV 2011 (tracking against a rendered model), on the sphere.
 """
 
@@ -22,13 +22,13 @@ from factors.robust import RobustLoss
 
 NAME = "splat"
 _kernel, _part = kernel_and_part(error_model="numpy")
-_MIN_SAMPLES = 50  # fewer say nothing about a pose
-_MIN_SPREAD = 1e-3  # floor of the residuals' spread, grey values 0..1
+_MIN_SAMPLES = 50  # least samples that constrain a pose
+_MIN_SPREAD = 1e-3  # least spread of the residuals, grey values 0..1
 
 
 @dataclass(frozen=True, slots=True)
 class RenderedView:
-    """What a splat shows from a pose, where that is certain."""
+    """Opaque pixels of a splat rendered at a pose, as points."""
 
     points_world: np.ndarray  # (N, 3) float64, world: pixels at their expected depth
     grey: np.ndarray  # (N,) float64, 0..1
@@ -39,7 +39,7 @@ class _Frame:
     """One frame between two renderings."""
 
     view: RenderedView
-    grey: np.ndarray  # (N,) float64, of the view, gain and offset applied
+    grey: np.ndarray  # (N,) float64, of the view, after gain and offset
     sigma: float  # of a residual, grey values
 
 
@@ -49,8 +49,8 @@ Render = Callable[[int, np.ndarray], RenderedView]  # row of keys, world_T_rig (
 class SplatBlock:
     """Alignment of frames to a fixed splat; implements `factors.block.Block`.
 
-    No two frames share a residual: the map is the splat's, and its gauge is held by whatever else
-    is in the graph.
+    No two frames share a residual: the map is the splat's, and its gauge is fixed by other factors
+    of the graph.
 
     Attributes:
         keys: (F,) keys of the Pose3 variables `world_T_rig`.
@@ -75,18 +75,18 @@ class SplatBlock:
             keys: (F,) keys of Pose3 variables.
             images: (F,) of (C, H, W) float32 grey values 0..1 of a frame's faces, which should
                 overlap by a few pixels for sampling near their edges.
-            weights: (F,) of (C, H, W) float or bool, how far pixels count, 0..1: 0 is never
+            weights: (F,) of (C, H, W) float or bool, weights of pixels, 0..1: 0 is never
                 sampled; or None.
             cameras: of the faces.
             render: the splat from a pose; called by `refresh`.
             loss: robust loss on each whitened residual; None is Cauchy at one sigma.
-            correlation: pixels that err together and count as one; 25 made the errors of aligned
-                poses about as large as their covariance says, at faces of 48 to 192 pixels.
-            centres: (C, 3) float64, of the cameras in the rig; None = all are in its own.
-            turns: (F, 3, 3) float64, of all cameras together in each frame's rig; None = none.
+            correlation: number of pixels with a common error, which count as one; 25 made the
+                errors of aligned poses agree with their covariance, at faces of 48 to 192 pixels.
+            centres: (C, 3) float64, centres of the cameras in the rig; None = the rig's.
+            turns: (F, 3, 3) float64, rotations of all cameras in each frame's rig; None = none.
 
         Raises:
-            ValueError: as many images and masks as keys are needed.
+            ValueError: images, masks and keys differ in number.
         """
         if not len(keys) == len(images) == len(weights):
             raise ValueError("keys, images and weights must be equally long")
@@ -127,7 +127,7 @@ class SplatBlock:
         return self.costs(values)[NAME]
 
     def accept(self) -> None:
-        """Nothing is tied to a proposal here."""
+        """Do nothing: there are no inner variables."""
 
     def costs(self, values: gtsam.Values) -> dict[str, float]:
         """Robust cost under the last renderings."""
@@ -135,12 +135,12 @@ class SplatBlock:
         return {NAME: sum(self._frame_cost(f, pose) for f, pose in enumerate(poses))}
 
     def residuals(self, values: gtsam.Values) -> list[np.ndarray]:
-        """Whitened residuals (N,) of each frame's samples, 0 where a sample is not seen."""
+        """Whitened residuals (N,) of each frame's samples, 0 where a sample is not visible."""
         poses = pose_rows(values, self.keys)
         return [self._residuals(f, pose, False)[0] for f, pose in enumerate(poses)]
 
     def factors(self) -> list[gtsam.CustomFactor]:
-        """The same cost under the last renderings as ordinary GTSAM factors, one per frame."""
+        """The cost under the last renderings as ordinary GTSAM factors, one per frame."""
         return [self._factor(f, key) for f, key in enumerate(self.keys)]
 
     def _factor(self, f: int, key: int) -> gtsam.CustomFactor:
@@ -170,7 +170,7 @@ class SplatBlock:
     def _residuals(
         self, f: int, pose: np.ndarray, with_jacobian: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Whitened residuals (N,), their Jacobian (N, 6), and weights (N,), 0 where not seen."""
+        """Whitened residuals (N,), their Jacobian (N, 6), and weights (N,), 0 = not visible."""
         if not self._frames:
             raise RuntimeError("refresh() comes before anything else")
         frame = self._frames[f]
@@ -183,7 +183,8 @@ class SplatBlock:
     def _sample(
         self, f: int, view: RenderedView, pose: np.ndarray, with_jacobian: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Captured grey (N,), its Jacobian by the pose (N, 6), and weights (N,), 0 = not seen."""
+        """Captured grey (N,), its Jacobian by the pose (N, 6), and weights (N,), 0 = not
+        visible."""
         num, cameras = len(view.points_world), self._cameras
         rotations, centres = cameras.rig_R_faces, self._centres
         if self._turns is not None:
@@ -216,7 +217,7 @@ def _spline(image: np.ndarray) -> np.ndarray:
 
 
 def _exposure(rendered: np.ndarray, captured: np.ndarray) -> tuple[float, float]:
-    """Gain and offset that carry rendered grey values (N,) to captured ones, by robust steps."""
+    """Gain and offset that map rendered grey values (N,) to captured ones, estimated robustly."""
     if len(rendered) < _MIN_SAMPLES or np.ptp(rendered) < _MIN_SPREAD:
         return 1.0, 0.0
     columns = np.column_stack([rendered, np.ones(len(rendered))])
@@ -246,7 +247,7 @@ def _sample_faces(
     points, pose, rig_R_faces, rig_t_faces, focals, principals, image, weights, with_jacobian,
     grey, jacobian, trust,
 ):  # fmt: skip
-    """See SplatBlock._sample; a point belongs to the face along which it is furthest out."""
+    """See SplatBlock._sample; a point belongs to the face whose axis it is closest to."""
     num_faces, height, width = image.shape
     across, d_across, down, d_down = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
     for n in range(len(points)):

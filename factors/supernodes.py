@@ -1,4 +1,4 @@
-"""Supernodes of a sparse Cholesky factor: runs of columns that share their rows below."""
+"""Supernodes of a sparse Cholesky factor: runs of columns with common rows below."""
 
 from dataclasses import dataclass
 
@@ -8,19 +8,19 @@ from factors.compiled import kernel_and_part
 
 _kernel, _ = kernel_and_part()
 
-# A run may take in the one before it where that leaves few zeros: up to so many columns, such a
-# part of the entries (columns here are blocks of 6).
+# A run may absorb the one before it if few zeros arise: up to a number of columns, a share of the
+# entries (columns here are blocks of 6).
 _RELAXED = ((2, 0.8), (6, 0.2), (np.inf, 0.05))
 
 
 @dataclass(frozen=True, slots=True)
 class Supernodes:
-    """Columns in elimination order, cut into runs; every run after those below it in the tree."""
+    """Columns in elimination order, cut into runs; a run comes after its children in the tree."""
 
     order: np.ndarray  # (N,) elimination place -> block
     starts: np.ndarray  # (S + 1,) first column of each run
     rows: tuple[np.ndarray, ...]  # S times (r,) places of the rows below a run, ascending
-    parents: np.ndarray  # (S,) run that takes in the update of each, -1 for none
+    parents: np.ndarray  # (S,) run that receives the update of each, -1 = none
 
 
 def find_supernodes(num: int, pairs: np.ndarray) -> Supernodes:
@@ -126,8 +126,8 @@ def _fundamental(starts: np.ndarray, columns: np.ndarray) -> tuple[list[int], li
     """First columns of the runs of a postordered pattern, and the rows below each run's end."""
     num = len(starts) - 1
     firsts: list[int] = []
-    rows: list[np.ndarray] = []  # of each run so far; the last one's from its last column on
-    waiting: dict[int, list[np.ndarray]] = {}  # rows that children hand on to a column
+    rows: list[np.ndarray] = []  # of each run so far; of the last one from its last column on
+    waiting: dict[int, list[np.ndarray]] = {}  # rows that children pass on to a column
     for k in range(num):
         own = columns[starts[k] : starts[k + 1]]
         handed = waiting.pop(k, [])
@@ -148,7 +148,7 @@ def _fundamental(starts: np.ndarray, columns: np.ndarray) -> tuple[list[int], li
 def _relaxed(
     firsts: list[int], rows: list[np.ndarray], num: int
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...], np.ndarray]:
-    """Starts, rows and parents of runs, small ones taken in by the next where few zeros arise."""
+    """Starts, rows and parents of runs, small ones absorbed by the next if few zeros arise."""
     kept: list[tuple[int, int, np.ndarray, int]] = []  # first, end, rows, zeros
     for first, end, below in zip(firsts, [*firsts[1:], num], rows, strict=True):
         zeros = 0

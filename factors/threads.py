@@ -1,7 +1,7 @@
-"""Threads, and runs of landmarks or patches shared out among them.
+"""Threads, and ranges of landmarks or patches distributed among them.
 
-Work is cut by its size alone, never by the number of threads, and what runs add up is added in
-their order: results are the same to the last bit however many threads there are.
+Work is divided by its size alone, never by the number of threads, and partial sums are added in
+order: results are identical to the last bit for any number of threads.
 """
 
 import os
@@ -15,7 +15,7 @@ import numpy as np
 
 T = TypeVar("T")
 
-_MOST_RUNS = 24  # each has sums of its own
+_MAX_RUNS = 24  # largest number of runs, as each has sums of its own
 
 
 def balanced_ranges(offsets: np.ndarray, least: int = 8192) -> list[tuple[int, int]]:
@@ -23,10 +23,10 @@ def balanced_ranges(offsets: np.ndarray, least: int = 8192) -> list[tuple[int, i
 
     Args:
         offsets: (N + 1,) owner n holds observations offsets[n] to offsets[n + 1] - 1.
-        least: observations of a run; fewer are not worth a thread.
+        least: least observations of a run.
     """
     total = int(offsets[-1])
-    num = min(max(total // least, 1), _MOST_RUNS)
+    num = min(max(total // least, 1), _MAX_RUNS)
     targets = np.linspace(0, total, num + 1)[1:-1]
     bounds = np.unique([0, *np.searchsorted(offsets, targets), len(offsets) - 1])
     if len(bounds) < 2:
@@ -42,15 +42,15 @@ def map_in_threads(work: Callable[[int], T], num: int, num_threads: int) -> Iter
 
 
 def run_in_threads(work: Callable[[int], None], num: int, num_threads: int) -> None:
-    """Call work(0) to work(num - 1), so many at a time; work must not use threads itself."""
+    """Call work(0) to work(num - 1) in threads; work must not use threads itself."""
     for _ in map_in_threads(work, num, num_threads):
         pass
 
 
 @lru_cache(maxsize=4)
 def pool(num: int) -> ThreadPoolExecutor:
-    """Threads that stay: solvers and renderers ask for them hundreds of times."""
+    """A pool of threads that persists: solvers and renderers use it hundreds of times."""
     return ThreadPoolExecutor(num, "factors")
 
 
-os.register_at_fork(after_in_child=pool.cache_clear)  # a child has none of its parent's threads
+os.register_at_fork(after_in_child=pool.cache_clear)  # a child process has no threads of its parent

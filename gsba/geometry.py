@@ -84,7 +84,7 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 
 
 def median_direction(directions: np.ndarray) -> np.ndarray:
-    """Unit vector (3,) of least summed chord to unit vectors (N, 3) (Weiszfeld)."""
+    """Unit vector (3,) with the least summed distance to unit vectors (N, 3) (Weiszfeld)."""
     median = directions.mean(axis=0)
     for _ in range(50):
         distance = np.linalg.norm(directions - median, axis=1)

@@ -13,12 +13,12 @@ _NO_FILE_NAME = re.compile(r"[/\x00-\x1f\x7f-\x9f\ud800-\udfff]|^\.{0,2}$")
 
 
 class PoseSource(IntEnum):
-    """Where a frame's coarse pose came from."""
+    """Source of a frame's coarse pose."""
 
     SLAM = 0  # an entry of the trajectory file
     INTERPOLATED = 1  # between two entries
     EXTRAPOLATED = 2  # before the first or after the last entry
-    NONE = 3  # there is no trajectory: a placeholder
+    NONE = 3  # no trajectory: a placeholder
 
 
 class PoseStatus(IntEnum):
@@ -57,7 +57,7 @@ class Fisheye:
 
 @dataclass(frozen=True, slots=True)
 class FrameSet:
-    """The captured frames on disk, in time order. No pixels are held.
+    """The captured frames on disk, in time order, without pixels.
 
     Raises:
         ValueError: a name or a face that cannot be a file name; exported files carry them.
@@ -164,11 +164,11 @@ class CoarsePoses:
 
 @dataclass(frozen=True, slots=True)
 class StepNoise:
-    """Standard deviations of the trajectory's steps from frame to frame."""
+    """Standard deviations of the trajectory's steps between frames."""
 
     rotation: float  # radians, per axis
-    direction: float  # of motion, radians, per axis
-    length: float  # relative
+    direction: float  # of motion's direction, radians, per axis
+    length: float  # of the step's length, relative
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,13 +183,13 @@ class GyroConstraints:
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """Keypoints of one frame, face after face, the strongest of a face first."""
+    """Keypoints of one frame, face after face, the strongest of each face first."""
 
     pixels: np.ndarray  # (K, 2) float64, (u, v) on the owning face, corner origin
     faces: np.ndarray  # (K,) uint8, index into FACES
     bearings_rig: np.ndarray  # (K, 3) float64, unit, rig frame
     sigmas_rad: np.ndarray  # (K,) float64, radians, per-axis localisation noise
-    descriptors: np.ndarray  # (K, D) uint8 or float32, unit length up to one common factor
+    descriptors: np.ndarray  # (K, D) uint8 or float32, of unit length up to a common factor
     colors: np.ndarray  # (K, 3) uint8, RGB at the keypoint
     scores: np.ndarray | None = None  # (K,) float32, a network's confidence in each keypoint
 
@@ -367,8 +367,8 @@ class Iteration:
 
     number: int
     cost: float  # total robust cost of the attempt
-    costs: Mapping[str, float]  # family -> cost; empty where the step was rejected
-    damping: float  # lambda the step was solved with
+    costs: Mapping[str, float]  # family -> cost; empty if the step was rejected
+    damping: float  # lambda of the step
     accepted: bool
     seconds: float  # wall time of this attempt
 
@@ -399,7 +399,7 @@ class FamilyVariables:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Poses and points after the last good round."""
+    """Poses and points after the last accepted round."""
 
     world_T_rigs: np.ndarray  # (F, 4, 4) float64
     landmarks: Landmarks
@@ -430,7 +430,7 @@ class Solution:
         return bool(np.all((self.observations() >= least) | (before.observations() < least)))
 
     def median_depth(self) -> float:
-        """Median distance of points from the frames that see them, map units; 0 without points."""
+        """Median distance of points from observing frames, map units; 0 without points."""
         tracks, points = self.landmarks.tracks, self.landmarks.points_world
         offsets = points[tracks.points] - self.world_T_rigs[tracks.frames, :3, 3]
         return float(np.median(np.linalg.norm(offsets, axis=1))) if len(offsets) else 0.0
@@ -551,7 +551,8 @@ class Reconstruction:
         baseline, scale = self.lens_baseline, self.map_scale(number)
         if baseline is not None:
             found = replace(found, lens_baseline=(scale * baseline[0], scale * baseline[1]))
-        return replace(found, vertical=None)  # it is known in the world of the largest map
+        return replace(found, vertical=None)  # the vertical is known in the world of the largest
+        # map
 
     def map_scale(self, number: int) -> float:
         """Units of a map's world per unit of the largest map's."""

@@ -1,8 +1,8 @@
-"""What is known of a raw pair's lenses, in files.
+"""Calibrations of a raw pair's two lenses, read from files.
 
-Takes JSON of our own form, whose rig keeps its axes: `rig_T_lens` in metres, unless `unit` says cm,
-mm, in, ft, or "map" for lengths of no known unit. Or what Kalibr and COLMAP write, see
-`gsba.camera.calibration_formats`. The rig's origin is laid into the middle between the lenses.
+Takes JSON of our own form, whose rig keeps its axes: `rig_T_lens` in metres, unless `unit` names
+cm, mm, in, ft, or "map" for lengths of no known unit. Takes Kalibr's and COLMAP's files too, see
+`gsba.camera.calibration_formats`. The rig's origin is moved into the middle between the lenses.
 """
 
 import json
@@ -27,30 +27,34 @@ from gsba.log import GsbaError
 from gsba.types import Fisheye
 
 _MODEL = "kannala-brandt: r = f (th + k1 th^3 + k2 th^5 + k3 th^7 + k4 th^9), corner origin"
-_WANTED = (
-    "it is to be lenses.front and lenses.back, each with width, height, f, cx, cy, k and "
+_EXPECTED_FORM = (
+    "give lenses.front and lenses.back, each with width, height, f, cx, cy, k and "
     "rig_T_lens, a Kalibr camchain of cam0 and cam1, or a COLMAP rig"
 )
-_MOST_BYTES = 1 << 18  # of a file; YAML takes a second for each hundred thousand
-_ASIDE = np.deg2rad(20.0)  # at most, of a lens's axis from that of the rig
+_MAX_FILE_BYTES = 1 << 18  # YAML takes a second for each hundred thousand
+_MAX_AXIS_ANGLE_RAD = np.deg2rad(20.0)  # between a lens's axis and the rig's z axis
 
 
 def read_calibration(path: Path) -> Pair:
     """The two lenses that a file describes, or the folder of a COLMAP model.
 
     Raises:
-        GsbaError: unreadable, or not of two lenses back to back.
+        GsbaError: the file is unreadable, or its lenses are not back to back.
     """
     try:
-        pair = from_colmap_model(path) if path.is_dir() else _of_tree(_tree(path), path)
+        pair = (
+            from_colmap_model(path) if path.is_dir() else _lenses_of_tree(_parsed_file(path), path)
+        )
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
         why = kind + _one_line(error)
         if isinstance(error, KeyError):
             why = f"it has no {error}"
-        raise GsbaError(f"{path}: not a calibration of two lenses ({why}); {_WANTED}") from None
+        raise GsbaError(
+            f"{path}: not a calibration of two lenses ({why}); {_EXPECTED_FORM}"
+        ) from None
     try:
-        return _centred(pair)
+        return _in_centred_rig(pair)
     except ValueError as error:
         raise GsbaError(f"{path}: {error}") from None
 
@@ -61,10 +65,10 @@ def calibration_json(
     """The content of a calibration file.
 
     Args:
-        pair: the lenses.
-        centre: (3,) of the front one in the rig; the other one is as far behind.
-        unit: of that, "m" or "map".
-        more: what else is known.
+        pair: front and back lens.
+        centre: (3,) centre of the front lens in the rig; the back one is opposite.
+        unit: unit of `centre`, "m" or "map".
+        more: further entries of the file.
     """
     return {
         "model": _MODEL,
@@ -85,35 +89,35 @@ def calibration_json(
     }
 
 
-def _centred(pair: Pair) -> Pair:
-    """The same lenses in a rig between them.
+def _in_centred_rig(pair: Pair) -> Pair:
+    """Both lenses in a rig whose origin is the middle between them.
 
     Raises:
-        ValueError: they do not look ahead and behind.
+        ValueError: the lenses do not look ahead and behind.
     """
     ways = [rotation_of(lens)[2, 2] for lens in pair]
-    if min(ways[0], -ways[1]) < np.cos(_ASIDE):
+    if min(ways[0], -ways[1]) < np.cos(_MAX_AXIS_ANGLE_RAD):
         raise ValueError(
-            "the front lens is to look along z of the rig and the back one the other way, within "
-            f"{np.rad2deg(_ASIDE):.0f} degrees: check their poses"
+            "the front lens must look along z of the rig and the back one the other way, within "
+            f"{np.rad2deg(_MAX_AXIS_ANGLE_RAD):.0f} degrees: check their poses"
         )
     middle = (np.asarray(pair[0].centre) + pair[1].centre) / 2
     front, back = (replace(lens, centre=_three(np.asarray(lens.centre) - middle)) for lens in pair)
     return front, back
 
 
-def fitted(pair: Pair, size: tuple[int, int], path: Path) -> Pair:
-    """A calibration for pictures of another size.
+def scaled_to_size(pair: Pair, size: tuple[int, int], path: Path) -> Pair:
+    """A calibration scaled to pictures of another size.
 
     Raises:
-        GsbaError: of another shape.
+        GsbaError: the pictures have another aspect ratio.
     """
     width, height = size
     for lens in pair:
         if abs(width * lens.height - height * lens.width) > 0.01 * width * lens.height:
             raise GsbaError(
-                f"{path}: is of pictures of {lens.width}x{lens.height}, but these are "
-                f"{width}x{height}: of another shape; give the calibration of this mode"
+                f"{path}: calibrates pictures of {lens.width}x{lens.height}, but these are "
+                f"{width}x{height}: another aspect ratio; give the calibration of this video mode"
             )
     front, back = (
         replace(
@@ -131,17 +135,17 @@ def fitted(pair: Pair, size: tuple[int, int], path: Path) -> Pair:
     return front, back
 
 
-def _tree(path: Path) -> Any:
-    """What a file holds, JSON or YAML.
+def _parsed_file(path: Path) -> Any:
+    """The parsed content of a JSON or YAML file.
 
     Raises:
-        GsbaError: neither, or it cannot be read.
+        GsbaError: the file is neither, or cannot be read.
     """
     try:
         with path.open("rb") as file:
-            content = file.read(_MOST_BYTES + 1)
-        if len(content) > _MOST_BYTES:
-            raise GsbaError(f"{path}: is larger than any calibration, {_MOST_BYTES >> 10} kB")
+            content = file.read(_MAX_FILE_BYTES + 1)
+        if len(content) > _MAX_FILE_BYTES:
+            raise GsbaError(f"{path}: is larger than any calibration, {_MAX_FILE_BYTES >> 10} kB")
         text = content.decode("utf-8")
     except OSError as error:
         raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
@@ -153,7 +157,7 @@ def _tree(path: Path) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise GsbaError(
-            f"{path}: is neither JSON nor YAML ({_one_line(error)}); {_WANTED}"
+            f"{path}: is neither JSON nor YAML ({_one_line(error)}); {_EXPECTED_FORM}"
         ) from None
 
 
@@ -161,7 +165,7 @@ def _yaml(text: str) -> Any:
     import yaml
 
     class Loader(yaml.SafeLoader):
-        """No aliases: few of them can stand for gigabytes."""
+        """A loader without aliases: few of them can stand for gigabytes."""
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
@@ -177,8 +181,8 @@ def _yaml(text: str) -> Any:
         raise ValueError(str(error)) from None
 
 
-def _of_tree(tree: Any, path: Path) -> Pair:
-    """The lenses, by whatever form a tree has."""
+def _lenses_of_tree(tree: Any, path: Path) -> Pair:
+    """Both lenses, read in the form that the tree's keys show."""
     if isinstance(tree, list):
         return from_colmap_config(tree, path)
     if "cameras" in tree:
@@ -186,11 +190,11 @@ def _of_tree(tree: Any, path: Path) -> Pair:
     if any(re.fullmatch(r"cam\d+", str(name)) for name in tree):
         return from_kalibr(tree, path)
     metres = metres_of(tree.get("unit", "m"))
-    front, back = (_lens(tree["lenses"][name], metres) for name in ("front", "back"))
+    front, back = (_lens_of_entry(tree["lenses"][name], metres) for name in ("front", "back"))
     return front, back
 
 
-def _lens(tree: Mapping[str, Any], metres: float) -> Fisheye:
+def _lens_of_entry(tree: Mapping[str, Any], metres: float) -> Fisheye:
     size = tree.get("width") or tree["size"], tree.get("height") or tree["size"]
     rig_T_lens = np.array(tree["rig_T_lens"], dtype=np.float64).reshape(4, 4)
     rig_T_lens[:3, 3] *= metres

@@ -1,7 +1,7 @@
-"""What other programs write of a raw pair's lenses: a Kalibr camchain, a COLMAP rig.
+"""Calibrations of a raw pair by other programs: a Kalibr camchain, a COLMAP rig.
 
-These say how one camera is against the other. The rig's z is halfway between the front lens's axis
-and the reversed axis of the back one, its x the front picture's, made orthogonal to that.
+These give the pose of one camera relative to the other. The rig's z is halfway between the front
+lens's axis and the reversed axis of the back one, its x is the front picture's, orthogonal to z.
 """
 
 import logging
@@ -20,12 +20,13 @@ from gsba.types import Fisheye
 
 _log = logging.getLogger(__name__)
 
-_FURTHEST = 1e6  # of a pose's numbers, in any unit
-_SQUARE = 0.01  # relative, by which both focal lengths of a camera may differ
-_SEEN = np.deg2rad(95.0)  # from a lens's axis, as far as it is asked
-_WORST_FIT = 0.1  # pixels, of another camera model taken for ours
-_MODEL = "OPENCV_FISHEYE"
-_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048, "map": 0.0}
+_MAX_POSE_ENTRY = 1e6  # largest absolute entry of a pose, in any unit
+_MAX_LOG_RATIO = 0.01  # largest logarithm of the ratio of a camera's two focal lengths
+_MAX_ANGLE_RAD = np.deg2rad(95.0)  # largest angle from a lens's axis at which its model must
+# hold
+_MAX_FIT_ERROR_PX = 0.1  # largest difference to another camera model after fitting ours
+_COLMAP_MODEL = "OPENCV_FISHEYE"
+_METRES_OF_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048, "map": 0.0}
 
 
 def lens_of(
@@ -35,7 +36,7 @@ def lens_of(
     radial: Sequence[Any],
     rig_T_lens: np.ndarray | None = None,
 ) -> Fisheye:
-    """A lens of numbers that a file holds.
+    """A lens built from the numbers of a file.
 
     Args:
         size: width and height, pixels.
@@ -45,27 +46,27 @@ def lens_of(
         rig_T_lens: (4, 4), metres; None = it is the rig.
 
     Raises:
-        ValueError: no numbers, or not those of a lens.
+        ValueError: the values are no numbers, or no lens has them.
     """
     from scipy.spatial.transform import Rotation
 
     width, height = (int(pixels) for pixels in size)
     (x, y), terms, f = (float(v) for v in principal), [float(k) for k in radial], float(focal)
     if len(terms) > 4 or not np.isfinite([f, x, y, *terms]).all() or min(f, width, height) <= 0:
-        raise ValueError("f, cx, cy, up to four k and the size are to be numbers, f above 0")
+        raise ValueError("f, cx, cy, up to four k and the size must be numbers, f above 0")
     if not (0 < x < width and 0 < y < height):
         raise ValueError(
-            f"the principal point ({x:g}, {y:g}) is outside of its picture, {width}x{height}"
+            f"the principal point ({x:g}, {y:g}) is outside the picture of {width}x{height}"
         )
     k1, k2, k3, k4 = [*terms, 0.0, 0.0, 0.0, 0.0][:4]
-    squares = np.linspace(0, _SEEN, 200) ** 2
+    squares = np.linspace(0, _MAX_ANGLE_RAD, 200) ** 2
     if (np.polyval([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0], squares) <= 0).any():
         raise ValueError(
-            f"r(theta) of k {terms} does not grow up to {np.rad2deg(_SEEN):.0f} degrees"
+            f"r(theta) of k {terms} does not grow up to {np.rad2deg(_MAX_ANGLE_RAD):.0f} degrees"
         )
     turn, place = np.zeros(3), np.zeros(3)
     if rig_T_lens is not None:
-        turn = Rotation.from_matrix(_rigid(rig_T_lens)[:3, :3]).as_rotvec()
+        turn = Rotation.from_matrix(_checked_rigid(rig_T_lens)[:3, :3]).as_rotvec()
         place = rig_T_lens[:3, 3]
     a, b, c = (float(v) for v in turn)
     d, e, g = (float(v) for v in place)
@@ -73,21 +74,21 @@ def lens_of(
 
 
 def metres_of(unit: Any) -> float:
-    """Metres in a unit that a file names; 0 for "map", as nobody knows how long its lengths are.
+    """Metres in a unit that a file names; 0 for "map", whose lengths have no known scale.
 
     Raises:
-        ValueError: it is none of those known.
+        ValueError: the unit is not known.
     """
-    if not isinstance(unit, str) or unit not in _METRES:
-        raise ValueError(f"unit {brief(repr(unit))} is not known: use {', '.join(_METRES)}")
-    return _METRES[unit]
+    if not isinstance(unit, str) or unit not in _METRES_OF_UNIT:
+        raise ValueError(f"unit {brief(repr(unit))} is not known: use {', '.join(_METRES_OF_UNIT)}")
+    return _METRES_OF_UNIT[unit]
 
 
 def from_kalibr(tree: Mapping[str, Any], path: Path) -> Pair:
     """The lenses of a camchain: `cam0` is the front one, `cam1` the back one.
 
     Raises:
-        GsbaError: of other cameras than these.
+        GsbaError: the file holds other cameras than these two.
         KeyError, TypeError, ValueError, IndexError: a field is missing, or is something else.
     """
     cameras = sorted(name for name in map(str, tree) if re.fullmatch(r"cam\d+", name))
@@ -98,17 +99,17 @@ def from_kalibr(tree: Mapping[str, Any], path: Path) -> Pair:
         )
     front, back = (_kalibr_lens(tree[name], f"{path}: {name}") for name in cameras)
     cam1_T_cam0 = np.array(tree["cam1"]["T_cn_cnm1"], dtype=np.float64).reshape(4, 4)
-    return _in_rig((front, back), inverse(_rigid(cam1_T_cam0)), path)
+    return _in_rig((front, back), inverse(_checked_rigid(cam1_T_cam0)), path)
 
 
 def from_colmap_config(tree: Sequence[Any], path: Path) -> Pair:
-    """The lenses of one rig of a `rig_config.json`: its `ref_sensor` is the front one.
+    """The lenses of one rig of a `rig_config.json`: its `ref_sensor` is the front lens.
 
-    COLMAP knows pictures' sizes from the pictures; here `width` and `height` stand beside
-    `camera_params`. Lengths are metres, unless the rig's `unit` says otherwise, see `metres_of`.
+    COLMAP takes pictures' sizes from the pictures; here `width` and `height` stand beside
+    `camera_params`. Lengths are metres, unless the rig names a `unit`, see `metres_of`.
 
     Raises:
-        GsbaError: of other cameras than these.
+        GsbaError: the file holds other cameras than these two.
         KeyError, TypeError, ValueError, IndexError: a field is missing, or is something else.
     """
     cameras = [camera for rig in tree for camera in rig["cameras"]]
@@ -124,7 +125,7 @@ def from_colmap_config(tree: Sequence[Any], path: Path) -> Pair:
     for name, camera in zip(("front", "back"), (fronts[0], backs[0]), strict=True):
         if "width" not in camera or "height" not in camera:
             raise GsbaError(
-                f"{path}: does not say how large the pictures of the {name} lens are: write width "
+                f"{path}: gives no picture size for the {name} lens: write width "
                 "and height, pixels, beside its camera_params"
             )
         size, model = (camera["width"], camera["height"]), camera["camera_model_name"]
@@ -132,11 +133,11 @@ def from_colmap_config(tree: Sequence[Any], path: Path) -> Pair:
         wxyz = np.array(camera.get("cam_from_rig_rotation", (1, 0, 0, 0)), dtype=np.float64)
         at = np.array(camera.get("cam_from_rig_translation", (0, 0, 0)), dtype=np.float64)
         if wxyz.shape != (4,) or at.shape != (3,) or not 0.9 < np.linalg.norm(wxyz) < 1.1:
-            raise ValueError("cam_from_rig of a quaternion wxyz and of three numbers is wanted")
+            raise ValueError("cam_from_rig must be a quaternion wxyz and three numbers")
         if name == "back" and "cam_from_rig_rotation" not in camera:
             raise KeyError("cam_from_rig_rotation")
         poses.append(pose(rotation_from_quaternion(wxyz / np.linalg.norm(wxyz)), at))
-    front_T_back = _rigid(poses[0]) @ inverse(_rigid(poses[1]))
+    front_T_back = _checked_rigid(poses[0]) @ inverse(_checked_rigid(poses[1]))
     front_T_back[:3, 3] *= metres_of(tree[0].get("unit", "m"))
     return _in_rig((lenses[0], lenses[1]), front_T_back, path)
 
@@ -144,10 +145,10 @@ def from_colmap_config(tree: Sequence[Any], path: Path) -> Pair:
 def from_colmap_model(folder: Path) -> Pair:
     """The lenses of a sparse model with one rig of two cameras, whose reference is the front one.
 
-    Its lengths are the model's own: how far the lenses are apart is not taken from it.
+    A model's scale is arbitrary, so that the baseline between the lenses is not taken from it.
 
     Raises:
-        GsbaError: no such model, or of other cameras than these.
+        GsbaError: no model can be read, or it holds other cameras than these two.
     """
     import pycolmap
 
@@ -168,81 +169,85 @@ def from_colmap_model(folder: Path) -> Pair:
         )
     ((sensor, back_from_front),) = others[0].items()
     if back_from_front is None:
-        raise GsbaError(f"{folder}: does not say how the back lens is against the front one")
+        raise GsbaError(f"{folder}: gives no pose of the back lens relative to the front one")
     lenses = []
     for name, index in (("front", rigs[0].ref_sensor_id.id), ("back", sensor.id)):
         camera, where = model.cameras[index], f"{folder}: {name} lens"
         size = camera.width, camera.height
         lenses.append(_colmap_lens(camera.model.name, size, list(camera.params), where))
     rotation = back_from_front.rotation.matrix().T
-    _log.info("%s: its lengths are its own: how far its lenses are apart is left out", folder)
+    _log.info("%s: a COLMAP model has no metric scale: its baseline is not used", folder)
     return _in_rig((lenses[0], lenses[1]), pose(rotation, np.zeros(3)), folder)
 
 
 def _kalibr_lens(tree: Mapping[str, Any], where: str) -> Fisheye:
-    """A camera of a camchain, as the rig itself; pixel centres there are whole numbers."""
+    """A camera of a camchain, its own frame being the rig's; Kalibr's pixel centres are whole
+    numbers."""
     kind = str(tree["camera_model"]), str(tree["distortion_model"])
     numbers = [float(v) for v in tree["intrinsics"]]
     terms = [float(v) for v in tree["distortion_coeffs"]]
     wanted = {("pinhole", "equidistant"): 4, ("omni", "radtan"): 5}.get(kind)
     if wanted is None:
         raise GsbaError(
-            f"{where} is {kind[0]} with {kind[1]}; pinhole with equidistant is wanted (Kalibr's "
+            f"{where} is {kind[0]} with {kind[1]}; it must be pinhole with equidistant (Kalibr's "
             "model pinhole-equi): calibrate with that"
         )
     if len(numbers) != wanted or len(terms) != 4:
-        raise ValueError(f"{wanted} intrinsics and 4 distortion_coeffs are wanted")
+        raise ValueError(f"{wanted} intrinsics and 4 distortion_coeffs are needed")
     *xi, fu, fv, pu, pv = numbers
     size, focal, principal = tree["resolution"], _focal(fu, fv, where), (pu + 0.5, pv + 0.5)
     if kind[0] == "pinhole":
         return lens_of(size, focal, principal, terms)
-    return _of_omni(size, (xi[0], focal), principal, terms, where)
+    return _fit_to_omni(size, (xi[0], focal), principal, terms, where)
 
 
 def _colmap_lens(model: str, size: Sequence[Any], params: Sequence[Any], where: str) -> Fisheye:
-    if model != _MODEL:
-        raise GsbaError(f"{where} is {model}; {_MODEL} is wanted: calibrate with that")
+    if model != _COLMAP_MODEL:
+        raise GsbaError(f"{where} is {model}, but must be {_COLMAP_MODEL}: calibrate with that")
     fx, fy, cx, cy, *terms = (float(v) for v in params)
     if len(terms) != 4:
-        raise ValueError(f"{_MODEL} has fx, fy, cx, cy, k1, k2, k3, k4")
+        raise ValueError(f"{_COLMAP_MODEL} has fx, fy, cx, cy, k1, k2, k3, k4")
     return lens_of(size, _focal(fx, fy, where), (cx, cy), terms)
 
 
 def _focal(across: float, down: float, where: str) -> float:
-    """One focal length for two that hardly differ."""
+    """The geometric mean of two focal lengths that hardly differ, pixels."""
     if not (across > 0 and down > 0):
-        raise ValueError("focal lengths are to be above 0")
-    if abs(np.log(across / down)) > _SQUARE:
+        raise ValueError("focal lengths must be above 0")
+    if abs(np.log(across / down)) > _MAX_LOG_RATIO:
         raise GsbaError(
-            f"{where} has focal lengths {across:g} and {down:g}, more than {100 * _SQUARE:.0f} % "
-            "apart: pixels are taken for square; calibrate again"
+            f"{where} has focal lengths {across:g} and {down:g}, more than "
+            f"{100 * _MAX_LOG_RATIO:.0f} % apart, but pixels are assumed to be square; calibrate "
+            "again"
         )
     return float(np.sqrt(across * down))
 
 
-def _of_omni(
+def _fit_to_omni(
     size: Sequence[Any],
     intrinsics: tuple[float, float],
     principal: tuple[float, float],
     distortion: Sequence[float],
     where: str,
 ) -> Fisheye:
-    """Our model next to Mei and Rives's (ICRA 2007) with radial and tangential distortion.
+    """Our lens model fitted to Mei and Rives's (ICRA 2007) with radial and tangential distortion.
 
     Args:
         size: pixels.
         intrinsics: xi and focal length.
         principal: pixels, corner origin.
         distortion: k1, k2, p1, p2.
-        where: for messages.
+        where: file and camera, for error messages.
     """
     (xi, focal), (k1, k2, p1, p2) = intrinsics, distortion
-    angles, around = np.meshgrid(np.linspace(0, _SEEN, 96), np.arange(24) * np.pi / 12)
+    angles, around = np.meshgrid(np.linspace(0, _MAX_ANGLE_RAD, 96), np.arange(24) * np.pi / 12)
     angles, around = angles.ravel(), around.ravel()
     away = np.stack([np.cos(around), np.sin(around)], axis=1)
     depths = np.cos(angles) + xi
     if not depths.min() > 0:
-        raise GsbaError(f"{where}: its omni model ends before {np.rad2deg(_SEEN):.0f} degrees")
+        raise GsbaError(
+            f"{where}: its omni model ends before {np.rad2deg(_MAX_ANGLE_RAD):.0f} degrees"
+        )
     x, y = (plane := (np.sin(angles) / depths)[:, None] * away).T
     squares = x * x + y * y
     bent = plane * (1 + k1 * squares + k2 * squares**2)[:, None]
@@ -254,22 +259,23 @@ def _of_omni(
     (f, *terms, dx, dy), *_ = np.linalg.lstsq(columns, (focal * bent).ravel())
     off = (columns @ [f, *terms, dx, dy] - (focal * bent).ravel()).reshape(-1, 2)
     worst = float(np.hypot(*off.T).max())
-    if not worst <= _WORST_FIT:
+    if not worst <= _MAX_FIT_ERROR_PX:
         raise GsbaError(
-            f"{where} is omni with radtan, {worst:.2f} pixels from any lens that is read, within "
-            f"{np.rad2deg(_SEEN):.0f} degrees: calibrate with Kalibr's model pinhole-equi"
+            f"{where} is omni with radtan, {worst:.2f} pixels from the best fit of our lens "
+            f"model within {np.rad2deg(_MAX_ANGLE_RAD):.0f} degrees: calibrate with "
+            "Kalibr's model pinhole-equi"
         )
     return lens_of(size, f, (principal[0] + dx, principal[1] + dy), np.array(terms) / f)
 
 
-def _rigid(a_T_b: np.ndarray) -> np.ndarray:
-    """A rigid motion (4, 4).
+def _checked_rigid(a_T_b: np.ndarray) -> np.ndarray:
+    """A pose (4, 4), checked to be a rigid motion.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the matrix is no rigid motion.
     """
     turn = a_T_b[:3, :3]
-    small = bool((np.abs(a_T_b) < _FURTHEST).all())  # no NaN either
+    small = bool((np.abs(a_T_b) < _MAX_POSE_ENTRY).all())  # no NaN either
     if not small or np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3:
         raise ValueError("the pose of a lens is no rigid motion")
     if np.linalg.det(turn) < 0:
@@ -278,7 +284,8 @@ def _rigid(a_T_b: np.ndarray) -> np.ndarray:
 
 
 def _in_rig(pair: Pair, front_T_back: np.ndarray, path: Path) -> Pair:
-    """Both lenses in a rig whose axes lie between theirs; its origin is at the front one."""
+    """Both lenses in a rig whose z lies between their axes; its origin is the front lens's
+    centre."""
     from scipy.spatial.transform import Rotation
 
     axis = np.array([0.0, 0, 1]) - front_T_back[:3, 2]

@@ -4,7 +4,7 @@ Track 0 shows left, front and right, the second track down, back and up, turned 
 square is as high as its track, and equal steps in it are equal angles from its middle: u = (atan(x
 / z) / (pi / 2) + 1/2) S, for both axes. Front and back are of one lens each. The other four are
 half of the front and half of the back lens: their middle columns stand twice, once from each lens,
-so that they are wider than high. As a track is 3 S + 2 overlap wide, any size tells its overlap.
+so that they are wider than high. A track is 3 S + 2 overlap wide: its size gives the overlap.
 
 Source of the layout: P. Bourke, paulbourke.net/panorama/gopromax2sphere (2021). The turns, the
 overlap and the angles were checked on frames of a MAX at 3K and panoramas made of them.
@@ -20,10 +20,10 @@ from gsba.camera.straighten import PAD, observed
 from gsba.camera.tables import table
 from gsba.types import FACES
 
-_MAX_OVERLAP = 1 / 8  # of a square: cameras have 1/60 to 1/20
+_MAX_OVERLAP = 1 / 8  # part of a square: cameras have 1/60 to 1/20
 
-# Where a track has each face: track, square from the left, and quarter turns counterclockwise that
-# set it upright, in FACES order.
+# Storage of each face in FACES order: track, square from the left, and quarter turns
+# counterclockwise that set it upright.
 _STORED = ((0, 1, 0), (0, 2, 0), (1, 1, 1), (0, 0, 0), (1, 2, -1), (1, 0, -1))
 
 _FACE_ALONG = np.array([[1, 3], [5, 4], [0, 2]])  # by axis x, y, z and sign +, -
@@ -41,19 +41,20 @@ class Taps:
 
 
 def is_equiangular(width: int, height: int) -> bool:
-    """Whether a track of two can have this size, pixels."""
+    """True if one of two tracks can have this size, pixels."""
     extra = width - 3 * height
     even = extra % 2 == 0 and (height + extra // 2) % 2 == 0
     return height > 0 and even and 0 <= extra <= 2 * _MAX_OVERLAP * height
 
 
 def overlap_of(width: int, height: int) -> int:
-    """Columns in the middle of a side square that stand twice, by the size of a track."""
+    """Columns in the middle of a side square that are recorded twice, by the size of a track,
+    pixels."""
     return (width - 3 * height) // 2
 
 
 def square_pixels(directions: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where upright equi-angular squares of `size` pixels show directions.
+    """Pixels of directions in upright equi-angular squares of `size` pixels.
 
     Args:
         directions: (..., 3) float64, any length, rig frame.
@@ -98,7 +99,7 @@ def taps(directions: np.ndarray, width: int, height: int) -> Taps:
 def squares(tracks: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Upright equi-angular squares (6, S, S[, C]) uint8, FACES order, of two tracks.
 
-    The columns that stand twice are blended, each lens's weight falling linearly to nothing where
+    The columns recorded twice are blended, each lens's weight falling linearly to nothing where
     its picture ends; no pixel is resampled.
 
     Args:
@@ -115,7 +116,7 @@ def squares(tracks: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
 
 
 def shrunk(faces: np.ndarray, size: int) -> np.ndarray:
-    """Squares averaged down to `size` pixels; themselves where they are no larger."""
+    """Squares averaged down to `size` pixels; unchanged where they are no larger."""
     if size >= faces.shape[1]:
         return faces
     return np.stack([cv2.resize(f, (size, size), interpolation=cv2.INTER_AREA) for f in faces])
@@ -140,10 +141,10 @@ def around_squares(faces: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Where the picture that `around_squares` makes shows directions."""
+    """Pixels of directions in the picture that `around_squares` makes."""
 
     size: int  # pixels across a square
-    correction: tuple[float, ...] = ()  # of what stitching bends, see `FrameSet`
+    correction: tuple[float, ...] = ()  # coefficients of the stitching field, see `FrameSet`
 
     def places(self, directions: np.ndarray) -> np.ndarray:
         """OpenCV pixels (..., 2) float64 of directions (..., 3), rig frame."""
@@ -177,8 +178,8 @@ def _left_share(columns: np.ndarray, size: int, overlap: int) -> np.ndarray:
 
 @table(maxsize=4)
 def _borders(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows and columns (n, k) of all padding in a grid, and OpenCV pixels (2, n, k) float32 where
-    the grid shows what lies there on the sphere."""
+    """Rows and columns (n, k) of all padding in a grid, and OpenCV pixels (2, n, k) float32 of the
+    grid from which the padding is copied."""
     cell, grid = size + 2 * PAD, Grid(size)
     ring = np.ones((cell, cell), bool)
     ring[PAD:-PAD, PAD:-PAD] = False

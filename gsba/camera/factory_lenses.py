@@ -1,7 +1,7 @@
 """Lens calibrations by Insta360, which its cameras write into their files, as starting lenses.
 
 A calibration is numbers with underscores between them: how many lenses, the numbers of each, then
-those of both. Four generations are known, told apart by how many numbers there are:
+those of both. Four generations are known, which differ in the number of numbers:
 
 1   radius, centre x y, angles; for both: width, height, kind
 2   radius, centre x y, angles, position x y z, coefficients c0 c1 c2 c3, width, height, kind
@@ -16,7 +16,7 @@ f u (1 + k1 u^2 + k2 u^4 + ...) from the centre (C. Mei and P. Rives, ICRA 2007)
 left out: they move pixels by a thousandth of the radius. Generation 2: c0 a + c1 a^2 + ... with a
 in radians, scaled such that `radius` is at 100 degrees. Generation 1: proportional to a, `radius`
 at 100 degrees. Those 100 degrees, and that c0 to c3 are of radians, were found out from published
-calibrations of one X4: what its third generation says reaches the radius of the first at 100.6 and
+calibrations of one X4: its third generation reaches the radius of the first at 100.6 and
 that of the second at 100.2 degrees, and its second generation agrees with the third within 1 %.
 
 Angles are degrees: the third, about the axis, is near 0, 90 or 180, and those of both lenses add up
@@ -37,16 +37,16 @@ from gsba.types import Fisheye
 
 _GENERATIONS = {6: 1, 16: 2, 19: 3, 27: 6}  # numbers of one lens -> generation
 _COUNTS = {16: 6, 34: 16, 40: 19, 56: 27}  # numbers of a calibration -> numbers of one lens
-_REFERENCE = np.deg2rad(100.0)  # angle at which `radius` is
-_FITTED_TO = np.deg2rad(100.0)  # largest angle to which radial terms are fitted
-_MAX_TILT_DEG = 5.0  # of a lens's axis, by the first two angles
-_MAX_OFF_AXIS_SUM_DEG = 10.0  # of the third angles of both lenses from 180
-_FOCAL_SIGMA = {1: 0.05, 2: 0.01, 3: 0.005, 6: 0.005}  # relative
-_DIRECTION_SIGMA = {n: np.deg2rad(deg) for n, deg in ((1, 1.5), (2, 0.7), (3, 0.4), (6, 0.4))}
-_ROTATION_SIGMA = np.deg2rad(1.5)
-_MAX_NUMBER = 1e7
-_BASELINES_M = 0.002, 0.2  # smallest and largest distance of two lenses
-_BEHIND = np.diag([-1.0, 1.0, -1.0])  # half a turn about y
+_REFERENCE_ANGLE_RAD = np.deg2rad(100.0)  # angle to which `radius` belongs
+_MAX_FITTED_ANGLE_RAD = np.deg2rad(100.0)  # largest angle to which radial terms are fitted
+_MAX_TILT_DEG = 5.0  # largest tilt of a lens's axis, by the first two angles
+_MAX_OFF_AXIS_SUM_DEG = 10.0  # largest deviation of the sum of both third angles from 180
+_RELATIVE_FOCAL_SIGMA = {1: 0.05, 2: 0.01, 3: 0.005, 6: 0.005}  # relative
+_DIRECTION_SIGMA_RAD = {n: np.deg2rad(deg) for n, deg in ((1, 1.5), (2, 0.7), (3, 0.4), (6, 0.4))}
+_ROTATION_SIGMA_RAD = np.deg2rad(1.5)
+_MAX_ABSOLUTE_NUMBER = 1e7
+_BASELINE_RANGE_M = 0.002, 0.2  # smallest and largest distance of two lenses
+_HALF_TURN_ABOUT_Y = np.diag([-1.0, 1.0, -1.0])  # rotation by pi about y
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,15 +61,15 @@ class FactoryLens:
 
 @dataclass(frozen=True, slots=True)
 class FactoryCalibration:
-    """A calibration as a camera wrote it, and which part of its sensors pictures show."""
+    """A calibration as a camera wrote it, and the recorded part of its sensors."""
 
     text: str  # numbers with underscores between them
     camera: str = ""  # model; "" = not known
-    sensor: tuple[int, int] | None = None  # width and height, pixels, of one lens; None
-    # = as the text says
+    sensor: tuple[int, int] | None = None  # width and height, pixels, of one lens's sensor; None
+    # = those in the text
     window: tuple[int, int] | None = None  # width and height of its recorded part; None = not known
-    shift: tuple[int, int] = (0, 0)  # of that part's middle from the sensor's, pixels right, down
-    back_first: bool = False  # whether pictures of the text's second lens come first
+    shift: tuple[int, int] = (0, 0)  # from the sensor's middle to that part's, pixels right, down
+    back_first: bool = False  # True if pictures of the text's second lens come first
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,10 +79,9 @@ class FactoryLenses:
     generation: int  # 1, 2, 3 or 6
     lenses: tuple[FactoryLens, FactoryLens]  # front, back
     canvas: tuple[int, int]  # width and height of one lens's half, pixels
-    window: tuple[float, float, float, float] | None  # left, top, width, height of what recordings
-    # show of that half, pixels; None = not known
+    window: tuple[float, float, float, float] | None  # recorded part of that half: left, top,
     baseline_m: float | None  # distance of the lenses, m; None = not stated
-    angles_known: bool  # whether angles are of the form described above; else they are not used
+    angles_known: bool  # True if angles have the form described above; else they are unused
 
     @property
     def focal_sigma(self) -> float:
@@ -90,12 +89,12 @@ class FactoryLenses:
 
         The first generation takes lenses for equidistant; those of an X4 are not, by 5 percent.
         """
-        return _FOCAL_SIGMA[self.generation]
+        return _RELATIVE_FOCAL_SIGMA[self.generation]
 
     @property
     def direction_sigma(self) -> float:
         """Standard deviation of directions of pixels in the axes of their own lens, rad."""
-        return float(_DIRECTION_SIGMA[self.generation])
+        return float(_DIRECTION_SIGMA_RAD[self.generation])
 
     @property
     def rotation_sigma(self) -> float:
@@ -103,12 +102,12 @@ class FactoryLenses:
 
         An X4 Air's own calibration was off by 2.4 degrees (Kjerag's study).
         """
-        return float(_ROTATION_SIGMA)
+        return float(_ROTATION_SIGMA_RAD)
 
     def pairs(self, size: tuple[int, int]) -> list[Pair]:
         """Lenses for pictures of a size that show the window or, less likely, all of the sensor.
 
-        Where pictures are of another shape, they show the middle.
+        Pictures of another aspect ratio show the middle of it.
 
         Args:
             size: width and height, pixels.
@@ -139,7 +138,7 @@ def parse_factory_lenses(calibration: FactoryCalibration) -> FactoryLenses:
     """Lenses that a calibration of Insta360 describes.
 
     Raises:
-        GsbaError: another form, or numbers that no lenses have.
+        GsbaError: the form is unknown, or no lenses have such numbers.
     """
     try:
         return _of_numbers(np.array(calibration.text.split("_"), np.float64), calibration)
@@ -152,32 +151,33 @@ def _of_numbers(numbers: np.ndarray, calibration: FactoryCalibration) -> Factory
     """Lenses from all numbers of a calibration.
 
     Raises:
-        ValueError: another form, or numbers that no lenses have.
+        ValueError: the form is unknown, or no lenses have such numbers.
     """
     count = _COUNTS.get(len(numbers))
-    if count is None or numbers[0] != 2 or not (abs(numbers) < _MAX_NUMBER).all():
-        raise ValueError("of no form that is known")
+    if count is None or numbers[0] != 2 or not (abs(numbers) < _MAX_ABSOLUTE_NUMBER).all():
+        raise ValueError("its form is not known")
     generation, parts = _GENERATIONS[count], numbers[1 : 1 + 2 * count].reshape(2, count)
     canvas = numbers[-3:-1] if generation == 1 else parts[0, -3:-1]
     half = canvas / (2, 1)
     if not (half >= 16).all() or (half > 1 << 15).any():
-        raise ValueError(f"a canvas of {canvas[0]:g}x{canvas[1]:g}")
-    at = 3 if generation >= 3 else 1  # of the centre
+        raise ValueError(f"its canvas cannot be {canvas[0]:g}x{canvas[1]:g}")
+    at = 3 if generation >= 3 else 1  # index of the centre
     angles = parts[:, at + 2 : at + 5]
     known = _are_as_described(angles)
     lenses = []
     for n in range(2):
         centre = parts[n, at : at + 2] - (n * half[0], 0)
         if (abs(centre - half / 2) > half / 4).any():
-            raise ValueError(f"a centre far from the middle of lens {n + 1}")
+            raise ValueError(f"the centre of lens {n + 1} is far from the middle")
         rotation = _camera_R_lens(angles[n] if known else np.array([0, 0, 90.0]), behind=n == 1)
         lenses.append(FactoryLens(*_radial_model(generation, parts[n]), _two(centre), rotation))
     if calibration.back_first:
         lenses = [
-            replace(each, camera_R_lens=_BEHIND @ each.camera_R_lens) for each in lenses[::-1]
+            replace(each, camera_R_lens=_HALF_TURN_ABOUT_Y @ each.camera_R_lens)
+            for each in lenses[::-1]
         ]
     apart = float(np.linalg.norm(parts[1, at + 5 : at + 8])) if generation > 1 else 0.0
-    low, high = _BASELINES_M
+    low, high = _BASELINE_RANGE_M
     return FactoryLenses(
         generation=generation,
         lenses=(lenses[0], lenses[1]),
@@ -189,16 +189,16 @@ def _of_numbers(numbers: np.ndarray, calibration: FactoryCalibration) -> Factory
 
 
 def _are_as_described(angles: np.ndarray) -> bool:
-    """Whether angles (2, 3) are degrees, the third ones about the axes and back to back."""
+    """True if angles (2, 3) are degrees, the third ones about the axes and back to back."""
     tilts, about = abs(angles[:, :2]), angles[:, 2].sum() % 360
     return bool((tilts < _MAX_TILT_DEG).all() and abs(about - 180) < _MAX_OFF_AXIS_SUM_DEG)
 
 
 def _camera_R_lens(angles: np.ndarray, behind: bool) -> np.ndarray:
-    """Rotation (3, 3) of a lens by its angles (3,) in degrees."""
+    """Rotation (3, 3) from a lens's frame to the camera's, by its angles (3,) in degrees."""
     yaw, pitch, roll = angles
     lens_R_camera = Rotation.from_euler("ZYX", [roll - 90, yaw, pitch], degrees=True).as_matrix()
-    return (lens_R_camera @ (_BEHIND if behind else np.eye(3))).T
+    return (lens_R_camera @ (_HALF_TURN_ABOUT_Y if behind else np.eye(3))).T
 
 
 def _radial_model(
@@ -207,28 +207,28 @@ def _radial_model(
     """Focal length, pixels per radian, and k1 to k4 of `Fisheye`, fitted over all angles.
 
     Raises:
-        ValueError: numbers that no lens has.
+        ValueError: no lens has such numbers.
     """
-    angles = np.linspace(0, _FITTED_TO, 201)[1:]
+    angles = np.linspace(0, _MAX_FITTED_ANGLE_RAD, 201)[1:]
     if generation == 1:
-        radii = numbers[0] * angles / _REFERENCE
+        radii = numbers[0] * angles / _REFERENCE_ANGLE_RAD
     elif generation == 2:
         shape = np.polynomial.Polynomial([0.0, *numbers[9:13]])
-        radii = numbers[0] * shape(angles) / (shape(_REFERENCE) or np.inf)
+        radii = numbers[0] * shape(angles) / (shape(_REFERENCE_ANGLE_RAD) or np.inf)
     else:
         count = 3 if generation == 3 else 5
         shape = np.polynomial.Polynomial([1.0, *numbers[11 : 11 + count]])
         within = np.cos(angles) + numbers[0]
         if within.min() <= 0.01:
-            raise ValueError(f"a lens of xi {numbers[0]:g}")
+            raise ValueError(f"no lens has xi {numbers[0]:g}")
         u = np.sin(angles) / within
         radii = numbers[1:3].mean() * u * shape(u * u)
     if not np.isfinite(radii).all() or (np.diff(radii, prepend=0.0) <= 0).any():
-        raise ValueError("a lens whose pictures fold over")
+        raise ValueError("its picture folds over")
     powers = angles[:, None] ** np.array([1, 3, 5, 7, 9])
     found = np.linalg.lstsq(powers, radii, rcond=None)[0]
     if found[0] <= 0:
-        raise ValueError("a lens without a focal length")
+        raise ValueError("it has no focal length")
     k1, k2, k3, k4 = (float(k) for k in found[1:] / found[0])
     return float(found[0]), (k1, k2, k3, k4)
 
@@ -236,7 +236,8 @@ def _radial_model(
 def _window(
     half: np.ndarray, calibration: FactoryCalibration
 ) -> tuple[float, float, float, float] | None:
-    """Left, top, width and height in a lens's half (2,) of the canvas; None = not within it."""
+    """Left, top, width and height in a lens's half (2,) of the canvas; None = it exceeds that
+    half."""
     if calibration.window is None:
         return None
     scale = half / (half if calibration.sensor is None else np.array(calibration.sensor))

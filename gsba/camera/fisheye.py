@@ -1,8 +1,8 @@
-"""Two raw fisheyes as parts of one panorama: where directions of the rig are in their pictures.
+"""Two raw fisheyes as parts of one panorama: projection of rig directions into their pictures.
 
-Each direction is seen by the lens that faces it, as `gsba.camera.lens` has it: the front one ahead
-of the rig, the back one behind. What a lens is thought to be may change after panoramas were cut:
-then a direction that these show is one pixel of a fisheye, and that has another direction.
+The lens that faces a direction sees it, as in `gsba.camera.lens`: the front one ahead of the rig,
+the back one behind. Lenses may be recalibrated after panoramas were cut by them: then a direction
+of a panorama is one pixel of a fisheye, which has another direction by the new calibration.
 """
 
 from dataclasses import replace
@@ -13,9 +13,9 @@ from gsba.types import Fisheye
 
 Pair = tuple[Fisheye, Fisheye]  # front, back
 
-PARAMETERS = 10  # of a lens: relative focal length, principal point (2) in parts of the focal
-# length, radial terms (4), turn (3) in the rig
-_NEWTON = 8  # steps to an angle: the last ones change nothing
+PARAMETERS = 10  # of a lens: relative focal length, principal point (2) in units of the focal
+# length, radial terms (4), rotation (3) in the rig
+_NUM_NEWTON_STEPS = 8  # enough for angles to converge in double precision
 
 
 def rotation_of(lens: Fisheye) -> np.ndarray:
@@ -29,7 +29,7 @@ def project(lens: Fisheye, directions: np.ndarray) -> np.ndarray:
     """Pixels (..., 2), corner origin, of vectors (..., 3) in the rig frame."""
     local = directions @ rotation_of(lens)
     across = np.hypot(local[..., 0], local[..., 1])
-    radii = lens.focal * _bent(lens, np.arctan2(across, local[..., 2]))[0]
+    radii = lens.focal * _distorted_radii(lens, np.arctan2(across, local[..., 2]))[0]
     away = local[..., :2] / np.maximum(across, 1e-300)[..., None]
     return np.asarray(lens.principal) + radii[..., None] * away
 
@@ -39,30 +39,31 @@ def unproject(lens: Fisheye, pixels: np.ndarray) -> np.ndarray:
     away = (pixels - np.asarray(lens.principal)) / lens.focal
     radii = np.hypot(away[..., 0], away[..., 1])
     angles = radii.copy()
-    for _ in range(_NEWTON):
-        bent, slope = _bent(lens, angles)
+    for _ in range(_NUM_NEWTON_STEPS):
+        bent, slope = _distorted_radii(lens, angles)
         angles = np.clip(angles - (bent - radii) / np.maximum(slope, 0.1), 0, np.pi)
     across = (np.sin(angles) / np.maximum(radii, 1e-300))[..., None] * away
     return np.concatenate([across, np.cos(angles)[..., None]], axis=-1) @ rotation_of(lens).T
 
 
 def by_parameters(lens: Fisheye, directions: np.ndarray) -> np.ndarray:
-    """How the directions of fixed pixels change with the lens, (N, 3, PARAMETERS).
+    """Jacobians (N, 3, PARAMETERS) of the directions of fixed pixels by the lens's parameters.
 
     Args:
-        lens: as it is.
+        lens: its current parameters.
         directions: (N, 3) unit, rig frame, of the pixels.
     """
     turn = rotation_of(lens)
     local = directions @ turn
     across = np.hypot(local[:, 0], local[:, 1])
     angles = np.arctan2(across, local[:, 2])
-    bent, slope = _bent(lens, angles)
+    bent, slope = _distorted_radii(lens, angles)
     away = local[:, :2] / np.maximum(across, 1e-300)[:, None]
     beside = np.stack([-away[:, 1], away[:, 0]], axis=1)
     powers = angles[:, None] ** np.array([3, 5, 7, 9])
     by_angle = np.concatenate([-bent[:, None], -away, -powers], axis=1) / slope[:, None]
-    around = np.zeros_like(by_angle)  # sine of the angle times the turn about the axis
+    around = np.zeros_like(by_angle)  # sine of the angle times the derivative by a rotation about
+    # the axis
     shrunk = np.divide(across, bent, out=np.ones_like(bent), where=bent > 1e-9)
     around[:, 1:3] = -beside * shrunk[:, None]
     outwards = np.concatenate([np.cos(angles)[:, None] * away, -across[:, None]], axis=1)
@@ -72,7 +73,7 @@ def by_parameters(lens: Fisheye, directions: np.ndarray) -> np.ndarray:
 
 
 def changed(lens: Fisheye, step: np.ndarray) -> Fisheye:
-    """A lens after a step (PARAMETERS,) of what `by_parameters` differentiates by."""
+    """A lens after a step (PARAMETERS,) in the parameters of `by_parameters`."""
     from scipy.spatial.transform import Rotation
 
     turn = Rotation.from_rotvec(step[7:]) * Rotation.from_rotvec(lens.rotation)
@@ -88,7 +89,7 @@ def changed(lens: Fisheye, step: np.ndarray) -> Fisheye:
 
 
 def turned(pair: Pair, old_R_new: np.ndarray) -> Pair:
-    """The same lenses in a rig of other axes, turned (3, 3) against those so far."""
+    """Both lenses in a rig whose axes are rotated by old_R_new (3, 3) against the old ones."""
     from scipy.spatial.transform import Rotation
 
     front, back = (
@@ -98,7 +99,7 @@ def turned(pair: Pair, old_R_new: np.ndarray) -> Pair:
 
 
 def difference(lens: Fisheye, before: Fisheye) -> np.ndarray:
-    """Step (PARAMETERS,) by which `changed` makes a lens of another one."""
+    """The step (PARAMETERS,) by which `changed` turns lens `before` into `lens`."""
     from scipy.spatial.transform import Rotation
 
     turn = Rotation.from_rotvec(lens.rotation) * Rotation.from_rotvec(before.rotation).inv()
@@ -113,7 +114,7 @@ def pixels_of(
     """Lens (...,), 0 or 1, that faces directions (..., 3), and their pixels (..., 2) in it.
 
     Args:
-        behind: (...,) bool, which ones are to be the back lens's; None = those that it faces.
+        behind: (...,) bool, directions to project by the back lens; None = those that it faces.
     """
     lens = (directions[..., 2] < 0 if behind is None else behind).astype(int)
     both = np.stack([project(one, directions) for one in pair])
@@ -123,10 +124,10 @@ def pixels_of(
 def recalibrated(
     directions: np.ndarray, before: Pair, after: Pair, behind: np.ndarray | None = None
 ) -> np.ndarray:
-    """Where pixels are by other lenses than those that their directions (N, 3) are by.
+    """Directions of pixels by lenses `after`, given their directions (N, 3) by lenses `before`.
 
     Args:
-        behind: (N,) bool, which ones are the back lens's; None = those that it faces.
+        behind: (N,) bool, directions of the back lens; None = those that it faces.
     """
     out = np.empty_like(directions)
     behind = directions[:, 2] < 0 if behind is None else behind
@@ -140,8 +141,8 @@ def _with_rotation(lens: Fisheye, rotation: np.ndarray) -> Fisheye:
     return replace(lens, rotation=(a, b, c))
 
 
-def _bent(lens: Fisheye, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance from the principal point in focal lengths, and its derivative, at angles."""
+def _distorted_radii(lens: Fisheye, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance from the principal point in focal lengths, and its derivative, at angles (rad)."""
     squares = angles * angles
     bent, slope = np.zeros_like(angles), np.zeros_like(angles)
     for power, k in zip((9, 7, 5, 3, 1), (*lens.radial[::-1], 1.0), strict=True):

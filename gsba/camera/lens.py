@@ -2,10 +2,10 @@
 
 A 360-degree camera has two fisheyes whose centres are some centimetres apart. A panorama stitched
 at infinity shows each direction as the lens that faces it saw it: a ray that starts at that lens.
-One stitched for a radius shows what is as far from the camera's middle where it would be seen from
-there: the ray goes from the lens to that place.
-Rows of each fisheye are read one after another, while the camera moves: a ray of a frame belongs to
-the pose of its row, which a twist over the readout carries to the pose of the frame's middle.
+A panorama stitched for a radius puts things at that distance from the camera's middle where the
+middle would see them: the ray goes from the lens to that place.
+Rows of each fisheye are read one after another, while the camera moves: a ray belongs to the pose
+of its row, which a twist over the readout time carries to the pose of the frame's middle.
 """
 
 from dataclasses import dataclass, field, replace
@@ -16,8 +16,9 @@ from gsba.camera.fisheye import Pair, pixels_of, recalibrated, rotation_of
 from gsba.geometry import pose
 from gsba.types import Keypoints, Tracks
 
-_HALF_FOV = np.deg2rad(100.0)  # of a fisheye that fills its sensor: the first and the last row
-_SETTLED = 4  # passes after which a row's time no longer changes where a point is seen
+_HALF_FOV_RAD = np.deg2rad(100.0)  # half field of view of a fisheye that fills its sensor, first to
+# last row
+_NUM_ROW_TIME_PASSES = 4  # fixed-point passes between a point's pixel and its row's time
 
 
 def _centre() -> np.ndarray:
@@ -32,24 +33,24 @@ class Lenses:
     """
 
     centre: np.ndarray = field(default_factory=_centre)  # (3,) float64, of the front lens in the
-    # lenses' frame, map units; the other one is as far behind the rig's centre
+    # lenses' frame, map units; the back lens is opposite
     inverse_stitch_radius: float = 0.0  # 1 / map units; 0 = panoramas are stitched at infinity
-    band_rad: float = 0.0  # from the seam, within which a picture is of neither lens alone
-    row_directions: np.ndarray | None = None  # (2, 3) float64, unit, lenses' frame: in which rows
-    # of the front and of the back lens are read; None = all at one instant
-    readout_motion: np.ndarray | None = None  # (F, 6) float64, of each frame from its first row to
-    # its last one, [rotation rad, translation map units], rig frame; None = none
+    band_rad: float = 0.0  # half width of the seam's band in which both lenses are blended
+    row_directions: np.ndarray | None = None  # (2, 3) float64, unit, lenses' frame: direction in
+    # which the front and the back lens read their rows; None = global shutter
+    readout_motion: np.ndarray | None = None  # (F, 6) float64, motion of each frame from its first
+    # to its last row, [rotation rad, translation map units], rig frame; None = none
     axes: np.ndarray | None = None  # (F, 3, 3) float64, rig_R_lenses of each frame, where a
-    # stabiliser turned the panorama above them; None = they are the rig's
+    # stabiliser rotated the panorama against them; None = the rig's axes
     reference_calibration: Pair | None = None  # by which panoramas of raw pairs were cut; None =
-    # they came as panoramas
+    # the frames are panoramas
     fisheyes: Pair | None = None  # lenses of raw pairs as estimated; None = reference_calibration
 
     def __bool__(self) -> bool:
         return bool(self.centre.any()) or self.fisheyes is not None
 
     def own(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
-        """Directions (N, 3) in the rig frames of frames (N,), in the lenses' frame."""
+        """Directions (N, 3) in the rig frames of frames (N,), rotated into the lenses' frame."""
         if self.axes is None:
             return directions
         return np.einsum("nji,nj->ni", self.axes[frames], directions)
@@ -70,7 +71,8 @@ class Lenses:
     def by_centre(
         self, by_origin: np.ndarray, directions: np.ndarray, frames: np.ndarray
     ) -> np.ndarray:
-        """Jacobians (N, D, 3) by the centre, from those by where rays start, in the rig frames."""
+        """Jacobians (N, D, 3) by the lens centre, from those by the rays' origins in the rig
+        frames."""
         signs = facing(self.own(directions, frames))[:, None, None]
         return signs * (by_origin if self.axes is None else by_origin @ self.axes[frames])
 
@@ -81,11 +83,12 @@ class Lenses:
         row_directions: np.ndarray | None = None,
         signs: np.ndarray | None = None,
     ) -> np.ndarray:
-        """When frames (N,) read unit directions (N, 3), part of the readout, (N,), 0 = its middle.
+        """Time at which frames (N,) read unit directions (N, 3), in readout times, (N,); 0 = the
+        middle.
 
-        Of raw pairs rows are known. Else a lens is taken to be equidistant: the motion takes up
-        what it is not. The lens is the one that faces a direction, or that of `signs` as in
-        `origins`.
+        Raw pairs have known rows. Otherwise a lens is assumed to be equidistant; the estimated
+        motion absorbs the deviation. The lens is the one that faces a direction, or that of `signs`
+        as in `origins`.
         """
         row_directions = self.row_directions if row_directions is None else row_directions
         if row_directions is None:
@@ -105,11 +108,11 @@ class Lenses:
         angles = np.arctan2(radii, signs * own[:, 2])
         lens = (signs < 0).astype(int)
         along = np.einsum("ni,ni->n", across, np.asarray(row_directions)[lens, :2])
-        return angles / (2 * _HALF_FOV) * along / np.maximum(radii, 1e-12)
+        return angles / (2 * _HALF_FOV_RAD) * along / np.maximum(radii, 1e-12)
 
     def swept(self, frame: int) -> np.ndarray:
-        """The rig of a frame when the front and the back lens of a raw pair read their top and
-        their bottom edge, (2, 2, 4, 4), in the rig in the middle of the readout."""
+        """Poses (2, 2, 4, 4) of the rig when the front and the back lens of a raw pair read their
+        top and bottom edge, relative to the rig in the middle of the readout."""
         assert (
             self.reference_calibration is not None
             and self.readout_motion is not None
@@ -121,70 +124,75 @@ class Lenses:
         return pose(turns, moved[..., 3:])
 
     def rays(self, directions: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Directions and starts (N, 3) of what frames (N,) show in directions (N, 3), rig frame
-        in the middle of the readout."""
+        """Directions and origins (N, 3) of the rays that frames (N,) show in directions (N, 3), rig
+        frame in the middle of the readout."""
         origins, seen = self.origins(directions, frames), self.calibrated(directions)
         if self.inverse_stitch_radius:
             seen = directions - self.inverse_stitch_radius * origins
             seen /= np.linalg.norm(seen, axis=1, keepdims=True)
         if self.readout_motion is None:
             return seen, origins
-        turns, moves = self._moved(directions, frames)
+        turns, moves = self._readout_motion_at(directions, frames)
         turned = np.einsum("nij,nj->ni", turns, seen)
         return turned, np.einsum("nij,nj->ni", turns, origins) + moves
 
     def views(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
-        """Transforms (N, 4, 4), rig_T_view, of what frames (N,) show around unit directions (N, 3).
+        """Transforms (N, 4, 4), rig_T_view, of local views of frames (N,) around unit directions
+        (N, 3).
 
-        A view has it in the same directions as the picture, from where the rays start. By how much
-        a stitch radius magnifies is left out.
+        A view shows the scene in the picture's directions, from the rays' origins. The
+        magnification by a finite stitching radius is left out.
         """
         bent, starts = replace(self, readout_motion=None).rays(directions, frames)
         axes = np.cross(directions, bent)
         sines = np.linalg.norm(axes, axis=1, keepdims=True)
         turns = _rotations(axes * (np.arcsin(np.minimum(sines, 1)) / np.maximum(sines, 1e-300)))
         if self.readout_motion is not None:
-            later, moves = self._moved(directions, frames)
+            later, moves = self._readout_motion_at(directions, frames)
             turns, starts = later @ turns, np.einsum("nij,nj->ni", later, starts) + moves
         return pose(turns, starts)
 
     def seeing(
         self, points_rig: np.ndarray, frames: np.ndarray, signs: np.ndarray | None = None
     ) -> np.ndarray:
-        """Points (N, 3), rig frame in the middle of the readout, as the lens of frames (N,) that
-        faces each has them, or that of `signs` as in `origins`: vectors (N, 3) along the directions
-        in which they are shown."""
-        vectors = self._shown(points_rig, frames, signs)
+        """Vectors (N, 3) along the directions in which pictures of frames (N,) show points (N, 3).
+
+        The lens that faces a point sees it, or the lens of `signs` as in `origins`. Points are in
+        the rig frame in the middle of the readout.
+        """
+        vectors = self._directions_in_panorama(points_rig, frames, signs)
         if self.readout_motion is None:
             return vectors
-        for _ in range(_SETTLED):
+        for _ in range(_NUM_ROW_TIME_PASSES):
             units = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
-            turns, moves = self._moved(units, frames, signs)
+            turns, moves = self._readout_motion_at(units, frames, signs)
             local = np.einsum("nij,nj->ni", np.swapaxes(turns, 1, 2), points_rig - moves)
-            vectors = self._shown(local, frames, signs)
+            vectors = self._directions_in_panorama(local, frames, signs)
         return vectors
 
     def calibrated(self, directions: np.ndarray) -> np.ndarray:
-        """Where pixels of directions (N, 3) in the panoramas are by the lenses."""
+        """Directions of pixels by the estimated lenses, given their directions (N, 3) in
+        panoramas."""
         if self.reference_calibration is None or self.fisheyes is None:
             return directions
         return recalibrated(directions, self.reference_calibration, self.fisheyes)
 
-    def _moved(
+    def _readout_motion_at(
         self, directions: np.ndarray, frames: np.ndarray, signs: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """How frames (N,) turn (N, 3, 3) and move (N, 3) from their middle to the rows of unit
-        directions (N, 3)."""
+        """Rotations (N, 3, 3) and translations (N, 3) of frames (N,) from the middle of the readout
+        to the rows of unit directions (N, 3)."""
         assert self.readout_motion is not None
         moved = (
             self.fractions(directions, frames, signs=signs)[:, None] * self.readout_motion[frames]
         )
         return _rotations(moved[:, :3]), moved[:, 3:]
 
-    def _shown(
+    def _directions_in_panorama(
         self, points: np.ndarray, frames: np.ndarray, signs: np.ndarray | None
     ) -> np.ndarray:
-        """Points (N, 3) along where a stitcher puts the directions that their lens sees them in."""
+        """Points (N, 3) of a lens's frame, moved to the directions in which a stitcher shows
+        them."""
         origins = self.origins(points, frames, signs)
         vectors = points - origins
         if self.reference_calibration is not None and self.fisheyes is not None:
@@ -201,7 +209,8 @@ class Lenses:
         return lengths * (near + (np.sqrt(np.maximum(left, 0)) - along) * units)
 
     def blended(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
-        """Whether directions (N, 3) lie where both lenses' pictures are blended in frames (N,)."""
+        """True (N,) for directions (N, 3) of frames (N,) at which both lenses' pictures are
+        blended."""
         lengths = np.linalg.norm(directions, axis=1)
         return np.abs(self.own(directions, frames)[:, 2]) < np.sin(self.band_rad) * lengths
 
@@ -213,14 +222,14 @@ class Lenses:
         return replace(keypoints, bearings_rig=directions, origins_rig=origins)
 
     def clear(self, tracks: Tracks, keypoints: Keypoints) -> Tracks:
-        """Tracks without the observations, and the points, seen only where lenses are blended."""
+        """Tracks without observations in the blended band, nor the points observed only there."""
         if not self.band_rad:
             return tracks
         bearings = keypoints.bearings_rig[keypoints.rows(tracks)]
         return tracks.of_observations(~self.blended(bearings, tracks.frames))
 
     def scaled(self, scale: float) -> "Lenses":
-        """The same in a unit of which a map unit has `scale`."""
+        """The lenses in another unit of length: one map unit is `scale` of the new ones."""
         readout_motion = (
             None
             if self.readout_motion is None
@@ -234,19 +243,19 @@ class Lenses:
         )
 
     def cut_anew(self) -> "Lenses":
-        """The same of panoramas that are cut by what the lenses of raw pairs were found to be."""
+        """The lenses for panoramas cut anew, by the estimated calibration of raw pairs."""
         return replace(
             self, reference_calibration=self.fisheyes or self.reference_calibration, fisheyes=None
         )
 
     def taken(self, rows: np.ndarray) -> "Lenses":
-        """The same of some frames (F',)."""
+        """The lenses of some frames (F',) only."""
         axes = None if self.axes is None else self.axes[rows]
         readout_motion = None if self.readout_motion is None else self.readout_motion[rows]
         return replace(self, axes=axes, readout_motion=readout_motion)
 
     def of_frame(self, frame: int) -> "Lenses":
-        """The same for one frame alone, which is then number 0."""
+        """The lenses of one frame, which then has index 0."""
         return self.taken(np.array([frame]))
 
 
@@ -254,12 +263,12 @@ ONE_CENTRE = Lenses()
 
 
 def facing(directions: np.ndarray) -> np.ndarray:
-    """1 for directions (N, 3) in the lenses' frame that the front lens faces, -1 for the others."""
+    """Signs (N,) of directions (N, 3) in the lenses' frame: 1 = front lens, -1 = back lens."""
     return np.where(directions[:, 2] >= 0, 1.0, -1.0)
 
 
 def rows_run(pair: Pair) -> np.ndarray:
-    """The way (2, 3) in which rows of the two lenses follow one another, rig frame."""
+    """Directions (2, 3) in which pictures' rows follow one another in either lens, rig frame."""
     return np.array([rotation_of(lens)[:, 1] for lens in pair])
 
 

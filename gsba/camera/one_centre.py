@@ -1,11 +1,11 @@
-"""Panoramas of two lenses as one camera in the middle between them would have taken them.
+"""Panoramas of two lenses resampled as one camera in the middle between them would take them.
 
-A stitcher joins both pictures as if everything were far: what is near stands beside its place, to
-one side in front and to the other behind, and is doubled or cut at the seam. Here each direction is
-looked up where its lens has what lies there, as far away as points of the map around it say, with
-all rows read in the middle of the exposure. Across the seam both are blended, which is no worse in
-pixels than a hard cut of raw pictures, and better than one of a panorama that is blended there.
-What no point tells the depth of stays about as wrong as it was.
+A stitcher joins both pictures as if everything were far: near objects are displaced, to one side in
+front and to the other behind, and are doubled or cut at the seam. Here each direction is looked up
+where its lens shows it, at the depth of map points around it, with all rows read in the middle of
+the exposure. Both lenses are blended across the seam, which is no worse in pixels than a hard cut
+of raw pictures, and better than a hard cut of a panorama that is blended there. Directions without
+points nearby keep about the displacement that they had.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,10 +22,11 @@ from gsba.camera.straighten import PAD
 from gsba.camera.views import depths_along, observed_points
 from gsba.types import Reconstruction
 
-_COARSE = 128  # width of the grid that depths are taken on
-_NEAREST = 12.0  # distances of a lens from the middle: nearer, the seam lies beyond fisheyes' rims
-_FAR = 1e9  # map units
-_BAND = 128  # rows of which coordinates are held in double precision
+_DEPTH_GRID_WIDTH = 128  # width of the grid that depths are taken on
+_MIN_DEPTH_IN_LENS_OFFSETS = 12.0  # smallest depth, in distances of a lens from the middle: nearer,
+# the seam lies beyond the rims
+_FAR_DEPTH = 1e9  # map units
+_ROWS_AT_ONCE = 128  # rows whose coordinates are held in double precision at once
 
 _Look = Callable[[int, np.ndarray], np.ndarray]  # lens and directions (h, w, 3) to pixels (h, w, C)
 
@@ -34,31 +35,37 @@ class Stitcher:
     """Makes the panorama of one frame."""
 
     def __init__(self, lenses: Lenses, frame: int, scene: np.ndarray) -> None:
-        """Where either lens has each direction of the rig.
+        """Compute the offset from each direction of the rig to its direction in either lens.
 
         Args:
-            lenses: two of them.
-            frame: its index there.
-            scene: (N, 3) points in the rig frame of this frame, which tell how far things are.
+            lenses: both lenses.
+            frame: index of the frame in `lenses`.
+            scene: (N, 3) points in the rig frame of this frame, which give the depths.
         """
         self._lenses = lenses.of_frame(frame)
-        centres = (np.arange(pixels) + 0.5 for pixels in (_COARSE, _COARSE // 2))
+        centres = (
+            np.arange(pixels) + 0.5 for pixels in (_DEPTH_GRID_WIDTH, _DEPTH_GRID_WIDTH // 2)
+        )
         pixels = np.stack(np.meshgrid(*centres), axis=-1)
-        rays = bearings_from_erp(pixels, _COARSE, _COARSE // 2).reshape(-1, 3)
-        depths = np.full(len(rays), _FAR)
+        rays = bearings_from_erp(pixels, _DEPTH_GRID_WIDTH, _DEPTH_GRID_WIDTH // 2).reshape(-1, 3)
+        depths = np.full(len(rays), _FAR_DEPTH)
         if len(scene):
-            nearest = _NEAREST * float(np.linalg.norm(lenses.centre))
+            nearest = _MIN_DEPTH_IN_LENS_OFFSETS * float(np.linalg.norm(lenses.centre))
             depths = np.maximum(depths_along(rays, scene), nearest)
         same, self._offsets = np.zeros(len(rays), int), []
         for sign in (1.0, -1.0):
             shown = self._lenses.seeing(depths[:, None] * rays, same, np.full(len(rays), sign))
             shown /= np.linalg.norm(shown, axis=1, keepdims=True)
-            offsets = (shown - rays).reshape(_COARSE // 2, _COARSE, 3).astype(np.float32)
+            offsets = (
+                (shown - rays)
+                .reshape(_DEPTH_GRID_WIDTH // 2, _DEPTH_GRID_WIDTH, 3)
+                .astype(np.float32)
+            )
             self._offsets.append(around_sphere(offsets, PAD))
 
     def stitched(self, erp: np.ndarray) -> np.ndarray:
-        """The panorama (H, 2 H, C) uint8 of one that a stitcher made."""
-        return self._joined(erp.shape[1], erp.shape[2], _looking_up(erp, cv2.INTER_LANCZOS4))
+        """The panorama (H, 2 H, C) uint8, resampled from a stitcher's one of that shape."""
+        return self._joined(erp.shape[1], erp.shape[2], _panorama_lookup(erp, cv2.INTER_LANCZOS4))
 
     def stitched_squares(
         self, squares: np.ndarray, correction: tuple[float, ...] = ()
@@ -67,7 +74,7 @@ class Stitcher:
 
         Args:
             squares: (6, S, S, C) uint8, FACES order.
-            correction: of what stitching bends, see `FrameSet`.
+            correction: coefficients of the stitching field, see `FrameSet`.
         """
         picture, grid = around_squares(squares), Grid(squares.shape[1], correction)
 
@@ -78,10 +85,10 @@ class Stitcher:
         return self._joined(4 * grid.size, squares.shape[3], look)
 
     def stitched_mask(self, mask: np.ndarray) -> np.ndarray:
-        """The mask (H, 2 H) bool of one that belongs to a stitcher's panorama, or to that of a raw
-        pair: a direction is used where all is that it is blended of."""
+        """The mask (H, 2 H) bool for the resampled panorama, from the mask of a stitcher's panorama
+        or of a raw pair: a direction is used where all pixels blended into it are."""
         white = mask.astype(np.uint8)[..., None] * 255
-        joined = self._joined(mask.shape[1], 1, _looking_up(white, cv2.INTER_NEAREST))
+        joined = self._joined(mask.shape[1], 1, _panorama_lookup(white, cv2.INTER_NEAREST))
         return joined[..., 0] == 255
 
     def stitched_raw(self, pictures: list[np.ndarray], width: int) -> np.ndarray:
@@ -100,10 +107,13 @@ class Stitcher:
         return self._joined(width, pictures[0].shape[2], look)
 
     def _joined(self, width: int, channels: int, look: _Look) -> np.ndarray:
-        """The panorama (width / 2, width, C) uint8 of what both lenses show."""
+        """The panorama (width / 2, width, C) uint8 joined from both lenses."""
         parts = []
         for top, rays in _bands(width):
-            ahead, joined = self._ahead(rays), np.zeros((*rays.shape[:2], channels), np.float32)
+            ahead, joined = (
+                self._front_weights(rays),
+                np.zeros((*rays.shape[:2], channels), np.float32),
+            )
             for lens, share in enumerate((ahead, 1 - ahead)):
                 columns = np.flatnonzero((share > 0).any(axis=0))
                 moved = self._moved(lens, top, columns, len(rays), width)
@@ -112,8 +122,8 @@ class Stitcher:
             parts.append(np.rint(joined).astype(np.uint8))
         return np.concatenate(parts)
 
-    def _ahead(self, rays: np.ndarray) -> np.ndarray:
-        """What part of directions (h, w, 3) is the front lens's, (h, w) float32 in [0, 1]."""
+    def _front_weights(self, rays: np.ndarray) -> np.ndarray:
+        """Blending weight (h, w) float32 of the front lens in directions (h, w, 3)."""
         axes, band = self._lenses.axes, self._lenses.band_rad
         along = rays[..., 2] if axes is None else rays @ axes[0][:, 2]
         if not band:
@@ -124,15 +134,16 @@ class Stitcher:
     def _moved(
         self, lens: int, top: int, columns: np.ndarray, num_rows: int, width: int
     ) -> np.ndarray:
-        """From directions of a panorama's rows and columns to where a lens has them, (h, w, 3)."""
-        scale = _COARSE / width
+        """Offsets (h, w, 3) from directions of a panorama's rows and columns to a lens's
+        directions."""
+        scale = _DEPTH_GRID_WIDTH / width
         places = np.meshgrid(columns + 0.5, np.arange(top, top + num_rows) + 0.5)
         across, down = ((at * scale - 0.5 + PAD).astype(np.float32) for at in places)
         return cv2.remap(self._offsets[lens], across, down, cv2.INTER_CUBIC)
 
 
-def _looking_up(erp: np.ndarray, how: int) -> _Look:
-    """Where a panorama (H, 2 H, C) shows directions, whichever lens they are of."""
+def _panorama_lookup(erp: np.ndarray, how: int) -> _Look:
+    """A lookup into a panorama (H, 2 H, C), which shows both lenses."""
     height, width = erp.shape[:2]
     padded = around_sphere(erp, PAD)
 
@@ -146,14 +157,14 @@ def _looking_up(erp: np.ndarray, how: int) -> _Look:
 def _bands(width: int) -> Iterator[tuple[int, np.ndarray]]:
     """First row and directions (h, width, 3) of parts of a panorama."""
     height = width // 2
-    for top in range(0, height, _BAND):
-        rows = np.arange(top, min(top + _BAND, height)) + 0.5
+    for top in range(0, height, _ROWS_AT_ONCE):
+        rows = np.arange(top, min(top + _ROWS_AT_ONCE, height)) + 0.5
         pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, rows), axis=-1)
         yield top, bearings_from_erp(pixels, width, height)
 
 
 def seen_from_the_middle(reconstruction: Reconstruction) -> Reconstruction:
-    """The same with bearings from the rig's centre to where observed rays are at their points."""
+    """Observed points as bearings from the rig's centre, instead of as rays from lenses."""
     if reconstruction.observation_origins is None:
         return reconstruction
     bearings = observed_points(reconstruction)

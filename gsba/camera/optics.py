@@ -1,4 +1,4 @@
-"""What the pictures of a sequence were taken through, for whoever renders what they show."""
+"""The optics of a sequence, for rendering: its lenses, and the depths around each frame."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,11 +13,11 @@ from gsba.types import Reconstruction
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """Lenses, and how far things are from them. One centre by default."""
+    """Lenses, and depths of the scene around them. One centre by default."""
 
     lenses: Lenses = field(default_factory=Lenses)  # in the unit of the poses
     scenes: Callable[[int], np.ndarray] | None = None  # points (N, 3) around a frame, rig frame, by
-    # its index; None = all is far
+    # its index; None = everything is far
 
     def __bool__(self) -> bool:
         return bool(self.lenses)
@@ -28,11 +28,11 @@ class Optics:
         return cls(lenses, scenes_of(reconstruction))
 
     def views(self, size: int) -> tuple[View, ...]:
-        """Six faces of `size` pixels and 90 degrees, or those of one lens each, as dense."""
+        """Six faces of `size` pixels and 90 degrees, or as dense faces of one lens each."""
         return lens_views(self.lenses, size) if self else rig_views(CubeRig(size, np.pi / 2))
 
     def cutter(self, views: tuple[View, ...], frame: int) -> ViewCutter:
-        """What cuts views out of the pictures of a frame."""
+        """The cutter of views out of the pictures of a frame."""
         return ViewCutter(views, self.lenses, frame, self.scenes and self.scenes(frame))
 
     def own(self, world_T_rigs: np.ndarray, frames: np.ndarray) -> np.ndarray:

@@ -68,5 +68,5 @@ def cells_of(bearings_rig: np.ndarray, per_side: int) -> np.ndarray:
 
 
 def witnesses(bearings_rig: np.ndarray, per_side: int) -> int:
-    """Cells that bearings (N, 3) fall into: what lies in one errs together."""
+    """Number of cells that bearings (N, 3) fall into; errors within one cell are correlated."""
     return len(np.unique(cells_of(bearings_rig, per_side)))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-_AT_ONCE = 64  # rows that are moved through the cache
+_ROWS_AT_ONCE = 64  # rows moved at once, so that they stay in the cache
 
 
 def bearings_from_erp(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -36,7 +36,7 @@ def dense_enough(width: int, focal: float) -> int:
 
 
 def low_passed(erp: np.ndarray, focal: float) -> np.ndarray:
-    """A panorama averaged down as `dense_enough` says; itself where it is."""
+    """A panorama averaged down to `dense_enough`; itself where it is no denser."""
     import cv2
 
     width = dense_enough(erp.shape[1], focal)
@@ -46,7 +46,7 @@ def low_passed(erp: np.ndarray, focal: float) -> np.ndarray:
 
 
 def around_seam(image: np.ndarray, columns: int) -> np.ndarray:
-    """A panorama (h, 2h[, C]) with columns from beyond the seam on either side."""
+    """A panorama (h, 2h[, C]) padded by columns from beyond the seam on either side."""
     return np.concatenate([image[:, -columns:], image, image[:, :columns]], axis=1)
 
 
@@ -61,8 +61,8 @@ def around_sphere(image: np.ndarray, pad: int, out: np.ndarray | None = None) ->
     if out is None:
         shape = (height + 2 * pad, width + 2 * pad, *image.shape[2:])
         out = np.empty(shape, image.dtype)
-    for top in range(0, height, _AT_ONCE):
-        rows = image[top : top + _AT_ONCE]
+    for top in range(0, height, _ROWS_AT_ONCE):
+        rows = image[top : top + _ROWS_AT_ONCE]
         out[pad + top : pad + top + len(rows), pad:-pad] = rows
     inner = out[:, pad:-pad]
     inner[:pad] = np.roll(inner[pad : 2 * pad][::-1], width // 2, axis=1)

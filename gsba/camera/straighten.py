@@ -1,4 +1,4 @@
-"""Panoramas resampled so that what stitching bends is straight."""
+"""Panoramas resampled to undo the bending by stitching."""
 
 import numpy as np
 
@@ -6,8 +6,9 @@ from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearin
 from gsba.camera.tables import table
 
 PAD = 4  # pixels of wrap-around: the support of bicubic sampling, and more
-_COARSE = 256  # width of the grid that a field is evaluated on; it turns over 18 degrees or more
-_BAND = 256  # rows of which coordinates are held in double precision
+_FIELD_GRID_WIDTH = 256  # width of the grid on which a field is evaluated; its shortest wave is 18
+# degrees or more
+_ROWS_AT_ONCE = 256  # rows whose coordinates are held in double precision at once
 
 
 def straightened(erp: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
@@ -18,7 +19,7 @@ def straightened(erp: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
         correction: coefficients of the field, see `factors.sphere_field`.
 
     Returns:
-        The like, resampled (Lanczos; masks by their nearest pixel).
+        The resampled panorama, of the same shape (Lanczos; masks by their nearest pixel).
     """
     import cv2
 
@@ -35,7 +36,8 @@ def straightened(erp: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
 def straightened_inside(
     padded: np.ndarray, correction: tuple[float, ...], out: np.ndarray | None = None
 ) -> np.ndarray:
-    """As `straightened`, uint8, of a panorama with PAD pixels around it; into `out`, if given."""
+    """Like `straightened`, uint8, for a panorama padded by PAD pixels; written to `out`, if
+    given."""
     import cv2
 
     height, width = (size - 2 * PAD for size in padded.shape[:2])
@@ -44,28 +46,28 @@ def straightened_inside(
 
 
 def observed(directions: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
-    """Directions (h, w, 3) in which bent pictures show directions (h, w, 3), rig frame, both unit.
+    """Directions (h, w, 3) in which bent pictures show true directions (h, w, 3), unit, rig frame.
 
     The field is evaluated on a coarse grid and interpolated.
     """
     import cv2
 
     padded = _padded_offsets(correction)
-    places = erp_from_bearings(directions, _COARSE, _COARSE // 2) - 0.5 + PAD
+    places = erp_from_bearings(directions, _FIELD_GRID_WIDTH, _FIELD_GRID_WIDTH // 2) - 0.5 + PAD
     places = places.astype(np.float32)
     return directions + cv2.remap(padded, places[..., 0], places[..., 1], cv2.INTER_CUBIC)
 
 
 @table(maxsize=1)
 def _maps(correction: tuple[float, ...], width: int, height: int) -> np.ndarray:
-    """Places (2, H, W) float32 in the padded panorama, OpenCV pixels."""
+    """OpenCV pixels (2, H, W) float32 in the padded panorama, one for each pixel of the result."""
     import cv2
 
     offsets = _padded_offsets(correction)
     out = np.empty((2, height, width), np.float32)
     columns, scale = np.arange(width) + 0.5, offsets.shape[1] - 2 * PAD
-    for first in range(0, height, _BAND):
-        rows = np.arange(first, min(first + _BAND, height)) + 0.5
+    for first in range(0, height, _ROWS_AT_ONCE):
+        rows = np.arange(first, min(first + _ROWS_AT_ONCE, height)) + 0.5
         pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
         places = (pixels * (scale / width) - 0.5 + PAD).astype(np.float32)
         moved = cv2.remap(offsets, places[..., 0], places[..., 1], cv2.INTER_CUBIC)
@@ -80,10 +82,14 @@ def _padded_offsets(correction: tuple[float, ...]) -> np.ndarray:
 
 
 def _offsets(correction: tuple[float, ...]) -> np.ndarray:
-    """From true to observed directions (h, 2h, 3) float32, on a coarse panorama."""
+    """Offsets (h, 2h, 3) float32 from true to observed directions, on a coarse panorama."""
     from factors.sphere_field import SphereField
 
-    centres = np.meshgrid(np.arange(_COARSE) + 0.5, np.arange(_COARSE // 2) + 0.5)
-    directions = bearings_from_erp(np.stack(centres, axis=-1), _COARSE, _COARSE // 2)
+    centres = np.meshgrid(
+        np.arange(_FIELD_GRID_WIDTH) + 0.5, np.arange(_FIELD_GRID_WIDTH // 2) + 0.5
+    )
+    directions = bearings_from_erp(
+        np.stack(centres, axis=-1), _FIELD_GRID_WIDTH, _FIELD_GRID_WIDTH // 2
+    )
     observed = SphereField(np.array(correction)).observed(directions)
     return (observed - directions).astype(np.float32)

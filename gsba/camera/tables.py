@@ -1,4 +1,4 @@
-"""Tables of where pixels lie: large, the same for all frames, and wanted by all threads at once."""
+"""Cached tables of pixel places: large, shared by all frames, and needed by all threads at once."""
 
 import functools
 import threading
@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 def table(maxsize: int) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """As `functools.lru_cache`, but threads that ask for the same at once have it computed once."""
+    """A `functools.lru_cache` that computes an entry once if several threads need it at once."""
 
     def kept(compute: Callable[P, T]) -> Callable[P, T]:
         cached, lock = functools.lru_cache(maxsize=maxsize)(compute), threading.Lock()

@@ -1,10 +1,10 @@
 """The pinhole cameras that panoramas are cut into: cube faces, or faces of one lens each.
 
-A panorama of two lenses has no one place that all of it is seen from. Faces of one lens have:
-front and back whole, and what each lens has on its four sides, each with its lens's centre in the
-rig and nothing of where both pictures are blended. They are cut as the lens would have had them
-with all rows read in the middle of the exposure, as far as points tell how far things are; their
-rig's axes are the lenses', which a stabiliser may have turned below the panorama.
+A panorama of two lenses has no single centre of projection. Faces of one lens each have one: front
+and back whole, and each lens's part of the four sides. Each has its lens's centre in the rig and
+leaves out the band where both pictures are blended. They are cut as the lens would show them with
+all rows read in the middle of the exposure, at the depths that map points give. Their rig's axes
+are the lenses', which a stabiliser may have rotated against the panorama's.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,15 +23,17 @@ from gsba.camera.straighten import PAD
 from gsba.geometry import pose
 from gsba.types import FACES, Fisheye, FrameSet, Reconstruction
 
-_FAR = 1e9  # map units: from there both lenses see alike
-_DENSE = 1.5  # times as many pixels as a view: beyond it, detail aliases
-_NEIGHBOURS = 12  # points that tell how far things are in a direction
-_SMOOTH = np.deg2rad(3.0)  # over which they are averaged, at least
-_ALIKE = 0.1  # part of a distance: what is further off a plane is of another one
-_UNTILTED = 0.05  # weight of a plane that faces the camera, part of the points'
-_ROBUST = 4  # rounds of weighting points by how far they lie off the plane
-_BAND = 128  # rows of which coordinates are held in double precision
-_NODES = 33  # across a face: what lenses bend turns over tens of degrees
+_FAR_DEPTH = 1e9  # map units: depth from which both lenses see alike
+_MAX_OVERSAMPLING = 1.5  # largest ratio of a picture's density to a view's: beyond it, detail
+# aliases
+_NUM_DEPTH_POINTS = 12  # map points that give the depth in a direction
+_MIN_SMOOTHING_RAD = np.deg2rad(3.0)  # least angle over which points are averaged
+_PLANE_TOLERANCE = 0.1  # relative depth error at which a point counts as off a plane
+_FRONTAL_PLANE_WEIGHT = 0.05  # weight of the fronto-parallel plane, relative to the points'
+_NUM_ROBUST_ROUNDS = 4  # reweighting rounds of the plane fit
+_ROWS_AT_ONCE = 128  # rows whose coordinates are held in double precision at once
+_NODES_ACROSS_FACE = 33  # nodes across a face of the interpolated offsets, which vary over tens of
+# degrees
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +60,7 @@ class View:
         return rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ self.rig_R_view.T
 
     def finer(self, times: int) -> "View":
-        """The same with `times` as many pixels either way."""
+        """The view with `times` as many pixels either way."""
         u, v = self.principal
         size = {"width": times * self.width, "height": times * self.height}
         return replace(self, **size, focal=times * self.focal, principal=(times * u, times * v))
@@ -97,16 +99,16 @@ def lens_views(lenses: Lenses, size: int) -> tuple[View, ...]:
 
 
 def _side(axis: np.ndarray, ahead: np.ndarray, size: int, band_rad: float) -> View:
-    """What a lens that looks ahead has on the side of an axis, from its whole face to the band.
+    """The view of the lens facing `ahead` towards `axis`, from its whole face to the blended band.
 
-    The principal point is in its middle: some trainers know of no other.
+    The principal point is the middle: some trainers support no other.
     """
     towards, along = _side_extents(band_rad)
     short, long = 2 * int(size / 2 * towards), 2 * int(np.ceil(size / 2 * along))
-    tilt = np.pi / 4 + np.arctan(short / size)  # begins where the whole face ends
+    tilt = np.pi / 4 + np.arctan(short / size)  # its edge meets the whole face's
     forward = np.cos(tilt) * ahead + np.sin(tilt) * axis
     seamwards = np.cos(tilt) * axis - np.sin(tilt) * ahead
-    if axis[0]:  # beside it, upright
+    if axis[0]:  # beside the lens, upright
         down = np.array([0.0, 1, 0])
         right, width, height = np.cross(down, forward), short, long
     else:
@@ -117,7 +119,7 @@ def _side(axis: np.ndarray, ahead: np.ndarray, size: int, band_rad: float) -> Vi
 
 
 def _side_extents(band_rad: float) -> tuple[float, float]:
-    """Half the extents of a side view towards and along the seam, tangents.
+    """Half the extents of a side view towards and along the seam, as tangents.
 
     It begins where the whole face ends, 45 degrees from its lens's axis, and its corners end at the
     band; along the seam it meets its neighbours on the diagonals between them.
@@ -142,10 +144,10 @@ def _side_extents(band_rad: float) -> tuple[float, float]:
 
 
 def seen_from_lenses(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
-    """The same with rigs whose axes are the lenses', all seen from where these are in the middle of
-    the readout."""
+    """Poses with the lenses' axes, and rays from the lenses' centres in the middle of the
+    readout."""
     if lenses.readout_motion is not None:
-        reconstruction = _in_the_middle(reconstruction, lenses)
+        reconstruction = _rays_from_lens_centres(reconstruction, lenses)
     if lenses.axes is None:
         return reconstruction
     turns = lenses.axes[reconstruction.observation_frames]
@@ -159,14 +161,14 @@ def seen_from_lenses(reconstruction: Reconstruction, lenses: Lenses) -> Reconstr
 
 
 def turned_rigs(world_T_rigs: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Poses (W, 4, 4) of the same rigs with axes turned (W, 3, 3) in them."""
+    """Poses (W, 4, 4) of rigs whose axes are rotated by `turns` (W, 3, 3)."""
     turned = world_T_rigs.copy()
     turned[:, :3, :3] = turned[:, :3, :3] @ turns
     return turned
 
 
-def _in_the_middle(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
-    """The same with rays from the lenses' centres to where observed rays are at their points."""
+def _rays_from_lens_centres(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
+    """Observed points as rays from the lenses' centres, all in the middle of the readout."""
     bearings, frames = reconstruction.observation_bearings, reconstruction.observation_frames
     origins = lenses.origins(bearings, frames)
     rays = observed_points(reconstruction) - origins
@@ -175,7 +177,7 @@ def _in_the_middle(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruc
 
 
 def shown_in_pictures(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
-    """The same with bearings along the directions in which pictures show them."""
+    """Observed points as bearings along the directions in which pictures show them."""
     if lenses.readout_motion is None:
         return reconstruction
     frames = reconstruction.observation_frames
@@ -187,20 +189,20 @@ def shown_in_pictures(reconstruction: Reconstruction, lenses: Lenses) -> Reconst
 
 @dataclass(frozen=True, slots=True)
 class Scenes:
-    """Points that frames see."""
+    """Points that frames observe."""
 
     world_T_rigs: np.ndarray  # (F, 4, 4) float64
     points_world: np.ndarray  # (J, 3) float64
-    seen: np.ndarray  # (O,) which of them, frame by frame
-    bounds: np.ndarray  # (F + 1,) int64: frame f sees seen[bounds[f]:bounds[f + 1]]
+    seen: np.ndarray  # indices of observed points, frame by frame
+    bounds: np.ndarray  # (F + 1,) int64: frame f observes seen[bounds[f]:bounds[f + 1]]
 
     def __call__(self, f: int) -> np.ndarray:
-        """Those of a frame (N, 3), in its rig frame."""
+        """Points (N, 3) that frame f observes, in its rig frame."""
         pose = self.world_T_rigs[f]
         return (self.points_world[self._of(f)] - pose[:3, 3]) @ pose[:3, :3]
 
     def taken(self, rows: np.ndarray) -> "Scenes":
-        """The same of some frames (F',)."""
+        """The scenes of some frames (F',) only."""
         seen = [self._of(f) for f in rows]
         points, numbers = np.unique(np.concatenate(seen), return_inverse=True)
         bounds = np.cumsum([0, *map(len, seen)])
@@ -211,7 +213,7 @@ class Scenes:
 
 
 def scenes_of(reconstruction: Reconstruction) -> Scenes:
-    """What its frames see."""
+    """The points that a reconstruction's frames observe."""
     poses, points = reconstruction.world_T_rigs, reconstruction.points_world
     return scenes_around(
         poses, points, reconstruction.observation_points, reconstruction.observation_frames
@@ -221,14 +223,15 @@ def scenes_of(reconstruction: Reconstruction) -> Scenes:
 def scenes_around(
     world_T_rigs: np.ndarray, points_world: np.ndarray, points: np.ndarray, frames: np.ndarray
 ) -> Scenes:
-    """As `scenes_of`, of poses (F, 4, 4), points (J, 3), and which (O,) of either is observed."""
+    """Scenes of poses (F, 4, 4), points (J, 3), and the observed `points` and `frames`, both
+    (O,)."""
     order = np.argsort(frames, kind="stable")
     bounds = np.searchsorted(frames[order], np.arange(len(world_T_rigs) + 1))
     return Scenes(world_T_rigs, points_world, points[order], bounds)
 
 
 def observed_points(reconstruction: Reconstruction) -> np.ndarray:
-    """Where (O, 3), rig frames, rays of two lenses are once as far as the points they observe."""
+    """Ends (O, 3), rig frames, of rays of two lenses, at the depths of the points they observe."""
     starts = reconstruction.observation_origins
     assert starts is not None
     poses = reconstruction.world_T_rigs[reconstruction.observation_frames]
@@ -248,11 +251,11 @@ class ViewCutter:
         frame: int,
         scene: np.ndarray | None = None,
     ) -> None:
-        """Where each view's pixels are pictured, frame `frame` of the lenses.
+        """Compute the offset from each view's rays to directions in frame `frame` of the lenses.
 
         Args:
-            scene: (N, 3) points in the rig frame of this frame, which tell how far things are; None
-                = they are far. What frames move during the readout is taken out by that.
+            scene: (N, 3) points in the rig frame of this frame, which give the depths; None =
+            everything is far. Rolling shutter is undone at these depths.
         """
         self._views = views
         self._offsets = [_offsets(view, lenses, frame, scene) for view in views]
@@ -265,7 +268,8 @@ class ViewCutter:
         return list(self._sampled(padded, cv2.INTER_CUBIC))
 
     def cut_padded(self, padded: np.ndarray) -> Iterator[np.ndarray]:
-        """As `cut`, one image after the other, of a panorama with PAD pixels around it."""
+        """Images like those of `cut`, one after the other, of a panorama with PAD pixels around
+        it."""
         inner = padded[PAD:-PAD, PAD:-PAD]
         small = low_passed(inner, self._views[0].focal)
         if small is not inner:
@@ -273,14 +277,14 @@ class ViewCutter:
         return self._sampled(padded, cv2.INTER_CUBIC)
 
     def cut_raw(self, pictures: list[np.ndarray]) -> Iterator[np.ndarray]:
-        """As `cut_padded`, straight from the pictures (h, w[, C]) uint8 of both lenses of a raw
-        pair."""
+        """Images like those of `cut_padded`, cut directly from both pictures (h, w[, C]) uint8 of a
+        raw pair."""
         assert self._cut_by is not None
         for view, offsets in zip(self._views, self._offsets, strict=True):
             number = int(view.centre[2] * self._front < 0)
             lens, picture = self._cut_by[number], pictures[number]
-            share, scale = min(_DENSE * view.focal / lens.focal, 1.0), np.ones(2)
-            if share * _DENSE < 1:
+            share, scale = min(_MAX_OVERSAMPLING * view.focal / lens.focal, 1.0), np.ones(2)
+            if share * _MAX_OVERSAMPLING < 1:
                 picture = cv2.resize(
                     picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA
                 )
@@ -295,7 +299,7 @@ class ViewCutter:
 
         Args:
             squares: (6, S, S[, C]) uint8, FACES order.
-            correction: of what stitching bends, see `FrameSet`.
+            correction: coefficients of the stitching field, see `FrameSet`.
         """
         width = dense_enough(4 * squares.shape[1], self._views[0].focal)
         squares = shrunk(squares, width // 4)
@@ -303,7 +307,7 @@ class ViewCutter:
         return self._looked_up(around_squares(squares), places, cv2.INTER_CUBIC)
 
     def cut_mask(self, mask: np.ndarray) -> list[np.ndarray]:
-        """Masks (height, width) of one (H, 2 H), bool or float32 weights."""
+        """Masks (height, width) cut out of one of a panorama (H, 2 H), bool or float32 weights."""
         whole = around_sphere(mask.astype(np.uint8) if mask.dtype == bool else mask, PAD)
         return [part.astype(mask.dtype) for part in self._sampled(whole, cv2.INTER_NEAREST)]
 
@@ -326,13 +330,13 @@ class ViewCutter:
     def _maps(
         self, view: View, offsets: np.ndarray, places: Callable[[np.ndarray], np.ndarray]
     ) -> np.ndarray:
-        """Places (2, height, width) float32 of a view's pixels: those (h, w, 2) of the directions
-        (h, w, 3) in which pictures show them."""
+        """OpenCV pixels (2, height, width) float32 of a view; `places` maps directions (h, w, 3) in
+        which pictures show its rays to pixels (h, w, 2)."""
         maps = np.empty((2, view.height, view.width), np.float32)
-        for top in range(0, view.height, _BAND):
-            rows = np.arange(top, min(top + _BAND, view.height)) + 0.5
+        for top in range(0, view.height, _ROWS_AT_ONCE):
+            rows = np.arange(top, min(top + _ROWS_AT_ONCE, view.height)) + 0.5
             pixels = np.stack(np.meshgrid(np.arange(view.width) + 0.5, rows), axis=-1)
-            nodes = pixels * ((_NODES - 1) / np.array([view.width, view.height]))
+            nodes = pixels * ((_NODES_ACROSS_FACE - 1) / np.array([view.width, view.height]))
             nodes = nodes.astype(np.float32)
             moved = cv2.remap(
                 offsets, nodes[..., 0], nodes[..., 1], cv2.INTER_CUBIC,
@@ -349,39 +353,41 @@ def _in_picture(lens: Fisheye, scale: np.ndarray, shown: np.ndarray) -> np.ndarr
 
 
 def _offsets(view: View, lenses: Lenses, frame: int, scene: np.ndarray | None) -> np.ndarray:
-    """From rays to where panoramas show them, (N, N, 3) float32, corner to corner of a view."""
-    places = np.linspace(0, [view.width, view.height], _NODES)
+    """Offsets (N, N, 3) float32 from a view's rays to directions in panoramas, corner to corner."""
+    places = np.linspace(0, [view.width, view.height], _NODES_ACROSS_FACE)
     rays = view.rays(np.stack(np.meshgrid(*places.T), axis=-1)).reshape(-1, 3)
     turned = rays if lenses.axes is None else rays @ lenses.axes[frame].T
     frames = np.full(len(rays), frame)
-    ends = _FAR * turned
+    ends = _FAR_DEPTH * turned
     if scene is not None and len(scene):
         ends = lenses.origins(turned, frames) + depths_along(turned, scene)[:, None] * turned
     shown = lenses.seeing(ends, frames)
     shown /= np.linalg.norm(shown, axis=1, keepdims=True)
-    return (shown - turned).reshape(_NODES, _NODES, 3).astype(np.float32)
+    return (shown - turned).reshape(_NODES_ACROSS_FACE, _NODES_ACROSS_FACE, 3).astype(np.float32)
 
 
 def depths_along(directions: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """How far (N,) things are in unit directions (N, 3), by points (M, 3) around.
+    """Depths (N,) of the scene in unit directions (N, 3), by points (M, 3) around.
 
-    Each is on a plane through the points nearest in direction: there, inverse distances are linear
-    in directions. Points off it count little; where they cannot tell its tilt, it faces the camera.
+    Each lies on a plane through the points nearest in direction: there, inverse depths are linear
+    in directions. Points off it count little; where they leave its tilt open, it faces the camera.
     """
     from scipy.spatial import KDTree
 
     lengths = np.linalg.norm(points, axis=1)
-    units, near = points / lengths[:, None], min(_NEIGHBOURS, len(points))
+    units, near = points / lengths[:, None], min(_NUM_DEPTH_POINTS, len(points))
     apart, rows = KDTree(units).query(directions, k=near)
     apart, rows = apart.reshape(-1, near), rows.reshape(-1, near)
-    spread = np.maximum(apart[:, near // 2, None], _SMOOTH)
+    spread = np.maximum(apart[:, near // 2, None], _MIN_SMOOTHING_RAD)
     weights, inverse = np.exp(-((apart / spread) ** 2)), 1 / lengths[rows]
     middle = _weighted_median(inverse, weights)
     flat, beside = middle[:, None] * directions, units[rows]
     tilt, left = np.zeros_like(flat), inverse - np.einsum("nki,ni->nk", beside, flat)
-    facing_us = (_UNTILTED * spread**2 * weights.sum(axis=1, keepdims=True))[..., None] * np.eye(3)
-    for _ in range(_ROBUST):
-        off = (left - np.einsum("nki,ni->nk", beside, tilt)) / (_ALIKE * middle[:, None])
+    facing_us = (_FRONTAL_PLANE_WEIGHT * spread**2 * weights.sum(axis=1, keepdims=True))[
+        ..., None
+    ] * np.eye(3)
+    for _ in range(_NUM_ROBUST_ROUNDS):
+        off = (left - np.einsum("nki,ni->nk", beside, tilt)) / (_PLANE_TOLERANCE * middle[:, None])
         shares = weights / (1 + off**2)
         normal = np.einsum("nk,nki,nkj->nij", shares, beside, beside) + facing_us
         right = np.einsum("nk,nki,nk->ni", shares, beside, left)
@@ -391,7 +397,7 @@ def depths_along(directions: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(N,) of rows of values (N, K)."""
+    """Weighted medians (N,) of rows of values (N, K)."""
     order = np.argsort(values, axis=1)
     heights = np.cumsum(np.take_along_axis(weights, order, axis=1), axis=1)
     half = np.argmax(heights >= heights[:, -1:] / 2, axis=1)
@@ -400,7 +406,7 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def views_for(frames: FrameSet, size: int, lenses: Lenses) -> tuple[View, ...]:
-    """What a dataset of frames is made of, faces of `size` pixels."""
+    """The views of a dataset of frames, faces of `size` pixels."""
     if lenses and frames.panoramic:
         return lens_views(lenses, size)
     return cube_views(frames.faces or FACES, size)

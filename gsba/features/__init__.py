@@ -1,7 +1,7 @@
 """Keypoints on the faces of frames, as bearings.
 
 Takes frames, their masks and an extractor.
-Gives features frame by frame, kept on disk, and all keypoints back to back.
+Gives features frame by frame, stored on disk, and all keypoints back to back.
 """
 
 from gsba.features.detection import Extractor, FaceKeypoints, SiftExtractor, gather

@@ -15,7 +15,7 @@ from gsba.types import FACES, Features, Keypoints
 
 @dataclass(frozen=True, slots=True)
 class FaceKeypoints:
-    """What an extractor finds on one face."""
+    """Keypoints that an extractor finds on one face."""
 
     pixels: np.ndarray  # (K, 2) float64, (u, v), corner origin
     sigmas_px: np.ndarray  # (K,) float64, per-axis localisation noise, face pixels
@@ -24,10 +24,10 @@ class FaceKeypoints:
 
 
 class Extractor(Protocol):
-    """Finds and describes keypoints on a pinhole image, the strongest first."""
+    """Detects and describes keypoints on a pinhole image, the strongest first."""
 
     def __call__(self, face_rgb: np.ndarray, mask: np.ndarray | None) -> FaceKeypoints:
-        """Keypoints of a (N, N, 3) uint8 image where mask (N, N) bool allows."""
+        """Keypoints of a (N, N, 3) uint8 image where mask (N, N) bool is True."""
         ...
 
 
@@ -78,14 +78,15 @@ def extract(
         rig: geometry of the faces.
         extractor: the detector.
     """
-    wanted = _owned(rig) if masks is None else _owned(rig) & masks
+    wanted = _owned_pixels(rig) if masks is None else _owned_pixels(rig) & masks
     usable = [face for face in range(len(FACES)) if wanted[face].any()]
     parts, scores = [], []
-    for face in usable or [0]:  # one at least: the extractor knows the shape of nothing
+    for face in usable or [0]:  # one at least: the extractor's descriptor has a shape even without
+        # keypoints
         found = extractor(faces_rgb[face], wanted[face])
         bearings = rig.bearings(found.pixels, face)
         own = owner_faces(bearings) == face
-        parts.append(_record(found, bearings, own, face, faces_rgb[face], rig))
+        parts.append(_feature_fields(found, bearings, own, face, faces_rgb[face], rig))
         if found.scores is not None:
             scores.append(found.scores[own])
     features = Features(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -93,8 +94,9 @@ def extract(
 
 
 @lru_cache(maxsize=2)
-def _owned(rig: CubeRig) -> np.ndarray:
-    """Pixels (6, N, N) bool that hold something a face owns: no other is worth describing."""
+def _owned_pixels(rig: CubeRig) -> np.ndarray:
+    """Pixels (6, N, N) bool at or beside those that a face owns; keypoints elsewhere are
+    dropped."""
     centres = np.arange(rig.size) + 0.5
     grid = np.stack(np.meshgrid(centres, centres), axis=-1)
     owned = [owner_faces(rig.bearings(grid, face)) == face for face in range(len(FACES))]
@@ -102,7 +104,7 @@ def _owned(rig: CubeRig) -> np.ndarray:
     return np.stack([cv2.dilate(own.astype(np.uint8), border) > 0 for own in owned])
 
 
-def _record(
+def _feature_fields(
     found: FaceKeypoints,
     bearings: np.ndarray,
     own: np.ndarray,
@@ -110,7 +112,7 @@ def _record(
     image: np.ndarray,
     rig: CubeRig,
 ) -> tuple[np.ndarray, ...]:
-    """Fields of Features for the keypoints of one face that it owns."""
+    """Fields of Features for the keypoints of one face that the face owns."""
     pixels = found.pixels[own]
     # A pixel at angle a off the axis subtends cos^2 a radially and cos a tangentially of 1 / f;
     # the geometric mean keeps the noise isotropic.
@@ -123,7 +125,7 @@ def _record(
 
 
 def gather(frames: Iterable[Features]) -> Keypoints:
-    """Keypoints of all frames in one record, descriptors left behind."""
+    """Keypoints of all frames in one record, without descriptors."""
     lengths, fields = [0], []
     for found in frames:
         lengths.append(len(found))

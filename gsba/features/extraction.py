@@ -19,16 +19,16 @@ from gsba.types import Features, FrameSet
 
 @dataclass(frozen=True, slots=True)
 class FrameFeatures:
-    """Features of frames by index, read from where they are stored."""
+    """Features of frames by index, read from their store."""
 
-    found: Sequence[PerFrame[Features]]  # (F,) which of several extractions holds each frame
+    found: Sequence[PerFrame[Features]]  # (F,) the extraction that holds each frame
     names: tuple[str, ...]  # (F,)
 
     def __call__(self, frame: int) -> Features:
         return self.found[frame][self.names[frame]]
 
     def taken(self, frames: Iterable[int]) -> Callable[[int], Features]:
-        """Those of some frames, as workers elsewhere can read them."""
+        """The features of some frames, with paths for other processes."""
         paths: dict[int, Path] = {}
         keys: dict[int, str] = {}
         for frame in frames:
@@ -40,7 +40,7 @@ class FrameFeatures:
 
 @dataclass(frozen=True, slots=True)
 class _Extraction:
-    """Finds the features of a frame; image and mask are read, cut and released."""
+    """The job of extracting a frame's features; image and mask are read, cut and released."""
 
     frames: FrameSet
     index: Mapping[str, int]
@@ -69,11 +69,11 @@ def extract(
     """Features by frame name; image and mask are read, cut and released one at a time.
 
     Args:
-        store, frames, rig, settings: of the run.
-        make_extractor: makes what finds keypoints, for each frame.
-        files: that it depends on: weights of a learned one.
-        name: of the stage.
-        chosen_frames: (F,) bool, frames treated; None = all.
+        store, frames, rig, settings: those of the run.
+        make_extractor: makes an extractor, once for each frame.
+        files: that the extractor depends on: weights of a learned one.
+        name: name of the stage.
+        chosen_frames: (F,) bool, frames to extract; None = all.
     """
     index = {
         frame: f

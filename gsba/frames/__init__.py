@@ -1,7 +1,7 @@
 """Captured frames on disk: found, timed, and read as panoramas or faces.
 
 Takes a folder of panoramas, raw fisheyes, tracks of a cube map or cube faces, times and masks.
-Gives a `FrameSet`, and its pixels and masks whenever they are asked for.
+Gives a `FrameSet`, and loads its pixels and masks on demand.
 """
 
 from gsba.frames.cubemap import cut, native_rig, rig_for

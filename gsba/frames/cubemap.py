@@ -16,15 +16,15 @@ from gsba.frames.pixels import load_erp, load_faces
 from gsba.frames.track_pairs import load_squares
 from gsba.types import FACES, FrameSet
 
-_BAND = 256  # rows of which coordinates are held in double precision
+_ROWS_AT_ONCE = 256  # rows whose coordinates are held in double precision at once
 
 
 def rig_for(frames: FrameSet, settings: CubemapSettings) -> CubeRig:
     """The rig on which features of these frames are found.
 
     Unless a size is set, a face centre has `oversampling` times the pixel density of the
-    panorama's equator, within `min_face_size` and `max_face_size`: half is enough where patches
-    refine what features find. Frames that come as cube faces keep their own size and
+    panorama's equator, within `min_face_size` and `max_face_size`: 0.5 suffices where patches
+    refine the keypoints. Frames that come as cube faces keep their own size and
     90 degrees.
     """
     if not frames.panoramic:
@@ -43,7 +43,8 @@ def native_rig(frames: FrameSet, most: int | None = None) -> CubeRig:
 
 
 def load(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.ndarray | None]:
-    """Faces (6, size, size, 3) uint8 RGB of a frame and where they may be used, bool or None."""
+    """Faces (6, size, size, 3) uint8 RGB of a frame and their masks (6, size, size) bool, or
+    None."""
     mask = load_usable(frames, frame)
     masks = None if mask is None else cut_mask(mask, rig)
     if frames.tracks is not None:
@@ -77,8 +78,8 @@ def cut(erp: np.ndarray, rig: CubeRig) -> np.ndarray:
 
 
 def cut_padded(padded: np.ndarray, rig: CubeRig, out: np.ndarray) -> Iterator[np.ndarray]:
-    """As `cut`, of a panorama with PAD pixels around it: one face after the other, all in `out`
-    (size, size[, C])."""
+    """Faces like those of `cut`, of a panorama with PAD pixels around it: one after the other, all
+    in `out` (size, size[, C])."""
     inner = padded[PAD:-PAD, PAD:-PAD]
     small = low_passed(inner, rig.focal)
     if small is not inner:
@@ -95,7 +96,7 @@ def cut_squares(
     Args:
         squares: (6, S, S[, C]) uint8 of `gsba.camera.equiangular.squares`, FACES order.
         rig: faces to cut.
-        correction: of what stitching bends, see `FrameSet`.
+        correction: coefficients of the stitching field, see `FrameSet`.
 
     Returns:
         (6, size, size[, C]) uint8, in FACES order.
@@ -137,8 +138,8 @@ def _maps_by(rig: CubeRig, places: Callable[[np.ndarray], np.ndarray]) -> np.nda
     centres = np.arange(rig.size) + 0.5
     maps = np.empty((len(FACES), 2, rig.size, rig.size), np.float32)
     for face in range(len(FACES)):
-        for top in range(0, rig.size, _BAND):
-            grid = np.stack(np.meshgrid(centres, centres[top : top + _BAND]), axis=-1)
+        for top in range(0, rig.size, _ROWS_AT_ONCE):
+            grid = np.stack(np.meshgrid(centres, centres[top : top + _ROWS_AT_ONCE]), axis=-1)
             found = places(rig.bearings(grid, face))
-            maps[face, :, top : top + _BAND] = np.moveaxis(found, -1, 0)
+            maps[face, :, top : top + _ROWS_AT_ONCE] = np.moveaxis(found, -1, 0)
     return maps

@@ -17,7 +17,7 @@ _EXIF_DIRECTORY, _GPS_DIRECTORY = 0x8769, 0x8825
 _TAKEN, _OFFSET, _SUBSECOND = 0x9003, 0x9011, 0x9291
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)
 _GPS_TIME, _STATUS, _DOP, _GPS_DATE, _ERROR = 7, 9, 11, 29, 31
-_LATEST_OFFSET_H = 14  # hours of a time zone from UTC, at most
+_MAX_OFFSET_H = 14  # largest offset of a time zone from UTC, hours
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,17 +28,17 @@ class GpsTag:
     longitude: float  # degrees
     altitude: float  # metres; NaN = not given
     dop: float  # dilution of precision; NaN = not given
-    error_m: float  # metres across, the receiver's own estimate; NaN = not given
+    error_m: float  # horizontal accuracy, metres, by the receiver; NaN = not given
     unix_time: float  # seconds, when the fix was taken; NaN = not given
 
 
 @dataclass(frozen=True, slots=True)
 class ExifTags:
-    """When and where a picture was taken, as far as its tags tell."""
+    """Time and place of a picture, as far as its tags give them."""
 
     taken: float | None  # seconds since 1970, local time unless `zoned`; None = not given
-    zoned: bool  # whether the tags name the time zone, so that `taken` is Unix time
-    subsecond: bool  # whether `taken` has a fraction of a second
+    zoned: bool  # True if the tags name the time zone, so that `taken` is Unix time
+    subsecond: bool  # True if `taken` has a fraction of a second
     gps: GpsTag | None  # None = no valid position
     camera: str = ""  # maker and model; "" = not given
 
@@ -47,22 +47,22 @@ def read_exif(path: Path) -> ExifTags:
     """Tags of a JPEG, PNG, WebP or TIFF picture.
 
     Raises:
-        ValueError: EXIF data that are damaged.
+        ValueError: the EXIF data are damaged.
         GsbaError: the file cannot be read.
     """
     from PIL import Image, UnidentifiedImageError
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", UserWarning)  # which is how Pillow reports damage
+            warnings.simplefilter("error", UserWarning)  # Pillow reports damage as warnings
             with Image.open(path) as picture:  # reads no pixels
                 exif = picture.getexif()
                 shot, gps = exif.get_ifd(_EXIF_DIRECTORY), exif.get_ifd(_GPS_DIRECTORY)
     except UnidentifiedImageError:
-        raise GsbaError(f"{path}: is no picture that can be read") from None
+        raise GsbaError(f"{path}: cannot be read as a picture") from None
     except OSError as error:
         raise GsbaError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except Exception:  # of the parser, each in its own words
+    except Exception:  # the parser raises errors of many types
         raise ValueError(f"{path}: damaged EXIF data") from None
     try:
         named = [text for text in (_text(exif, _MAKE), _text(exif, _MODEL)) if text]
@@ -72,10 +72,11 @@ def read_exif(path: Path) -> ExifTags:
 
 
 def _taken(tags: Mapping[int, Any]) -> tuple[float | None, bool, bool]:
-    """Time of DateTimeOriginal with its fraction, whether its zone is known, and the fraction."""
+    """Time of DateTimeOriginal with its fraction; True if its zone is known; True if it has a
+    fraction."""
     try:
         moment = datetime.strptime(_text(tags, _TAKEN), "%Y:%m:%d %H:%M:%S")
-    except ValueError:  # absent, or blank as cameras without a clock write it
+    except ValueError:  # absent, or blank as written by cameras without a clock
         return None, False, False
     zone = _zone(_text(tags, _OFFSET))
     digits = _text(tags, _SUBSECOND)
@@ -90,7 +91,7 @@ def _zone(text: str) -> timezone | None:
         offset = datetime.strptime(text, "%z").utcoffset()
     except ValueError:
         return None
-    if offset is None or abs(offset) > timedelta(hours=_LATEST_OFFSET_H):
+    if offset is None or abs(offset) > timedelta(hours=_MAX_OFFSET_H):
         return None
     return timezone(offset)
 
@@ -103,7 +104,7 @@ def _gps_tag(gps: Mapping[int, Any]) -> GpsTag | None:
     latitude *= -1 if _text(gps, _LATITUDE_REF).upper() == "S" else 1
     longitude *= -1 if _text(gps, _LONGITUDE_REF).upper() == "W" else 1
     valid = math.isfinite(latitude + longitude) and abs(latitude) <= 90 and abs(longitude) <= 180
-    if not valid or latitude == longitude == 0:  # what cameras write before the first fix
+    if not valid or latitude == longitude == 0:  # cameras write zeros before the first fix
         return None
     altitude = _number(gps, _ALTITUDE, -math.inf)
     below = gps.get(_ALTITUDE_REF) in (1, b"\x01")
@@ -124,13 +125,14 @@ def _gps_tag(gps: Mapping[int, Any]) -> GpsTag | None:
 
 
 def _number(tags: Mapping[int, Any], tag: int, low: float = 0.0) -> float:
-    """A finite number above `low`; NaN = not given, or unknown as 0/0 and 0 mean."""
+    """A finite number above `low`; NaN = not given, or unknown, which 0/0 and 0 stand for."""
     value = float(tags.get(tag, math.nan))
     return value if math.isfinite(value) and value > low else math.nan
 
 
 def _sexagesimal(parts: Sequence[Any]) -> float:
-    """First unit of (degrees or hours, minutes, seconds); a later part may be absent or 0/0."""
+    """Value in the first unit of (degrees or hours, minutes, seconds); later parts may be absent or
+    0/0."""
     values = [float(part) for part in parts]
     values[1:] = [value if math.isfinite(value) else 0.0 for value in values[1:]]
     return sum(value / 60**k for k, value in enumerate(values[:3]))

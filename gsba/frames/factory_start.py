@@ -1,4 +1,5 @@
-"""Lenses of raw pairs to start from, by what their camera's maker wrote into its files."""
+"""Initial lenses of raw pairs, by the calibration that their camera's maker wrote into its
+files."""
 
 import json
 import logging
@@ -26,21 +27,22 @@ _log = logging.getLogger(__name__)
 
 FACTORY_FILE = "factory_lenses.json"  # beside the frames of a video
 INSTA360_PICTURE = ".insp"  # suffix of JPEG images with both lenses side by side
-_LOOKS = 8  # frames in which rims are compared
+_NUM_COMPARED_FRAMES = 8  # frames in which rims are compared
 _QUARTER_TURNS = 4
-_MAX_BYTES = 1 << 16  # of FACTORY_FILE
-_CLEARLY = 0.1  # by how much more alike rims must become for another reading than the usual one
-_AGREEING = 0.3  # likeness of the rims that says that a reading is right
+_MAX_FILE_BYTES = 1 << 16  # largest size of FACTORY_FILE
+_MIN_CORRELATION_GAIN = 0.1  # gain in rim correlation from which another reading is preferred to
+# the usual one
+_MIN_CONFIRMING_CORRELATION = 0.3  # rim correlation above which a reading counts as confirmed
 
 
 def factory_calibration(
     files: Iterable[Path], two_tracks: bool = False
 ) -> FactoryCalibration | None:
-    """The maker's calibration in the first of some files that holds one that can be read.
+    """The maker's calibration in the first of some files that holds a readable one.
 
     Args:
         files: videos or pictures of one camera, as it wrote them.
-        two_tracks: whether they show the lenses in two tracks, in an order that the file states.
+        two_tracks: True if they hold the lenses in two tracks, in an order that the file states.
     """
     for path in files:
         try:
@@ -70,13 +72,13 @@ def factory_calibration(
 
 
 def write_factory_calibration(folder: Path, calibration: FactoryCalibration) -> None:
-    """Keep a maker's calibration beside frames, for `find_factory_lenses`."""
+    """Write a maker's calibration beside frames, for `find_factory_lenses`."""
     write_json(folder / FACTORY_FILE, asdict(calibration))
 
 
 def find_factory_lenses(folder: Path, images: Sequence[Path]) -> FactoryLenses | None:
-    """The maker's calibration of frames: beside those of a video, in pictures as the camera wrote
-    them; None = there is none.
+    """The maker's calibration of frames: beside those of a video, or in pictures as the camera
+    wrote them; None = there is none.
 
     Raises:
         GsbaError: the file beside the frames is damaged.
@@ -93,19 +95,20 @@ def starting_lenses(
     size: tuple[int, int],
     factory: FactoryLenses,
 ) -> Pair:
-    """Lenses of raw pairs by the maker's calibration, which leaves open what only images tell.
+    """Initial lenses of raw pairs by the maker's calibration, which leaves two questions to the
+    images.
 
-    That is whether pictures show the stated window of the sensor or all of it, and, if somebody
-    turned pictures, by which quarter the back ones are turned against the front ones. The usual
-    reading is taken unless another one makes the lenses' pictures clearly more alike at the rims.
+    Pictures may show the stated window of the sensor or all of it; and if somebody turned
+    pictures, the back ones may be turned by quarters against the front ones. The usual reading is
+    kept unless another one makes both lenses' rims clearly more alike.
 
     Args:
         folder: of the pictures, for the log.
-        pairs: pictures of the front and of the back lens of each frame, or twice one of both.
+        pairs: pictures of the front and back lens of each frame, or twice the one that holds both.
         size: width and height of one lens's picture.
         factory: the maker's calibration.
     """
-    rows = np.unique(np.linspace(0, len(pairs) - 1, _LOOKS).astype(int))
+    rows = np.unique(np.linspace(0, len(pairs) - 1, _NUM_COMPARED_FRAMES).astype(int))
     looks = [decode_pair(pairs[f], size, gray=True) for f in rows]
     readings = [
         _with_back_turned(pair, quarters)
@@ -114,17 +117,22 @@ def starting_lenses(
     ]
     scores = [rim_likeness(looks, pair) for pair in readings]
     best = int(np.argmax(scores))
-    if scores[best] <= scores[0] + _CLEARLY:
+    if scores[best] <= scores[0] + _MIN_CORRELATION_GAIN:
         best = 0
     _log.warning(
-        "%s: lenses start from the maker's calibration (generation %d, directions to %.1f "
-        "degrees, one lens against the other to %.1f%s), %s; --calibration FILE says better",
+        "%s: lenses start from the maker's calibration (generation %d; standard "
+        "deviations: directions %.1f degrees, rotation between lenses %.1f%s), %s; for a better "
+        "start pass --calibration FILE",
         folder,
         factory.generation,
         np.rad2deg(factory.direction_sigma),
         np.rad2deg(factory.rotation_sigma),
-        _other_reading(best) if factory.angles_known else "; its angles are of no known form",
-        "which both lenses' rims confirm" if scores[best] > _AGREEING else "unconfirmed by images",
+        _difference_to_usual_reading(best)
+        if factory.angles_known
+        else "; its angles have no known form",
+        "which both lenses' rims confirm"
+        if scores[best] > _MIN_CONFIRMING_CORRELATION
+        else "unconfirmed by images",
     )
     return readings[best]
 
@@ -133,12 +141,12 @@ def _read_factory_calibration(folder: Path) -> FactoryCalibration | None:
     """The maker's calibration beside frames; None = there is none.
 
     Raises:
-        GsbaError: a file of that name that is damaged.
+        GsbaError: the file is damaged.
     """
     path = folder / FACTORY_FILE
     try:
         with path.open("rb") as file:
-            tree = json.loads(file.read(_MAX_BYTES))
+            tree = json.loads(file.read(_MAX_FILE_BYTES))
         texts = {key: tree[key] for key in ("text", "camera")}
         sizes = {key: tree[key] and _two_whole(tree[key]) for key in ("sensor", "window")}
         if not all(isinstance(text, str) for text in texts.values()):
@@ -154,10 +162,10 @@ def _read_factory_calibration(folder: Path) -> FactoryCalibration | None:
 
 
 def _two_whole(values: Any) -> tuple[int, int]:
-    """Two whole numbers.
+    """Two integers.
 
     Raises:
-        ValueError, TypeError: others.
+        ValueError, TypeError: the values are not two integers.
     """
     first, second = values
     if not all(isinstance(value, int) and abs(value) < 1 << 20 for value in (first, second)):
@@ -166,7 +174,7 @@ def _two_whole(values: Any) -> tuple[int, int]:
 
 
 def _with_back_turned(pair: Pair, quarters: int) -> Pair:
-    """A pair whose back pictures are turned by quarters about the lens's axis."""
+    """The pair with its back lens rotated by quarter turns about its axis."""
     if not quarters:
         return pair
     front, back = pair
@@ -175,8 +183,8 @@ def _with_back_turned(pair: Pair, quarters: int) -> Pair:
     return front, replace(back, rotation=(a, b, c))
 
 
-def _other_reading(reading: int) -> str:
-    """How a reading differs from the usual one, for the log; "" = it is that."""
+def _difference_to_usual_reading(reading: int) -> str:
+    """Difference of a reading to the usual one, for the log; "" = it is the usual one."""
     turned = reading % _QUARTER_TURNS
     parts = [f"the back lens turned by {90 * turned} degrees"] if turned else []
     parts += ["the whole sensor in the picture"] if reading >= _QUARTER_TURNS else []

@@ -13,11 +13,12 @@ from gsba.log import GsbaError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".insp")  # the last: JPEG
 
-_MOST_PADDING, _FILLS = 1024, (b"\0", b"\xff")  # bytes before the end, and what they are
+_MAX_PADDING_BYTES, _PADDING_VALUES = 1024, (b"\0", b"\xff")  # largest number of padding bytes
+# before the end, and their values
 
 
 def is_image(path: Path) -> bool:
-    """Whether the name is that of a visible JPEG, PNG, WebP or TIFF file."""
+    """True if the name is that of a visible JPEG, PNG, WebP or TIFF file."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
@@ -25,17 +26,17 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image as shown (EXIF orientation respected), without decoding.
 
     Raises:
-        GsbaError: as of `image_header`.
+        GsbaError: see `image_header`.
     """
     return image_header(path).size
 
 
 def image_header(path: Path) -> Header:
-    """What a JPEG, PNG, WebP or TIFF says of itself.
+    """The header of a JPEG, PNG, WebP or TIFF file.
 
     Raises:
-        GsbaError: unreadable, no such image, its end is missing (truncated), a variant that is not
-            read, or more than MAX_PIXELS.
+        GsbaError: unreadable, no such image, its end is missing (truncated), an unsupported
+            variant, or more than MAX_PIXELS.
     """
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
@@ -47,7 +48,7 @@ def image_header(path: Path) -> Header:
 
 
 def goes_out_as_it_is(source: Path, target: Path) -> bool:
-    """Whether every trainer can read a copy of an image under another name.
+    """True if every trainer can read a copy of an image under another name.
 
     That is an upright JPEG or PNG of 8 bits in colour. COLMAP and trainers ignore the orientation
     tag, COLMAP reads no WebP, and nerfstudio takes 16-bit grey modulo 256.
@@ -71,7 +72,7 @@ def decode(
         gray: one channel instead of RGB.
         at_least: width that is enough: a JPEG is decoded at a half, a quarter or an eighth of its
             size, which is fast, as long as it stays that wide.
-        room: (N,) uint8, as many as there are values: where those of most JPEGs then lie.
+        room: (N,) uint8, one for each value of the result: most JPEGs are decoded into it.
 
     Returns:
         (H, W, 3) uint8 RGB, or (H, W) uint8.
@@ -96,15 +97,15 @@ def decode(
         pixels = _decoded_jpeg(encoded, path, stored, part, gray, room)
     else:
         pixels = _decoded(encoded, path, gray)
-    upright = header.kind == "TIFF"  # which OpenCV turns, asked or not
+    upright = header.kind == "TIFF"  # OpenCV turns TIFFs by their tag in any case
     return pixels if upright else _turned(pixels, header.orientation)
 
 
 def _turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Stored pixels (h, w[, 3]) as they are to be shown. Exif 3.0, section 4.6.5, tag 0x0112."""
+    """Stored pixels (h, w[, 3]) turned for display. Exif 3.0, section 4.6.5, tag 0x0112."""
     if orientation == 1:
         return pixels
-    if orientation > 4:  # 1 to 4 of the transposed picture
+    if orientation > 4:  # 5 to 8 are 1 to 4 of the transposed picture
         pixels, orientation = pixels.swapaxes(0, 1), orientation - 4
     down = -1 if orientation in (3, 4) else 1
     across = -1 if orientation in (2, 3) else 1
@@ -112,7 +113,7 @@ def _turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def _decoded(encoded: bytes, path: Path, gray: bool) -> np.ndarray:
-    """Pixels of what is no JPEG, or a JPEG of printing inks."""
+    """Pixels of a file that is no JPEG, or of a JPEG in printing inks."""
     import cv2
 
     flag = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
@@ -125,7 +126,7 @@ def _decoded(encoded: bytes, path: Path, gray: bool) -> np.ndarray:
     if pixels is None:
         raise GsbaError(f"{path}: cannot be decoded; copy or extract it again")
     if pixels.dtype == np.uint16:
-        pixels = cv2.convertScaleAbs(pixels, alpha=1 / 257)  # 65535 is 255
+        pixels = cv2.convertScaleAbs(pixels, alpha=1 / 257)  # 65535 becomes 255
     return pixels if gray else cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB, dst=pixels)
 
 
@@ -137,7 +138,7 @@ def _decoded_jpeg(
     gray: bool,
     room: np.ndarray | None,
 ) -> np.ndarray:
-    """Pixels of a JPEG at 1 / part of its size; what a decoder would make up is refused."""
+    """Pixels of a JPEG at 1 / part of its size; damage that a decoder would fill in is refused."""
     import simplejpeg
 
     try:
@@ -152,7 +153,7 @@ def _decoded_jpeg(
             if not _is_padding(str(error), encoded):
                 raise
             pixels = wanted(strict=False)
-    except (ValueError, KeyError) as error:  # KeyError: of a colour space that there is not
+    except (ValueError, KeyError) as error:  # KeyError: unknown colour space
         raise GsbaError(
             f"{path}: damaged ({error}); copy or extract it again, or remove it"
         ) from None
@@ -160,7 +161,9 @@ def _decoded_jpeg(
 
 
 def _is_padding(complaint: str, encoded: bytes) -> bool:
-    """Whether all that a decoder complains of is that some cameras fill up before the end."""
+    """True if a decoder complains only of padding before the end, which some cameras write."""
     found = re.search(r"(\d+) extraneous bytes before marker 0xd9", complaint)
-    num = int(found[1]) if found else _MOST_PADDING + 1
-    return num <= _MOST_PADDING and any(fill * num + JPEG_END in encoded for fill in _FILLS)
+    num = int(found[1]) if found else _MAX_PADDING_BYTES + 1
+    return num <= _MAX_PADDING_BYTES and any(
+        fill * num + JPEG_END in encoded for fill in _PADDING_VALUES
+    )

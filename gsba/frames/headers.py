@@ -1,6 +1,6 @@
-"""What image files say of themselves before any pixel is decoded: JPEG, PNG, WebP and TIFF.
+"""Headers of image files, read without decoding pixels: JPEG, PNG, WebP and TIFF.
 
-Sizes are of what is shown: the orientation tag of EXIF turns or mirrors what is stored.
+Sizes are those on display: the orientation tag of EXIF turns or mirrors the stored picture.
 """
 
 import mmap
@@ -12,18 +12,18 @@ import numpy as np
 
 from gsba.log import GsbaError
 
-MAX_PIXELS = 1 << 28  # of one image: 768 MB of colours
+MAX_PIXELS = 1 << 28  # pixels of one image: 768 MB of colours
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"  # chunk type and its constant CRC
 _PNG_COLOURS = (2, 6)  # RGB, RGB with alpha
-_PNG_TAIL = 1 << 16  # bytes before the end in which tags are looked for
+_PNG_TAIL_BYTES = 1 << 16  # bytes before the end in which tags are searched
 _JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _JPEG_BARE = {0x01, *range(0xD0, 0xD9)}  # markers without a segment: TEM, RST0-7, SOI
 _JPEG_FRAME = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0-15; not DHT, JPG, DAC
 _JPEG_SCAN, _JPEG_APP1 = 0xDA, 0xE1  # SOS; where EXIF is
 _EXIF = b"Exif\0\0"
-_WEBP_ANIMATED = 0x02  # of the flags of an extended file
+_WEBP_ANIMATED = 0x02  # flag of an extended file
 _TIFF_STARTS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"  # with +: BigTIFF
 _TIFF_TYPES = {1: 1, 3: 2, 4: 4, 16: 8}  # bytes of an unsigned number
 _WIDTH, _HEIGHT, _BITS, _COMPRESSION, _COLOURS = 256, 257, 258, 259, 262
@@ -34,7 +34,8 @@ _TIFF_TAGS = {
     *(_WIDTH, _HEIGHT, _BITS, _COMPRESSION, _COLOURS, _ORIENTATION, _SAMPLES, _PLANES, _FORMAT),
     *_TIFF_PARTS,
 }
-_MOST_TAGS, _MOST_VALUES = 4096, 64  # of a directory; of a tag that lists no parts
+_MAX_TAGS, _MAX_VALUES = 4096, 64  # largest number of tags of a directory; of values of a tag
+# that lists no parts
 _NOTHING = np.zeros(0, np.uint64)
 _TIFF_COMPRESSIONS = {1, 5, 7, 8, 32773, 32946}  # none, LZW, JPEG, deflate, PackBits, old deflate
 
@@ -43,13 +44,13 @@ Bytes = mmap.mmap | bytes
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What an image file says of itself."""
+    """The header of an image file."""
 
     kind: str  # "JPEG", "PNG", "WebP" or "TIFF"
     width: int  # pixels as shown
     height: int  # pixels as shown
     orientation: int = 1  # EXIF's, 1 (as stored) to 8
-    plain: bool = False  # 8 bits of red, green and blue, as any program reads them
+    plain: bool = False  # True for 8 bits of red, green and blue, which any program reads
 
     @property
     def size(self) -> tuple[int, int]:
@@ -58,36 +59,36 @@ class Header:
 
     @property
     def swapped(self) -> bool:
-        """Whether rows are shown as columns."""
+        """True if the orientation tag transposes the stored picture."""
         return self.orientation > 4
 
 
-class _Unread(Exception):
-    """Something that is whole, but not read here."""
+class _Unsupported(Exception):
+    """The file is intact, but of a variant that is not supported."""
 
 
-class _CutOff(Exception):
-    """The end is missing."""
+class _Truncated(Exception):
+    """The end of the file is missing."""
 
 
 def header_of(data: Bytes, path: Path) -> Header:
     """The header of an image file's content.
 
     Args:
-        data: all of it.
-        path: for messages.
+        data: the whole file.
+        path: its path, for error messages.
 
     Raises:
-        GsbaError: no such image, its end is missing, a variant that is not read, or more than
+        GsbaError: no such image, its end is missing, an unsupported variant, or more than
             MAX_PIXELS.
     """
     try:
         header = _header(data)
-    except _CutOff:
+    except _Truncated:
         raise GsbaError(
             f"{path}: truncated image (its end is missing); copy or extract it again"
         ) from None
-    except _Unread as what:
+    except _Unsupported as what:
         raise GsbaError(f"{path}: {what}") from None
     except (IndexError, ValueError):  # ran past the end
         raise GsbaError(f"{path}: truncated or damaged image; copy or extract it again") from None
@@ -109,11 +110,11 @@ def _header(data: Bytes) -> Header:
         return _webp(data)
     if data[:4] in _TIFF_STARTS:
         return _tiff(data)
-    raise _Unread("not a JPEG, PNG, WebP or TIFF image; remove or convert it")
+    raise _Unsupported("not a JPEG, PNG, WebP or TIFF image; remove or convert it")
 
 
 def _shown(kind: str, width: int, height: int, orientation: int, plain: bool) -> Header:
-    """A header of a stored width and height."""
+    """A header with the size on display, of a stored width and height."""
     if orientation > 4:
         width, height = height, width
     return Header(kind, width, height, orientation, plain and orientation == 1)
@@ -124,7 +125,7 @@ def _png(data: Bytes) -> Header:
     if len(data) < 33 or data[12:16] != b"IHDR":
         raise ValueError
     if data.rfind(_PNG_END) <= 0:
-        raise _CutOff
+        raise _Truncated
     width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
     plain = data[24] == 8 and data[25] in _PNG_COLOURS
     return _shown("PNG", width, height, _orientation(_png_exif(data)), plain)
@@ -138,7 +139,7 @@ def _png_exif(data: Bytes) -> bytes:
         if kind == b"eXIf":
             return data[position + 8 : position + 8 + length]
         position += 12 + length
-    at = data.rfind(b"eXIf", max(len(data) - _PNG_TAIL, position))
+    at = data.rfind(b"eXIf", max(len(data) - _PNG_TAIL_BYTES, position))
     length = int.from_bytes(data[at - 4 : at], "big") if at > 0 else 0
     found = data[at : at + 4 + length]
     checksum = int.from_bytes(data[at + 4 + length : at + 8 + length], "big")
@@ -164,7 +165,9 @@ def _jpeg(data: Bytes) -> Header:
         length = int.from_bytes(data[position : position + 2], "big")
         if marker in _JPEG_FRAME:
             if data[position + 2] != 8:
-                raise _Unread(f"a JPEG of {data[position + 2]} bits; save it with 8, or as PNG")
+                raise _Unsupported(
+                    f"a JPEG of {data[position + 2]} bits; save it with 8, or as PNG"
+                )
             height, width = (
                 int.from_bytes(data[position + k : position + k + 2], "big") for k in (3, 5)
             )
@@ -175,7 +178,7 @@ def _jpeg(data: Bytes) -> Header:
             if size is None:
                 raise ValueError
             if data.rfind(JPEG_END, position) <= 0:
-                raise _CutOff
+                raise _Truncated
             return _shown("JPEG", *size, _orientation(exif), components == 3)
         position += max(length, 2)
 
@@ -184,13 +187,13 @@ def _webp(data: Bytes) -> Header:
     """RFC 9649, section 2."""
     end = 8 + int.from_bytes(data[4:8], "little")
     if len(data) < end:
-        raise _CutOff
+        raise _Truncated
     kind, body = data[12:16], data[20:30]
     if len(body) < 10:
         raise ValueError
     if kind == b"VP8X":
         if body[0] & _WEBP_ANIMATED:
-            raise _Unread("an animated WebP; extract its pictures to files of their own")
+            raise _Unsupported("an animated WebP; extract its pictures to files of their own")
         width, height = (int.from_bytes(body[at : at + 3], "little") + 1 for at in (4, 7))
     elif kind == b"VP8L":
         bits = int.from_bytes(body[1:5], "little")
@@ -216,18 +219,18 @@ def _tiff(data: Bytes) -> Header:
     deep = max(bits) > 8
     what = ""
     if any(form != 1 for form in tags.get(_FORMAT, (1,))):
-        what = "numbers that are signed or floating-point"
+        what = "signed or floating-point numbers"
     elif deep and (set(bits) != {16} or colours not in (1, 2) or (planes != 1 and samples > 1)):
         what = f"{max(bits)} bits in an order of its own"
     elif tags.get(_COMPRESSION, (1,))[0] not in _TIFF_COMPRESSIONS:
         what = f"compression {tags[_COMPRESSION][0]}"
     if what:
-        raise _Unread(f"a TIFF of {what}; save it as PNG, or as TIFF of 8 or 16 bits with LZW")
+        raise _Unsupported(f"a TIFF of {what}; save it as PNG, or as TIFF of 8 or 16 bits with LZW")
     for parts, part_sizes in ((_STRIPS, _STRIP_SIZES), (_TILES, _TILE_SIZES)):
         starts, sizes = tags.get(parts, _NOTHING), tags.get(part_sizes, _NOTHING)
         starts, sizes = (values[: min(len(starts), len(sizes))] for values in (starts, sizes))
         if ((starts > len(data)) | (sizes > len(data) - np.minimum(starts, len(data)))).any():
-            raise _CutOff
+            raise _Truncated
     if _STRIPS not in tags and _TILES not in tags:
         raise ValueError
     width, height = (int(tags.get(tag, (0,))[0]) for tag in (_WIDTH, _HEIGHT))
@@ -235,9 +238,9 @@ def _tiff(data: Bytes) -> Header:
 
 
 def _directory(data: Bytes) -> dict[int, np.ndarray]:
-    """The tags of a TIFF's first directory that are asked for here; of EXIF data too.
+    """The supported tags of a TIFF's first directory, or of EXIF data.
 
-    Of a tag that is there more than once the first counts, as for other readers.
+    If a tag occurs more than once, the first one counts, as in other readers.
     """
     starts = {b"II": "little", b"MM": "big"}
     order = starts.get(data[:2])
@@ -254,29 +257,29 @@ def _directory(data: Bytes) -> dict[int, np.ndarray]:
     first = number(8 if big else 4, wide)
     tags: dict[int, np.ndarray] = {}
     num = number(first, of_count)
-    if num > _MOST_TAGS:
+    if num > _MAX_TAGS:
         raise ValueError
     for k in range(num):
         at = first + of_count + k * entry
         tag, size, count = number(at, 2), _TIFF_TYPES.get(number(at + 2, 2)), number(at + 4, wide)
         if tag not in _TIFF_TAGS or tag in tags or size is None or not count:
             continue
-        if count > _MOST_VALUES and tag not in _TIFF_PARTS:
+        if count > _MAX_VALUES and tag not in _TIFF_PARTS:
             raise ValueError
         at += 4 + wide
         place = at if size * count <= wide else number(at, wide)
         if place + size * count > len(data):
-            raise _CutOff
+            raise _Truncated
         kind = np.dtype(f"{'<' if order == 'little' else '>'}u{size}")
         tags[tag] = np.frombuffer(data[place : place + size * count], kind).astype(np.uint64)
     return tags
 
 
 def _orientation(exif: bytes) -> int:
-    """What EXIF data say of how a picture is held; 1 where they say nothing that can be read."""
+    """Orientation 1 to 8 in EXIF data; 1 where they hold none that can be read."""
     try:
         return _turn(_directory(exif))
-    except (ValueError, _CutOff):
+    except (ValueError, _Truncated):
         return 1
 
 

@@ -1,4 +1,4 @@
-"""Image circles of fisheyes: where in a picture the light that came through a lens ends.
+"""Image circles of fisheyes: the borders in a picture of the light that came through a lens.
 
 The rim of an image circle is the strongest drop of brightness along most rays from the middle, at
 any level of stray light: glowing housings and flare are brighter than black, but the step at the
@@ -12,37 +12,39 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-_SIDE = 512  # pixels of the longer side at which edges are found
+_SEARCH_SIZE_PX = 512  # pixels of the longer side at which edges are found
 _DARK_OFFSET = 8.0  # grey values added before the logarithm: noise of black pixels is no edge
-_BLUR = 1.0  # pixels, standard deviation
-_NUM_RAYS = 360
-_SAMPLE_STEP = 0.5  # pixels along a ray
-_WINDOW = 6  # samples on either side of an edge, whose means are compared
-_MIN_DROP = 0.25  # of the logarithm of the grey value at an edge
-_MAX_DROP = 1.0  # above it, an edge counts no more
+_BLUR_PX = 1.0  # pixels, standard deviation
+_NUM_RAYS = 360  # around the middle of a picture
+_SAMPLE_STEP_PX = 0.5  # pixels along a ray
+_WINDOW_SAMPLES = 6  # samples on either side of an edge, whose means are compared
+_MIN_DROP = 0.25  # least drop of the logarithm of the grey value at an edge
+_DROP_LIMIT = 1.0  # drop above which an edge gains no more weight
 _EDGES_PER_RAY = 3
-_EDGE_GAP = 8  # samples between two edges of a ray
-_NUM_TRIALS = 3000  # circles through three edges
+_MIN_EDGE_GAP = 8  # samples between two edges of a ray
+_NUM_TRIALS = 3000  # circles tried, each through three edges
 _TRIALS_AT_ONCE = 250
-_TOLERANCE = 0.006  # of an edge from a circle, part of the radius
-_REFINED_TOLERANCE = 0.01  # the same while the circle is refined
-_REFINEMENTS = 8
-_MIN_RADIUS, _MAX_RADIUS = 0.3, 0.72  # of the shorter and of the longer side
-_MAX_OFF_CENTRE = 0.15  # part of each side
-_BORDER = 1.5  # pixels at the picture's border that show no edge
+_MAX_RELATIVE_DISTANCE = 0.006  # largest distance of an edge from a circle, relative to the radius
+_MAX_REFINED_DISTANCE = 0.01  # largest distance of an edge while the circle is refined, relative
+_NUM_REFINEMENTS = 8
+_MIN_RADIUS, _MAX_RADIUS = 0.3, 0.72  # in units of the shorter and of the longer side
+_MAX_OFF_CENTRE = 0.15  # distance of the centre from the middle, in units of each side
+_BORDER_PX = 1.5  # pixels at the picture's border in which edges are ignored
 _MIN_SUPPORT = 0.5  # share of the visible rim on which an edge must lie
-_MIN_RAYS = 54  # that must agree
-_INNER = 0.75, 0.97  # radii of a circle within a housing's, parts of the outer one
-_CONCENTRIC = 0.03  # distance of their centres, part of the radius
-_INNER_SCORE = 0.4  # of a circle within a housing's, part of the outer one's
-_PLAIN = 0.6  # contrast of a housing, part of that of the scene within
-_TEXTURE_BLUR, _TEXTURE_PARTS = 1.5, 12  # pixels; of a circle, whose mean is taken off
-_RAYS_PER_WITNESS = 8  # neighbouring rays have the same error
+_MIN_AGREEING_RAYS = 54  # rays that must have an edge on the circle
+_INNER_RADII = 0.75, 0.97  # range of radii of a circle within a housing's, relative to the outer
+# one
+_MAX_CENTRE_DISTANCE = 0.03  # largest distance of their centres, relative to the radius
+_MIN_INNER_SCORE = 0.4  # least score of a circle within a housing's, relative to the outer one's
+_MAX_HOUSING_CONTRAST = 0.6  # largest contrast of a housing, relative to that of the scene within
+_TEXTURE_BLUR_PX, _TEXTURE_PARTS = 1.5, 12  # pixels; parts of a circle over which the mean is
+# removed
+_CORRELATED_RAYS = 8  # neighbouring rays with correlated errors
 
 
 @dataclass(frozen=True, slots=True)
 class ImageCircle:
-    """The disc that a lens lights."""
+    """The disc of a picture that a lens lights."""
 
     x: float  # centre, pixels, corner origin
     y: float
@@ -51,18 +53,18 @@ class ImageCircle:
     sigma: float = 0.0  # pixels, standard deviation of the radius and of the centre
 
     def scaled(self, factor: float) -> "ImageCircle":
-        """The same circle in a picture of another resolution."""
+        """The circle in a picture of `factor` times the resolution."""
         x, y, radius, sigma = (factor * v for v in (self.x, self.y, self.radius, self.sigma))
         return ImageCircle(x, y, radius, self.support, sigma)
 
 
 @dataclass(frozen=True, slots=True)
 class CircleSearch:
-    """What a search for an image circle found."""
+    """The result of a search for an image circle."""
 
-    best: ImageCircle | None  # the best candidate; None = no edges at all
+    best: ImageCircle | None  # the best candidate; None = no edges were found
     num_rays: int  # rays that agree with it
-    found: bool  # whether it is an image circle
+    found: bool  # True if it is an image circle
     middle_grey: int  # median of the middle of the picture
     corner_grey: int  # median of its corners
 
@@ -72,7 +74,7 @@ class CircleSearch:
         return self.best if self.found else None
 
     def sighting(self) -> str:
-        """What was seen, for a message."""
+        """Description of the best candidate, for a message."""
         seen = f"median grey {self.middle_grey} in the middle, {self.corner_grey} in the corners"
         if self.best is None:
             return f"{seen}; no edges around the middle"
@@ -90,64 +92,64 @@ def find_circle(pictures: Sequence[np.ndarray]) -> CircleSearch:
         pictures: (h, w) uint8 each, of one lens, of one size; 5 to 10 from all over the capture.
     """
     height, width = pictures[0].shape
-    scale = min(1.0, _SIDE / max(height, width))
+    scale = min(1.0, _SEARCH_SIZE_PX / max(height, width))
     size = max(round(scale * width), 8), max(round(scale * height), 8)
     small = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in pictures]
     median = np.median(small, axis=0).astype(np.float32)
-    smooth = cv2.GaussianBlur(median, (0, 0), _BLUR)
+    smooth = cv2.GaussianBlur(median, (0, 0), _BLUR_PX)
     best, num_rays = _best_circle(_edges(smooth), small)
     if best is not None:
         best = best.scaled(width / size[0])
-    found = best is not None and best.support >= _MIN_SUPPORT and num_rays >= _MIN_RAYS
+    found = best is not None and best.support >= _MIN_SUPPORT and num_rays >= _MIN_AGREEING_RAYS
     return CircleSearch(best, num_rays, found, *_greys(median))
 
 
 @dataclass(frozen=True, slots=True)
 class _Edges:
-    """Places at which brightness drops along rays from the middle of a picture."""
+    """Edges at which brightness drops along rays from the middle of a picture."""
 
     places: np.ndarray  # (E, 2) float64, pixels, corner origin
-    drops: np.ndarray  # (E,) float64, of the logarithm of the grey value, at most _MAX_DROP
+    drops: np.ndarray  # (E,) float64, of the logarithm of the grey value, at most _DROP_LIMIT
     rays: np.ndarray  # (E,) int64
 
 
 def _edges(smooth: np.ndarray) -> _Edges:
-    """The strongest drops of brightness along each ray of a picture (h, w), relative ones."""
+    """The strongest relative drops of brightness along each ray of a picture (h, w)."""
     height, width = smooth.shape
     angles = _ray_angles()
     reach = np.arange(
-        0.5 * _MIN_RADIUS * min(height, width), np.hypot(height, width) / 2, _SAMPLE_STEP
+        0.5 * _MIN_RADIUS * min(height, width), np.hypot(height, width) / 2, _SAMPLE_STEP_PX
     )
     across = width / 2 + reach * np.cos(angles)[:, None]
     down = height / 2 + reach * np.sin(angles)[:, None]
-    inside = (across > _BORDER) & (across < width - _BORDER)
-    inside &= (down > _BORDER) & (down < height - _BORDER)
+    inside = (across > _BORDER_PX) & (across < width - _BORDER_PX)
+    inside &= (down > _BORDER_PX) & (down < height - _BORDER_PX)
     values = _sampled(smooth, across, down)
     logs = np.log(values + _DARK_OFFSET)
     sums = np.cumsum(np.pad(logs, ((0, 0), (1, 0))), axis=1)
-    means = (sums[:, _WINDOW:] - sums[:, :-_WINDOW]) / _WINDOW
-    drops = means[:, :-_WINDOW] - means[:, _WINDOW:]
-    drops[~inside[:, 2 * _WINDOW - 1 :]] = 0.0
+    means = (sums[:, _WINDOW_SAMPLES:] - sums[:, :-_WINDOW_SAMPLES]) / _WINDOW_SAMPLES
+    drops = means[:, :-_WINDOW_SAMPLES] - means[:, _WINDOW_SAMPLES:]
+    drops[~inside[:, 2 * _WINDOW_SAMPLES - 1 :]] = 0.0
     every, found = np.arange(_NUM_RAYS), []
     for _ in range(_EDGES_PER_RAY):
         at = np.argmax(drops, axis=1)
         depth = drops[every, at]
         for ray in np.flatnonzero(depth >= _MIN_DROP):
-            profile = values[ray, at[ray] : at[ray] + 2 * _WINDOW]
-            radius = reach[at[ray]] + _SAMPLE_STEP * _half_level(profile)
+            profile = values[ray, at[ray] : at[ray] + 2 * _WINDOW_SAMPLES]
+            radius = reach[at[ray]] + _SAMPLE_STEP_PX * _half_level(profile)
             found.append((radius, depth[ray], ray))
-            drops[ray, max(at[ray] - _EDGE_GAP, 0) : at[ray] + _EDGE_GAP + 1] = 0.0
+            drops[ray, max(at[ray] - _MIN_EDGE_GAP, 0) : at[ray] + _MIN_EDGE_GAP + 1] = 0.0
     radii, depths, rays = np.array(found).reshape(-1, 3).T
     rays = rays.astype(np.int64)
     away = np.stack([np.cos(angles[rays]), np.sin(angles[rays])], axis=1)
     places = np.array([width / 2, height / 2]) + radii[:, None] * away
-    return _Edges(places, np.minimum(depths, _MAX_DROP), rays)
+    return _Edges(places, np.minimum(depths, _DROP_LIMIT), rays)
 
 
 def _half_level(profile: np.ndarray) -> float:
-    """Where a falling profile (n,) of brightness is midway between its ends, in samples.
+    """Position in samples at which a falling profile (n,) of brightness is midway between its ends.
 
-    The steepest place of the logarithm lies further out: blur shows there most.
+    The logarithm is steepest further out, where blur weighs most.
     """
     level = 0.5 * (profile[:2].mean() + profile[-2:].mean())
     after = int(np.argmax(profile < level))
@@ -157,14 +159,15 @@ def _half_level(profile: np.ndarray) -> float:
 
 
 def _best_circle(edges: _Edges, pictures: Sequence[np.ndarray]) -> tuple[ImageCircle | None, int]:
-    """The circle that most rays agree with, and how many do; of a scene within a housing, its."""
+    """The circle on which most rays have an edge, and their number; the scene's circle in a
+    housing."""
     height, width = pictures[0].shape
     circles = _trials(edges.places, width, height)
     if not len(circles):
         return None, 0
     scores = np.concatenate(
         [
-            _agreeing(edges.places, circles[start : start + _TRIALS_AT_ONCE]) @ edges.drops
+            _edges_on_circles(edges.places, circles[start : start + _TRIALS_AT_ONCE]) @ edges.drops
             for start in range(0, len(circles), _TRIALS_AT_ONCE)
         ]
     )
@@ -172,20 +175,20 @@ def _best_circle(edges: _Edges, pictures: Sequence[np.ndarray]) -> tuple[ImageCi
     outer = circles[best]
     parts = circles[:, 2] / outer[2]
     apart = np.hypot(*(circles[:, :2] - outer[:2]).T) / outer[2]
-    within = (parts > _INNER[0]) & (parts < _INNER[1]) & (apart < _CONCENTRIC)
-    within &= scores > _INNER_SCORE * scores[best]
+    within = (parts > _INNER_RADII[0]) & (parts < _INNER_RADII[1]) & (apart < _MAX_CENTRE_DISTANCE)
+    within &= scores > _MIN_INNER_SCORE * scores[best]
     if within.any():
         inner = circles[int(np.argmax(np.where(within, scores, -1.0)))]
         between = outer - 0.5 * (outer - inner)
         scene = inner * np.array([1.0, 1.0, 0.93])
-        if _contrast(pictures, between) < _PLAIN * _contrast(pictures, scene):
+        if _contrast(pictures, between) < _MAX_HOUSING_CONTRAST * _contrast(pictures, scene):
             outer = inner
     return _refined(edges, outer, width, height)
 
 
 def _trials(places: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Circles (C, 3), x y radius, through three edges each that may be image circles."""
-    if len(places) < _MIN_RAYS:
+    """Candidate circles (C, 3), x y radius, each through three edges."""
+    if len(places) < _MIN_AGREEING_RAYS:
         return np.zeros((0, 3))
     rng = np.random.default_rng(0)  # the same circles in every run
     a, b, c = (places[rng.integers(len(places), size=_NUM_TRIALS)] for _ in range(3))
@@ -204,19 +207,19 @@ def _trials(places: np.ndarray, width: int, height: int) -> np.ndarray:
     return circles[good]
 
 
-def _agreeing(places: np.ndarray, circles: np.ndarray) -> np.ndarray:
-    """Which edges (E, 2) lie on which circles (C, 3), (C, E) bool."""
+def _edges_on_circles(places: np.ndarray, circles: np.ndarray) -> np.ndarray:
+    """True (C, E) where edges (E, 2) lie on circles (C, 3)."""
     away = np.hypot(places[:, 0] - circles[:, :1], places[:, 1] - circles[:, 1:2])
-    return np.abs(away - circles[:, 2:]) < _TOLERANCE * circles[:, 2:]
+    return np.abs(away - circles[:, 2:]) < _MAX_RELATIVE_DISTANCE * circles[:, 2:]
 
 
 def _refined(edges: _Edges, circle: np.ndarray, width: int, height: int) -> tuple[ImageCircle, int]:
-    """The circle (3,) that fits all edges near it best, and the number of rays with such edges."""
+    """The circle fitted to all edges near a circle (3,), and the number of rays with such edges."""
     x, y, radius = circle
-    for _ in range(_REFINEMENTS):
+    for _ in range(_NUM_REFINEMENTS):
         away = np.hypot(edges.places[:, 0] - x, edges.places[:, 1] - y) - radius
-        near = np.abs(away) < _REFINED_TOLERANCE * radius
-        if np.count_nonzero(near) < _MIN_RAYS // 2:
+        near = np.abs(away) < _MAX_REFINED_DISTANCE * radius
+        if np.count_nonzero(near) < _MIN_AGREEING_RAYS // 2:
             break
         at, weights = edges.places[near], np.sqrt(edges.drops[near])
         columns = np.column_stack([2 * at, np.ones(len(at))]) * weights[:, None]
@@ -224,41 +227,42 @@ def _refined(edges: _Edges, circle: np.ndarray, width: int, height: int) -> tupl
         (x, y, rest), *_ = np.linalg.lstsq(columns, right, rcond=None)
         radius = float(np.sqrt(max(rest + x * x + y * y, 1e-9)))
     away = np.hypot(edges.places[:, 0] - x, edges.places[:, 1] - y) - radius
-    near = np.abs(away) < _REFINED_TOLERANCE * radius
+    near = np.abs(away) < _MAX_REFINED_DISTANCE * radius
     num, angles = len(np.unique(edges.rays[near])), _ray_angles()
     across, down = x + radius * np.cos(angles), y + radius * np.sin(angles)
-    visible = (across > 2 * _BORDER) & (across < width - 2 * _BORDER)
-    visible &= (down > 2 * _BORDER) & (down < height - 2 * _BORDER)
+    visible = (across > 2 * _BORDER_PX) & (across < width - 2 * _BORDER_PX)
+    visible &= (down > 2 * _BORDER_PX) & (down < height - 2 * _BORDER_PX)
     support = min(num / max(int(np.count_nonzero(visible)), 1), 1.0)
     sigma = _sigma(edges.places[near] - np.array([x, y]), away[near])
     return ImageCircle(float(x), float(y), radius, support, sigma), num
 
 
 def _sigma(away: np.ndarray, residuals: np.ndarray) -> float:
-    """Largest standard deviation of centre and radius, pixels, of edges (E, 2) from the centre."""
-    if len(away) <= _RAYS_PER_WITNESS * 3:
+    """Largest standard deviation of centre and radius, pixels, by edges (E, 2) relative to the
+    centre."""
+    if len(away) <= _CORRELATED_RAYS * 3:
         return float("inf")
     units = away / np.linalg.norm(away, axis=1, keepdims=True)
     jacobian = np.column_stack([units, np.ones(len(units))])
-    variance = _RAYS_PER_WITNESS * float(np.mean(residuals**2))
+    variance = _CORRELATED_RAYS * float(np.mean(residuals**2))
     covariance = variance * np.linalg.inv(jacobian.T @ jacobian + 1e-9 * np.eye(3))
     return float(np.sqrt(np.diag(covariance).max()))
 
 
 def _contrast(pictures: Sequence[np.ndarray], circle: np.ndarray) -> float:
-    """Relative contrast of fine structure along a circle (3,), where pictures show it.
+    """Relative contrast of fine structure along a circle (3,), inside the pictures.
 
-    Single pictures tell: their median has lost most of a scene that moves.
+    Single pictures are used: their median has lost most of a moving scene.
     """
     x, y, radius = circle
     angles = np.arange(0, 2 * np.pi, 1.0 / radius)
     across, down = x + radius * np.cos(angles), y + radius * np.sin(angles)
     height, width = pictures[0].shape
-    inside = (across > _BORDER) & (across < width - _BORDER)
-    inside &= (down > _BORDER) & (down < height - _BORDER)
+    inside = (across > _BORDER_PX) & (across < width - _BORDER_PX)
+    inside &= (down > _BORDER_PX) & (down < height - _BORDER_PX)
     if not inside.any():
         return 0.0
-    smooth = [cv2.GaussianBlur(picture, (0, 0), _TEXTURE_BLUR) for picture in pictures]
+    smooth = [cv2.GaussianBlur(picture, (0, 0), _TEXTURE_BLUR_PX) for picture in pictures]
     values = np.stack([_sampled(one, across[None], down[None])[0] for one in smooth])
     length = max(len(angles) // _TEXTURE_PARTS, 3)
     fine = values - cv2.blur(values, (length, 1), borderType=cv2.BORDER_REFLECT)

@@ -1,4 +1,4 @@
-"""Faces of one lens each, cut from whatever a frame is made of."""
+"""Faces of one lens each, cut from frames of any layout."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ def cut(frames: FrameSet, f: int, cutter: ViewCutter) -> list[np.ndarray]:
 
     Args:
         frames: panoramas; raw pairs and equi-angular cube maps are cut in one step.
-        cutter: of that frame.
+        cutter: the cutter for that frame.
     """
     if frames.fisheyes is not None:
         return list(cutter.cut_raw(load_raw(frames, f)))

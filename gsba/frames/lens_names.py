@@ -1,4 +1,4 @@
-"""How cameras name the two files of one recording or picture, one of each lens."""
+"""File names by which cameras mark the two files of one recording, one for each lens."""
 
 import re
 from dataclasses import dataclass
@@ -7,15 +7,15 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class LensNames:
-    """How the names of files say which lens took them."""
+    """A scheme of file names that include the lens."""
 
     pattern: re.Pattern[str]  # of a name: groups before, lens, after
-    lenses: tuple[str, str]  # what the front and the back lens are called, in upper case
-    shown: tuple[str, str]  # how messages call the files
-    maker: str = ""  # camera that names files so; empty = several do
+    lenses: tuple[str, str]  # names of the front and the back lens, in upper case
+    shown: tuple[str, str]  # names of the files in messages
+    maker: str = ""  # camera with this scheme; empty = several have it
 
     def read(self, stem: str) -> tuple[int, str] | None:
-        """Lens, 0 front or 1 back, and the frame's name; None = the stem says no lens."""
+        """Lens, 0 front or 1 back, and the frame's name; None = the stem names no lens."""
         found = self.pattern.fullmatch(stem)
         if found is None:
             return None
@@ -23,7 +23,7 @@ class LensNames:
         return self.lenses.index(found["lens"].upper()), name
 
     def both(self, name: str) -> tuple[str, str] | None:
-        """Names of the front and of the back lens's file; None = the name says no lens."""
+        """Names of the front and of the back lens's file; None = the name includes no lens."""
         found = self.pattern.fullmatch(name)
         if found is None:
             return None
@@ -45,7 +45,7 @@ FUSION_NAMES = (
         ("GPFR...", "GPBK..."),
         "GoPro Fusion",
     ),
-    LensNames(  # the same, further chapters and bursts
+    LensNames(  # further chapters and bursts
         re.compile(r"(?P<before>G)(?P<lens>F|B)(?P<after>\d.*)", re.IGNORECASE),
         ("F", "B"),
         ("GF...", "GB..."),

@@ -1,8 +1,8 @@
-"""What both lenses of a raw pair show at their rims, and what it tells of them.
+"""The overlap of a raw pair's pictures at their rims, and the lens parameters it determines.
 
 Fisheyes of more than 180 degrees both show the seam. Their pictures agree there under the right
 quarter turn of the back lens about its axis, and under the focal length that puts the seam at 90
-degrees: this tells how wide an image circle is before anything is matched.
+degrees: this gives the angle of an image circle before anything is matched.
 """
 
 from collections.abc import Sequence
@@ -14,27 +14,28 @@ import numpy as np
 from gsba.camera.fisheye import Pair, project
 from gsba.types import Fisheye
 
-_MAX_WIDTH = 1024  # pixels of a picture that are enough
+_MAX_WIDTH_PX = 1024  # sufficient width of a picture, pixels
 _NUM_AROUND = 720  # places along the seam
-_OVERLAP = np.deg2rad(np.arange(-4.0, 4.5, 1.0))  # from the seam
+_OVERLAP_RAD = np.deg2rad(np.arange(-4.0, 4.5, 1.0))  # angles from the seam
 _SCALES = 100.0 / np.arange(90.0, 112.25, 0.5)[::-1]  # of focal lengths: circles of 90 to 112
 # degrees from the axis, where they are taken for 100
-_INSIDE = 0.985  # part of a circle's radius: what lies further out is its dark rim
-_MIN_ROWS = 5  # of _OVERLAP
-_LOW = 3  # harmonics around the seam below this one are sky and ground at any focal length
-_TURN_MARGIN = 0.1  # by which the right turn must correlate better than any other
-_MIN_PEAK = 0.25  # correlation at the right focal length
-_PEAK_WIDTH = 5  # of _SCALES on either side, where the correlation must be lower,
-_PEAK_DROP = 0.13  # by this part of the peak
+_MAX_RELATIVE_RADIUS = 0.985  # part of a circle's radius: the rim beyond is dark
+_MIN_ROWS = 5  # least number of rows of _OVERLAP_RAD inside both image circles
+_MIN_HARMONIC = 3  # lowest harmonic used: those below are sky and ground at any focal length
+_MIN_TURN_MARGIN = 0.1  # margin in correlation of the right turn over any other
+_MIN_PEAK_CORRELATION = 0.25  # least correlation at the right focal length
+_PEAK_HALF_WIDTH = 5  # steps of _SCALES on either side of the peak, where the correlation must be
+# lower
+_PEAK_DROP = 0.13  # by this part of the peak's
 
 
 @dataclass(frozen=True, slots=True)
 class Overlap:
-    """How two lenses fit together at the seam."""
+    """The relation of two lenses that their pictures at the seam determine."""
 
     turn: int  # index of the back lens whose pictures continue the front one's
-    turn_is_clear: bool  # whether they continue clearly better than under any other turn
-    scale: float | None  # of focal lengths, by which pictures agree best; None = they do not tell
+    turn_is_clear: bool  # True if they match clearly better than under any other turn
+    scale: float | None  # of focal lengths at which pictures correlate best; None = undetermined
 
 
 def measure_overlap(
@@ -43,15 +44,15 @@ def measure_overlap(
     behind: Sequence[Fisheye],
     radii: tuple[float, float],
 ) -> Overlap:
-    """Compare what both lenses show at the seam under several turns and focal lengths.
+    """Correlate both lenses' pictures at the seam under several turns and focal lengths.
 
     Args:
-        looks: (h, w) uint8 pictures of both lenses, of each of several frames.
+        looks: pictures (h, w) uint8 of both lenses of each frame.
         front: the front lens.
         behind: back lenses, one for each turn about the axis that it may have.
-        radii: of both image circles, pixels.
+        radii: radii of both image circles, pixels.
     """
-    share = min(1.0, _MAX_WIDTH / front.width)
+    share = min(1.0, _MAX_WIDTH_PX / front.width)
     front, behind = _shrunk(front, share), [_shrunk(lens, share) for lens in behind]
     radii, size = (share * radii[0], share * radii[1]), (front.width, front.height)
     smooth = [
@@ -66,43 +67,45 @@ def measure_overlap(
         ahead = [_harmonics(pictures[0], _scaled(front, scale), ring) for pictures in smooth]
         for t, lens in enumerate(behind):
             back = [_harmonics(pictures[1], _scaled(lens, scale), ring) for pictures in smooth]
-            whole[t, s] = np.mean([_alike(a, b, 1) for a, b in zip(ahead, back, strict=True)])
-            fine[t, s] = np.mean([_alike(a, b, _LOW) for a, b in zip(ahead, back, strict=True)])
+            whole[t, s] = np.mean([_correlation(a, b, 1) for a, b in zip(ahead, back, strict=True)])
+            fine[t, s] = np.mean(
+                [_correlation(a, b, _MIN_HARMONIC) for a, b in zip(ahead, back, strict=True)]
+            )
     best = whole.max(axis=1)
     order = np.argsort(best)[::-1]
     turn = int(order[0])
-    clear = len(behind) == 1 or bool(best[turn] > best[order[1]] + _TURN_MARGIN)
+    clear = len(behind) == 1 or bool(best[turn] > best[order[1]] + _MIN_TURN_MARGIN)
     return Overlap(turn, clear, _peak(fine[turn]))
 
 
 def rim_likeness(looks: Sequence[Sequence[np.ndarray]], pair: Pair) -> float:
-    """Mean correlation of what both lenses show around the seam, about 1 where lenses are right.
+    """Mean correlation of both lenses' pictures around the seam, about 1 for correct lenses.
 
     Args:
-        looks: (h, w) uint8 pictures of both lenses, of each of several frames.
+        looks: pictures (h, w) uint8 of both lenses of each frame.
         pair: the lenses.
     """
-    share = min(1.0, _MAX_WIDTH / pair[0].width)
+    share = min(1.0, _MAX_WIDTH_PX / pair[0].width)
     front, back = (_shrunk(lens, share) for lens in pair)
     size, sigma = (front.width, front.height), front.focal / _NUM_AROUND * np.pi
-    ring = _rings(np.pi / 2 + _OVERLAP)
+    ring = _rings(np.pi / 2 + _OVERLAP_RAD)
     scores = []
     for pictures in looks:
         ahead, behind = (
             _harmonics(_smooth(picture, size, sigma), lens, ring)
             for picture, lens in zip(pictures, (front, back), strict=True)
         )
-        scores.append(_alike(ahead, behind, 1))
+        scores.append(_correlation(ahead, behind, 1))
     return float(np.mean(scores))
 
 
 def scaled(pair: Pair, scale: float) -> Pair:
-    """Lenses with focal lengths a number of times as long."""
+    """Both lenses with focal lengths multiplied by `scale`."""
     return _scaled(pair[0], scale), _scaled(pair[1], scale)
 
 
 def _shrunk(lens: Fisheye, share: float) -> Fisheye:
-    """The lens in pictures of a share of its size."""
+    """The lens in pictures scaled by `share`."""
     x, y = lens.principal
     width, height = round(share * lens.width), round(share * lens.height)
     at = (share * x, share * y)
@@ -120,11 +123,11 @@ def _scaled(lens: Fisheye, scale: float) -> Fisheye:
 
 def _seam(front: Fisheye, radii: tuple[float, float], scale: float) -> np.ndarray:
     """Directions (R, A, 3) around the seam that lie inside of both image circles."""
-    ring = np.array([[np.sin(a), np.cos(a)] for a in np.pi / 2 + np.abs(_OVERLAP)])
+    ring = np.array([[np.sin(a), np.cos(a)] for a in np.pi / 2 + np.abs(_OVERLAP_RAD)])
     meridian = np.stack([ring[:, 0], np.zeros(len(ring)), ring[:, 1]], axis=1)
     plain = replace(_scaled(front, scale), rotation=(0.0, 0.0, 0.0))
     reach = np.linalg.norm(project(plain, meridian) - np.asarray(front.principal), axis=1)
-    return _rings(np.pi / 2 + _OVERLAP[reach < _INSIDE * min(radii)])
+    return _rings(np.pi / 2 + _OVERLAP_RAD[reach < _MAX_RELATIVE_RADIUS * min(radii)])
 
 
 def _rings(angles: np.ndarray) -> np.ndarray:
@@ -144,7 +147,7 @@ def _harmonics(picture: np.ndarray, lens: Fisheye, ring: np.ndarray) -> np.ndarr
     return np.fft.rfft(seen.astype(np.float64), axis=1)
 
 
-def _alike(one: np.ndarray, other: np.ndarray, lowest: int) -> float:
+def _correlation(one: np.ndarray, other: np.ndarray, lowest: int) -> float:
     """Correlation of two pictures by their coefficients from the harmonic `lowest` on."""
     a, b = one[:, lowest:], other[:, lowest:]
     product = float(np.sum(np.real(a * np.conj(b))))
@@ -152,10 +155,11 @@ def _alike(one: np.ndarray, other: np.ndarray, lowest: int) -> float:
 
 
 def _peak(scores: np.ndarray) -> float | None:
-    """The scale of focal lengths at the peak of correlations (S,); None = there is no clear one."""
+    """The scale of focal lengths at a clear peak of correlations (S,); None = there is no clear
+    one."""
     best = int(np.argmax(scores))
-    sides = best - _PEAK_WIDTH, best + _PEAK_WIDTH
-    if sides[0] < 0 or sides[1] >= len(scores) or scores[best] < _MIN_PEAK:
+    sides = best - _PEAK_HALF_WIDTH, best + _PEAK_HALF_WIDTH
+    if sides[0] < 0 or sides[1] >= len(scores) or scores[best] < _MIN_PEAK_CORRELATION:
         return None
     if max(scores[list(sides)]) > (1 - _PEAK_DROP) * scores[best]:
         return None

@@ -1,4 +1,4 @@
-"""Equirectangular masks: white = use, black = do not, light grey = use with less weight."""
+"""Equirectangular masks: white = use, black = do not use, light grey = use with less weight."""
 
 import functools
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from gsba.frames.files import IMAGE_SUFFIXES, decode, image_size, is_image
 from gsba.log import GsbaError
 from gsba.types import FrameSet
 
-_UNUSED = 127  # grey level up to which pixels are not used
+_MAX_UNUSED_LEVEL = 127  # highest grey level of unused pixels
 
 
 def find_masks(
@@ -29,7 +29,7 @@ def find_masks(
         (F,) paths, all None without masks.
 
     Raises:
-        GsbaError: a missing or unreadable mask, or one of another size.
+        GsbaError: a mask is missing, unreadable or of another size.
     """
     if masks is None:
         return (None,) * len(names)
@@ -61,12 +61,12 @@ def load_mask(frames: FrameSet, f: int) -> np.ndarray | None:
     levels = _load_levels(frames, f)
     if levels is None:
         return None
-    usable = levels > _UNUSED
+    usable = levels > _MAX_UNUSED_LEVEL
     return straightened(usable, frames.correction) if frames.correction else usable
 
 
 def load_usable(frames: FrameSet, f: int) -> np.ndarray | None:
-    """As `load_mask`, and of raw pairs without what lies on the seam between the lenses."""
+    """Mask like that of `load_mask`, without the seam between the lenses of raw pairs."""
     mask = load_mask(frames, f)
     if frames.fisheyes is None:
         return mask
@@ -82,21 +82,21 @@ def load_weights(frames: FrameSet, f: int) -> np.ndarray | None:
     levels = _load_levels(frames, f)
     if levels is None:
         return None
-    usable = levels > _UNUSED
+    usable = levels > _MAX_UNUSED_LEVEL
     if frames.correction:
         usable, levels = (straightened(image, frames.correction) for image in (usable, levels))
-    above = np.maximum(levels, _UNUSED + 1) - np.float32(_UNUSED)
-    return np.where(usable, above / (255 - _UNUSED), 0).astype(np.float32)
+    above = np.maximum(levels, _MAX_UNUSED_LEVEL + 1) - np.float32(_MAX_UNUSED_LEVEL)
+    return np.where(usable, above / (255 - _MAX_UNUSED_LEVEL), 0).astype(np.float32)
 
 
 def levels_of(weights: np.ndarray) -> np.ndarray:
     """Grey levels (H, 2H) uint8 of a mask file with these weights (H, 2H) 0..1, or bool."""
-    above = np.maximum(np.rint((255 - _UNUSED) * weights.astype(np.float32)), 1)
-    return np.where(weights > 0, _UNUSED + above, 0).astype(np.uint8)
+    above = np.maximum(np.rint((255 - _MAX_UNUSED_LEVEL) * weights.astype(np.float32)), 1)
+    return np.where(weights > 0, _MAX_UNUSED_LEVEL + above, 0).astype(np.uint8)
 
 
 def _load_levels(frames: FrameSet, f: int) -> np.ndarray | None:
-    """Grey levels (H, 2H) uint8 as they are in the file."""
+    """Grey levels (H, 2H) uint8 of the mask file."""
     path = frames.mask_paths[f]
     if path is None:
         return None
@@ -107,10 +107,10 @@ def _load_levels(frames: FrameSet, f: int) -> np.ndarray | None:
 
 @functools.lru_cache(maxsize=1)
 def _levels_in(path: Path, size: tuple[int, int], written: int | None) -> np.ndarray:
-    """What a file written at that time holds: one mask of all frames is decoded once."""
+    """Grey levels of a file written at that time: a mask shared by all frames is decoded once."""
     values = decode(path, size, gray=True)
     if values.max() == 1:
-        raise GsbaError(f"{path}: mask holds 0 and 1; write 255 where pixels are to be used")
+        raise GsbaError(f"{path}: mask holds 0 and 1; write 255 for pixels to be used")
     values.setflags(write=False)
     return values
 

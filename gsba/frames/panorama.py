@@ -11,14 +11,14 @@ from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.types import FACES, FrameSet
 
-_LOOKS = 5  # frames whose brightness stands for all
-_PAD = 3  # pixels of a face's neighbours around it: the support of bicubic sampling, and one
+_NUM_BRIGHTNESS_FRAMES = 5  # frames by whose brightness `bright_level` judges all
+_PADDING_PX = 3  # pixels copied from a face's neighbours: the support of bicubic sampling, and one
 
 
 def width_for(frames: FrameSet, max_width: int) -> int:
     """Width of the panoramas that `load_grey` makes.
 
-    Cube faces become a panorama with at least their own density at their centres.
+    A panorama of cube faces is at least as dense as these at their centres.
     """
     width = frames.panorama_width
     while width > max_width and width % 4 == 0:
@@ -27,10 +27,10 @@ def width_for(frames: FrameSet, max_width: int) -> int:
 
 
 def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Panorama of a frame and where it may be used.
+    """Grey panorama of a frame and its mask.
 
     Args:
-        width: as `width_for` says.
+        width: pixels across, see `width_for`.
 
     Returns:
         (width / 2, width) uint8 grey; (width / 2, width) bool or None, True = use.
@@ -57,7 +57,7 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
 
 
 class Greys:
-    """Grey panoramas of frames that are read again and again: the first ones stay in memory."""
+    """Grey panoramas of frames that are read repeatedly: the first ones stay in memory."""
 
     def __init__(self, frames: FrameSet, max_width: int, limit_mb: float = 128.0) -> None:
         self.num_frames, self.width = len(frames), width_for(frames, max_width)
@@ -65,15 +65,15 @@ class Greys:
         self._room = int(limit_mb * 2**20 / self.width**2)  # images of width^2 / 2, and masks
         self._kept: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
 
-    def __reduce__(self) -> tuple[object, ...]:  # pictures are read again
+    def __reduce__(self) -> tuple[object, ...]:  # workers read the pictures again
         return Greys, (self._frames, self.width, self._limit_mb)
 
     def taken(self, chosen: np.ndarray) -> "Greys":
-        """Those of some frames (F',), ascending, as workers elsewhere can read them."""
+        """The panoramas of some frames (F',), ascending, with paths for other processes."""
         return Greys(self._frames.taken(chosen, absolute=True), self.width, self._limit_mb)
 
     def __getitem__(self, frame: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """As `load_grey`, from any thread."""
+        """Panorama and mask like those of `load_grey`, from any thread."""
         found = self._kept.get(frame)
         if found is None:
             found = load_grey(self._frames, frame, self.width)
@@ -84,7 +84,7 @@ class Greys:
 
 def bright_level(greys: Greys) -> int:
     """Grey value that 99 % of the usable pixels of some frames do not exceed; 255 without any."""
-    chosen = np.unique(np.linspace(0, greys.num_frames - 1, _LOOKS).astype(int))
+    chosen = np.unique(np.linspace(0, greys.num_frames - 1, _NUM_BRIGHTNESS_FRAMES).astype(int))
     found = [greys[int(f)] for f in chosen]
     used = [(grey if mask is None else grey[mask]).ravel() for grey, mask in found]
     values = np.concatenate(used)
@@ -99,7 +99,7 @@ def _fit(grey: np.ndarray, width: int) -> np.ndarray:
 
 
 def fit_mask(mask: np.ndarray, width: int) -> np.ndarray:
-    """A mask resized to a width; a pixel is usable where all it covers is."""
+    """A mask resized to a width; a pixel is usable if all pixels below it are."""
     if mask.shape[1] == width:
         return mask
     share = cv2.resize(mask.astype(np.float32), (width, width // 2), interpolation=cv2.INTER_AREA)
@@ -113,14 +113,14 @@ def _erp_maps(size: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     bearings = bearings_from_erp(np.stack(centres, axis=-1), width, width // 2)
     owners = owner_faces(bearings)
     pixels = CubeRig(size, np.pi / 2).project(bearings, owners)
-    return np.moveaxis(pixels - 0.5 + _PAD, -1, 0).astype(np.float32), owners
+    return np.moveaxis(pixels - 0.5 + _PADDING_PX, -1, 0).astype(np.float32), owners
 
 
 @functools.lru_cache(maxsize=2)
 def _border_maps(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where the padding of each face lies on others: as `_erp_maps`, (2, 6, N, N) and (6, N, N)."""
+    """Owner pixels of the padding of each face, like `_erp_maps`: (2, 6, N, N) and (6, N, N)."""
     rig = CubeRig(size, np.pi / 2)
-    places = np.arange(-_PAD, size + _PAD) + 0.5
+    places = np.arange(-_PADDING_PX, size + _PADDING_PX) + 0.5
     grid = np.stack(np.meshgrid(places, places), axis=-1)
     bearings = np.stack([rig.bearings(grid, face) for face in range(len(FACES))])
     owners = owner_faces(bearings)
@@ -131,9 +131,11 @@ def _border_maps(size: int) -> tuple[np.ndarray, np.ndarray]:
 def _padded(faces: np.ndarray) -> np.ndarray:
     """Faces (6, N, N) with a border of their neighbours' pixels."""
     maps, owners = _border_maps(faces.shape[1])
-    out = np.pad(faces, ((0, 0), (_PAD, _PAD), (_PAD, _PAD)), mode="edge")
+    out = np.pad(
+        faces, ((0, 0), (_PADDING_PX, _PADDING_PX), (_PADDING_PX, _PADDING_PX)), mode="edge"
+    )
     inner = np.zeros(owners.shape[1:], bool)
-    inner[_PAD:-_PAD, _PAD:-_PAD] = True
+    inner[_PADDING_PX:-_PADDING_PX, _PADDING_PX:-_PADDING_PX] = True
     for face in range(len(FACES)):
         for other in range(len(FACES)):
             own = (owners[face] == other) & ~inner

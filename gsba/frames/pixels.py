@@ -1,4 +1,4 @@
-"""Pixels of a frame: its panorama, of whatever it is made, or its cube faces."""
+"""Pixels of a frame: its panorama, for any panoramic layout, or its cube faces."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from gsba.types import FrameSet
 def load_erp(frames: FrameSet, f: int, gray: bool = False, width: int | None = None) -> np.ndarray:
     """Equirectangular image of frame f, (height, width, 3) uint8 RGB, or (height, width) grey.
 
-    Where the frames have a correction, it is applied.
+    The frames' stitching correction is applied, if they have one.
 
     Args:
         frames: panoramas.
@@ -37,9 +37,9 @@ def load_erp(frames: FrameSet, f: int, gray: bool = False, width: int | None = N
 
 
 def load_padded(frames: FrameSet, f: int, buffers: Buffers) -> np.ndarray:
-    """As `load_erp`, in colour, with PAD pixels of wrap-around: (height + 2 PAD, width + 2 PAD, 3).
+    """Panorama like that of `load_erp`, RGB, padded: (height + 2 PAD, width + 2 PAD, 3) uint8.
 
-    It lies in the thread's buffers: the next one takes its place. A JPEG is decoded at the end of
+    It lies in the thread's buffers: the next one replaces it. A JPEG is decoded at the end of
     the memory through which it is then moved, so that a frame is held once.
     """
     shape = (frames.height + 2 * PAD, frames.width + 2 * PAD, 3)

@@ -1,4 +1,4 @@
-"""Raw dual fisheyes on disk: which pictures are of one frame, what their lenses are at first."""
+"""Raw dual fisheyes on disk: pairs of pictures, and the initial calibration of their lenses."""
 
 import logging
 import re
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsba.camera.calibration import fitted, read_calibration
+from gsba.camera.calibration import read_calibration, scaled_to_size
 from gsba.camera.fisheye import Pair
 from gsba.frames.files import decode, image_size, is_image
 from gsba.frames.image_circles import CircleSearch, ImageCircle, find_circle
@@ -21,12 +21,14 @@ from gsba.types import FACES, Fisheye
 _log = logging.getLogger(__name__)
 
 _OF_FACE = re.compile(rf".+_({'|'.join(FACES)})", re.IGNORECASE)
-_HALF_FOV = np.deg2rad(100.0)  # of the circle that a fisheye of unknown make fills
-_LOOKS = 8  # frames that show the image circles
-_BEHIND = np.diag([-1.0, 1.0, -1.0])  # rig_R_lens of an upright back lens
-_TURNS = [Rotation.from_euler("z", turn).as_matrix() for turn in np.deg2rad([0, 90, 180, 270])]
-_CONTRADICTED = 0.025  # of focal lengths: a calibration this far off is not of the pictures; near
-# things may tell one or two percent where there is none
+_NOMINAL_HALF_FOV_RAD = np.deg2rad(100.0)  # half angle of the image circle of an unknown fisheye
+_NUM_CIRCLE_FRAMES = 8  # frames in which image circles are searched
+_RIG_R_BACK_LENS = np.diag([-1.0, 1.0, -1.0])  # rig_R_lens of an upright back lens
+_QUARTER_TURNS = [
+    Rotation.from_euler("z", turn).as_matrix() for turn in np.deg2rad([0, 90, 180, 270])
+]
+_MAX_FOCAL_CHANGE = 0.025  # relative change of focal lengths from which pictures contradict a
+# calibration; parallax of near things looks like one or two percent
 
 Found = dict[str, tuple[Path, Path]]  # frame -> picture of the front lens, of the back lens
 
@@ -38,7 +40,7 @@ def find_pairs(folder: Path) -> Found | None:
     """Pictures of raw pairs in a folder, one file for each lens; None = it holds something else.
 
     Raises:
-        GsbaError: a picture of one lens has none of the other.
+        GsbaError: a picture of one lens has no counterpart.
     """
     entries = sorted(folder.iterdir())
     images = [path for path in entries if is_image(path) and path.is_file()]
@@ -75,7 +77,8 @@ def find_pairs(folder: Path) -> Found | None:
 
 
 def _tagged_pairs(folder: Path, images: Sequence[Path], tags: LensNames) -> Found | None:
-    """Pairs of files whose names say the lens; panoramas and cube faces may be named so."""
+    """Pairs of files whose names include the lens; None for panoramas and cube faces named like
+    that."""
     tagged = {path: tag for path in images if (tag := tags.read(path.stem))}
     if not tagged or all(_OF_FACE.fullmatch(path.stem) for path in tagged):
         return None
@@ -85,7 +88,7 @@ def _tagged_pairs(folder: Path, images: Sequence[Path], tags: LensNames) -> Foun
     of_lens: tuple[dict[str, Path], dict[str, Path]] = {}, {}
     for path, (lens, name) in tagged.items():
         if name in of_lens[lens]:
-            raise _twice(folder, of_lens[lens][name], path)
+            raise _duplicate_error(folder, of_lens[lens][name], path)
         of_lens[lens][name] = path
     stray = next((path for path in images if path not in tagged), None)
     if stray is not None and all(of_lens):
@@ -107,7 +110,7 @@ def decode_pair(
     """Pictures (h, w[, 3]) uint8 of the front and of the back lens.
 
     Args:
-        paths: of each, or twice that of one file in which they are side by side, perhaps squeezed.
+        paths: of each lens, or twice that of a file with both side by side, perhaps squeezed.
         size: width and height of one lens's picture, not squeezed.
         gray: one channel instead of RGB.
     """
@@ -127,78 +130,81 @@ def lenses_of(
     calibration: Path | None,
     circles: Sequence[ImageCircle] = (),
 ) -> tuple[Pair, bool]:
-    """What the lenses of raw pairs are at first: by a calibration, or of the circles they show.
+    """Initial lenses of raw pairs: from a calibration, or from the image circles.
 
     Args:
-        folder: that the pictures are in.
+        folder: folder of the pictures.
         pairs: files of each frame.
         size: width and height of one lens's picture.
         calibration: file; None = there is none.
-        circles: image circles of the front and the back lens, or one of both; none = found.
+        circles: image circles of the front and the back lens, or one for both; none = detect them.
 
     Returns:
-        the lenses, and whether they are to be estimated: plain ones of unknown make, or of a
-        calibration that the pictures contradict.
+        the lenses, and True if they are to be estimated: nominal lenses, or a calibration that the
+        pictures contradict.
 
     Raises:
         GsbaError: a calibration of other pictures, circles outside of the pictures, or pictures
-            that show no circle.
+            without a visible circle.
     """
-    rows = np.unique(np.linspace(0, len(pairs) - 1, _LOOKS).astype(int))
+    rows = np.unique(np.linspace(0, len(pairs) - 1, _NUM_CIRCLE_FRAMES).astype(int))
     if calibration is not None:
-        known = fitted(read_calibration(calibration), size, calibration)
-        return _checked(folder, known, [pairs[f] for f in rows], size, calibration)
+        known = scaled_to_size(read_calibration(calibration), size, calibration)
+        return _checked_calibration(folder, known, [pairs[f] for f in rows], size, calibration)
     looks = [decode_pair(pairs[f], size, gray=True) for f in rows]
-    front_circle, back_circle = _given(circles, size) or _found(folder, pairs[0], looks)
-    front = _nominal(size, front_circle, np.eye(3))
-    behind = [_nominal(size, back_circle, _BEHIND @ turn) for turn in _TURNS]
+    front_circle, back_circle = _given_circles(circles, size) or _found_circles(
+        folder, pairs[0], looks
+    )
+    front = _nominal_lens(size, front_circle, np.eye(3))
+    behind = [_nominal_lens(size, back_circle, _RIG_R_BACK_LENS @ turn) for turn in _QUARTER_TURNS]
     radii = front_circle.radius, back_circle.radius
     overlap = measure_overlap(looks, front, behind, radii)
     if not overlap.turn_is_clear:
         raise GsbaError(
-            f"{folder}: raw fisheyes of unknown lenses, and what both show at their rims does not "
-            "tell how one is turned against the other: give --calibration FILE"
+            f"{folder}: raw fisheyes of unknown lenses, and their overlap at the rims does not "
+            "determine how one is turned against the other: give --calibration FILE"
         )
     scale = overlap.scale or 1.0
     off = max(front_circle.sigma, back_circle.sigma)
     _log.warning(
-        "%s: raw fisheyes of unknown lenses, taken for %.0f degrees in circles of %.0f and %.0f "
-        "pixels (circles %s%s): --calibration FILE says better",
+        "%s: raw fisheyes of unknown lenses, assumed to cover %.0f degrees in circles of %.0f "
+        "and %.0f pixels (circles %s%s): for a better start pass --calibration FILE",
         folder,
-        np.rad2deg(2 * _HALF_FOV) / scale,
+        np.rad2deg(2 * _NOMINAL_HALF_FOV_RAD) / scale,
         *(2 * radius for radius in radii),
         "given" if circles else f"found to {off:.1f} pixels",
-        "" if overlap.scale is None else "; degrees by what both lenses show at the seam",
+        "" if overlap.scale is None else "; degrees by both lenses' overlap at the seam",
     )
     return scaled((front, behind[overlap.turn]), scale), True
 
 
-def _checked(
+def _checked_calibration(
     folder: Path,
     pair: Pair,
     chosen: Sequence[Sequence[Path]],
     size: tuple[int, int],
     calibration: Path,
 ) -> tuple[Pair, bool]:
-    """Calibrated lenses, and whether pictures contradict them: then with focal lengths that fit.
+    """Calibrated lenses; if pictures contradict them, rescaled focal lengths and True (to
+    estimate).
 
     Args:
         chosen: files of some frames, as for `decode_pair`.
     """
     try:
         looks = [decode_pair(paths, size, gray=True) for paths in chosen]
-    except GsbaError:  # said when the picture is used
+    except GsbaError:  # the error is raised when the picture is used
         return pair, False
     circles = [find_circle(pictures).circle for pictures in zip(*looks, strict=True)]
     if circles[0] is None or circles[1] is None:
         return pair, False
     overlap = measure_overlap(looks, pair[0], [pair[1]], (circles[0].radius, circles[1].radius))
     scale = overlap.scale or 1.0
-    if abs(scale - 1) < _CONTRADICTED:
+    if abs(scale - 1) < _MAX_FOCAL_CHANGE:
         return pair, False
     _log.warning(
-        "%s: %s does not fit these pictures: both lenses show the same at the seam with focal "
-        "lengths %.1f %% %s, so they are taken for that and estimated",
+        "%s: %s does not fit these pictures: both lenses match at the seam with focal lengths "
+        "%.1f %% %s; the lenses start from these and are estimated",
         folder,
         calibration.name,
         100 * abs(scale - 1),
@@ -207,10 +213,10 @@ def _checked(
     return scaled(pair, scale), True
 
 
-def _given(
+def _given_circles(
     circles: Sequence[ImageCircle], size: tuple[int, int]
 ) -> tuple[ImageCircle, ImageCircle] | None:
-    """Circles of both lenses as a caller says; None = nothing is said.
+    """Image circles given by the caller; None = none are given.
 
     Raises:
         GsbaError: one of them is not in the picture.
@@ -229,13 +235,13 @@ def _given(
     return circles[0], circles[-1]
 
 
-def _found(
+def _found_circles(
     folder: Path, first: Sequence[Path], looks: Sequence[Sequence[np.ndarray]]
 ) -> tuple[ImageCircle, ImageCircle]:
-    """Circles that the pictures of both lenses show.
+    """Image circles found in the pictures of both lenses.
 
     Raises:
-        GsbaError: one lens's show none.
+        GsbaError: the pictures of a lens show none.
     """
     circles = []
     for name, pictures in zip(("front", "back"), zip(*looks, strict=True), strict=True):
@@ -252,7 +258,7 @@ def _found(
 
 
 def _images_in(folder: Path) -> list[Path]:
-    """Images of what may be a folder, in name order."""
+    """Images in a folder, in name order; none if it is no folder."""
     if not folder.is_dir():
         return []
     try:
@@ -262,18 +268,18 @@ def _images_in(folder: Path) -> list[Path]:
 
 
 def _by_frame(folder: Path, images: Iterable[Path]) -> dict[str, Path]:
-    """Pictures of one lens by frame: by their stems, without what these say of the lens."""
+    """Pictures of one lens by frame name: their stems without the part that names the lens."""
     found: dict[str, Path] = {}
     for path in images:
         tag = next((tag for tags in FUSION_NAMES if (tag := tags.read(path.stem))), None)
         name = path.stem if tag is None else tag[1]
         if name in found:
-            raise _twice(folder, found[name], path)
+            raise _duplicate_error(folder, found[name], path)
         found[name] = path
     return found
 
 
-def _twice(folder: Path, one: Path, other: Path) -> GsbaError:
+def _duplicate_error(folder: Path, one: Path, other: Path) -> GsbaError:
     return GsbaError(
         f"{folder}: '{one.name}' and '{other.name}' are one lens's picture of one frame twice: "
         "keep one"
@@ -293,8 +299,8 @@ def _paired(
     return {name: (path, found[1][name]) for name, path in found[0].items()}
 
 
-def _nominal(size: tuple[int, int], circle: ImageCircle, rig_R_lens: np.ndarray) -> Fisheye:
-    """An equidistant lens that fills a circle."""
+def _nominal_lens(size: tuple[int, int], circle: ImageCircle, rig_R_lens: np.ndarray) -> Fisheye:
+    """An equidistant lens whose field of view fills an image circle."""
     a, b, c = (float(v) for v in Rotation.from_matrix(rig_R_lens).as_rotvec())
-    focal, none = circle.radius / float(_HALF_FOV), (0.0, 0.0, 0.0, 0.0)
+    focal, none = circle.radius / float(_NOMINAL_HALF_FOV_RAD), (0.0, 0.0, 0.0, 0.0)
     return Fisheye(*size, focal, (circle.x, circle.y), none, (a, b, c))

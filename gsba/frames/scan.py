@@ -29,9 +29,9 @@ from gsba.types import FACES, FrameSet
 _log = logging.getLogger(__name__)
 
 MIN_FRAMES = 3
-_SIDES = ("front", "right", "back", "left")
+_SIDE_FACES = ("front", "right", "back", "left")
 _TIMES_FILE = "timestamps.csv"
-_FOREIGN = {  # images that are not read, by suffix
+_UNSUPPORTED_FORMATS = {  # images that are not read, by suffix
     ".avif": "AVIF",
     ".bmp": "BMP",
     ".dng": "DNG",
@@ -53,7 +53,7 @@ def scan(
     calibration: Path | None = None,
     circles: Sequence[ImageCircle] = (),
 ) -> FrameSet:
-    """Frames of a folder, in time order, checked by their headers.
+    """The frames of a folder, in time order, checked by their headers.
 
     It holds equirectangular images; or cube faces in subfolders `front`, `right`, ... or files
     `NAME_front.jpg`, ...; or raw fisheyes, a file for each lens (see `find_pairs`) or side by side
@@ -65,12 +65,12 @@ def scan(
             `fps` is given; else file names that are times; else EXIF tags.
         fps: frames per second of these files in name order.
         masks: one ERP mask for all frames, or a folder with one for each; white = use.
-        order_suffices: where nothing gives times, name order stands in for them.
-        calibration: of the lenses of raw fisheyes, see `gsba.camera.calibration`.
-        circles: of raw fisheyes, front and back, or one of both; none = found.
+        order_suffices: use name order where no source gives times.
+        calibration: calibration file of raw fisheyes, see `gsba.camera.calibration`.
+        circles: image circles of raw fisheyes, front and back, or one for both; none = detect.
 
     Raises:
-        GsbaError: naming the first file or frame that cannot be used.
+        GsbaError: a file or frame cannot be used; the message names the first one.
     """
     _check_times(timestamps, fps)
     layout, faces, found = _find_frames(Path(folder))
@@ -83,7 +83,7 @@ def scan(
     images, lens_size = [group[0] for group in paths], (width, height)
     factory = find_factory_lenses(Path(folder), images) if calibration is None else None
     known = calibration, circles, factory
-    if layout == "erp" and (raw := _beside(Path(folder), images, lens_size, *known)) is not None:
+    if layout == "erp" and (raw := _pair_size(Path(folder), images, lens_size, *known)) is not None:
         layout, lens_size = "fisheye", raw
         paths = tuple((path, path) for path in images)
     fisheyes, nominal = _lenses(Path(folder), layout, paths, lens_size, *known)
@@ -109,7 +109,7 @@ def scan(
 def _check_times(timestamps: Path | None, fps: float | None) -> None:
     """Refuse two sources of times."""
     if timestamps is not None and fps is not None:
-        raise GsbaError("--timestamps and --fps both say when frames were taken; pass one")
+        raise GsbaError("--timestamps and --fps both give the times of frames; pass one")
 
 
 def _in_time_order(
@@ -119,7 +119,7 @@ def _in_time_order(
     fps: float | None,
     order_suffices: bool,
 ) -> tuple[tuple[str, ...], np.ndarray, bool]:
-    """Names (F,) of the frames, their times (F,) ascending, and whether these are times."""
+    """Names (F,) of the frames, ascending times (F,), and True if these are real times."""
     names = sorted(found, key=_natural)
     _check_names(folder, names)
     if names != sorted(names):
@@ -140,7 +140,7 @@ def _in_time_order(
     return tuple(names), times, timed
 
 
-def _beside(
+def _pair_size(
     folder: Path,
     images: Sequence[Path],
     size: tuple[int, int],
@@ -148,8 +148,7 @@ def _beside(
     circles: Sequence[ImageCircle] = (),
     factory: FactoryLenses | None = None,
 ) -> tuple[int, int] | None:
-    """Width and height of one lens's picture where images hold two side by side; None = they are
-    panoramas.
+    """Width and height of one lens's picture where images hold two side by side; None = panoramas.
 
     Raises:
         GsbaError: they are neither.
@@ -164,7 +163,7 @@ def _beside(
     for note in found.notes:
         _log.info(note)
     if found.lens_size is None and circles and may_hold_two(size):
-        _log.info("%s: taken for two fisheyes side by side, as --circle says", folder)
+        _log.info("%s: read as two fisheyes side by side, because of --circle", folder)
         return lens_sizes(size)[-1]
     if found.lens_size is None and size[0] != 2 * size[1]:
         raise _no_panorama(images[0], image_header(images[0]), "; nor are there two image circles")
@@ -180,7 +179,8 @@ def _lenses(
     circles: Sequence[ImageCircle],
     factory: FactoryLenses | None,
 ) -> tuple[Pair | None, bool]:
-    """What the lenses of raw fisheyes are, None = there are none, and whether to estimate them."""
+    """Initial lenses of raw fisheyes, None = other layouts; and True if they are to be
+    estimated."""
     if layout == "fisheye" and factory is not None and not circles:
         return starting_lenses(folder, paths, size, factory), True
     if layout == "fisheye":
@@ -197,20 +197,22 @@ def _lenses(
 
 
 def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
-    """Panoramas of a folder in name order; nothing is asked of their times, which are 0, 1, ...
+    """The panoramas of a folder in name order; times are not needed, and are 0, 1, ...
 
     Raises:
-        GsbaError: no panoramas, or a mask that does not fit.
+        GsbaError: the folder holds no panoramas, or a mask does not fit.
     """
     layout, _, found = _find_frames(Path(folder))
     if layout != "erp":
-        raise GsbaError(f"{folder}: holds no panoramas; these are wanted here")
+        raise GsbaError(f"{folder}: holds no panoramas; give a folder of equirectangular images")
     names = sorted(found, key=_natural)
     _check_names(Path(folder), names)
     paths = tuple(found[name] for name in names)
     width, height = _common_size(paths, layout)
-    if _beside(Path(folder), [path for (path,) in paths], (width, height)) is not None:
-        raise GsbaError(f"{folder}: holds raw fisheyes side by side; panoramas are wanted here")
+    if _pair_size(Path(folder), [path for (path,) in paths], (width, height)) is not None:
+        raise GsbaError(
+            f"{folder}: holds raw fisheyes side by side; give a folder of equirectangular images"
+        )
     return FrameSet(
         names=tuple(names),
         paths=_absolute(paths),
@@ -225,7 +227,7 @@ def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
 
 
 def _check_names(folder: Path, names: Sequence[str]) -> None:
-    """Refuse names that no table and no dataset could hold."""
+    """Refuse names that a table or a dataset cannot hold."""
     for name in names:
         if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in name):
             raise GsbaError(
@@ -235,7 +237,7 @@ def _check_names(folder: Path, names: Sequence[str]) -> None:
 
 
 def _absolute(paths: Sequence[Sequence[Path]]) -> tuple[tuple[Path, ...], ...]:
-    """Paths that hold from any working folder."""
+    """Paths that do not depend on the working folder."""
     return tuple(tuple(path.absolute() for path in group) for group in paths)
 
 
@@ -264,7 +266,7 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
     if others:
         _log.info("%s: ignored %d other entries: %s", folder, len(others), ", ".join(others[:5]))
     places = [folder, *(path for path in entries if path.name.lower() in FACES and path.is_dir())]
-    foreign = _foreign(path for place in places for path in _entries(place))
+    foreign = _unsupported_images(path for place in places for path in _entries(place))
     if foreign and (subfolders or images):
         _log.warning("%s: left out %s: convert them to JPEG, PNG, WebP or TIFF", folder, foreign)
     if subfolders:
@@ -287,7 +289,7 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
         )
     tagged = {path: m for path in images if (m := re.fullmatch(_TAGGED, path.stem))}
     tags = {match["face"].lower() for match in tagged.values()}
-    if not tags.issuperset(_SIDES) and len(tagged) < len(images):
+    if not tags.issuperset(_SIDE_FACES) and len(tagged) < len(images):
         found = _by_name(folder, images)
         return "erp", (), {name: (path,) for name, path in found.items()}
     stray = next((path for path in images if path not in tagged), None)
@@ -304,9 +306,9 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
 _TAGGED = re.compile(rf"(?P<name>.+)_(?P<face>{'|'.join(FACES)})", re.IGNORECASE)
 
 
-def _foreign(paths: Iterable[Path]) -> str:
-    """How many images of which formats that are not read: "2 TIFF and 1 WebP images", or ""."""
-    kinds = [_FOREIGN.get(path.suffix.lower()) for path in paths if path.name[0] != "."]
+def _unsupported_images(paths: Iterable[Path]) -> str:
+    """Number and format of images in unsupported formats: "2 TIFF and 1 WebP images", or ""."""
+    kinds = [_UNSUPPORTED_FORMATS.get(path.suffix.lower()) for path in paths if path.name[0] != "."]
     counts = sorted(Counter(kind for kind in kinds if kind).items())
     *front, last = [f"{n} {kind}" for kind, n in counts] or [""]
     text = f"{', '.join(front)} and {last}" if front else last
@@ -341,7 +343,7 @@ def _cube_frames(
     """Faces present and each frame's images in that order; all frames have the same faces."""
     faces = tuple(by_face)
     names = set().union(*by_face.values())
-    for face in dict.fromkeys((*_SIDES, *faces)):
+    for face in dict.fromkeys((*_SIDE_FACES, *faces)):
         missing = sorted(names - set(by_face.get(face, ())), key=_natural)
         if missing:
             raise GsbaError(
@@ -352,7 +354,7 @@ def _cube_frames(
 
 
 def _common_size(paths: Sequence[tuple[Path, ...]], layout: str) -> tuple[int, int]:
-    """Width and height that all images share, of the shape the layout asks for."""
+    """Width and height shared by all images, checked against the layout."""
     first = paths[0][0]
     width, height = image_size(first)
     for group in track(paths, "checking frames"):

@@ -17,17 +17,17 @@ from gsba.frames.files import decode
 from gsba.frames.image_circles import CircleSearch, find_circle
 from gsba.log import GsbaError
 
-LOOKED_AT = 5  # pictures in which two circles side by side are searched for
+LOOKED_AT = 5  # pictures in which two image circles side by side are searched
 
-_SMALL = 512  # pixels across that are enough for it
-_SEVERAL = 2  # of them that must show such
-_BLACK, _LIT = 32, 40  # grey levels: around image circles, and inside
-_GLOW = 110  # grey level of corners that a glowing housing lights, at most
-_GLOW_SHARE = 0.75  # the same as a part of the median grey level inside the circles
-_OUTSIDE, _INSIDE = 0.58, 0.42  # radii in heights: beyond circles, those of 200 degrees too, which
-# the frame cuts off; well within
-_ROWS = 0.25  # part of the rows with corners in which circles show beside black ones
-_MAX_HEIGHT = 0.6  # height of a picture that is no 2:1, part of its width
+_SEARCH_WIDTH_PX = 512  # sufficient width of these pictures, pixels
+_MIN_PICTURES = 2  # least number of pictures that must show two circles
+_MAX_BLACK_LEVEL, _MIN_LIT_LEVEL = 32, 40  # grey levels: darkest around image circles; lit inside
+_MAX_GLOW_LEVEL = 110  # largest grey level of corners that a glowing housing lights
+_MAX_RELATIVE_GLOW = 0.75  # the largest level relative to the median inside the circles
+_OUTSIDE_RADIUS, _INSIDE_RADIUS = 0.58, 0.42  # radii in heights: beyond all circles, including
+# those of 200 degrees, which the frame cuts off; well inside of them
+_MIN_LIT_ROWS = 0.25  # least part of the rows with black corners in which circles are lit
+_MAX_RELATIVE_HEIGHT = 0.6  # largest height of a picture that is not 2:1, relative to its width
 _MAKERS = (
     (re.compile(r"360_\d+", re.IGNORECASE), "Samsung Gear 360"),
     (re.compile(r"R00\d+", re.IGNORECASE), "Ricoh Theta"),
@@ -36,7 +36,7 @@ _MAKERS = (
 
 @dataclass(frozen=True, slots=True)
 class SideBySide:
-    """Whether pictures hold two fisheyes side by side, and how these are cut out."""
+    """The result of a search for two fisheyes side by side, and how to cut them out."""
 
     lens_size: tuple[int, int] | None  # width and height, pixels, of one lens's picture, cut out
     # and unsqueezed; None = they hold something else
@@ -45,9 +45,9 @@ class SideBySide:
 
 
 def may_hold_two(size: tuple[int, int]) -> bool:
-    """Whether pictures of this width and height may hold two fisheyes side by side."""
+    """True if pictures of this width and height may hold two fisheyes side by side."""
     width, height = size
-    return width % 2 == 0 and 0.5 * width <= height <= _MAX_HEIGHT * width and height > 0
+    return width % 2 == 0 and 0.5 * width <= height <= _MAX_RELATIVE_HEIGHT * width and height > 0
 
 
 def lens_sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
@@ -58,15 +58,15 @@ def lens_sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
 
 
 def recognise(greys: Iterable[np.ndarray], size: tuple[int, int], where: Path) -> SideBySide:
-    """Find out whether pictures hold two fisheyes side by side.
+    """Detect two fisheyes side by side in pictures.
 
-    Black corners around lit circles tell it of most. Where housings glow in the corners, and in
-    pictures that are no 2:1, both image circles must be found.
+    Black corners around lit circles suffice for most. Where housings glow in the corners, and in
+    pictures that are not 2:1, both image circles must be found.
 
     Args:
         greys: (h, w) uint8 each, perhaps smaller than `size`; no more are taken than needed.
         size: width and height of the pictures.
-        where: they are from, for the notes.
+        where: source of the pictures, for the notes.
     """
     if not may_hold_two(size):
         return SideBySide(None)
@@ -74,7 +74,7 @@ def recognise(greys: Iterable[np.ndarray], size: tuple[int, int], where: Path) -
     rest = iter(greys)
     lens_size = lens_sizes(size)[0]
     if size[0] == 2 * size[1]:
-        shown, notes = two_circles(_noted(rest, taken), where)
+        shown, notes = two_circles(_collected(rest, taken), where)
         if shown or notes:
             return SideBySide(lens_size if shown else None, notes)
     looks = []
@@ -86,25 +86,25 @@ def recognise(greys: Iterable[np.ndarray], size: tuple[int, int], where: Path) -
 
 
 def two_circles(greys: Iterable[np.ndarray], where: Path) -> tuple[bool, tuple[str, ...]]:
-    """Whether 2:1 pictures are two image circles side by side, by their black corners; notes on it.
+    """True if 2:1 pictures hold two image circles side by side, by their black corners; and notes.
 
     A panorama may be black above and below, but then it is black in whole rows; circles are lit in
-    rows whose corners are black. Pictures that are dark all over say nothing.
+    rows whose corners are black. Pictures that are dark all over are skipped.
 
     Args:
         greys: (H, 2H) uint8 each; no more are taken than needed.
-        where: they are of, for the notes.
+        where: source of the pictures, for the notes.
     """
     seen = lit = 0
     for grey in greys:
-        corners_black, rows = _circles(grey)
+        corners_black, rows = _circle_evidence(grey)
         if not corners_black:
             return False, ()
-        seen, lit = seen + 1, lit + (rows >= _ROWS)
+        seen, lit = seen + 1, lit + (rows >= _MIN_LIT_ROWS)
     if not seen:
         return False, ()
-    if lit < min(_SEVERAL, seen):
-        return False, (f"{where}: black corners, but around no circles: taken for a panorama",)
+    if lit < min(_MIN_PICTURES, seen):
+        return False, (f"{where}: black corners, but around no circles: read as a panorama",)
     note = (
         f"{where}: raw, two fisheyes side by side, front left and back right: corners black "
         f"around circles that are not, in {lit} of {seen} frames looked at"
@@ -119,14 +119,14 @@ def in_folder(
     shape: tuple[int, int] | None = None,
     source: str = "",
 ) -> SideBySide:
-    """Find out whether images of a folder hold two fisheyes side by side.
+    """Detect two fisheyes side by side in the images of a folder.
 
     Args:
-        folder: that they are in.
-        paths: in order.
-        size: of each.
-        shape: width and height of the lens's picture that a calibration is of; None = none is
-            given. With one, images are taken for raw.
+        folder: folder of the images.
+        paths: the images in order.
+        size: width and height of each image.
+        shape: width and height of the lens's picture that a calibration belongs to; None = no
+            calibration is given. With one, images are assumed to be raw.
         source: the calibration's name.
 
     Raises:
@@ -135,7 +135,7 @@ def in_folder(
     if not may_hold_two(size):
         return SideBySide(None)
     spread = [(2 * i + 1) * len(paths) // (2 * LOOKED_AT) for i in range(LOOKED_AT)]
-    rows = dict.fromkeys([len(paths) // 2, *spread])  # the middle one settles most panoramas
+    rows = dict.fromkeys([len(paths) // 2, *spread])  # the middle one suffices for most panoramas
     greys = _readable([paths[row] for row in rows], size)
     maker = next((name for named, name in _MAKERS if named.match(paths[0].stem)), "")
     if shape is None:
@@ -143,7 +143,7 @@ def in_folder(
         if found.lens_size is None or not maker:
             return found
         return SideBySide(found.lens_size, (*found.notes, f"{folder}: named as a {maker} does"))
-    if not all(_circles(grey)[0] for grey in greys):
+    if not all(_circle_evidence(grey)[0] for grey in greys):
         raise GsbaError(
             f"{folder}: holds 2:1 pictures that are lit up to the corners, so panoramas that are "
             f"stitched, and {source} is of raw fisheyes: leave --calibration out, or "
@@ -168,7 +168,7 @@ def cut(picture: np.ndarray, lens_size: tuple[int, int]) -> list[np.ndarray]:
 
 
 def _by_circles(looks: Sequence[np.ndarray], size: tuple[int, int], where: Path) -> SideBySide:
-    """The size of a lens's picture under which both halves of pictures show image circles best."""
+    """The lens picture's size under which both halves of pictures show image circles best."""
     best, num_rays, middle = None, 0, 0.5
     for width, height in lens_sizes(size):
         across = looks[0].shape[1] // 2
@@ -194,23 +194,25 @@ def _even(picture: np.ndarray) -> np.ndarray:
     return picture[:, : picture.shape[1] // 2 * 2]
 
 
-def _noted(greys: Iterator[np.ndarray], taken: list[np.ndarray]) -> Iterator[np.ndarray]:
+def _collected(greys: Iterator[np.ndarray], taken: list[np.ndarray]) -> Iterator[np.ndarray]:
     for grey in greys:
         taken.append(grey)
         yield grey
 
 
 def _readable(paths: Iterable[Path], size: tuple[int, int]) -> Iterator[np.ndarray]:
-    """Grey pictures, small ones where that is fast; what is damaged is refused when it is used."""
+    """Grey pictures, small ones where that is fast; damaged ones are skipped here and refused
+    later."""
     for path in paths:
         try:
-            yield decode(path, size, gray=True, at_least=_SMALL)
+            yield decode(path, size, gray=True, at_least=_SEARCH_WIDTH_PX)
         except GsbaError:
             continue
 
 
 def _radii(shape: tuple[int, ...]) -> np.ndarray:
-    """Distance of pixels from the middle of the half that they are in, parts of a half's sides."""
+    """Distance of pixels from the middle of their half of the picture, in units of the half's
+    sides."""
     height, width = shape[0], shape[1]
     v, u = np.ogrid[:height, :width]
     side = width / 2
@@ -218,27 +220,28 @@ def _radii(shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _corners_lit(grey: np.ndarray) -> bool:
-    """Whether a picture (h, w) uint8 is brighter around image circles than a housing glows."""
+    """True if a picture (h, w) uint8 is brighter around image circles than a glowing housing."""
     radii = _radii(grey.shape)
-    around = float(np.percentile(grey[radii > _OUTSIDE], 90))
-    inside = float(np.median(grey[radii < _INSIDE]))
-    return around >= min(_GLOW, max(_GLOW_SHARE * inside, _BLACK))
+    around = float(np.percentile(grey[radii > _OUTSIDE_RADIUS], 90))
+    inside = float(np.median(grey[radii < _INSIDE_RADIUS]))
+    return around >= min(_MAX_GLOW_LEVEL, max(_MAX_RELATIVE_GLOW * inside, _MAX_BLACK_LEVEL))
 
 
-def _circles(grey: np.ndarray) -> tuple[bool, float]:
-    """What speaks for two image circles in a picture (H, 2H) uint8, or in one that is squeezed.
+def _circle_evidence(grey: np.ndarray) -> tuple[bool, float]:
+    """Evidence for two image circles in a picture (H, 2H) uint8, or in a squeezed one.
 
     Returns:
-        whether all around them is black, and in which part of the rows they are lit beside it.
+        True if all around them is black; part of the rows in which they are lit beside it.
     """
     radii = _radii(grey.shape)
-    outside, inside = radii > _OUTSIDE, radii < _INSIDE
+    outside, inside = radii > _OUTSIDE_RADIUS, radii < _INSIDE_RADIUS
     rows = np.flatnonzero(outside.any(axis=1) & inside.any(axis=1))
     if not len(rows):
         return False, 0.0
-    black = bool(np.percentile(grey[outside], 90) < _BLACK)
+    black = bool(np.percentile(grey[outside], 90) < _MAX_BLACK_LEVEL)
     lit = [
-        np.median(grey[row, inside[row]]) > _LIT and grey[row, outside[row]].mean() < _BLACK
+        np.median(grey[row, inside[row]]) > _MIN_LIT_LEVEL
+        and grey[row, outside[row]].mean() < _MAX_BLACK_LEVEL
         for row in rows
     ]
     return black, float(np.mean(lit))

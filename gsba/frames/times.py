@@ -16,16 +16,21 @@ _log = logging.getLogger(__name__)
 
 # Whole numbers that are Unix times between 2001 and 2100, by unit: ticks per second.
 _UNIX_RANGE_S = (1_000_000_000, 4_102_444_800)
-_TICKS = {"seconds": 1, "milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}
+_TICKS_PER_SECOND = {
+    "seconds": 1,
+    "milliseconds": 10**3,
+    "microseconds": 10**6,
+    "nanoseconds": 10**9,
+}
 
-_LATEST_S = 1e20  # even nanoseconds since 1970 taken for seconds are earlier
-_RATES = (1e-6, 1e6)  # frames per second that --fps may be
-_MIN_INTERVAL_S = 1e-3  # frame intervals shorter than this are not times but numbering
-_HOW = "pass --timestamps FILE or --fps F, or put a timestamps.csv (name,timestamp) beside them"
+_MAX_TIME_S = 1e20  # upper bound; even nanoseconds since 1970 read as seconds are below
+_FPS_RANGE = (1e-6, 1e6)  # range of --fps, frames per second
+_MIN_INTERVAL_S = 1e-3  # frame intervals shorter than this are numbering, not times
+_ADVICE = "pass --timestamps FILE or --fps F, or put a timestamps.csv (name,timestamp) beside them"
 
 
 class NoTimesError(GsbaError):
-    """Nothing says when frames were taken."""
+    """No source gives the times of frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +46,7 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
     """Numbered lines of a text file without blank lines and # comments.
 
     Raises:
-        GsbaError: missing, unreadable or not text.
+        GsbaError: the file is missing, unreadable or not text.
     """
     try:
         if path.is_dir() or path.is_char_device() or path.is_block_device():
@@ -59,11 +64,11 @@ def seconds(text: str) -> float:
     """Seconds written as a decimal number, or as Unix time in whole ms, us or ns.
 
     Raises:
-        ValueError: not a finite number, or none that a clock could show.
+        ValueError: the text is no finite number, or no clock shows it.
     """
     unit = unix_unit(text)
-    value = int(text) / _TICKS[unit] if unit else float(text)
-    if not abs(value) <= _LATEST_S:
+    value = int(text) / _TICKS_PER_SECOND[unit] if unit else float(text)
+    if not abs(value) <= _MAX_TIME_S:
         raise ValueError(text)
     return value
 
@@ -73,7 +78,7 @@ def unix_unit(text: str) -> str | None:
     if not re.fullmatch(r"[0-9]+", text):
         return None
     low, high = _UNIX_RANGE_S
-    return next((u for u, t in _TICKS.items() if low * t <= int(text) < high * t), None)
+    return next((u for u, t in _TICKS_PER_SECOND.items() if low * t <= int(text) < high * t), None)
 
 
 def read_times(path: Path) -> list[TimeRow]:
@@ -82,7 +87,7 @@ def read_times(path: Path) -> list[TimeRow]:
     A header is optional. Columns are separated by commas or blanks.
 
     Raises:
-        GsbaError: naming the line that is malformed.
+        GsbaError: a line is malformed; the message names it.
     """
     lines = read_lines(path)
     rows = [
@@ -132,14 +137,14 @@ def frame_times(
         names: (F,) frame names without extension, in name order.
         table: file that `read_times` understands; a plain list is in name order.
         fps: frames per second of these very frames: frame i is at i / fps.
-        order_suffices: where nothing gives times, name order stands in for them.
+        order_suffices: use name order where no source gives times.
         pictures: (F,) files of each frame, whose EXIF tags are read last.
 
     Returns:
         (F,) float64 seconds, not necessarily sorted, and whether they are times.
 
     Raises:
-        GsbaError: a frame without a time, or times that would have to be guessed.
+        GsbaError: a frame has no time, or its time would have to be guessed.
     """
     if table is not None:
         rows = read_times(table)
@@ -162,15 +167,15 @@ def frame_times(
 
 
 def check_fps(fps: float) -> float:
-    """A rate that was asked for, if it is one.
+    """The frame rate, if it is valid.
 
     Raises:
-        GsbaError: not positive, or so small or large that no camera has it.
+        GsbaError: the rate is not positive, or no camera has it.
     """
-    if not _RATES[0] <= fps <= _RATES[1]:
+    if not _FPS_RANGE[0] <= fps <= _FPS_RANGE[1]:
         raise GsbaError(
-            f"--fps {fps}: must be a positive number of frames per second, from {_RATES[0]:g} to "
-            f"{_RATES[1]:g}"
+            f"--fps {fps}: must be a positive number of frames per second, from "
+            f"{_FPS_RANGE[0]:g} to {_FPS_RANGE[1]:g}"
         )
     return fps
 
@@ -211,11 +216,11 @@ def _times_at_rate(names: Sequence[str], fps: float) -> np.ndarray:
     counters = [int(m[0]) for name in names if (m := re.search(r"[0-9]{1,18}$", name))]
     steps = np.diff(counters)
     skips = np.flatnonzero(steps != np.median(steps)) if len(counters) == len(names) else []
-    if 0 < len(skips) <= len(steps) / 2:  # mostly even: counters with holes
+    if 0 < len(skips) <= len(steps) / 2:  # counters are mostly even, with gaps
         before, after = names[skips[0]], names[skips[0] + 1]
         raise NoTimesError(
-            f"frame numbers skip between '{before}' and '{after}', so --fps alone does not say "
-            "when frames were taken; pass --timestamps FILE"
+            f"frame numbers skip between '{before}' and '{after}', so --fps alone does not give "
+            "their times; pass --timestamps FILE"
         )
     return np.arange(len(names)) / fps
 
@@ -223,12 +228,12 @@ def _times_at_rate(names: Sequence[str], fps: float) -> np.ndarray:
 def _times_from_names(names: Sequence[str]) -> np.ndarray | None:
     """Times of names that are decimal seconds, or whole Unix times after a common prefix.
 
-    None where names are none of these.
+    None = other names.
     """
     if all(re.fullmatch(r"[0-9]+\.[0-9]+", name) for name in names):
         times = np.array([float(name) for name in names])
         if np.median(np.diff(np.sort(times))) < _MIN_INTERVAL_S:
-            raise NoTimesError(f"names like '{names[0]}' are too close to be seconds; {_HOW}")
+            raise NoTimesError(f"names like '{names[0]}' are too close to be seconds; {_ADVICE}")
         _log.info("frame times are the file names, in seconds")
         return times
     split = [re.fullmatch(r"(.*?)([0-9]+)", name) for name in names]
@@ -245,14 +250,14 @@ def _times_from_exif(names: Sequence[str], pictures: Sequence[Sequence[Path]]) -
     """Times of DateTimeOriginal and SubSecTimeOriginal, Unix time where the zone is given.
 
     Raises:
-        NoTimesError: not all frames have one, or they do not ascend with the names.
+        NoTimesError: a frame has none, or they do not ascend with the names.
     """
     tags = [_time_tags(files) for files in track(pictures, "reading EXIF")]
-    why, taken = _unusable(names, tags), [tag.taken for tag in tags if tag is not None]
+    why, taken = _why_exif_is_unusable(names, tags), [tag.taken for tag in tags if tag is not None]
     if not taken or why:
-        said = f"; EXIF times are not used: {why}" if why else ""
+        unused = f"; EXIF times are not used: {why}" if why else ""
         first = f"the frames ('{names[0]}', ...)"
-        raise NoTimesError(f"nothing says when {first} were taken{said}; {_HOW}")
+        raise NoTimesError(f"no source gives the times of {first}{unused}; {_ADVICE}")
     zoned = all(tag is not None and tag.zoned for tag in tags)
     what = "Unix time" if zoned else "local time, as no time zone is given"
     whole = "" if any(tag is not None and tag.subsecond for tag in tags) else ", in whole seconds"
@@ -260,8 +265,8 @@ def _times_from_exif(names: Sequence[str], pictures: Sequence[Sequence[Path]]) -
     return np.array(taken, np.float64)
 
 
-def _unusable(names: Sequence[str], tags: Sequence[ExifTags | None]) -> str:
-    """Why EXIF times are no times of the frames; empty = they are, or none is there."""
+def _why_exif_is_unusable(names: Sequence[str], tags: Sequence[ExifTags | None]) -> str:
+    """Reason why EXIF times cannot be used; empty = they can, or no picture has one."""
     dated = [tag for tag in tags if tag is not None]
     if dated and len(dated) < len(tags):
         lacking = next(name for name, tag in zip(names, tags, strict=True) if tag is None)
@@ -280,7 +285,7 @@ def _unusable(names: Sequence[str], tags: Sequence[ExifTags | None]) -> str:
 
 
 def _time_tags(files: Sequence[Path]) -> ExifTags | None:
-    """Tags of the first picture of a frame that says when it was taken; None = none does."""
+    """Tags of the first picture of a frame that has a time; None = none has."""
     for path in files:
         try:
             tags = read_exif(path)

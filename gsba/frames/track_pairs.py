@@ -1,6 +1,6 @@
-"""Equi-angular cube maps on disk: the two tracks of GoPro's MAX cameras, a picture each a frame.
+"""Equi-angular cube maps on disk: two tracks of GoPro's MAX cameras, two pictures a frame.
 
-They are resampled once, straight into what is asked for: a panorama here, faces in `cubemap`.
+They are resampled once, directly into the result: a panorama here, faces in `cubemap`.
 """
 
 import logging
@@ -30,12 +30,12 @@ from gsba.types import FACES, FrameSet
 _log = logging.getLogger(__name__)
 
 _FOLDER = re.compile(r"track(\d+)", re.IGNORECASE)
-_BAND = 256  # rows of which coordinates are held in double precision
-_LOOKED_AT = 5  # frames in which edges of squares are compared
-_MIN_CORRELATION = 0.5  # median, of grey values along edges that squares of both tracks share:
+_ROWS_AT_ONCE = 256  # rows whose coordinates are held in double precision at once
+_NUM_CHECKED_FRAMES = 5  # frames in which edges of squares are compared
+_MIN_CORRELATION = 0.5  # median correlation of grey values along edges shared by both tracks:
 # 0.95 and more on real frames, 0.2 and less on pictures of several instants
-_PARTS = 64  # of an edge, whose mean grey values are compared
-_MIN_CONTRAST = 4.0  # grey levels, standard deviation along an edge that tells
+_NUM_SEGMENTS = 64  # segments of an edge, whose mean grey values are compared
+_MIN_CONTRAST = 4.0  # least standard deviation of grey levels along an edge that is used
 
 
 def find_tracks(folder: Path) -> dict[str, tuple[Path, ...]] | None:
@@ -76,10 +76,11 @@ def find_tracks(folder: Path) -> dict[str, tuple[Path, ...]] | None:
 
 
 def track_size(folder: Path, pairs: Sequence[tuple[Path, ...]]) -> tuple[int, int]:
-    """Width and height of the pictures of two tracks, after a look at all headers and some pixels.
+    """Width and height of the pictures of two tracks; checks all headers and the pixels of some
+    frames.
 
     Args:
-        folder: of both tracks.
+        folder: folder of both tracks.
         pairs: paths of both pictures of each frame.
 
     Raises:
@@ -90,7 +91,7 @@ def track_size(folder: Path, pairs: Sequence[tuple[Path, ...]]) -> tuple[int, in
     width, height = image_size(first)
     if not is_equiangular(width, height):
         raise GsbaError(
-            f"{first}: is {width}x{height}, no track of a .360 recording: that is three squares "
+            f"{first}: is {width}x{height}, no track of a .360 recording, which is three squares "
             "wide and up to a twelfth more (4096x1344, 2272x736)"
         )
     for path in (path for pair in pairs for path in pair):
@@ -132,7 +133,7 @@ def _decoded(paths: Sequence[Path], size: tuple[int, int], gray: bool) -> np.nda
 
 def _check_edges(folder: Path, pairs: Sequence[tuple[Path, ...]], size: tuple[int, int]) -> None:
     """Refuse tracks whose grey values on both sides of common edges are not correlated."""
-    rows = np.unique(np.linspace(0, len(pairs) - 1, _LOOKED_AT).astype(int))
+    rows = np.unique(np.linspace(0, len(pairs) - 1, _NUM_CHECKED_FRAMES).astype(int))
     found = [_edge_correlations(_decoded(pairs[row], size, gray=True)) for row in rows]
     known = np.concatenate(found)
     if len(known) and np.median(known) < _MIN_CORRELATION:
@@ -148,8 +149,8 @@ def _maps(grid: Grid, width: int) -> np.ndarray:
     """Places (2, width / 2, width) float32 of a panorama's pixels in a grid, OpenCV pixels."""
     height = width // 2
     maps = np.empty((2, height, width), np.float32)
-    for top in range(0, height, _BAND):
-        rows = np.arange(top, min(top + _BAND, height)) + 0.5
+    for top in range(0, height, _ROWS_AT_ONCE):
+        rows = np.arange(top, min(top + _ROWS_AT_ONCE, height)) + 0.5
         pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, rows), axis=-1)
         found = grid.places(bearings_from_erp(pixels, width, height))
         maps[:, top : top + len(rows)] = np.moveaxis(found, -1, 0)
@@ -174,7 +175,7 @@ def _edge_correlations(faces: np.ndarray) -> np.ndarray:
             inner = np.clip(beyond, 0, size - 1).astype(int)
             there = np.clip(pixels, 0, size - 1).astype(int)
             sides = faces[n, inner[:, 1], inner[:, 0]], faces[others, there[:, 1], there[:, 0]]
-            parts = [np.array_split(values, min(_PARTS, size)) for values in sides]
+            parts = [np.array_split(values, min(_NUM_SEGMENTS, size)) for values in sides]
             a, b = ([part.mean() for part in side] for side in parts)
             if min(np.std(a), np.std(b)) > _MIN_CONTRAST:
                 found.append(np.corrcoef(a, b)[0, 1])

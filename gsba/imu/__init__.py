@@ -1,7 +1,7 @@
-"""A gyro and an accelerometer that ride with the camera.
+"""A gyro and an accelerometer fixed to the camera.
 
-Takes their readings from a table or a maker's file, and how the images turn.
-Gives the turn between frames and during each, in the rig's axes, and which way is up.
+Takes their readings from a table or a maker's file, and rotations from images.
+Gives rotations between frames, angular velocities during each, and the vertical, rig axes.
 """
 
 from gsba.imu.alignment import Alignment, align

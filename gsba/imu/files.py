@@ -1,10 +1,10 @@
-"""Readings of inertial units from disk: a table, or a maker's recording.
+"""Files of inertial readings: a table, or a maker's recording.
 
 Recordings of Insta360 are read by `gsba.containers`: it knows the layouts that `telemetry_parser`
-knows, leaves axes as they are (the library mirrors those of some cameras), and neither ends the
-process nor takes gigabytes over a damaged file. Other recordings are read by the library.
+knows, keeps the axes (the library mirrors those of some cameras), and neither ends the process nor
+takes gigabytes over a damaged file. Other recordings are read by the library.
 
-A table has a column of times, three of rates and, if need be, three of forces, separated by commas,
+A table has a column of times, three of rates and optionally three of forces, separated by commas,
 semicolons or blanks. Without a header these are, in this order, seconds, rad/s and m/s^2. A header
 names columns (`t`, `gyro_x`, `acc_x`, ...), in any order among others, and may give units in
 brackets (`gyro_x [deg/s]`).
@@ -22,28 +22,34 @@ from gsba.imu.readings import Readings
 from gsba.log import GsbaError, brief
 
 _TABLES = (".csv", ".txt", ".tsv", ".dat")
-_FASTEST = 40.0  # rad/s: gyros end at 35, which are 2000 deg/s
-_SLOWEST = 25.0  # readings per second: less say nothing of the 10 to 30 ms of a readout
-_LEAST = 10  # readings
+_MAX_RATE_RAD_S = 40.0  # rad/s: gyros saturate at 35, which are 2000 deg/s
+_MIN_READINGS_HZ = 25.0  # readings per second: fewer do not resolve a readout of 10 to 30 ms
+_MIN_READINGS = 10  # least number of readings
 _STANDARD_GRAVITY = 9.80665
 _DEGREE = np.pi / 180
-_TIMES = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_RATES = {"": 1.0, "rad/s": 1.0, "deg/s": _DEGREE, "dps": _DEGREE}
-_FORCES = {"": 1.0, "m/s2": 1.0, "g": _STANDARD_GRAVITY}
-_NAMES = {
-    "t": (r"t|time|timestamp", _TIMES),
-    "gyro": (r"(?:w|g|gyr|gyro|gyroscope|omega|w_rs_s|angular_velocity)[_. ]?([xyz])", _RATES),
-    "acc": (r"(?:a|acc|accel|accelerometer|a_rs_s|linear_acceleration)[_. ]?([xyz])", _FORCES),
+_SECONDS_OF_UNIT = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_RAD_S_OF_UNIT = {"": 1.0, "rad/s": 1.0, "deg/s": _DEGREE, "dps": _DEGREE}
+_M_S2_OF_UNIT = {"": 1.0, "m/s2": 1.0, "g": _STANDARD_GRAVITY}
+_COLUMN_PATTERNS = {
+    "t": (r"t|time|timestamp", _SECONDS_OF_UNIT),
+    "gyro": (
+        r"(?:w|g|gyr|gyro|gyroscope|omega|w_rs_s|angular_velocity)[_. ]?([xyz])",
+        _RAD_S_OF_UNIT,
+    ),
+    "acc": (
+        r"(?:a|acc|accel|accelerometer|a_rs_s|linear_acceleration)[_. ]?([xyz])",
+        _M_S2_OF_UNIT,
+    ),
 }
-_UNSAID = ["t", *(f"gyro_{axis}" for axis in "xyz"), *(f"acc_{axis}" for axis in "xyz")]
+_DEFAULT_COLUMNS = ["t", *(f"gyro_{axis}" for axis in "xyz"), *(f"acc_{axis}" for axis in "xyz")]
 
 
 def read_imu(path: Path) -> Readings:
     """Readings of a table, or of a maker's recording.
 
     Raises:
-        GsbaError: what cannot be read or used, with the line; or `telemetry_parser` is needed and
-            not installed.
+        GsbaError: the file cannot be read or used; the message names the line. Or
+            `telemetry_parser` is needed and not installed.
     """
     path = Path(path)
     if path.suffix.lower() in _TABLES or not path.is_file():
@@ -52,15 +58,15 @@ def read_imu(path: Path) -> Readings:
 
 
 def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
-    """Readings that a maker's recording holds.
+    """Readings stored in a maker's recording.
 
     Args:
-        path: of the recording.
-        lasting_s: seconds that its pictures last; readings that state their times from the first
-            frame, and none from while these last, are of another recording. None = not known.
+        path: the recording.
+        lasting_s: duration of its pictures, seconds; readings timed from the first frame that begin
+            after it are of another recording. None = not known.
 
     Raises:
-        GsbaError: it holds no readings that can be used, or `telemetry_parser` is needed and not
+        GsbaError: the file holds no usable readings, or `telemetry_parser` is needed and not
             installed.
     """
     trailer = read_trailer(path)
@@ -113,7 +119,7 @@ def _read_table(path: Path) -> Readings:
             f"{path}:{lines[0][0]}: {len(lines[0][1])} columns; want t, gyro x y z [rad/s] and "
             "accelerometer x y z [m/s^2], or a header that names them"
         )
-    names = _UNSAID[: len(lines[0][1])] if header is None else header[1]
+    names = _DEFAULT_COLUMNS[: len(lines[0][1])] if header is None else header[1]
     columns = _columns(f"{path}:{header[0]}" if header else str(path), names)
     values = np.empty((len(lines), len(columns)))
     for n, (line, cells) in enumerate(lines):
@@ -129,11 +135,11 @@ def _read_table(path: Path) -> Readings:
 
 
 def _header(path: Path) -> tuple[int, list[str]] | None:
-    """A header behind a #, where the first line is one: it begins with the column of times."""
+    """A header behind a # in the first line, which begins with the column of times."""
     with path.open(encoding="utf-8-sig") as file:
         first = file.readline().strip()
     cells = _cells(first.lstrip("# "))
-    timed = re.fullmatch(_NAMES["t"][0], _name_and_unit(cells[0] if cells else "")[0])
+    timed = re.fullmatch(_COLUMN_PATTERNS["t"][0], _name_and_unit(cells[0] if cells else "")[0])
     return (1, cells) if first.startswith("#") and timed else None
 
 
@@ -152,15 +158,15 @@ def _is_number(text: str) -> bool:
 
 
 def _columns(where: str, names: list[str]) -> list[tuple[int, float]]:
-    """Column of t, of each axis of the gyro and of the accelerometer, and what its unit is worth.
+    """Column of t, of each axis of gyro and accelerometer, and the factor of its unit.
 
     Raises:
-        GsbaError: one that is missing, named twice, or of a unit that is not known.
+        GsbaError: a column is missing, named twice, or has an unknown unit.
     """
     found: dict[str, tuple[int, float]] = {}
     for column, name in enumerate(names):
         plain, unit = _name_and_unit(name)
-        for kind, (pattern, units) in _NAMES.items():
+        for kind, (pattern, units) in _COLUMN_PATTERNS.items():
             match = re.fullmatch(pattern, plain)
             if match is None:
                 continue
@@ -171,15 +177,17 @@ def _columns(where: str, names: list[str]) -> list[tuple[int, float]]:
             if key in found:
                 raise GsbaError(f"{where}: two columns are {key}: leave one out")
             found[key] = column, units[unit]
-    wanted = _UNSAID if any(key.startswith("acc") for key in found) else _UNSAID[:4]
+    wanted = (
+        _DEFAULT_COLUMNS if any(key.startswith("acc") for key in found) else _DEFAULT_COLUMNS[:4]
+    )
     for key in wanted:
         if key not in found:
-            raise GsbaError(f"{where}: no column is {key}: name them {', '.join(_UNSAID)}")
+            raise GsbaError(f"{where}: no column is {key}: name them {', '.join(_DEFAULT_COLUMNS)}")
     return [found[key] for key in wanted]
 
 
 def _name_and_unit(name: str) -> tuple[str, str]:
-    """A column's name in small letters, and its unit as the tables here spell it."""
+    """A column's name in lower case, and its unit in the spelling of the tables here."""
     match = re.fullmatch(r"([^\[(]*?)\s*(?:[\[(](.*)[\])])?", name.lower().strip())
     plain, unit = (match[1], match[2] or "") if match else (name, "?")
     for old, new in (("²", "2"), ("^2", "2"), ("s^-1", "/s"), ("s^-2", "/s2"), ("°", "deg")):
@@ -194,9 +202,11 @@ def _checked(
     forces: np.ndarray | None,
     where: list[str],
 ) -> Readings:
-    """Readings that can be used; `where` names each."""
-    if len(times) < _LEAST:
-        raise GsbaError(f"{path}: {len(times)} readings of a gyro; at least {_LEAST} are needed")
+    """Readings, checked to be usable; `where` names each."""
+    if len(times) < _MIN_READINGS:
+        raise GsbaError(
+            f"{path}: {len(times)} readings of a gyro; at least {_MIN_READINGS} are needed"
+        )
     bad = np.flatnonzero(~np.isfinite(np.column_stack([times, rates])).all(axis=1))
     if len(bad):
         raise GsbaError(f"{path}:{where[bad[0]]}: holds a number that is not finite")
@@ -206,16 +216,16 @@ def _checked(
             f"{path}:{where[late[0] + 1]}: time {times[late[0] + 1]:.9g} does not come after "
             f"{times[late[0]]:.9g}; sort the file"
         )
-    fast = np.flatnonzero(np.abs(rates).max(axis=1) > _FASTEST)
+    fast = np.flatnonzero(np.abs(rates).max(axis=1) > _MAX_RATE_RAD_S)
     if len(fast):
         raise GsbaError(
             f"{path}:{where[fast[0]]}: {np.abs(rates[fast[0]]).max():.4g} rad/s, which no gyro "
-            "measures: if these are deg/s, say so in a header (gyro_x [deg/s], ...)"
+            "measures: if these are deg/s, name the unit in a header (gyro_x [deg/s], ...)"
         )
     every = float(np.median(np.diff(times)))
-    if every > 1 / _SLOWEST:
+    if every > 1 / _MIN_READINGS_HZ:
         raise GsbaError(
-            f"{path}: a reading every {every:.3g} s; {_SLOWEST:g} per second are needed: is t in "
-            "another unit (t [ms])?"
+            f"{path}: a reading every {every:.3g} s; {_MIN_READINGS_HZ:g} per second are needed: "
+            "is t in another unit (t [ms])?"
         )
     return Readings(times, rates, forces)

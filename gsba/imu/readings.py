@@ -1,27 +1,27 @@
-"""What an inertial unit measured, and the rotations that its rates add up to."""
+"""Readings of an inertial unit, and their integration to rotations."""
 
 import hashlib
 from dataclasses import dataclass
 
 import numpy as np
 
-_MOST_GAP = 0.1  # s between two readings: the camera may have turned otherwise meanwhile
+_MAX_GAP_S = 0.1  # s between two readings: in longer gaps the rotation is unknown
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """What a gyro makes of a rate."""
+    """Calibration of a gyro: true rate = scales * (measured rate - bias)."""
 
-    bias: np.ndarray  # (3,) float64, rad/s, what it shows at rest
-    scales: np.ndarray  # (3,) float64, rad/s for each that it shows beside, about one
+    bias: np.ndarray  # (3,) float64, rad/s, reading at rest
+    scales: np.ndarray  # (3,) float64, true over measured rate without bias, about one
 
     @classmethod
     def ideal(cls) -> "Sensor":
-        """One that shows what is."""
+        """A gyro without bias and scale error."""
         return cls(np.zeros(3), np.ones(3))
 
     def true(self, shown: np.ndarray) -> np.ndarray:
-        """Rates (n, 3) of rates that it shows."""
+        """True rates (n, 3) of measured rates (n, 3)."""
         return self.scales * (shown - self.bias)
 
 
@@ -29,7 +29,7 @@ class Sensor:
 class Readings:
     """Readings of a gyro and an accelerometer with common axes, right-handed, fixed to the camera.
 
-    How these lie in the camera, and what the gyro shows at rest, is not known.
+    Their rotation against the camera and the gyro's bias are not known.
     """
 
     timestamps: np.ndarray  # (N,) float64, seconds on a clock of their own, strictly increasing
@@ -38,21 +38,21 @@ class Readings:
 
     @property
     def digest(self) -> str:
-        """Equal for equal readings."""
+        """Hash of the readings: equal readings have equal digests."""
         forces = () if self.forces is None else (self.forces,)
         parts = [np.ascontiguousarray(part) for part in (self.timestamps, self.rates, *forces)]
         return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
 
     def between(self, begin: float, end: float) -> "Readings":
-        """Those of a span of time, and one more at either end."""
+        """Readings of a span of time, and one more at either end."""
         first = max(int(np.searchsorted(self.timestamps, begin)) - 1, 0)
         last = int(np.searchsorted(self.timestamps, end, side="right")) + 1
         forces = None if self.forces is None else self.forces[first:last]
         return Readings(self.timestamps[first:last], self.rates[first:last], forces)
 
     def covers(self, times: np.ndarray) -> np.ndarray:
-        """Whether spans of time (n, 2) lie within the readings (n,), without a gap."""
-        late = np.diff(self.timestamps, append=np.inf) > _MOST_GAP
+        """True (n,) for spans of time (n, 2) within the readings, without a gap."""
+        late = np.diff(self.timestamps, append=np.inf) > _MAX_GAP_S
         gaps = np.concatenate([[0], np.cumsum(late)])
         first = np.searchsorted(self.timestamps, times[:, 0], side="right") - 1
         last = np.searchsorted(self.timestamps, times[:, 1]) - 1
@@ -79,7 +79,7 @@ class Readings:
         return np.concatenate([np.eye(3)[None], turned])
 
     def mean_rates(self, times: np.ndarray, span: float) -> np.ndarray:
-        """Mean rates (n, 3) over a span of seconds around times (n,); NaN where none are known."""
+        """Mean rates (n, 3) over a span of seconds around times (n,); NaN where unknown."""
         angles = np.zeros_like(self.rates)
         steps = 0.5 * (self.rates[:-1] + self.rates[1:]) * np.diff(self.timestamps)[:, None]
         np.cumsum(steps, axis=0, out=angles[1:])
@@ -88,6 +88,6 @@ class Readings:
         return np.where(self.covers(ends)[:, None], (at[:, 1] - at[:, 0]) / span, np.nan)
 
     def noise(self) -> float:
-        """Noise of a rate, rad/s per axis, from how neighbours differ from a line."""
+        """Noise of a rate, rad/s per axis, from second differences of neighbours."""
         bent = self.rates[2:] - 2 * self.rates[1:-1] + self.rates[:-2]
         return float(1.4826 * np.median(np.abs(bent)) / np.sqrt(6)) if len(bent) else 0.0

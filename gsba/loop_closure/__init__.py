@@ -1,7 +1,7 @@
-"""Places met again: loops that drift had hidden, and maps that nothing ties together.
+"""Loop closure and map merging: revisited places that drift displaced, and maps without a tie.
 
-Takes a solution and what matches its frames.
-Gives it bent so that places coincide, or its parts joined into one map.
+Takes a solution, and features and settings to match its frames.
+Gives the solution with loops closed, or its parts joined into one map.
 """
 
 from gsba.loop_closure.connectivity import parted

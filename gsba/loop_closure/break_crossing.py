@@ -1,8 +1,8 @@
-"""Similarities of two maps from single pairs of frames over a short break between both.
+"""Similarities of two maps from single pairs of frames across a short break between them.
 
-Two frames that see the same things give their relative rotation and the direction from one to the
-other, and distances of points in units of that step. Points that one of the maps knows say how long
-the step is in its unit; so both maps together say what the one's unit is in the other's.
+Two overlapping frames give their relative rotation, the direction from one to the other, and
+distances of points in units of that step. Points of one of the maps give the step's length in its
+unit; so both maps together give the ratio of their units.
 """
 
 import numpy as np
@@ -13,9 +13,10 @@ from gsba.similarity import Sim3
 from gsba.trajectory.steps import ray_depths
 from gsba.types import Keypoints, VerifiedPairs
 
-_MIN_POINTS = 8  # that either map must know of a pair
-_MAX_SIGMA = 0.1  # of the logarithm of a length, relative: points that are too far tell no scale
-MIN_AGREEING = 3  # pairs
+_MIN_SHARED_POINTS = 8  # points of a pair that either map must hold
+# Largest standard deviation of the logarithm of a length: far points determine no scale.
+_MAX_LOG_LENGTH_SIGMA = 0.1
+MIN_AGREEING = 3  # least number of pairs
 
 
 def crossing(
@@ -28,8 +29,8 @@ def crossing(
     """Similarities of a part and the map, one from each pair of frames over a break.
 
     Args:
-        pairs: of one frame outside the map and one inside.
-        keypoints: of all frames.
+        pairs: pairs of one frame outside the map and one inside.
+        keypoints: keypoints of all frames.
         poses: (F, 4, 4), each frame's in its own map.
         known: (F) of (K_f, 3), points of each frame's keypoints in its rig frame, NaN = unknown.
         outside: frames of the part.
@@ -59,7 +60,7 @@ def agreed(proposals: list[Proposal], poses: np.ndarray, depth: float) -> Propos
     """The proposal that most others agree with; None if these are too few, or no majority.
 
     Args:
-        proposals: of single pairs.
+        proposals: proposals of single pairs.
         poses: (F, 4, 4), each frame's in its own map.
         depth: median distance of points, map units.
     """
@@ -70,12 +71,12 @@ def agreed(proposals: list[Proposal], poses: np.ndarray, depth: float) -> Propos
 
 
 def _step_length(known: np.ndarray, depths: np.ndarray) -> float | None:
-    """Length of a step in the unit of a map that knows points (m, 3), from their distances (m,) in
-    steps; None where it is not sure."""
+    """Length of a step in the unit of a map, from its points (m, 3) and their distances (m,) in
+    steps; None if it is too uncertain."""
     logs = np.log(np.linalg.norm(known, axis=1) / depths)
     logs = logs[np.isfinite(logs)]
-    if len(logs) < _MIN_POINTS:
+    if len(logs) < _MIN_SHARED_POINTS:
         return None
     middle = float(np.median(logs))
     sigma = 1.25 * 1.4826 * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))
-    return float(np.exp(middle)) if sigma < _MAX_SIGMA else None
+    return float(np.exp(middle)) if sigma < _MAX_LOG_LENGTH_SIGMA else None

@@ -1,4 +1,4 @@
-"""Which frames belong together: tied by images or steps, and the matches and maps of each group."""
+"""Connected components of frames, tied by images or steps; matches within components."""
 
 import numpy as np
 
@@ -8,12 +8,10 @@ from gsba.types import Matches, Solution, Tracks
 def parted(
     pairs: np.ndarray, held: np.ndarray, scarce: np.ndarray | None = None
 ) -> np.ndarray | None:
-    """Part (F,) int64 that each frame is in, 0 that of the most frames; None = there is one.
-
-    Args:
-        pairs: (P, 2) frames that images tie together.
-        held: (F - 1,) bool, steps that tie their frames besides.
-        scarce: (F,) bool, frames that are parts of their own whatever the pairs.
+    """Component (F,) int64 of each frame, 0 = the largest; None = there is one.
+    pairs: (P, 2) frames tied by images.
+    held: (F - 1,) bool, steps that tie their frames without images.
+    scarce: (F,) bool, frames that are components of their own despite pairs.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -28,12 +26,12 @@ def parted(
 
 
 def several(found: np.ndarray) -> np.ndarray | None:
-    """Labels, or None where all are the same."""
+    """Labels, or None if all are equal."""
     return found if (found != found[0]).any() else None
 
 
 def by_size(found: np.ndarray) -> np.ndarray:
-    """Labels (F,) numbered anew, the most frequent one 0."""
+    """Labels (F,) renumbered by descending frequency."""
     _, first, inverse_, counts = np.unique(
         found, return_index=True, return_inverse=True, return_counts=True
     )
@@ -58,8 +56,8 @@ def starving(solved: Solution, least: int) -> np.ndarray:
 
 
 def bridging(tracks: Tracks, num_frames: int) -> np.ndarray:
-    """Points (F,) that hand the scale on at each frame: seen from three frames or more, of which
-    some are before it and some after it."""
+    """Number (F,) of points that carry the scale across each frame: seen from three or more frames,
+    some before and some after it."""
     first = np.flatnonzero(np.diff(tracks.points, prepend=-1))
     if not len(first):
         return np.zeros(num_frames, np.int64)

@@ -1,10 +1,10 @@
-"""What speaks for a join of two parts of a map, and what speaks against it.
+"""Evidence for and against a join of two parts of a map.
 
-If a join is true, a point that one part knows shows in frames of the other part that stand close by
-and know a surface where the point must appear. A poster, a window or an arch that repeats brings
-matches for a false join, but not the rest of the place. So points that are found again are weighed
-against those that are not, by how often points are found again within parts under the same change
-of view. Points of a small cell of space are one witness, and witnesses of one region err together.
+If a join is true, frames of one part see points of the other part that lie on surfaces they already
+know nearby. A repeated poster, window or arch brings matches for a false join, but not the rest of
+the place. So points that are found again are weighed against those that are not, relative to the
+rate at which points are found again within parts under the same change of view. Points of a small
+cell of space count as one witness, and witnesses of one region have correlated errors.
 """
 
 from collections.abc import Sequence
@@ -17,36 +17,38 @@ from gsba.geometry import inverse
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.types import Matches
 
-LOCAL = 12  # frames to either side of a meeting, which are asked what speaks for and against it
-WIDER = 36  # the same where these leave it open
-_REACH = 2.0  # local depths between two frames that are compared
-_NEAREST = 3  # frames that each frame is compared with
-_MOST_PAIRS = 150
-_MADE_BY = 2  # frames apart: points are made from matches of frames as close as that
-_GATE = np.deg2rad(4.0)  # around the direction in which a point must appear
-_SURFACE = 2 * np.sin(np.deg2rad(6.0) / 2)  # chord around it, in which a frame must know a surface
-_SURFACE_POINTS = 3  # of those a frame knows, the nearest to the direction
-_SAME_SURFACE = 1.25  # ratio of the distances of a surface and of a point on it
-_ANGLES = np.deg2rad([6.0, 12.0, 20.0, 30.0, 45.0])  # edges of bins of the angle between two views
-_RATIOS = np.log([1.15, 1.35, 1.7])  # edges of bins of the ratio of distances
-_BINS = (len(_ANGLES) + 1) * (len(_RATIOS) + 1)
-_PSEUDO = 20.0  # points that each bin starts with, found at the rate of all bins
-_TYPICAL = 0.3  # rate where no two frames of one part can be compared
-_AWAY = 2.0  # rad about the vertical: predictions turned by that are met by chance only
-_CELL, _REGION = 0.25, 1.0  # edges of cells of space, median depths
-_UNSEEN_REGIONS = 1.0  # regions with nothing found that are added to those there are; and as many
-# with all found
-_LOOK_ALIKE = 0.3  # share of what should be found again that a look-alike brings: as much as a hall
-# of repeated arches one arch further on
-_SIGMAS = 3.09  # a one-sided error rate of 1e-3
-_ABSENT = 0.1  # share that is as good as nothing found
+LOCAL = 12  # frames to either side of a meeting that are compared
+WIDER = 36  # frames to either side if the LOCAL ones leave it open
+_MAX_DISTANCE_DEPTHS = 2.0  # largest distance of two compared frames, local depths
+_NUM_NEAREST = 3  # nearest frames that each frame is compared with
+_MAX_PAIRS = 150  # largest number of compared pairs of frames
+_TRIANGULATION_GAP = 2  # largest gap in frames between matches that make points
+_GATE_RAD = np.deg2rad(4.0)  # radius around a point's predicted bearing
+# Chord around the predicted bearing within which a frame must know a surface.
+_SURFACE_CHORD = 2 * np.sin(np.deg2rad(6.0) / 2)
+_NUM_SURFACE_POINTS = 3  # points of the frame nearest to the bearing that represent the surface
+_MAX_SURFACE_RATIO = 1.25  # largest ratio of the distances of a surface and of a point on it
+# Edges of bins of the angle between two views.
+_ANGLE_EDGES_RAD = np.deg2rad([6.0, 12.0, 20.0, 30.0, 45.0])
+_LOG_RATIO_EDGES = np.log([1.15, 1.35, 1.7])  # edges of bins of the ratio of distances
+_NUM_BINS = (len(_ANGLE_EDGES_RAD) + 1) * (len(_LOG_RATIO_EDGES) + 1)
+_PRIOR_COUNT = 20.0  # prior count of points in each bin, found at the mean rate of all bins
+_DEFAULT_RATE = 0.3  # rate assumed if no two frames of one part can be compared
+# Rotation about the vertical after which predictions are found by chance only.
+_CHANCE_ROTATION_RAD = 2.0
+_CELL_DEPTHS, _REGION_DEPTHS = 0.25, 1.0  # edges of cells of space, median depths
+_PRIOR_REGIONS = 1.0  # prior number of regions with nothing found, and of regions with all found
+# Share found again at a look-alike: as much as in a hall of repeated arches, one arch further on.
+_LOOK_ALIKE_SHARE = 0.3
+_NUM_SIGMAS = 3.09  # standard deviations of a one-sided error rate of 1e-3
+_ABSENT_SHARE = 0.1  # share that counts as nothing found
 
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Frames of one or of several parts of a map, and the points they know.
+    """Frames of one or of several parts of a map, and the points of their keypoints.
 
-    Each part is in units of its own, or all are in those of one map.
+    Each part has a unit of its own, or all share that of one map.
     """
 
     world_T_rigs: np.ndarray  # (F, 4, 4) float64
@@ -54,7 +56,7 @@ class Places:
     # rig frame, NaN where unknown
 
     def depths(self) -> np.ndarray:
-        """Median distances (F,) of the points that frames know; NaN where there are none."""
+        """Median distances (F,) of the points of each frame; NaN without points."""
         lengths = [np.linalg.norm(points, axis=1) for points in self.known]
         known = [length[np.isfinite(length)] for length in lengths]
         return np.array([np.median(some) if len(some) else np.nan for some in known])
@@ -62,86 +64,86 @@ class Places:
 
 @dataclass(frozen=True, slots=True)
 class Predictions:
-    """Points that one frame knows, where another frame must show them."""
+    """Points of one frame, predicted in another frame."""
 
     points_world: np.ndarray  # (V, 3) float64
-    bins: np.ndarray  # (V,) int64, of the change of view
-    found: np.ndarray  # (V,) bool: a keypoint there matches
+    bins: np.ndarray  # (V,) int64, bin of the change of view
+    found: np.ndarray  # (V,) bool: a keypoint near the prediction matches
 
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """How often predicted points are found."""
+    """Rates at which predicted points are found."""
 
     within: np.ndarray  # (B,) float64, within parts, by change of view
-    chance: float  # where predictions are turned away
+    chance: float  # rate for predictions rotated away
 
 
 @dataclass(frozen=True, slots=True)
 class JoinEvidence:
-    """What the surroundings say of a join."""
+    """Evidence that the surroundings give for or against a join."""
 
-    share: float  # of what a true join lets find again: 1 = as much as within parts, 0 = no more
+    share: float  # found again, relative to a true join: 1 = as much as within parts, 0 = no more
     # than by chance
-    sigma: float  # infinite: nothing is predicted
-    witnesses: int  # cells of space whose points are predicted
+    sigma: float  # infinite: nothing can be predicted
+    witnesses: int  # cells of space with predicted points
 
     def __str__(self) -> str:
         if not self.witnesses:
-            return "no frames of both stand where they see the same"
+            return "no frames of the two maps overlap at this place"
         return (
-            f"{100 * self.share:.0f} % (sigma {100 * self.sigma:.0f} %) of what frames of both "
-            f"should show is found again; look-alikes bring {100 * _LOOK_ALIKE:.0f} %"
+            f"{100 * self.share:.0f} % (sigma {100 * self.sigma:.0f} %) of the points "
+            f"expected in both maps are found again; look-alikes: {100 * _LOOK_ALIKE_SHARE:.0f} %"
         )
 
     @property
     def least(self) -> float:
-        """The share that surely is found again."""
-        return self.share - _SIGMAS * self.sigma
+        """Lower bound of the share found again."""
+        return self.share - _NUM_SIGMAS * self.sigma
 
     @property
     def confirmed(self) -> bool:
-        """Whether surely more is found again than a look-alike brings."""
-        return self.least > _LOOK_ALIKE
+        """True if significantly more is found again than at a look-alike."""
+        return self.least > _LOOK_ALIKE_SHARE
 
     @property
     def refuted(self) -> bool:
-        """Whether surely less is found again than a true join brings."""
-        return self.share + _SIGMAS * self.sigma < _LOOK_ALIKE
+        """True if significantly less is found again than under a true join."""
+        return self.share + _NUM_SIGMAS * self.sigma < _LOOK_ALIKE_SHARE
 
     @property
     def decided(self) -> bool:
-        """Whether the join is confirmed or refuted."""
+        """True if the join is confirmed or refuted."""
         return self.confirmed or self.refuted
 
     @property
     def absent(self) -> bool:
-        """Whether surely next to nothing is found again."""
-        return self.share + _SIGMAS * self.sigma < _ABSENT
+        """True if significantly less than `_ABSENT_SHARE` is found again."""
+        return self.share + _NUM_SIGMAS * self.sigma < _ABSENT_SHARE
 
     def beats(self, other: "JoinEvidence") -> bool:
-        """Whether this join is surely the better one of two."""
-        return self.share - other.share > _SIGMAS * float(np.hypot(self.sigma, other.sigma))
+        """True if this join is significantly better than another."""
+        return self.share - other.share > _NUM_SIGMAS * float(np.hypot(self.sigma, other.sigma))
 
 
 def rates(context: MatchContext, places: Places, parts: np.ndarray, surfaces: bool = True) -> Rates:
-    """How often points of a frame are found again in frames of its own part.
+    """Rates at which points of a frame are found again in frames of its own part.
 
     Args:
-        context: of the run.
-        places: frames and points, each part right in itself.
+        context: features and settings of the run.
+        places: frames and points, each part consistent in itself.
         parts: (F,) int, part of each frame.
         surfaces: see `predict`.
     """
     rows = [np.flatnonzero(parts == p) for p in np.unique(parts)]
     pairs = np.concatenate([nearest_pairs(places, some, some) for some in rows])
-    pairs = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), _MOST_PAIRS)).astype(int)]
+    pairs = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_PAIRS)).astype(int)]
     seen = predict(context, places, pairs, surfaces)[0]
-    numbers, hits = (np.bincount(seen.bins, w, _BINS) for w in (None, seen.found))
-    mean = (hits.sum() + _PSEUDO * _TYPICAL) / (numbers.sum() + _PSEUDO)
-    within = (hits + _PSEUDO * mean) / (numbers + _PSEUDO)
+    numbers, hits = (np.bincount(seen.bins, w, _NUM_BINS) for w in (None, seen.found))
+    mean = (hits.sum() + _PRIOR_COUNT * _DEFAULT_RATE) / (numbers.sum() + _PRIOR_COUNT)
+    within = (hits + _PRIOR_COUNT * mean) / (numbers + _PRIOR_COUNT)
     poses, odd = places.world_T_rigs.copy(), np.arange(len(parts)) % 2 == 1
-    cosine, sine = np.cos(_AWAY), np.sin(_AWAY)
+    cosine, sine = np.cos(_CHANCE_ROTATION_RAD), np.sin(_CHANCE_ROTATION_RAD)
     poses[odd, :3, :3] = poses[odd, :3, :3] @ [[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]
     turned = pairs[odd[pairs[:, 0]] != odd[pairs[:, 1]]]
     away = predict(context, replace(places, world_T_rigs=poses), turned, surfaces)[0]
@@ -156,32 +158,32 @@ def weigh(
     depth: float,
     surfaces: bool = True,
 ) -> tuple[JoinEvidence, Matches]:
-    """Weigh what speaks for and against a join of two groups of frames.
+    """Weigh the evidence for and against a join of two groups of frames.
 
     Args:
-        context: of the run.
-        places: frames and points of both groups, as the join has them.
+        context: features and settings of the run.
+        places: frames and points of both groups after the join.
         groups: (N,) and (M,) frames.
-        usual: of `rates`, with the same `surfaces`.
+        usual: result of `rates`, with the same `surfaces`.
         depth: median distance of points, map units.
         surfaces: see `predict`.
 
     Returns:
-        The evidence, and what was found again: matches of frames of both groups.
+        The evidence, and the points found again: matches of frames of both groups.
     """
-    pairs = nearest_pairs(places, *groups)[:_MOST_PAIRS]
+    pairs = nearest_pairs(places, *groups)[:_MAX_PAIRS]
     seen, found = predict(context, places, pairs, surfaces)
     if not len(seen.found):
         return JoinEvidence(0.0, np.inf, 0), found
-    cells = np.floor(seen.points_world / (_CELL * depth)).astype(np.int64)
+    cells = np.floor(seen.points_world / (_CELL_DEPTHS * depth)).astype(np.int64)
     cells, cell_of = np.unique(cells, axis=0, return_inverse=True)
     numbers = np.bincount(cell_of)
     excess = np.bincount(cell_of, seen.found - usual.chance) / numbers
     expected = np.bincount(cell_of, usual.within[seen.bins] - usual.chance) / numbers
-    regions = np.floor(cells * (_CELL / _REGION)).astype(np.int64)
+    regions = np.floor(cells * (_CELL_DEPTHS / _REGION_DEPTHS)).astype(np.int64)
     region_of = np.unique(regions, axis=0, return_inverse=True)[1]
     excess, expected = np.bincount(region_of, excess), np.bincount(region_of, expected)
-    unseen = _UNSEEN_REGIONS * float(expected.mean())
+    unseen = _PRIOR_REGIONS * float(expected.mean())
     total = float(expected.sum()) + 2 * unseen
     share = (float(excess.sum()) + unseen) / total
     squares = float(np.sum((excess - share * expected) ** 2))
@@ -196,16 +198,18 @@ def around(frames: np.ndarray, middle: int, reach: int = LOCAL) -> np.ndarray:
 
 
 def nearest_pairs(places: Places, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Pairs (P, 2) int32 of frames of two groups that stand close to one another, the closest
-    first, in both orders. Within one group, pairs whose matches make points are left out."""
+    """Pairs (P, 2) int32 of nearby frames of two groups, the closest first, in both orders. Within
+    one group, pairs whose matches make points are left out."""
     positions, depths = places.world_T_rigs[:, :3, 3], places.depths()
     found = set[tuple[int, int]]()
     for some, others in ((one, other), (other, one)):
         for f in some.tolist():
-            apart = others[np.abs(others - f) > _MADE_BY] if some is others else others
+            apart = others[np.abs(others - f) > _TRIANGULATION_GAP] if some is others else others
             distances = np.linalg.norm(positions[apart] - positions[f], axis=1)
-            close = np.flatnonzero(distances < _REACH * np.fmin(depths[apart], depths[f]))
-            nearest = close[np.argsort(distances[close], kind="stable")][:_NEAREST]
+            close = np.flatnonzero(
+                distances < _MAX_DISTANCE_DEPTHS * np.fmin(depths[apart], depths[f])
+            )
+            nearest = close[np.argsort(distances[close], kind="stable")][:_NUM_NEAREST]
             found |= {pair for g in apart[nearest].tolist() for pair in ((f, g), (g, f))}
     pairs = np.array(sorted(found), np.int32).reshape(-1, 2)
     lengths = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
@@ -215,19 +219,19 @@ def nearest_pairs(places: Places, one: np.ndarray, other: np.ndarray) -> np.ndar
 def predict(
     context: MatchContext, places: Places, pairs: np.ndarray, surfaces: bool
 ) -> tuple[Predictions, Matches]:
-    """Where second frames of pairs must show points that the first frames know.
+    """Predict points of the first frames of pairs in the second frames, and match them.
 
     Args:
-        context: of the run.
+        context: features and settings of the run.
         places: frames and points.
         pairs: (P, 2) frames.
-        surfaces: only points on surfaces that the second frame knows; else all, though some will
-            be occluded.
+        surfaces: predict only points on surfaces that the second frame knows; else all, of which
+            some will be occluded.
 
     Returns:
         Predictions, and the matches that were found.
     """
-    gates = [Gate.around_points(_GATE)] * len(pairs)
+    gates = [Gate.around_points(_GATE_RAD)] * len(pairs)
     found = context.match(pairs, places.world_T_rigs, gates, places.known, guided_only=True)
     parts = [_predicted(places, f, g, found.of(p), surfaces) for p, (f, g) in enumerate(pairs)]
     points, bins, hits = (
@@ -240,7 +244,8 @@ def predict(
 def _predicted(
     places: Places, f: int, g: int, matched: np.ndarray, surfaces: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of one pair: points (V, 3) in the world, bins (V,) of their change of view, found (V,)."""
+    """Predictions of one pair: points (V, 3) in the world, bins (V,) of change of view, found
+    (V,)."""
     rows = np.flatnonzero(np.isfinite(places.known[f]).all(axis=1))
     own, g_T_f = places.known[f][rows], inverse(places.world_T_rigs[g]) @ places.world_T_rigs[f]
     there = own @ g_T_f[:3, :3].T + g_T_f[:3, 3]
@@ -250,22 +255,24 @@ def _predicted(
         rows, own, there, distances = rows[on], own[on], there[on], distances[on]
     before = np.linalg.norm(own, axis=1)
     cosines = np.sum((own @ g_T_f[:3, :3].T) * there, axis=1) / (before * distances)
-    angles = np.digitize(np.arccos(np.clip(cosines, -1, 1)), _ANGLES)
-    ratios = np.digitize(np.abs(np.log(before / distances)), _RATIOS)
+    angles = np.digitize(np.arccos(np.clip(cosines, -1, 1)), _ANGLE_EDGES_RAD)
+    ratios = np.digitize(np.abs(np.log(before / distances)), _LOG_RATIO_EDGES)
     world_T_f = places.world_T_rigs[f]
     points = own @ world_T_f[:3, :3].T + world_T_f[:3, 3]
-    return points, angles * (len(_RATIOS) + 1) + ratios, np.isin(rows, matched[:, 0])
+    return points, angles * (len(_LOG_RATIO_EDGES) + 1) + ratios, np.isin(rows, matched[:, 0])
 
 
 def _on_surface(known: np.ndarray, directions: np.ndarray, distances: np.ndarray) -> np.ndarray:
-    """Which points, at distances (V,) along unit directions (V, 3), lie on surfaces (V,) bool that
-    a frame's points (K, 3) show."""
+    """True (V,) for points at distances (V,) along unit directions (V, 3) that lie on surfaces
+    shown by a frame's points (K, 3)."""
     points = known[np.isfinite(known).all(axis=1)]
     if not len(points):
         return np.zeros(len(distances), bool)
     lengths = np.linalg.norm(points, axis=1)
     tree = KDTree(points / lengths[:, None])
-    chords, nearest = tree.query(directions, _SURFACE_POINTS, distance_upper_bound=_SURFACE)
+    chords, nearest = tree.query(
+        directions, _NUM_SURFACE_POINTS, distance_upper_bound=_SURFACE_CHORD
+    )
     around = np.append(lengths, np.inf)[nearest].min(axis=1)
     known_there = np.isfinite(chords[:, 0])
-    return known_there & (np.abs(np.log(around / distances)) < np.log(_SAME_SURFACE))
+    return known_there & (np.abs(np.log(around / distances)) < np.log(_MAX_SURFACE_RATIO))

@@ -1,6 +1,6 @@
-"""The test of joins: what the frames around a meeting say of a similarity that is proposed there.
+"""The test of joins: evidence from the frames around a meeting on a proposed similarity.
 
-It judges joins of maps and loops within one map alike: evidence for and against, and rivals.
+Joins of maps and loops within one map are tested alike: evidence, and rival proposals.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,13 +16,15 @@ from gsba.matching.guided_search import MatchContext
 from gsba.similarity import Sim3
 from gsba.types import Matches
 
-_SAME_PLACE = 2.0  # times the differences of two estimates of one join: no other place yet, as
-# parts that drift meet a little differently at either end
+# Times the differences of two estimates of one join within which proposals are of one place:
+# drifting parts meet a little differently at either end.
+_SAME_PLACE_FACTOR = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A proposal fitted to all that both sides know around its meeting."""
+    """A proposal refined with all points that both sides share around its meeting, and its
+    evidence."""
 
     proposal: Proposal
     evidence: JoinEvidence
@@ -30,13 +32,13 @@ class Judged:
 
 @dataclass(slots=True)
 class JoinTest:
-    """Frames, their points, and how often points are found again where all is right."""
+    """Frames, their points, and the usual rate at which points are found again."""
 
     context: MatchContext
     poses: np.ndarray  # (F, 4, 4) float64, changes while maps grow
     known: Sequence[np.ndarray]  # (F) of (K_f, 3): points of keypoints, rig frames; NaN = unknown
     depth: float  # median distance of points, map units
-    measure_rates: Callable[[], Rates]  # how often points are found again; asked once
+    measure_rates: Callable[[], Rates]  # measures the rate of points found again; called once
     _usual: Rates | None = None
 
     def judge(self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray) -> Judged:
@@ -44,23 +46,23 @@ class JoinTest:
         found = self._judged(proposal, rows, inside, join_evidence.LOCAL)
         if found.evidence.decided:
             return found
-        # More frames tell more, if drift lets them.
+        # More frames give more evidence, if drift permits.
         wider = self._judged(proposal, rows, inside, join_evidence.WIDER)
         return max((found, wider), key=lambda one: one.evidence.least)
 
     def rivals(self, best: Judged, others: Sequence[Judged]) -> list[Judged]:
-        """Proposals for another place that are confirmed too, and no worse."""
+        """Confirmed proposals for another place that `best` does not significantly beat."""
         return [
             other
             for other in others
             if other.evidence.confirmed and not best.evidence.beats(other.evidence)
-            if not alike(best.proposal, other.proposal, self.poses, self.depth, _SAME_PLACE)
+            if not alike(best.proposal, other.proposal, self.poses, self.depth, _SAME_PLACE_FACTOR)
         ]
 
     def weigh(
         self, rows: np.ndarray, inside: np.ndarray, move: Sim3
     ) -> tuple[JoinEvidence, Matches]:
-        """Evidence for frames being where a similarity carries them, and points found again."""
+        """Evidence for a similarity that carries frames `rows`, and the points found again."""
         poses, known = self.poses.copy(), list(self.known)
         poses[rows] = move.poses(poses[rows])
         for f in rows:
@@ -76,8 +78,8 @@ class JoinTest:
         """Matched points that both frames of pairs know, one of them among those outside.
 
         Args:
-            matches: of P pairs.
-            outside: frames (N,).
+            matches: matches of P pairs.
+            outside: frames (N,) outside the map.
             f0_T_f1s: (P, 4, 4) relative poses by bearings, their translations of any length.
         """
         found = []
@@ -96,7 +98,7 @@ class JoinTest:
     def _judged(
         self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, reach: int
     ) -> Judged:
-        """The proposal judged by frames at most `reach` to either side of the meeting."""
+        """The proposal tested with frames at most `reach` to either side of the meeting."""
         f, g = proposal.frames
         groups = around(rows, f, reach), around(inside, g, reach)
         evidence, found = self.weigh(*groups, proposal.move)

@@ -1,8 +1,8 @@
-"""Places met again that drift has moved out of reach: found by looks, believed by consistency.
+"""Loop closure: candidates by place recognition, accepted by geometric consistency.
 
-What looks alike (`gsba.loop_closure.retrieval`) is compared point by point, and every loop is
-tested against the map: repeated structure makes perfect loops to the wrong place, but those ask
-for more drift than the path can have, or disagree with one another.
+Frames with similar global descriptors (`gsba.loop_closure.retrieval`) are matched, and every loop
+is tested against the map: repeated structure makes perfect loops to the wrong place, but those need
+more drift than the path can have, or contradict one another.
 """
 
 import logging
@@ -23,29 +23,30 @@ from gsba.similarity import relative_map
 from gsba.types import Counts, Keypoints, Solution, VerifiedPairs
 
 logger = logging.getLogger(__name__)
-_LOOKS = 3  # places compared for each frame
-MIN_GROUP = 3  # pairs that must agree
-RIVAL = 1.5  # by how much a group must outweigh one that contradicts it
-_TURN_DEG, _UNSEEN_TURN_DEG = 10.0, 45.0  # of the map between two frames, and per unseen step
-AGREE_DEG, AGREE = 2.0, 0.1  # of two pairs; part of the median depth
+_NUM_CANDIDATES = 3  # candidate places for each frame
+MIN_GROUP = 3  # least number of pairs that agree
+RIVAL = 1.5  # ratio by which a group must outweigh one that contradicts it
+# Largest rotation error of the map between two frames; of each step without matches besides.
+_MAX_ROTATION_DEG, _UNSEEN_ROTATION_DEG = 10.0, 45.0
+AGREE_DEG, AGREE = 2.0, 0.1  # between two pairs; relative to the median depth
 
 
 @dataclass(frozen=True, slots=True)
 class Closed:
-    """A map bent so that its far loops meet."""
+    """A map with its loops closed."""
 
     solved: Solution
-    pairs: np.ndarray  # (L, 2) int32, loops that were believed
+    pairs: np.ndarray  # (L, 2) int32, accepted loops
     counts: Counts  # of pairs compared
 
 
 def close(context: MatchContext, solved: Solution, unseen: np.ndarray) -> Closed:
-    """Find places met again, and bend the map so that they coincide.
+    """Find revisited places, and deform the map so that they coincide.
 
     Args:
         context: of the run; its strongest features are compared.
-        solved: poses and points that are right between neighbours.
-        unseen: (F - 1,) bool, steps that no images confirm: they may be off by their length.
+        solved: poses and points, accurate between neighbours.
+        unseen: (F - 1,) bool, steps that no images confirm: their error may be their length.
     """
     settings, keypoints = context.settings, context.keypoints
     num = len(solved.world_T_rigs)
@@ -53,10 +54,10 @@ def close(context: MatchContext, solved: Solution, unseen: np.ndarray) -> Closed
     chosen = candidates(looks, solved, unseen, settings)
     strongest = replace(context, frames=context.strongest)
     verified = recovery.match_anywhere(strongest, chosen)
-    loops = _measure(verified, keypoints, solved, settings.seed)
+    loops = _measured_loops(verified, keypoints, solved, settings.seed)
     within = [loop for loop in loops if within_drift(loop, solved, unseen, settings)]
     agreeing = consistent(within, solved, settings.pairs.window)
-    upheld = _upheld(context, solved, agreeing)
+    upheld = _not_refuted(context, solved, agreeing)
     believed = met(upheld, solved, unseen)
     counts = Counts(
         len(chosen),
@@ -75,17 +76,17 @@ def close(context: MatchContext, solved: Solution, unseen: np.ndarray) -> Closed
 
 
 def connected(unseen: np.ndarray, pairs: np.ndarray) -> bool:
-    """Whether loops (P, 2) link what steps (F - 1,) that no images confirm leave apart."""
+    """True if loops (P, 2) connect all parts that steps (F - 1,) without images leave apart."""
     return parted(pairs, ~unseen) is None
 
 
 def candidates(
     looks: np.ndarray, solved: Solution, unseen: np.ndarray, settings: RefineSettings
 ) -> np.ndarray:
-    """Pairs (P, 2) int32 that look most alike among those that drift can have brought apart."""
+    """Pairs (P, 2) int32 with the most similar global descriptors within reach of drift."""
     positions, depth = solved.world_T_rigs[:, :3, 3], solved.median_depth()
     num = len(positions)
-    drifts = np.concatenate([[0.0], np.cumsum(_drifts(positions, unseen, settings))])
+    drifts = np.concatenate([[0.0], np.cumsum(_max_step_drifts(positions, unseen, settings))])
     found: set[tuple[int, int]] = set()
     for f in range(num):
         others = np.arange(num)
@@ -93,30 +94,32 @@ def candidates(
         distance = np.linalg.norm(positions[others] - positions[f], axis=1)
         reach = settings.pairs.max_baseline_depths * depth
         others = others[distance < reach + np.abs(drifts[others] - drifts[f])]
-        for g in others[np.argsort(-(looks[others] @ looks[f]))[:_LOOKS]]:
+        for g in others[np.argsort(-(looks[others] @ looks[f]))[:_NUM_CANDIDATES]]:
             found.add((min(f, int(g)), max(f, int(g))))
     return np.array(sorted(found), np.int32).reshape(-1, 2)
 
 
-def _drift(
+def _max_drift(
     f0: int, f1: int, positions: np.ndarray, unseen: np.ndarray, settings: RefineSettings
 ) -> float:
-    """How far the map may have the one frame wrong relative to the other, map units."""
+    """Largest error of the map between two frames, map units."""
     first, last = min(f0, f1), max(f0, f1)
     between = positions[first : last + 1]
-    return float(_drifts(between, unseen[first:last], settings).sum())
+    return float(_max_step_drifts(between, unseen[first:last], settings).sum())
 
 
-def _drifts(positions: np.ndarray, unseen: np.ndarray, settings: RefineSettings) -> np.ndarray:
-    """How far each step (N - 1,) between positions (N, 3) may be off, map units."""
+def _max_step_drifts(
+    positions: np.ndarray, unseen: np.ndarray, settings: RefineSettings
+) -> np.ndarray:
+    """Largest error (N - 1,) of each step between positions (N, 3), map units."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return np.where(unseen, 1.0, settings.pairs.far_drift) * steps
 
 
-def _measure(
+def _measured_loops(
     verified: VerifiedPairs, keypoints: Keypoints, solved: Solution, seed: int
 ) -> list[Loop]:
-    """Loops, from points of the map that both frames of a pair see."""
+    """Loops, measured from map points that both frames of a pair observe."""
     known = solved.points_by_keypoint(keypoints)
     loops = []
     for p, (f0, f1) in enumerate(verified.matches.pairs.tolist()):
@@ -132,26 +135,26 @@ def _measure(
 def within_drift(
     loop: Loop, solved: Solution, unseen: np.ndarray, settings: RefineSettings
 ) -> bool:
-    """Whether a loop asks for no more than the path between its frames can have drifted."""
+    """True if a loop needs no more drift than the path between its frames can have."""
     poses = solved.world_T_rigs
-    slack = _drift(loop.f0, loop.f1, poses[:, :3, 3], unseen, settings)
+    slack = _max_drift(loop.f0, loop.f1, poses[:, :3, 3], unseen, settings)
     expected = poses[loop.f0] @ loop.f0_T_f1
     moved = np.linalg.norm(expected[:3, 3] - poses[loop.f1, :3, 3])
     turned = np.degrees(rotation_angle(expected[:3, :3].T @ poses[loop.f1, :3, :3]))
-    allowed = _TURN_DEG + _UNSEEN_TURN_DEG * np.count_nonzero(unseen[loop.f0 : loop.f1])
+    allowed = _MAX_ROTATION_DEG + _UNSEEN_ROTATION_DEG * np.count_nonzero(unseen[loop.f0 : loop.f1])
     return bool(moved < slack + AGREE * solved.median_depth() and turned < allowed)
 
 
 def consistent(loops: list[Loop], solved: Solution, window: int) -> list[Loop]:
-    """Loops that agree with others around them and outweigh what contradicts them.
+    """Loops that agree with others around them and outweigh those that contradict them.
 
-    Two loops between the same stretches of the path agree if going once around (one loop, along
-    the path, back over the other) leads to where one started.
+    Two loops between the same stretches of the path agree if a round trip (one loop, along the
+    path, back over the other) leads back to its start.
 
     Args:
-        loops: all that could be measured.
-        solved: the map, right over short stretches.
-        window: frames up to which a stretch counts as right.
+        loops: all measured loops.
+        solved: the map, accurate over short stretches.
+        window: number of frames over which the map counts as accurate.
     """
     depth, poses = solved.median_depth(), solved.world_T_rigs
     rivals = [
@@ -181,7 +184,7 @@ def consistent(loops: list[Loop], solved: Solution, window: int) -> list[Loop]:
     return believed
 
 
-def _upheld(context: MatchContext, solved: Solution, loops: list[Loop]) -> list[Loop]:
+def _not_refuted(context: MatchContext, solved: Solution, loops: list[Loop]) -> list[Loop]:
     """Loops that the surroundings of both places do not refute, weighed stretch by stretch."""
     if not loops:
         return loops
@@ -208,7 +211,7 @@ def _upheld(context: MatchContext, solved: Solution, loops: list[Loop]) -> list[
 
 
 def _closes(one: Loop, other: Loop, poses: np.ndarray, depth: float) -> bool:
-    """Whether two loops and the path between their ends return to the start."""
+    """True if two loops and the path between their ends return to the start."""
     there = inverse(poses[one.f0]) @ poses[other.f0] @ other.f0_T_f1
     back = there @ inverse(poses[other.f1]) @ poses[one.f1]
     around = inverse(one.f0_T_f1) @ back

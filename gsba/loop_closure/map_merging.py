@@ -1,10 +1,10 @@
-"""Parts of a map that no step of the images ties together: joined where they meet, or kept apart.
+"""Map merging: parts of a map that no verified step connects, joined where they overlap.
 
-A pause of the video, a restarted SLAM or frames that show nothing leave maps with a scale and a
-world of their own. Whole panoramas that look alike are compared; points that a frame of either
-map knows give the similarity between both, and it is believed if several pairs agree. A frame
-alone, without a map, gets its pose from points of the map. What meets nowhere is held by the
-trajectory where it knows better, and is a map of its own otherwise.
+A pause of the video, a restarted SLAM or frames without texture leave maps with a scale and a
+world of their own. Whole panoramas with similar global descriptors are matched; points that both
+maps know give the similarity between them, accepted if several pairs agree. A single frame without
+a map gets its pose from points of a map. Parts without overlap keep the trajectory's pose where it
+has one, and become maps of their own otherwise.
 """
 
 import logging
@@ -29,16 +29,18 @@ from gsba.similarity import Sim3
 from gsba.types import Counts, Solution
 
 logger = logging.getLogger(__name__)
-_LOOKS = 3  # places compared for each frame of a part; twice as many for a frame alone
-_SAMPLED = 24  # frames of a part that are looked for elsewhere
-_BESIDE = 3  # frames from a break that are compared whatever they look like
-_BEST = 2  # meetings whose surroundings are compared too
-_MIN_MAP = 3  # frames of a part that is a map
-_MIN_TESTABLE = 6  # frames of a map that joins can be tested by: two small parts in rooms with one
-# floor look like one place all around
-_BEHIND = 3.0  # times the pace: a frame alone is no further off than that
-_APART = 4.0  # extents between maps that nothing ties together
-_LEVEL = np.deg2rad(5.0)  # between the verticals of two parts, besides how frames tilt in each
+_NUM_CANDIDATES = 3  # candidate places for each frame of a part; twice as many for a single frame
+_NUM_SAMPLED_FRAMES = 24  # frames of a part for which candidates are searched
+_BREAK_REACH_FRAMES = 3  # frames from a break that are compared in any case
+_NUM_BEST_MEETINGS = 2  # best meetings whose neighbours are compared too
+_MIN_MAP_FRAMES = 3  # least frames of a part that count as a map
+# Least frames of a map for the test of joins: two small parts in rooms with one floor look like one
+# place all around.
+_MIN_TESTABLE_FRAMES = 6
+_MAX_PACES = 3.0  # largest distance of a single frame from its neighbours, in median paces
+_MAP_SPACING_EXTENTS = 4.0  # distance between unconnected maps, in their extents
+# Largest angle between the verticals of two parts, besides the spread within each.
+_MAX_TILT_RAD = np.deg2rad(5.0)
 
 
 def merge(
@@ -50,18 +52,18 @@ def merge(
     timestamps: np.ndarray,
     absent: bool = True,
 ) -> Registered:
-    """Join the parts of a map where they meet, and register frames that are in none.
+    """Join the parts of a map where they overlap, and register single frames.
 
     Args:
-        context: of the run.
-        solved: poses and points, right within every part.
+        context: features and settings of the run.
+        solved: poses and points, consistent within every part.
         parts: (F,) int, see `gsba.loop_closure.connectivity.parted`.
-        held: (F - 1,) bool, steps that no image shows but the trajectory knows.
-        seen: (F - 1,) bool, steps that images show: what becomes of frames with too few points.
+        held: (F - 1,) bool, steps without matches whose pose the trajectory gives.
+        seen: (F - 1,) bool, steps verified by images: they tie frames with too few points.
         timestamps: (F,) seconds.
-        absent: whether there is no trajectory; maps of few frames test no join then.
+        absent: True if there is no trajectory; then small maps are not joined.
     """
-    min_testable = _MIN_TESTABLE if absent else _MIN_MAP
+    min_testable = _MIN_TESTABLE_FRAMES if absent else _MIN_MAP_FRAMES
     joining = _Joining(context, solved, parts, held, held | seen, timestamps, min_testable)
     component = 0
     while joining.begin(component):
@@ -73,7 +75,7 @@ def merge(
 
 
 class _Joining:
-    """The map while it grows: what was carried where so far."""
+    """The growing map, and the similarity by which each frame was moved so far."""
 
     def __init__(
         self,
@@ -95,29 +97,29 @@ class _Joining:
         self.poses = solved.world_T_rigs.copy()
         known = solved.points_by_keypoint(context.keypoints)
         self.own_known = [known[f] for f in range(num)]  # rig frames, units of their parts
-        self.known = list(self.own_known)  # the same, in units of the map once carried
+        self.known = list(self.own_known)  # in the map's unit once moved there
         self.test = JoinTest(context, self.poses, self.known, self.depth, self._usual_rates)
         self.usual_anywhere: Rates | None = None
         self.min_testable = min_testable  # frames of a map that joins can be tested by
-        self.moves = [Sim3()] * num  # of each frame, so far
+        self.moves = [Sim3()] * num  # of each frame, from its part to the map
         self.components = np.full(num, -1)
         self.met, self.alone = np.zeros(num, bool), np.zeros(num, bool)
-        self.reasons: dict[int, str] = {}  # why a part was not carried to the map
+        self.reasons: dict[int, str] = {}  # why a part was not joined to the map
         self.tried: set[tuple[int, int]] = set()  # part, size of the map it was compared with
         self.current = 0
 
     def begin(self, component: int) -> bool:
-        """Start a map from the largest part that is in none; False if there is no such part."""
+        """Start a map from the largest free part; False if there is no such part."""
         free = self.components < 0
         sizes = np.bincount(self.parts[free], minlength=1)
-        if not free.any() or (component > 0 and sizes.max() < _MIN_MAP):
+        if not free.any() or (component > 0 and sizes.max() < _MIN_MAP_FRAMES):
             return False
         base = self.parts == int(np.argmax(sizes))
         self.components[base], self.met[base], self.current = component, True, component
         return True
 
     def by_images(self) -> bool:
-        """Carry one more part to where it meets the map; False if none does."""
+        """Move one more part to where it overlaps the map; False if none does."""
         inside = np.flatnonzero(self.components == self.current)
         free = self.components < 0
         for part in np.unique(self.parts[free]).tolist():
@@ -125,7 +127,7 @@ class _Joining:
                 continue
             self.tried.add((part, len(inside)))
             rows = np.flatnonzero(self.parts == part)
-            if len(rows) >= _MIN_MAP and any(np.isfinite(self.known[f]).any() for f in rows):
+            if len(rows) >= _MIN_MAP_FRAMES and any(np.isfinite(self.known[f]).any() for f in rows):
                 move = self._similarity(part, rows, inside)
                 if move is not None:
                     self._carry(rows, move)
@@ -138,7 +140,7 @@ class _Joining:
         return False
 
     def by_ties(self) -> bool:
-        """Carry one more part along with the map that the trajectory or a step ties it to."""
+        """Move one more part along with the map to which the trajectory or a step ties it."""
         for f in np.flatnonzero(self.ties).tolist():
             for inner, outer in ((f, f + 1), (f + 1, f)):
                 if self.components[inner] == self.current and self.components[outer] < 0:
@@ -151,13 +153,13 @@ class _Joining:
         return False
 
     def _is_refuted(self, part: int, rows: np.ndarray, move: Sim3) -> bool:
-        """Whether images contradict where the trajectory has a part of the map."""
-        if len(rows) < _MIN_MAP:
+        """True if images contradict the pose of a part by the trajectory."""
+        if len(rows) < _MIN_MAP_FRAMES:
             return False
         inside = np.flatnonzero(self.components == self.current)
         evidence = self.test.weigh(rows, inside, move)[0]
         if evidence.refuted:
-            self.reasons[part] = f"not where the trajectory has it: {evidence}"
+            self.reasons[part] = f"images contradict its pose in the trajectory: {evidence}"
         return evidence.refuted
 
     def _carry(self, rows: np.ndarray, move: Sim3) -> None:
@@ -168,28 +170,31 @@ class _Joining:
         self.components[rows] = self.current
 
     def _candidates(self, rows: np.ndarray, inside: np.ndarray, looks: int) -> np.ndarray:
-        """Pairs (P, 2) of a frame outside and one inside: alike, or next in time."""
+        """Pairs (P, 2) of a frame outside and one inside: similar descriptors, or next in time."""
         alike = self.looks[rows] @ self.looks[inside].T
         found = set()
         for n, f in enumerate(rows.tolist()):
             near = np.argsort(-alike[n])[:looks].tolist()
             after = int(np.searchsorted(inside, f))
             beside = [g for g in (after - 1, after) if 0 <= g < len(inside)]
-            near += [g for g in beside if abs(int(inside[g]) - f) <= _BESIDE]
+            near += [g for g in beside if abs(int(inside[g]) - f) <= _BREAK_REACH_FRAMES]
             found |= {(f, int(inside[g])) for g in near}
         return np.array(sorted(found), np.int32).reshape(-1, 2)
 
     def _similarity(self, part: int, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
-        """The similarity that carries a part to where it meets the map; None if none is sure."""
-        if len(inside) < self.min_testable and not self._held(rows):
-            self.reasons[part] = f"a map of {len(inside)} frames is too small to test a join by"
+        """The similarity that moves a part to where it overlaps the map; None if none is
+        certain."""
+        if len(inside) < self.min_testable and not self._is_held_by_trajectory(rows):
+            self.reasons[part] = f"a map of {len(inside)} frames is too small to test a join"
             return None
-        sampled = np.linspace(0, len(rows) - 1, _SAMPLED).astype(int)
-        sampled = rows[np.unique([*sampled, *range(_BESIDE), *range(-_BESIDE, 0)])]
-        chosen = self._candidates(sampled, inside, _LOOKS)
+        sampled = np.linspace(0, len(rows) - 1, _NUM_SAMPLED_FRAMES).astype(int)
+        sampled = rows[
+            np.unique([*sampled, *range(_BREAK_REACH_FRAMES), *range(-_BREAK_REACH_FRAMES, 0)])
+        ]
+        chosen = self._candidates(sampled, inside, _NUM_CANDIDATES)
         meetings = self._meetings(replace(self.context, frames=self.context.strongest), chosen)
         found = self._best(part, meetings, rows, inside)
-        if meetings and found is None:  # too few of them, perhaps: look around the best
+        if meetings and found is None:  # perhaps too few: search around the best
             meetings += self._meetings(self.context, self._around(meetings, rows, inside, chosen))
             found = self._best(part, meetings, rows, inside)
         return found or self._over_break(rows, inside)
@@ -197,104 +202,113 @@ class _Joining:
     def _best(
         self, part: int, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray
     ) -> Sim3 | None:
-        """The similarity that the surroundings of both parts confirm, if they confirm no other."""
+        """The similarity that the surroundings of both parts confirm, unless they confirm a rival
+        too."""
         weighed: list[Judged] = []
         for proposal in propose(meetings, self.poses, self.depth, self.context.settings.seed):
-            if self._held(rows) and not self._plausible(proposal):
+            if self._is_held_by_trajectory(rows) and not self._plausible(proposal):
                 continue
             judged = self.test.judge(proposal, rows, inside)
             if self._is_level(rows, inside, judged.proposal.move):
                 weighed.append(judged)
         if not weighed:
-            self.reasons[part] = (
-                "no frame of it knows enough points that frames of another map know"
-            )
+            self.reasons[part] = "no frame of it shares enough points with a frame of another map"
             return None
         best = max(weighed, key=lambda one: one.evidence.least)
         frames, why = best.proposal.frames, best.evidence
-        logger.info("a part of %d frames meets the map at frames %s: %s", len(rows), frames, why)
+        logger.info("a part of %d frames overlaps the map at frames %s: %s", len(rows), frames, why)
         if why.confirmed and not self.test.rivals(best, weighed):
             return best.proposal.move
-        self.reasons[part] = "it fits two places alike" if why.confirmed else f"doubtful: {why}"
+        self.reasons[part] = "it fits two places" if why.confirmed else f"not certain: {why}"
         return None
 
     def _over_break(self, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
-        """The similarity that several pairs of frames over a short break in time agree on, unless
-        what is around refutes it; None if the part is not next to the map in time.
+        """The similarity that several pairs of frames across a short break agree on; None if its
+        surroundings refute it, or the part is not next to the map in time.
 
-        The camera cannot have gone far in between, so that a look-alike is no danger here.
+        The camera cannot have moved far in between, so that a look-alike is unlikely here.
         """
         for f, after in pairs.without_pause(self.times).tolist():
             if not ((f in rows and after in inside) or (f in inside and after in rows)):
                 continue
             earlier, later = (rows, inside) if f in rows else (inside, rows)
-            ends = earlier[earlier <= f][-_BESIDE:], later[later > f][:_BESIDE]
-            chosen = np.array([(a, b) for a in ends[0] for b in ends[1] if b - a <= _BESIDE])
+            ends = (
+                earlier[earlier <= f][-_BREAK_REACH_FRAMES:],
+                later[later > f][:_BREAK_REACH_FRAMES],
+            )
+            chosen = np.array(
+                [(a, b) for a in ends[0] for b in ends[1] if b - a <= _BREAK_REACH_FRAMES]
+            )
             found = recovery.match_anywhere(self.context, chosen)
             given = found, self.context.keypoints, self.poses, self.known, rows
             best = agreed(crossing(*given), self.poses, self.depth)
-            if best is None or (self._held(rows) and not self._plausible(best)):
+            if best is None or (self._is_held_by_trajectory(rows) and not self._plausible(best)):
                 continue
             own, theirs = ends if f in rows else ends[::-1]
             evidence = self.test.weigh(own, theirs, best.move)[0]
-            logger.info("a part of %d frames goes on at a break: %s", len(rows), evidence)
+            logger.info(
+                "a part of %d frames continues the map across a break: %s", len(rows), evidence
+            )
             if not evidence.refuted:
                 return best.move
         return None
 
     def _is_level(self, rows: np.ndarray, inside: np.ndarray, move: Sim3) -> bool:
-        """Whether a part would stand upright on the map, as far as its frames do in themselves."""
+        """True if a part would stand upright on the map, within the spread of its frames'
+        verticals."""
         down, theirs = self.poses[rows, :3, 1] @ move.rotation.T, self.poses[inside, :3, 1]
         means = [unit(axes.mean(axis=0)) for axes in (down, theirs)]
         spreads = [
             np.sqrt(np.mean(angles_between(axes, mean) ** 2))
             for axes, mean in zip((down, theirs), means, strict=True)
         ]
-        return bool(angles_between(means[0], means[1]) < _LEVEL + 3 * np.hypot(*spreads))
+        return bool(angles_between(means[0], means[1]) < _MAX_TILT_RAD + 3 * np.hypot(*spreads))
 
     def _usual_rates(self) -> Rates:
-        """How often points are found again within the parts, as they came."""
+        """Rates at which points are found again within the original parts."""
         places = Places(self.solved.world_T_rigs, self.own_known)
         return join_evidence.rates(self.context, places, self.parts)
 
     def _meetings(self, context: MatchContext, chosen: np.ndarray) -> list[Meeting]:
-        """Points that both frames of pairs (P, 2), one outside and one inside the map, know."""
+        """Matched points that both frames of pairs (P, 2) know, one outside and one inside the
+        map."""
         verified = recovery.match_anywhere(context, np.sort(chosen, axis=1), rivals=False)
         return self.test.meetings(verified.matches, chosen[:, 0])
 
     def _around(
         self, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray, chosen: np.ndarray
     ) -> np.ndarray:
-        """Pairs (P, 2) beside the meetings of the most points that were not compared yet."""
-        best = sorted(meetings, key=lambda meeting: -len(meeting.own))[:_BEST]
-        reach = range(-_BESIDE + 1, _BESIDE)
+        """Pairs (P, 2) not yet compared, beside the meetings with the most points."""
+        best = sorted(meetings, key=lambda meeting: -len(meeting.own))[:_NUM_BEST_MEETINGS]
+        reach = range(-_BREAK_REACH_FRAMES + 1, _BREAK_REACH_FRAMES)
         found = {(m.f + i, m.g + j) for m in best for i in reach for j in reach}
         free, taken = set(rows.tolist()), set(inside.tolist())
         found = {(f, g) for f, g in found if f in free and g in taken}
         found -= {(int(f), int(g)) for f, g in chosen}
         return np.array(sorted(found), np.int32).reshape(-1, 2)
 
-    def _held(self, rows: np.ndarray) -> bool:
-        """Whether the trajectory ties a part to the map."""
+    def _is_held_by_trajectory(self, rows: np.ndarray) -> bool:
+        """True if the trajectory ties a part to the map."""
         inside = self.components == self.current
         outside = np.zeros(len(self.parts), bool)
         outside[rows] = True
         return bool((self.held & ((inside[1:] & outside[:-1]) | (inside[:-1] & outside[1:]))).any())
 
     def _plausible(self, proposal: Proposal) -> bool:
-        """Whether a proposal asks for no more than the trajectory can have drifted."""
+        """True if a proposal needs no more drift than the trajectory can have."""
         (f, g), poses, settings = proposal.frames, self.poses, self.context.settings
         ends = {g: poses[g], f: proposal.move.poses(poses[f])}
         first, last = sorted(ends)
-        asked = inverse(ends[first]) @ ends[last]
-        loop = Loop(first, last, asked, proposal.support)
+        step = inverse(ends[first]) @ ends[last]
+        loop = Loop(first, last, step, proposal.support)
         solved = replace(self.solved, world_T_rigs=poses)
         even = abs(np.log(proposal.move.scale)) < np.log(settings.verify.max_length_ratio)
         return even and loops.within_drift(loop, solved, self.held, settings)
 
     def _register(self, f: int, inside: np.ndarray) -> bool:
-        """Pose of a frame alone from points of the map; False if none can be believed."""
-        chosen = self._candidates(np.array([f]), inside, 2 * _LOOKS)
+        """True if a single frame gets an accepted pose from points of the map; the map then holds
+        it."""
+        chosen = self._candidates(np.array([f]), inside, 2 * _NUM_CANDIDATES)
         for strongest in (True, False):
             rows, points = self._sightings(f, chosen, strongest)
             if len(rows) == 0:
@@ -313,8 +327,8 @@ class _Joining:
         return False
 
     def _shows_map(self, f: int, inside: np.ndarray, world_T_rig: np.ndarray) -> bool:
-        """Whether a frame alone shows what frames of the map beside it know, more than a look-alike
-        of a poster would."""
+        """True unless a single frame shows next to nothing of the map around it: a look-alike
+        poster brings no surroundings."""
         poses = self.poses.copy()
         poses[f] = world_T_rig
         if self.usual_anywhere is None:
@@ -328,7 +342,7 @@ class _Joining:
     def _sightings(
         self, f: int, chosen: np.ndarray, strongest: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Keypoints (m,) of a frame and the points (m, 3) of the map that each may show."""
+        """Keypoints (m,) of a frame and the map points (m, 3) that each may observe."""
         nowhere = np.tile(np.eye(4), (len(self.parts), 1, 1))
         gates = [Gate.anywhere()] * len(chosen)
         found = self.context.match(chosen, nowhere, gates, strongest=strongest)
@@ -345,7 +359,8 @@ class _Joining:
         return rows[first], points[first]
 
     def _in_reach(self, f: int, world_T_rig: np.ndarray) -> bool:
-        """Whether a frame is no further from those next in time than one can have gone."""
+        """True if a frame is no further from its neighbours in time than the camera can have
+        moved."""
         inside = np.flatnonzero(self.components == self.current)
         lengths = np.linalg.norm(np.diff(self.poses[inside, :3, 3], axis=0), axis=1)
         pace = float(np.median(lengths / np.diff(self.times[inside])))
@@ -354,14 +369,14 @@ class _Joining:
             if 0 <= n < len(inside):
                 g = inside[n]
                 off = np.linalg.norm(world_T_rig[:3, 3] - self.poses[g, :3, 3])
-                if off > _BEHIND * pace * abs(self.times[f] - self.times[g]) + self.depth:
+                if off > _MAX_PACES * pace * abs(self.times[f] - self.times[g]) + self.depth:
                     return False
         return True
 
     def result(self) -> Registered:
-        """The map as it is now, each map in the world of its earliest part.
+        """The map in its current state, each map in the world of its earliest part.
 
-        A frame in no part of it is apart, beside the one before it.
+        A frame in no map is placed beside the one before it.
         """
         self._keep_earliest_worlds()
         lost, maps = self.components < 0, int(self.components.max()) + 1
@@ -392,7 +407,7 @@ class _Joining:
         )
 
     def _keep_earliest_worlds(self) -> None:
-        """Carry each map to where its earliest part was before parts were joined."""
+        """Move each map back to the world that its earliest part had before parts were joined."""
         for component in range(int(self.components.max()) + 1):
             rows = np.flatnonzero(self.components == component)
             parts = rows[self.met[rows] & ~self.alone[rows]]
@@ -402,20 +417,21 @@ class _Joining:
                 self.moves[f] = back.after(self.moves[f])
 
     def _reasons(self, order: np.ndarray) -> tuple[str, ...]:
-        """Why each map (order: (F,) number of each frame's) was not joined to a larger one."""
+        """Reason why each map (order: (F,) number of each frame's) was not joined to a larger
+        one."""
         first = np.unique(order, return_index=True)[1]
         return tuple(
             "" if f == first[0] else self.reasons.get(int(self.parts[f]), "") for f in first
         )
 
     def _side_by_side(self, components: np.ndarray) -> np.ndarray:
-        """Offsets (F, 3) after which no frame of one map is near a point of another."""
+        """Offsets (F, 3) that separate maps: no frame of one is near a point of another."""
         positions, offsets = self.poses[:, :3, 3], np.zeros((len(components), 3))
         groups = [components == c for c in range(int(components.max()) + 1)]
         extent = max(float(np.linalg.norm(np.ptp(positions[group], axis=0))) for group in groups)
         extent += self.context.settings.pairs.max_baseline_depths * self.depth
         for number, group in enumerate(groups[1:], 1):
-            away = np.array([number * _APART * extent, 0, 0])
+            away = np.array([number * _MAP_SPACING_EXTENTS * extent, 0, 0])
             offsets[group] = positions[groups[0]].mean(axis=0) + away
             offsets[group] -= positions[group].mean(axis=0)
         return offsets
@@ -428,7 +444,7 @@ def _moved(
     moves: np.ndarray,
     offsets: np.ndarray,
 ) -> Solution:
-    """The new poses with their offsets; points go with the first frame that sees them."""
+    """The new poses with their offsets; each point moves with its first frame."""
     landmarks = solved.landmarks.moved(scales, moves)
     points = landmarks.points_world + offsets[landmarks.tracks.hosts()]
     poses = world_T_rigs.copy()

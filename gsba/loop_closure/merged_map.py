@@ -1,4 +1,4 @@
-"""A map whose parts were joined, and what follows from that for the trajectory and its report."""
+"""A map whose parts were joined, and the consequences for the trajectory and its report."""
 
 from dataclasses import dataclass, replace
 
@@ -12,27 +12,27 @@ from gsba.types import CoarsePoses, Counts, Solution
 
 @dataclass(frozen=True, slots=True)
 class Registered:
-    """A map whose parts were joined as far as they meet."""
+    """A map whose parts were joined where they overlap."""
 
     solved: Solution  # each map in the world of its earliest part
     components: np.ndarray  # (F,) int32, map of each frame, 0 = the largest
-    scales: np.ndarray  # (F,) float64: each frame was carried by scale * R @ x + t
+    scales: np.ndarray  # (F,) float64: each frame was moved by scale * R @ x + t
     moves: np.ndarray  # (F, 4, 4) float64, R and t
-    offsets: np.ndarray  # (F, 3) float64: and by this, so that maps lie side by side
-    met: np.ndarray  # (F,) bool: images tie it to the map's first part
-    alone: np.ndarray  # (F,) bool: got its pose from points of the map
-    lost: np.ndarray  # (F,) bool: nothing could place it
+    offsets: np.ndarray  # (F, 3) float64, added so that maps lie side by side
+    met: np.ndarray  # (F,) bool: images connect it to the map's first part
+    alone: np.ndarray  # (F,) bool: its pose comes from points of the map
+    lost: np.ndarray  # (F,) bool: no pose could be found
     counts: Counts  # of parts
     reasons: tuple[str, ...] = ()  # (maps) why each map, by its component, was not joined to a
-    # larger one, in words for the report; "" or missing = not known
+    # larger one, as text for the report; "" or missing = unknown
 
     def move(self, f: int) -> Sim3:
-        """What a frame was carried by, before its map was laid beside others."""
+        """The similarity by which a frame was moved, before its map was laid beside others."""
         return Sim3.of(float(self.scales[f]), self.moves[f])
 
 
 def side_by_side(world_T_rigs: np.ndarray, registered: Registered | None) -> np.ndarray:
-    """Poses (F, 4, 4) where the map has their frames: each map beside the others."""
+    """Poses (F, 4, 4) with each map's offset to lie beside the others."""
     poses = world_T_rigs.copy()
     if registered is not None:
         poses[:, :3, 3] += registered.offsets
@@ -45,10 +45,10 @@ def follow(
     trust: StepChecks,
     joints: tuple[SegmentAlignment, ...],
 ) -> tuple[CoarsePoses, StepChecks, tuple[SegmentAlignment, ...]]:
-    """The trajectory, its judgement and its joints after parts of the map were carried.
+    """The trajectory, its checks and its alignments after parts of the map were moved.
 
-    Steps that no image shows lose their prior where images tie both their frames to one map. A
-    piece of the trajectory that was placed by guess goes where its frames were carried.
+    Steps without matches lose their prior if images connect both their frames to one map. A piece
+    of the trajectory whose pose was a guess moves with its frames.
     """
     together = registered.components[:-1] == registered.components[1:]
     met = registered.met[:-1] & registered.met[1:] & together

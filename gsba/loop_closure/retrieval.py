@@ -1,6 +1,6 @@
-"""What a panorama looks like, whatever its heading.
+"""Place recognition by global descriptors of panoramas, invariant to heading.
 
-Looks are compared as vectors of locally aggregated descriptors (VLAD: Jegou et al., CVPR 2010;
+Frames are compared by vectors of locally aggregated descriptors (VLAD: Jegou et al., CVPR 2010;
 normalised word by word as in Arandjelovic and Zisserman, CVPR 2013) over whole panoramas.
 """
 
@@ -15,21 +15,24 @@ from scipy.sparse import csr_matrix
 from gsba.matching.guided_search import SearchableFrames
 from gsba.store.shards import Workers, blocks_of_frames
 
-_WORDS = 64  # of the vocabulary
-_SAMPLES = 20_000  # descriptors it is made from
-_ROUNDING = 1e-5  # of descriptors, float32 and of length one: a shorter sum has no direction
+_NUM_WORDS = 64  # visual words of the vocabulary
+_NUM_SAMPLES = 20_000  # descriptors that train the vocabulary
+# Rounding of descriptors, float32 of unit length: a shorter sum has no direction.
+_MIN_SUM_LENGTH = 1e-5
 
 
 def global_descriptors(
     frames: SearchableFrames, num_frames: int, seed: int, workers: Workers
 ) -> np.ndarray:
-    """What each panorama looks like, whatever its heading: (F, D) float32 of length one."""
-    share = max(_SAMPLES // max(num_frames, 1), 8)
-    draw = partial(_drawn, share=share, seed=seed)
+    """Global descriptors (F, D) float32 of all panoramas, of unit length, invariant to heading."""
+    share = max(_NUM_SAMPLES // max(num_frames, 1), 8)
+    draw = partial(_sampled_descriptors, share=share, seed=seed)
     everyone = np.arange(num_frames)
-    sample = np.concatenate(list(workers.map_shards(_LookJob("sampling", frames, everyone, draw))))
-    words = _words(sample, np.random.default_rng(seed))
-    job = _LookJob("looks", frames, everyone, partial(_seen, words=words))
+    sample = np.concatenate(
+        list(workers.map_shards(_DescriptorJob("sampling", frames, everyone, draw)))
+    )
+    words = _vocabulary(sample, np.random.default_rng(seed))
+    job = _DescriptorJob("looks", frames, everyone, partial(_descriptor_of, words=words))
     looks = np.empty((num_frames, words.size), np.float32)
     for row, look in zip(looks, workers.map_shards(job), strict=True):
         row[:] = look
@@ -37,13 +40,13 @@ def global_descriptors(
 
 
 @dataclass(frozen=True, slots=True)
-class _LookJob:
-    """The job of looking at the descriptors of each frame."""
+class _DescriptorJob:
+    """The job of processing the descriptors of each frame."""
 
     title: str
     frames: SearchableFrames
     chosen: np.ndarray  # (F,) frames
-    look: Callable[[np.ndarray, int], np.ndarray]  # at descriptors (K, D) of a frame
+    look: Callable[[np.ndarray, int], np.ndarray]  # of descriptors (K, D) of a frame
     returns: Any = np.ndarray
 
     def __len__(self) -> int:
@@ -56,28 +59,28 @@ class _LookJob:
     def blocks(self) -> Sequence[tuple[int, int]]:
         return blocks_of_frames(self.chosen)
 
-    def part(self, start: int, stop: int) -> "_LookJob":
+    def part(self, start: int, stop: int) -> "_DescriptorJob":
         chosen = self.chosen[start:stop]
         return replace(self, chosen=chosen, frames=self.frames.taken(chosen.tolist()))
 
 
-def _drawn(descriptors: np.ndarray, frame: int, share: int, seed: int) -> np.ndarray:
-    """Some descriptors of a frame, the same whoever draws them."""
+def _sampled_descriptors(descriptors: np.ndarray, frame: int, share: int, seed: int) -> np.ndarray:
+    """A sample of a frame's descriptors that does not depend on the worker."""
     return np.random.default_rng([seed, frame]).permutation(descriptors)[:share].copy()
 
 
-def _seen(descriptors: np.ndarray, _frame: int, words: np.ndarray) -> np.ndarray:
-    """What a frame looks like, whichever it is."""
+def _descriptor_of(descriptors: np.ndarray, _frame: int, words: np.ndarray) -> np.ndarray:
+    """The global descriptor of a frame."""
     return _aggregate(descriptors, words)
 
 
-def _words(sample: np.ndarray, rng: np.random.Generator, rounds: int = 12) -> np.ndarray:
+def _vocabulary(sample: np.ndarray, rng: np.random.Generator, rounds: int = 12) -> np.ndarray:
     """Centres (W, D) of a k-means clustering."""
-    words = sample[rng.permutation(len(sample))[:_WORDS]].copy()
+    words = sample[rng.permutation(len(sample))[:_NUM_WORDS]].copy()
     for _ in range(rounds):
         nearest = _nearest(sample, words)
         counts = np.bincount(nearest, minlength=len(words))
-        sums = _sums(sample, nearest, len(words))
+        sums = _sums_by_group(sample, nearest, len(words))
         words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], words)
     return words
 
@@ -86,16 +89,16 @@ def _nearest(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
     return np.argmax(descriptors @ words.T - 0.5 * np.sum(words**2, axis=1), axis=1)
 
 
-def _sums(rows: np.ndarray, groups: np.ndarray, num: int) -> np.ndarray:
+def _sums_by_group(rows: np.ndarray, groups: np.ndarray, num: int) -> np.ndarray:
     """Sums (num, D) of the rows (K, D) of each group."""
     ones, starts = np.ones(len(rows), rows.dtype), np.arange(len(rows) + 1)
     return csr_matrix((ones, groups, starts), shape=(len(rows), num)).T @ rows
 
 
 def _aggregate(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
-    """Sums of the differences from the nearest words, each word's of length one."""
+    """Sums of the differences from the nearest words, normalised word by word."""
     nearest = _nearest(descriptors, words)
-    sums = _sums(descriptors - words[nearest], nearest, len(words))
+    sums = _sums_by_group(descriptors - words[nearest], nearest, len(words))
     lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-    sums = np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > _ROUNDING)
+    sums = np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > _MIN_SUM_LENGTH)
     return sums.ravel() / max(float(np.linalg.norm(sums)), 1e-12)

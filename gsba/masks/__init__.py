@@ -1,6 +1,6 @@
-"""What is no part of the scene: what carries the camera, what moves, what a user masks.
+"""Masks of pixels outside the scene: the carrier, moving objects, and a user's own masks.
 
-Takes frames, and for what moves a first solution.
+Takes frames, and a first solution to detect moving objects.
 Gives frames with masks on disk.
 """
 

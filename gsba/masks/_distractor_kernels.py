@@ -1,4 +1,4 @@
-"""Compiled: how a panorama differs from its neighbours seen through assumed distances."""
+"""Compiled: differences between a panorama and its neighbours at assumed distances."""
 
 import math
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from factors.compiled import kernel_and_part
 
-_COS_MIN, _RATIO_MAX = 0.6, 2.2  # a view turned or scaled by more does not tell
+_MIN_VIEW_COSINE, _MAX_DISTANCE_RATIO = 0.6, 2.2  # views rotated or scaled by more are not compared
 _PI, _HALF_PI = np.float32(math.pi), np.float32(0.5 * math.pi)  # float32: twice as many at once
 _A, _B, _C = np.float32(-0.0464964749), np.float32(0.15931422), np.float32(-0.327622764)
 _kernel, _part = kernel_and_part(fastmath=True)
@@ -16,7 +16,7 @@ _TINY, _FAR = np.float32(1e-30), np.float32(1e9)
 
 @_part
 def _atan2(y, x):
-    """Within 1e-3 rad: a tenth of a pixel on the panoramas that are compared."""
+    """atan2 within 1e-3 rad: a tenth of a pixel on the panoramas that are compared."""
     ax, ay = abs(x), abs(y)
     a = min(ax, ay) / max(max(ax, ay), _TINY)
     s = a * a
@@ -63,12 +63,12 @@ def compare(own, least, most, others, n_T_own, rays, inverse, cap, differences, 
         least, most: (H, W, C) float32, extremes of `own` around each pixel: a neighbour's level
             between them is no difference (Birchfield, Tomasi, PAMI 20(4), 1998).
         others: (M, H, W, C) float32, the neighbours, negative where masked.
-        n_T_own: (M, 4, 4) float32, a neighbour's frame from the panorama's own.
+        n_T_own: (M, 4, 4) float32, from the panorama's own frame to the neighbour's.
         rays: (H, W, 3) float32, unit, rig frame.
         inverse: (H, W) float32, assumed inverse distances along the rays.
-        cap: grey levels, the largest difference that is told apart.
-        differences: (M, H, W) float32, out: to each neighbour; the cap where it is masked.
-        away: (H, W) float32, out: from the median grey level of all neighbours.
+        cap: grey levels at which differences are clipped.
+        differences: (M, H, W) float32, out: difference to each neighbour; the cap where masked.
+        away: (H, W) float32, out: distance from the neighbours' median grey level.
         spread: (H, W) float32, out: typical distance of neighbours from that median.
     """
     num, height, width, channels = others.shape
@@ -119,10 +119,10 @@ def compare(own, least, most, others, n_T_own, rays, inverse, cap, differences, 
 
 @_kernel
 def keep_best(differences, away, spread, best, away_best, spread_best):
-    """Keep what the best distance so far leaves over.
+    """Update the best differences so far with those of one more distance.
 
     Args:
-        differences, away, spread: of one assumed distance, as of `compare`, averaged over patches.
+        differences, away, spread: see `compare`, of one assumed distance, averaged over patches.
         best: (2, H, W) float32, in and out: second and third smallest difference.
         away_best, spread_best: (H, W) float32, in and out: where neighbours agree best.
     """
@@ -141,7 +141,7 @@ def keep_best(differences, away, spread, best, away_best, spread_best):
 
 @_exact
 def witnesses(usable, n_T_own, rays, inverse):
-    """How many neighbours see what is at some distance, unmasked and from where it looks alike.
+    """Number of neighbours that see an assumed distance, unmasked and from a similar viewpoint.
 
     Args:
         usable: (M, H, W) bool, the neighbours' masks.
@@ -164,7 +164,10 @@ def witnesses(usable, n_T_own, rays, inverse):
                     seen[i] = turned[i] + w * T[i, 3]
                 ratio = math.sqrt(seen[0] ** 2 + seen[1] ** 2 + seen[2] ** 2)
                 cosine = turned[0] * seen[0] + turned[1] * seen[1] + turned[2] * seen[2]
-                if cosine < _COS_MIN * ratio or not 1 < _RATIO_MAX * ratio < _RATIO_MAX**2:
+                if (
+                    cosine < _MIN_VIEW_COSINE * ratio
+                    or not 1 < _MAX_DISTANCE_RATIO * ratio < _MAX_DISTANCE_RATIO**2
+                ):
                     continue
                 u = _atan2(seen[0], seen[2]) / (2 * math.pi) + 0.5
                 v = _atan2(seen[1], math.sqrt(seen[0] ** 2 + seen[2] ** 2)) / math.pi + 0.5

@@ -1,10 +1,10 @@
-"""What carries the camera, found from the frames: it keeps its direction while the world moves.
+"""Detection of the camera's carrier: it keeps its direction in the rig while the world moves.
 
-Head, shoulders, arm, stick, helmet, bag or vehicle turn with the camera, so that their structure
-stays where it is in the picture (`gsba.masks.fixed_structure`), up to an outline
+Head, shoulders, arm, stick, helmet, bag or vehicle move with the camera, so that their structure
+keeps its place in the picture (`gsba.masks.fixed_structure`), up to an outline
 (`gsba.masks.carrier_outline`). With direction lock on, pictures do not turn with the camera and the
-carrier turns below them: how far is found for each frame (`gsba.masks.carrier_turns`), and taken
-back first.
+carrier turns against them: this rotation is estimated for each frame (`gsba.masks.carrier_turns`)
+and undone first.
 """
 
 import logging
@@ -28,50 +28,53 @@ logger = logging.getLogger(__name__)
 PICTURE_WIDTH = 512  # pixels across the pictures in which the outline is found
 _MAX_FRAMES = 20
 _MIN_FRAMES = 6  # fewer agree by chance
-_STAYS, _MOVES = 0.75, 0.5  # correlation of structure that stays; of structure that moves, at most
-_MIN_MOVING = 1 / 3  # of the textured directions: fewer do not tell a carrier from what is far away
-_STANDING = 0.9  # of the textured directions that stay: the camera stands
-VEHICLE_SHARE = 1 / 3  # of the picture: more than people or sticks fill
-_MIN_TEXTURED = 0.02  # of all directions
-_STRUCTURE, _STRUCTURE_TURNED = 256, 128  # pixels across the pictures that are compared: the
-# camera's tilt, which turns leave, moves the carrier by a pixel of these
-_LEAST_TURN = np.deg2rad(2.0)  # less is the noise of finding turns
+_MIN_FIXED_CORRELATION, _MAX_MOVING_CORRELATION = 0.75, 0.5  # least correlation of fixed structure;
+# largest of moving structure
+_MIN_MOVING_SHARE = 1 / 3  # share of the textured directions: with fewer, a carrier looks like the
+# distant world
+_STANDSTILL_SHARE = 0.9  # share of fixed textured directions from which the camera stands still
+VEHICLE_SHARE = 1 / 3  # share of the picture from which the carrier is a vehicle: people and sticks
+# fill less
+_MIN_TEXTURED_SHARE = 0.02  # share of all directions
+_STRUCTURE_WIDTH_PX, _TURNED_STRUCTURE_WIDTH_PX = 256, 128  # width in pixels of compared pictures:
+# the camera's tilt, which remains when turns are undone, moves the carrier by a pixel of the latter
+_MIN_TURN_RAD = np.deg2rad(2.0)  # smaller turns are estimation noise
 _MIN_FRAMES_TURNED = 12  # fewer agree by chance once turns are free
 
 
 @dataclass(frozen=True, slots=True)
 class Carrier:
-    """Pixels that are not of the world."""
+    """The pixels that show the carrier instead of the world."""
 
     mask: np.ndarray  # (h, 2h) bool, True = use; smaller than the frames, for turns of 0
-    turns: np.ndarray  # (F,) float64, radians to the right, of the carrier in each frame
+    turns: np.ndarray  # (F,) float64, radians to the right, rotation of the carrier in each frame
     median: np.ndarray  # (h, 2h, 3) uint8 RGB, the median picture
-    share: float  # part of the picture that is the carrier; 0 = none found
-    reason: str  # why there is none, or ""
+    share: float  # part of the picture that the carrier fills; 0 = none found
+    reason: str  # why no carrier was found, or ""
 
 
 def no_carrier(frames: FrameSet, reason: str) -> Carrier:
-    """A carrier that covers nothing, for this reason."""
+    """A carrier without pixels, with the reason."""
     size = PICTURE_WIDTH // 2, PICTURE_WIDTH
     grey = np.full((*size, 3), 128, np.uint8)
     return Carrier(np.ones(size, bool), np.zeros(len(frames)), grey, 0.0, reason)
 
 
 def find_carrier(frames: FrameSet) -> Carrier:
-    """The carrier in panoramas of a moving camera.
+    """Detect the carrier in panoramas of a moving camera.
 
     Args:
         frames: panoramas or raw pairs.
 
     Raises:
-        GsbaError: cube faces, too few frames, no texture, or too little that moves.
+        GsbaError: cube faces, too few frames, no texture, or too little motion.
     """
     if not frames.panoramic:
-        raise GsbaError("the carrier is looked for in panoramas; these frames are cube faces")
+        raise GsbaError("the carrier is detected in panoramas; these frames are cube faces")
     _require_enough(len(frames))
     chosen = np.unique(np.linspace(0, len(frames) - 1, _MAX_FRAMES).astype(int))
     pictures = np.stack([_load(frames, f) for f in track(chosen, "looking for the carrier")])
-    structure, turns = _measure(pictures, _STRUCTURE), np.zeros(len(frames))
+    structure, turns = _measure(pictures, _STRUCTURE_WIDTH_PX), np.zeros(len(frames))
     if not certain_places(structure).any() and len(pictures) >= _MIN_FRAMES_TURNED:
         below = _measure_turned(pictures)
         if below is not None:
@@ -86,38 +89,38 @@ def find_carrier(frames: FrameSet) -> Carrier:
     if share > VEHICLE_SHARE:
         logger.warning(
             "%.0f%% of the picture turn with the camera, as a vehicle does, and are masked: poses "
-            "rest on the rest; look at carrier_check.jpg",
+            "come from the remaining pixels; check the mask in carrier_check.jpg",
             100 * share,
         )
     return Carrier(~found, turns, median, share, reason)
 
 
 def find_fixed_carrier(pictures: np.ndarray) -> np.ndarray:
-    """Where pictures show the world and not what carries the camera, if it keeps its direction.
+    """Mask of the world in pictures, False at a carrier that keeps its direction.
 
     Args:
         pictures: (N, h, 2h, 3) uint8 RGB, `PICTURE_WIDTH` across, of a moving camera.
 
     Returns:
-        (h, 2h) bool, True = use; all of it where nothing stays in place.
+        (h, 2h) bool, True = use; all True if nothing stays in place.
 
     Raises:
-        GsbaError: too few pictures, no texture, or too little that moves.
+        GsbaError: too few pictures, no texture, or too little motion.
     """
     _require_enough(len(pictures))
-    return ~_outlined(pictures, _measure(pictures, _STRUCTURE))[1]
+    return ~_outlined(pictures, _measure(pictures, _STRUCTURE_WIDTH_PX))[1]
 
 
 def _require_enough(num: int) -> None:
     if num < _MIN_FRAMES:
-        raise GsbaError(f"{num} frames do not tell what is fixed to the camera: give {_MIN_FRAMES}")
+        raise GsbaError(f"{num} frames are too few to detect the carrier: give {_MIN_FRAMES}")
 
 
 def _outlined(pictures: np.ndarray, structure: FixedStructure) -> tuple[np.ndarray, np.ndarray]:
-    """The median (h, 2h, 3) uint8 of pictures, and where it shows the carrier (h, 2h) bool.
+    """The median (h, 2h, 3) uint8 of pictures, and the carrier in it (h, 2h) bool.
 
     Raises:
-        GsbaError: too little moves to tell.
+        GsbaError: too little moves.
     """
     _check_moving(structure)
     median = np.median(pictures, axis=0).astype(np.uint8)
@@ -125,7 +128,7 @@ def _outlined(pictures: np.ndarray, structure: FixedStructure) -> tuple[np.ndarr
 
 
 def carrier_mask(carrier: Carrier, frames: FrameSet, frame: int) -> np.ndarray:
-    """Where a frame shows the world, (H, 2H) bool, True = use."""
+    """Mask of the world in a frame, (H, 2H) bool, True = use."""
     full = cv2.resize(carrier.mask.astype(np.float32), (frames.width, frames.height)) > 0.5
     return np.roll(full, round(carrier.turns[frame] / (2 * np.pi) * frames.width), axis=1)
 
@@ -133,14 +136,14 @@ def carrier_mask(carrier: Carrier, frames: FrameSet, frame: int) -> np.ndarray:
 def write_carrier(
     carrier: Carrier, frames: FrameSet, out: Path, merge: bool = True, name: str = "carrier"
 ) -> list[Path]:
-    """Write what was found, to look at and to use.
+    """Write the carrier's mask, and a picture to check it.
 
-    `NAME.png` is the mask (white = use), `NAME_check.jpg` the median picture with the outline.
-    Where the frames have masks of their own, or the carrier turns, `merged/FRAME.png` has all there
-    is for each frame, unless `merge` is False.
+    `NAME.png` is the mask (white = use), `NAME_check.jpg` the median picture with the outline. If
+    the frames have masks of their own, or the carrier turns, `merged/FRAME.png` combines the masks
+    of each frame, unless `merge` is False.
 
     Returns:
-        the files.
+        the written files.
     """
     written = [out / f"{name}.png", out / f"{name}_check.jpg"]
     write_image(written[0], carrier_mask(carrier, frames, 0).astype(np.uint8) * 255)
@@ -175,43 +178,47 @@ def _measure(pictures: np.ndarray, width: int) -> FixedStructure:
 
 
 def _measure_turned(pictures: np.ndarray) -> tuple[np.ndarray, FixedStructure] | None:
-    """Pictures with the carrier turned to one direction, and their structure; None = it stays."""
+    """Pictures rotated so that the carrier keeps its direction, and their structure; None = no
+    turns."""
     turns = find_turns(np.stack([band_of(picture) for picture in pictures]))
-    if np.ptp(turns) < _LEAST_TURN:
+    if np.ptp(turns) < _MIN_TURN_RAD:
         return None
     back = -turns / (2 * np.pi) * pictures.shape[2]
     rolls = zip(pictures, back, strict=True)
     turned = np.stack([np.roll(picture, round(by), axis=1) for picture, by in rolls])
-    coarse = _measure(turned, _STRUCTURE_TURNED)
+    coarse = _measure(turned, _TURNED_STRUCTURE_WIDTH_PX)
     if not certain_places(coarse).any():
         return None
-    fine = _measure(turned, _STRUCTURE)
+    fine = _measure(turned, _STRUCTURE_WIDTH_PX)
     return turned, fine if certain_places(fine).any() else coarse
 
 
 def _check_moving(structure: FixedStructure) -> None:
-    """Refuse frames in which too little moves for what stays to be the carrier.
+    """Refuse frames in which too little moves to tell the carrier from the world.
 
     Raises:
-        GsbaError: saying how much stays.
+        GsbaError: too little moves; the message gives the shares.
     """
     heights = (np.arange(len(structure.strong)) + 0.5) / len(structure.strong)
     weights = structure.textured * np.sin(np.pi * heights)[:, None]  # solid angles
-    if weights.mean() < _MIN_TEXTURED:
-        raise GsbaError("the frames show too little texture to tell what stays in place")
+    if weights.mean() < _MIN_TEXTURED_SHARE:
+        raise GsbaError("the frames show too little texture to detect the carrier")
     staying, moving = (
         float((weights * places).sum() / weights.sum())
-        for places in (structure.strong > _STAYS, structure.strong < _MOVES)
+        for places in (
+            structure.strong > _MIN_FIXED_CORRELATION,
+            structure.strong < _MAX_MOVING_CORRELATION,
+        )
     )
     logger.debug("textured: %.0f%% stay, %.0f%% move", 100 * staying, 100 * moving)
-    if staying > _STANDING:
+    if staying > _STANDSTILL_SHARE:
         raise GsbaError(
-            f"the frames hardly differ ({100 * staying:.0f}% of what has texture stays in its "
-            "direction): the camera must move for its carrier to stand out"
+            f"the frames hardly differ ({100 * staying:.0f}% of textured directions stay fixed): "
+            "the camera must move to detect its carrier"
         )
-    if moving < _MIN_MOVING:
+    if moving < _MIN_MOVING_SHARE:
         raise GsbaError(
-            f"{100 * staying:.0f}% of what has texture stays in its direction and only "
-            f"{100 * moving:.0f}% moves: most of the picture is a vehicle, or far away, or the "
-            "camera hardly moves; give a mask of what carries it (--masks FILE)"
+            f"{100 * staying:.0f}% of textured directions stay fixed, only "
+            f"{100 * moving:.0f}% move: most of the picture is a vehicle, or far away, or the "
+            "camera hardly moves; give a mask of the carrier (--masks FILE)"
         )

@@ -1,17 +1,17 @@
-"""How far the carrier has turned in pictures that do not turn with the camera.
+"""Rotation of the carrier in pictures that do not turn with the camera.
 
-With direction lock the picture keeps its heading, so that what carries the camera turns below it:
-its columns shift as a whole, while the floor moves otherwise. A template of the lowest rows and
-each frame's shift against it are found in turn, every pixel weighted by how well it stays.
+With direction lock the picture keeps its heading, so that the carrier turns in it: its columns
+shift as a whole, while the floor moves differently. A template of the lowest rows and each frame's
+shift against it are estimated in turn, every pixel weighted by its stability.
 """
 
 import numpy as np
 
-WIDTH = 256  # pixels across the pictures that shifts are found in
-_TOP = 0.7  # of the height: rows from here down are compared
-_REFERENCES = 3  # frames tried as the first template
-_ROUNDS = 4
-_FLOOR_LEVELS = 4.0  # grey levels: pixels that stay better than that all count the same
+WIDTH = 256  # pixels across the pictures in which shifts are estimated
+_TOP_ROW_SHARE = 0.7  # part of the height: only rows from here down are compared
+_NUM_REFERENCES = 3  # frames tried as the first template
+_NUM_ROUNDS = 4
+_MIN_CHANGE = 4.0  # grey levels: more stable pixels have equal weights
 
 
 def band_of(picture: np.ndarray) -> np.ndarray:
@@ -19,28 +19,30 @@ def band_of(picture: np.ndarray) -> np.ndarray:
     import cv2
 
     small = cv2.resize(picture, (WIDTH, WIDTH // 2), interpolation=cv2.INTER_AREA)
-    return cv2.cvtColor(small[int(_TOP * len(small)) :], cv2.COLOR_RGB2GRAY).astype(np.float32)
+    return cv2.cvtColor(small[int(_TOP_ROW_SHARE * len(small)) :], cv2.COLOR_RGB2GRAY).astype(
+        np.float32
+    )
 
 
 def find_turns(bands: np.ndarray) -> np.ndarray:
-    """How far the carrier has turned in each frame.
+    """Rotation of the carrier in each frame.
 
     Args:
         bands: (F, r, WIDTH) float32 grey levels, the lowest rows of each picture.
 
     Returns:
-        Turns (F,) float64, radians, to the right of the first frame's.
+        Turns (F,) float64, radians, to the right, relative to the first frame.
     """
     levels = bands.mean(axis=(1, 2), keepdims=True)
     even = bands / np.maximum(levels, 1.0) * levels.mean()
     spectra = np.fft.rfft(even, axis=-1)
     squares = np.fft.rfft(even**2, axis=-1)
     best, turns = 0.0, np.zeros(len(bands))
-    references = np.unique(np.linspace(0, len(bands) - 1, _REFERENCES).astype(int))
+    references = np.unique(np.linspace(0, len(bands) - 1, _NUM_REFERENCES).astype(int))
     for reference in references:
         template, weights = even[reference], np.ones(even.shape[1:])
         shifts = np.zeros(len(bands))
-        for _ in range(_ROUNDS):
+        for _ in range(_NUM_ROUNDS):
             shifts = _shifts(spectra, squares, template, weights)
             template, weights = _steadiness(_rolled(spectra, -shifts))
         if weights.sum() > best:
@@ -53,13 +55,13 @@ def _steadiness(bands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Median (r, WIDTH) of bands, and the weight (r, WIDTH) of each pixel: 1 / its variance."""
     median = np.median(bands, axis=0)
     change = np.median(np.abs(bands - median), axis=0)
-    return median, 1 / (change**2 + _FLOOR_LEVELS**2)
+    return median, 1 / (change**2 + _MIN_CHANGE**2)
 
 
 def _shifts(
     spectra: np.ndarray, squares: np.ndarray, template: np.ndarray, weights: np.ndarray
 ) -> np.ndarray:
-    """Columns (F,) that frames are shifted to the right of a template: least weighted squares."""
+    """Shifts (F,) in columns to the right of a template, by least weighted squares."""
     w, wt = (np.fft.rfft(x, axis=-1).conj() for x in (weights, weights * template))
     costs = np.fft.irfft((squares * w - 2 * spectra * wt).sum(axis=1), WIDTH, axis=-1)
     at = np.argmin(costs, axis=1)
@@ -70,6 +72,6 @@ def _shifts(
 
 
 def _rolled(spectra: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-    """Bands (F, r, WIDTH) shifted to the right by columns (F,), between pixels too."""
+    """Bands (F, r, WIDTH) shifted to the right by fractional columns (F,)."""
     waves = -2j * np.pi / WIDTH * np.arange(spectra.shape[-1])
     return np.fft.irfft(spectra * np.exp(waves * shifts[:, None, None]), WIDTH, axis=-1)

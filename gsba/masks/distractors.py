@@ -1,10 +1,10 @@
-"""What moves by itself, found from a solved map: pixels that no static scene explains.
+"""Detection of moving objects from a solved map: pixels that no static scene explains.
 
 A panorama is compared with its neighbours through their solved poses, at a range of distances
-that the map's points around each direction allow (a plane sweep, Collins, CVPR 1996). What stands
-still agrees with several neighbours at some distance. What walked about agrees with hardly any,
-while those agree with one another on what was behind it. A pixel is accused only where enough
-neighbours could have seen it.
+bounded by the map's points around each direction (a plane sweep, Collins, CVPR 1996). Static scene
+agrees with several neighbours at some distance. Moving objects agree with hardly any, while those
+agree with one another on the background. A pixel is marked only if enough neighbours could have
+seen it.
 """
 
 import threading
@@ -26,44 +26,45 @@ from gsba.store.shards import StoredRecords
 from gsba.store.store import PerFrame
 from gsba.types import FrameSet, Landmarks, Tracks
 
-_WIDTH = 512  # pixels across the panoramas that are compared
-_NEIGHBOURS = 6
-_WITNESSES = 3  # fewer neighbours accuse nobody
-_LEAST_SHARED = 30  # points that a neighbour shares
-_DISTANCES = 18
-_MARGIN = 1.4  # beyond the nearest and furthest points around a direction
-_CELL = 8  # pixels: the grid on which distances are bounded
-_REACH = 3  # cells around a direction whose points bound it
-_EMPTY = np.float32(-1e9)  # a cell of it without points
-_PATCH = 5  # pixels over which differences are averaged
-_CAP = 60.0  # grey levels
-_WEAK, _STRONG = 5.0, 14.0  # grey levels: of a distractor's pixels, and of some of them
-_NOISE = 1.0  # grey levels that half of the pixels of good pictures stay below
-_WORST = 5.0  # grey levels: where half of the pixels do not, nothing can be told
-_AGREE = 2.0  # spreads of the neighbours that a pixel must be away from their median
-_THIN = 5  # pixels: narrower is an edge
-_LEAST_AREA = 120  # strong pixels at the equator
-_CLOSED = 13  # pixels: gaps up to this are closed
-_GROWN = 5  # pixels: the rim is blurred, and a splat shows what is left of it
-_MOST = 0.35  # of a picture: more is a wrong pose, or light that changed
-_LEVELS = 15  # of a weight that is kept
-_WRAP = 32  # pixels over the seam
-_wrapped = partial(around_seam, columns=_WRAP)
+_WIDTH_PX = 512  # pixels across the panoramas that are compared
+_NUM_NEIGHBOURS = 6  # neighbours that each frame is compared with
+_MIN_WITNESSES = 3  # least number of neighbours that can mark a pixel
+_MIN_SHARED_POINTS = 30  # least number of shared points of a neighbour
+_NUM_DISTANCES = 18  # assumed distances
+_DISTANCE_MARGIN = 1.4  # factor beyond the nearest and furthest points around a direction
+_CELL_PX = 8  # pixels: the grid on which distances are bounded
+_REACH_CELLS = 3  # cells around a direction whose points bound its distance
+_EMPTY_CELL = np.float32(-1e9)  # value of a cell without points
+_PATCH_PX = 5  # pixels over which differences are averaged
+_MAX_DIFFERENCE = 60.0  # grey levels at which differences are clipped
+_WEAK_DIFFERENCE, _STRONG_DIFFERENCE = 5.0, 14.0  # grey levels: of all pixels of a distractor, and
+# of at least some of them
+_TYPICAL_DIFFERENCE = 1.0  # grey levels, median difference of good pictures
+_MAX_MEDIAN_DIFFERENCE = 5.0  # grey levels, median difference from which a frame cannot be judged
+_MIN_SPREADS = 2.0  # spreads of the neighbours by which a pixel must differ from their median
+_MIN_WIDTH_PX = 5  # pixels: narrower regions are edges
+_MIN_AREA_PX = 120  # strong pixels at the equator
+_CLOSING_PX = 13  # pixels: gaps up to this are closed
+_DILATION_PX = 5  # pixels added: the rim is blurred, and a splat shows any remainder
+_MAX_SHARE = 0.35  # share of a picture: more is a wrong pose, or changed light
+_NUM_LEVELS = 15  # levels of a stored weight
+_WRAP_PX = 32  # pixels padded over the seam
+_wrapped = partial(around_seam, columns=_WRAP_PX)
 
 
 @dataclass(frozen=True, slots=True)
 class Distractors:
-    """What was found in one frame."""
+    """The distractors found in one frame."""
 
     weights: np.ndarray  # compressed (h, 2h) 0..1, 0 = distractor; see `distractor_weights`
-    share: float  # of the sphere
-    reason: str  # why nothing was looked for, or ""
+    share: float  # of the sphere that distractors cover
+    reason: str  # why the frame was not searched, or ""
 
 
 def distractor_weights(found: Distractors) -> np.ndarray:
-    """How far pixels can be trusted, (h, 2h) float32, 0..1, 0 = distractor."""
+    """Weights of pixels, (h, 2h) float32, 0..1, 0 = distractor."""
     levels = np.asarray(cv2.imdecode(found.weights, cv2.IMREAD_GRAYSCALE), np.float32)
-    return levels / _LEVELS
+    return levels / _NUM_LEVELS
 
 
 def distractor_mask(found: Distractors) -> np.ndarray:
@@ -73,7 +74,7 @@ def distractor_mask(found: Distractors) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class KnownMasks:
-    """What an earlier look found: (h, 2h) bool, True = distractor, by frame."""
+    """Distractors of an earlier pass, (h, 2h) bool by frame."""
 
     found: PerFrame[Distractors]
     names: tuple[str, ...]  # (F,)
@@ -82,13 +83,13 @@ class KnownMasks:
         return distractor_mask(self.found[self.names[frame]])
 
     def taken(self, chosen: Sequence[int]) -> "_StoredMasks":
-        """Those of some frames, renumbered, as workers elsewhere can read them."""
+        """The masks of some frames, renumbered, with paths for other processes."""
         return _StoredMasks(self.found.records({n: self.names[f] for n, f in enumerate(chosen)}))
 
 
 @dataclass(frozen=True, slots=True)
 class _StoredMasks:
-    """The same from files alone."""
+    """Distractors of an earlier pass, read from files alone."""
 
     records: StoredRecords[Distractors]
 
@@ -97,18 +98,18 @@ class _StoredMasks:
 
 
 class StaticScene:
-    """A solved map, ready to be asked frame by frame, from any thread.
+    """A solved map, prepared to search frames one by one, from any thread.
 
-    Small pictures are kept in memory up to a limit; the rest is read again.
+    Small pictures are kept in memory up to a limit; the others are read again.
 
     Args:
-        frames: of any layout; what their masks exclude neither accuses nor is accused.
+        frames: of any layout; masked pixels are neither compared nor marked.
         world_T_rigs: (F, 4, 4) solved poses.
         landmarks: the solved points.
-        known: distractors (h, w) bool of a frame found before: they explain and accuse nobody, and
-            stay what they are where too few neighbours are left to tell.
-        limit_mb: of memory.
-        neighbours: of frames that will be asked for, where others are left out.
+        known: distractors (h, w) bool of a frame found before: they are not compared, and stay
+            marked where too few neighbours are left to judge.
+        limit_mb: limit of memory for pictures, MB.
+        neighbours: neighbours of frames to search, if other frames are left out.
     """
 
     def __init__(
@@ -123,7 +124,9 @@ class StaticScene:
         self._frames, self._poses, self._landmarks = frames, world_T_rigs, landmarks
         self._limit_mb, self._known_neighbours = limit_mb, neighbours or {}
         whole = frames.panoramic
-        self.width = min(_WIDTH, frames.width) if whole else panorama.width_for(frames, _WIDTH)
+        self.width = (
+            min(_WIDTH_PX, frames.width) if whole else panorama.width_for(frames, _WIDTH_PX)
+        )
         self._known, self._rays = known, _rays(self.width)
         self._room = int(limit_mb * 2**20 / (1.5 * self.width**2))
         self._kept: dict[int, np.ndarray] = {}
@@ -133,15 +136,15 @@ class StaticScene:
         starts = np.searchsorted(tracks.frames[order], np.arange(len(frames) + 1))
         self._seen = [np.unique(tracks.points[order[a:b]]) for a, b in pairwise(starts)]
 
-    def __reduce__(self) -> tuple[object, ...]:  # pictures are read again
+    def __reduce__(self) -> tuple[object, ...]:  # workers read pictures again
         own = self._frames, self._poses, self._landmarks, self._known
         return StaticScene, (*own, self._limit_mb, self._known_neighbours)
 
     def taken(self, chosen: Sequence[int]) -> tuple["StaticScene", dict[int, int]]:
-        """The scene that some frames need, as workers elsewhere can look at it.
+        """The part of the scene that some frames need, for other processes.
 
         Returns:
-            It, and the number there of each of its frames.
+            The scene, and the index in it of each of its frames.
         """
         near = {frame: self._neighbours(frame) for frame in chosen}
         rows = np.unique(np.concatenate([np.array(chosen, np.int64), *near.values()]))
@@ -169,7 +172,7 @@ class StaticScene:
         """Distractors in one frame."""
         shape = (self.width // 2, self.width)
         near = self._neighbours(frame)
-        if len(near) < _WITNESSES:
+        if len(near) < _MIN_WITNESSES:
             return _packed(np.ones(shape), "too few frames share points with it")
         own = self._picture(frame)
         usable = own[..., 0] >= 0
@@ -179,30 +182,30 @@ class StaticScene:
         middle = np.exp(0.5 * (lowest + highest)).astype(np.float32)
         seen = _distractor_kernels.witnesses(others[..., 0] >= 0, n_T_own, self._rays, middle)
         score = _score(own, others, n_T_own, self._rays, lowest, highest)
-        unjudged = seen < min(_WITNESSES, len(near))
+        unjudged = seen < min(_MIN_WITNESSES, len(near))
         score[unjudged | ~usable] = 0
-        noise = max(1.0, float(np.median(score)) / _NOISE)
+        noise = max(1.0, float(np.median(score)) / _TYPICAL_DIFFERENCE)
         found = _decide(score, noise)
-        if self._known is not None:  # whom the first look accused and none is left to judge
+        if self._known is not None:  # marked in the first pass, with no neighbour left to judge
             found |= self._known(frame) & unjudged
         found &= usable
-        if np.median(score) > _WORST or _share(found) > _MOST:
+        if np.median(score) > _MAX_MEDIAN_DIFFERENCE or _share(found) > _MAX_SHARE:
             return _packed(np.ones(shape), "fits no neighbour: its pose or light is off")
-        return _packed(np.where(found, 0, 1 / (1 + (score / (noise * _WEAK)) ** 2)), "")
+        return _packed(np.where(found, 0, 1 / (1 + (score / (noise * _WEAK_DIFFERENCE)) ** 2)), "")
 
     def _neighbours(self, frame: int) -> np.ndarray:
-        """The frames that share most points, most first."""
+        """The frames that share the most points, most first."""
         if frame in self._known_neighbours:
             return self._known_neighbours[frame]
         inside = np.zeros(len(self._landmarks.points_world), bool)
         inside[self._seen[frame]] = True
         shared = np.array([np.count_nonzero(inside[seen]) for seen in self._seen])
         shared[frame] = 0
-        best = np.argsort(-shared, kind="stable")[:_NEIGHBOURS]
-        return best[shared[best] >= _LEAST_SHARED]
+        best = np.argsort(-shared, kind="stable")[:_NUM_NEIGHBOURS]
+        return best[shared[best] >= _MIN_SHARED_POINTS]
 
     def _picture(self, frame: int) -> np.ndarray:
-        """Small panorama (h, w, C) float32, negative where it may not be used."""
+        """Small panorama (h, w, C) float32, negative where masked."""
         kept = self._kept.get(frame)
         if kept is None:
             kept = _load(self._frames, frame, self.width)
@@ -215,14 +218,14 @@ class StaticScene:
         return picture
 
     def _exposed(self, other: int, frame: int, own: np.ndarray) -> np.ndarray:
-        """A neighbour's picture at the exposure of a frame, judged by the points that both see."""
+        """A neighbour's picture scaled to the exposure of a frame, by their shared points."""
         picture = self._picture(other)
         if self._known is not None:
             picture[self._known(other)] = -1.0
         points = np.intersect1d(self._seen[frame], self._seen[other], assume_unique=True)
         a, b = self._colors(own, frame, points), self._colors(picture, other, points)
         good = (a.min(axis=1) > 0) & (b.min(axis=1) > 0)
-        if np.count_nonzero(good) >= _LEAST_SHARED // 2:
+        if np.count_nonzero(good) >= _MIN_SHARED_POINTS // 2:
             gain = np.median(a[good] / b[good], axis=0)
             picture = np.where(picture < 0, -1.0, np.clip(gain, 0.4, 2.5) * picture)
         return picture.astype(np.float32)
@@ -244,17 +247,17 @@ class StaticScene:
     def _bounds(self, frame: int, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Logarithms (h, w) float32 of the least and largest inverse distance to assume."""
         points = np.unique(np.concatenate([self._seen[f] for f in (frame, *near)]))
-        width = self.width // _CELL
+        width = self.width // _CELL_PX
         pixels, distances = self._pixels(frame, points, width)
         u, v = pixels.T
         logs = -np.log(distances).astype(np.float32)
-        high = np.full((width // 2, width), _EMPTY, np.float32)
+        high = np.full((width // 2, width), _EMPTY_CELL, np.float32)
         low = high.copy()  # of the negative, so that both are maxima
         np.maximum.at(high, (v, u), logs)
         np.maximum.at(low, (v, u), -logs)
         high, low = _spread_out(high), _spread_out(low)
         size = (self.width, self.width // 2)
-        margin = np.float32(np.log(_MARGIN))
+        margin = np.float32(np.log(_DISTANCE_MARGIN))
         return -cv2.resize(low, size) - margin, cv2.resize(high, size) + margin
 
 
@@ -264,7 +267,7 @@ def _rays(width: int) -> np.ndarray:
 
 
 def _load(frames: FrameSet, frame: int, width: int) -> np.ndarray:
-    """Small picture (h, w, C + 1) uint8: colours, or grey of cube faces, and where to use it."""
+    """Small picture (h, w, C + 1) uint8: colours, or grey of cube faces, and the mask."""
     if frames.panoramic:
         color = load_erp(frames, frame, width=width)
         mask = load_mask(frames, frame)
@@ -279,15 +282,15 @@ def _load(frames: FrameSet, frame: int, width: int) -> np.ndarray:
 
 def _spread_out(cells: np.ndarray) -> np.ndarray:
     """Maxima over the cells around each (h, w), then outward until no cell is empty."""
-    window = np.ones((2 * _REACH + 1, 2 * _REACH + 1), np.uint8)
+    window = np.ones((2 * _REACH_CELLS + 1, 2 * _REACH_CELLS + 1), np.uint8)
 
     def widened(a: np.ndarray) -> np.ndarray:
-        ring = np.concatenate([a[:, -_REACH:], a, a[:, :_REACH]], axis=1)
-        return np.maximum(cv2.dilate(ring, window)[:, _REACH:-_REACH], _EMPTY)
+        ring = np.concatenate([a[:, -_REACH_CELLS:], a, a[:, :_REACH_CELLS]], axis=1)
+        return np.maximum(cv2.dilate(ring, window)[:, _REACH_CELLS:-_REACH_CELLS], _EMPTY_CELL)
 
     cells = widened(cells)
-    while (cells <= _EMPTY).any():
-        cells = np.where(cells <= _EMPTY, widened(cells), cells)
+    while (cells <= _EMPTY_CELL).any():
+        cells = np.where(cells <= _EMPTY_CELL, widened(cells), cells)
     return cells
 
 
@@ -309,20 +312,23 @@ def _score(
     least, most = (np.ascontiguousarray(_unwrapped(x)).reshape(own.shape) for x in (least, most))
     differences = np.empty((num, *shape), np.float32)
     away, spread = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    best = np.full((2, *shape), _CAP, np.float32)
-    away_best, spread_best = np.zeros(shape, np.float32), np.full(shape, 2 * _CAP, np.float32)
+    best = np.full((2, *shape), _MAX_DIFFERENCE, np.float32)
+    away_best, spread_best = (
+        np.zeros(shape, np.float32),
+        np.full(shape, 2 * _MAX_DIFFERENCE, np.float32),
+    )
     nearest, furthest = np.exp(highest), np.exp(lowest)
-    for step in np.linspace(0, 1, _DISTANCES, dtype=np.float32):  # even steps in the pictures
+    for step in np.linspace(0, 1, _NUM_DISTANCES, dtype=np.float32):  # even steps in the pictures
         assumed = (1 - step) * nearest + step * furthest
         _distractor_kernels.compare(
-            own, least, most, others, n_T_own, rays, assumed, np.float32(_CAP),
+            own, least, most, others, n_T_own, rays, assumed, np.float32(_MAX_DIFFERENCE),
             differences, away, spread,
         )  # fmt: skip
         smooth = np.stack([_averaged(differences[n]) for n in range(num)])
         _distractor_kernels.keep_best(
             smooth, _averaged(away), _averaged(spread), best, away_best, spread_best
         )
-    contradicted = 0.5 * (away_best - _AGREE * spread_best)
+    contradicted = 0.5 * (away_best - _MIN_SPREADS * spread_best)
     return np.maximum(best[0], np.minimum(best[1], contradicted))
 
 
@@ -330,26 +336,30 @@ def _decide(score: np.ndarray, noise: float) -> np.ndarray:
     """Distractors (h, w) bool: connected, not thin, and strong somewhere."""
     wide = _wrapped(score)
     weak = cv2.morphologyEx(
-        (wide > noise * _WEAK).astype(np.uint8), cv2.MORPH_OPEN, np.ones((_THIN, _THIN), np.uint8)
+        (wide > noise * _WEAK_DIFFERENCE).astype(np.uint8),
+        cv2.MORPH_OPEN,
+        np.ones((_MIN_WIDTH_PX, _MIN_WIDTH_PX), np.uint8),
     )
     num, parts = cv2.connectedComponents(weak, connectivity=4)
     labels = np.asarray(parts, np.int32)
     rows = (np.arange(len(wide)) + 0.5) / len(wide)
     areas = np.broadcast_to(np.sin(np.pi * rows)[:, None], wide.shape)
-    strong = (weak > 0) & (wide > noise * _STRONG)
+    strong = (weak > 0) & (wide > noise * _STRONG_DIFFERENCE)
     sums = np.bincount(labels[strong], weights=areas[strong], minlength=num)
     sums[0] = 0
-    found = (sums >= _LEAST_AREA)[labels].astype(np.uint8)
-    ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_CLOSED, _CLOSED))
+    found = (sums >= _MIN_AREA_PX)[labels].astype(np.uint8)
+    ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_CLOSING_PX, _CLOSING_PX))
     found = cv2.morphologyEx(found, cv2.MORPH_CLOSE, ellipse)
     outlines, _ = cv2.findContours(found, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(found, outlines, -1, 1, cv2.FILLED)
-    grown = cv2.dilate(found, np.ones((_GROWN, _GROWN), np.uint8))
+    grown = cv2.dilate(found, np.ones((_DILATION_PX, _DILATION_PX), np.uint8))
     return _unwrapped(grown) > 0
 
 
 def _packed(weights: np.ndarray, reason: str) -> Distractors:
-    levels = np.where(weights > 0, np.maximum(np.rint(_LEVELS * weights), 1), 0).astype(np.uint8)
+    levels = np.where(weights > 0, np.maximum(np.rint(_NUM_LEVELS * weights), 1), 0).astype(
+        np.uint8
+    )
     return Distractors(cv2.imencode(".png", levels)[1].ravel(), _share(weights == 0), reason)
 
 
@@ -360,11 +370,13 @@ def _share(found: np.ndarray) -> float:
 
 
 def _unwrapped(image: np.ndarray) -> np.ndarray:
-    return image[:, _WRAP:-_WRAP]
+    return image[:, _WRAP_PX:-_WRAP_PX]
 
 
 def _averaged(image: np.ndarray) -> np.ndarray:
-    return _unwrapped(cv2.blur(_wrapped(image), (_PATCH, _PATCH), borderType=cv2.BORDER_REPLICATE))
+    return _unwrapped(
+        cv2.blur(_wrapped(image), (_PATCH_PX, _PATCH_PX), borderType=cv2.BORDER_REPLICATE)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -378,6 +390,6 @@ class Look:
         return self.scene.find(self.numbers[name])
 
     def taken(self, names: Sequence[str]) -> "Look":
-        """What some frames need of it; see `gsba.store.store.Taken`."""
+        """The part that some frames need, see `gsba.store.store.Taken`."""
         scene, number = self.scene.taken([self.numbers[name] for name in names])
         return Look(scene, {name: number[self.numbers[name]] for name in names})

@@ -1,10 +1,10 @@
-"""How well local structure keeps its direction, in the camera's frame, while the camera moves.
+"""Stability of local structure's direction, in the rig frame, while the camera moves.
 
-Around every direction, the gradients of each frame are correlated with their mean over the
-frames. What rides with the camera agrees in nearly every frame. The world agrees in none, but for
-edges that the motion shifts along themselves: a rail at the horizon, the line where a corridor
-meets its floor. They agree along one direction alone, so the gradients along the weaker principal
-direction of the structure tensor (Förstner, Gülch, ISPRS 1987) are correlated apart.
+Around every direction, the gradients of each frame are correlated with their mean over the frames.
+The carrier agrees in nearly every frame. The world agrees in none, except for edges that the motion
+shifts along themselves: a rail at the horizon, the line where a corridor meets its floor. They
+agree along one direction alone, so the gradients along the weaker principal direction of the
+structure tensor (Förstner, Gülch, ISPRS 1987) are correlated separately.
 """
 
 from dataclasses import dataclass
@@ -15,20 +15,23 @@ import numpy as np
 
 from gsba.camera.sphere import around_sphere
 
-_PAD = 16  # pixels around them
-_SMOOTHING = 0.7  # pixels, standard deviation, before gradients are taken
-_WINDOW, _WINDOW_SIZE = 2.0, (7, 7)  # pixels, standard deviation and extent, around a direction
-_NOISE = 3.0  # grey levels per pixel and channel: gradients of noise, JPEG and smooth shading
-_WORST = 0.1  # quantile of the frames: a passing shadow or hand may hide the carrier in so many
+_PADDING_PX = 16  # pixels padded around pictures
+_SMOOTHING_PX = 0.7  # pixels, standard deviation, before gradients are taken
+_WINDOW_SIGMA_PX, _WINDOW_SIZE = 2.0, (7, 7)  # pixels, standard deviation and extent, around a
+# direction
+_GRADIENT_NOISE = 3.0  # grey levels per pixel and channel: gradients of noise, JPEG and smooth
+# shading
+_WORST_QUANTILE = 0.1  # quantile of the frames: a passing shadow or hand may hide the carrier in
+# this share
 
 
 @dataclass(frozen=True, slots=True)
 class FixedStructure:
-    """Correlation of frames with what they have in common, -1..1, in all but the worst frames."""
+    """Correlation of frames with their mean, -1..1, in all but the worst frames."""
 
     strong: np.ndarray  # (h, 2h) float32, of all gradients around a direction
     weak: np.ndarray  # (h, 2h) float32, of those along the weaker principal direction
-    textured: np.ndarray  # (h, 2h) bool, structure beyond noise in most frames
+    textured: np.ndarray  # (h, 2h) bool, structure above noise in most frames
 
 
 def measure_fixed_structure(pictures: np.ndarray) -> FixedStructure:
@@ -40,13 +43,13 @@ def measure_fixed_structure(pictures: np.ndarray) -> FixedStructure:
     """
     across, down = np.stack([_gradients(picture) for picture in pictures], axis=1)
     u, v = across.mean(axis=0), down.mean(axis=0)
-    window = partial(cv2.GaussianBlur, ksize=_WINDOW_SIZE, sigmaX=_WINDOW)
+    window = partial(cv2.GaussianBlur, ksize=_WINDOW_SIZE, sigmaX=_WINDOW_SIGMA_PX)
     uu, uv, vv = (window(_dot(a, b)) for a, b in ((u, u), (u, v), (v, v)))
     strong_angle = 0.5 * np.arctan2(2 * uv, uu - vv)
     a, b = -np.sin(strong_angle)[..., None], np.cos(strong_angle)[..., None]
     weak = a * u + b * v
     energy, weak_energy = uu + vv, window(_dot(weak, weak))
-    noise = np.float32(u.shape[-1] * _NOISE**2)
+    noise = np.float32(u.shape[-1] * _GRADIENT_NOISE**2)
     correlations, energies = [], []
     for x, y in zip(across, down, strict=True):
         own, along = window(_dot(x, x) + _dot(y, y)), a * x + b * y
@@ -56,15 +59,18 @@ def measure_fixed_structure(pictures: np.ndarray) -> FixedStructure:
         weak_scale = np.sqrt((own_weak + noise / 2) * np.maximum(weak_energy, 1e-6))
         correlations.append((shared / strong_scale, shared_weak / weak_scale))
         energies.append(own)
-    worst = np.quantile(np.array(correlations), _WORST, axis=0).astype(np.float32)
+    worst = np.quantile(np.array(correlations), _WORST_QUANTILE, axis=0).astype(np.float32)
     textured = np.median(energies, axis=0) > noise
-    return FixedStructure(*(x[_PAD:-_PAD, _PAD:-_PAD] for x in (*worst, textured)))
+    return FixedStructure(
+        *(x[_PADDING_PX:-_PADDING_PX, _PADDING_PX:-_PADDING_PX] for x in (*worst, textured))
+    )
 
 
 def _gradients(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gradients to the right and down, (h + 2 _PAD, 2h + 2 _PAD, 3) float32, levels per pixel."""
-    padded = around_sphere(picture, _PAD).astype(np.float32)
-    smooth = cv2.GaussianBlur(padded, (0, 0), _SMOOTHING)
+    """Gradients to the right and down, (h + 2 _PADDING_PX, 2h + 2 _PADDING_PX, 3) float32, levels
+    per pixel."""
+    padded = around_sphere(picture, _PADDING_PX).astype(np.float32)
+    smooth = cv2.GaussianBlur(padded, (0, 0), _SMOOTHING_PX)
     return cv2.Sobel(smooth, -1, 1, 0, scale=1 / 8), cv2.Sobel(smooth, -1, 0, 1, scale=1 / 8)
 
 

@@ -1,7 +1,7 @@
-"""The masks of a run: given, found before the first solution and after it, merged into files.
+"""The masks of a run: given ones, and those found before and after the first solution, merged.
 
-White = use. What is found is written where it can be looked at; features, patches, splats and
-exports then read the files as they read masks that were given.
+White = use. Found masks are written to the run's folder; features, patches, splats and exports then
+read these files like given masks.
 """
 
 import logging
@@ -36,29 +36,30 @@ from gsba.types import Counts, FrameSet, Solution
 
 logger = logging.getLogger(__name__)
 
-AUTO, CARRIER, DISTRACTORS, NONE = "auto", "carrier", "distractors", "none"  # in place of a file
+AUTO, CARRIER, DISTRACTORS, NONE = "auto", "carrier", "distractors", "none"  # values of --masks
+# beside a file
 Masks = Path | str | Sequence[Path | str] | None
 _FOLDER = "masks"
-_SHOWN, _SHOWN_WIDTH = 6, 768  # frames and pixels of the picture to look at
+_NUM_CHECK_FRAMES, _CHECK_WIDTH_PX = 6, 768  # frames in the check picture, and its width in pixels
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Where masks come from."""
+    """The sources of masks."""
 
     given: Path | None  # file or folder
     carrier: bool
     distractors: bool
     segment: Segment | None
-    carrier_required: bool = False  # frames that do not tell what carries the camera are refused
+    carrier_required: bool = False  # True if an undetectable carrier is an error
 
 
 def choose(masks: Masks, segment: Segment | None = None) -> Choice:
-    """What `--masks` and `--segment` ask for.
+    """The sources of masks that `--masks` and `--segment` name.
 
     Args:
         masks: a file or a folder, "auto", "carrier", "distractors", or several of these; "none" or
-            None = no masks. "carrier" is "auto" that refuses frames which do not tell.
+            None = no masks. "carrier" is "auto" that fails if the carrier cannot be detected.
         segment: see `gsba.masks.segmentation`.
 
     Raises:
@@ -81,11 +82,10 @@ def choose(masks: Masks, segment: Segment | None = None) -> Choice:
 
 
 def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
-    """Frames without what is known before any solution: what is segmented, and the carrier.
+    """Frames with masks known before any solution: segmentation, and the carrier.
 
     Raises:
-        GsbaError: a segmentation that fails; frames that do not tell what carries the camera,
-            where that is required.
+        GsbaError: a segmentation fails; or the carrier is required and cannot be detected.
     """
     parts: list[Callable[[int], np.ndarray | None]] = []
     names = []
@@ -110,14 +110,14 @@ def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
 def after(
     store: RunStore, frames: FrameSet, solved: Solution, stage: str
 ) -> tuple[FrameSet, Counts]:
-    """Frames without what no static scene explains.
+    """Frames with masks of pixels that no static scene explains.
 
-    It is looked for twice: the second time, what the first has found in other frames neither
-    explains nor accuses.
+    Distractors are searched twice: the second pass does not compare pixels that the first one
+    marked in other frames.
 
     Args:
         solved: a first solution.
-        stage: its name.
+        stage: its stage name.
     """
     items = dict.fromkeys(frames.names)
 
@@ -140,20 +140,20 @@ def after(
     reasons = [one.reason.partition(":")[0] for one in results if one.reason]
     for name, one in zip(frames.names, results, strict=True):
         if one.reason:
-            logger.warning("%s: no distractors looked for: %s", name, one.reason)
+            logger.warning("%s: not searched for distractors: %s", name, one.reason)
     logger.info("distractors: %.1f%% of the pictures", 100 * shares.mean())
     dropped = {reason: reasons.count(reason) for reason in dict.fromkeys(reasons)}
     return merged, Counts(len(results), len(results) - len(reasons), "frames", dropped)
 
 
 def recut(store: RunStore, frames: FrameSet, cut: int) -> FrameSet:
-    """Raw pairs whose lenses are known better, with the carrier where these see it.
+    """Raw pairs cut anew by a better calibration, with the carrier detected again.
 
-    Masks that hold anything else stay as they are.
+    Masks of anything else are kept.
 
     Args:
-        frames: with masks of an earlier cut.
-        cut: its number, from 1.
+        frames: frames with masks of an earlier cut.
+        cut: number of this cut, from 1.
     """
     earlier = ["carrier.png", *(f"carrier{n}.png" for n in range(1, cut))]
     if not set(frames.mask_paths) <= {store.root / name for name in earlier}:
@@ -164,7 +164,7 @@ def recut(store: RunStore, frames: FrameSet, cut: int) -> FrameSet:
 
 
 def _carrier(store: RunStore, frames: FrameSet, required: bool, name: str = "carrier") -> Carrier:
-    """The carrier as stage `name`, and its pictures in the run's folder where there is one."""
+    """The carrier as stage `name`, and its pictures in the run's folder if there is one."""
 
     def compute() -> Carrier:
         try:
@@ -172,7 +172,7 @@ def _carrier(store: RunStore, frames: FrameSet, required: bool, name: str = "car
         except GsbaError as error:
             if required:
                 raise
-            logger.info("nothing is masked: %s", error)
+            logger.info("no carrier is masked: %s", error)
             return no_carrier(frames, str(error))
 
     files = fingerprint(path for group in frames.paths for path in group)
@@ -180,7 +180,8 @@ def _carrier(store: RunStore, frames: FrameSet, required: bool, name: str = "car
     if not found.share:
         return found
     path = store.root / f"{name}.png"
-    if not (path.exists() and store.records[name].resumed):  # a new file would undo all stages
+    if not (path.exists() and store.records[name].resumed):  # a new file would invalidate all
+        # stages
         write_carrier(found, frames, store.root, merge=False, name=name)
     for written in (path, store.root / f"{name}_check.jpg"):
         store.claim(written)
@@ -194,11 +195,11 @@ def _merge(
     parts: Sequence[Callable[[int], np.ndarray | None]],
     stages: Sequence[str],
 ) -> FrameSet:
-    """Frames with masks `folder`/NAME.png of what they had and all parts.
+    """Frames with masks `folder`/NAME.png, merged from their own masks and all parts.
 
-    A part is (h, 2h), bool or weights 0..1, or None.
+    A part gives (h, 2h), bool or weights 0..1, or None.
 
-    A file that would not change keeps its time, so that stages which depend on it resume.
+    An unchanged file keeps its time, so that stages that depend on it resume.
     """
     paths = [folder / f"{name}.png" for name in frames.names]
 
@@ -244,17 +245,17 @@ def _write_if_new(path: Path, levels: np.ndarray) -> None:
 
 
 def _write_check(path: Path, frames: FrameSet, shares: np.ndarray) -> None:
-    """The frames with most distractors, what is masked in them tinted."""
+    """Write a picture of the frames with most distractors, masked pixels tinted."""
     rows = []
-    for f in np.sort(np.argsort(-shares, kind="stable")[:_SHOWN]):
-        size = (_SHOWN_WIDTH, _SHOWN_WIDTH // 2)
+    for f in np.sort(np.argsort(-shares, kind="stable")[:_NUM_CHECK_FRAMES]):
+        size = (_CHECK_WIDTH_PX, _CHECK_WIDTH_PX // 2)
         if frames.panoramic:
-            shown = cv2.resize(load_erp(frames, int(f), width=_SHOWN_WIDTH), size)
+            shown = cv2.resize(load_erp(frames, int(f), width=_CHECK_WIDTH_PX), size)
         else:
             shown = np.full((size[1], size[0], 3), 128, np.uint8)
         mask = load_mask(frames, int(f))
         assert mask is not None
-        out = _fit(mask, _SHOWN_WIDTH) == 0
+        out = _fit(mask, _CHECK_WIDTH_PX) == 0
         shown[out] = (shown[out] * 0.5 + np.array([128, 0, 60])).astype(np.uint8)
         outlines, _ = cv2.findContours(out.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(shown, outlines, -1, (255, 80, 160), 1)

@@ -1,7 +1,7 @@
-"""A segmentation model of the user's own: a command or a Python callable that masks faces.
+"""A user's segmentation model: a command or a Python callable that masks faces.
 
-Each frame is cut into faces of 90 degrees; the model says where they may be used (white = use),
-and the answers are put back onto the sphere.
+Each frame is cut into faces of 90 degrees; the model masks them (white = use), and the masks are
+put back onto the sphere.
 """
 
 import functools
@@ -28,13 +28,13 @@ from gsba.types import FACES, FrameSet
 Segment = str | Callable[[np.ndarray], np.ndarray]
 """A command line, or a function from a face (N, N, 3) uint8 RGB to (N, N) bool, True = use."""
 
-_MAX_FACE = 1024  # pixels
-_FIELDS = ("{image}", "{mask}", "{images}", "{masks}")
+_MAX_FACE_PX = 1024  # pixels
+_PLACEHOLDERS = ("{image}", "{mask}", "{images}", "{masks}")
 
 
 @dataclass(frozen=True, slots=True)
 class Segmented:
-    """Where the faces of one frame may be used."""
+    """Masks of the faces of one frame."""
 
     bits: np.ndarray  # packed (6, size, size) bool, True = use, in FACES order
     size: int  # pixels
@@ -43,16 +43,16 @@ class Segmented:
 def segmented(store: RunStore, frames: FrameSet, segment: Segment) -> PerFrame[Segmented]:
     """Faces' masks by frame name, as stage `segmented` of a run.
 
-    A command is called once, `COMMAND IMAGES MASKS` with two folders: one PNG for each face is to
-    be answered by one of the same name and size. `{images}` and `{masks}` in it say where the
-    folders go; `{image}` and `{mask}` make it a call for every face. A callable's results are
+    A command is called once, `COMMAND IMAGES MASKS` with two folders: for each PNG of a face it
+    must write a mask of the same name and size. `{images}` and `{masks}` in the command stand for
+    the folders; `{image}` and `{mask}` make it a call for every face. A callable's results are
     never resumed.
 
     Raises:
-        GsbaError: a command that fails, or a mask that is missing or of another size.
+        GsbaError: the command fails, or a mask is missing or of another size.
     """
     index = {name: f for f, name in enumerate(frames.names)}
-    rig = cubemap.native_rig(frames, _MAX_FACE)
+    rig = cubemap.native_rig(frames, _MAX_FACE_PX)
     size = rig.size
     folder = store.root / "stages" / "segmented-faces"
     present = [FACES.index(face) for face in frames.faces] or list(range(len(FACES)))
@@ -79,14 +79,14 @@ def segmented(store: RunStore, frames: FrameSet, segment: Segment) -> PerFrame[S
 
 
 def load_segmented(found: PerFrame[Segmented], frames: FrameSet, frame: int) -> np.ndarray:
-    """Where frame may be used, (h, 2h) bool as dense as the faces."""
+    """Mask of a frame, (h, 2h) bool as dense as the faces."""
     one = found[frames.names[frame]]
     use = np.unpackbits(one.bits, count=len(FACES) * one.size**2) > 0
     return use[_places(one.size)]
 
 
 class _Once:
-    """Calls a function once, whoever comes first."""
+    """A function that is called once, by its first caller."""
 
     def __init__(self, work: Callable[[], None]) -> None:
         self._work, self._lock, self._done = work, threading.Lock(), False
@@ -99,7 +99,7 @@ class _Once:
 
 
 def _run(command: str, frames: FrameSet, rig: CubeRig, present: list[int], folder: Path) -> None:
-    """Write all faces, call the command, and check that it has answered them."""
+    """Write all faces, call the command, and check that it has masked them."""
     images, masks = folder / "images", folder / "masks"
     shutil.rmtree(folder, ignore_errors=True)
     with disk_errors(folder):
@@ -115,7 +115,7 @@ def _run(command: str, frames: FrameSet, rig: CubeRig, present: list[int], folde
         for name in track(names, "segmenting"):
             _call(words, {"{image}": images / name, "{mask}": masks / name}, command)
     else:
-        if not any(field in word for word in words for field in _FIELDS):
+        if not any(field in word for word in words for field in _PLACEHOLDERS):
             words = [*words, "{images}", "{masks}"]
         _call(words, {"{images}": images, "{masks}": masks}, command)
     missing = [name for name in names if not (masks / name).is_file()]
@@ -147,7 +147,7 @@ def _call(words: list[str], values: dict[str, Path], command: str) -> None:
     """Run a command without a shell.
 
     Raises:
-        GsbaError: it cannot be started, or fails: with the last line that it said.
+        GsbaError: the command cannot be started, or fails; the message quotes its last line.
     """
     filled = []
     for word in words:
@@ -159,15 +159,15 @@ def _call(words: list[str], values: dict[str, Path], command: str) -> None:
     except OSError as error:
         raise GsbaError(f"--segment {command}: cannot be run ({error.strerror})") from None
     if done.returncode:
-        said = (done.stderr.strip() or done.stdout.strip() or "it said nothing").splitlines()[-1]
-        raise GsbaError(f"--segment {command}: failed with exit code {done.returncode}: {said}")
+        last = (done.stderr.strip() or done.stdout.strip() or "it printed nothing").splitlines()[-1]
+        raise GsbaError(f"--segment {command}: failed with exit code {done.returncode}: {last}")
 
 
 def _checked(mask: np.ndarray, size: int, where: str) -> np.ndarray:
-    """A callable's mask.
+    """A callable's mask, checked.
 
     Raises:
-        GsbaError: not (size, size) bool.
+        GsbaError: the mask is not (size, size) bool.
     """
     mask = np.asarray(mask)
     if mask.shape != (size, size) or mask.dtype != bool:
@@ -180,7 +180,7 @@ def _checked(mask: np.ndarray, size: int, where: str) -> np.ndarray:
 
 @functools.lru_cache(maxsize=1)
 def _places(size: int) -> np.ndarray:
-    """Index (2 size, 4 size) int64 into flat faces of what each panorama pixel shows."""
+    """Index (2 size, 4 size) int64 into flat faces of each panorama pixel."""
     width, height = 4 * size, 2 * size
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + 0.5
     bearings = bearings_from_erp(grid, width, height)

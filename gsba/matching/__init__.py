@@ -1,6 +1,6 @@
-"""Correspondences between frames, guided by predicted poses or by nothing at all.
+"""Correspondences between frames, guided by predicted poses or without any prediction.
 
-Takes keypoints, poses that predict, and how far to trust them.
+Takes keypoints, predicted poses, and gates for their uncertainty.
 Gives matches, and pairs whose geometry was verified.
 """
 

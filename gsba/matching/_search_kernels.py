@@ -1,4 +1,4 @@
-"""The compiled search behind guided matching: which descriptors are compared, and which win."""
+"""The compiled search of guided matching: selects and compares descriptors, and keeps the best."""
 
 from typing import NamedTuple
 
@@ -8,31 +8,32 @@ from factors.compiled import kernel_and_part
 
 HEAD = 24  # axes of a descriptor compared before the rest
 _ZERO = np.float32(0)
-_LEAST_SINE = np.float32(0.05)  # of the angle to the motion; nearer to it, planes mean nothing
+_MIN_SINE = np.float32(0.05)  # least sine of the angle to the motion; nearer to it, epipolar
+# planes are undetermined
 _kernel, _part = kernel_and_part(fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 
 class Limits(NamedTuple):
-    """A gate and the thresholds on descriptors as the compiled search takes them."""
+    """A gate and the thresholds on descriptors, as the compiled search takes them."""
 
-    rotation: np.float32  # radians
-    direction: np.float32  # tangent
+    rotation: np.float32  # radians, uncertainty of the relative rotation
+    direction: np.float32  # tangent of the uncertainty of the motion's direction
     chord: np.float32  # largest distance of both bearings on the unit sphere
-    point: np.float32  # radians
-    similarity: np.float32  # least
-    ratio: np.float32  # largest
+    point: np.float32  # radians, uncertainty of a known point's bearing
+    similarity: np.float32  # least cosine similarity of descriptors
+    ratio: np.float32  # largest ratio of descriptor distances
 
 
 class Rows(NamedTuple):
-    """What is compared of a frame's features, all float32."""
+    """A frame's features in the form the search compares, all float32."""
 
     bearings: np.ndarray  # (n, 3), frame 0's axes
     descriptors: np.ndarray  # (n, D) of length one
-    tails: np.ndarray  # (n) length of a descriptor behind its first HEAD axes
+    tails: np.ndarray  # (n) norm of a descriptor beyond its first HEAD axes
 
 
 class Cells(NamedTuple):
-    """Rows that lie together: balls around their bearings, frame 0's axes."""
+    """Cells of neighbouring rows: balls around their bearings, frame 0's axes."""
 
     starts: np.ndarray  # (C + 1) first row of each cell
     centres: np.ndarray  # (C, 3) float32
@@ -46,8 +47,8 @@ def search(first, second, cells, targets, only_targets, direction, limits):
     Args:
         first, second: Rows of both frames.
         cells: Cells of the second.
-        targets: (n0, 3) float32 where rows of the first must be found, NaN where unknown.
-        only_targets: look there, and not along epipolar lines.
+        targets: (n0, 3) float32 predicted bearings of the first frame's rows, NaN where unknown.
+        only_targets: search around the targets, not along epipolar lines.
         direction, limits: unit vector of the motion, and Limits.
     """
     bearings0, descriptors0, tails0 = first
@@ -57,14 +58,14 @@ def search(first, second, cells, targets, only_targets, direction, limits):
     head = min(HEAD, dim)
     heads0 = np.ascontiguousarray(descriptors0[:, :head])  # stays in the cache
     heads1 = np.ascontiguousarray(descriptors1[:, :head])
-    # Less alike than this, a candidate neither wins nor stands against the least winner.
+    # A candidate with a lower similarity neither wins nor rivals the weakest winner.
     floor = 1 - (1 - limits.similarity) / (limits.ratio * limits.ratio)
     x, y, z = _columns(bearings1)
     balls = _columns(centres)
     no_radii = np.zeros(n1, np.float32)
     marks, worth = np.empty(n1, np.bool_), np.empty(len(radii), np.bool_)
-    best0, top0, next0 = _nothing(n0)
-    best1, top1, next1 = _nothing(n1)
+    best0, top0, next0 = _no_candidates(n0)
+    best1, top1, next1 = _no_candidates(n1)
     for i in range(n0):
         if only_targets and np.isnan(targets[i, 0]):
             continue
@@ -73,13 +74,13 @@ def search(first, second, cells, targets, only_targets, direction, limits):
         circle = _great_circle(bearing, direction, limits)
         rest0 = descriptors0[i, head:]
         about = target, bearing, direction, circle, limits
-        _mark(balls, radii, only_targets, about, worth)
+        _mark_balls(balls, radii, only_targets, about, worth)
         for cell in range(len(radii)):
             if not worth[cell] or starts[cell] == starts[cell + 1]:
                 continue
             begin, end = starts[cell], starts[cell + 1]
             members = x[begin:end], y[begin:end], z[begin:end]
-            _mark(members, no_radii[begin:end], only_targets, about, marks)
+            _mark_balls(members, no_radii[begin:end], only_targets, about, marks)
             for j in range(begin, end):
                 if not marks[j - begin]:
                     continue
@@ -89,19 +90,19 @@ def search(first, second, cells, targets, only_targets, direction, limits):
                 if dot + tails0[i] * tails1[j] < floor:  # Cauchy-Schwarz on the other axes
                     continue
                 rest1 = descriptors1[j, head:]
-                for d in range(dim - head):  # an index that might be negative makes it gather
+                for d in range(dim - head):  # a possibly negative index would compile to gathers
                     dot += rest0[d] * rest1[d]
-                if dot > next0[i]:  # asked here, as calls that pass arrays are dear
-                    _offer(best0, top0, next0, i, j, dot, bearings1)
+                if dot > next0[i]:  # tested here, as calls that pass arrays are expensive
+                    _update_best(best0, top0, next0, i, j, dot, bearings1)
                 if dot > next1[j]:
-                    _offer(best1, top1, next1, j, i, dot, bearings0)
+                    _update_best(best1, top1, next1, j, i, dot, bearings0)
     _keep_mutual(best0, top0, next0, best1, next1, limits)
     return best0, top0
 
 
 @_kernel
 def passes(bearings0, bearings1, targets, only_targets, direction, limits):
-    """Which rows of two frames, paired one to one, `search` would compare: (n,) bool.
+    """True (n,) for the rows of two frames, paired one to one, that `search` would compare.
 
     Args:
         bearings0, bearings1: (n, 3) float32, frame 0's axes.
@@ -128,43 +129,43 @@ def _columns(rows):
 
 
 @_part
-def _nothing(n):
-    """Best candidate of n rows, its similarity, and that of the best elsewhere: none yet."""
+def _no_candidates(n):
+    """Initial best candidate of n rows, its similarity, and that of the best at another place."""
     return np.full(n, -1, np.int32), np.full(n, -1, np.float32), np.full(n, -1, np.float32)
 
 
 @_part
 def _keep_mutual(best0, top0, next0, best1, next1, limits):
-    """Undo, in place, what is not the best both ways and by a margin."""
+    """Reset, in place, candidates that are not the best both ways by a margin."""
     for i in range(len(best0)):
         j = best0[i]
         if j >= 0 and not (
-            best1[j] == i and _distinctive(top0[i], max(next0[i], next1[j]), limits)
+            best1[j] == i and _passes_ratio_test(top0[i], max(next0[i], next1[j]), limits)
         ):
             best0[i] = -1
 
 
 @_part
 def _great_circle(bearing, direction, limits):
-    """Normal of the plane of a bearing and the motion, largest cosine to the motion of a bearing
-    that is not displaced towards it, and how far off the plane an error of the motion's direction
-    takes a point for each unit of its parallax."""
+    """Normal of the epipolar plane of a bearing; largest cosine to the motion of a bearing that is
+    not displaced towards it; distance off the plane, per unit of parallax, that an error of the
+    motion's direction causes."""
     (ax, ay, az), (tx, ty, tz) = bearing, direction
     nx, ny, nz = ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax
     sine = np.sqrt(nx * nx + ny * ny + nz * nz)
     if sine > 1e-6:
         nx, ny, nz = nx / sine, ny / sine, nz / sine
     slack = limits.rotation * (sine + limits.rotation)
-    spread = limits.direction / max(sine, _LEAST_SINE)
+    spread = limits.direction / max(sine, _MIN_SINE)
     return (nx, ny, nz), tx * ax + ty * ay + tz * az + slack, spread
 
 
 @_part
 def _in_band(ball, radius, bearing, direction, circle, limits):
-    """Whether a bearing within `radius` of the centre of a ball can be of the same point.
+    """True if a bearing within `radius` of the centre of a ball can show the same point.
 
     It lies on the great circle, no further than parallax goes, and is not displaced towards the
-    direction of motion: that is where points behind both frames are seen.
+    direction of motion, as points behind both frames would be.
     """
     normal, max_cosine, spread = circle
     chord = _distance(bearing, ball)
@@ -177,8 +178,8 @@ def _in_band(ball, radius, bearing, direction, circle, limits):
 
 
 @_part
-def _mark(centres, radii, only_targets, about, marks):
-    """Flags of the balls around (3, m) that pass; without branches, so that it runs in vectors."""
+def _mark_balls(centres, radii, only_targets, about, marks):
+    """Flags of the balls around (3, m) that pass; free of branches, so that it is vectorised."""
     target, bearing, direction, circle, limits = about
     x, y, z = centres
     if only_targets:
@@ -191,9 +192,10 @@ def _mark(centres, radii, only_targets, about, marks):
 
 
 @_part
-def _offer(best, top, second, row, candidate, similarity, bearings):
-    """Note a candidate that beats a row's second best, which must lie elsewhere than the best."""
-    elsewhere = best[row] < 0 or not _one_place(bearings, best[row], candidate)
+def _update_best(best, top, second, row, candidate, similarity, bearings):
+    """Update a row's best and second best candidate; the second must lie elsewhere than the
+    best."""
+    elsewhere = best[row] < 0 or not _at_one_place(bearings, best[row], candidate)
     if similarity > top[row]:
         if elsewhere:
             second[row] = top[row]
@@ -203,15 +205,15 @@ def _offer(best, top, second, row, candidate, similarity, bearings):
 
 
 @_part
-def _distinctive(similarity, second, limits):
+def _passes_ratio_test(similarity, second, limits):
     """Ratio test on descriptor distances: half their squares are 1 - similarity."""
     ratio = limits.ratio * limits.ratio
     return similarity >= limits.similarity and 1 - similarity <= ratio * (1 - second)
 
 
 @_part
-def _one_place(bearings, a, b):
-    """Whether two rows are one feature found twice: closer than 0.18 degrees."""
+def _at_one_place(bearings, a, b):
+    """True if two rows are one feature found twice: closer than 0.18 degrees."""
     x = bearings[a, 0] - bearings[b, 0]
     y = bearings[a, 1] - bearings[b, 1]
     z = bearings[a, 2] - bearings[b, 2]

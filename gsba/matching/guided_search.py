@@ -2,7 +2,7 @@
 
 A point seen along `a` in frame 0 must lie, in frame 1, on the great circle through the rotated
 `a` and the epipole, displaced away from the direction of motion. Candidates outside that band are
-never compared: this is the speed, and the defence against repeated structure.
+never compared: this makes the search fast and guards against repeated structure.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -24,45 +24,47 @@ from gsba.store.shards import Workers, blocks_of_frames
 from gsba.types import Features, Keypoints, Matches
 
 T = TypeVar("T")
-_CELLS = 8  # cells along a face's side
+_CELLS_PER_SIDE = 8  # cells along a face's side
 _NO_MATCHES = np.zeros((0, 2), np.int32)
 
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """How far a match may stray from a predicted relative pose."""
+    """Largest deviation of a match from a predicted relative pose."""
 
     rotation_rad: float  # uncertainty of the relative rotation, and of keypoints
     direction: float  # tangent of the uncertainty of the translation direction
     max_parallax_rad: float  # largest angle between both bearings in one orientation
     point_rad: float = 0.0  # uncertainty of the bearing of a point of known depth
-    lenses: Lenses = field(default_factory=Lenses)  # of the frame that looks for known points
+    lenses: Lenses = field(default_factory=Lenses)  # lenses of the frame whose known points are
+    # searched
 
     @classmethod
     def anywhere(cls) -> "Gate":
-        """Nothing is predicted."""
+        """A gate without any prediction: every match passes."""
         return cls(np.pi, 1e3, np.pi)
 
     @classmethod
     def around_points(cls, radius_rad: float) -> "Gate":
-        """Around predicted points only."""
+        """A gate around predicted points only."""
         return cls(np.pi, 1.0, np.pi, min(radius_rad, np.pi))
 
     def chance(self, max_error_rad: float) -> float:
-        """Probability that a false match within the gate is as near to the epipolar plane of the
-        prediction as `max_error_rad`; 0 = nothing is predicted."""
+        """Probability that a false match within the gate lies within `max_error_rad` of the
+        predicted epipolar plane; 0 = nothing is predicted."""
         if self.point_rad > 0:
-            return min(4 * max_error_rad / (np.pi * self.point_rad), 1.0)  # a strip of a disc
+            return min(4 * max_error_rad / (np.pi * self.point_rad), 1.0)  # area of a strip of a
+            # disc
         return 0.0 if self.rotation_rad >= np.pi else min(max_error_rad / self.rotation_rad, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Searchable:
-    """Features of a frame sorted into cells of the sphere."""
+    """Features of a frame, sorted into cells of the sphere."""
 
     bearings: np.ndarray  # (K, 3) float32, rig frame, sorted by cell
     descriptors: np.ndarray  # (K, D) float32, unit length, in the axes of a basis
-    tails: np.ndarray  # (K,) float32, norm of what lies beyond the first HEAD axes
+    tails: np.ndarray  # (K,) float32, norm beyond the first HEAD axes
     keypoints: np.ndarray  # (K,) int32, index of the keypoint standing for each row
     starts: np.ndarray  # (C + 1,) int32, rows of each cell
     centres: np.ndarray  # (C, 3) float32, unit
@@ -70,7 +72,8 @@ class Searchable:
 
 
 def principal_axes(descriptors: np.ndarray) -> np.ndarray:
-    """Orthonormal axes (D, D) float32 as columns, those that hold most of descriptors first."""
+    """Orthonormal axes (D, D) float32 as columns, in descending order of the descriptors'
+    energy."""
     rows = descriptors.astype(np.float64)
     return np.linalg.eigh(rows.T @ rows)[1][:, ::-1].astype(np.float32)
 
@@ -81,16 +84,18 @@ def searchable(
     """Sort features into cells; keypoints at one place (several orientations) become one.
 
     Args:
-        features: of one frame.
-        axes: (D, D) orthonormal columns, the same for all frames; similarities do not depend on
-            them, but the search is fast if the first columns hold most of the descriptors.
+        features: features of one frame.
+        axes: (D, D) orthonormal columns, equal for all frames; similarities do not depend on them,
+            but the search is fast if the first columns hold most of the descriptors' energy.
         strongest: keypoints of a face to search among, None for all.
     """
     chosen = strongest_of(features, strongest)
     bearings = features.bearings_rig[chosen]
-    cells = cells_of(bearings, _CELLS)
+    cells = cells_of(bearings, _CELLS_PER_SIDE)
     order = np.argsort(cells, kind="stable")
-    starts = np.searchsorted(cells[order], np.arange(6 * _CELLS * _CELLS + 1)).astype(np.int32)
+    starts = np.searchsorted(
+        cells[order], np.arange(6 * _CELLS_PER_SIDE * _CELLS_PER_SIDE + 1)
+    ).astype(np.int32)
     places = features.pixels[chosen, 0] + 1j * features.pixels[chosen, 1]  # one number sorts fast
     places += 1e6 * features.faces[chosen]
     _, first, inverse = np.unique(places, return_index=True, return_inverse=True)
@@ -115,7 +120,7 @@ def searchable(
 
 
 def strongest_of(features: Features, per_face: int | None) -> np.ndarray:
-    """Indices, ascending, of the strongest keypoints of each face; of all for None."""
+    """Indices, ascending, of the strongest keypoints of each face; None = of all."""
     if per_face is None:
         return np.arange(len(features))
     ranks = np.arange(len(features)) - np.searchsorted(features.faces, features.faces)
@@ -166,7 +171,7 @@ def within_gate(
     gate: Gate,
     points_f0: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Which matches (m, 2) `match_pair` would have considered under the same gate: (m,) bool."""
+    """True (m,) for matches (m, 2) that `match_pair` would compare under the gate."""
     rotation = f0_T_f1[:3, :3].astype(np.float32)
     direction, limits = _limits(f0_T_f1, gate, MatchingSettings())
     return passes(
@@ -212,7 +217,7 @@ def _targets(
 
 
 def one_to_one(pairs: np.ndarray, similarity: np.ndarray) -> np.ndarray:
-    """Keep the best match of every keypoint that took part under several orientations or faces."""
+    """Keep the best match of every keypoint that occurs under several orientations or faces."""
     order = np.argsort(-similarity, kind="stable")
     pairs = pairs[order]
     for column in (0, 1):
@@ -225,7 +230,7 @@ class Points(Protocol):
     """Scene points of the keypoints of frames, see `match_pair`."""
 
     def __getitem__(self, frame: int, /) -> np.ndarray:
-        """Those of one frame (K_f, 3), its rig frame, NaN where unknown."""
+        """Points (K_f, 3) of one frame's keypoints in its rig frame, NaN where unknown."""
         ...
 
 
@@ -250,7 +255,7 @@ class Matcher(Protocol):
 
 
 class _Once(Generic[T]):
-    """A value that whoever asks first makes, while others wait for it and for nothing else."""
+    """A value computed by the first caller, while only callers that need it wait."""
 
     def __init__(self, make: Callable[[], T]) -> None:
         self._make, self._lock, self._made = make, Lock(), []
@@ -263,13 +268,13 @@ class _Once(Generic[T]):
 
 
 class SearchableFrames:
-    """Features of frames and how to match them; read when asked for, the latest used are kept.
+    """Features of frames, prepared for matching; read on demand, the most recent ones are kept.
 
     Args:
         load: reads the features of a frame.
         strongest: keypoints of a face to match, None for all.
         capacity: frames kept in memory.
-        axes: that descriptors are searched in, see `searchable`; None = those of frame 0.
+        axes: axes of the descriptors, see `searchable`; None = those of frame 0.
     """
 
     def __init__(
@@ -294,7 +299,7 @@ class SearchableFrames:
         return SearchableFrames, (self._load, self.strongest, self._capacity, self._axes)
 
     def taken(self, frames: Iterable[int]) -> "SearchableFrames":
-        """Some of them, as workers elsewhere can read them."""
+        """The features of some frames, with paths for other processes."""
         load = self._load
         if isinstance(load, FrameFeatures):
             load = load.taken(frames)
@@ -327,15 +332,15 @@ def guided(
 
 @dataclass(frozen=True, slots=True)
 class MatchContext:
-    """What a run's frames are matched by: their features, and how."""
+    """Features, settings and workers with which a run's frames are matched."""
 
     frames: SearchableFrames
-    strongest: SearchableFrames  # the same with the strongest keypoints only
+    strongest: SearchableFrames  # with the strongest keypoints only
     keypoints: Keypoints  # of all frames
-    settings: RefineSettings  # of pairs, matching and verification
-    workers: Workers  # who match pairs
+    settings: RefineSettings  # settings of pairs, matching and verification
+    workers: Workers  # workers that match pairs
     matcher: Matcher = guided  # compares two frames
-    lenses: Lenses = field(default_factory=Lenses)  # that keypoints are seen through
+    lenses: Lenses = field(default_factory=Lenses)  # lenses of the keypoints
 
     def match(
         self,
@@ -347,7 +352,7 @@ class MatchContext:
         strongest: bool = False,
         guided_only: bool = False,
     ) -> Matches:
-        """Match frame pairs as `match` does, on demand by guided search whatever the matcher."""
+        """Match frame pairs like `match`; `guided_only` replaces the matcher by guided search."""
         if self.lenses:
             gates = [
                 replace(gate, lenses=self.lenses.of_frame(int(f1)))
@@ -374,15 +379,15 @@ def match(
     Args:
         pairs: (P, 2) frame indices.
         world_T_rigs: (F, 4, 4) poses that predict the pairs' geometry.
-        gates: (P) how far to trust the prediction.
-        frames: features.
-        settings: similarity and distinctiveness.
-        workers: who do it.
-        points_rig: of each frame (K_f, 3), see `match_pair`.
+        gates: (P) uncertainty of each prediction.
+        frames: features of the frames.
+        settings: thresholds on similarity and distinctiveness.
+        workers: threads or processes that run it.
+        points_rig: points (K_f, 3) of each frame, see `match_pair`.
         matcher: compares two frames.
     """
     f0_T_f1s = inverse(world_T_rigs[pairs[:, 0]]) @ world_T_rigs[pairs[:, 1]]
-    order, places = by_place(pairs, len(world_T_rigs))  # those that share frames follow one another
+    order, places = by_place(pairs, len(world_T_rigs))  # pairs that share frames follow one another
     chosen = [gates[p] for p in order]
     geometry = pairs[order], places, f0_T_f1s[order], chosen
     job = _PairJob(*geometry, frames, settings, points_rig, matcher)
@@ -397,12 +402,12 @@ class _PairJob:
     """The job of matching pairs, place by place."""
 
     pairs: np.ndarray  # (P, 2)
-    places: np.ndarray  # (P,) number of the frame that each goes with, see `by_place`
+    places: np.ndarray  # (P,) number of the frame each is grouped with, see `by_place`
     f0_T_f1s: np.ndarray  # (P, 4, 4)
     gates: Sequence[Gate]  # (P)
     frames: SearchableFrames
     settings: MatchingSettings
-    points: Points | None  # of first frames
+    points: Points | None  # points of first frames
     matcher: Matcher
     title: str = "matching"
     returns: Any = np.ndarray

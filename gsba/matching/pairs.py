@@ -1,4 +1,4 @@
-"""Which frames to match with which."""
+"""Selection of the frame pairs to match."""
 
 from collections.abc import Callable
 
@@ -6,9 +6,9 @@ import numpy as np
 
 from gsba.config import PairSettings
 
-_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-_HERE = 0.125  # part of the reach within which a place counts as the same
-_PAUSE = 2.5  # median intervals: frames further apart in time are no neighbours
+_FRAME_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+_SAME_PLACE_SHARE = 0.125  # part of the reach within which a position counts as the same place
+_MAX_INTERVAL_RATIO = 2.5  # largest interval between neighbours, in median intervals
 
 
 def adjacent(num_frames: int, reach: int = 2) -> np.ndarray:
@@ -24,7 +24,7 @@ def without_pause(timestamps: np.ndarray) -> np.ndarray:
         timestamps: (F,) seconds.
     """
     intervals = np.diff(timestamps)
-    close = np.flatnonzero(intervals <= _PAUSE * np.median(intervals))
+    close = np.flatnonzero(intervals <= _MAX_INTERVAL_RATIO * np.median(intervals))
     return np.column_stack([close, close + 1])
 
 
@@ -45,7 +45,7 @@ def covisible(
     num = len(rigs_in_world)
     reach = settings.max_baseline_depths * median_depth
     window = np.array(
-        [(f, f + gap) for gap in _GAPS if gap <= settings.window for f in range(num - gap)],
+        [(f, f + gap) for gap in _FRAME_GAPS if gap <= settings.window for f in range(num - gap)],
         np.int32,
     ).reshape(-1, 2)
     lengths = np.linalg.norm(rigs_in_world[window[:, 0]] - rigs_in_world[window[:, 1]], axis=1)
@@ -60,8 +60,8 @@ def covisible(
 def closing(rigs_in_world: np.ndarray, median_depth: float, settings: PairSettings) -> np.ndarray:
     """Pairs that close loops while drift between far frames is unknown.
 
-    However often a place is met again, each visit is paired with the ones before and after alone:
-    drift is least between these, and they imply the others.
+    However often a place is revisited, each visit is paired with the previous and the next one
+    only: drift is least between these, and they imply the others.
 
     Args:
         rigs_in_world, median_depth, settings: as for `covisible`.
@@ -72,7 +72,7 @@ def closing(rigs_in_world: np.ndarray, median_depth: float, settings: PairSettin
 
     def next_visits(f: int, near: np.ndarray, distances: np.ndarray) -> np.ndarray:
         apart = np.abs(near - f) > settings.window
-        met = near[apart & (distances <= _HERE * reach)]
+        met = near[apart & (distances <= _SAME_PLACE_SHARE * reach)]
         last = met[met < f].max(initial=0) - settings.window
         following = met[met > f].min(initial=len(rigs_in_world)) + settings.window
         return apart & (near >= last) & (near <= following)
@@ -82,24 +82,24 @@ def closing(rigs_in_world: np.ndarray, median_depth: float, settings: PairSettin
 
 
 def by_place(pairs: np.ndarray, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """An order of pairs in which each frame is wanted for a short while only.
+    """An order of pairs in which each frame is needed for a short while only.
 
     Pairs of frames close in time come first, one frame after the other. For the others, frames are
     numbered so that those with a pair get numbers close to one another (Cuthill and McKee, 1969):
-    all visits to a place follow one another.
+    all visits to a place are consecutive.
 
     Args:
         pairs: (P, 2) frame indices.
         num_frames: F.
 
     Returns:
-        The order (P,), and for each pair in that order the number of the frame that it goes with,
+        The order (P,), and for each pair in that order the number of the frame it is grouped with,
         ascending: below F where it is that of a frame in time.
     """
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-    close = np.abs(pairs[:, 1] - pairs[:, 0]) <= _GAPS[-1]
+    close = np.abs(pairs[:, 1] - pairs[:, 0]) <= _FRAME_GAPS[-1]
     far = pairs[~close]
     ends = np.concatenate([far, far[:, ::-1]])
     graph = csr_matrix((np.ones(len(ends)), ends.T), shape=(num_frames, num_frames))
@@ -120,7 +120,7 @@ def _nearest(
     """Pairs (L, 2) int32 of each frame and its nearest in space among those chosen.
 
     Args:
-        chosen: of a frame, the frames within reach (N,), ascending, and their distances: (N,) bool.
+        chosen: selects, given a frame, frames within reach (N,) and distances: (N,) bool.
     """
     from scipy.spatial import KDTree
 

@@ -1,4 +1,4 @@
-"""Neighbours that the trajectory cannot guide: matched without it, and what that says about it."""
+"""Neighbours that the trajectory cannot guide: matched without it, to check it against images."""
 
 from dataclasses import dataclass, replace
 
@@ -24,21 +24,22 @@ from gsba.trajectory.steps import (
 )
 from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
 
-_WIDER = 2, 4, 8  # frames
-_MANY_LOST = 0.2  # part of the neighbours
-_LEAST_ALIKE = 5  # points that tell how long a step is beside the one before it
-_MAX_STEP_RATIO = 4.0  # of two steps in a row; beyond, a floor's pattern met one tile further on
-_AGAIN = Gate(np.deg2rad(1.5), 0.03, np.pi)  # around relative poses that few matches have told
+_WIDER_GAPS = 2, 4, 8  # gaps in frames of additional pairs
+_MIN_LOST_SHARE = 0.2  # share of lost neighbours from which whole panoramas are compared
+_MIN_COMMON_POINTS = 5  # common points that suffice for the ratio of two steps' lengths
+_MAX_STEP_RATIO = 4.0  # largest ratio of consecutive steps; a repeated pattern exceeds it
+_REMATCHING_GATE = Gate(np.deg2rad(1.5), 0.03, np.pi)  # around relative poses estimated from few
+# matches
 
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """Neighbours in time, verified with or without the trajectory, and its judgement."""
+    """Neighbours in time, verified with or without the trajectory, and the checks of its steps."""
 
     neighbours: VerifiedPairs
     trust: StepChecks
     coarse: CoarsePoses  # the trajectory, its pieces in one world
-    joints: tuple[SegmentAlignment, ...] = ()  # of those pieces
+    joints: tuple[SegmentAlignment, ...] = ()  # alignments of those pieces
 
     @property
     def counts(self) -> Counts:
@@ -49,18 +50,18 @@ class Recovered:
 def recover(
     context: MatchContext, guided: VerifiedPairs, coarse: CoarsePoses, timestamps: np.ndarray
 ) -> Recovered:
-    """Match the neighbours that guidance lost, judge the trajectory, and guide anew from that.
+    """Match the neighbours that guided matching lost, check the trajectory, and match guided by it.
 
-    Frames next to one another are compared as a whole: they share so much that repeated structure
-    does not mislead. Frames two apart, or with a pause between them, where it does, are only
-    matched along the steps found or the trajectory.
+    Frames next to one another are compared without prediction: they share so much that repetition
+    does not mislead. Frames two apart, or with a pause between them, where it would, are only
+    matched guided by the steps found or the trajectory.
 
-    Frames of two pieces of the trajectory are not compared here. Two views have no scale of their
-    own, and what both show may ride along with the camera or be far away: how two pieces lie to
-    one another is for `gsba.loop_closure.map_merging` to decide, from points that both know.
+    Frames of two pieces of the trajectory are not compared here. Two views do not determine a
+    scale, and the points of both may move with the camera or be far away: the relative pose of two
+    pieces is estimated by `gsba.loop_closure.map_merging`, from points that both maps hold.
 
     Args:
-        context: of the run.
+        context: features and settings of the run.
         guided: neighbours verified under the trajectory's guidance; all of them where it is right.
         coarse: the trajectory.
         timestamps: (F,) seconds.
@@ -69,33 +70,33 @@ def recover(
         GsbaError: the images contradict most of the trajectory.
     """
     settings, keypoints = context.settings, context.keypoints
-    chosen = _of_one_piece(pairs.adjacent(len(coarse.sources)), coarse)
+    chosen = _pairs_of_one_piece(pairs.adjacent(len(coarse.sources)), coarse)
     guided = guided.within(coarse.segments)
-    lost = guided.missing(_of_one_piece(pairs.without_pause(timestamps), coarse))
+    lost = guided.missing(_pairs_of_one_piece(pairs.without_pause(timestamps), coarse))
     absent = coarse.absent
     alone = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
-    alone = _with_wider(context, alone).within(coarse.segments)
-    alone = _of_one_scale(context, alone) if absent else alone
+    alone = _with_wider_pairs(context, alone).within(coarse.segments)
+    alone = _with_consistent_scale(context, alone) if absent else alone
     steps = image_steps(alone, keypoints)
     alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
     coarse, joints = joining.join(coarse)
     misread.refuse_misfit(coarse, steps, settings.verify)
-    trust = _judge(alone, keypoints, coarse, settings)
+    trust = _check_steps(alone, keypoints, coarse, settings)
     if trust.sound and not joints:
         return Recovered(guided, trust, coarse)
-    again = _of_one_piece(_two_apart(alone, steps, absent), coarse)
+    again = _pairs_of_one_piece(_missing_two_apart(alone, steps, absent), coarse)
     over = _match_along(context, trust.world_T_rigs, again)
     neighbours = VerifiedPairs.joined([alone, _consistent(over, steps, keypoints, settings)])
     alike = judgement.confirmed(coarse, steps, settings.priors)
     doubtful = {
         (f0, f1)
         for f0, f1 in lost.tolist()
-        if not (alike[f0] or _supported((f0, f1), neighbours, keypoints, absent))
+        if not (alike[f0] or _is_supported((f0, f1), neighbours, keypoints, absent))
     }
     if doubtful:
         frames = map(tuple, neighbours.matches.pairs.tolist())
         neighbours = neighbours.taken([p for p, pair in enumerate(frames) if pair not in doubtful])
-        trust = _judge(neighbours, keypoints, coarse, settings)
+        trust = _check_steps(neighbours, keypoints, coarse, settings)
     num, kept = len(chosen), len(neighbours.matches.pairs)
     counts = Counts(num, kept, "pairs", {"no common geometry": num - kept})
     neighbours = replace(neighbours, counts=counts)
@@ -105,19 +106,19 @@ def recover(
     return Recovered(neighbours, trust, coarse, joints)
 
 
-def _two_apart(found: VerifiedPairs, steps: Steps, absent: bool) -> np.ndarray:
-    """Pairs (P, 2) of frames two apart that are not found yet; without a trajectory, over steps
-    that images show: nothing else tells how long one is."""
+def _missing_two_apart(found: VerifiedPairs, steps: Steps, absent: bool) -> np.ndarray:
+    """Pairs (P, 2) of frames two apart that are not found yet; without a trajectory, only over two
+    verified steps: nothing else gives a step's length."""
     first = np.arange(len(steps.verified) - 1)
     if absent:
         first = first[steps.verified[:-1] & steps.verified[1:]]
     return found.missing(np.column_stack([first, first + 2]))
 
 
-def _with_wider(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
-    """Neighbours, and where most of them are too close to tell walking from turning, pairs of
-    frames further apart over those."""
-    for gap in _WIDER:
+def _with_wider_pairs(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
+    """Neighbours, and wider pairs over steps that are too short to tell translation from
+    rotation."""
+    for gap in _WIDER_GAPS:
         steps = image_steps(found, context.keypoints)
         short = steps.verified & ~steps.directed
         if 2 * np.count_nonzero(short) <= np.count_nonzero(steps.verified):
@@ -130,8 +131,8 @@ def _with_wider(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
     return found
 
 
-def _of_one_piece(chosen: np.ndarray, coarse: CoarsePoses) -> np.ndarray:
-    """Those pairs (P, 2) whose frames belong to one piece of the trajectory."""
+def _pairs_of_one_piece(chosen: np.ndarray, coarse: CoarsePoses) -> np.ndarray:
+    """Pairs (P, 2) whose frames belong to one piece of the trajectory."""
     if coarse.segments is None:
         return chosen
     pieces = coarse.segments[chosen]
@@ -145,24 +146,24 @@ def check_clock(
     timestamps: np.ndarray,
     trajectory: Trajectory,
 ) -> ClockEstimate:
-    """Whether the trajectory turns when the images do, or at other times.
+    """The trajectory's clock offset, at which it turns when the images do.
 
-    One that fits if read otherwise is refused first: it may turn like the images at other times.
+    A trajectory that fits in another convention is refused first: it may turn at other times.
 
     Args:
-        context: of the run.
+        context: features and settings of the run.
         guided: neighbours verified under the trajectory's guidance. Where it lost many, whole
-            panoramas are compared: a clock that is off loses the turns, which tell it.
+            panoramas are matched: a wrong clock loses the turns, which determine it.
         coarse: the trajectory at the frames' times.
         timestamps: (F,) seconds.
-        trajectory: all its entries.
+        trajectory: all entries of its file.
 
     Raises:
-        GsbaError: it is reversed, mirrored, inverted or in other axes.
+        GsbaError: the trajectory is reversed, mirrored, inverted or in other axes.
     """
     settings, chosen = context.settings, pairs.without_pause(timestamps)
     lost = guided.missing(chosen)
-    if len(lost) > _MANY_LOST * len(chosen):
+    if len(lost) > _MIN_LOST_SHARE * len(chosen):
         guided = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
     steps = image_steps(guided, context.keypoints)
     misread.refuse_misread(coarse, steps, settings.verify)
@@ -183,14 +184,14 @@ def _match_along(
 
 
 def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = True) -> VerifiedPairs:
-    """Match whole panoramas without any prediction, and verify their geometry alone.
+    """Match whole panoramas without any prediction, and verify their geometry.
 
-    The strongest features are tried first, and all for pairs that those do not settle.
+    The strongest features are tried first, then all for pairs that these leave open.
 
     Args:
-        context: of the run.
+        context: features and settings of the run.
         chosen: (P, 2) frame indices.
-        rivals: whether another pose that explains about as many matches speaks against a pair.
+        rivals: True if another pose that explains about as many matches speaks against a pair.
     """
     nowhere = np.tile(np.eye(4), (len(context.keypoints.starts) - 1, 1, 1))
 
@@ -208,12 +209,12 @@ def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = Tru
 
 
 def match_again(context: MatchContext, found: VerifiedPairs, steps: set[int]) -> VerifiedPairs:
-    """Match steps once more, all keypoints along the epipolar lines found, and verify them anew.
+    """Match steps again with all keypoints along the epipolar lines found, and verify them anew.
 
     Args:
-        context: of the run.
+        context: features and settings of the run.
         found: neighbours.
-        steps: first frames of the steps; each keeps what more matches agree on.
+        steps: first frames of the steps; each keeps the pose with more inliers.
     """
     chosen = [
         p
@@ -224,7 +225,7 @@ def match_again(context: MatchContext, found: VerifiedPairs, steps: set[int]) ->
     for p in chosen:
         poses = np.tile(np.eye(4), (len(context.keypoints.starts) - 1, 1, 1))
         poses[found.matches.pairs[p, 1]] = found.f0_T_f1s[p]
-        pair, gates = found.matches.pairs[p : p + 1], [_AGAIN]
+        pair, gates = found.matches.pairs[p : p + 1], [_REMATCHING_GATE]
         matches = context.match(pair, poses, gates, guided_only=True)
         again = verified(matches, gates, None, None, context, rivals=True)
         if len(again.matches.pairs) and len(again.matches.of(0)) > len(found.matches.of(p)):
@@ -234,7 +235,7 @@ def match_again(context: MatchContext, found: VerifiedPairs, steps: set[int]) ->
     return VerifiedPairs.joined([kept, *(again for _, again in better)])
 
 
-def _judge(
+def _check_steps(
     found: VerifiedPairs, keypoints: Keypoints, coarse: CoarsePoses, settings: RefineSettings
 ) -> StepChecks:
     steps = image_steps(found, keypoints)
@@ -245,14 +246,14 @@ def _judge(
 def _length_ratios(
     found: VerifiedPairs, steps: Steps, keypoints: Keypoints, absent: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """See `length_ratios`; without a trajectory fewer points suffice, if they agree."""
-    return length_ratios(found, steps, keypoints, _LEAST_ALIKE if absent else None)
+    """Length ratios like those of `length_ratios`; without a trajectory fewer points suffice."""
+    return length_ratios(found, steps, keypoints, _MIN_COMMON_POINTS if absent else None)
 
 
-def _supported(
+def _is_supported(
     pair: tuple[int, int], found: VerifiedPairs, keypoints: Keypoints, absent: bool
 ) -> bool:
-    """Whether a third frame confirms a step that no trajectory guided.
+    """True if a third frame confirms a step that no trajectory guided.
 
     Either a pair that spans it fits the steps it is made of, or points that it shares with a step
     beside it lie at distances in one proportion.
@@ -268,35 +269,35 @@ def _supported(
     return bool(np.isfinite(sigmas[max(f - 1, 0) : f + 1]).any()) or len(steps.verified) == 1
 
 
-def _of_one_scale(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
-    """Neighbours without steps that are many times too short, as points beside them tell.
+def _with_consistent_scale(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
+    """Neighbours without steps that are many times too short, by points common to two steps.
 
-    Where a floor's pattern is met one tile further on, relative poses look right. One of the two
-    steps is given up there, and pairs over it: the map goes in parts, which the test of joins may
-    join. Steps that share too few points to tell their lengths are matched with all keypoints
-    first.
+    Where a floor's pattern is matched one tile further on, relative poses look right. One of the
+    two steps is dropped there, and pairs over it: the map splits, and the test of joins may rejoin
+    it. Steps that share too few points for a ratio of their lengths are first matched with all
+    keypoints.
 
     Args:
-        context: of the run, which has no trajectory.
+        context: features and settings of a run without a trajectory.
         found: neighbours.
     """
-    open_at = _open_ratios(context, found)[0]
+    open_at = _frames_of_open_ratio(context, found)[0]
     found = match_again(context, found, {step for f in open_at for step in (f - 1, f)})
     matches = matches_of_steps(found, len(context.keypoints.starts) - 1)
-    return without_steps(found, given_up(_open_ratios(context, found)[1], matches))
+    return without_steps(found, given_up(_frames_of_open_ratio(context, found)[1], matches))
 
 
-def _open_ratios(context: MatchContext, found: VerifiedPairs) -> tuple[set[int], set[int]]:
-    """Frames between two steps that share few points: where these do not tell how long one step is
-    beside the other, or tell more than `_MAX_STEP_RATIO`; and the latter alone."""
+def _frames_of_open_ratio(context: MatchContext, found: VerifiedPairs) -> tuple[set[int], set[int]]:
+    """Frames between two steps whose common points leave the ratio of lengths open, or give one
+    beyond `_MAX_STEP_RATIO`; and the latter alone."""
     steps = image_steps(found, context.keypoints)
-    logs, sigmas = length_ratios(found, steps, context.keypoints, _LEAST_ALIKE)
+    logs, sigmas = length_ratios(found, steps, context.keypoints, _MIN_COMMON_POINTS)
     rows = {int(f0): p for p, (f0, f1) in enumerate(found.matches.pairs) if f1 - f0 == 1}
     unknown, extreme = set[int](), set[int]()
     for f in range(1, len(steps.verified)):
         both = [rows[g] for g in (f - 1, f) if g in rows]
         if len(both) < 2 or not np.isfinite(found.direction_sigmas[both]).any():
-            continue  # a break, or turns on the spot
+            continue  # a break, or rotations on the spot
         before, after = (found.matches.of(p) for p in both)
         shared = len(np.intersect1d(before[:, 1], after[:, 0]))
         if shared >= context.settings.pairs.scarce_matches:
@@ -311,7 +312,7 @@ def _open_ratios(context: MatchContext, found: VerifiedPairs) -> tuple[set[int],
 def _consistent(
     found: VerifiedPairs, steps: Steps, keypoints: Keypoints, settings: RefineSettings
 ) -> VerifiedPairs:
-    """Pairs without those over two steps that a repeated structure made up: see `off_steps`."""
+    """Pairs without those over two steps that repeated structure contradicts, see `off_steps`."""
     off = off_steps(found, steps)
     false = off > np.deg2rad(settings.verify.max_triplet_deg)
     return found.taken(np.flatnonzero(~false).tolist()) if false.any() else found

@@ -1,7 +1,7 @@
-"""Visual odometry: where a 360-degree camera was during a video, from the video alone.
+"""Visual odometry: the trajectory of a 360-degree camera, from its video alone.
 
 Takes small panoramas in time order.
-Gives a pose for every frame, and the frames that are worth refining.
+Gives a pose for every frame, and a selection of frames to refine.
 """
 
 from gsba.odometry.frame_choice import choose_frames

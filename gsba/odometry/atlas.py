@@ -1,7 +1,7 @@
 """A small panorama as six overlapping pinhole faces side by side in one picture, its atlas.
 
 Optical flow needs pictures without seam and poles. Frames are cut along axes that are nearly fixed
-in the world, so that what a feature looks like does not turn when the camera does.
+in the world, so that the appearance of features does not rotate with the camera.
 """
 
 from dataclasses import dataclass
@@ -19,10 +19,11 @@ from gsba.odometry.lucas_kanade import pyramid
 _kernel, _part = kernel_and_part()
 HFOV = np.deg2rad(106.0)  # of a face: a feature may move 8 degrees beyond the face that owns it
 _COLUMNS = 3  # faces side by side
-_PAD = 2  # pixels beyond seam and poles that interpolation reads
-_MAX_CUT_ERROR = np.deg2rad(6.0)  # of the axes of a cut: maps are computed anew beyond it
-_SAME_CUT = 1e-9  # radians between axes that are the same
-# Minimax polynomial of arctan(t) / t in t^2 on [0, 1] (Chebyshev nodes): 7e-7 at most off.
+_PAD = 2  # pixels beyond seam and poles for interpolation
+_MAX_CUT_ERROR = np.deg2rad(6.0)  # largest rotation of a cut's axes against the world: maps are
+# computed anew beyond it
+_SAME_CUT = 1e-9  # largest angle, radians, between axes that count as equal
+# Minimax polynomial of arctan(t) / t in t^2 on [0, 1] (Chebyshev nodes): error 7e-7 at most.
 _A0, _A1, _A2, _A3, _A4, _A5, _A6 = (
     np.float32(a)
     for a in (
@@ -49,7 +50,7 @@ class Atlas:
 
 @dataclass(frozen=True)
 class AtlasLayout:
-    """Where bearings lie in an atlas."""
+    """Pixels of bearings in an atlas, and back."""
 
     rig: CubeRig  # faces of the cube
 
@@ -94,7 +95,8 @@ class AtlasLayout:
         return self.rig.bearings(pixels + 0.5 - self.corners[faces], faces)
 
     def inside(self, pixels: np.ndarray, faces: np.ndarray, margin: float) -> np.ndarray:
-        """Which pixels (N, 2) are in their face and `margin` pixels from its border, (N,) bool."""
+        """True (N,) for pixels (N, 2) in their face and at least `margin` pixels from its
+        border."""
         local = pixels - self.corners[faces]
         with np.errstate(invalid="ignore"):
             within = (local > margin) & (local < self.rig.size - 1 - margin)
@@ -102,7 +104,7 @@ class AtlasLayout:
 
 
 class Cutter:
-    """Cuts frames along axes that stay within `_MAX_CUT_ERROR` of those of the world."""
+    """Cuts frames along axes that stay within `_MAX_CUT_ERROR` of the world's."""
 
     def __init__(self, layout: AtlasLayout, cut_R_rig: np.ndarray | None = None) -> None:
         """A cutter for one layout; `cut_R_rig` (3, 3): axes of the cut before, if there was one."""
@@ -141,7 +143,7 @@ class Cutter:
 
 
 def shared_faces(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Face (N,) that shows best a feature seen along two bearings (N, 3), axes of the cut."""
+    """Face (N,) that best shows a feature with two bearings (N, 3), axes of the cut."""
     return owner_faces(unit(one + other)).astype(np.int64)
 
 
@@ -160,7 +162,8 @@ def _arctangent(y, x):
 
 @_kernel
 def _erp_pixels(xs, ys, zs, cut_R_rig, height, across, down):
-    """OpenCV pixels of a panorama that rays along the axes of a cut meet; float32 throughout."""
+    """OpenCV pixels of a panorama in the directions of rays, axes of the cut; float32
+    throughout."""
     per_radian = height / _HALF
     half = _ONE_HALF
     for i in range(len(xs)):

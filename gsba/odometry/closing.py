@@ -1,7 +1,7 @@
-"""The end of odometry, once a whole walk is tracked: maps joined, loops closed, covariances.
+"""The last step of odometry, on all keyframes: maps joined, loops closed, covariances.
 
-A wrong loop or join is the worst that can happen to a map, and one that is missed is only drift:
-both are believed by the test of joins alone (`gsba.loop_closure.join_test`).
+A wrong loop or join ruins a map, and a missed one only leaves drift: both must pass the test of
+joins (`gsba.loop_closure.join_test`).
 """
 
 import logging
@@ -21,7 +21,7 @@ from gsba.store.shards import Workers
 
 logger = logging.getLogger(__name__)
 
-_MIN_PLACES = 3  # of a map that is compared with others
+_MIN_PLACES = 3  # least number of places of a map that is compared with others
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,13 +30,13 @@ class TrackedKeyframes:
 
     world_T_keys: np.ndarray  # (K, 4, 4) float64, each in the world of its map
     maps: np.ndarray  # (K,) int32
-    solved: np.ndarray  # (K,) bool, keyframes of maps that have points
+    solved: np.ndarray  # (K,) bool, keyframes of maps with points
     distances: np.ndarray  # (K,) float64, median distance of points, map units; positive
     features: Sequence[tuple[np.ndarray, np.ndarray]]  # (K) ids (N,) and bearings (N, 3), rig frame
-    pictures: Sequence[np.ndarray]  # (K) panoramas, see `gsba.odometry.places.compressed`
+    pictures: Sequence[np.ndarray]  # (K) JPEG panoramas, see `gsba.odometry.places.compressed`
     timestamps: np.ndarray  # (K,) float64, seconds
     width: int  # pixels across the panoramas
-    usable: np.ndarray | None  # (h, 2h) bool, what shows the scene; None = all
+    usable: np.ndarray | None  # (h, 2h) bool, pixels of the scene; None = all
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +44,11 @@ class ClosedKeyframes:
     """Keyframes after maps were joined and loops closed."""
 
     world_T_keys: np.ndarray  # (K, 4, 4) float64
-    scales: np.ndarray  # (K,) float64, length now of what was one unit long beside each keyframe
+    scales: np.ndarray  # (K,) float64, present length of one former unit beside each keyframe
     maps: np.ndarray  # (K,) int32; joined maps have the number of the first of them
     covariances: np.ndarray  # (K, 6, 6) float64, tangent [rotation rad, translation], map units,
     # the first pose of each map and its distance to the furthest held; NaN = not known
-    loops: np.ndarray  # (L, 2) int64, keyframes at which one map was found to meet itself
+    loops: np.ndarray  # (L, 2) int64, keyframes of loops within a map
     joins: np.ndarray  # (M, 2) int64, keyframes at which two maps were joined
 
     @classmethod
@@ -60,7 +60,7 @@ class ClosedKeyframes:
 
 
 def close(tracked: TrackedKeyframes, seed: int, workers: Workers) -> ClosedKeyframes:
-    """Join the maps of a walk where they meet, close loops, and say how well poses are known.
+    """Join the maps of a walk where they overlap, close loops, and estimate covariances.
 
     Args:
         tracked: all keyframes.
@@ -92,7 +92,7 @@ def _places(tracked: TrackedKeyframes, seed: int, workers: Workers) -> Places | 
 
 
 def _joined(found: ClosedKeyframes, places: Places, tracked: TrackedKeyframes) -> ClosedKeyframes:
-    """Maps carried to where they meet others; the first map of each stays where it is."""
+    """Maps moved to where they overlap others; the first map of each group stays in place."""
     numbers, counts = np.unique(places.maps, return_counts=True)
     numbers = numbers[counts >= _MIN_PLACES]
     if len(numbers) < 2:
@@ -139,7 +139,7 @@ def _closed(
     joins = [of_keys(one) for one in find_joins(some)]
     loops = [of_keys(one) for one in find_loops(some, np.diff(some.maps) != 0)]
     path = [*_steps(keys, poses, scales, row_of, steps), *joins]
-    since = np.ones(len(keys))  # scales after joining
+    since = np.ones(len(keys))  # changes of scale after joining
     if loops:
         closed = close_loops(poses, path, loops)
         if not closed.kept.all():
@@ -175,7 +175,7 @@ def _steps(
     row_of: dict[int, int],
     steps: MeasuredSteps,
 ) -> list[Constraint]:
-    """The steps of odometry within a map, in the units that its parts were carried to."""
+    """The steps of odometry within a map, in the units that its parts have after joining."""
     found = []
     for row, key in enumerate(keys.tolist()):
         if steps.parents[key] < 0:

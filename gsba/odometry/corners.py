@@ -6,24 +6,25 @@ import numpy as np
 from gsba.camera.rig import cells_of, owner_faces
 from gsba.odometry.atlas import Atlas, AtlasLayout
 
-_PER_SIDE = 11  # cells along a side of a cube face: 8 degrees each
-_PER_CELL = 1  # features in a cell, followed ones among them
+_PER_SIDE = 11  # cells along a side of a cube face, 8 degrees each
+_PER_CELL = 1  # features in a cell, including followed ones
 _BLOCK = 5  # pixels across the patch of which gradients are summed
-_APART_PX = 5  # between features
-_MIN_EIGENVALUE = 3e-5  # of a patch's gradients, as OpenCV normalises them: less is noise
-_NOISES = 4.0  # times the median response of a picture's flattest quarter
+_APART_PX = 5  # least distance between features
+_MIN_EIGENVALUE = 3e-5  # least eigenvalue of a patch's gradients, in OpenCV's normalisation: less
+# is noise
+_NOISES = 4.0  # least response of a corner, in median responses of a picture's flattest quarter
 
 
 def new_corners(
     layout: AtlasLayout, atlas: Atlas, usable: np.ndarray | None, known: np.ndarray
 ) -> np.ndarray:
-    """Bearings (N, 3), rig frame, of corners where features are wanting.
+    """Bearings (N, 3), rig frame, of corners in cells with too few features.
 
     Args:
         layout: of the atlas.
         atlas: the keyframe.
-        usable: (2 s, 3 s) bool, what of the atlas shows the scene; None = all.
-        known: (M, 3) bearings, rig frame, of features that are followed already.
+        usable: (2 s, 3 s) bool, pixels of the scene; None = all.
+        known: (M, 3) bearings, rig frame, of features followed so far.
     """
     response = cv2.cornerMinEigenVal(atlas.image, _BLOCK)
     allowed = layout.owned if usable is None else layout.owned & usable
@@ -46,13 +47,13 @@ def new_corners(
 
 
 def _flat(response: np.ndarray, allowed: np.ndarray) -> float:
-    """Median response of the flattest quarter of a picture: that of noise, where walls are bare."""
+    """Median response of the flattest quarter of a picture: that of noise, if walls are bare."""
     some = response[::4, ::4][allowed[::4, ::4]]
     return float(np.quantile(some, 0.125)) if len(some) else 0.0
 
 
 def _block(peaks: np.ndarray, layout: AtlasLayout, along: np.ndarray) -> None:
-    """Clear `peaks` around features that are known, bearings (M, 3) along the axes of the cut."""
+    """Clear `peaks` around known features, bearings (M, 3) along the axes of the cut."""
     faces = owner_faces(along).astype(np.int64)
     for u, v in np.rint(layout.pixels(along, faces)).astype(int):
         top, left = max(v - _APART_PX, 0), max(u - _APART_PX, 0)
@@ -69,7 +70,7 @@ def _strongest(cells: np.ndarray, room: np.ndarray) -> np.ndarray:
 
 
 def _apart(pixels: np.ndarray) -> np.ndarray:
-    """Rows of pixels (N, 2), in falling order, that are `_APART_PX` from all that go before."""
+    """Rows of pixels (N, 2), in falling order, at least `_APART_PX` from all earlier ones."""
     from scipy.spatial import KDTree
 
     if len(pixels) < 2:

@@ -1,7 +1,7 @@
-"""How a camera turned between two frames, from their panoramas alone, whatever the angle.
+"""Rotation between two frames from their panoramas alone, at any angle.
 
-Used where no prediction holds: after fast turns, gaps and blackouts. Rows are correlated for the
-yaw, then the whole sphere is aligned over SO(3) (Gauss-Newton, inverse compositional).
+Used without a reliable prediction: after fast turns, gaps and blackouts. Rows are correlated for
+the yaw, then the whole sphere is aligned over SO(3) (Gauss-Newton, inverse compositional).
 """
 
 from dataclasses import dataclass
@@ -13,25 +13,25 @@ from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearin
 from gsba.camera.tables import table
 
 _WIDTH = 128  # pixels across the panoramas that are compared
-_BLUR = 1.2, 8.0  # pixels: band of detail that is compared
+_BLUR = 1.2, 8.0  # pixels, standard deviations: band of detail that is compared
 _STEPS = 15
-_PAD = 2  # pixels beyond seam and poles that interpolation reads
+_PAD = 2  # pixels beyond seam and poles for interpolation
 _CONVERGED = np.deg2rad(0.05)
 _MAX_STEP = np.deg2rad(15.0)
-_ROWS = (0.25, 0.75)  # part of the height whose rows are correlated
+_ROWS = (0.25, 0.75)  # band of rows that are correlated, parts of the height
 
 
 @dataclass(frozen=True, slots=True)
 class Miniature:
-    """Detail of a panorama between two scales, of unit spread."""
+    """Band-passed panorama of unit standard deviation."""
 
     detail: np.ndarray  # (64, 128) float32
-    weights: np.ndarray  # (64, 128) float32, solid angle, 0 = not the scene
-    contrast: float  # grey values, spread of the detail before it was scaled
+    weights: np.ndarray  # (64, 128) float32, solid angle; 0 = masked
+    contrast: float  # grey values, standard deviation of the detail before scaling
 
 
 def miniature(grey: np.ndarray, usable: np.ndarray | None = None) -> Miniature:
-    """A panorama (h, 2h) uint8 made small; `usable` (h, 2h) bool says what shows the scene."""
+    """Band-passed small copy of a panorama (h, 2h) uint8; `usable` (h, 2h) bool masks the scene."""
     size = (_WIDTH, _WIDTH // 2)
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     wide = np.concatenate([small[:, -32:], small, small[:, :32]], axis=1)
@@ -47,11 +47,11 @@ def miniature(grey: np.ndarray, usable: np.ndarray | None = None) -> Miniature:
 
 
 def turned(one: Miniature, other: Miniature, guesses: list[np.ndarray]) -> np.ndarray:
-    """one_R_other (3, 3) that lays the two panoramas best upon one another.
+    """one_R_other (3, 3) that best aligns the two panoramas.
 
     Args:
-        one, other: of frames of one place, or near one another.
-        guesses: rotations to begin at, besides the best turn about the vertical axis.
+        one, other: miniatures of frames at nearby positions.
+        guesses: initial rotations, besides the best rotation about the vertical axis.
     """
     best, least = np.eye(3), np.inf
     for start in [*guesses, _yaw(one, other)]:
@@ -62,7 +62,7 @@ def turned(one: Miniature, other: Miniature, guesses: list[np.ndarray]) -> np.nd
 
 
 def _yaw(one: Miniature, other: Miniature) -> np.ndarray:
-    """Turn about the vertical axis by which rows correlate best."""
+    """Rotation about the vertical axis under which rows correlate best."""
     rows = slice(*(round(part * len(one.detail)) for part in _ROWS))
     spectra = [np.fft.rfft(m.detail[rows] * (m.weights[rows] > 0), axis=1) for m in (one, other)]
     correlation = np.fft.irfft(spectra[0] * np.conj(spectra[1]), axis=1).sum(axis=0)
@@ -72,14 +72,14 @@ def _yaw(one: Miniature, other: Miniature) -> np.ndarray:
 
 
 def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.ndarray, float]:
-    """one_R_other near `start`, and the mean robust cost of what is left."""
+    """one_R_other near `start`, and the mean robust cost of the residuals."""
     from scipy.spatial.transform import Rotation
 
     rays, rotation, cost = _rays(), start, np.inf
     weights = one.weights.ravel()
     jacobian = _jacobian(one.detail)
     for _ in range(_STEPS):
-        # The other picture, turned by the estimate, is compared at the rays of the first.
+        # The other picture, rotated by the estimate, is compared at the rays of the first.
         places = erp_from_bearings(rays @ rotation, _WIDTH, _WIDTH // 2) - 0.5
         maps = np.ascontiguousarray(places, np.float32).reshape(-1, _WIDTH, 2)
         sampled, seen = _sampled(other.detail, maps), _sampled(other.weights, maps)
@@ -114,13 +114,14 @@ def _rays() -> np.ndarray:
 
 
 def _jacobian(detail: np.ndarray) -> np.ndarray:
-    """Derivative (64 * 128, 3) of the detail at each ray by a turn of the ray about the axes."""
+    """Derivative (64 * 128, 3) of the detail at each ray by a rotation of the ray about the
+    axes."""
     per_radian = _WIDTH / (2 * np.pi)
     by_u = 0.5 * (np.roll(detail, -1, axis=1) - np.roll(detail, 1, axis=1)) * per_radian
     by_v = np.gradient(detail, axis=0) * per_radian
     x, y, z = _rays().T
     level = np.maximum(np.hypot(x, z), 0.05)
-    # Turning a ray r about w moves it by w x r: longitude and elevation angles follow.
+    # Rotating a ray r about w moves it by w x r: longitude and elevation angles follow.
     by_longitude, by_height = by_u.ravel(), by_v.ravel()
     east = np.stack([z, np.zeros_like(x), -x], axis=1) / level[:, None]
     down = np.stack([-x * y, level**2, -z * y], axis=1) / level[:, None]

@@ -1,4 +1,4 @@
-"""Odometry on disk: the trajectory, its keyframes, and what happened."""
+"""Odometry on disk: the trajectory, its keyframes, the status of each frame, and the report."""
 
 import csv
 from pathlib import Path
@@ -17,8 +17,8 @@ _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # of a pose covariance
 
 
 def write_odometry(found: Odometry, walk: Path, keyframes: Path, poses: Path, report: Path) -> None:
-    """Write the poses of all frames and of the keyframes as TUM files, what is known of each pose
-    as CSV, and the report as JSON."""
+    """Write the poses of all frames and of the keyframes as TUM files, status and covariance of
+    each pose as CSV, and the report as JSON."""
     for path in (walk, keyframes, poses, report):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_tum(keyframes, found.trajectory(keyframes=True))
@@ -62,9 +62,9 @@ def _write_poses(path: Path, found: Odometry) -> None:
 
 
 def write_chosen(found: Odometry, rows: np.ndarray, path: Path) -> None:
-    """Write the poses of chosen frames (N,) as a TUM file, by whose times they are extracted.
+    """Write the poses of chosen frames (N,) as a TUM file, whose times select them for extraction.
 
-    A file that holds them already is left as it is: what was extracted by it stays valid.
+    A file that holds them already is not rewritten: frames extracted by it stay valid.
     """
     chosen = Trajectory(found.timestamps[rows], found.world_T_rigs[rows])
     if path.is_file() and _holds(path, chosen):
@@ -74,7 +74,7 @@ def write_chosen(found: Odometry, rows: np.ndarray, path: Path) -> None:
 
 
 def _holds(path: Path, trajectory: Trajectory) -> bool:
-    """Whether a file has a trajectory's times and, as far as they are written, its poses."""
+    """True if a file has a trajectory's times and poses, to the precision of the file."""
     try:
         written = read_trajectory(path)
     except GsbaError:

@@ -5,8 +5,8 @@ import numpy as np
 from gsba.odometry.atlas import Atlas, AtlasLayout, shared_faces
 from gsba.odometry.lucas_kanade import LEVELS, WINDOW, align_patches
 
-_MAX_RETURN_ERROR_PX = 0.6  # of a feature followed forth and back
-_MAX_DIFFERENCE = 25.0  # grey values between both patches, in the mean
+_MAX_RETURN_ERROR_PX = 0.6  # largest error of a feature followed forth and back
+_MAX_DIFFERENCE = 25.0  # largest mean difference of both patches, grey values
 
 
 def follow(
@@ -16,18 +16,18 @@ def follow(
     bearings_template: np.ndarray,
     predicted: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where features of one frame are in another.
+    """Bearings of one frame's features in another frame.
 
-    Each is followed on the face that shows both ends best, forth and back.
+    Each is followed, forth and back, on the face that best shows both bearings.
 
     Args:
         layout: of both atlases.
         template, frame: cut along nearly the same axes of the world.
         bearings_template: (N, 3) features in the template's rig frame.
-        predicted: (N, 3) unit, where they are expected in the frame's rig frame.
+        predicted: (N, 3) unit, predicted bearings in the frame's rig frame.
 
     Returns:
-        bearings (N, 3) in the frame's rig frame, and which of them (N,) bool were found.
+        bearings (N, 3) in the frame's rig frame, and (N,) bool, True for found features.
     """
     before = bearings_template @ template.cut_R_rig.T
     guess = predicted @ frame.cut_R_rig.T

@@ -1,4 +1,4 @@
-"""Frames of a video chosen by what they show: sharp, and near enough to one another."""
+"""Selection of frames of a video for refinement: sharp, and close enough to one another."""
 
 from dataclasses import dataclass
 
@@ -8,21 +8,21 @@ from gsba.config import OdometrySettings
 from gsba.geometry import rotation_angle
 from gsba.odometry.walk import Odometry
 
-_EARLIEST = 0.6  # part of a step after which the sharpest frame is looked for
-_MOST_LONGER = 1e6  # times the step, where few frames are wanted
-_HALVINGS = 20  # of the interval in which that factor is looked for
+_EARLIEST = 0.6  # part of a step after which the sharpest frame is searched
+_MOST_LONGER = 1e6  # largest factor on the step, if few frames are wanted
+_HALVINGS = 20  # bisections of the interval of that factor
 
 
 def choose_frames(found: Odometry, settings: OdometrySettings) -> np.ndarray:
-    """Rows (N,) of frames that are worth refining.
+    """Rows (N,) of the frames to refine.
 
-    From one frame to the next the camera moves by at most `step` times the median distance of
-    what it sees, and turns by at most `max_turn_deg`, wherever the video has frames as close; the
-    sharpest of the last part of each such stretch is taken. Frames without a pose are left out.
+    From one frame to the next the camera moves by at most `step` times the median distance of the
+    scene, and rotates by at most `max_turn_deg`, wherever the video has frames that close; the
+    sharpest of the last part of each such stretch is selected. Frames without a pose are left out.
 
     Args:
-        found: of all frames.
-        settings: lengths of the steps, and how many frames at most.
+        found: odometry of all frames.
+        settings: lengths of the steps, and the largest number of frames.
     """
     count = settings.max_frames
     steps = _Steps.of(found, settings.step, np.deg2rad(settings.max_turn_deg))
@@ -45,7 +45,7 @@ def choose_frames(found: Odometry, settings: OdometrySettings) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class _Steps:
-    """How far frames are from one another, in steps of the length that is allowed."""
+    """Distances between frames, in steps of the allowed length."""
 
     positions: np.ndarray  # (F, 3) float64, map units
     rotations: np.ndarray  # (F, 3, 3) float64
@@ -54,7 +54,7 @@ class _Steps:
 
     @classmethod
     def of(cls, found: Odometry, step: float, max_turn: float) -> "_Steps":
-        """Steps between frames; the distance of things is interpolated where it is not known."""
+        """Steps between frames; unknown distances of the scene are interpolated."""
         known = np.flatnonzero(np.isfinite(found.distances) & found.posed())
         distances = np.full(len(found), np.inf)
         if len(known):
@@ -63,7 +63,7 @@ class _Steps:
         return cls(poses[:, :3, 3], poses[:, :3, :3], step * distances, max_turn)
 
     def between(self, one: int, others: np.ndarray) -> np.ndarray:
-        """From one frame to others (N,)."""
+        """Steps from one frame to others (N,)."""
         moved = np.linalg.norm(self.positions[others] - self.positions[one], axis=1)
         turned = rotation_angle(self.rotations[one].T @ self.rotations[others])
         shorter = np.minimum(self.allowed[others], self.allowed[one])
@@ -71,7 +71,7 @@ class _Steps:
 
 
 def _chosen(found: Odometry, steps: _Steps, longer: float) -> np.ndarray:
-    """Rows of frames at most `longer` steps apart, the first of each map among them."""
+    """Rows of frames at most `longer` steps apart, including the first of each map."""
     out: list[int] = []
     posed = found.posed()
     for number in np.unique(found.maps[posed]):
@@ -86,7 +86,7 @@ def _chosen(found: Odometry, steps: _Steps, longer: float) -> np.ndarray:
 def _next(
     rows: np.ndarray, here: int, steps: _Steps, longer: float, sharpness: np.ndarray
 ) -> int | None:
-    """The frame to take after `rows[here]`, as an index into `rows`; None = nothing new follows."""
+    """Index into `rows` of the frame to select after `rows[here]`; None = no new frame follows."""
     reach, end = 32, len(rows)
     while True:
         ahead = np.arange(here + 1, min(here + 1 + reach, end))

@@ -7,11 +7,11 @@ import numpy as np
 
 
 class FrameStatus(IntEnum):
-    """How the pose of a frame was found."""
+    """Source of a frame's pose."""
 
     TRACKED = 0  # from known points
-    TURNING = 1  # before the map had points: the rotation alone, the position is kept
-    LOST = 2  # not at all: the pose of the frame before stands in for it
+    TURNING = 1  # before the map had points: the rotation alone, at the position before
+    LOST = 2  # no pose: that of the frame before stands in
 
 
 @dataclass(slots=True)
@@ -20,7 +20,7 @@ class FrameRecord:
 
     status: FrameStatus
     map_number: int  # 0 = the first map
-    keyframe: int  # number of the keyframe it hangs on
+    keyframe: int  # number of the keyframe that it is relative to
     key_T_rig: np.ndarray  # (4, 4) float64, pose in that keyframe
     distance: float  # median distance of the points, map units; NaN = not known
-    inliers: int  # features that fit
+    inliers: int  # features that fit the pose

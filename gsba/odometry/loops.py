@@ -1,4 +1,4 @@
-"""Places of one map that are met again, believed by the test that judges joins of maps."""
+"""Loops within one map, accepted by the test that judges joins of maps."""
 
 import logging
 from dataclasses import replace
@@ -20,28 +20,29 @@ from gsba.similarity import Sim3
 
 logger = logging.getLogger(__name__)
 
-_MAX_SCALE_DRIFT = 1.25  # of a map between two visits, either way
-_MIN_POINTS = 6  # that both places of a pair know
-_BESIDE = 4  # places from the ends of a meeting: others are a meeting of their own
-_MAX_TRIED = 4  # proposals of one meeting that are weighed
-_FITTED = 3  # places to either side of a meeting, by which the loop is measured
-_DIRECTION_SIGMA = np.deg2rad(0.25)  # of points that both sides know, as seen from a place
-_DISTANCE_SIGMA = 0.1  # of the logarithm of the ratio of their distances
-_FITTING = 4.0  # of these, from where a point should be seen from either side, at most: it fits
-_MIN_FITTING = 0.35  # share of points that fit a loop that is measured; true ones have 0.4 to 0.6
-_MIN_ROTATION = np.deg2rad(0.1)  # standard deviations of a loop however many points it rests on:
-_MIN_TRANSLATION = 0.003  # lenses have two centres, and each side has drifted; in median distances
+_MAX_SCALE_DRIFT = 1.25  # largest ratio of scales between two visits, either way
+_MIN_POINTS = 6  # least number of points known at both places of a pair
+_BESIDE = 4  # places from a meeting's ends that belong to it
+_MAX_TRIED = 4  # proposals of one meeting that are tested
+_FITTED = 3  # places to either side of a meeting whose points measure the loop
+_DIRECTION_SIGMA = np.deg2rad(0.25)  # noise of common points' bearings, as seen from a place
+_DISTANCE_SIGMA = 0.1  # noise of the logarithm of the ratio of common points' distances
+_FITTING = 4.0  # largest residual, in these standard deviations, of a point that fits
+_MIN_FITTING = 0.35  # least share of points that fit a measured loop; true ones have 0.4 to 0.6
+_MIN_ROTATION = np.deg2rad(0.1)  # least standard deviations of a loop: lenses have two centres, and
+_MIN_TRANSLATION = 0.003  # each side has drifted; in radians, median distances, and log scale
 _MIN_LOG_SCALE = 0.01
-_UNMEASURED = 5.0  # times these, where too few points beside the meeting measure it
-_CORRELATED = 4.0  # times the variance of independent points: those of one surface err alike
+_UNMEASURED = 5.0  # factor on these if too few points beside the meeting measure it
+_CORRELATED = 4.0  # factor on the variance of independent points: those of one surface have
+# correlated errors
 
 
 def find_loops(places: Places, unseen: np.ndarray) -> list[Constraint]:
-    """Loops that appearance proposes, and that geometry and all that is around confirm.
+    """Loops proposed by appearance and confirmed by geometry and surroundings.
 
     Args:
-        places: of one map, in time order.
-        unseen: (P - 1,) bool, steps between places that no image tells.
+        places: places of one map, in time order.
+        unseen: (P - 1,) bool, steps between places without matches.
     """
     solved, context, num = places.solved, places.context, len(places.keyframes)
     looks = global_descriptors(context.strongest, num, context.settings.seed, context.workers)
@@ -49,7 +50,7 @@ def find_loops(places: Places, unseen: np.ndarray) -> list[Constraint]:
     strongest = replace(context, frames=context.strongest)
     verified = recovery.match_anywhere(strongest, chosen, rivals=False)
     test = _join_test(places)
-    none = np.zeros(0, np.int64)  # the later place of each pair is carried to the earlier one
+    none = np.zeros(0, np.int64)  # the later place of each pair moves to the earlier one
     meetings = test.meetings(verified.matches, none, verified.f0_T_f1s)
     meetings = [found for found in meetings if len(found.own) >= _MIN_POINTS]
     judged = [
@@ -66,10 +67,10 @@ def find_loops(places: Places, unseen: np.ndarray) -> list[Constraint]:
 
 
 def find_joins(places: Places) -> list[Constraint]:
-    """Constraints between maps that were joined, each measured where it comes closest.
+    """Constraints between joined maps, each measured where they are closest.
 
     Args:
-        places: of one map that several were joined to, with poses in its world.
+        places: places of several joined maps, with poses in one world.
     """
     positions, maps = places.solved.world_T_rigs[:, :3, 3], places.maps
     found, test = list[Constraint](), _join_test(places)
@@ -82,7 +83,7 @@ def find_joins(places: Places) -> list[Constraint]:
         part = np.flatnonzero(maps == maps[rows[f]])
         measured = _measured(proposal, part, others, test)
         if measured is None:
-            # Frames that tell lie further off; the join itself is believed all the same.
+            # Frames that measure it are further off; the join itself is accepted all the same.
             end, start = others[g], rows[f]
             poses, wide = places.solved.world_T_rigs, _UNMEASURED * _floor(test.depth)
             step = Sim3.of(1.0, inverse(poses[end]) @ poses[start])
@@ -106,7 +107,7 @@ def _join_test(places: Places) -> JoinTest:
 
 
 def _meeting_by_meeting(meetings: list[Meeting]) -> list[list[Meeting]]:
-    """Pairs of places grouped with those beside them, around the pairs that share most points."""
+    """Pairs of places grouped with their neighbours, around the pairs with the most points."""
     rest, groups = sorted(meetings, key=lambda m: -len(m.own)), list[list[Meeting]]()
     while rest:
         best = rest[0]
@@ -119,7 +120,7 @@ def _meeting_by_meeting(meetings: list[Meeting]) -> list[list[Meeting]]:
 def _judged(
     group: list[Meeting], places: Places, unseen: np.ndarray, test: JoinTest
 ) -> list[Judged]:
-    """Each similarity that a group of pairs proposes, judged by its surroundings."""
+    """Each similarity proposed by a group of pairs, judged by its surroundings."""
     poses, seed = places.solved.world_T_rigs, places.context.settings.seed
     found = []
     for proposal in propose(group, poses, test.depth, seed)[:_MAX_TRIED]:
@@ -132,7 +133,7 @@ def _judged(
 
 
 def _plausible(proposal: Proposal, places: Places, unseen: np.ndarray) -> bool:
-    """Whether a loop asks for no more than the path between its places can have drifted."""
+    """True if a loop needs no more drift than the path between its places can have."""
     if abs(np.log(proposal.move.scale)) > np.log(_MAX_SCALE_DRIFT):
         return False
     (f, g), poses = proposal.frames, places.solved.world_T_rigs
@@ -142,7 +143,7 @@ def _plausible(proposal: Proposal, places: Places, unseen: np.ndarray) -> bool:
 
 
 def _rivals(one: Judged, judged: list[Judged], test: JoinTest) -> list[Judged]:
-    """Other loops of the same stretch that would carry it elsewhere, and are no worse."""
+    """Other loops of the same stretch that lead elsewhere and are no worse."""
     f, g = one.proposal.frames
     shared = [
         other
@@ -155,11 +156,11 @@ def _rivals(one: Judged, judged: list[Judged], test: JoinTest) -> list[Judged]:
 def _measured(
     proposal: Proposal, rows: np.ndarray, inside: np.ndarray, test: JoinTest
 ) -> Constraint | None:
-    """A proposal that is believed, fitted to what the places next to the meeting know: drift is
-    least there. None where few of their points fit it.
+    """An accepted proposal, fitted to points of the places next to the meeting, where drift is
+    least. None if few of their points fit it.
 
     Args:
-        proposal: carries places `rows` (N,) to places `inside` (M,), ascending.
+        proposal: moves places `rows` (N,) to places `inside` (M,), ascending.
     """
     (f, g), poses, move = proposal.frames, test.poses, proposal.move
     rows, inside = around(rows, f, _FITTED), around(inside, g, _FITTED)
@@ -180,18 +181,18 @@ def _sides(f: int, g: int, num: int) -> tuple[np.ndarray, np.ndarray]:
 def fit_loop(
     meetings: list[Meeting], poses: np.ndarray, at: tuple[int, int], start: Sim3
 ) -> tuple[Sim3, np.ndarray] | None:
-    """The similarity of two places by directions and distances of points that both sides know.
+    """The similarity of two places by directions and distances of common points.
 
-    Directions fix the pose; distances fix the scale where the places are close to one another.
+    Directions determine the pose; distances the scale, if the places are close to one another.
 
     Args:
-        meetings: of places beside f and beside g.
-        poses: (P, 4, 4) of all places, right within either side.
+        meetings: meetings of places beside f with places beside g.
+        poses: (P, 4, 4) poses of all places, consistent on either side.
         at: the places f and g.
         start: g_T_f, similarity of their rigs.
 
     Returns:
-        g_T_f and its covariance (7, 7), see `Constraint`; None where few points fit it.
+        g_T_f and its covariance (7, 7), see `Constraint`; None if few points fit it.
     """
     from scipy.optimize import least_squares
 
@@ -226,7 +227,7 @@ def fit_loop(
 
 
 def _floor(distance: float) -> np.ndarray:
-    """Standard deviations (7,) of a loop among points at a median distance."""
+    """Least standard deviations (7,) of a loop among points at a median distance."""
     return np.array(
         [_MIN_ROTATION] * 3 + [_MIN_TRANSLATION * distance] * 3 + [_MIN_LOG_SCALE], float
     )
@@ -247,7 +248,7 @@ def moved(similarity: Sim3, tangent: np.ndarray) -> Sim3:
 def _in_rig(
     points: list[np.ndarray], rig_T_frames: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3) of frames in one rig, and where the frame of each is there (N, 3)."""
+    """Points (N, 3) of frames in one rig, and positions (N, 3) there of their frames."""
     there = [p @ T[:3, :3].T + T[:3, 3] for p, T in zip(points, rig_T_frames, strict=True)]
     seers = [np.tile(T[:3, 3], (len(p), 1)) for p, T in zip(points, rig_T_frames, strict=True)]
     return np.concatenate(there), np.concatenate(seers)

@@ -33,21 +33,21 @@ from gsba.video.recording import (
 
 logger = logging.getLogger(__name__)
 
-_LOOKS = 8  # frames of a raw recording by which its lenses are guessed
-_CARRIER_LOOKS = 20  # frames in which the carrier is looked for
-_LEAST = 3  # frames that make a sequence
+_LOOKS = 8  # frames of a raw recording from which its lenses are initialised
+_CARRIER_LOOKS = 20  # frames in which the carrier is detected
+_LEAST = 3  # least number of frames of a sequence
 
 
 @dataclass(frozen=True, slots=True)
 class SmallPanoramas:
-    """A sequence of panoramas that are read when they are asked for."""
+    """A sequence of panoramas that are read on demand."""
 
     source: Path  # video or folder
     timestamps: np.ndarray  # (F,) float64, seconds, strictly increasing
     width: int  # pixels across
     read: Callable[[Sequence[int], bool], Iterator[tuple[int, np.ndarray]]]  # rows, in colour ->
     # (row, (h, 2h[, 3]) uint8, RGB); rows that are damaged are left out
-    usable: np.ndarray | None = None  # (h, 2h) bool, what shows the scene in every frame
+    usable: np.ndarray | None = None  # (h, 2h) bool, pixels that show the scene in every frame
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -57,9 +57,9 @@ def of_frames(frames: FrameSet, source: Path, width: int) -> SmallPanoramas:
     """Panoramas of a folder.
 
     Args:
-        frames: panoramas or raw pairs; what all their masks leave out is left out.
+        frames: panoramas or raw pairs; pixels masked in all of them are masked.
         source: the folder.
-        width: pixels across; less where the frames are smaller.
+        width: pixels across; less if the frames are smaller.
 
     Raises:
         GsbaError: cube faces.
@@ -94,16 +94,17 @@ def of_video(
     from_s: float | None = None,
     to_s: float | None = None,
 ) -> SmallPanoramas:
-    """Panoramas of a video: stitched, or raw and joined by what its lenses are taken for.
+    """Panoramas of a video: stitched, or raw and joined by its lenses' calibration.
 
     Args:
         video: see `gsba.video.recording`.
-        width: pixels across; less where the video is smaller.
-        calibration: of the lenses of a raw recording; None = guessed from its image circles.
+        width: pixels across; less if the video is smaller.
+        calibration: calibration file of a raw recording; None = from image circles or the maker's
+            file.
         from_s, to_s: seconds since its first frame, the part that is read; None = all.
 
     Raises:
-        GsbaError: no such video, fewer than three frames, or a raw one that shows no circles.
+        GsbaError: no such video, fewer than three frames, or a raw one without image circles.
     """
     if not video.is_file():
         raise GsbaError(f"{video}: no such file")
@@ -137,9 +138,9 @@ def of_video(
 
 
 def without_carrier(panoramas: SmallPanoramas) -> SmallPanoramas:
-    """The same panoramas, masked where what carries the camera stays in place.
+    """The panoramas with the carrier masked, if it keeps its place in the pictures.
 
-    Where the pictures do not tell, a line says so and nothing is masked.
+    If it cannot be detected, a line in the log says so and nothing is masked.
     """
     rows = np.unique(np.linspace(0, len(panoramas) - 1, _CARRIER_LOOKS).astype(int)).tolist()
     size = (PICTURE_WIDTH, PICTURE_WIDTH // 2)
@@ -154,7 +155,7 @@ def without_carrier(panoramas: SmallPanoramas) -> SmallPanoramas:
 
 
 def masked(panoramas: SmallPanoramas, mask: Path) -> SmallPanoramas:
-    """The same panoramas, used where a 2:1 picture, the mask of all frames, is white.
+    """The panoramas, masked by a 2:1 picture for all frames, white = use.
 
     Raises:
         GsbaError: the mask cannot be read, or is not 2:1.
@@ -168,7 +169,7 @@ def masked(panoramas: SmallPanoramas, mask: Path) -> SmallPanoramas:
 
 
 def _narrowed(panoramas: SmallPanoramas, usable: np.ndarray) -> SmallPanoramas:
-    """Used only where a mask (h, 2h) bool of any size is True besides."""
+    """The panoramas, masked by another mask (h, 2h) bool of any size besides."""
     size = (panoramas.width, panoramas.width // 2)
     fitted = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.9
     before = panoramas.usable
@@ -180,7 +181,7 @@ def _pixels(picture: Picture, colour: bool) -> np.ndarray:
 
 
 def _lenses(recording: Recording, rows: np.ndarray, calibration: Path | None) -> Pair:
-    """Lenses of a raw recording, from a few of its frames."""
+    """Initial lenses of a raw recording, from a few of its frames."""
     looks = np.unique(np.linspace(0, len(rows) - 1, _LOOKS).astype(int))
     size = (recording.width, recording.width)
     with TemporaryDirectory(prefix="gsba-") as name:

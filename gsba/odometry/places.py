@@ -1,4 +1,4 @@
-"""Places of a walk: some keyframes, with descriptors and points by which they are met again."""
+"""Places of a walk: selected keyframes, with descriptors and points for place recognition."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,28 +19,28 @@ from gsba.store.shards import Workers
 from gsba.types import Features, Solution
 
 _JPEG_QUALITY = 90
-_HFOV = np.deg2rad(94.0)  # of faces: keypoints near a border are described by what is beyond it
-_STEP = 0.12  # from one place to the next, at least; part of the median distance of points
+_HFOV = np.deg2rad(94.0)  # of faces: keypoints near a border are described by pixels beyond it
+_STEP = 0.12  # least distance of consecutive places, in median distances of points
 _MAX_PER_FACE = 150  # keypoints
-_STRONGEST_PER_FACE = 100  # of these, that are compared where nothing is predicted
+_STRONGEST_PER_FACE = 100  # strongest of these, compared without any prediction
 _SETTINGS = RefineSettings(
     pairs=PairSettings(strongest_per_face=_STRONGEST_PER_FACE, far_drift=0.03)
 )
-_MAX_ERROR_SIGMAS = 6.0  # of an observation from its point
+_MAX_ERROR_SIGMAS = 6.0  # largest residual of an observation
 
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Chosen keyframes of maps that have points; a place is a frame to whatever compares them."""
+    """Selected keyframes of maps with points; each place is a frame of the matching."""
 
     keyframes: np.ndarray  # (P,) int64, numbers of the keyframes
-    maps: np.ndarray  # (P,) int32, map that each was tracked in
+    maps: np.ndarray  # (P,) int32, map in which each was tracked
     features: Sequence[Features]  # (P), keypoints and their descriptors
     solved: Solution  # poses, each in the world of its map, and points of the keypoints
-    context: MatchContext  # of the keypoints
+    context: MatchContext  # for matching the keypoints
 
     def taken(self, rows: np.ndarray, world_T_rigs: np.ndarray) -> "Places":
-        """Some places (P',), ascending, with other poses (P', 4, 4) and points that fit these."""
+        """Some places (P',), ascending, with other poses (P', 4, 4), triangulated again."""
         features = [self.features[row] for row in rows]
         seed, workers = self.context.settings.seed, self.context.workers
         return make_places(
@@ -56,11 +56,11 @@ def compressed(grey: np.ndarray) -> np.ndarray:
 def chosen_keyframes(
     world_T_rigs: np.ndarray, maps: np.ndarray, distances: np.ndarray
 ) -> np.ndarray:
-    """Numbers (P,) of keyframes that are a step apart from the one chosen before.
+    """Numbers (P,) of keyframes at least a step from the one selected before.
 
     Args:
-        world_T_rigs: (K, 4, 4) of all keyframes.
-        maps: (K,) map of each, -1 = none that has points.
+        world_T_rigs: (K, 4, 4) poses of all keyframes.
+        maps: (K,) map of each, -1 = a map without points.
         distances: (K,) median distance of their points, map units.
     """
     chosen: list[int] = []
@@ -79,9 +79,9 @@ def described(
     """Keypoints of keyframes.
 
     Args:
-        pictures: panoramas as `compressed` made them.
+        pictures: panoramas, see `compressed`.
         width: pixels across them.
-        usable: (h, 2h) bool, what shows the scene; None = all.
+        usable: (h, 2h) bool, pixels of the scene; None = all.
     """
     size = round(width / np.pi * np.tan(_HFOV / 2))
     rig = CubeRig(size, _HFOV)
@@ -109,12 +109,12 @@ def make_places(
     seed: int,
     workers: Workers,
 ) -> Places:
-    """Match each place with those next to it, along the poses, and triangulate what they share.
+    """Match each place with its neighbours, along the poses, and triangulate common points.
 
     Args:
-        keyframes, maps: (P,) of the places.
+        keyframes, maps: (P,) keyframe number and map of each place.
         world_T_rigs: (P, 4, 4) poses, each in the world of its map.
-        features: (P) of `described`.
+        features: (P) see `described`.
         seed: of later sampling.
         workers: who match.
     """

@@ -1,8 +1,8 @@
-"""The pose graph of keyframes over Sim(3): odometry steps that hand scale on, and loops.
+"""The pose graph of keyframes over Sim(3): odometry steps that propagate scale, and loops.
 
 Poses of a monocular camera drift in scale besides rotation and position (Strasdat, Montiel and
-Davison, RSS 2010). Each keyframe is a similarity: the pose of its rig, and how long a unit of its
-neighbourhood is in the world.
+Davison, RSS 2010). Each keyframe is a similarity: the pose of its rig, and the length of its local
+unit in the world.
 """
 
 from collections.abc import Sequence
@@ -15,13 +15,13 @@ from gsba.bundle.prior_factors import X
 from gsba.geometry import adjoint, inverse, pose
 from gsba.similarity import Sim3
 
-_HELD = 1e-5  # standard deviation of the first keyframe of a map, all parts of its tangent
+_HELD = 1e-5  # standard deviation of the fixed first keyframe of a map, all parts of its tangent
 _HELD_LOG_DISTANCE = 1e-5  # of the distance to the furthest keyframe, in the gauge of covariances
 _FREE_LOG_SCALE = 1.0  # of the first keyframe's scale in that gauge
-_POSE_ROTATION = 0.007  # standard deviations of what is each frame's own: radians, and parts of
-_POSE_TRANSLATION = 0.005  # the median distance
-_ERROR_RATE = 1e-9  # of leaving out a true loop: covariances are of random errors, and drift is
-# partly steady
+_POSE_ROTATION = 0.007  # standard deviations of each frame's own errors: radians, and units of the
+_POSE_TRANSLATION = 0.005  # median distance
+_ERROR_RATE = 1e-9  # probability of rejecting a true loop, low because drift is partly systematic
+# while covariances are of random errors
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Constraint:
 
     first: int  # row of a keyframe
     second: int  # row of the other
-    first_T_second: Sim3  # carries the second rig, with its unit, into the first
+    first_T_second: Sim3  # maps the second rig, with its unit, into the first
     covariance: np.ndarray  # (7, 7) float64, tangent [rotation, translation, log scale], on the
     # right, units of the second keyframe
 
@@ -40,22 +40,22 @@ class ClosedGraph:
     """Keyframes after loops were closed."""
 
     world_T_keys: np.ndarray  # (K, 4, 4) float64
-    scales: np.ndarray  # (K,) float64, how long a unit of each keyframe's odometry is now
-    kept: np.ndarray  # (L,) bool, loops that the path can meet
+    scales: np.ndarray  # (K,) float64, present length of a unit of each keyframe's odometry
+    kept: np.ndarray  # (L,) bool, loops that the path can close
 
 
 def close_loops(
     world_T_keys: np.ndarray, steps: Sequence[Constraint], loops: Sequence[Constraint]
 ) -> ClosedGraph:
-    """Bend the path so that its loops close, without those that its steps cannot pay for.
+    """Deform the path so that its loops close, without loops that contradict its steps.
 
-    Loops join one after another, those of the shortest time first: drift is least there. One that
-    costs more than a true one can, as steps have to bend further than they can be off, stays out.
+    Loops are added one after another, those of the shortest time first: drift is least there. A
+    loop is rejected if closing it costs more than the noise of the steps explains.
 
     Args:
-        world_T_keys: (K, 4, 4) of one map; the first is held.
-        steps: that lead to all keyframes but the first, and are certain.
-        loops: to be closed.
+        world_T_keys: (K, 4, 4) poses of one map; the first is fixed.
+        steps: steps to all keyframes but the first.
+        loops: candidate loops.
     """
     from scipy.stats import chi2
 
@@ -98,12 +98,12 @@ def covariances_of(
 ) -> np.ndarray:
     """Marginal covariances (K, 6, 6) of poses, tangent [rotation, translation], map units.
 
-    The gauge is that of refined maps: the first pose is held, and its distance to the furthest one.
+    The gauge is that of refined maps: the first pose and its distance to the furthest are fixed.
 
     Args:
         world_T_keys: (K, 4, 4) poses of one map.
-        scales: (K,) of the keyframes, see `ClosedGraph`.
-        constraints: steps and loops, that tie all keyframes together.
+        scales: (K,) scales of the keyframes, see `ClosedGraph`.
+        constraints: steps and loops that connect all keyframes.
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k, (world_T_key, scale) in enumerate(zip(world_T_keys, scales, strict=True)):
@@ -129,13 +129,13 @@ def covariances_of(
 def carried_covariances(
     covariances: np.ndarray, key_T_rigs: np.ndarray, distances: np.ndarray
 ) -> np.ndarray:
-    """Covariances (F, 6, 6) of frames that hang on keyframes.
+    """Covariances (F, 6, 6) of frames, from those of their keyframes.
 
-    To the keyframe's errors comes what is each pose's own: lenses have two centres, and rows are
+    The keyframe's errors are increased by each pose's own: lenses have two centres, and rows are
     read one after another.
 
     Args:
-        covariances: (F, 6, 6) of each frame's keyframe, see `covariances_of`.
+        covariances: (F, 6, 6) those of each frame's keyframe, see `covariances_of`.
         key_T_rigs: (F, 4, 4) poses of frames in their keyframes, map units.
         distances: (F,) median distance of points, map units.
     """
@@ -148,7 +148,7 @@ def carried_covariances(
 
 
 def _fixed_distance(far: int, world_T_ends: np.ndarray, scale: float) -> gtsam.CustomFactor:
-    """Holds the distance (logarithm) of a keyframe from the first one, which is held itself."""
+    """Fixes the logarithm of a keyframe's distance from the first one, which is fixed itself."""
     offset = world_T_ends[1, :3, 3] - world_T_ends[0, :3, 3]
     direction = offset / np.linalg.norm(offset)
     # A tangent moves the position by scale * rotation @ translation.

@@ -1,4 +1,4 @@
-"""A lost frame placed relative to a keyframe by descriptors, with the scale of the map's points."""
+"""Relocalisation of a lost frame by a keyframe's descriptors, at the scale of the map's points."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ from gsba.matching.verification import relative_pose
 from gsba.odometry.atlas import Atlas, AtlasLayout
 
 _MAX_KEYPOINTS = 1500
-_CONTRAST = 0.02  # least of a keypoint, as OpenCV's SIFT takes it
-_RATIO = 0.85  # of the distances of the best and the second best match, at most
+_CONTRAST = 0.02  # least contrast of a keypoint, in units of OpenCV's SIFT
+_RATIO = 0.85  # largest ratio of the distances of the best and the second best match
 _MIN_MATCHES = 20
 _VERIFY = VerifySettings(max_error_deg=0.4)
-_NEAR = np.deg2rad(4.0)  # between a match and the point whose distance it is given
-_MIN_SCALES = 8  # matches near a point
-_MIN_PARALLAX = np.deg2rad(1.0)  # of a match whose distance is compared
+_NEAR = np.deg2rad(4.0)  # largest angle between a match and the point whose distance it takes
+_MIN_SCALES = 8  # least number of matches near a point
+_MIN_PARALLAX = np.deg2rad(1.0)  # least parallax of a match whose distance is compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,10 +29,10 @@ class Described:
 
 
 def describe(layout: AtlasLayout, atlas: Atlas, usable: np.ndarray | None) -> Described:
-    """SIFT of an atlas, each keypoint in the face that owns it.
+    """SIFT keypoints of an atlas, each in the face that owns it.
 
     Args:
-        usable: (2 s, 3 s) bool, what of the atlas shows the scene; None = all.
+        usable: (2 s, 3 s) bool, pixels of the scene; None = all.
     """
     allowed = layout.owned if usable is None else layout.owned & usable
     sift = cv2.SIFT.create(_MAX_KEYPOINTS, 3, _CONTRAST)
@@ -53,12 +53,12 @@ def placed(
     distances: np.ndarray,
     seed: int,
 ) -> np.ndarray | None:
-    """key_T_rig (4, 4) of a frame, in the unit of the map; None where nothing is certain.
+    """key_T_rig (4, 4) of a frame, in the unit of the map; None if it is uncertain.
 
     Args:
-        key, frame: keypoints of both.
-        bearings: (P, 3) unit, the keyframe's rig frame, to its points.
-        distances: (P,) of these points, map units.
+        key, frame: keypoints of the keyframe and the frame.
+        bearings: (P, 3) unit, the keyframe's rig frame, of its points.
+        distances: (P,) distances of these points, map units.
         seed: of the sampling.
     """
     if min(len(key.bearings_rig), len(frame.bearings_rig)) < _MIN_MATCHES:
@@ -79,7 +79,7 @@ def placed(
 
 
 def _matched(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Rows (m, 2) of descriptors that are each other's nearest, by far."""
+    """Rows (m, 2) of descriptors that are mutual nearest neighbours and pass the ratio test."""
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     forth = matcher.knnMatch(one, other, k=2)
     back = {m[0].queryIdx: m[0].trainIdx for m in matcher.knnMatch(other, one, k=1) if m}
@@ -100,11 +100,11 @@ def _length(
     bearings: np.ndarray,
     distances: np.ndarray,
 ) -> float | None:
-    """Length of the step at which matches are as far away as the points beside them; or None.
+    """Length of the step at which matches have the distances of nearby points; or None.
 
     Args:
         one, other: (m, 3) rays of the matches in the keyframe's axes.
-        direction: (3,) unit, of the step.
+        direction: (3,) unit, direction of the step.
         bearings, distances: of the points.
     """
     from scipy.spatial import KDTree

@@ -1,4 +1,4 @@
-"""The pose of one frame from bearings of known points (resection), robust to false ones."""
+"""The pose of one frame from bearings of known points (resection), robust to outliers."""
 
 from dataclasses import dataclass
 
@@ -10,27 +10,30 @@ from gsba.camera.rig import witnesses
 from gsba.significance import least_agreeing
 
 _kernel, _part = kernel_and_part()
-_STEPS = 12  # Gauss-Newton
+_STEPS = 12  # Gauss-Newton steps
 _CONVERGED = 1e-6  # radians, and parts of the median distance
-_ANNEALED = (8.0, 4.0, 2.0, 1.0)  # scale of the loss in the first steps, times the last
+_ANNEALED = (8.0, 4.0, 2.0, 1.0)  # factors on the scale of the loss in the first steps
 _GATE = 3.5  # standard deviations of an inlier
 _SAMPLE = 3  # bearings that determine a pose
-_CELLS = 16  # along a cube face's side: all features within one cell, 6 degrees, are one witness
-_MIN_WITNESSES = 20  # that agree: fewer may be of one thing that moves on its own
-_MAX_FALSE_ALARMS = 1e-6  # poses that chance explains as well as the one believed
-_CHANCE_SPAN = np.deg2rad(6.0)  # false matches lie anywhere within this of where they were expected
+_CELLS = 16  # cells along a cube face's side: all features within one, 6 degrees, count as one
+# witness
+_MIN_WITNESSES = 20  # least number of witnesses: fewer may be of one moving object
+_MAX_FALSE_ALARMS = 1e-6  # expected number of poses that chance explains as well as the accepted
+# one
+_CHANCE_SPAN = np.deg2rad(6.0)  # false matches lie anywhere within this angle of their prediction
 _MAX_POSITION_SIGMA = 0.05  # of the position, in median distances of the points
 
 
 @dataclass(frozen=True, slots=True)
 class Resection:
-    """A pose, and what speaks for it."""
+    """A pose, and the evidence for it."""
 
     world_T_rig: np.ndarray  # (4, 4) float64, map units
     inliers: np.ndarray  # (N,) bool
     noise: float  # radians, standard deviation of the inliers per axis
     covariance: np.ndarray  # (6, 6) float64, tangent [rotation rad, translation], map units
-    significant: bool  # chance does not explain the inliers, and they fix the position
+    significant: bool  # True if chance does not explain the inliers, and they determine the
+    # position
 
 
 def resect(
@@ -41,7 +44,7 @@ def resect(
     Args:
         points_world: (N, 3) map units.
         bearings_rig: (N, 3) unit, rig frame.
-        start: (4, 4) world_T_rig to begin at.
+        start: (4, 4) initial world_T_rig.
         sigma: radians, standard deviation of bearings per axis.
     """
     pose, information, residuals, distances = _fitted(points_world, bearings_rig, start, sigma)
@@ -113,7 +116,7 @@ def retracted(world_T_rig: np.ndarray, tangent: np.ndarray) -> np.ndarray:
 
 
 def _significant(bearings: np.ndarray, inliers: np.ndarray, sigma: float) -> bool:
-    """Whether chance does not explain the inliers among features that are independent."""
+    """True if chance does not explain the inliers, counted in independent witnesses."""
     num = witnesses(bearings, _CELLS) if len(bearings) else 0
     agreeing = witnesses(bearings[inliers], _CELLS) if inliers.any() else 0
     chance = min((_GATE * sigma / _CHANCE_SPAN) ** 2, 0.5)
@@ -128,7 +131,7 @@ def _linearise_one(points, bases, bearings, world_T_rig, i, residual, jacobian):
     dx = points[i, 0] - world_T_rig[0, 3]
     dy = points[i, 1] - world_T_rig[1, 3]
     dz = points[i, 2] - world_T_rig[2, 3]
-    # The offset of the point in the rig frame.
+    # Offset of the point in the rig frame
     x = world_T_rig[0, 0] * dx + world_T_rig[1, 0] * dy + world_T_rig[2, 0] * dz
     y = world_T_rig[0, 1] * dx + world_T_rig[1, 1] * dy + world_T_rig[2, 1] * dz
     z = world_T_rig[0, 2] * dx + world_T_rig[1, 2] * dy + world_T_rig[2, 2] * dz

@@ -1,4 +1,4 @@
-"""Steps from keyframe to keyframe: which keyframe each was followed from, and how well."""
+"""Steps from keyframe to keyframe: the parent of each keyframe, and covariances."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,22 +11,23 @@ from gsba.config import TriangulateSettings
 from gsba.odometry.resection import linearised
 from gsba.odometry.window import WindowObservations
 
-_REACH = 12  # keyframes before one among which it was followed from one
-_MIN_SHARED = 8  # features with points that tell a step
-_CORRELATED = 13.0  # times the variance of independent features: those of a surface err alike
-_MODEL = 0.0003, 0.001, 0.002  # standard deviations beside what features tell: lenses have two
-# centres, rows are read one after another; rotation, translation in median distances, log scale
+_REACH = 12  # keyframes before one among which its parent is searched
+_MIN_SHARED = 8  # least number of common features with points that measure a step
+_CORRELATED = 13.0  # factor on the variance of independent features: those of a surface have
+# correlated errors
+_MODEL = 0.0003, 0.001, 0.002  # standard deviations of model errors (two lens centres, rolling
+# shutter): rotation, translation in median distances, log scale
 _SIGMA = np.deg2rad(0.15)  # radians per axis, of bearings
-_GATE = 4.0  # standard deviations of a feature off its point
-_UNKNOWN = np.deg2rad(2.0), 0.1, 0.05  # standard deviations of a step that no points tell:
+_GATE = 4.0  # largest residual of a feature, standard deviations
+_UNKNOWN = np.deg2rad(2.0), 0.1, 0.05  # standard deviations of a step without common points:
 # rotation, translation in median distances, log scale
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredSteps:
-    """The step that leads to each keyframe."""
+    """The step to each keyframe from its parent."""
 
-    parents: np.ndarray  # (K,) int64, keyframe it was followed from; -1 = the first of its map
+    parents: np.ndarray  # (K,) int64, keyframe it was tracked from; -1 = the first of its map
     covariances: np.ndarray  # (K, 7, 7) float64, tangent [rotation, translation, log scale] on the
     # right, units of the keyframe
 
@@ -37,14 +38,14 @@ def measure_steps(
     maps: np.ndarray,
     distances: np.ndarray,
 ) -> MeasuredSteps:
-    """Covariances of steps between keyframes, by the features that both see; scale included.
+    """Covariances of steps between keyframes, from common features; scale included.
 
-    Rotation and translation: information of the directions to points that the keyframe before sees
-    too. Scale: a point hands it on as well as the angle tells under which the first keyframe that
-    saw it and this one see each other.
+    Rotation and translation: information of the directions to points that the parent observes too.
+    Scale: a point propagates it as accurately as the triangulation angle between its first keyframe
+    and this one permits.
 
     Args:
-        features: ids (N,) and bearings (N, 3), rig frame, of each keyframe; no id is of two maps.
+        features: ids (N,) and bearings (N, 3), rig frame, of each keyframe; maps share no id.
         world_T_keys: (K, 4, 4) poses, each in the world of its map.
         maps: (K,) map of each keyframe.
         distances: (K,) median distances of points, map units.
@@ -70,7 +71,7 @@ def measure_steps(
 def _points(
     features: Sequence[tuple[np.ndarray, np.ndarray]], world_T_keys: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """By id, the point (3,) of each feature, NaN = unknown, and the first keyframe that sees it."""
+    """By id, the point (3,) of each feature, NaN = unknown, and its first keyframe."""
     seen = WindowObservations.of(features)
     sigmas = np.full(len(seen.ids), _SIGMA)
     bearings, settings = seen.bearings_rig.astype(float), TriangulateSettings()
@@ -91,8 +92,8 @@ def _covariance(
     origins: np.ndarray,
     distance: float,
 ) -> np.ndarray:
-    """Covariance (7, 7) of the step to a keyframe that sees points (N, 3) along bearings (N, 3);
-    `origins` (N, 3): where each was seen first."""
+    """Covariance (7, 7) of the step to a keyframe that observes points (N, 3) with bearings (N, 3);
+    `origins` (N, 3): positions from which they were observed first."""
     unknown, model = (
         np.diag(np.square([rotation] * 3 + [translation * distance] * 3 + [log_scale]))
         for rotation, translation, log_scale in (_UNKNOWN, _MODEL)

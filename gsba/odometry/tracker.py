@@ -1,9 +1,9 @@
-"""Visual odometry on the sphere: one small grey panorama after another, one pose for each.
+"""Visual odometry on the sphere: a pose for each of a sequence of small grey panoramas.
 
-Features of the last keyframe are followed into each frame; the frame's pose comes from those whose
-points are known (resection). A frame that shows enough parallax, or too few features, becomes a
-keyframe: new features are added, all of the window are triangulated anew and adjusted together.
-Frames hang on their keyframes, and move with them.
+Features of the last keyframe are tracked into each frame; the frame's pose comes from those with
+known points (resection). A frame with enough parallax, or too few features, becomes a keyframe: new
+features are added, all of the window are triangulated again and adjusted together. Frames are
+stored relative to their keyframes, and move with them.
 """
 
 import logging
@@ -26,32 +26,32 @@ from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_wind
 
 logger = logging.getLogger(__name__)
 
-FREE, HELD = 8, 5  # keyframes of the window that are adjusted, and before them that are held
+FREE, HELD = 8, 5  # keyframes of the window that are adjusted, and fixed ones before them
 _REMEMBERED = 10  # keyframes that a lost frame is compared with
-_DESCRIBED = 4  # of these, the last ones, that it is compared with by descriptors
-_MIN_CONTRAST = 1.5  # grey values: less is darkness, or a hand over the lenses
-_KEYFRAME_PARALLAX = np.deg2rad(3.0)  # median of the features, since the last keyframe
-_KEYFRAME_SHARE = 0.7  # of the last keyframe's features that could be followed, still found
-_FADING_SHARE = 0.7  # of the first keyframe's features, below which less parallax has to do
-_START_SHARE = 0.45  # of the first keyframe's features, below which a start is begun anew
-_MIN_SIGMA, _MAX_SIGMA = np.deg2rad([0.05, 0.35])  # of bearings, per axis
-_ADAPTING = 0.1  # weight of one frame in the noise of bearings
-_GATE = 4.0  # standard deviations of a feature that fits
-_FEW_INLIERS = 60  # below which less parallax makes a keyframe
+_DESCRIBED = 4  # last keyframes with which it is compared by descriptors
+_MIN_CONTRAST = 1.5  # grey values: a lower contrast is darkness, or a hand over the lenses
+_KEYFRAME_PARALLAX = np.deg2rad(3.0)  # median parallax of the features since the last keyframe
+_KEYFRAME_SHARE = 0.7  # share of the last keyframe's trackable features that are still found
+_FADING_SHARE = 0.7  # share of the first keyframe's features below which less parallax suffices
+_START_SHARE = 0.45  # share of the first keyframe's features below which initialisation restarts
+_MIN_SIGMA, _MAX_SIGMA = np.deg2rad([0.05, 0.35])  # noise of bearings, per axis
+_ADAPTING = 0.1  # weight of one frame in the estimated noise of bearings
+_GATE = 4.0  # largest residual of a feature that fits, standard deviations
+_FEW_INLIERS = 60  # inliers below which less parallax makes a keyframe
 _SOME_PARALLAX = np.deg2rad(1.0)
-_MIN_FOUND_AGAIN = 0.4  # of a keyframe's points, in a lost frame: another door shows some of them
-_NUDGE = 0.03  # median distances of the points along each axis, and a turn, that a pose found
-_NUDGE_R = Rotation.from_rotvec(np.deg2rad([1.2, 1.2, 1.2])).as_matrix()  # again is tried from
-_MIN_LEADING = 8  # features whose pose may lead to others
-_MAX_MISPREDICTED = np.deg2rad(1.5)  # of features, beyond which those not found are tried again
-_MIN_FEATURES = 40  # of a picture that shows anything
-_MAX_MISSES = 4  # frames in a row in which a feature without a point was not found
-_MAX_PENDING = 300  # frames before the start of a map that are posed again once it has points
+_MIN_FOUND_AGAIN = 0.4  # share of a keyframe's points in a lost frame: other doors show some
+_NUDGE = 0.03  # perturbation from which a relocalised pose must be found again: median distances
+_NUDGE_R = Rotation.from_rotvec(np.deg2rad([1.2, 1.2, 1.2])).as_matrix()  # its rotation
+_MIN_LEADING = 8  # least number of features whose pose predicts others
+_MAX_MISPREDICTED = np.deg2rad(1.5)  # error of predictions beyond which features are retried
+_MIN_FEATURES = 40  # least number of features of a picture that shows a scene
+_MAX_MISSES = 4  # consecutive frames in which a feature without a point may be missed
+_MAX_PENDING = 300  # frames before the start of a map that are posed once it has points
 
 
 @dataclass(frozen=True, slots=True)
 class _Attempt:
-    """Where the features are in a frame, and the pose they give."""
+    """Bearings of the features in a frame, and the pose they give."""
 
     atlas: Atlas
     bearings: np.ndarray  # (N, 3)
@@ -61,13 +61,21 @@ class _Attempt:
 
 @dataclass(slots=True)
 class Tracker:
-    """Follows a camera from frame to frame; `state` is all that it knows."""
+    """State of the odometry between frames.
+
+    Attributes:
+        records: of all frames so far.
+        keyframe_poses: (4, 4) each, of all keyframes so far, in the world of their map.
+        keyframe_frames: index of each keyframe's frame.
+        keyframe_features: of each keyframe, its features: ids (N,) int64, and bearings
+            (N, 3) float32, rig frame.
+    """
 
     width: int  # pixels across the panoramas
-    usable: np.ndarray | None = None  # (h, 2h) bool, what shows the scene in every frame
+    usable: np.ndarray | None = None  # (h, 2h) bool, pixels that show the scene in every frame
     seed: int = 0  # of the sampling at the start of a map
-    patience: int = 8  # frames that show something and fit no keyframe before a new map is begun
-    state: TrackerState = field(default_factory=TrackerState)  # one stored before goes on
+    patience: int = 8  # frames with contrast that fit no keyframe before a new map is begun
+    state: TrackerState = field(default_factory=TrackerState)  # a stored one is continued
 
     _layout: AtlasLayout = field(init=False)
     _cutter: Cutter = field(init=False)
@@ -100,7 +108,7 @@ class Tracker:
     # A frame before the map has points.
 
     def _begin_map(self, grey: np.ndarray, small: Miniature, frame: int) -> None:
-        """Make a frame the first keyframe of a map, if it shows anything."""
+        """Make a frame the first keyframe of a map, if it has enough features."""
         atlas = self._cutter.cut(grey, self.state.world_T_rig[:3, :3])
         corners = self._corners(atlas, np.zeros((0, 3)))
         if len(corners) < _MIN_FEATURES or small.contrast < _MIN_CONTRAST:
@@ -112,7 +120,7 @@ class Tracker:
         self.state.small = small
 
     def _add_before_start(self, grey: np.ndarray, small: Miniature, frame: int) -> None:
-        """Follow the first keyframe's features until they show that the camera moved."""
+        """Track the first keyframe's features until they have enough parallax."""
         key, features = self.state.window[-1], self.state.features
         assert key.atlas is not None and features is not None
         predicted_R = self.state.world_T_rig[:3, :3] @ self.state.motion[:3, :3]
@@ -139,7 +147,7 @@ class Tracker:
         features.assumed_world[found] = position + bearings[found] @ world_R_rig.T
         self._step(pose(world_R_rig, position), small)
         if len(ids) < _START_SHARE * key.most_found:
-            # Turned away from what it saw, without a step: the rotation goes on from here.
+            # The camera rotated away from its features, without a step: rotations start from here.
             self.state.pending.clear()
             corners = self._corners(atlas, np.zeros((0, 3)))
             self.state.window = []
@@ -153,7 +161,7 @@ class Tracker:
     def _followed(
         self, grey: np.ndarray, key: Keyframe, features: Features, world_R_rig: np.ndarray
     ) -> tuple[Atlas, np.ndarray, np.ndarray]:
-        """A frame's atlas, bearings (N, 3) of features in it, and which were found, by rotation."""
+        """Atlas, bearings (N, 3) of features and found (N,), tracked at a predicted rotation."""
         assert key.atlas is not None
         atlas = self._cutter.cut(grey, world_R_rig)
         expected = unit((features.assumed_world - self.state.world_T_rig[:3, 3]) @ world_R_rig)
@@ -168,7 +176,7 @@ class Tracker:
         ids: np.ndarray,
         bearings: np.ndarray,
     ) -> None:
-        """Give the map its first points, in the world that the first keyframe has."""
+        """Give the map its first points, in the world of the first keyframe."""
         key = self.state.window[-1]
         world_T_key = key.world_T_rig
         points = solved.points_world @ world_T_key[:3, :3].T + world_T_key[:3, 3]
@@ -184,7 +192,7 @@ class Tracker:
         self._become_keyframe(frame, atlas, small, ids[~false], bearings[~false])
 
     def _pose_again(self, frame: int, ids: np.ndarray, bearings: np.ndarray, key: Keyframe) -> None:
-        """Pose a frame before the start of the map from the points it has now."""
+        """Pose a frame before the start of the map from the points known by now."""
         points = self.state.points[ids]
         known = np.isfinite(points[:, 0])
         record = self.state.records[frame]
@@ -199,7 +207,7 @@ class Tracker:
     # A frame of a map that has points.
 
     def _add_to_map(self, grey: np.ndarray, small: Miniature, frame: int) -> None:
-        """Pose a frame by known points; look for it among keyframes where that fails."""
+        """Pose a frame by known points; if that fails, relocalise it by keyframes."""
         features, key = self.state.features, self.state.window[-1]
         assert features is not None
         tried = self._attempt(grey, key, features, self.state.world_T_rig @ self.state.motion)
@@ -217,7 +225,7 @@ class Tracker:
         found_again = self.state.records[-1].status == FrameStatus.LOST
         self.state.failures = 0
         self._accept(frame, tried, small)
-        if found_again:  # the step from where the camera was lost is no velocity
+        if found_again:  # the step from the last pose before the loss is no velocity
             self.state.motion = np.eye(4)
 
     def _attempt(
@@ -225,8 +233,8 @@ class Tracker:
     ) -> _Attempt:
         """Follow a keyframe's features into a frame whose pose (4, 4) is predicted, and pose it.
 
-        Features with points go first. Where the pose that they give is far from the predicted one,
-        those that do not fit it are looked for once more; all others are, by that pose.
+        Features with points go first. If their pose is far from the predicted one, those that do
+        not fit it are tracked once more; all others are predicted by that pose.
         """
         template = key.atlas
         assert template is not None
@@ -259,7 +267,7 @@ class Tracker:
         return _Attempt(atlas, bearings, found, fit)
 
     def _accept(self, frame: int, tried: _Attempt, small: Miniature) -> None:
-        """Take the pose of a frame; make it a keyframe if it is time."""
+        """Accept the pose of a frame; make it a keyframe if needed."""
         features, key, fit = self.state.features, self.state.window[-1], tried.fit
         assert features is not None
         self._step(fit.world_T_rig, small)
@@ -285,7 +293,7 @@ class Tracker:
         self._record(FrameStatus.TRACKED, key_T_rig, distance, number)
 
     def _fitting(self, features: Features, tried: _Attempt, key: Keyframe) -> np.ndarray:
-        """Features (N,) bool that were found where the pose allows them."""
+        """Features (N,) bool found where the pose permits them."""
         points = self.state.points[features.ids]
         known = np.isfinite(points[:, 0])
         fits = tried.found.copy()
@@ -297,7 +305,7 @@ class Tracker:
         normals = np.cross(key_T_rig[:3, 3], features.bearings[rows])
         lengths = np.linalg.norm(normals, axis=1)
         across = np.abs(np.sum(normals * rays, axis=1)) / np.maximum(lengths, 1e-12)
-        # Near the epipole, and without a step, what is left is compared with the bearing itself.
+        # Near the epipole, and without a step, rays are compared with the bearing itself.
         off = angles_between(features.bearings[rows], rays)
         fits[rows] = np.minimum(across, off) < _GATE * self.state.sigma
         return fits
@@ -305,7 +313,7 @@ class Tracker:
     def _parallax(
         self, features: Features, tried: _Attempt, fits: np.ndarray, key: Keyframe
     ) -> float:
-        """Median angle between where features lie from the keyframe and from the frame."""
+        """Median angle between features' rays in the keyframe and in the frame."""
         if not fits.any():
             return 0.0
         key_R_rig = key.world_T_rig[:3, :3].T @ self.state.world_T_rig[:3, :3]
@@ -317,7 +325,7 @@ class Tracker:
     def _become_keyframe(
         self, frame: int, atlas: Atlas, small: Miniature, ids: np.ndarray, bearings: np.ndarray
     ) -> None:
-        """Make the frame posed last a keyframe: add features, adjust the window."""
+        """Make the last posed frame a keyframe: add features, adjust the window."""
         corners = self._corners(atlas, bearings)
         self._add_keyframe(frame, self.state.world_T_rig, atlas, small, (ids, bearings), corners)
         self._adjust()
@@ -334,7 +342,7 @@ class Tracker:
         followed: tuple[np.ndarray, np.ndarray] | None,
         corners: np.ndarray,
     ) -> None:
-        """Add a keyframe with features that were followed to it (ids, bearings), and new ones."""
+        """Add a keyframe with tracked features (ids, bearings), and new corners."""
         state = self.state
         ids = state.num_ids + np.arange(len(corners))
         state.num_ids += len(corners)
@@ -378,10 +386,10 @@ class Tracker:
         self.state.world_T_rig = last.world_T_rig.copy()
         self.state.features = self._followable(last)
 
-    # Frames that nothing is known of.
+    # Lost frames.
 
     def _relocalised(self, grey: np.ndarray, small: Miniature) -> _Attempt | None:
-        """A lost frame posed by one of the last keyframes, which takes the lead then; or None."""
+        """A lost frame posed by one of the last keyframes, which becomes the reference; or None."""
         if small.contrast < _MIN_CONTRAST:
             return None
         for key in reversed(self.state.window):
@@ -412,10 +420,10 @@ class Tracker:
     def _confirmed(
         self, grey: np.ndarray, key: Keyframe, features: Features, tried: _Attempt
     ) -> bool:
-        """Whether features lead back to a pose from another near it.
+        """True if tracking from a perturbed pose leads back to the pose.
 
-        What optical flow finds of features that are not there lies where they were expected, and
-        agrees with any pose that they were expected from.
+        Optical flow of features that are not visible stays near their predictions, and so agrees
+        with any pose that predicted them.
         """
         nudge = pose(_NUDGE_R, np.full(3, _NUDGE * self._distance(key.ids, tried.fit.world_T_rig)))
         other = self._attempt(grey, key, features, tried.fit.world_T_rig @ nudge)
@@ -429,7 +437,7 @@ class Tracker:
     def _by_keyframe(
         self, grey: np.ndarray, key: Keyframe, predicted: np.ndarray
     ) -> _Attempt | None:
-        """A frame followed from a keyframe, which leads then; None where no pose comes of it."""
+        """A frame tracked from a keyframe, which becomes the reference; None without a pose."""
         features = self._followable(key)
         tried = self._attempt(grey, key, features, predicted)
         if tried.fit.significant:
@@ -468,10 +476,10 @@ class Tracker:
         state.pending.clear()
         self._begin_map(grey, small, frame)
 
-    # Small things.
+    # Helpers.
 
     def _turned(self, small: Miniature, guess: np.ndarray) -> np.ndarray:
-        """Orientation (3, 3) by the panorama as a whole, from that of the frame posed last."""
+        """Orientation (3, 3) by the whole panorama, relative to the last posed frame."""
         assert self.state.small is not None
         before = self.state.world_T_rig[:3, :3]
         return before @ turned(self.state.small, small, [before.T @ guess, np.eye(3)])
@@ -488,7 +496,7 @@ class Tracker:
         return self._mask.image > 250
 
     def _followable(self, key: Keyframe) -> Features:
-        """Features of a keyframe, assumed as far away as the nearest that has a point."""
+        """Features of a keyframe, at the distance of the nearest one with a point."""
         points = self.state.points[key.ids]
         known = np.isfinite(points[:, 0])
         distances = np.ones(len(points))
@@ -501,7 +509,7 @@ class Tracker:
         return Features(key.ids, key.bearings, assumed, np.zeros(len(rays), int))
 
     def _assume(self, features: Features, found: np.ndarray, bearings: np.ndarray) -> None:
-        """Move where features found (N,) bool are assumed onto their bearings in the last frame."""
+        """Move assumed positions of features found (N,) bool onto their last bearings."""
         position = self.state.world_T_rig[:3, 3]
         distances = np.linalg.norm(features.assumed_world[found] - position, axis=1)
         rays = distances[:, None] * (bearings @ self.state.world_T_rig[:3, :3].T)
@@ -516,8 +524,8 @@ class Tracker:
         return float(np.median(np.linalg.norm(points - world_T_rig[:3, 3], axis=1)))
 
     def _step(self, world_T_rig: np.ndarray, small: Miniature) -> None:
-        """Go on to the pose of the next frame."""
-        # A product of products would double what rounding leaves of R^T R - I with every frame.
+        """Set pose and motion from the new frame's pose."""
+        # A product of products would double the rounding error R^T R - I with every frame.
         motion = inverse(self.state.world_T_rig) @ world_T_rig
         self.state.motion = pose(nearest_rotation(motion[:3, :3]), motion[:3, 3])
         self.state.world_T_rig = pose(nearest_rotation(world_T_rig[:3, :3]), world_T_rig[:3, 3])
@@ -530,7 +538,7 @@ class Tracker:
         distance: float = float("nan"),
         inliers: int = 0,
     ) -> None:
-        """Note the frame after the last one."""
+        """Append the record of the next frame."""
         state = self.state
         if not state.keyframe_poses:
             state.keyframe_poses.append(np.eye(4))

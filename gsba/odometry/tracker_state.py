@@ -1,4 +1,4 @@
-"""All that a tracker knows after a frame, so that it can be stored and taken up again."""
+"""State of the tracker between frames: it can be stored, and tracking continued from it."""
 
 from dataclasses import dataclass, field
 
@@ -14,31 +14,31 @@ SIGMA = float(np.deg2rad(0.25))  # of bearings, per axis, at first
 
 @dataclass(slots=True)
 class Keyframe:
-    """A keyframe of the map that is being made."""
+    """A keyframe of the current map."""
 
     number: int  # of the keyframe in the whole recording
     frame: int  # index of its frame
     world_T_rig: np.ndarray  # (4, 4)
     ids: np.ndarray  # (N,) int64, features seen
     bearings: np.ndarray  # (N, 3) unit, rig frame
-    atlas: Atlas | None  # None = forgotten
+    atlas: Atlas | None  # None = dropped
     small: Miniature | None
-    described: Described | None = None  # when a lost frame was first compared with it
-    most_found: int = 0  # of its features in one of the frames after it
+    described: Described | None = None  # computed when a lost frame is first compared with it
+    most_found: int = 0  # largest number of its features found in a later frame
 
 
 @dataclass(slots=True)
 class Features:
-    """Features of the last keyframe that are followed."""
+    """Tracked features of the last keyframe."""
 
     ids: np.ndarray  # (N,) int64
     bearings: np.ndarray  # (N, 3) unit, rig frame of the keyframe
-    assumed_world: np.ndarray  # (N, 3) map units: where features without a point are assumed, by
-    # their direction when last found and the distance of points beside them
-    misses: np.ndarray  # (N,) int, frames since
+    assumed_world: np.ndarray  # (N, 3) map units, assumed positions of features without a point: at
+    # their last bearing and the distance of neighbouring points
+    misses: np.ndarray  # (N,) int, frames since it was last found
 
     def taken(self, rows: np.ndarray) -> "Features":
-        """Some rows."""
+        """The features of some rows."""
         return Features(
             self.ids[rows], self.bearings[rows], self.assumed_world[rows], self.misses[rows]
         )
@@ -46,7 +46,7 @@ class Features:
 
 @dataclass(slots=True)
 class TrackerState:
-    """Every frame so far, and what the next one is posed by."""
+    """All frames so far, and the window of keyframes that poses the next one."""
 
     records: list[FrameRecord] = field(default_factory=list)  # of all frames so far
     keyframe_poses: list[np.ndarray] = field(default_factory=list)  # (4, 4) each, of all keyframes
@@ -55,7 +55,7 @@ class TrackerState:
     keyframe_features: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)  # that
     # each keyframe sees: ids (N,) int64, bearings (N, 3) float32 in the rig frame
     window: list[Keyframe] = field(default_factory=list)  # the last keyframes
-    features: Features | None = None  # that are followed; None = a map is to be begun
+    features: Features | None = None  # tracked ones; None = the next frame begins a map
     points: np.ndarray = field(default_factory=lambda: np.full((4096, 3), np.nan))  # (ids, 3) of
     # features, world of the map; NaN = unknown
     num_ids: int = 0  # of features so far

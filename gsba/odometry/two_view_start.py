@@ -1,4 +1,4 @@
-"""The first points of a map: two frames between which the camera certainly moved."""
+"""Initialisation of a map from two frames between which the camera certainly moved."""
 
 from dataclasses import dataclass
 
@@ -10,11 +10,11 @@ from gsba.geometry import angles_between, nearest_rotation
 from gsba.matching.verification import relative_pose
 from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window
 
-_REFITS = 6  # of a rotation, without the features that are furthest off
-_MOVED, _MOVED_LITTLE = np.deg2rad([4.0, 1.2])  # parallax of the upper quarter of the features,
-# from which on a start is tried; where features are being lost
-_MAX_DIRECTION_SIGMA = np.deg2rad(6.0)  # of the translation
-_MIN_POINTS = 40  # that are independent, cells of 6 degrees
+_REFITS = 6  # refits of a rotation without the features that are furthest off
+_MOVED, _MOVED_LITTLE = np.deg2rad([4.0, 1.2])  # parallax of the upper quarter of the features from
+# which initialisation is tried; the latter while features are being lost
+_MAX_DIRECTION_SIGMA = np.deg2rad(6.0)  # largest standard deviation of the translation's direction
+_MIN_POINTS = 40  # least number of independent points, in cells of 6 degrees
 _CELLS = 16
 _VERIFY = VerifySettings(max_error_deg=0.3)
 _GATE = 4.0  # standard deviations
@@ -22,14 +22,14 @@ _GATE = 4.0  # standard deviations
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """The rotation that explains most features of two frames."""
+    """The rotation that explains most features of two frames, and residuals."""
 
     one_R_other: np.ndarray  # (3, 3) float64
-    parallaxes: np.ndarray  # (N,) float64, radians, what it leaves over of each feature
+    parallaxes: np.ndarray  # (N,) float64, radians, residual of each feature under the rotation
 
 
 def median_turn(one: np.ndarray, other: np.ndarray) -> Turn:
-    """The rotation that carries most bearings (N, 3) of the other frame onto those of the first."""
+    """The rotation that maps most bearings (N, 3) of the other frame onto those of the first."""
     near, rotation = np.ones(len(one), bool), np.eye(3)
     off = np.zeros(len(one))
     for _ in range(_REFITS if len(one) >= 3 else 0):
@@ -48,17 +48,17 @@ def start_map(
     seed: int,
     fading: bool,
 ) -> AdjustedWindow | None:
-    """Poses of two frames and the points they see; None where the camera may have turned only.
+    """Poses of two frames and their points; None if the camera may have rotated only.
 
     The first pose is the identity; the median distance of points from it is 1.
 
     Args:
         ids: (N,) features.
-        one, other: (N, 3) their bearings in either frame.
-        turn: of the bearings.
-        sigma: radians, of bearings per axis.
+        one, other: (N, 3) their bearings in the two frames.
+        turn: rotation of the bearings.
+        sigma: radians, noise of bearings per axis.
         seed: of the sampling.
-        fading: whether features are being lost, so that little parallax has to do.
+        fading: True if features are being lost; then little parallax suffices.
     """
     moved = _MOVED_LITTLE if fading else _MOVED
     if len(ids) < _MIN_POINTS or np.quantile(turn.parallaxes, 0.75) < moved:

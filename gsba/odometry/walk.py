@@ -1,4 +1,4 @@
-"""Odometry of a whole sequence: its poses, what is known of each, and what went wrong."""
+"""Odometry of a whole sequence: poses, statuses, covariances, and the report."""
 
 import logging
 import os
@@ -20,7 +20,7 @@ from gsba.types import Trajectory
 
 logger = logging.getLogger(__name__)
 
-_MIN_FRAMES_OF_MAP = 5  # fewer say nothing
+_MIN_FRAMES_OF_MAP = 5  # maps with fewer frames are ignored
 
 
 def _no_pairs() -> np.ndarray:
@@ -38,7 +38,7 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class Odometry:
-    """Where the camera was during a sequence; each map has a world and a unit of its own."""
+    """Poses of the camera during a sequence; each map has a world and a unit of its own."""
 
     timestamps: np.ndarray  # (F,) float64, seconds
     world_T_rigs: np.ndarray  # (F, 4, 4) float64, world of each frame's map
@@ -48,23 +48,23 @@ class Odometry:
     distances: np.ndarray  # (F,) float64, median distance of points, map units; NaN = not known
     inliers: np.ndarray  # (F,) int32, features that fit the pose
     sharpness: np.ndarray  # (F,) float64, of the small picture; see gsba.video.likeness
-    cpu_s: float  # processor time of tracking, decoding apart
+    cpu_s: float  # processor time of tracking, without decoding
     covariances: np.ndarray | None = None  # (F, 6, 6) float64, of poses: tangent [rotation rad,
     # translation], map units; the first pose of each map and its distance to the furthest are held;
     # NaN and None = not known
-    loops: np.ndarray = field(default_factory=_no_pairs)  # (L, 2) int64, frames at which a map was
-    # found to meet itself
+    loops: np.ndarray = field(default_factory=_no_pairs)  # (L, 2) int64, frames of loops within a
+    # map
     joins: np.ndarray = field(default_factory=_no_pairs)  # (M, 2) int64, frames at which a map was
-    # joined to one begun before
+    # joined to an earlier one
     closing_cpu_s: float = 0.0  # processor time of joining maps and closing loops
 
     def __len__(self) -> int:
         return len(self.timestamps)
 
     def posed(self) -> np.ndarray:
-        """(F,) bool, frames whose pose images tell, in a map that has points.
+        """(F,) bool, frames with a pose from images, in a map with points.
 
-        Where no map has points the camera only turned: all frames of the first map count then.
+        If no map has points the camera only rotated: all frames of the largest map count then.
         """
         found = self.statuses != FrameStatus.LOST
         with_points = np.unique(self.maps[self.statuses == FrameStatus.TRACKED])
@@ -75,21 +75,21 @@ class Odometry:
         return found & np.isin(self.maps, large)
 
     def usable(self) -> bool:
-        """Whether most frames are posed, and the camera moved enough to tell where it went."""
+        """True if most frames are posed with points, so that the camera's path is known."""
         found = self.posed() & np.isfinite(self.distances)
         return bool(np.count_nonzero(found) > 0.5 * len(self))
 
     def pieces(self) -> list[Trajectory]:
         """Posed frames of each map in order of time; no two pieces are related.
 
-        A map that was joined to one before another that stands apart is a piece of its own here.
+        A map joined to an earlier one across a separate map is a piece of its own here.
         """
         return [Trajectory(self.timestamps[rows], self.world_T_rigs[rows]) for rows in self._runs()]
 
     def trajectory(self, keyframes: bool = False) -> Trajectory:
         """Posed frames of all pieces one after another, or keyframes alone.
 
-        Each begins at the identity, by which `gsba.trajectory.restarts` tells them apart.
+        Each piece begins at the identity, which `gsba.trajectory.restarts` recognises.
         """
         poses, seen = self.world_T_rigs.copy(), set[int]()
         for rows in self._runs():
@@ -117,12 +117,12 @@ class Odometry:
         return self._stretches(~self.posed())
 
     def path_lengths(self) -> list[float]:
-        """Of each map, in its unit."""
+        """Path length of each map, in its unit."""
         steps = [np.diff(piece.world_T_rigs[:, :3, 3], axis=0) for piece in self.pieces()]
         return [float(np.linalg.norm(some, axis=1).sum()) for some in steps]
 
     def report(self) -> dict[str, object]:
-        """What happened, for a file."""
+        """Summary of the odometry, for a JSON file."""
         posed = self.posed()
         return {
             "frames": len(self),
@@ -139,7 +139,7 @@ class Odometry:
         }
 
     def summary(self) -> str:
-        """One line for the terminal."""
+        """Summary of the odometry in one line for the terminal."""
         told = self.report()
         line = f"{told['posed']} of {told['frames']} frames posed, {told['keyframes']} keyframes"
         if not (self.statuses == FrameStatus.TRACKED).any():
@@ -169,15 +169,15 @@ def track_panoramas(
     with_loops: bool = True,
     checkpoint: Path | None = None,
 ) -> Odometry:
-    """Follow a camera through a sequence, then join its maps and close its loops.
+    """Track a camera through a sequence, then join its maps and close its loops.
 
     Args:
         panoramas: all frames, in time order; damaged ones count as lost.
         seed: of the sampling.
-        workers: who compare places; None = threads of this process.
-        with_loops: False = leave maps and drift as they are, and covariances unknown.
-        checkpoint: file in which tracking is kept each minute; one of the same panoramas is gone
-            on with, and it is removed in the end. None = keep nothing.
+        workers: threads or processes that compare places; None = threads of this process.
+        with_loops: False = join no maps, close no loops, estimate no covariances.
+        checkpoint: file that tracking is saved to each minute, continued from if it is of the same
+            panoramas, and removed at the end; None = no file.
 
     Raises:
         GsbaError: no picture can be decoded.
@@ -199,7 +199,7 @@ def track_panoramas(
 
 
 def _tracked_keyframes(tracked: Tracking, panoramas: SmallPanoramas) -> TrackedKeyframes:
-    """Keyframes as tracking left them."""
+    """Keyframes with their poses, maps and features."""
     state, rows = tracked.state, np.array(tracked.rows)
     frames = np.array(state.keyframe_frames)
     statuses = np.array([record.status for record in state.records])
@@ -230,7 +230,7 @@ def _odometry(
     timestamps: np.ndarray,
     closing_cpu_s: float,
 ) -> Odometry:
-    """Frames moved with their keyframes.
+    """Frames moved with their keyframes, as the result of odometry.
 
     Args:
         tracked: all frames.

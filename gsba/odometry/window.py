@@ -1,4 +1,4 @@
-"""Bundle adjustment of the last keyframes, those before them held."""
+"""Bundle adjustment of the last keyframes, with those before them fixed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,21 +15,21 @@ from gsba.types import Landmarks, Tracks
 _SOLVER = SolverSettings(
     max_iterations=8, relative_tolerance=1e-3, absolute_tolerance=1.0, lambda_initial=1e-6
 )
-_MIN_PARALLAX_DEG = 1.0  # of a point's rays
-_HELD = 1e-6  # standard deviation of poses that are held: radians, and parts of their extent
+_MIN_PARALLAX_DEG = 1.0  # least triangulation angle of a point
+_HELD = 1e-6  # standard deviation of fixed poses: radians, and parts of their extent
 
 
 @dataclass(frozen=True, slots=True)
 class WindowObservations:
-    """Which features keyframes of a window see, and where."""
+    """Observations of features in the keyframes of a window."""
 
-    frames: np.ndarray  # (O,) int32, rows of the window's keyframes
-    ids: np.ndarray  # (O,) int64, features
+    frames: np.ndarray  # (O,) int32, row of the keyframe in the window
+    ids: np.ndarray  # (O,) int64, feature
     bearings_rig: np.ndarray  # (O, 3) float64, unit, rig frame
 
     @classmethod
     def of(cls, keyframes: Sequence[tuple[np.ndarray, np.ndarray]]) -> "WindowObservations":
-        """From ids (n,) and bearings (n, 3) of each keyframe."""
+        """Observations from ids (n,) and bearings (n, 3) of each keyframe."""
         frames = np.repeat(np.arange(len(keyframes)), [len(ids) for ids, _ in keyframes])
         ids = np.concatenate([ids for ids, _ in keyframes])
         bearings = np.concatenate([bearings for _, bearings in keyframes])
@@ -43,7 +43,7 @@ class WindowObservations:
         return Tracks(points.astype(np.int32), self.frames, rows, len(found))
 
     def features_of(self, landmarks: Landmarks) -> np.ndarray:
-        """Features (J,) of points that were triangulated from `tracks`."""
+        """Features (J,) of points triangulated from `tracks`."""
         first = np.unique(landmarks.tracks.points, return_index=True)[1]
         return self.ids[landmarks.tracks.keypoints[first]]
 
@@ -53,23 +53,23 @@ class AdjustedWindow:
     """Poses and points after adjustment."""
 
     world_T_rigs: np.ndarray  # (K, 4, 4) float64
-    ids: np.ndarray  # (J,) int64, features that are points
+    ids: np.ndarray  # (J,) int64, feature of each point
     points_world: np.ndarray  # (J, 3) float64
-    outliers: np.ndarray  # (N, 2) int64, keyframe and feature of observations off their point
+    outliers: np.ndarray  # (N, 2) int64, keyframe and feature of outlier observations
 
 
 def adjust_window(
     world_T_rigs: np.ndarray, num_held: int, seen: WindowObservations, sigma: float, gate: float
 ) -> AdjustedWindow:
-    """Triangulate all features of a window anew, and adjust poses and points.
+    """Triangulate all features of a window again, and adjust poses and points.
 
     Args:
-        world_T_rigs: (K, 4, 4) poses at the start.
-        num_held: keyframes at the beginning that are held. With one, the distance from it to the
-            furthest keyframe is held besides: the scale is free otherwise.
+        world_T_rigs: (K, 4, 4) initial poses.
+        num_held: number of first keyframes that are fixed. With one, its distance to the furthest
+            keyframe is fixed besides, as the scale is free otherwise.
         seen: observations.
-        sigma: radians, of bearings per axis.
-        gate: observations further off their point are outliers, standard deviations.
+        sigma: radians, noise of bearings per axis.
+        gate: residual from which observations are outliers, standard deviations.
     """
     tracks, sigmas = seen.tracks(), np.full(len(seen.ids), sigma)
     settings = TriangulateSettings(min_parallax_deg=_MIN_PARALLAX_DEG)
@@ -96,7 +96,7 @@ def adjust_window(
 
 
 def _held(world_T_rigs: np.ndarray, num_held: int) -> gtsam.NonlinearFactorGraph:
-    """Priors that hold the gauge."""
+    """Priors that fix the gauge."""
     extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), 1e-9)
     sigmas = np.array([_HELD] * 3 + [_HELD * extent] * 3)
     noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)

@@ -1,7 +1,7 @@
 """Grey values: patches aligned to frames, and direct refinement of poses by them.
 
 Takes a solved map and the frames' pictures.
-Gives observations to a hundredth of a pixel, or the map refined by pixels.
+Gives observations accurate to a hundredth of a pixel, or the map refined by pixels.
 """
 
 from gsba.photometric.direct import PhotometricResult

@@ -22,29 +22,30 @@ from gsba.types import Counts, FrameSet, Keypoints, Round, Solution
 
 logger = logging.getLogger(__name__)
 
-_LEAST_WEIGHT = 1e-3  # of a frame
-_DEPTH_STEPS = 5  # Gauss-Newton steps on the planes at each level
-_LEAST_JUDGED = 10  # observations of a frame that is judged
-_CHUNK = 40_000  # observations whose depths are found at a time: bounds the windows held
+_MIN_FRAME_WEIGHT = 1e-3  # least weight of a frame
+_NUM_DEPTH_STEPS = 5  # Gauss-Newton steps on the planes at each level
+_MIN_OBSERVATIONS = 10  # observations of a frame from which its fit is judged
+_OBSERVATIONS_AT_ONCE = 40_000  # observations whose depths are estimated at once: bounds the memory
+# of windows
 
 
 @dataclass(frozen=True, slots=True)
 class PhotometricResult:
-    """Poses and points after the joint solve, and what became of the patches."""
+    """Poses and points after the joint solve, and counts and residuals of the patches."""
 
     adjustment: Solution
     counts: tuple[Counts, ...]  # of patches, then of observations, for each level
-    frame_weights: np.ndarray  # (F,) float64, 1 = full trust in a frame's pixels
-    residuals: np.ndarray  # (F,) float64, median over a frame of patches' residuals, sigmas
+    frame_weights: np.ndarray  # (F,) float64, weight of each frame's pixels, 1 = full
+    residuals: np.ndarray  # (F,) float64, median of each frame's patch residuals, sigmas
 
     @property
     def rounds(self) -> tuple[Round, ...]:
-        """Of the adjustment."""
+        """Rounds of the adjustment."""
         return self.adjustment.rounds
 
 
 def check(frames: FrameSet, settings: RefineSettings) -> None:
-    """Where the family is asked for, refuse frames that patches cannot be sampled from.
+    """If the family is selected, refuse frames that patches cannot be sampled from.
 
     Raises:
         GsbaError: cube faces, or panoramas of an odd height.
@@ -70,10 +71,10 @@ def refine(
 
     Args:
         frames: panoramas; read twice a level, one at a time.
-        keypoints: of all frames.
+        keypoints: keypoints of all frames.
         start: the solved map.
         problem: priors, families, loss, solver, patches.
-        lenses: what the panoramas are stitched from.
+        lenses: the camera's lenses.
     """
     solved, counts, settings = start, [], problem.settings
     weights, residuals = np.ones(len(frames)), np.full(len(frames), np.nan)
@@ -83,7 +84,9 @@ def refine(
         )
         counts += found
         if pixels is None:
-            logger.warning("no patch is seen twice at level %d: left as it was", level)
+            logger.warning(
+                "no patch is observed twice at level %d: nothing is refined there", level
+            )
             continue
         solved, weights, residuals = _solve(pixels, trust, keypoints, solved, problem)
     return PhotometricResult(solved, tuple(counts), weights, residuals)
@@ -97,7 +100,7 @@ def _patches(
     num_threads: int,
     lenses: Lenses,
 ) -> tuple[PatchPixels | None, np.ndarray, list[Counts]]:
-    """Pixels of the patches and observations that are good enough, if any; weights; the counts."""
+    """Pixels of the patches and observations that are accepted, if any; weights; the counts."""
     chosen, world_T_rigs = settings.photometric, solved.world_T_rigs
     bearings, width = [], 0
     for f in track(range(len(frames)), "choosing patches"):
@@ -119,7 +122,7 @@ def _patches(
         left &= ~flag
     table, _ = table.select(left)
     trust = np.zeros(len(table.targets))
-    rows = np.cumsum(np.diff(table.offsets)) // _CHUNK
+    rows = np.cumsum(np.diff(table.offsets)) // _OBSERVATIONS_AT_ONCE
     for chunk in np.unique(rows):
         observations = (rows == chunk)[table.owners]
         part, own = table.select(observations)
@@ -142,9 +145,9 @@ def _with_depths(
     num_threads: int,
     dropped: dict[str, int],
 ) -> PhotometricBlock:
-    """Patches with planes found at fixed poses, coarse to fine; only what correlates counts.
+    """Patches with planes estimated at fixed poses, coarse to fine; uncorrelated ones do not count.
 
-    What does not is added to `dropped`.
+    The number of uncorrelated ones is added to `dropped`.
     """
     chosen, values = settings.photometric, adjustment.values_of(world_T_rigs)
     gathered, visible = _gather(
@@ -155,7 +158,7 @@ def _with_depths(
         block = make_block(pixels, visible, settings, num_threads)
         block.planes = planes
         block.refresh(values)
-        block.polish(values, _DEPTH_STEPS)
+        block.polish(values, _NUM_DEPTH_STEPS)
         planes = block.planes
     block.refresh(values)
     correlated = block.correlations(values) >= chosen.min_correlation
@@ -179,7 +182,8 @@ def _gather(
     top: int,
     settings: PhotometricSettings,
 ) -> tuple[list[PatchPixels], np.ndarray]:
-    """Pixels of the patches at the levels from `level` to `top`; weights (O,) by both masks."""
+    """Pixels of the patches at the levels from `level` to `top`; weights (O,) from the masks of
+    both frames."""
     gathered: list[PatchPixels] = []
     visible, trusted = np.ones(len(table.targets)), np.ones(len(table))
     needed = np.union1d(table.hosts, table.targets)
@@ -208,9 +212,9 @@ def _solve(
     solved: Solution,
     problem: AdjustmentContext,
 ) -> tuple[Solution, np.ndarray, np.ndarray]:
-    """The joint solve, repeated once where frames are doubted: their weights, their residuals.
+    """The joint solve, repeated once with lower weights of bad frames: weights, residuals.
 
-    It is undone where it explains the map's own observations worse than before.
+    It is undone if it fits the map's own observations worse than before.
     """
     settings, num_threads = problem.settings, problem.num_threads
     chosen, terms = settings.photometric, problem.terms(solved)
@@ -246,11 +250,11 @@ def joint(
     num_threads: int,
     lenses: Lenses = ONE_CENTRE,
 ) -> list[PhotometricBlock]:
-    """The patches of a solved map, to join the solve of a further family; none if not asked for.
+    """The patches of a solved map, for a joint solve with another family; none if not selected.
 
     Args:
-        frame_weights: (F,) of each frame's pixels, see `PhotometricResult`.
-        lenses: what the panoramas are stitched from.
+        frame_weights: (F,) weights of each frame's pixels, see `PhotometricResult`.
+        lenses: the camera's lenses.
     """
     if "photometric" not in settings.factors:
         return []
@@ -273,7 +277,7 @@ def make_block(
     num_threads: int,
     noise: float = 1.0,
 ) -> PhotometricBlock:
-    """The factor block of gathered patches, `noise` times as uncertain as the settings say."""
+    """The factor block of gathered patches, with the settings' noise times `noise`."""
     chosen = settings.photometric
     contrasts = pixels.templates.std(axis=1).astype(np.float64)
     sigmas = noise * np.hypot(chosen.noise_grey, chosen.noise_contrast * contrasts)
@@ -304,7 +308,7 @@ def _geometric_fits(landmarks: LandmarkBlock, values: gtsam.Values) -> np.ndarra
     fits = np.ones(len(landmarks.keys))
     for f in range(len(fits)):
         rows = frames == f
-        if np.count_nonzero(rows) >= _LEAST_JUDGED:
+        if np.count_nonzero(rows) >= _MIN_OBSERVATIONS:
             fits[f] = max(float(np.median(norms[rows])), 1e-9)
     return fits
 
@@ -317,9 +321,9 @@ def _frame_weights(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weight (F,) of each frame's pixels, and the median (F,) of its residuals in sigmas.
 
-    Blur, a passer-by or a wrong pose make a frame's patches fit worse than those of the others;
-    or its pixels pull it off its geometric observations, whose residuals grow by `growth (F,)`.
-    Beyond what is allowed a weight falls with the square of the ratio.
+    Blur, a passer-by or a wrong pose make a frame's patches fit worse than those of the others; or
+    its pixels contradict its geometric observations, whose residuals grow by `growth (F,)`. Above
+    the limit a weight falls with the square of the ratio.
     """
     kept = block.counted
     errors = np.sqrt(block.errors(values)[kept])
@@ -327,12 +331,12 @@ def _frame_weights(
     residuals = np.full(len(block.keys), np.nan)
     for f in range(len(residuals)):
         rows = (targets == f) | (hosts == f)
-        if np.count_nonzero(rows) >= _LEAST_JUDGED:
+        if np.count_nonzero(rows) >= _MIN_OBSERVATIONS:
             residuals[f] = np.median(errors[rows])
     typical = np.nanmedian(residuals) if np.isfinite(residuals).any() else 1.0
     ratios = np.nan_to_num(residuals / typical, nan=1.0) / settings.max_frame_ratio
     worst = np.maximum(1.0, np.maximum(ratios, growth / settings.max_frame_growth))
-    return np.maximum(worst**-2.0, _LEAST_WEIGHT), residuals
+    return np.maximum(worst**-2.0, _MIN_FRAME_WEIGHT), residuals
 
 
 def _adjusted(
@@ -343,10 +347,10 @@ def _adjusted(
     settings: RefineSettings,
     num_threads: int,
 ) -> Solution:
-    """The solution with the joint solve's poses, or as it was if not accepted.
+    """The solution with the joint solve's poses, or the old one if not accepted.
 
-    Points are placed anew as after a bundle adjustment: those of the solve lie closer to most
-    observations than noise allows.
+    Points are triangulated again as after a bundle adjustment: those of the solve are closer to
+    most observations than noise permits.
     """
     tracks, least = solved.landmarks.tracks, settings.rounds.min_observations
     gate = solved.rounds[-1].gate_sigmas if solved.rounds else np.inf

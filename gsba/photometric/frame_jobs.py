@@ -1,4 +1,4 @@
-"""Patches cut from frames, and aligned to frames: jobs of which each frame is an item."""
+"""Patches cut from frames, and aligned to frames: jobs with one item a frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,10 +13,10 @@ from gsba.config import PatchSettings
 from gsba.frames.panorama import Greys
 from gsba.store.shards import Workers, blocks_of_frames
 
-_WINDOW = 0.6  # standard deviation of the patch's window, part of half a patch
-_SEARCH = 1.5  # shifts followed while aligning, in largest accepted ones
-_STEPS = 12
-_TOLERANCE = 0.02  # of the last step, pixels
+_WINDOW_SIGMA_SHARE = 0.6  # standard deviation of the patch's window, in half patches
+_SEARCH_SHIFT_RATIO = 1.5  # largest shift during alignment, in largest accepted shifts
+_MAX_STEPS = 12  # largest number of alignment steps
+_TOLERANCE_PX = 0.02  # of the last step, pixels
 
 
 def cut(
@@ -28,7 +28,7 @@ def cut(
     settings: PatchSettings,
     workers: Workers,
 ) -> PatchSet:
-    """Templates cut from the frames they are from.
+    """Templates cut from their host frames.
 
     Args:
         name: beside the progress bar.
@@ -36,9 +36,9 @@ def cut(
         hosts: (J,) frame of each template.
         origins (J, 3), spreads (J, 3, 2): plane patches, rig frame of the host.
         settings: sizes and limits.
-        workers: who do it.
+        workers: threads or processes that run it.
     """
-    patches = _room(len(hosts), settings)
+    patches = _empty_patches(len(hosts), settings)
     rows = _by_frame(hosts, greys.num_frames)
     job = _CutJob(name, greys, rows, origins, spreads, settings)
     whole = patches.templates
@@ -63,7 +63,7 @@ def align(
     Args:
         seeing: (O,) frame of each sighting.
         patches: the templates.
-        sightings: where they should be; what became of them is filled in.
+        sightings: predicted sightings; the results are filled in.
         name, greys, settings, workers: as for `cut`.
     """
     rows = _by_frame(seeing, greys.num_frames)
@@ -74,14 +74,16 @@ def align(
             array[chosen] = part
 
 
-def _room(num: int, settings: PatchSettings) -> PatchSet:
-    """Room for templates."""
-    return PatchSet(num, settings.patch_size, _WINDOW, settings.affine_sigma, settings.grey_sigma)
+def _empty_patches(num: int, settings: PatchSettings) -> PatchSet:
+    """Empty storage for templates."""
+    return PatchSet(
+        num, settings.patch_size, _WINDOW_SIGMA_SHARE, settings.affine_sigma, settings.grey_sigma
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class _Rows:
-    """Rows of a table that belong to each of some frames."""
+    """Rows of a table, grouped by frame."""
 
     frames: np.ndarray  # (N,) ascending, those with rows
     order: np.ndarray  # (R,) rows, frame by frame
@@ -94,7 +96,7 @@ class _Rows:
         return self.order[self.bounds[item] : self.bounds[item + 1]]
 
     def taken(self, start: int, stop: int) -> tuple[np.ndarray, "_Rows"]:
-        """Rows of some items, and these numbered by their place among them."""
+        """Rows of some items, and these renumbered by their place among them."""
         bounds = self.bounds[start : stop + 1]
         chosen = self.order[bounds[0] : bounds[-1]]
         frames = np.arange(stop - start)
@@ -110,7 +112,7 @@ def _by_frame(frame_of: np.ndarray, num_frames: int) -> _Rows:
 
 @dataclass(frozen=True, slots=True)
 class _FrameJob:
-    """A job of which each frame with rows is an item."""
+    """A job with one item for each frame that has rows."""
 
     title: str
     greys: Greys
@@ -127,7 +129,7 @@ class _FrameJob:
         return blocks_of_frames(self.rows.frames)
 
     def image(self, item: int) -> tuple[SphereImage, np.ndarray | None]:
-        """Of a frame, and where it may be used."""
+        """Image of a frame, and its mask."""
         grey, mask = self.greys[int(self.rows.frames[item])]
         return SphereImage.of(grey, smooth=True), mask
 
@@ -142,7 +144,7 @@ class _CutJob(_FrameJob):
 
     def __call__(self, item: int) -> tuple[np.ndarray, ...]:
         rows = self.rows.of(item)
-        found = _room(len(rows), self.settings)
+        found = _empty_patches(len(rows), self.settings)
         every, least = np.arange(len(rows)), self.settings.min_contrast
         found.cut(*self.image(item), every, self.origins[rows], self.spreads[rows], least)
         own = found.templates
@@ -170,8 +172,8 @@ class _AlignJob(_FrameJob):
     def __call__(self, item: int) -> tuple[np.ndarray, ...]:
         rows = self.rows.of(item)
         own = Sightings(*(column[rows] for column in self.sightings))
-        reach, every = _SEARCH * self.settings.max_shift_px, np.arange(len(rows))
-        self.patches.align(*self.image(item), every, own, reach, _STEPS, _TOLERANCE)
+        reach, every = _SEARCH_SHIFT_RATIO * self.settings.max_shift_px, np.arange(len(rows))
+        self.patches.align(*self.image(item), every, own, reach, _MAX_STEPS, _TOLERANCE_PX)
         return own.warps, own.scores, own.variances, own.states
 
     def part(self, start: int, stop: int) -> "_AlignJob":

@@ -1,4 +1,4 @@
-"""Patches for photometric refinement: spread over the sphere, depth from the map, seen nearby."""
+"""Patches for photometric refinement: spread over the sphere, with depth from the map."""
 
 import functools
 from dataclasses import replace
@@ -15,16 +15,16 @@ from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp
 from gsba.types import Counts, FrameSet, Landmarks
 
-_NEIGHBOURS = 8  # map points that a patch's plane is laid through
-_DARK, _BRIGHT = 3, 252  # grey values beyond which a pixel counts as saturated
-_EDGE_SHARE = 0.05  # of an edge's strength, beside that of a corner
-_MAX_LATITUDE = np.deg2rad(80.0)  # beyond, pixels of a panorama are mostly invented
+_NUM_PLANE_POINTS = 8  # map points that determine a patch's plane
+_MIN_GREY, _MAX_GREY = 3, 252  # grey values beyond which a pixel counts as saturated
+_EDGE_WEIGHT = 0.05  # weight of an edge's strength, beside that of a corner
+_MAX_LATITUDE_RAD = np.deg2rad(80.0)  # pixels of a panorama beyond are mostly interpolated
 
 
 def pyramid(
     frames: FrameSet, frame: int, settings: PhotometricSettings, top: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Grey images of a frame, level 0 to `top`, and where level 0 may be used.
+    """Grey images of a frame, level 0 to `top`, and the mask of level 0.
 
     Level 0 is the largest within `settings.max_width`; each further one has half the width, down
     to 64 pixels, where the levels end.
@@ -33,7 +33,7 @@ def pyramid(
         (H, 2 H) float32 of each level, and (H, 2 H) bool: not masked, neither black nor saturated.
     """
     grey = cv2.cvtColor(load_erp(frames, frame), cv2.COLOR_RGB2GRAY).astype(np.float32)
-    usable = (grey > _DARK) & (grey < _BRIGHT)
+    usable = (grey > _MIN_GREY) & (grey < _MAX_GREY)
     mask = load_usable(frames, frame)
     if mask is not None:
         usable &= mask
@@ -58,7 +58,7 @@ def halved(grey: np.ndarray) -> np.ndarray:
 
 
 def coarser(usable: np.ndarray, step: int) -> np.ndarray:
-    """(H / step, W / step) bool, whether all of step x step pixels (H, W) bool may be used."""
+    """(H / step, W / step) bool, True if all of step x step pixels (H, W) bool may be used."""
     height, width = usable.shape
     blocks = usable.reshape(height // step, step, width // step, step)
     return np.logical_and.reduce(blocks, axis=(1, 3))
@@ -81,11 +81,12 @@ def candidates(grey: np.ndarray, usable: np.ndarray, settings: PhotometricSettin
     )
     spread = np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
     least, most = 0.5 * (xx + yy) - spread, 0.5 * (xx + yy) + spread
-    score = least + _EDGE_SHARE * most
+    score = least + _EDGE_WEIGHT * most
     border = 2 * (settings.size // 2) + 3
     open_ = cv2.erode(usable.astype(np.uint8), np.ones((border, border), np.uint8)) > 0
-    open_[:, : border // 2] = open_[:, -(border // 2) :] = False  # erosion knows no seam
-    score = np.where(open_ & (np.abs(latitude) < _MAX_LATITUDE), score, 0.0).ravel()
+    open_[:, : border // 2] = open_[:, -(border // 2) :] = False  # erosion does not wrap around the
+    # seam
+    score = np.where(open_ & (np.abs(latitude) < _MAX_LATITUDE_RAD), score, 0.0).ravel()
     order, starts = _cells(width, height, settings.spacing_deg)
     ranked = score[order]
     best = np.maximum.reduceat(ranked, starts)
@@ -100,7 +101,7 @@ def candidates(grey: np.ndarray, usable: np.ndarray, settings: PhotometricSettin
 
 @functools.lru_cache(maxsize=2)
 def _cells(width: int, height: int, spacing_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels sorted by their cell, and where each cell starts: rings of equal height."""
+    """Pixels sorted by cell, and the first one of each cell: rings of equal height."""
     rings = max(1, round(180 / spacing_deg))
     ring = np.minimum(np.arange(height) * rings // height, rings - 1)
     middle = np.pi * ((np.arange(rings) + 0.5) / rings - 0.5)
@@ -115,26 +116,26 @@ def _cells(width: int, height: int, spacing_deg: float) -> tuple[np.ndarray, np.
 def lay_planes(
     bearings: np.ndarray, points_rig: np.ndarray, settings: PhotometricSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse-depth planes of patches through map points around them.
+    """Inverse-depth planes of patches, fitted to map points around them.
 
     A plane's inverse depth is linear over the tangent plane, so that a weighted linear fit to the
-    nearest points gives it; its slopes are held by a prior that faces the patch to its host.
+    nearest points estimates it; a prior on its slopes makes the patch face its host.
 
     Args:
         bearings: (K, 3) unit, centres of patches.
-        points_rig: (M, 3) points that the host sees, its rig frame.
+        points_rig: (M, 3) points that the host observes, its rig frame.
 
     Returns:
-        planes (K, 3), 1 / map units, and (K,) bool, whether the points around agree on one.
+        planes (K, 3), 1 / map units, and (K,) bool, True if the points around agree on a plane.
     """
     from scipy.spatial import KDTree
 
     planes, clear = np.zeros((len(bearings), 3)), np.zeros(len(bearings), bool)
     ranges = np.linalg.norm(points_rig, axis=1)
-    if len(points_rig) < _NEIGHBOURS or len(bearings) == 0:
+    if len(points_rig) < _NUM_PLANE_POINTS or len(bearings) == 0:
         return planes, clear
     reach = 2 * np.sin(np.deg2rad(settings.depth_reach_deg) / 2)
-    chords, rows = KDTree(points_rig / ranges[:, None]).query(bearings, k=_NEIGHBOURS)
+    chords, rows = KDTree(points_rig / ranges[:, None]).query(bearings, k=_NUM_PLANE_POINTS)
     local = np.einsum("pki,pni->pnk", patch_axes(bearings), points_rig[rows])
     ahead = (local[..., 0] > 0) & (chords < reach)
     depth = np.where(ahead, local[..., 0], 1.0)
@@ -142,7 +143,7 @@ def lay_planes(
     y = 1.0 / depth
     weights = np.where(ahead, 1 / (chords**2 + (0.25 * reach) ** 2), 0.0)
     trust = weights
-    for _ in range(4):  # reweighted: points of another surface let go
+    for _ in range(4):  # reweighted: points of another surface lose weight
         typical = (trust * y).sum(axis=1) / np.maximum(trust.sum(axis=1), 1e-300)
         V = np.einsum("pn,pni,pnj->pij", trust, x, x)
         ridge = (settings.depth_tolerance / settings.slope_sigma) ** 2 * weights.max(axis=1)
@@ -174,7 +175,7 @@ def table_of(
         world_T_rigs: (F, 4, 4) solved poses.
         landmarks: the solved map.
         width: of the panoramas that patches are sampled from, pixels.
-        lenses: what the panoramas are stitched from.
+        lenses: the camera's lenses.
     """
     tracks = landmarks.tracks
     positions = world_T_rigs[:, :3, 3]
@@ -212,7 +213,7 @@ def table_of(
 
 
 def views_of(table: PatchTable, world_T_rigs: np.ndarray, lenses: Lenses) -> PatchViews:
-    """How lenses see the patches of a table, and the places where these are laid."""
+    """Views of a table's patches through the lenses of host and target frames."""
     rig_T_hosts = lenses.views(table.bearings_rig, table.hosts)
     world_T_hosts = (world_T_rigs[table.hosts] @ rig_T_hosts)[table.owners]
     centres = (table.bearings_rig / table.planes[:, :1])[table.owners, :, None]
@@ -226,7 +227,7 @@ def views_of(table: PatchTable, world_T_rigs: np.ndarray, lenses: Lenses) -> Pat
 
 
 def values_at(image: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Values (R,) of the pixels of a panorama (H, 2H) that vectors (R, 3) point to."""
+    """Values (R,) of a panorama (H, 2H) in directions (R, 3)."""
     height, width = image.shape
     uv = erp_from_bearings(directions, width, height).astype(np.int64)
     return image[np.clip(uv[:, 1], 0, height - 1), uv[:, 0] % width]

@@ -1,4 +1,4 @@
-"""Which frames are to show a point: the one it is taken from, and those it is looked for in."""
+"""Selection of frames for a point: its reference frame, and the frames it is searched in."""
 
 import numpy as np
 
@@ -7,14 +7,14 @@ from gsba.config import PatchSettings
 from gsba.types import Landmarks
 
 _kernel, _part = kernel_and_part()
-_SCALE_WEIGHT = 0.25  # of a squared log ratio of distances, against a squared angle
+_LOG_RATIO_WEIGHT = 0.25  # weight of a squared log ratio of distances, relative to a squared angle
 
 
 def references(landmarks: Landmarks, world_T_rigs: np.ndarray) -> np.ndarray:
-    """Row (J,) of the observation of each point that is in the middle of all its observations.
+    """Row (J,) of each point's most central observation.
 
-    Middle is where the sum of squared angles between views, and of squared log ratios of
-    distances, to the point's other observations is least.
+    It minimises the sum of squared angles between views, and of squared log ratios of distances, to
+    the point's other observations.
     """
     centres = np.ascontiguousarray(world_T_rigs[:, :3, 3])
     out = np.zeros(len(landmarks.points_world), np.int64)
@@ -29,16 +29,16 @@ def visible_frames(
     extended: np.ndarray,
     settings: PatchSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frames in which each point is looked for, its reference left out.
+    """Frames in which each point is searched, without its reference.
 
-    They are the frames of its observations, and where asked for those near its reference in space,
-    whatever their time, that see it from a like direction and distance: the most similar first.
+    They are the frames of its observations, and for `extended` points those near its reference in
+    space, at any time, that see it from a similar direction and distance: the most similar first.
 
     Args:
         landmarks: the points.
         world_T_rigs: (F, 4, 4) current poses.
-        rows: (J,) observation each point is taken from.
-        extended: (J,) bool, points that are looked for where they have no observation.
+        rows: (J,) reference observation of each point.
+        extended: (J,) bool, points also searched in frames without an observation.
 
     Returns:
         points (O,) and frames (O,), int64, by point.
@@ -68,13 +68,13 @@ def _starts(landmarks: Landmarks) -> np.ndarray:
 
 @_part
 def _difference(ax, ay, az, bx, by, bz):
-    """Cosine of the angle, ratio of lengths, and how unlike two views of a point are."""
+    """Cosine of the angle, ratio of lengths, and dissimilarity of two views of a point."""
     aa, bb = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz
     if aa < 1e-300 or bb < 1e-300:
         return -1.0, np.inf, np.inf
     cosine = (ax * bx + ay * by + az * bz) / np.sqrt(aa * bb)
     ratio = np.sqrt(bb / aa)
-    return cosine, ratio, 2.0 * (1.0 - cosine) + _SCALE_WEIGHT * np.log(ratio) ** 2
+    return cosine, ratio, 2.0 * (1.0 - cosine) + _LOG_RATIO_WEIGHT * np.log(ratio) ** 2
 
 
 @_kernel
@@ -95,7 +95,7 @@ def _references(starts, frames, centres, points, out):
 def _views(
     starts, frames, centres, points, rows, near, min_cosine, max_ratio, max_views, extended, out
 ):
-    listed = np.full(len(centres), -1)  # point that last listed each frame
+    listed = np.full(len(centres), -1)  # last point that listed each frame
     costs = np.empty(near.shape[1])
     num = 0
     for j in range(len(points)):

@@ -1,10 +1,10 @@
-"""Surfaces around points: how patches turn when seen from elsewhere tells which way they face.
+"""Surface normals around points, from affine parts of patch alignments.
 
 A patch is a plane through a point. Its template's step (x, y) lies at the relative depth
-1 + slopes @ (x, y); slopes of zero face the host. Seen from elsewhere, depth along the host's ray
-shows as a shift: so where the true slopes differ by d from those that carried the patch, the affine
+1 + slopes @ (x, y); slopes of zero face the host. In another view, depth along the host's ray
+appears as a shift: if the true slopes differ by d from those that projected the patch, the affine
 part M of its alignment is u d^T, u the image of the host's ray in template steps. All sightings of
-a template give d by least squares. A wrong slope shifts the patch, too, by its second-order
+a template give d by least squares. A wrong slope also shifts the patch by its second-order
 terms: always the same way along a floor or a wall, which bends maps.
 """
 
@@ -13,9 +13,9 @@ import numpy as np
 from factors import tangent_basis
 from factors.patches import Sightings, found_at
 
-_AFFINE_SIGMA = 0.07  # of the affine part of an alignment
-_SLOPE_SIGMA = 0.7  # of the slopes of surfaces, tangents of their tilt
-_STEEPEST = 3.0  # tangent of a tilt beyond which a patch holds too little of its surface
+_AFFINE_SIGMA = 0.07  # noise of an alignment's affine part
+_SLOPE_SIGMA = 0.7  # prior of surface slopes, tangents of their tilt
+_MAX_TILT_TANGENT = 3.0  # tangent of a tilt beyond which a patch covers too little of its surface
 
 
 def slopes_of(normals_rig: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> np.ndarray:
@@ -32,7 +32,7 @@ def slopes_of(normals_rig: np.ndarray, origins: np.ndarray, spreads: np.ndarray)
     slopes = -across / np.where(known, facing, 1.0)[:, None]
     steps = np.linalg.norm(spreads[:, :, 0], axis=1)
     steepness = np.linalg.norm(slopes, axis=1) / np.maximum(steps, 1e-300)
-    slopes *= np.minimum(1.0, _STEEPEST / np.maximum(steepness, _STEEPEST))[:, None]
+    slopes *= np.minimum(1.0, _MAX_TILT_TANGENT / np.maximum(steepness, _MAX_TILT_TANGENT))[:, None]
     return np.where(known[:, None], slopes, 0.0)
 
 
@@ -44,18 +44,18 @@ def normals(
     origins: np.ndarray,
     spreads: np.ndarray,
 ) -> np.ndarray:
-    """Normals (J, 3) of the surfaces, rig frames of the hosts, by how their patches were found.
+    """Normals (J, 3) of the surfaces, rig frames of the hosts, from their patches' alignments.
 
     Args:
-        sightings: of the templates, aligned.
-        kept: (N,) rows of those to believe.
-        rays: (N, 3) the template's point from its host, in the frame of the seeing, in units of
-            its distance there.
-        slopes: (J, 2) that the patches were carried with.
+        sightings: aligned sightings of the templates.
+        kept: (N,) accepted rows.
+        rays: (N, 3) from the host to the template's point, in the observing frame, in units of its
+            distance there.
+        slopes: (J, 2) slopes by which the patches were projected.
         origins (J, 3), spreads (J, 3, 2): the patches in their hosts, before slopes.
 
     Returns:
-        Normals of any length, zero where too little tells.
+        Normals of any length, zero where they are undetermined.
     """
     there = Sightings(*(column[kept] for column in sightings))
     axes = tangent_basis(found_at(there)[0])

@@ -1,7 +1,7 @@
 """Gaussian splats: rendered, trained, scored, and poses refined against them.
 
 Takes posed frames and a cloud.
-Gives Gaussians, pictures and scores, or the map refined by what a splat shows.
+Gives Gaussians, pictures and scores, or the map refined against a splat.
 """
 
 from gsba.splat.camera import FaceCamera, face_camera

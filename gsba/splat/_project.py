@@ -1,17 +1,17 @@
 """Compiled passes over Gaussians: to splats of one pinhole camera, and gradients back.
 
 Projection by a local affine map (EWA: Zwicker et al., 2001) with the dilation and the guard band
-of Kerbl et al., 3D Gaussian Splatting, 2023; colours by real spherical harmonics. All of it is
-one file because numba renews a cached kernel only when its own file changes.
+of Kerbl et al., 3D Gaussian Splatting, 2023; colours by real spherical harmonics. All passes share
+a file because numba renews a cached kernel only when its own file changes.
 """
 
 import numpy as np
 
 from factors.compiled import kernel_and_part
 
-DILATION = 0.3  # pixels^2 added to both variances: a splat is never thinner than a pixel
+DILATION = 0.3  # pixels^2 added to both variances: no splat is thinner than a pixel
 GUARD = 1.3  # slopes x / z beyond an image this much wider are clamped in the affine map
-_ALPHA = 255.0  # 1 / the least alpha that is blended, see _tiles.MIN_ALPHA
+_INVERSE_MIN_ALPHA = 255.0  # 1 / the smallest alpha that is blended, see _tiles.MIN_ALPHA
 
 _C0 = 0.28209479177387814
 _C1 = 0.4886025119029199
@@ -29,7 +29,7 @@ _kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
 
 @_part
 def _harmonics(x, y, z, num, basis, slopes):
-    """First `num` real spherical harmonics at a unit vector, signs as 3DGS has them.
+    """First `num` real spherical harmonics at a unit vector, signs as in 3DGS.
 
     Args:
         basis: (16,) filled up to num.
@@ -91,15 +91,15 @@ def _rotation(q, out):
 
 
 @_part
-def _flatten(camera, mean, log_scale, rotation, scales, at, slope, flat):
-    """A Gaussian in the image.
+def _project_gaussian(camera, mean, log_scale, rotation, scales, at, slope, flat):
+    """Project a Gaussian to an ellipse in the image.
 
     Args:
         camera: (17,) `[face_R_world row-major (9), centre (3), focal, principal (2), width,
             height]`.
         rotation: (3, 3) of the Gaussian.
         scales: (3,) filled: standard deviations.
-        at: (5,) filled: mean in the camera, then x / z and y / z as the affine map takes them.
+        at: (5,) filled: mean in the camera, then x / z and y / z clamped for the affine map.
         slope: (2, 3) filled: d(u, v) / d(world) of the affine map.
         flat: (2, 3) filled: slope @ rotation @ diag(scales), a square root of the covariance.
     Returns:
@@ -132,7 +132,7 @@ def _flatten(camera, mean, log_scale, rotation, scales, at, slope, flat):
 
 @_part
 def _color(offset, sh, num, basis, slopes, splat):
-    """Colour of a splat (10,) that lies at an offset (3,) from the camera, not below black."""
+    """Colour of a splat (10,) at an offset (3,) from the camera, at least black."""
     distance = np.sqrt(offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2)
     x, y, z = offset[0] / distance, offset[1] / distance, offset[2] / distance
     _harmonics(x, y, z, num, basis, slopes)
@@ -161,12 +161,12 @@ def project(
     """Splats of the Gaussians begin..end - 1 in an image.
 
     Args:
-        camera: (17,) float64, see `_flatten`.
-        near: Gaussians nearer in z are not seen.
+        camera: (17,) float64, see `_project_gaussian`.
+        near: Gaussians nearer in z are not rendered.
         degree: of the spherical harmonics in use; sh is (N, K, 3).
         splats: (N, 10) float32, filled, see `_tiles`.
         reach2: (N,) float32, filled: squared radius of the ellipse in which a splat's alpha is at
-            least 1/255, in standard deviations; 0 = not seen.
+            least 1/255, in standard deviations; 0 = not rendered.
     """
     num = (degree + 1) ** 2
     basis, slopes, rotation = np.empty(16), np.zeros((16, 3)), np.empty((3, 3))
@@ -178,12 +178,14 @@ def project(
         z = 0.0
         for k in range(3):
             z += camera[6 + k] * (means[g, k] - camera[9 + k])
-        if z <= near or opacity * _ALPHA <= 1:
+        if z <= near or opacity * _INVERSE_MIN_ALPHA <= 1:
             continue
         _rotation(quaternions[g], rotation)
-        uu, uv, vv = _flatten(camera, means[g], log_scales[g], rotation, scales, at, slope, flat)
+        uu, uv, vv = _project_gaussian(
+            camera, means[g], log_scales[g], rotation, scales, at, slope, flat
+        )
         det = uu * vv - uv * uv
-        reach = 2 * np.log(opacity * _ALPHA)
+        reach = 2 * np.log(opacity * _INVERSE_MIN_ALPHA)
         u = camera[12] * at[0] / z + camera[13]
         v = camera[12] * at[1] / z + camera[14]
         wide, tall = np.sqrt(reach * uu), np.sqrt(reach * vv)
@@ -203,10 +205,11 @@ def project(
 def _through_shape(
     camera, d_splat, splat, at, slope, flat, rotation, scales, d_rotation, d_scale, d_at
 ):
-    """From the inverse covariance of a splat to the Gaussian's axes and place in the camera.
+    """Propagate the gradient of a splat's inverse covariance to the Gaussian's axes and place.
 
     Args:
-        d_splat, splat: (10,) gradient and splat; at, slope, flat, rotation, scales: as before.
+        d_splat, splat: (10,) gradient and splat; at, slope, flat, rotation, scales: as in
+            `_project_gaussian`.
         d_rotation: (3, 3) filled; d_scale: (3,) filled, of the logarithms.
         d_at: (3,) added to.
     """
@@ -261,7 +264,7 @@ def _through_rotation(q, d_rotation, out):
 
 @_part
 def _through_color(d_splat, splat, sh, offset, num, basis, slopes, d_sh, d_offset):
-    """From a splat's colour to its harmonics (K, 3) and the offset (3,) from the camera."""
+    """Propagate the gradient of a splat's colour to its harmonics (K, 3) and its offset (3,)."""
     distance = np.sqrt(offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2)
     x, y, z = offset[0] / distance, offset[1] / distance, offset[2] / distance
     _harmonics(x, y, z, num, basis, slopes)
@@ -286,7 +289,8 @@ def backproject(
 ):  # fmt: skip
     """Gradients of the parameters begin..end - 1 from those of their splats, d_splats (N, 10).
 
-    The d_ arrays have the shapes of their parameters and hold zeros where a splat is not seen.
+    The d_ arrays have the shapes of their parameters and hold zeros for splats that are not
+    rendered.
     """
     num = (degree + 1) ** 2
     basis, slopes = np.empty(16), np.zeros((16, 3))
@@ -297,7 +301,7 @@ def backproject(
         if reach2[g] == 0:
             continue
         _rotation(quaternions[g], rotation)
-        _flatten(camera, means[g], log_scales[g], rotation, scales, at, slope, flat)
+        _project_gaussian(camera, means[g], log_scales[g], rotation, scales, at, slope, flat)
         d, z = d_splats[g], at[2]
         d_at[0], d_at[1] = d[0] * camera[12] / z, d[1] * camera[12] / z
         d_at[2] = d[9] - (d_at[0] * at[0] + d_at[1] * at[1]) / z

@@ -5,7 +5,7 @@ A projected splat is a row of ten float32, here and in its gradient:
 `[[a, b], [b, c]]`. A tile is 16 x 16 pixels. All loops over pixels run along whole tiles in one
 flat buffer at constant offsets, so that the compiler makes vector code of them; no tile and no
 (splat, tile) entry is written by two threads, so that results do not depend on their number.
-All of it is one file because numba renews a cached kernel only when its own file changes.
+All passes share a file because numba renews a cached kernel only when its own file changes.
 """
 
 import numpy as np
@@ -17,18 +17,18 @@ from factors.compiled import kernel_and_part
 
 TILE = 16  # pixels
 CHANNELS = 5  # red, green, blue, sum of weight * z, alpha
-MIN_ALPHA = np.float32(1 / 255)  # less is not blended
+MIN_ALPHA = np.float32(1 / 255)  # smaller alphas are not blended
 MAX_ALPHA = np.float32(0.99)
-MIN_TRANSMITTANCE = np.float32(1e-4)  # pixels that let less through take no more
+MIN_TRANSMITTANCE = np.float32(1e-4)  # pixels that let less through receive no more splats
 
 _PIXELS = TILE * TILE
 _U, _V = np.uint64(0), np.uint64(_PIXELS)  # rows of a tile's buffer: pixel centres,
 _T, _C = np.uint64(2 * _PIXELS), np.uint64(3 * _PIXELS)  # transmittance, five channels,
-_REST = np.uint64(8 * _PIXELS)  # and what is still to come of the loss's slope
+_REST = np.uint64(8 * _PIXELS)  # and the rest of the loss's slope from splats behind
 _P = np.uint64(_PIXELS)
-_CHECK_EVERY = 16  # entries between looks whether a tile is full
+_ENTRIES_BETWEEN_CHECKS = 16  # entries between tests for a full tile
 _ZERO, _ONE, _HALF, _LOG2E = (np.float32(x) for x in (0, 1, 0.5, 1.4426950408889634))
-_LEAST_POWER = np.float32(-80.0)
+_MIN_EXPONENT = np.float32(-80.0)
 _EXP2 = tuple(np.float32(np.log(2) ** k / f) for k, f in enumerate((1, 1, 2, 6, 24, 120, 720)))
 _E1, _E2, _E3, _E4, _E5, _E6 = _EXP2[1:]
 
@@ -64,7 +64,7 @@ def _power_of_two(typing_context, value):
 @_part
 def _exp(x):
     """Exponential of a float32 <= 0, to a relative 1.2e-7 (2 - x); e^-80 for anything less."""
-    t = max(min(x, _ZERO), _LEAST_POWER) * _LOG2E
+    t = max(min(x, _ZERO), _MIN_EXPONENT) * _LOG2E
     n = _nearest_whole(t)  # type: ignore[call-arg]
     f = t - n
     series = _ONE + f * (_E1 + f * (_E2 + f * (_E3 + f * (_E4 + f * (_E5 + f * _E6)))))
@@ -120,7 +120,7 @@ def _tile_rows(splat, reach2, num_rows):
 
 @_kernel
 def count_tiles(splats, reach2, num_rows, num_columns, counts, begin, end):
-    """Number of tiles each splat touches; reach2 (N,) is 0 where a splat is not seen."""
+    """Number of tiles each splat touches; reach2 (N,) is 0 for splats that are not rendered."""
     for g in range(begin, end):
         counts[g] = 0
         if reach2[g] > 0:
@@ -132,16 +132,16 @@ def count_tiles(splats, reach2, num_rows, num_columns, counts, begin, end):
 
 @_kernel
 def fill_tiles(splats, reach2, order, offsets, num_rows, num_columns, starts, owners, entries):
-    """List each tile's splats from near to far: a counting sort of what comes in depth order.
+    """List each tile's splats from near to far, by a counting sort of splats in depth order.
 
-    What `count_tiles` has counted is kept to: where both kernels round an ellipse's border to
-    different sides of a pixel, an entry that has no room is left out, one too many has no row.
+    The counts of `count_tiles` are binding: if both kernels round an ellipse's border to different
+    sides of a pixel, an entry without room is left out, and a superfluous one has no row.
 
     Args:
         order: splats by depth.
         offsets: (N + 1,) a splat's entries are offsets[g]..offsets[g + 1] - 1, tile after tile.
         starts: (tiles + 1,) filled: tile t owns rows starts[t]..starts[t + 1] - 1 of the lists.
-        owners, entries: (E,) filled: splat and entry of each row; the last may stay as they are.
+        owners, entries: (E,) filled: splat and entry of each row; the last rows may stay unset.
     """
     tiles = np.empty(len(entries), np.int32)
     starts[:] = 0
@@ -169,7 +169,7 @@ def fill_tiles(splats, reach2, order, offsets, num_rows, num_columns, starts, ow
 
 @_part
 def _pixel_rows(splat, reach2, top):
-    """Pixels of a tile, first..last - 1 of its buffer, in the rows that a splat reaches."""
+    """Pixels of a tile, first..last - 1 of its buffer, in the rows within a splat's reach."""
     a, b, c = float(splat[2]), float(splat[3]), float(splat[4])
     tall = np.sqrt(reach2 * a / (a * c - b * b))
     first = max(np.ceil(splat[1] - tall - 0.5) - top, 0.0)
@@ -179,7 +179,7 @@ def _pixel_rows(splat, reach2, top):
 
 @_part
 def _start_tile(buffer, tile, num_columns):
-    """Pixel centres and full transmittance; returns the tile's first pixel row and column."""
+    """Set pixel centres and full transmittance; return the tile's first pixel row and column."""
     top, left = tile // num_columns * TILE, tile % num_columns * TILE
     for i in range(_PIXELS):
         buffer[i] = np.float32(left + i % TILE + 0.5)
@@ -229,7 +229,7 @@ def blend_tiles(splats, reach2, starts, owners, num_columns, image, used, first,
         buffer[3 * _PIXELS :] = _ZERO
         row = starts[tile]
         while row < starts[tile + 1]:
-            if (row - starts[tile]) % _CHECK_EVERY == 0 and _is_full(buffer):
+            if (row - starts[tile]) % _ENTRIES_BETWEEN_CHECKS == 0 and _is_full(buffer):
                 break
             g = owners[row]
             begin, end = _pixel_rows(splats[g], reach2[g], top)
@@ -246,9 +246,9 @@ def blend_tiles(splats, reach2, starts, owners, num_columns, image, used, first,
 def _differentiate(buffer, splat, first, last, out):
     """Gradient of the loss with respect to a splat, over the pixels first..last - 1 of a tile.
 
-    With v = slope along what the splat adds to a pixel, dL/dalpha = T v - rest / (1 - alpha),
-    where `rest` is what the splats behind contribute to the loss's slope: the total less what
-    has been replayed. So the pass runs from near to far like the one before it.
+    With v = slope along the splat's colour at a pixel, dL/dalpha = T v - rest / (1 - alpha),
+    where `rest` is the contribution of the splats behind to the loss's slope: the total less the
+    part already replayed. So the pass runs from near to far like the one before it.
     """
     u, v, a, b, c = splat[0], splat[1], -_HALF * splat[2], splat[3], -_HALF * splat[4]
     opacity, red, green, blue, z = splat[5], splat[6], splat[7], splat[8], splat[9]
@@ -293,9 +293,9 @@ def differentiate_tiles(
     """Gradients (E, 10) of the entries of the tiles first..last - 1.
 
     Args:
-        image: what `blend_tiles` made.
+        image: the result of `blend_tiles`.
         slopes: (5, rows * 16, columns * 16) float32, derivative of the loss for each value of it.
-        out: filled at `entries`; rows of entries that were not blended stay as they are.
+        out: filled at `entries`; rows of entries that were not blended stay unset.
     """
     buffer = np.empty(9 * _PIXELS, np.float32)
     for tile in range(first, last):

@@ -20,7 +20,7 @@ class Rates:
     quaternions: float
     opacity_logits: float
     sh: float  # of the constant harmonic
-    sh_rest: float  # of the others
+    sh_rest: float  # of the other harmonics
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,20 +32,20 @@ class Moments:
 
     @classmethod
     def zero(cls, gaussians: Gaussians) -> "Moments":
-        """Of Gaussians that have not moved yet."""
+        """Zero moments of Gaussians before the first step."""
         return cls(zeros_like(gaussians), zeros_like(gaussians))
 
     def select(self, rows: np.ndarray) -> "Moments":
-        """Those of some Gaussians."""
+        """The moments of some Gaussians."""
         return Moments(self.first.select(rows), self.second.select(rows))
 
     def extended(self, new: Gaussians) -> "Moments":
-        """With zeros for further Gaussians."""
+        """The moments with zeros appended for new Gaussians."""
         zeros = zeros_like(new)
         return Moments(concatenate([self.first, zeros]), concatenate([self.second, zeros]))
 
     def without_opacity(self) -> "Moments":
-        """Forget how opacities moved."""
+        """The moments with those of opacities reset to zero."""
         zero = np.zeros_like(self.first.opacity_logits)
         first, second = (
             replace(part, opacity_logits=zero.copy()) for part in (self.first, self.second)
@@ -56,7 +56,7 @@ class Moments:
 def step(
     gaussians: Gaussians, gradients: Gaussians, moments: Moments, rates: Rates, count: int
 ) -> None:
-    """Move all parameters in place.
+    """Move all parameters in place by one step.
 
     Args:
         gaussians, gradients, moments: of equal shapes; gaussians and moments are changed.

@@ -1,4 +1,4 @@
-"""Frames against a splat: the block that aligns rig poses to what the splat renders."""
+"""Alignment of frames to a splat: the block that compares rig poses with its renderings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,25 +23,27 @@ from gsba.splat.gaussians import Gaussians
 from gsba.splat.scene import cut_faces, cut_lens_faces, place_points
 from gsba.types import FrameSet, Reconstruction
 
-MIN_ALPHA = 0.95  # of a rendered pixel that is believed
-MAX_STEP = 0.1  # of the depth, between neighbouring pixels: more is an edge
-MAX_STEPS = 15  # of the solver at each size
-GATES_DEG = (16.0, 5.0, 1.5, 0.5)  # of observations at the first sizes; then the last
+MIN_ALPHA = 0.95  # least alpha of a rendered pixel that is used
+MAX_STEP = 0.1  # relative depth step between neighbouring pixels from which they are an edge
+MAX_STEPS = 15  # solver steps at each size
+GATES_DEG = (16.0, 5.0, 1.5, 0.5)  # degrees, gates of observations at the first sizes; the last one
+# at all further sizes
 _GATE_SIGMAS = 10.0  # wider gates loosen the loss in proportion
 _LUMA = np.array([0.299, 0.587, 0.114])
-_MARGIN_HFOV_DEG = 100.0  # of captured faces, so that samples beyond an edge find pixels
+_CAPTURED_HFOV_DEG = 100.0  # of captured faces, so that samples beyond a rendered edge find pixels
 
 
 @dataclass(frozen=True, slots=True)
 class Captured:
-    """Grey faces of frames, to be aligned to renderings of one size."""
+    """Grey faces of frames, to align with renderings of one size."""
 
     which: np.ndarray  # (W,) int, frame indices
-    rendered: tuple[View, ...]  # what they are compared with
+    rendered: tuple[View, ...]  # views that are compared with the captured faces
     views: tuple[View, ...]  # (K,) the captured faces
     images: tuple[np.ndarray, ...]  # (W,) of (K, S, S) float32, 0..1
     weights: tuple[np.ndarray | None, ...]  # (W,) of (K, S, S) float32, 0..1; None = all one
-    turns: np.ndarray | None = None  # (W, 3, 3) of the views' rig in each frame's; None = none
+    turns: np.ndarray | None = None  # (W, 3, 3) axes of the views' rig in each frame's; None =
+    # equal
 
 
 def align(
@@ -54,20 +56,20 @@ def align(
     reconstruction: Reconstruction | None = None,
     optics: Optics = ONE_EYE,
 ) -> np.ndarray:
-    """Align the poses of all frames to a splat that stays as it is, from coarse to fine.
+    """Align the poses of all frames to a fixed splat, from coarse to fine.
 
-    The splat holds the gauge. The coarsest faces have the widest basin; observations, where given,
+    The splat fixes the gauge. The coarsest faces have the widest basin; observations, where given,
     join from the start, with a gate and a loss that tighten from size to size.
 
     Args:
         gaussians: the splat.
         frames: captured frames.
-        world_T_rigs: (F, 4, 4) start, in the splat's world.
+        world_T_rigs: (F, 4, 4) initial poses, in the splat's world.
         near: least z of a Gaussian, map units.
         backend: the renderer.
         sizes: pixels of a face at each level.
-        reconstruction: whose observations join as bearing factors; None = the splat alone.
-        optics: of the frames.
+        reconstruction: its observations join as bearing factors; None = the splat alone.
+        optics: lenses of the frames.
 
     Returns:
         (F, 4, 4) float64.
@@ -94,12 +96,12 @@ def align(
 def bearing_block(
     reconstruction: Reconstruction, world_T_rigs: np.ndarray, gate_rad: float
 ) -> LandmarkBlock:
-    """A run's observations as bearing factors, points placed under given poses.
+    """A run's observations as bearing factors, with points triangulated under given poses.
 
     Args:
         world_T_rigs: (F, 4, 4).
-        gate_rad: observations further from their point are left out; what such a gate lets in is
-            believed less than what the run has found.
+        gate_rad: observations further from their point are left out; wider gates make the
+            observations less certain than the run estimated.
     """
     which = np.arange(len(world_T_rigs))
     landmarks, _ = place_points(reconstruction, world_T_rigs, which, gate_rad)
@@ -129,9 +131,9 @@ def capture(frames: FrameSet, which: np.ndarray, size: int, optics: Optics = ONE
 
 
 def _capture_of_lenses(frames: FrameSet, which: np.ndarray, size: int, optics: Optics) -> Captured:
-    """As `capture`, faces of one lens each, squares around those that are rendered.
+    """Captured faces like those of `capture`, of one lens each, squares around the rendered ones.
 
-    What is blended or of the other lens has no weight.
+    Pixels that are blended or of the other lens have no weight.
     """
     wide, rendered, lenses = _wide_rig(size), optics.views(size), optics.lenses
     square = {"width": wide.size, "height": wide.size, "principal": (wide.principal,) * 2}
@@ -162,7 +164,7 @@ def splat_block(
     """The block of captured frames against a fixed splat.
 
     Args:
-        gaussians: the splat; its world is the poses'.
+        gaussians: the splat, in the world of the poses.
         captured: frames; keys are graph.X(frame). Coarse to fine is one block after another.
         near: least z of a Gaussian, map units.
         backend: the renderer.
@@ -194,11 +196,11 @@ def render_view(
     near: float,
     backend: Backend,
 ) -> RenderedView:
-    """Pixels of all views that the splat is sure of, as points with grey values.
+    """Opaque pixels of all views, as points with grey values.
 
     Args:
-        world_T_rig: (4, 4), where to render from.
-        views: of that rig.
+        world_T_rig: (4, 4) pose to render from.
+        views: views of that rig.
     """
     points, greys = [], []
     cameras = rig_cameras(world_T_rig, views)
@@ -210,13 +212,13 @@ def render_view(
         offsets = (np.stack(grid, axis=-1)[sure] - camera.principal) / camera.focal
         local = np.column_stack([offsets, np.ones(len(offsets))]) * depth[:, None]
         points.append(local @ camera.world_R_face.T + camera.face_in_world)
-        # What lies behind a pixel that is not quite opaque is unknown: leave its share out.
+        # The scene behind a pixel that is not quite opaque is unknown: its share is left out.
         greys.append((image.color[sure] @ _LUMA) / image.alpha[sure])
     return RenderedView(np.concatenate(points), np.concatenate(greys))
 
 
 def _edges(depth: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) bool at a jump of the depth, where an expected depth is nobody's."""
+    """Pixels (H, W) bool at a step of the depth, where the expected depth is of neither side."""
     low, high = depth.copy(), depth.copy()
     for axis in (0, 1):
         for shift in (1, -1):
@@ -226,12 +228,12 @@ def _edges(depth: np.ndarray) -> np.ndarray:
 
 
 def _captured_rig(frames: FrameSet, size: int) -> CubeRig:
-    """Faces as dense as rendered ones and a little wider; those of cube frames are as they are."""
+    """Faces as dense as rendered ones and a little wider; cube frames keep their own faces."""
     if not frames.panoramic:
         return cubemap.native_rig(frames)
     return _wide_rig(size)
 
 
 def _wide_rig(size: int) -> CubeRig:
-    hfov = np.deg2rad(_MARGIN_HFOV_DEG)
+    hfov = np.deg2rad(_CAPTURED_HFOV_DEG)
     return CubeRig(round(size * np.tan(hfov / 2)), hfov)

@@ -1,4 +1,4 @@
-"""The two renderers behind one interface: `cpu`, ours, and `gsplat` on CUDA."""
+"""The two renderers behind one interface: `cpu`, of this package, and `gsplat` on CUDA."""
 
 import logging
 import os
@@ -20,10 +20,10 @@ logger = logging.getLogger(__name__)
 
 
 class Backend(Protocol):
-    """Renders splats, and makes them look like images."""
+    """Renders splats, and trains them on images."""
 
     name: str
-    stretch: int  # steps that are best made in one call of `descend`
+    stretch: int  # steps that are most efficient in one call of `descend`
     memory_bytes: int  # of the device, all of it
 
     def render(
@@ -45,13 +45,13 @@ class Backend(Protocol):
         near: float,
         ssim_weight: float,
     ) -> None:
-        """A step of Adam for each lesson, down `gsba.splat.metrics.training_loss` times the view's
-        share of a face: pixels of all views count alike.
+        """Take a step of Adam for each lesson, down `gsba.splat.metrics.training_loss` times the
+        view's share of a face, so that pixels of all views weigh equally.
 
         Args:
             gaussians, moments: changed in place.
-            pull: changed in place: each view is added; None = not wanted.
-            lessons: in this order.
+            pull: changed in place: each view is added; None = not recorded.
+            lessons: training views, in this order.
             near: least z of a Gaussian, map units.
             ssim_weight: see `training_loss`.
         """
@@ -59,7 +59,7 @@ class Backend(Protocol):
 
 
 class CpuBackend:
-    """The rasteriser of `gsba.splat.rasterise`: deterministic, any machine."""
+    """The rasteriser of `gsba.splat.rasterise`: deterministic, on any machine."""
 
     name, stretch = "cpu", 1
 
@@ -96,7 +96,7 @@ class CpuBackend:
     def gradients(
         self, gaussians: Gaussians, lesson: Lesson, near: float, ssim_weight: float
     ) -> Gradients:
-        """Of the training loss of one lesson, times the share of its view."""
+        """Gradients of the training loss of one lesson, times the share of its view."""
         image, tape = render(gaussians, lesson.camera, lesson.sh_degree, near, self.num_threads)
         truth = lesson.truth.astype(np.float32) / 255
         slope = training_loss(image.color, truth, lesson.use, ssim_weight)[1]
@@ -104,14 +104,14 @@ class CpuBackend:
 
 
 def choose_backend(name: str, num_threads: int | None = None) -> Backend:
-    """The renderer of a name.
+    """The renderer with a name.
 
     Args:
-        name: "cpu", "gsplat", or "auto": gsplat where it and a CUDA device are there.
+        name: "cpu", "gsplat", or "auto": gsplat if it and a CUDA device are available.
         num_threads: of the CPU renderer; None = all cores.
 
     Raises:
-        GsbaError: gsplat is asked for and cannot be used.
+        GsbaError: gsplat is requested and cannot be used.
     """
     if name == "cpu":
         return CpuBackend(num_threads)

@@ -22,7 +22,7 @@ class FaceCamera:
 
     @property
     def share(self) -> float:
-        """Its pixels, part of those of a face of 90 degrees that is as dense."""
+        """Number of pixels, relative to a face of 90 degrees of the same focal length."""
         return self.width * self.height / (2 * self.focal) ** 2
 
     def packed(self) -> np.ndarray:

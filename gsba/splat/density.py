@@ -1,4 +1,4 @@
-"""Adaptive density control: clone, split and prune Gaussians as published with 3DGS."""
+"""Adaptive density control: clone, split and prune Gaussians as in 3DGS."""
 
 from dataclasses import dataclass, replace
 
@@ -8,29 +8,29 @@ from gsba.geometry import rotation_from_quaternion
 from gsba.splat.adam import Moments
 from gsba.splat.gaussians import Gaussians, concatenate
 
-SPLIT_SHRINK = 1.6  # a split Gaussian's halves are this much smaller
+SPLIT_SHRINK = 1.6  # factor by which a split Gaussian's halves are smaller
 RESET_OPACITY = 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class Pull:
-    """How strongly images have pulled at projected centres since the last densification."""
+    """Accumulated gradients at projected centres since the last densification."""
 
-    sums: np.ndarray  # (N,) float32, gradient lengths, focal lengths
-    counts: np.ndarray  # (N,) float32, views that saw the Gaussian
+    sums: np.ndarray  # (N,) float32, sums of gradient lengths, focal lengths
+    counts: np.ndarray  # (N,) float32, views that rendered the Gaussian
 
     @classmethod
     def none(cls, num: int) -> "Pull":
-        """Of Gaussians that no view has seen yet."""
+        """Zero sums for Gaussians without any view."""
         return cls(np.zeros(num, np.float32), np.zeros(num, np.float32))
 
     def add(self, centres: np.ndarray, seen: np.ndarray, focal: float) -> None:
-        """Count one view, in place.
+        """Add one view, in place.
 
         Args:
             centres: (N, 2) gradients per pixel.
-            seen: (N,) bool.
-            focal: of the view, pixels: half the width of a face.
+            seen: (N,) bool, Gaussians rendered in the view.
+            focal: focal length, pixels: half the width of a face.
         """
         self.sums[:] += focal * np.hypot(centres[:, 0], centres[:, 1])
         self.counts[:] += seen
@@ -40,11 +40,11 @@ class Pull:
 class DensityLimits:
     """Thresholds of the density control."""
 
-    pull: float  # mean gradient from which on a Gaussian is densified, focal lengths
-    clone_scale: float  # smaller ones are cloned, larger ones split, map units
-    max_scale: float | None  # larger ones are pruned, map units; None = none
-    min_opacity: float  # fainter ones are pruned
-    max_gaussians: int  # the strongest pulls come first where there is no room for all
+    pull: float  # mean gradient from which a Gaussian is densified, focal lengths
+    clone_scale: float  # map units, smaller Gaussians are cloned, larger ones split
+    max_scale: float | None  # map units, larger Gaussians are pruned; None = no limit
+    min_opacity: float  # fainter Gaussians are pruned
+    max_gaussians: int  # limit; the strongest gradients are densified first
 
 
 def densify(
@@ -54,10 +54,10 @@ def densify(
     limits: DensityLimits,
     rng: np.random.Generator,
 ) -> tuple[Gaussians, Moments, bool]:
-    """Clone small and split large Gaussians that are pulled at, then prune.
+    """Clone small and split large Gaussians with strong gradients, then prune.
 
     Returns:
-        The Gaussians, their moments (zero for new ones), and whether the cap kept some out.
+        The Gaussians, their moments (zero for new ones), and True if the limit kept some out.
     """
     strength = pull.sums / np.maximum(pull.counts, 1)
     chosen = np.flatnonzero(strength >= limits.pull)
@@ -90,7 +90,7 @@ def densify(
 
 
 def reset_opacity(gaussians: Gaussians, moments: Moments) -> tuple[Gaussians, Moments]:
-    """Make every Gaussian almost transparent, so that only those that are needed come back."""
+    """Make every Gaussian almost transparent, so that only necessary ones regain opacity."""
     highest = np.float32(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
     logits = np.minimum(gaussians.opacity_logits, highest)
     return replace(gaussians, opacity_logits=logits), moments.without_opacity()

@@ -1,22 +1,22 @@
-"""What paired differences say of two alternatives, in standard errors."""
+"""Evidence of paired differences for one of two alternatives, in standard errors."""
 
 import numpy as np
 
 
 def standard_error(differences: np.ndarray) -> float:
-    """Of the mean of differences (N,); infinite for a single one."""
+    """Standard error of the mean of differences (N,); infinite for a single one."""
     num = len(differences)
     return float(differences.std(ddof=1) / np.sqrt(num)) if num > 1 else np.inf
 
 
 def score(differences: np.ndarray, chance: float = 0.0) -> float:
-    """How clearly the sum of differences (N,) is above zero, in standard errors.
+    """Significance of a positive sum of differences (N,), in standard errors.
 
-    A few differences do not know their spread well: their t is carried to the score of a normal
-    distribution that is as rare (Wallace, Bounds on normal approximations, 1959).
+    Few differences determine their spread poorly: their t is mapped to the normal score of equal
+    probability (Wallace, Bounds on normal approximations, 1959).
 
     Args:
-        chance: a sum as small as this says nothing either way; what is beyond counts.
+        chance: part of the sum that chance explains; only the excess counts.
     """
     total, num = float(differences.sum()), len(differences)
     beyond, spread = max(abs(total) - chance, 0.0), num * standard_error(differences)
@@ -28,6 +28,6 @@ def score(differences: np.ndarray, chance: float = 0.0) -> float:
 
 
 def together(*scores: float) -> float:
-    """Evidence of several kinds as one score: log likelihoods, half the squares, add up."""
+    """Combined score of several kinds of evidence: log likelihoods, half the squares, add up."""
     total = sum(one * abs(one) for one in scores)
     return float(np.copysign(np.sqrt(abs(total)), total))

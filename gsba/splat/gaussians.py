@@ -1,4 +1,4 @@
-"""The one type of a splat's Gaussians, and the cloud they start from."""
+"""The Gaussians of a splat, and their initialisation from a cloud."""
 
 from dataclasses import dataclass, fields
 
@@ -28,11 +28,11 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Highest degree that there are coefficients for."""
+        """Highest degree with coefficients."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
     def usable_degree(self, wanted: int | None) -> int:
-        """The degree to render with where one is wanted; None = all there are."""
+        """The degree to render with, at most the wanted one; None = the highest."""
         return self.sh_degree if wanted is None else min(wanted, self.sh_degree)
 
     def arrays(self) -> tuple[np.ndarray, ...]:
@@ -44,23 +44,23 @@ class Gaussians:
         return Gaussians(*(array[rows] for array in self.arrays()))
 
     def is_finite(self) -> bool:
-        """Whether every parameter is a number."""
+        """True if every parameter is a number."""
         return all(bool(np.isfinite(array).all()) for array in self.arrays())
 
 
 def num_parameters(sh_degree: int) -> int:
-    """Numbers that make a Gaussian."""
+    """Number of parameters of a Gaussian."""
     return 3 + 3 + 4 + 1 + 3 * (sh_degree + 1) ** 2
 
 
 def concatenate(parts: "list[Gaussians]") -> Gaussians:
-    """Several sets as one."""
+    """Several sets of Gaussians as one."""
     columns = zip(*(part.arrays() for part in parts), strict=True)
     return Gaussians(*(np.concatenate(column) for column in columns))
 
 
 def zeros_like(gaussians: Gaussians) -> Gaussians:
-    """All parameters zero, e.g. to gather gradients in."""
+    """Gaussians with all parameters zero, to accumulate gradients."""
     return Gaussians(*(np.zeros_like(array) for array in gaussians.arrays()))
 
 
@@ -71,7 +71,7 @@ def from_cloud(
     opacity: float = 0.1,
     neighbours: int = 3,
 ) -> Gaussians:
-    """Round Gaussians at the points of a cloud, as wide as their neighbours are apart.
+    """Round Gaussians at the points of a cloud, as wide as the distance to their neighbours.
 
     The start of Kerbl et al., 3D Gaussian Splatting, 2023: the standard deviation is the root
     mean square distance to the three nearest points, limited to a tenth of the cloud's extent.
@@ -79,12 +79,12 @@ def from_cloud(
     Args:
         points_world: (N, 3) float, map units.
         colors: (N, 3) uint8, RGB.
-        sh_degree: harmonics to make room for, 0 to 3; all but the constant one start at zero.
+        sh_degree: highest degree of harmonics, 0 to 3; all but the constant one start at zero.
         opacity: of every Gaussian, 0..1.
-        neighbours: nearest points that a width is taken from.
+        neighbours: nearest points that determine a width.
 
     Raises:
-        GsbaError: no point at all, or points that are no numbers.
+        GsbaError: the cloud has no points, or points that are not finite.
     """
     points = np.asarray(points_world, np.float64)
     if len(points) == 0:

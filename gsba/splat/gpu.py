@@ -1,8 +1,8 @@
 """gsplat on CUDA, classic pinhole path, behind the interface of `gsba.splat.backend`.
 
-A stretch of training stays on the device: parameters and moments travel to it and back once.
-The authors of this file have run gsplat 1.5.3's Python side, on its own PyTorch versions of its
-CUDA kernels (tests/splat/test_gsplat.py), but not yet those kernels.
+A stretch of training stays on the device: parameters and moments are copied to it and back once.
+Tested with the Python side of gsplat 1.5.3 on its own PyTorch versions of its
+CUDA kernels (tests/splat/test_gsplat.py), but not yet with those kernels.
 """
 
 import os
@@ -30,11 +30,11 @@ class GsplatBackend:
     """Renders and trains by gsplat and PyTorch.
 
     Args:
-        device: of PyTorch.
+        device: device of PyTorch.
 
     Raises:
-        GsbaError: torch or gsplat is not installed, or there is no CUDA device, or no kernels
-            for it.
+        GsbaError: torch or gsplat is not installed, or there is no CUDA device, or its kernels
+            are missing.
     """
 
     name, stretch = "gsplat", 100
@@ -180,9 +180,9 @@ class GsplatBackend:
         return use * ((1 - ssim_weight) * (x - y).sign() - ssim_weight * slope) / image.numel()
 
     def _blur(self, image: Any) -> Any:
-        """By the window of SSIM, with black around the image (H, W, C).
+        """Convolve with the window of SSIM, with black around the image (H, W, C).
 
-        Not by a convolution: where those run in TF32, variances drown in rounding.
+        PyTorch's convolution is not used: in TF32, rounding would exceed the variances.
         """
         half = len(self._window) // 2
         for axis, edges in enumerate([(0, 0, 0, 0, half, half), (0, 0, half, half)]):
@@ -206,7 +206,7 @@ class GsplatBackend:
 
 
 def _require_kernels(torch: Any) -> None:
-    """Load gsplat's CUDA kernels, which it builds when they are first wanted.
+    """Load gsplat's CUDA kernels, which it builds when they are first used.
 
     Raises:
         GsbaError: no CUDA device, or no kernels.

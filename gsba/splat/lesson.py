@@ -1,4 +1,4 @@
-"""What one step of training shows a splat."""
+"""The view and learning rates of one training step."""
 
 from dataclasses import dataclass
 
@@ -10,11 +10,11 @@ from gsba.splat.camera import FaceCamera
 
 @dataclass(frozen=True, slots=True)
 class Lesson:
-    """One view, and how far to go to look like it."""
+    """A view to train on, and the learning rates of its step."""
 
     camera: FaceCamera
     truth: np.ndarray  # (H, W, 3) uint8, RGB
-    use: np.ndarray | None  # (H, W) bool, pixels that count; None = all
-    sh_degree: int  # of the harmonics, at most
+    use: np.ndarray | None  # (H, W) bool, pixels of the loss; None = all
+    sh_degree: int  # highest degree of the harmonics
     rates: adam.Rates
     number: int  # of the step, from 1

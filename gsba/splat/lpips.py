@@ -15,24 +15,26 @@ import numpy as np
 
 from gsba.log import GsbaError
 
-_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of the authors, for -1..1
+_CHANNEL_MEANS, _CHANNEL_SIGMAS = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # constants of
+# the authors, for values -1..1
 _LAYERS = re.compile(r"(?:net\.slice\d+|features)\.(\d+)\.(weight|bias)$")
 _HEADS = re.compile(r"(?:^|\.)lin(\d)\.model\.1\.weight$")
 _ALEX = ((0, 4, 2), (3, 1, 2), (6, 1, 1), (8, 1, 1), (10, 1, 1))  # layer, stride, padding
 _VGG = tuple((k, 1, 1) for k in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28))
-_POOLS = {"alex": (3, 6), "vgg": (5, 10, 17, 24)}  # layers that a pooling comes before
-_TAPS = {"alex": (0, 3, 6, 8, 10), "vgg": (2, 7, 14, 21, 28)}  # layers that are compared
-_LEAST = {"alex": 32, "vgg": 16}  # pixels of an image, or nothing is left to compare
+_POOLS = {"alex": (3, 6), "vgg": (5, 10, 17, 24)}  # layers preceded by a pooling
+_TAPS = {"alex": (0, 3, 6, 8, 10), "vgg": (2, 7, 14, 21, 28)}  # layers whose activations are
+# compared
+_MIN_SIZE_PX = {"alex": 32, "vgg": 16}  # least pixels of an image that leave something to compare
 
 
 class Lpips:
-    """The distance, on AlexNet or VGG16 as the weights are.
+    """The LPIPS distance, on AlexNet or VGG16 as given by the weights.
 
     Args:
         paths: files of weights; see above.
 
     Raises:
-        GsbaError: torch is not installed, or the files are no such weights.
+        GsbaError: torch is not installed, or the files hold no such weights.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -42,7 +44,9 @@ class Lpips:
             raise GsbaError("LPIPS needs torch: pip install 'gsba[splat]'") from None
         self._torch = torch
         names = ", ".join(map(str, paths))
-        state = {name: value for path in paths for name, value in _read(torch, path).items()}
+        state = {
+            name: value for path in paths for name, value in _read_weights(torch, path).items()
+        }
         layers = {m.groups(): v.float() for n, v in state.items() if (m := _LAYERS.search(n))}
         self._heads = {int(m[1]): v.float() for n, v in state.items() if (m := _HEADS.search(n))}
         self.net = "vgg" if ("28", "weight") in layers else "alex"
@@ -66,12 +70,12 @@ class Lpips:
 
         Args:
             image, truth: (H, W, 3), values 0..1.
-            use: (H, W) bool, pixels that count; the others are taken as equal in both images.
+            use: (H, W) bool, pixels that count; the others count as equal in both images.
 
         Raises:
             GsbaError: the images are too small for the network.
         """
-        torch, least = self._torch, _LEAST[self.net]
+        torch, least = self._torch, _MIN_SIZE_PX[self.net]
         if min(image.shape[:2]) < least:
             raise GsbaError(f"LPIPS on {self.net} needs faces of {least} pixels or more")
         if use is not None:
@@ -89,7 +93,9 @@ class Lpips:
         torch, found = self._torch, []
         operations = torch.nn.functional
         x = 2 * torch.from_numpy(np.moveaxis(np.asarray(image, np.float32), -1, 0).copy())[None] - 1
-        x = (x - torch.tensor(_SHIFT)[:, None, None]) / torch.tensor(_SCALE)[:, None, None]
+        x = (x - torch.tensor(_CHANNEL_MEANS)[:, None, None]) / torch.tensor(_CHANNEL_SIGMAS)[
+            :, None, None
+        ]
         window = 3 if self.net == "alex" else 2
         for layer, stride, padding in self._plan:
             if layer in _POOLS[self.net]:
@@ -100,10 +106,10 @@ class Lpips:
         return found
 
 
-def _read(torch: Any, path: Path) -> dict[str, Any]:
+def _read_weights(torch: Any, path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise GsbaError(f"{path}: no such file of LPIPS weights")
     try:
         return dict(torch.load(path, map_location="cpu", weights_only=True))
-    except Exception as error:  # of pickle, zipfile or torch, each in its own words
+    except Exception as error:  # pickle, zipfile and torch raise errors of many types
         raise GsbaError(f"{path}: not a file of weights; get it again") from error

@@ -1,4 +1,4 @@
-"""How close two images are: PSNR, SSIM, and the training loss made of L1 and SSIM.
+"""Similarity of two images: PSNR, SSIM, and the training loss of L1 and SSIM.
 
 SSIM as of Wang et al., Image Quality Assessment: From Error Visibility to Structural Similarity,
 2004: an 11 x 11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, values 0..1.
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 _Image = Any  # an array of NumPy or PyTorch
-_RADIUS, _SIGMA = 5, 1.5
+_WINDOW_RADIUS_PX, _WINDOW_SIGMA_PX = 5, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
 
 
@@ -31,13 +31,16 @@ def ssim(image: np.ndarray, truth: np.ndarray, use: np.ndarray | None = None) ->
 
     Args:
         image, truth: (H, W, C), values 0..1, at least 11 pixels high and wide.
-        use: (H, W) bool, pixels that count; the others are taken as equal in both images, and
+        use: (H, W) bool, pixels that count; the others count as equal in both images, and
             NaN is returned if no pixel with a whole window counts.
     """
     x, y = np.asarray(image, np.float64), np.asarray(truth, np.float64)
     if use is not None:
         x = np.where(use[..., None], x, y)
-    inner = (slice(_RADIUS, -_RADIUS), slice(_RADIUS, -_RADIUS))
+    inner = (
+        slice(_WINDOW_RADIUS_PX, -_WINDOW_RADIUS_PX),
+        slice(_WINDOW_RADIUS_PX, -_WINDOW_RADIUS_PX),
+    )
     values = similarity(x, y, _blur)[0][inner].mean(axis=-1)
     if use is not None:
         values = values[use[inner]]
@@ -49,7 +52,7 @@ def training_loss(
 ) -> tuple[float, np.ndarray]:
     """The loss (1 - w) L1 + w (1 - SSIM) of 3DGS, and its derivative (H, W, C) by the image.
 
-    SSIM is taken at every pixel, with black around the image, as the published trainer does.
+    SSIM is computed at every pixel, with black around the image, like the published trainer.
 
     Args:
         image, truth: (H, W, C) float32.
@@ -91,11 +94,11 @@ def window() -> np.ndarray:
     """Weights (11,) float64 of the window along one axis."""
     import cv2
 
-    return cv2.getGaussianKernel(2 * _RADIUS + 1, _SIGMA)[:, 0]
+    return cv2.getGaussianKernel(2 * _WINDOW_RADIUS_PX + 1, _WINDOW_SIGMA_PX)[:, 0]
 
 
 def _blur(image: np.ndarray) -> np.ndarray:
     import cv2
 
-    size = (2 * _RADIUS + 1, 2 * _RADIUS + 1)
-    return cv2.GaussianBlur(image, size, _SIGMA, borderType=cv2.BORDER_CONSTANT)
+    size = (2 * _WINDOW_RADIUS_PX + 1, 2 * _WINDOW_RADIUS_PX + 1)
+    return cv2.GaussianBlur(image, size, _WINDOW_SIGMA_PX, borderType=cv2.BORDER_CONSTANT)

@@ -12,7 +12,7 @@ from gsba.splat.camera import rig_cameras
 from gsba.splat.gaussians import Gaussians
 from gsba.types import FACES
 
-_PANORAMA_HFOV_DEG = 94.0  # of the faces a panorama is sampled from
+_PANORAMA_HFOV_DEG = 94.0  # of the faces that a panorama is sampled from
 
 
 def render_views(
@@ -52,5 +52,5 @@ def render_panorama(
 
 
 def to_uint8(color: np.ndarray) -> np.ndarray:
-    """Colours 0..1 as 0..255, limited and rounded."""
+    """Colours 0..1 as 0..255, clipped and rounded."""
     return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""`point_cloud.ply` as INRIA's 3D Gaussian Splatting lays it out, which every viewer opens.
+"""`point_cloud.ply` in the layout of INRIA's 3D Gaussian Splatting, which every viewer opens.
 
 Properties, all float32: `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3`.
 f_rest holds all coefficients of red, then green, then blue; opacity is a logit, scales are
@@ -24,14 +24,14 @@ _TYPES = {
     **dict.fromkeys(("uint", "uint32"), "<u4"),
     **dict.fromkeys(("int", "int32"), "<i4"),
 }
-_MAX_HEADER = 1 << 16  # bytes
+_MAX_HEADER_BYTES = 1 << 16  # bytes
 
 
 def write_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write a splat, beside and renamed.
+    """Write a splat, atomically by renaming.
 
     Raises:
-        GsbaError: the disk refuses.
+        GsbaError: the file cannot be written.
     """
     num = len(gaussians)
     names = _names(gaussians.sh.shape[1])
@@ -50,8 +50,8 @@ def read_ply(path: Path) -> Gaussians:
     """Read a splat of degree 0 to 3.
 
     Raises:
-        GsbaError: unreadable, no binary little-endian PLY of a splat, truncated, or holding
-            values that are not finite.
+        GsbaError: the file is unreadable, no binary little-endian PLY of a splat, truncated, or
+            holds values that are not finite.
     """
     try:
         data = path.read_bytes()
@@ -98,8 +98,9 @@ def _names(num_harmonics: int) -> list[str]:
 
 
 def _header(path: Path, data: bytes) -> tuple[int, np.dtype, int]:
-    """Number of vertices, their type, and where they start; vertices come first in the file."""
-    end = data.find(b"end_header\n", 0, _MAX_HEADER)
+    """Number of vertices, their type, and their offset in bytes; vertices come first in the
+    file."""
+    end = data.find(b"end_header\n", 0, _MAX_HEADER_BYTES)
     if not data.startswith(b"ply\n") or end < 0:
         raise GsbaError(f"{path}: not a PLY file, or its header is truncated")
     lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()[1:]]

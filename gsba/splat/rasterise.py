@@ -1,9 +1,9 @@
 """Render Gaussians on the CPU: colour, expected depth and alpha, with analytic gradients.
 
 The image model of Kerbl et al., 3D Gaussian Splatting for Real-Time Radiance Field Rendering,
-2023: splats sorted by depth and blended from near to far over black. A splat counts where its
+2023: splats sorted by depth and blended from near to far over black. A splat is blended where its
 alpha is 1/255 or more (its tiles and rows are bounded by exactly that ellipse), alpha is at most
-0.99, and a pixel that lets less than 1e-4 through takes no more.
+0.99, and a pixel that lets less than 1e-4 through receives no more splats.
 """
 
 import functools
@@ -24,7 +24,7 @@ from gsba.splat.gaussians import Gaussians, zeros_like
 class Rendering:
     """An image of a splat."""
 
-    color: np.ndarray  # (H, W, 3) float32, 0 = black; not limited above
+    color: np.ndarray  # (H, W, 3) float32, 0 = black; without upper limit
     depth: np.ndarray  # (H, W) float32, expected z in map units where alpha > 0, else 0
     alpha: np.ndarray  # (H, W) float32, 0..1
 
@@ -33,20 +33,20 @@ class Rendering:
 class Gradients:
     """Derivatives of a loss with respect to a splat."""
 
-    gaussians: Gaussians  # of every parameter
-    centres: np.ndarray  # (N, 2) float32, of the projected centres, per pixel
+    gaussians: Gaussians  # derivatives by every parameter
+    centres: np.ndarray  # (N, 2) float32, derivatives by the projected centres, per pixel
     seen: np.ndarray  # (N,) bool, Gaussians that reach into the image
 
 
 @dataclass(frozen=True, slots=True)
 class Tape:
-    """What a rendering leaves for its gradients."""
+    """Intermediate results of a rendering, kept for its gradients."""
 
     gaussians: Gaussians
     camera: FaceCamera
     sh_degree: int
     splats: np.ndarray  # (N, 10) float32, see _tiles
-    reach2: np.ndarray  # (N,) float32, 0 = not seen
+    reach2: np.ndarray  # (N,) float32, 0 = not rendered
     offsets: np.ndarray  # (N + 1,) int64, entries of each splat
     starts: np.ndarray  # (tiles + 1,) int64, rows of each tile
     owners: np.ndarray  # (E,) int32, splat of each row
@@ -65,14 +65,14 @@ def render(
     """Render a splat.
 
     Args:
-        gaussians: what to render.
+        gaussians: the splat.
         camera: a pinhole image.
-        sh_degree: harmonics to use; None = all there are.
+        sh_degree: highest degree of harmonics to use; None = all.
         near: least z of a Gaussian's mean, map units.
         num_threads: None = all cores. Results do not depend on it.
 
     Returns:
-        The image, and what `differentiate` needs.
+        The image, and the tape for `differentiate`.
     """
     degree = gaussians.usable_degree(sh_degree)
     num = len(gaussians)
@@ -114,7 +114,7 @@ def differentiate(
     """Gradients of a loss from its derivatives with respect to a rendering.
 
     Args:
-        tape: of that rendering.
+        tape: tape of that rendering.
         d_color: (H, W, 3).
         d_depth: (H, W), with respect to the expected depth; None = zero.
         d_alpha: (H, W); None = zero.

@@ -1,19 +1,19 @@
-"""Poses refined against a splat of their own frames, judged on frames that no splat has seen.
+"""Refinement of poses against a splat of their own frames, judged on held-out frames.
 
-Splat and poses take turns. The poses move by a few joint steps against the splat as it is, the
-map's own observations, the patches if there are any, and the priors, which hold the gauge. Then
-training goes on, once with the poses as they were and once as they moved, and evidence whose noise
-is known judges the move:
+Splat and poses are refined in turn. The poses move by a few joint steps against the fixed splat,
+the map's own observations, the patches if there are any, and the priors, which fix the gauge. Then
+training goes on, once with the old poses and once with the moved ones, and evidence with known
+noise judges the move:
 
-- Faces of whole panoramas that are neither trained on nor aligned to the splat: how much better
-  each of them looks. Both trainings have the same Gaussians, views and order. Density control
-  rests, because what it clones and prunes sends two trainings tenths of a dB apart, when a
-  twentieth of a pixel is worth hundredths.
-- Points of the map: by how much the cost of each one's observations falls. The poses may have been
-  fitted to them before, so a change that fitting six numbers per pose gains by chance says nothing.
+- Faces of held-out panoramas, neither trained on nor aligned to the splat: the gain in PSNR of each
+  of them. Both trainings have the same Gaussians, views and order. Density control rests, because
+  cloning and pruning separate two trainings by tenths of a dB, while a twentieth of a pixel is
+  worth hundredths.
+- Points of the map: the fall of the cost of each one's observations. The poses may have been fitted
+  to them before, so a change is ignored if fitting six numbers per pose gains as much by chance.
 
-A move is taken where both together are clearly for it; otherwise it is undone, and finer faces have
-their turn.
+A move is accepted if both together are clearly in its favour; otherwise it is undone, and finer
+faces follow.
 """
 
 import logging
@@ -44,40 +44,40 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """One joint move of all poses, and what held-out frames say of it."""
+    """One joint move of all poses, and its evidence from held-out frames."""
 
     size: int  # pixels of a face
-    psnr_stayed: float  # dB, mean of held-out faces, exposure aside, poses as they were
-    psnr_moved: float  # the same, trained and measured with the moved poses
-    psnr_sigma: float  # standard error of the difference of both, from face to face
+    psnr_stayed: float  # dB, mean of held-out faces after fitting gains, old poses
+    psnr_moved: float  # dB, mean of held-out faces, trained and measured with the moved poses
+    psnr_sigma: float  # standard error of the difference of both, over faces
     growth: float  # cost of the map's own observations after the move, over that before
-    growth_sigma: float  # its standard error, from point to point
-    evidence: float  # of both together for the move, in standard errors
-    turned_deg: float  # median turn of a pose
-    shifted: float  # median shift of a pose, map units
+    growth_sigma: float  # its standard error, over points
+    evidence: float  # for the move from both, in standard errors
+    turned_deg: float  # median rotation of a pose
+    shifted: float  # median translation of a pose, map units
     accepted: bool
 
 
 @dataclass(frozen=True, slots=True)
 class SplatResult:
-    """Poses and points after the last move that was taken."""
+    """Poses and points after the last accepted move."""
 
     adjustment: Solution
-    counts: tuple[Counts, ...]  # of frames: those the splat is trained on are kept
+    counts: tuple[Counts, ...]  # of frames: those that the splat is trained on are kept
     moves: tuple[Move, ...]
 
     @property
     def rounds(self) -> tuple[Round, ...]:
-        """Of the adjustment, the moves' with them."""
+        """Rounds of the adjustment, including the moves."""
         return self.adjustment.rounds
 
 
 @dataclass(frozen=True, slots=True)
 class _Progress:
-    """Where an interrupted refinement goes on."""
+    """State from which an interrupted refinement resumes."""
 
     level: int  # index into the sizes
-    turns: int  # moves made at this level; -1: its first training is still to come
+    turns: int  # moves made at this level; -1: before its first training
     world_T_rigs: np.ndarray  # (F, 4, 4)
     state: State
     moves: tuple[Move, ...]
@@ -97,17 +97,17 @@ def refine(
     """Refine a solved map against splats of its own frames, from coarse faces to fine.
 
     Args:
-        frames: panoramas or cube faces; the faces of all are held in memory, one size at a time.
-        keypoints: of all frames.
+        frames: panoramas or cube faces; all their faces are held in memory, one size at a time.
+        keypoints: keypoints of all frames.
         start: the solved map.
         problem: priors, families, loss, solver, splat; its threads render, too.
-        further: blocks that join each move, on the same keys.
-        checkpoint: file that keeps the turns made, and that they go on from; None = none.
-        key: what the turns depend on; a checkpoint of another key is not taken up.
-        optics: of the frames.
+        further: further blocks of each move, on the same keys.
+        checkpoint: file to store finished turns in and to resume from; None = none.
+        key: digest of the inputs; a checkpoint with another key is not resumed.
+        optics: lenses of the frames.
 
     Raises:
-        GsbaError: all frames are masked, or a splat that is no longer finite.
+        GsbaError: all frames are masked, or the splat is no longer finite.
     """
     chosen = problem.settings.splat
     usable = start.observations() >= problem.settings.rounds.min_observations
@@ -144,9 +144,9 @@ def _resume(checkpoint: Path | None, key: str) -> _Progress | None:
             return None
         progress = load_record(checkpoint, _Progress)
     except RecordError as error:
-        logger.warning("taking turns anew: %s", error)
+        logger.warning("the splat refinement starts anew: %s", error)
         return None
-    logger.info("going on after %d moves of %s", len(progress.moves), checkpoint)
+    logger.info("resuming after %d moves of %s", len(progress.moves), checkpoint)
     return progress
 
 
@@ -160,7 +160,7 @@ def _cloud(landmarks: Landmarks, keypoints: Keypoints, sh_degree: int) -> Gaussi
 
 
 class _Turns:
-    """What does not change from turn to turn, and the faces of one size."""
+    """Inputs that are constant over all turns, and the faces of one size."""
 
     def __init__(
         self,
@@ -178,7 +178,7 @@ class _Turns:
         self.captured: Captured
 
     def training(self, level: int) -> SplatSettings:
-        """Settings of the one training that all turns are parts of, at a level's size."""
+        """Settings of the training that all turns share, at a level's size."""
         chosen = self.settings.splat
         each = chosen.first_steps + chosen.moves * chosen.steps
         return SplatSettings(
@@ -208,11 +208,14 @@ class _Turns:
         fixed = settings.model_copy(update={"densify": False})
         stayed = self._trained(before.state, poses, fixed, chosen.steps)
         went = self._trained(before.state, moved, fixed, chosen.steps)
-        looks = [self._looks(stayed, poses, settings), self._looks(went, moved, settings)]
+        looks = [
+            self._held_out_psnrs(stayed, poses, settings),
+            self._held_out_psnrs(went, moved, settings),
+        ]
         costs = [self._point_costs(poses), self._point_costs(moved)]
         gains, savings = looks[1] - looks[0], costs[0] - costs[1]
         total, later = max(float(costs[0].sum()), 1e-12), float(costs[1].sum())
-        growth, chance = later / total, self._chance(min(total, later))
+        growth, chance = later / total, self._chance_gain(min(total, later))
         evidence = together(score(gains), score(savings, chance))
         after = self._placed(moved)
         accepted = evidence > chosen.min_sigmas and growth <= chosen.max_growth
@@ -221,7 +224,7 @@ class _Turns:
         move = Move(
             settings.face_size, float(looks[0].mean()), float(looks[1].mean()),
             standard_error(gains), growth, len(savings) * standard_error(savings) / total,
-            evidence, *_way(poses, moved), accepted,
+            evidence, *_median_move(poses, moved), accepted,
         )  # fmt: skip
         _log(move)
         tracks = self.solved.landmarks.tracks
@@ -239,7 +242,7 @@ class _Turns:
         )
 
     def adjusted(self, progress: _Progress) -> Solution:
-        """The solution with the last poses taken, points placed anew; or as it was."""
+        """The solution with the last accepted poses, points triangulated anew; or unchanged."""
         rounds = (*self.solved.rounds, *progress.rounds)
         if not any(move.accepted for move in progress.moves):
             return replace(self.solved, rounds=rounds)
@@ -251,7 +254,7 @@ class _Turns:
     def _moved(
         self, gaussians: Gaussians, world_T_rigs: np.ndarray
     ) -> tuple[np.ndarray, OptimizeResult]:
-        """Poses after a few joint steps, and the solver's way."""
+        """Poses after a few joint steps, and the solver's result."""
         settings = self.settings
         terms = self.problem.terms(replace(self.solved, world_T_rigs=world_T_rigs))
         values, landmarks = terms.values, self._block()
@@ -270,7 +273,7 @@ class _Turns:
         )
 
     def _point_costs(self, world_T_rigs: np.ndarray) -> np.ndarray:
-        """Robust cost (J,) of each point's observations, the point at its best under the poses."""
+        """Robust cost (J,) of each point's observations, the point optimised under the poses."""
         block, values = self._block(), adjustment.values_of(world_T_rigs)
         block.polish(values)
         costs = np.zeros(len(block.points_world))
@@ -279,8 +282,8 @@ class _Turns:
             costs += np.bincount(term.points, losses, len(costs))
         return costs
 
-    def _chance(self, cost: float) -> float:
-        """What of a total cost of observations fitting all poses to their noise gains."""
+    def _chance_gain(self, cost: float) -> float:
+        """Part of a cost of observations that fitting all poses to noise gains by chance."""
         tracks = self.solved.landmarks.tracks
         unknowns = 6 * len(np.unique(tracks.frames))
         redundancy = 2 * len(tracks) - 3 * tracks.num_points - unknowns
@@ -292,14 +295,16 @@ class _Turns:
         views = make_views(self.faces, world_T_rigs[self.split.training])
         return advance(state, views, settings, self.backend, steps)
 
-    def _looks(self, state: State, world_T_rigs: np.ndarray, settings: SplatSettings) -> np.ndarray:
-        """PSNR (V,) of each held-out face in dB, exposure aside."""
+    def _held_out_psnrs(
+        self, state: State, world_T_rigs: np.ndarray, settings: SplatSettings
+    ) -> np.ndarray:
+        """PSNR (V,) of each held-out face in dB, after fitting gains."""
         views = make_views(self.held_out, world_T_rigs[self.split.held_out])
         near = near_of(world_T_rigs[self.split.training], settings)
         return face_psnrs(state.gaussians, views, settings, near, self.backend)
 
     def _placed(self, world_T_rigs: np.ndarray) -> Landmarks:
-        """The map's points under other poses."""
+        """The map's points, triangulated under other poses."""
         return triangulation.place(
             self.solved.landmarks.tracks,
             self.keypoints,
@@ -315,7 +320,7 @@ class _Turns:
 
 
 def _log(move: Move) -> None:
-    gain, verdict = move.psnr_moved - move.psnr_stayed, "taken" if move.accepted else "undone"
+    gain, verdict = move.psnr_moved - move.psnr_stayed, "accepted" if move.accepted else "undone"
     logger.info(
         "faces of %d px: held out %+.4f dB (standard error %.4f), cost of observations times %.4f "
         "(%.4f): evidence %+.1f, %s",
@@ -323,8 +328,8 @@ def _log(move: Move) -> None:
     )  # fmt: skip
 
 
-def _way(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
-    """Median turn in degrees and median shift in map units between poses (F, 4, 4)."""
+def _median_move(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
+    """Median rotation in degrees and median translation in map units between poses (F, 4, 4)."""
     turns = np.einsum("fji,fjk->fik", before[:, :3, :3], after[:, :3, :3])
     cosines = (np.trace(turns, axis1=1, axis2=2) - 1) / 2
     shifts = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)

@@ -1,4 +1,4 @@
-"""From a run to splats: posed faces, start clouds, training, and metrics of held-out frames."""
+"""Splats from a run: posed faces, initial clouds, training, and metrics of held-out frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,27 +18,28 @@ from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.train import Images, Views, extent_of
 from gsba.types import FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
 
-_GATE = np.deg2rad(3.0)  # of an observation under poses that may have drifted
-_MAX_TIMES = 8  # samples of a panorama along a pixel of a face, at most
+_GATE_RAD = np.deg2rad(3.0)  # largest angle of an observation to its point, under poses that may
+# have drifted
+_MAX_OVERSAMPLING = 8  # largest number of samples of a panorama along a pixel of a face
 
 
 @dataclass(frozen=True, slots=True)
 class Faces:
-    """Pictures of some frames, the same views of each."""
+    """Pictures of some frames, with the same views of each."""
 
     views: tuple[View, ...]  # (K,)
     images: Images  # (W K,) of (h, w, 3) uint8 RGB, frame after frame
-    use: Images  # (W K,) of (h, w) bool, pixels that count
+    use: Images  # (W K,) of (h, w) bool, unmasked pixels
     turns: np.ndarray | None = None  # (W, 3, 3) rig_R_lenses of each frame; None = the rig's axes
 
     def poses(self, world_T_rigs: np.ndarray) -> np.ndarray:
-        """Of the rigs that the views are in, (W, 4, 4), from those of the frames."""
+        """Poses (W, 4, 4) of the rigs that the views belong to, from those of the frames."""
         return world_T_rigs if self.turns is None else turned_rigs(world_T_rigs, self.turns)
 
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """Which frames a splat is trained on and which it is measured on."""
+    """The frames that a splat is trained on, and those it is measured on."""
 
     training: np.ndarray  # (T,) int, frame indices
     held_out: np.ndarray  # (H,) int, frame indices: whole panoramas
@@ -71,7 +72,7 @@ def load_faces(frames: FrameSet, which: np.ndarray, size: int, optics: Optics = 
 
     Args:
         size: pixels of a whole face.
-        optics: of the frames.
+        optics: lenses of the frames.
     """
     rig, images, use = CubeRig(size, np.pi / 2), [], []
     views = optics.views(size)
@@ -87,32 +88,32 @@ def load_faces(frames: FrameSet, which: np.ndarray, size: int, optics: Optics = 
 
 
 def cut_faces(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.ndarray | None]:
-    """Faces whose pixels are means over their area, as a renderer's are.
+    """Faces whose pixels are means over their area, like a renderer's.
 
-    Sampling a panorama that was shrunk to the density of a face's middle would blur its corners,
+    Sampling a panorama shrunk to the density of a face's middle would blur the face's corners,
     where three times as many pixels share an angle.
 
     Returns:
-        (6, size, size, 3) uint8 RGB, and where they may be used, bool or None.
+        (6, size, size, 3) uint8 RGB, and their masks, bool or None.
     """
     if not frames.panoramic:
         whole = cubemap.native_rig(frames)
     else:
         times = -(-frames.width / (2 * np.pi) // rig.focal)  # until no denser in the middle
-        whole = replace(rig, size=int(np.clip(times, 1, _MAX_TIMES)) * rig.size)
+        whole = replace(rig, size=int(np.clip(times, 1, _MAX_OVERSAMPLING)) * rig.size)
     images, mask = cubemap.load(frames, frame, whole)
     if whole.size == rig.size:
         return images, mask
     shapes = [(rig.size, rig.size)] * len(images)
-    surely = None if mask is None else np.stack(_surely(mask, shapes))
+    surely = None if mask is None else np.stack(_masks_of_whole_pixels(mask, shapes))
     return np.stack(_averaged(images, shapes)), surely
 
 
 def cut_lens_faces(
     frames: FrameSet, frame: int, views: Sequence[View], optics: Optics
 ) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
-    """As `cut_faces`, of one lens each: images as large as the views, and masks or None."""
-    times = int(np.clip(-(-frames.width / (2 * np.pi) // views[0].focal), 1, _MAX_TIMES))
+    """Like `cut_faces`, of one lens each: images as large as the views, and masks or None."""
+    times = int(np.clip(-(-frames.width / (2 * np.pi) // views[0].focal), 1, _MAX_OVERSAMPLING))
     finer = tuple(view.finer(times) for view in views)
     cutter = optics.cutter(finer, frame)
     images, whole = lens_faces.cut(frames, frame, cutter), load_mask(frames, frame)
@@ -120,11 +121,13 @@ def cut_lens_faces(
     if times == 1:
         return images, masks
     shapes = [(view.width, view.height) for view in views]
-    return _averaged(images, shapes), None if masks is None else _surely(masks, shapes)
+    return _averaged(images, shapes), None if masks is None else _masks_of_whole_pixels(
+        masks, shapes
+    )
 
 
 def _averaged(images: Images, shapes: Sequence[tuple[int, int]]) -> list[np.ndarray]:
-    """Images resized to widths and heights, of means over areas where they shrink."""
+    """Images resized to widths and heights, by means over areas where they shrink."""
     import cv2
 
     way = cv2.INTER_AREA if shapes[0][1] < len(images[0]) else cv2.INTER_CUBIC
@@ -132,18 +135,18 @@ def _averaged(images: Images, shapes: Sequence[tuple[int, int]]) -> list[np.ndar
     return [cv2.resize(image, shape, interpolation=way) for image, shape in pairs]
 
 
-def _surely(masks: Images, shapes: Sequence[tuple[int, int]]) -> list[np.ndarray]:
-    """Masks resized to widths and heights, True where they are all over the pixel."""
+def _masks_of_whole_pixels(masks: Images, shapes: Sequence[tuple[int, int]]) -> list[np.ndarray]:
+    """Masks resized to widths and heights, True where all of a pixel is."""
     shares = _averaged([mask.astype(np.float32) for mask in masks], shapes)
     return [share > 0.999 for share in shares]
 
 
 def make_views(faces: Faces, world_T_rigs: np.ndarray) -> Views:
-    """Pose faces, dropping those with nothing to see.
+    """Posed faces, without those that are masked altogether.
 
     Args:
-        faces: of `load_faces`.
-        world_T_rigs: (W, 4, 4) of their frames.
+        faces: result of `load_faces`.
+        world_T_rigs: (W, 4, 4) poses of their frames.
     """
     each, poses = len(faces.views), faces.poses(world_T_rigs)
     seen = [v for v, use in enumerate(faces.use) if use.any()]
@@ -157,10 +160,10 @@ def make_views(faces: Faces, world_T_rigs: np.ndarray) -> Views:
 def place_points(
     reconstruction: Reconstruction, world_T_rigs: np.ndarray, frames: np.ndarray, gate_rad: float
 ) -> tuple[Landmarks, np.ndarray]:
-    """The run's points, triangulated anew from some frames under given poses.
+    """The run's points, triangulated again from some frames under given poses.
 
     Args:
-        reconstruction: whose observations are used.
+        reconstruction: source of the observations.
         world_T_rigs: (F, 4, 4) poses, in a world of their own; only those of `frames` are used.
         frames: frame indices.
         gate_rad: observations further from their point are left out.
@@ -196,16 +199,16 @@ def place_points(
 def start_cloud(
     reconstruction: Reconstruction, world_T_rigs: np.ndarray, frames: np.ndarray, sh_degree: int
 ) -> Gaussians:
-    """Gaussians at the run's points, placed in the world of any poses by one recipe.
+    """Gaussians at the run's points, triangulated under any poses by one recipe.
 
     Args:
         reconstruction, world_T_rigs, frames: see `place_points`.
-        sh_degree: of the Gaussians.
+        sh_degree: highest degree of the Gaussians' harmonics.
     """
-    landmarks, known = place_points(reconstruction, world_T_rigs, frames, float(_GATE))
+    landmarks, known = place_points(reconstruction, world_T_rigs, frames, float(_GATE_RAD))
     return from_cloud(landmarks.points_world, reconstruction.point_colors[known], sh_degree)
 
 
 def near_of(world_T_rigs: np.ndarray, settings: SplatSettings) -> float:
-    """Least z, map units, of a Gaussian that is seen by rigs (N, 4, 4)."""
+    """Least z, map units, of a Gaussian rendered by rigs (N, 4, 4)."""
     return settings.near * extent_of(world_T_rigs[:, :3, 3])

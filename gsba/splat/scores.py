@@ -1,4 +1,4 @@
-"""How close renderings of a splat are to what was captured: PSNR, SSIM, LPIPS of panoramas."""
+"""Similarity of renderings of a splat to captured pictures: PSNR, SSIM, LPIPS of panoramas."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -12,18 +12,18 @@ from gsba.splat.gaussians import Gaussians
 from gsba.splat.metrics import psnr, ssim
 from gsba.splat.train import Views
 
-_ROUNDED_DB = 60.0  # of a face at most: rounding to 8 bits alone leaves 59
+_MAX_PSNR_DB = 60.0  # upper limit of a face's PSNR: rounding to 8 bits alone leaves 59
 Distance = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """How close renderings of a panorama's six faces are to what was captured."""
+    """Similarity of renderings of a panorama's six faces to the captured ones."""
 
     psnr: float  # dB, over the pixels of all faces together
     ssim: float  # mean over faces
-    psnr_exposed: float  # dB, after the gain of each channel that fits best: exposure aside
-    lpips: float | None = None  # mean over faces; None = there were no weights
+    psnr_exposed: float  # dB, after fitting a gain for each channel
+    lpips: float | None = None  # mean over faces; None = no weights were given
 
 
 def measure(
@@ -38,11 +38,11 @@ def measure(
 
     Args:
         gaussians: the splat.
-        views: held-out faces; a panorama that is masked altogether has none, and no score.
+        views: held-out faces; a panorama that is masked altogether has no faces and no score.
         settings: degree of the harmonics.
         near: least z of a Gaussian, map units.
         backend: the renderer.
-        lpips: see `gsba.splat.lpips`; None = leave it out.
+        lpips: see `gsba.splat.lpips`; None = not measured.
 
     Raises:
         GsbaError: no panorama has a pixel to measure.
@@ -58,7 +58,7 @@ def measure(
 def face_psnrs(
     gaussians: Gaussians, views: Views, settings: SplatSettings, near: float, backend: Backend
 ) -> np.ndarray:
-    """PSNR of each view (V,) in dB, after the gain of each channel that fits its panorama best.
+    """PSNR of each view (V,) in dB, after fitting a gain for each channel of its panorama.
 
     Args:
         gaussians, views, settings, near, backend: see `measure`.
@@ -73,7 +73,7 @@ def face_psnrs(
             [image[use] for image, _, use in pairs], [real[use] for _, real, use in pairs]
         )
         for v, (image, real, use) in zip(rows, pairs, strict=True):
-            found[v] = min(psnr(np.clip(gains * image, 0, 1), real, use), _ROUNDED_DB)
+            found[v] = min(psnr(np.clip(gains * image, 0, 1), real, use), _MAX_PSNR_DB)
     return found
 
 
@@ -114,7 +114,7 @@ def _panoramas(views: Views) -> list[np.ndarray]:
     """Rows of the views of each panorama.
 
     Raises:
-        GsbaError: there is none.
+        GsbaError: there are none.
     """
     if len(views.cameras) == 0:
         raise GsbaError("no pixel to measure a splat on: all held-out frames are masked")
@@ -129,7 +129,7 @@ def _pairs(
     near: float,
     backend: Backend,
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of each view: rendering and truth (H, W, 3) float32, 0..1, and where they count, bool."""
+    """Rendering and truth (H, W, 3) float32, 0..1, and mask (H, W) bool of each view."""
     cameras = [views.cameras[v] for v in rows]
     renderings = backend.render(gaussians, cameras, settings.sh_degree, near)
     pairs = []
@@ -141,6 +141,6 @@ def _pairs(
 
 
 def _gains(images: Sequence[np.ndarray], truths: Sequence[np.ndarray]) -> np.ndarray:
-    """Gain of each channel (3,) that carries pixels (N, 3) closest to what they should be."""
+    """Gain of each channel (3,) that minimises the distance of pixels (N, 3) to their truth."""
     image, real = np.concatenate(images), np.concatenate(truths)
     return np.sum(image * real, axis=0) / np.maximum(np.sum(image * image, axis=0), 1e-9)

@@ -1,9 +1,9 @@
-"""Train a splat on posed faces: 3D Gaussian Splatting as published (Kerbl et al., 2023).
+"""Training of a splat on posed faces: 3D Gaussian Splatting as published (Kerbl et al., 2023).
 
 One view a step, in an order drawn anew for every round through the views; Adam; clone, split and
-prune; opacity resets. The published times are for 30,000 steps and shrink with the number asked
-for, down to sensible floors. Every random draw depends on the seed and the step alone, so that a
-run that was interrupted goes on to the same result.
+prune; opacity resets. The published schedule is for 30,000 steps and is scaled to the requested
+number, down to sensible minima. Every random draw depends on the seed and the step alone, so that
+an interrupted run resumes to the same result.
 """
 
 import logging
@@ -26,11 +26,13 @@ from gsba.store.records import RecordError, load_record, read_info, save_record
 
 logger = logging.getLogger(__name__)
 
-_PUBLISHED = 30_000  # steps that the published times are for
-_COPIES = 8  # of all parameters at once: gradients, two moments, and what density control makes
-_CHECK_EVERY = 20  # steps between looks for values that are not finite, at ends of stretches
+_PUBLISHED_STEPS = 30_000  # steps of the published schedule
+_PARAMETER_COPIES = 8  # copies of all parameters in memory: gradients, two moments, and those of
+# density control
+_STEPS_BETWEEN_CHECKS = 20  # steps between checks for values that are not finite, at ends of
+# stretches
 
-Images = Sequence[np.ndarray] | np.ndarray  # of sizes of their own, or of one
+Images = Sequence[np.ndarray] | np.ndarray  # of individual sizes, or of one size
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +41,12 @@ class Views:
 
     cameras: Sequence[FaceCamera]  # (V,)
     images: Images  # (V,) of (H, W, 3) uint8, RGB
-    use: Images | None  # (V,) of (H, W) bool, pixels that count; None = all
-    panoramas: np.ndarray  # (V,) int, which panorama each is a part of
+    use: Images | None  # (V,) of (H, W) bool, pixels of the loss; None = all
+    panoramas: np.ndarray  # (V,) int, panorama that each is a part of
 
     @property
     def num_pixels(self) -> int:
-        """How many count."""
+        """Number of pixels of the loss."""
         if self.use is not None:
             return sum(int(np.count_nonzero(use)) for use in self.use)
         return sum(camera.width * camera.height for camera in self.cameras)
@@ -60,7 +62,7 @@ class State:
     pull: Pull
 
     def copy(self) -> "State":
-        """With arrays of its own: a step may change those of its state in place."""
+        """A state with arrays of its own: a step may change those of its state in place."""
         rows = np.arange(len(self.gaussians))
         pull = Pull(self.pull.sums.copy(), self.pull.counts.copy())
         return State(self.step, self.gaussians.select(rows), self.moments.select(rows), pull)
@@ -68,29 +70,29 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """When what happens, in steps."""
+    """The schedule of training, in steps."""
 
     densify_from: int
     densify_until: int
     densify_every: int
     reset_every: int  # opacities
-    degree_every: int  # one more degree of the harmonics
+    degree_every: int  # steps until one more degree of the harmonics
 
 
 def times_for(iterations: int) -> Times:
-    """The published times, scaled to a number of steps."""
-    scale = iterations / _PUBLISHED
+    """The published schedule, scaled to a number of steps."""
+    scale = iterations / _PUBLISHED_STEPS
     return Times(
         densify_from=max(round(500 * scale), 100),
         densify_until=iterations // 2,
         densify_every=min(max(round(100 * scale), 50), 100),
-        reset_every=max(round(3000 * scale), 3000),  # short trainings cannot recover from one
+        reset_every=max(round(3000 * scale), 3000),  # short trainings cannot recover from a reset
         degree_every=max(round(1000 * scale), 1),
     )
 
 
 def extent_of(places: np.ndarray) -> float:
-    """Radius of the region that cameras at (N, 3) are in, times 1.1; 1 for a single place."""
+    """Radius of the region of cameras at (N, 3), times 1.1; 1 for a single place."""
     radius = float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
     return 1.1 * radius if radius > 0 else 1.0
 
@@ -107,17 +109,17 @@ def train(
     """Train a splat.
 
     Args:
-        start: e.g. of `from_cloud`.
-        views: what it shall look like.
+        start: initial Gaussians, e.g. of `from_cloud`.
+        views: views to train on.
         settings: length, rates and thresholds.
         backend: the renderer.
-        checkpoint: file that keeps the training, and that it goes on from; None = none.
-        key: what the training depends on; a checkpoint of another key is not taken up.
+        checkpoint: file to store the training in and to resume from; None = none.
+        key: digest of the inputs; a checkpoint with another key is not resumed.
         watch: called with the steps made and the splat, after each stretch of the backend's.
 
     Raises:
-        GsbaError: all pixels masked, no Gaussian, or parameters that are no longer finite; the
-            last checkpoint with finite ones stays.
+        GsbaError: all pixels are masked, there is no Gaussian, or parameters are no longer finite;
+            the last checkpoint with finite ones is kept.
     """
     state = _resume(checkpoint, key)
     if state is None:
@@ -130,7 +132,7 @@ def train(
             continue  # made together with an earlier one
         state = trainer.advance(state, settings.iterations)
         last = state.step == settings.iterations
-        if state.step % _CHECK_EVERY == 0 or last:
+        if state.step % _STEPS_BETWEEN_CHECKS == 0 or last:
             _require_finite(state, checkpoint)
         if watch is not None:
             watch(state.step, state.gaussians)
@@ -142,14 +144,14 @@ def train(
 
 
 def begin(start: Gaussians, settings: SplatSettings) -> State:
-    """A training that has not made a step; where there are too many Gaussians, a part of them.
+    """A training before its first step; if there are too many Gaussians, with a sample of them.
 
     Args:
-        start: e.g. of `from_cloud`.
-        settings: seed and the most Gaussians; None = all of them.
+        start: initial Gaussians, e.g. of `from_cloud`.
+        settings: seed and limit on Gaussians; None = no limit.
 
     Raises:
-        GsbaError: no Gaussian.
+        GsbaError: there is no Gaussian.
     """
     if len(start) == 0:
         raise GsbaError("no Gaussian to start from")
@@ -165,10 +167,10 @@ def begin(start: Gaussians, settings: SplatSettings) -> State:
 def advance(
     state: State, views: Views, settings: SplatSettings, backend: Backend, steps: int
 ) -> State:
-    """Train for some steps; the state passed in stays as it is.
+    """Train for some steps; the given state is not changed.
 
     Raises:
-        GsbaError: all pixels masked, or parameters that are no longer finite.
+        GsbaError: all pixels are masked, or parameters are no longer finite.
     """
     trainer, state = Trainer(views, settings, backend), state.copy()
     end = state.step + steps
@@ -190,36 +192,40 @@ def _resume(checkpoint: Path | None, key: str) -> State | None:
         return None
     try:
         if read_info(checkpoint).get("key") != key:
-            logger.info("%s is of other inputs or settings: training anew", checkpoint)
+            logger.info(
+                "%s was made with other inputs or settings: training starts anew", checkpoint
+            )
             return None
         state = load_record(checkpoint, State)
     except RecordError as error:
-        logger.warning("training anew: %s", error)
+        logger.warning("training starts anew: %s", error)
         return None
-    logger.info("going on from step %d of %s", state.step, checkpoint)
+    logger.info("resuming at step %d of %s", state.step, checkpoint)
     return state
 
 
 def most_gaussians(views: Views, settings: SplatSettings, backend: Backend) -> tuple[int, str]:
-    """How many Gaussians a training may have, and what allows no more.
+    """Limit on the number of Gaussians of a training, and its reason.
 
-    As many as settings say. Else they have at most as many parameters as pixels have values, for
-    more could show anything between the views; and they fill at most half of the memory. A start
-    that has more stays as it is.
+    The limit is that of the settings, if given. Otherwise Gaussians have at most as many parameters
+    as pixels have values, as more would be undetermined between the views; and they fill at most
+    half of the memory. An initial cloud with more is kept.
     """
     if settings.max_gaussians is not None:
         return settings.max_gaussians, "allowed"
     num = num_parameters(settings.sh_degree)
     pixels = views.num_pixels
     determined = max(3 * pixels // num, 1)
-    held = max(backend.memory_bytes // 2 // (_COPIES * np.dtype(np.float32).itemsize * num), 1)
+    held = max(
+        backend.memory_bytes // 2 // (_PARAMETER_COPIES * np.dtype(np.float32).itemsize * num), 1
+    )
     if determined <= held:
         return determined, f"that {pixels} pixels determine"
     return held, f"that half of {backend.memory_bytes / 1e9:.1f} GB of memory holds"
 
 
 class Trainer:
-    """What does not change between steps.
+    """Inputs that are constant over all steps.
 
     Raises:
         GsbaError: all pixels are masked.
@@ -236,7 +242,8 @@ class Trainer:
         self.capped = False
 
     def advance(self, state: State, end: int) -> State:
-        """A stretch of steps, not beyond `end`; arrays of the state may be changed in place."""
+        """Take a stretch of steps, at most to `end`; arrays of the state may be changed in
+        place."""
         settings, times = self.settings, self.times
         gaussians, moments, pull = state.gaussians, state.moments, state.pull
         step = self._stop(state.step, end)
@@ -254,14 +261,15 @@ class Trainer:
         return State(step, gaussians, moments, pull)
 
     def _stop(self, step: int, end: int) -> int:
-        """Where a stretch from some step on ends: where density control may be due, or earlier."""
+        """End of a stretch from a step: the next step at which density control may be due, or
+        earlier."""
         times = self.times
         rhythms = (self.backend.stretch, times.densify_every, times.reset_every)
         stops = [end, *(step // every * every + every for every in rhythms)]
         return min([*stops, times.densify_until] if step < times.densify_until else stops)
 
     def _lesson(self, number: int) -> Lesson:
-        """What is learned in a step, counted from 1."""
+        """The view and rates of a step, counted from 1."""
         views, view = self.views, self._view(number - 1)
         return Lesson(
             views.cameras[view],

@@ -1,7 +1,7 @@
-"""The coarse trajectory: its files, its clock, its pieces, and what images say of its steps.
+"""The coarse trajectory: its files, clock and pieces, and checks of its steps against images.
 
-Takes files of other programs, frames' times, and relative poses that images show.
-Gives a pose for every frame, and which steps to believe.
+Takes files of other programs, frames' times, and relative poses from images.
+Gives a pose for every frame, and the steps that images confirm or contradict.
 """
 
 from gsba.trajectory.association import associate, matched_in_time, without_trajectory

@@ -12,22 +12,23 @@ from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
 
 _log = logging.getLogger(__name__)
 
-_SHARED = 0.5  # part of the frames or of the entries that must lie in the other's span
-_GRID_TOLERANCE = 0.1  # of the shortest interval: how well times must meet to find an offset
-# Beyond an end: the stretch whose velocity is continued, and the time constants with which its two
-# parts fade. Chosen by predicting real SLAM output of walks 0.1 to 4 s ahead: people keep walking
-# but do not keep turning.
+_MIN_SHARED_SPAN = 0.5  # least part of the frames or of the entries within the other's span
+_GRID_TOLERANCE = 0.1  # tolerance of coinciding times when an offset is searched, in shortest
+# intervals
+# Extrapolation beyond an end: duration from which the velocity is taken, and time constants with
+# which its two parts fade. Chosen by predicting real SLAM output of walks 0.1 to 4 s ahead: people
+# keep walking but do not keep turning.
 _VELOCITY_S = 0.5
 _TRANSLATION_FADE_S = 10.0
 _ROTATION_FADE_S = 1.0
 
 
 def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) -> CoarsePoses:
-    """Give each frame the trajectory's pose at its time, interpolated or extrapolated if need be.
+    """Give each frame the trajectory's pose at its time, interpolated or extrapolated if needed.
 
     Between entries rotations are slerped and positions linear. Beyond the ends the velocity there
-    is continued and fades out. A frame counts as seen by the SLAM if an entry lies within half an
-    interval of frames or entries, whichever is shorter.
+    is continued and fades out. A frame counts as tracked by the SLAM if an entry lies within half
+    an interval of frames or entries, whichever is shorter.
 
     Args:
         frames: F frames.
@@ -36,8 +37,8 @@ def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) 
             exactly one offset must make all times meet; that one is then used, with a warning.
 
     Raises:
-        GsbaError: no overlap in time, and no single offset that explains it; times in another
-            unit; next to no pose in the frames' time.
+        GsbaError: no overlap in time, and no single offset that explains it; times in another unit;
+            hardly any pose within the frames' time.
     """
     entries = trajectory.timestamps
     refuse_intervals(frames.timestamps, entries)
@@ -51,18 +52,18 @@ def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) 
     sources = np.where(
         seen, PoseSource.SLAM, np.where(outside, PoseSource.EXTRAPOLATED, PoseSource.INTERPOLATED)
     ).astype(np.uint8)
-    _report(frames, sources, times, entries, settings.max_interpolation_s)
+    _log_sources(frames, sources, times, entries, settings.max_interpolation_s)
     return CoarsePoses(poses_at(trajectory, times), sources, offset)
 
 
 def without_trajectory(frames: FrameSet) -> CoarsePoses:
-    """Placeholder poses where there is no trajectory: one unit ahead for every frame."""
+    """Placeholder poses for runs without a trajectory: one unit ahead for every frame."""
     positions = np.outer(np.arange(len(frames)), [0.0, 0.0, 1.0])
     poses = pose(np.tile(np.eye(3), (len(frames), 1, 1)), positions)
     return CoarsePoses(poses, np.full(len(frames), PoseSource.NONE, np.uint8), 0.0)
 
 
-def _report(
+def _log_sources(
     frames: FrameSet,
     sources: np.ndarray,
     times: np.ndarray,
@@ -92,9 +93,9 @@ def _report(
 
 
 def _clock_offset(frame_times: np.ndarray, entries: np.ndarray, stated: float | None) -> float:
-    """Seconds to add to frame times so that they are on the trajectory's clock."""
-    shared = _shared(frame_times + (stated or 0.0), entries)
-    if shared >= _SHARED or (stated is not None and shared > 0):
+    """Offset to add to frame times to reach the trajectory's clock, seconds."""
+    shared = _shared_span(frame_times + (stated or 0.0), entries)
+    if shared >= _MIN_SHARED_SPAN or (stated is not None and shared > 0):
         return stated or 0.0
     ranges = (
         f"frames span {span(frame_times + (stated or 0.0))} s, the trajectory {span(entries)} s"
@@ -122,7 +123,7 @@ def _clock_offset(frame_times: np.ndarray, entries: np.ndarray, stated: float | 
     )
 
 
-def _shared(times: np.ndarray, entries: np.ndarray) -> float:
+def _shared_span(times: np.ndarray, entries: np.ndarray) -> float:
     """Part of the frames in the trajectory's span or of the entries in the frames', the larger."""
     half = _half_interval(times, entries)
     frames_in = np.mean((times >= entries[0] - half) & (times <= entries[-1] + half))
@@ -170,14 +171,14 @@ def poses_at(trajectory: Trajectory, times: np.ndarray) -> np.ndarray:
         last = Rotation.from_matrix(world_T_rigs[end, :3, :3])
         turn = (Rotation.from_matrix(world_T_rigs[other, :3, :3]).inv() * last).as_rotvec()
         step = world_T_rigs[end, :3, 3] - world_T_rigs[other, :3, 3]
-        turned = _faded(ahead, _ROTATION_FADE_S) * turn / reach[other]
+        turned = _faded_duration(ahead, _ROTATION_FADE_S) * turn / reach[other]
         rotations[beyond] = last * Rotation.from_rotvec(turned)
-        moved = _faded(ahead, _TRANSLATION_FADE_S) * step / reach[other]
+        moved = _faded_duration(ahead, _TRANSLATION_FADE_S) * step / reach[other]
         positions[beyond] = world_T_rigs[end, :3, 3] + moved
     return pose(rotations.as_matrix(), positions)
 
 
-def _faded(duration: np.ndarray, time_constant: float) -> np.ndarray:
+def _faded_duration(duration: np.ndarray, time_constant: float) -> np.ndarray:
     """Seconds at full speed that equal `duration` seconds of exponentially fading speed."""
     return -time_constant * np.expm1(-duration / time_constant)
 

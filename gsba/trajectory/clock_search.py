@@ -1,4 +1,5 @@
-"""Which clock makes a trajectory turn as the images do: a search on a grid, then least squares."""
+"""Search for the clock under which trajectory and images rotate alike: a grid, then least
+squares."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,27 +9,29 @@ import numpy as np
 from gsba.geometry import quaternion_from_rotation
 from gsba.types import Trajectory
 
-_MAX_STEPS = 600  # more are merged into longer ones: people turn slowly
-_MIN_STEP_S = 0.2  # shortest after merging
-_SPACING = 0.25  # of a step, between offsets tried
-_MAX_RATE = 0.03  # largest deviation of the rate that is tried
-_RATE_SIGMA = 0.02  # what is expected of it
-_TRIED = 5  # candidates of the grid
-_MOST_TRIED, _MOST_RATES = 60_000, 100  # clocks on the grid, and rates among them
-_MOST_INSTANTS = 200_000  # at which angular velocities are had
-_ITERATIONS = 20
-_WIDTH = 2.0  # of the loss, standard deviations
-_MIN_SIGMA = np.deg2rad(0.03)  # of a rotation, per axis: images know no better
-_ROUGH_SIGMA = np.deg2rad(1.0)  # least of it on the grid
-_QUIET, _QUIET_LENGTH = 0.4, 1.367  # quantile that noise is read from; of unit Gaussian 3-vectors
-_SCANNED = 41  # shifts within a step of the best, for its uncertainty
-_INFLATION = 3.0  # of standard deviations
-_CERTAIN = 4.0  # standard deviations within which no shift may do as well
+_MAX_STEPS = 600  # largest number of steps; more are merged, as people turn slowly
+_MIN_STEP_S = 0.2  # least duration of a merged step
+_SPACING_STEPS = 0.25  # spacing of tried offsets, in steps
+_MAX_RATE_DEVIATION = 0.03  # largest tried deviation of the rate from one
+_RATE_SIGMA = 0.02  # prior standard deviation of the rate
+_NUM_CANDIDATES = 5  # candidates taken from the grid
+_MAX_CLOCKS, _MAX_RATES = 60_000, 100  # largest number of clocks on the grid, and of rates among
+# them
+_MAX_INSTANTS = 200_000  # largest number of instants with an angular velocity
+_NUM_ITERATIONS = 20  # of least squares
+_LOSS_WIDTH_SIGMAS = 2.0  # width of the loss, standard deviations
+_MIN_SIGMA_RAD = np.deg2rad(0.03)  # least noise of a rotation per axis: images are no more accurate
+_MIN_GRID_SIGMA_RAD = np.deg2rad(1.0)  # least noise of a rotation on the grid
+_NOISE_QUANTILE, _UNIT_NOISE_QUANTILE = 0.4, 1.367  # quantile from which noise is estimated; its
+# value for unit Gaussian 3-vectors
+_NUM_SHIFTS = 41  # shifts within one step of the best, tried for its uncertainty
+_SIGMA_INFLATION = 3.0  # factor on standard deviations
+_CERTAIN_SIGMAS = 4.0  # standard deviations beyond which every shift must fit worse
 
 
 @dataclass(frozen=True, slots=True)
 class Turns:
-    """Rotations of the camera between pairs of instants, by the images."""
+    """Rotations of the camera between pairs of instants, estimated from images."""
 
     times: np.ndarray  # (N, 2) float64, seconds on the frames' clock
     rotvecs: np.ndarray  # (N, 3) float64, radians, first_R_second
@@ -38,27 +41,27 @@ class Turns:
 
     @property
     def middle(self) -> float:
-        """Instant that parameters are about."""
+        """Instant that shift and rate refer to, seconds."""
         return float(self.times.mean())
 
     @property
     def ends(self) -> np.ndarray:
-        """First and last instant (2,), from the middle."""
+        """First and last instant (2,), relative to the middle, seconds."""
         return np.array([self.times.min(), self.times.max()]) - self.middle
 
     @property
     def step(self) -> float:
-        """Median duration in seconds."""
+        """Median duration of a turn, seconds."""
         return float(np.median(np.diff(self.times, axis=1)))
 
 
 def merged(timestamps: np.ndarray, f_R_nexts: np.ndarray, verified: np.ndarray) -> Turns:
-    """Turns from the steps of frames, short ones put together.
+    """Turns from the steps of frames, short ones merged.
 
     Args:
         timestamps: (F,) seconds.
-        f_R_nexts: (F - 1, 3, 3) rotations between frames that follow one another.
-        verified: (F - 1,) bool, which of them are known.
+        f_R_nexts: (F - 1, 3, 3) rotations between consecutive frames.
+        verified: (F - 1,) bool, True for known rotations.
     """
     from scipy.spatial.transform import Rotation
 
@@ -91,12 +94,12 @@ class ClockFit:
         self._onward = _log(_product(_conjugate(self._at[:-1]), self._at[1:]))
         self._seen = _exp(turns.rotvecs)
         typical = float(np.quantile(np.linalg.norm(turns.rotvecs, axis=1), 0.75))
-        self._rough_sigma = max(0.5 * typical, _ROUGH_SIGMA)
+        self._rough_sigma = max(0.5 * typical, _MIN_GRID_SIGMA_RAD)
 
     def residuals(self, parameters: np.ndarray) -> np.ndarray:
-        """Rotations in radians from what the images say to what the trajectory says.
+        """Rotation residuals in radians, from the images' to the trajectory's.
 
-        Where it has no poses, it says that nothing turns.
+        Outside its span the trajectory counts as not rotating.
 
         Args:
             parameters: (..., 2) shift and rate.
@@ -113,14 +116,15 @@ class ClockFit:
         return np.where(inside[..., None], found, -self.turns.rotvecs)
 
     def _rotations(self, times: np.ndarray) -> np.ndarray:
-        """Quaternions (..., 4) of the trajectory in its span, turning evenly between entries."""
+        """Quaternions (..., 4) of the trajectory in its span, at constant angular velocity between
+        entries."""
         before = np.clip(np.searchsorted(self._entries, times) - 1, 0, len(self._onward) - 1)
         span = self._entries[before + 1] - self._entries[before]
         share = (times - self._entries[before]) / span
         return _product(self._at[before], _exp(share[..., None] * self._onward[before]))
 
     def cost(self, parameters: np.ndarray, sigma: float) -> float:
-        """Mean disagreement of a step, from 0 to 1 (Geman and McClure, 1987).
+        """Mean bounded residual of a step, from 0 to 1 (Geman and McClure, 1987).
 
         Args:
             parameters: (2,) shift and rate.
@@ -131,19 +135,17 @@ class ClockFit:
     def refine(
         self, start: np.ndarray, with_rate: bool = True, widening: float = 3.0
     ) -> np.ndarray:
-        """Parameters (2,) of the best agreement around a start, under a Cauchy loss.
-
-        Args:
-            start: (2,) where to begin.
-            with_rate: find the rate, too.
-            widening: how much wider than noise the loss is at first.
+        """Parameters (2,) of the best fit around a start, under a Cauchy loss.
+        start: (2,) initial shift and rate.
+        with_rate: estimate the rate, too.
+        widening: initial width of the loss, relative to the noise.
         """
         parameters, free = start.copy(), 1 + with_rate
         residuals = self.residuals(parameters)
         sigma, damping = widening * noise(residuals), 1e-3
-        for _ in range(_ITERATIONS):
+        for _ in range(_NUM_ITERATIONS):
             jacobian, prior = self._jacobian(parameters)[..., :free], self._prior(free)
-            weights = 1 / (1 + np.sum(residuals**2, axis=1) / (_WIDTH * sigma) ** 2)
+            weights = 1 / (1 + np.sum(residuals**2, axis=1) / (_LOSS_WIDTH_SIGMAS * sigma) ** 2)
             normal = np.einsum("n,nij,nik->jk", weights, jacobian, jacobian)
             slope = np.einsum("n,nij,ni->j", weights, jacobian, residuals)
             slope[1:] += prior[1:, 1:] @ (parameters[1:free] - 1) * sigma**2
@@ -164,16 +166,17 @@ class ClockFit:
         return parameters
 
     def covariance(self, parameters: np.ndarray, with_rate: bool = True) -> np.ndarray:
-        """Covariance (2, 2) of the parameters; a rate that is held is exact.
+        """Covariance (2, 2) of the parameters; a fixed rate is exact.
 
-        Residuals of steps that follow one another correlate, since trajectories drift smoothly:
-        after Newey and West (Econometrica 55, 1987), but never below what independent ones give,
-        nor below what shifts that do nearly as well say. Inflated as measured on simulated drift.
+        Residuals of consecutive steps correlate, since trajectories drift smoothly: the estimate
+        follows Newey and West (Econometrica 55, 1987), but is never below that of independent
+        residuals, nor below the spread of shifts that fit nearly as well. It is inflated as
+        measured on simulated drift.
         """
         residuals, free = self.residuals(parameters), 1 + with_rate
         sigma = noise(residuals)
         jacobian = self._jacobian(parameters)[..., :free]
-        weights = 1 / (1 + np.sum(residuals**2, axis=1) / (_WIDTH * sigma) ** 2)
+        weights = 1 / (1 + np.sum(residuals**2, axis=1) / (_LOSS_WIDTH_SIGMAS * sigma) ** 2)
         normal = np.einsum("n,nij,nik->jk", weights, jacobian, jacobian)
         normal += self._prior(free) * sigma**2 + 1e-15 * np.eye(free)
         pulls = np.einsum("n,nij,ni->nj", weights, jacobian, residuals)
@@ -185,10 +188,10 @@ class ClockFit:
         inverse, choices = np.linalg.inv(normal), np.zeros((2, 2, 2))
         choices[:, :free, :free] = sigma**2 * inverse, inverse @ spread @ inverse
         larger = max(choices, key=self.time_sigma)
-        return larger * max(_INFLATION**2, self._width(parameters) ** 2 / larger[0, 0])
+        return larger * max(_SIGMA_INFLATION**2, self._width(parameters) ** 2 / larger[0, 0])
 
     def settle(self, parameters: np.ndarray, with_rate: bool = True) -> np.ndarray:
-        """The best of the minima within a step: entries make the agreement jagged."""
+        """The best of the minima within a step: the trajectory's entries make the loss jagged."""
         for _ in range(2):
             shifts, losses, sigma = self._profile(parameters)
             moved = parameters + np.array([shifts[np.argmin(losses)], 0.0])
@@ -200,24 +203,24 @@ class ClockFit:
         return parameters
 
     def _profile(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Shifts (n,) up to a step, the loss under each, and the least noise.
+        """Shifts (n,) up to one step, the loss under each, and the least noise.
 
-        The loss is bounded: one outlier more or less must not outweigh what all others say.
+        The loss is bounded: one outlier more or less must not outweigh all inliers.
         """
-        shifts = self.turns.step * np.linspace(-1, 1, _SCANNED)
-        tried = parameters + np.column_stack([shifts, np.zeros(_SCANNED)])
+        shifts = self.turns.step * np.linspace(-1, 1, _NUM_SHIFTS)
+        tried = parameters + np.column_stack([shifts, np.zeros(_NUM_SHIFTS)])
         residuals = self.residuals(tried)
         sigma = min(map(noise, residuals))
-        losses = [_WIDTH**2 * len(r) * _bounded(r, sigma) for r in residuals]
+        losses = [_LOSS_WIDTH_SIGMAS**2 * len(r) * _bounded(r, sigma) for r in residuals]
         return shifts, np.array(losses), sigma
 
     def _width(self, parameters: np.ndarray) -> float:
-        """Standard deviation of the shift, from how far off one does nearly as well."""
+        """Standard deviation of the shift, from the range of shifts that fit nearly as well."""
         shifts, losses, _ = self._profile(parameters)
         here = losses[len(losses) // 2]
-        as_good = np.abs(shifts[losses < here + _CERTAIN**2])
+        as_good = np.abs(shifts[losses < here + _CERTAIN_SIGMAS**2])
         spacing = float(shifts[1] - shifts[0])
-        return max(float(as_good.max(initial=0)) - spacing, 0.0) / _CERTAIN
+        return max(float(as_good.max(initial=0)) - spacing, 0.0) / _CERTAIN_SIGMAS
 
     def time_sigma(self, covariance: np.ndarray) -> float:
         """Standard deviation in seconds of an instant's time, at the worse end of the video."""
@@ -233,13 +236,15 @@ class ClockFit:
 
         Args:
             start: the clock in the middle of the grid.
-            reach_s: largest offset from it that is tried. Steps of a fraction of a second are not
-                searched as far: the grid has a bounded size, whatever the times are.
+            reach_s: largest tried difference of the offset. Steps of a fraction of a second are
+                searched less far: the size of the grid is bounded, whatever the times are.
         """
-        spacing = _SPACING * self.turns.step
-        rates = max(round(min(_MAX_RATE * self.turns.ends[1] / spacing, _MOST_RATES / 2)), 1)
-        rates = _MAX_RATE * np.arange(-rates, rates + 1) / rates
-        most = round(min(reach_s / spacing, _MOST_TRIED / len(rates) / 2))
+        spacing = _SPACING_STEPS * self.turns.step
+        rates = max(
+            round(min(_MAX_RATE_DEVIATION * self.turns.ends[1] / spacing, _MAX_RATES / 2)), 1
+        )
+        rates = _MAX_RATE_DEVIATION * np.arange(-rates, rates + 1) / rates
+        most = round(min(reach_s / spacing, _MAX_CLOCKS / len(rates) / 2))
         shifts = spacing * np.arange(-most, most + 1)
         tried = np.stack(np.meshgrid(shifts, rates), axis=-1).reshape(-1, 2) + start
         lookup = self._angular_velocity(spacing, self.turns.middle + start[0], shifts[-1])
@@ -249,21 +254,20 @@ class ClockFit:
             if all(self.apart(parameters, other) > 2.5 * spacing for other in chosen):
                 chosen.append(parameters)
                 yield parameters
-            if len(chosen) == _TRIED:
+            if len(chosen) == _NUM_CANDIDATES:
                 return
 
     def _angular_velocity(
         self, spacing: float, middle: float, reach: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Instants (n,) of the trajectory and its mean turn (n, 3) over a step around each.
-
-        Those that turns can be shifted to: the trajectory may be of days, or in another unit.
+        """Instants (n,) of the trajectory and its mean angular velocity (n, 3) over a step around
+        each.
         """
         half = 0.5 * min(self.turns.step, float(np.ptp(self.span)))
-        far = reach + (1 + _MAX_RATE) * np.abs(self.turns.ends).max() + half
+        far = reach + (1 + _MAX_RATE_DEVIATION) * np.abs(self.turns.ends).max() + half
         begin, end = self.span[0] + half, self.span[1] - half
         begin, end = max(begin, min(middle - far, end)), min(end, max(middle + far, begin))
-        count = int(np.clip((end - begin) / (0.5 * spacing), 2, _MOST_INSTANTS))
+        count = int(np.clip((end - begin) / (0.5 * spacing), 2, _MAX_INSTANTS))
         times = np.linspace(begin, end, count)
         begin, end = self._rotations(times - half), self._rotations(times + half)
         return times, _log(_product(_conjugate(begin), end)) / (2 * half)
@@ -271,7 +275,7 @@ class ClockFit:
     def _rough_cost(
         self, parameters: np.ndarray, times: np.ndarray, velocities: np.ndarray
     ) -> float:
-        """Disagreement of angular velocities, bounded for each step, from 0 to 1."""
+        """Mean bounded residual of angular velocities, from 0 to 1."""
         duration = np.diff(self.turns.times, axis=1)
         at = self.turns.middle + parameters[0] + parameters[1] * self._from_middle().mean(axis=1)
         turned = [np.interp(at, times, velocities[:, k], 0, 0) for k in range(3)]
@@ -282,7 +286,8 @@ class ClockFit:
         return self.turns.times - self.turns.middle
 
     def _jacobian(self, parameters: np.ndarray) -> np.ndarray:
-        """Derivatives (N, 3, 2) of residuals, over a part of a step: entries make them jagged."""
+        """Derivatives (N, 3, 2) of residuals, by differences over part of a step: residuals are
+        jagged."""
         reach = 0.1 * self.turns.step
         steps = np.diag([reach, reach / self.turns.ends[1]])
         ahead, back = self.residuals(parameters + np.stack([steps, -steps]))
@@ -290,13 +295,13 @@ class ClockFit:
 
     @staticmethod
     def _prior(free: int) -> np.ndarray:
-        """Information (free, free): rates are near one, shifts anything."""
+        """Prior information (free, free): rates are near one, shifts are free."""
         return np.diag([0, _RATE_SIGMA**-2])[:free, :free]
 
     def _total(self, residuals: np.ndarray, parameters: np.ndarray, sigma: float) -> float:
-        """What `refine` makes small."""
-        squares = np.sum(residuals**2, axis=1) / (_WIDTH * sigma) ** 2
-        return float(_WIDTH**2 * np.log1p(squares).sum()) + float(
+        """The cost that `refine` minimises."""
+        squares = np.sum(residuals**2, axis=1) / (_LOSS_WIDTH_SIGMAS * sigma) ** 2
+        return float(_LOSS_WIDTH_SIGMAS**2 * np.log1p(squares).sum()) + float(
             (parameters[1] - 1) ** 2 / _RATE_SIGMA**2
         )
 
@@ -304,13 +309,14 @@ class ClockFit:
 def _bounded(residuals: np.ndarray, sigma: float) -> float:
     """Mean of r^2 / (r^2 + width^2) over rotations (N, 3)."""
     squares = np.sum(residuals**2, axis=1)
-    return float(np.mean(squares / (squares + (_WIDTH * sigma) ** 2)))
+    return float(np.mean(squares / (squares + (_LOSS_WIDTH_SIGMAS * sigma) ** 2)))
 
 
-def noise(residuals: np.ndarray, least: float = _MIN_SIGMA) -> float:
-    """Noise per axis of rotations (N, 3), however large most of them are, but not below `least`."""
+def noise(residuals: np.ndarray, least: float = _MIN_SIGMA_RAD) -> float:
+    """Noise per axis of rotations (N, 3), from a quantile that outliers leave alone, at least
+    `least`."""
     lengths = np.linalg.norm(residuals, axis=1)
-    return max(float(np.quantile(lengths, _QUIET)) / _QUIET_LENGTH, least)
+    return max(float(np.quantile(lengths, _NOISE_QUANTILE)) / _UNIT_NOISE_QUANTILE, least)
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Trajectories of other programs as `world_T_rigs`: TUM, KITTI, stella_vslam's map; TUM back."""
+"""Trajectory files as `world_T_rigs`: TUM, KITTI, stella_vslam's map; writing TUM."""
 
 import math
 import os
@@ -16,12 +16,12 @@ from gsba.types import Trajectory
 if TYPE_CHECKING:
     import msgpack
 
-_FURTHEST = 1e12  # from the origin, in any unit: beyond, differences are lost
-_UNIT_TOLERANCE = 1e-3  # how far a quaternion or rotation may be from unit before it is refused
+_MAX_COORDINATE = 1e12  # largest coordinate, in any unit: beyond, differences lose precision
+_UNIT_TOLERANCE = 1e-3  # largest deviation of a quaternion's norm, or of a matrix from a rotation
 
 
 def read_trajectory(path: Path, timestamps: Path | None = None) -> Trajectory:
-    """Timed rig poses of a TUM, KITTI or stella_vslam map (`.msg`) file, told by their content.
+    """Timed rig poses of a TUM, KITTI or stella_vslam map (`.msg`) file, recognised by its content.
 
     TUM: `timestamp tx ty tz qx qy qz qw`, world_T_rig. KITTI: 12 numbers, row-major 3x4
     world_T_rig, times from `timestamps`, one for each row. A map gives its keyframes.
@@ -30,7 +30,7 @@ def read_trajectory(path: Path, timestamps: Path | None = None) -> Trajectory:
     poses from before the closure, and interpolating the keyframes was three times more accurate.
 
     Raises:
-        GsbaError: with file and line number of what cannot be used.
+        GsbaError: a line cannot be used; the message names file and line.
     """
     path = Path(path)
     try:
@@ -158,7 +158,7 @@ def _keyframes(unpacker: "msgpack.Unpacker") -> dict[str, dict[str, Any]]:
 def _split(
     path: Path, rows: Sequence[tuple[int, str]], columns: int
 ) -> tuple[list[str], list[list[str]]]:
-    """Place ("file:line") and cells of each row, all of the same number of columns."""
+    """Place ("file:line") and cells of each row, all with the same number of columns."""
     where, cells = [], []
     for line, text in rows:
         where.append(f"{path}:{line}")
@@ -195,9 +195,11 @@ def _trajectory(
 ) -> Trajectory:
     if len(times) < 2:
         raise GsbaError(f"{path}: {len(times)} poses; at least 2 are needed")
-    far = np.flatnonzero(np.abs(world_T_rigs[:, :3, 3]).max(axis=1) > _FURTHEST)
+    far = np.flatnonzero(np.abs(world_T_rigs[:, :3, 3]).max(axis=1) > _MAX_COORDINATE)
     if len(far):
-        raise GsbaError(f"{where[far[0]]}: a position further than {_FURTHEST:g} from the origin")
+        raise GsbaError(
+            f"{where[far[0]]}: a position further than {_MAX_COORDINATE:g} from the origin"
+        )
     late = np.flatnonzero(np.diff(times) <= 0)
     if len(late):
         before, after = float(times[late[0]]), float(times[late[0] + 1])

@@ -1,8 +1,8 @@
-"""Pieces of a trajectory, each with an origin and a scale of its own, laid into one world.
+"""Pieces of a trajectory, each with an origin and a scale of its own, moved into one world.
 
-Nothing that a trajectory says relates two of its pieces. Each further one is placed by guess, as if
-the camera had gone on at the same pace, so that every frame has a start. Points that both pieces
-know join them later (`gsba.loop_closure.map_merging`), or they stay maps of their own.
+A trajectory does not relate its pieces. Each further one is placed by a guess, at a constant pace
+over the gap, so that every frame has an initial pose. Points that both pieces share join them later
+(`gsba.loop_closure.map_merging`), or they stay maps of their own.
 """
 
 from dataclasses import dataclass, replace
@@ -17,23 +17,24 @@ PLACES, GUESS = "points that both know", "guess: the same pace"
 
 @dataclass(frozen=True, slots=True)
 class SegmentAlignment:
-    """How a piece of the trajectory lies in the world of the first: x = scale * R @ own + t."""
+    """Similarity of a piece of the trajectory to the world of the first: x = scale * R @ own +
+    t."""
 
     first: int  # its first frame
     last: int  # its last frame
     scale: float
     world_T_own: np.ndarray  # (4, 4) float64, R and t
-    how: str
+    how: str  # source of the alignment: PLACES or GUESS
 
 
 def join(coarse: CoarsePoses) -> tuple[CoarsePoses, tuple[SegmentAlignment, ...]]:
-    """Lay the pieces of a trajectory into the world of the first, each by guess.
+    """Move the pieces of a trajectory into the world of the first, each by a guess.
 
     Args:
         coarse: poses of each piece in its own world.
 
     Returns:
-        Poses in one world, and how each further piece was placed, in order.
+        Poses in one world, and the alignment of each further piece, in order.
     """
     if coarse.segments is None:
         return coarse, ()
@@ -49,14 +50,14 @@ def join(coarse: CoarsePoses) -> tuple[CoarsePoses, tuple[SegmentAlignment, ...]
 
 
 def guessed(joints: tuple[SegmentAlignment, ...], num_frames: int) -> np.ndarray:
-    """Steps (F - 1,) bool over which no image says how two pieces lie."""
+    """True (F - 1,) for steps between two pieces whose alignment is a guess."""
     steps = np.zeros(max(num_frames - 1, 0), bool)
     steps[[joint.first - 1 for joint in joints if joint.how == GUESS]] = True
     return steps
 
 
 def _by_pace(before: int, poses: np.ndarray, segments: np.ndarray) -> Sim3:
-    """A similarity after which the piece behind a step goes on where that before it ends."""
+    """A similarity that continues the piece before a step at its pace with the piece behind it."""
     paces = []
     for rows in (segments == segments[before], segments == segments[before + 1]):
         lengths = np.linalg.norm(np.diff(poses[rows, :3, 3], axis=0), axis=1)

@@ -1,9 +1,9 @@
-"""What the images say about each step of the trajectory, and a start that follows both.
+"""Checks of the trajectory's steps against images, and initial poses that follow both.
 
-Two frames that follow one another share so much that their relative rotation and direction of
-motion can be had from the images alone. The length of a step, which two views leave open, follows
+Consecutive frames overlap so much that their relative rotation and direction of
+motion can be estimated from images alone. The length of a step, which two views leave open, follows
 from its neighbours': a point that two steps see must be equally far in both. Steps of the
-trajectory that this contradicts lose their prior, and the start is chained past them.
+trajectory that images contradict lose their prior, and initial poses are chained past them.
 """
 
 import logging
@@ -18,43 +18,43 @@ from gsba.types import CoarsePoses, PoseSource
 
 logger = logging.getLogger(__name__)
 
-_LEAP = 4.0  # median speeds
-_ROUGH = 3.0  # standard deviations of the prior: a step further off starts from the images
+_MIN_LEAP_RATIO = 4.0  # median speeds: a faster step is a leap
+_MAX_PRIOR_SIGMAS = 3.0  # standard deviations of the prior beyond which a step starts from the
+# images
 
-_MAX_RUN = 12  # false frames in a row that are told from a jump
-_BREAK = 1.5  # price of a jump in frames named
-_QUIET = 0.25  # part of the steps that no outlier spoils: the quantile that noise is read from
-_NOISE = (
-    4.0  # times that quantile: of a drifting trajectory's steps, one in a thousand is further off
-)
+_MAX_FALSE_RUN = 12  # largest number of consecutive false frames told apart from a jump
+_JUMP_COST = 1.5  # cost of a jump, in false frames
+_NOISE_QUANTILE = 0.25  # share of steps free of outliers: quantile from which noise is estimated
+# Multiple of the quantile from which an error is an outlier: drift exceeds it once in 1000 steps.
+_OUTLIER_RATIO = 4.0
 
 
 @dataclass(frozen=True, slots=True)
 class StepChecks:
-    """Which steps of the trajectory the images contradict, and where to start instead."""
+    """Steps of the trajectory that images contradict, and initial poses past these."""
 
     world_T_rigs: np.ndarray  # (F, 4, 4) float64, the trajectory chained past false steps
-    false_steps: np.ndarray  # (F - 1,) bool, contradicted: no prior
+    false_steps: np.ndarray  # (F - 1,) bool, contradicted by images: no prior
     false_frames: np.ndarray  # (F,) bool, both steps at a frame are false, but not around it
-    unseen_steps: np.ndarray  # (F - 1,) bool, the images say nothing: the trajectory alone
+    unseen_steps: np.ndarray  # (F - 1,) bool, not estimated from images: the trajectory alone
     lengths: np.ndarray  # (F - 1,) float64, map units, of the steps
-    turning_only: bool  # no two frames have parallax: only rotations can be had
+    turning_only: bool  # no two frames have parallax: only rotations can be estimated
 
     @classmethod
     def of_all(cls, world_T_rigs: np.ndarray) -> "StepChecks":
-        """Of a trajectory (F, 4, 4) that nothing contradicts."""
+        """Checks of a trajectory (F, 4, 4) that nothing contradicts."""
         none = np.zeros(max(len(world_T_rigs) - 1, 0), bool)
         lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
         return cls(world_T_rigs, none, np.zeros(len(world_T_rigs), bool), none, lengths, False)
 
     @property
     def sound(self) -> bool:
-        """Whether every step of the trajectory was confirmed."""
+        """True if every step of the trajectory was confirmed."""
         return not (self.false_steps.any() or self.unseen_steps.any())
 
     @property
     def held_steps(self) -> np.ndarray:
-        """Steps (F - 1,) bool that no image shows, but the trajectory may know."""
+        """Steps (F - 1,) bool without images, whose pose the trajectory may give."""
         return self.unseen_steps & ~self.false_steps
 
 
@@ -71,14 +71,14 @@ def judge(
     Args:
         coarse: the trajectory.
         found: steps from the images.
-        logs, sigmas: ratios of their lengths.
-        verify: disagreement that counts as contradiction.
+        logs, sigmas: (F - 2,) logarithms of ratios of lengths, and standard deviations.
+        verify: thresholds of contradiction.
         priors: noise of the trajectory's steps.
     """
     slam = inverse(coarse.world_T_rigs[:-1]) @ coarse.world_T_rigs[1:]
     slam_lengths = np.linalg.norm(slam[:, :3, 3], axis=1)
     own = coarse.sources == PoseSource.SLAM
-    turned, off = _disagreement(slam, found)
+    turned, off = _step_errors(slam, found)
     if not own.any() or (found.verified.any() and not found.directed.any()):
         return _from_images_alone(coarse, slam, found, logs, sigmas)
     wrong = found.verified & (turned > np.deg2rad(verify.max_rotation_deg))
@@ -93,9 +93,11 @@ def judge(
     linked[1:] |= np.isfinite(sigmas)
     wrong |= found.directed & linked & (strain > np.log(verify.max_length_ratio))
     unseen = ~found.verified
-    rough = wrong | (found.verified & (turned > _ROUGH * np.deg2rad(priors.rotation_deg)))
-    rough |= found.directed & (off > np.arctan(_ROUGH * priors.translation) + unsure)
-    rough |= found.directed & linked & (strain > _ROUGH * priors.translation)
+    rough = wrong | (
+        found.verified & (turned > _MAX_PRIOR_SIGMAS * np.deg2rad(priors.rotation_deg))
+    )
+    rough |= found.directed & (off > np.arctan(_MAX_PRIOR_SIGMAS * priors.translation) + unsure)
+    rough |= found.directed & linked & (strain > _MAX_PRIOR_SIGMAS * priors.translation)
     chosen = slam.copy()
     if wrong.any() or unseen.any():
         chosen[rough, :3, :3] = found.f_T_nexts[rough, :3, :3]
@@ -116,19 +118,19 @@ def judge(
 
 
 def confirmed(coarse: CoarsePoses, found: Steps, priors: PriorSettings) -> np.ndarray:
-    """Steps (F - 1,) bool that images and trajectory have alike, within the latter's noise."""
+    """Steps (F - 1,) bool on which images and trajectory agree within the latter's noise."""
     slam = inverse(coarse.world_T_rigs[:-1]) @ coarse.world_T_rigs[1:]
-    turned, off = _disagreement(slam, found)
+    turned, off = _step_errors(slam, found)
     own = coarse.sources == PoseSource.SLAM
-    close = turned < _ROUGH * np.deg2rad(priors.rotation_deg)
-    close &= off < np.arctan(_ROUGH * priors.translation) + 3 * found.direction_sigmas
+    close = turned < _MAX_PRIOR_SIGMAS * np.deg2rad(priors.rotation_deg)
+    close &= off < np.arctan(_MAX_PRIOR_SIGMAS * priors.translation) + 3 * found.direction_sigmas
     return found.directed & close & own[:-1] & own[1:]
 
 
 def _from_images_alone(
     coarse: CoarsePoses, slam: np.ndarray, found: Steps, logs: np.ndarray, sigmas: np.ndarray
 ) -> StepChecks:
-    """A start from the steps of the images wherever there are any; no step keeps its prior."""
+    """Initial poses from the steps of the images where known; no step keeps its prior."""
     slam_lengths = np.linalg.norm(slam[:, :3, 3], axis=1)
     lengths = slam_lengths
     if found.directed.any():
@@ -148,14 +150,17 @@ def _from_images_alone(
 
 
 def leaps(world_T_rigs: np.ndarray, timestamps: np.ndarray) -> np.ndarray:
-    """Steps (F - 1,) bool much faster than the rest: without images, they are another world's."""
+    """Steps (F - 1,) bool much faster than the rest: without images, they lead into another
+    world."""
     lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
     speeds = lengths / np.diff(timestamps)
     moving = speeds[speeds > 0]
-    return speeds > _LEAP * np.median(moving) if len(moving) else np.zeros(len(speeds), bool)
+    return (
+        speeds > _MIN_LEAP_RATIO * np.median(moving) if len(moving) else np.zeros(len(speeds), bool)
+    )
 
 
-def _disagreement(slam: np.ndarray, found: Steps) -> tuple[np.ndarray, np.ndarray]:
+def _step_errors(slam: np.ndarray, found: Steps) -> tuple[np.ndarray, np.ndarray]:
     """Angles (F - 1,) in radians between both rotations and both directions of each step."""
     turned = rotation_angle(np.swapaxes(slam[:, :3, :3], 1, 2) @ found.f_T_nexts[:, :3, :3])
     moved, seen = slam[:, :3, 3], found.f_T_nexts[:, :3, 3]
@@ -164,7 +169,8 @@ def _disagreement(slam: np.ndarray, found: Steps) -> tuple[np.ndarray, np.ndarra
 
 
 def _chain(world_T_rigs: np.ndarray, chosen: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Poses (F, 4, 4) that follow the chosen steps, laid over the trajectory's own frames."""
+    """Poses (F, 4, 4) that follow the chosen steps, aligned with the trajectory's tracked
+    frames."""
     poses = chained(chosen)
     own = own if own.any() else np.ones(len(own), bool)
     rotation = nearest_rotation(
@@ -177,37 +183,40 @@ def _chain(world_T_rigs: np.ndarray, chosen: np.ndarray, own: np.ndarray) -> np.
 
 @dataclass(frozen=True, slots=True)
 class OutlierLimits:
-    """Disagreement of two frames' relative pose with the images that sets it apart."""
+    """Thresholds on the error of two frames' relative pose that mark an outlier."""
 
     rotation: float  # radians
-    offset: float  # part of the distance between the frames
-    noise_rotation: float  # radians, of one step: below, it is as noisy as the rest
-    noise_offset: float  # the same of its position, map units
+    offset: float  # relative to the distance between the frames
+    noise_rotation: float  # radians, of one step: smaller errors are noise
+    noise_offset: float  # map units, of one step's position: smaller errors are noise
 
 
 def outlier_limits(
     slam: np.ndarray, images: np.ndarray, judged: np.ndarray, settings: VerifySettings
 ) -> OutlierLimits:
-    """What sets a frame apart: more than the settings allow, and than the rest is off.
+    """Thresholds that mark an outlier: beyond the settings, and beyond the trajectory's noise.
 
-    A trajectory that drifts quickly contradicts the images in many steps, each by about as much;
-    none of its frames is an outlier. How much that is can be read from its better steps, as
-    outliers leave those alone.
+    A quickly drifting trajectory contradicts the images in many steps, each by about as much; none
+    of its frames is an outlier. Its noise is estimated from its better steps, which outliers leave
+    alone.
 
     Args:
         slam: (F - 1, 4, 4) steps of the trajectory.
-        images: (F - 1, 4, 4) steps that the images show, with lengths.
-        judged: (F - 1,) bool, steps of which both are known.
-        settings: disagreement that counts as contradiction.
+        images: (F - 1, 4, 4) steps from images, with lengths.
+        judged: (F - 1,) bool, steps known from both.
+        settings: thresholds of contradiction.
     """
     turned = rotation_angle(np.swapaxes(slam[:, :3, :3], 1, 2) @ images[:, :3, :3])
     off = np.linalg.norm(slam[:, :3, 3] - images[:, :3, 3], axis=1)
-    usual = [float(np.quantile(x[judged], _QUIET)) if judged.any() else 0.0 for x in (turned, off)]
+    usual = [
+        float(np.quantile(x[judged], _NOISE_QUANTILE)) if judged.any() else 0.0
+        for x in (turned, off)
+    ]
     return OutlierLimits(
         np.deg2rad(settings.max_rotation_deg),
         float(np.sin(np.deg2rad(settings.max_direction_deg))),
-        _NOISE * usual[0],
-        _NOISE * usual[1],
+        _OUTLIER_RATIO * usual[0],
+        _OUTLIER_RATIO * usual[1],
     )
 
 
@@ -218,17 +227,17 @@ def false_frames(
     own: np.ndarray,
     limits: OutlierLimits,
 ) -> np.ndarray:
-    """Frames (F,) whose own pose is false: the fewest whose absence explains the false steps.
+    """Frames (F,) with a false pose: the fewest whose removal explains the false steps.
 
-    The longest chain of frames is kept whose relative poses in the trajectory agree with the
-    images, from each to the next in the chain; a jump for good breaks it, at a price, and names the
-    frame behind. Filled-in poses take no part: they were guesses.
+    The longest chain of frames is kept whose consecutive relative poses in the trajectory agree
+    with the images; a permanent jump breaks it, at a cost, and marks the frame behind. Interpolated
+    poses are ignored.
 
     Args:
-        wrong: (F - 1,) bool, steps that the images contradict.
-        slam, chosen: (F - 1, 4, 4) steps of the trajectory and what is known of them.
-        own: (F,) bool, frames with a pose of the trajectory.
-        limits: disagreement that sets a frame apart from the others.
+        wrong: (F - 1,) bool, steps that images contradict.
+        slam, chosen: (F - 1, 4, 4) steps of the trajectory and the best known steps.
+        own: (F,) bool, frames with an entry in the trajectory.
+        limits: thresholds of an outlier.
     """
     named = np.zeros(len(own), bool)
     if not wrong.any():
@@ -238,10 +247,10 @@ def false_frames(
     score, back = np.ones(len(ours)), np.full(len(ours), -1)
     broken = np.zeros(len(ours), bool)
     for n in range(1, len(ours)):
-        for m in range(n - 1, max(n - 1 - _MAX_RUN, -1), -1):
+        for m in range(n - 1, max(n - 1 - _MAX_FALSE_RUN, -1), -1):
             a, b = int(ours[m]), int(ours[n])
             agree = (b == a + 1 and not wrong[a]) or _agree(theirs, images, a, b, limits)
-            gain = score[m] + 1 - (0 if agree else _BREAK)
+            gain = score[m] + 1 - (0 if agree else _JUMP_COST)
             if gain > score[n]:
                 score[n], back[n], broken[n] = gain, m, not agree
     named[ours] = True
@@ -253,11 +262,11 @@ def false_frames(
 
 
 def _agree(theirs: np.ndarray, images: np.ndarray, a: int, b: int, limits: OutlierLimits) -> bool:
-    """Whether a trajectory's relative pose of two frames fits the steps of the images."""
+    """True if a trajectory's relative pose of two frames fits the steps of the images."""
     one, other = inverse(theirs[a]) @ theirs[b], inverse(images[a]) @ images[b]
     turned = rotation_angle(one[:3, :3].T @ other[:3, :3])
     off, length = np.linalg.norm(one[:3, 3] - other[:3, 3]), np.linalg.norm(other[:3, 3])
-    walked = np.sqrt(b - a)  # noise of steps adds up like a random walk's
+    walked = np.sqrt(b - a)  # noise of steps accumulates like a random walk
     rotation = max(limits.rotation, walked * limits.noise_rotation)
     offset = max(limits.offset * length, walked * limits.noise_offset)
     return bool(turned < rotation and off < offset)

@@ -1,4 +1,4 @@
-"""Why a trajectory does not fit the images at all: reversed, mirrored, or of something else."""
+"""Detection of trajectories in another convention, or of another recording."""
 
 import numpy as np
 
@@ -8,55 +8,56 @@ from gsba.log import GsbaError
 from gsba.trajectory.steps import Steps
 from gsba.types import CoarsePoses, PoseSource
 
-_MIN_STEPS = 5  # fewer say nothing about a whole trajectory
-_FITS = 0.5  # part of the steps that must roughly agree: of random ones, a third does
-_LOOSE = {"max_rotation_deg": 20.0, "max_direction_deg": 60.0}  # roughly
-_DOUBTFUL = 0.6  # part below which another reading that explains the rest is the right one
-_EXPLAINS = 0.7  # part of the steps that a reading must explain to be named
-_WITHOUT = "or refine without it (--no-trajectory)"
+_MIN_STEPS = 5  # least number of steps that judge a whole trajectory
+_MIN_AGREEING_SHARE = 0.5  # least share of steps in loose agreement: of random ones, a third agrees
+_LOOSE_LIMITS = {"max_rotation_deg": 20.0, "max_direction_deg": 60.0}  # thresholds of loose
+# agreement
+_DOUBTFUL_SHARE = 0.6  # share of agreeing steps below which another convention is accepted
+_MIN_EXPLAINED_SHARE = 0.7  # least share of steps that another convention must explain
+_ADVICE = "or refine without it (--no-trajectory)"
 
 
 def refuse_useless(coarse: CoarsePoses) -> None:
-    """Refuse poses that say nothing.
+    """Refuse a trajectory without information.
 
     Raises:
-        GsbaError: all poses are one and the same.
+        GsbaError: all poses are identical.
     """
     poses = coarse.world_T_rigs
     if len(poses) > 1 and np.abs(poses - poses[0]).max() < 1e-12:
         raise GsbaError(
-            f"all {len(poses)} poses of the trajectory are identical: check the file, {_WITHOUT}"
+            f"all {len(poses)} poses of the trajectory are identical: check the file, {_ADVICE}"
         )
 
 
 def refuse_misread(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -> None:
-    """Refuse a trajectory that most steps of the images contradict, but not if read otherwise.
+    """Refuse a trajectory that most steps of the images contradict, but not in another convention.
 
     Args:
         coarse: the trajectory.
         found: steps from the images.
-        settings: disagreement that counts as contradiction.
+        settings: thresholds of contradiction.
 
     Raises:
-        GsbaError: it is reversed, mirrored, inverted or in other axes.
+        GsbaError: the trajectory is reversed, mirrored, inverted or in other axes.
     """
-    judged = _judged(coarse, found)
+    judged = _judged_steps(coarse, found)
     if judged.sum() < _MIN_STEPS:
         return
     shares = {
-        reading: _agreeing(steps, found, judged, settings)
-        for reading, steps in _readings(coarse.world_T_rigs).items()
+        reading: _agreeing_share(steps, found, judged, settings)
+        for reading, steps in _steps_in_other_conventions(coarse.world_T_rigs).items()
     }
     best = max(shares, key=lambda reading: shares[reading])
-    if not best or shares[best] < _EXPLAINS or shares[""] >= _DOUBTFUL:
+    if not best or shares[best] < _MIN_EXPLAINED_SHARE or shares[""] >= _DOUBTFUL_SHARE:
         return
-    late, explained = _lateness(coarse, found, judged, settings)
+    late, explained = _delay_in_frames(coarse, found, judged, settings)
     if explained >= shares[best] * judged.sum():
-        return  # on a loop, the other side looks reversed
-    text, other = _contradicted(shares[""], judged), ""
+        return  # on a loop, the way back looks reversed
+    text, other = _contradiction_text(shares[""], judged), ""
     if late:
         other = f" or on another clock, by about {abs(late)} frames"
-    raise GsbaError(f"{text}: the trajectory is {best}{other}, {_WITHOUT}")
+    raise GsbaError(f"{text}: the trajectory is {best}{other}, {_ADVICE}")
 
 
 def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -> None:
@@ -66,32 +67,35 @@ def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -
         coarse, found, settings: as for `refuse_misread`.
 
     Raises:
-        GsbaError: most steps disagree.
+        GsbaError: most steps contradict the images.
     """
     refuse_misread(coarse, found, settings)
-    judged, loose = _judged(coarse, found), settings.model_copy(update=_LOOSE)
+    judged, loose = _judged_steps(coarse, found), settings.model_copy(update=_LOOSE_LIMITS)
     steps = _steps(coarse.world_T_rigs)
-    if judged.sum() < _MIN_STEPS or _agreeing(steps, found, judged, loose) > _FITS:
+    if (
+        judged.sum() < _MIN_STEPS
+        or _agreeing_share(steps, found, judged, loose) > _MIN_AGREEING_SHARE
+    ):
         return
-    text = _contradicted(_agreeing(steps, found, judged, settings), judged)
-    late, _ = _lateness(coarse, found, judged, settings)
+    text = _contradiction_text(_agreeing_share(steps, found, judged, settings), judged)
+    late, _ = _delay_in_frames(coarse, found, judged, settings)
     if late:
         raise GsbaError(
             f"{text}: the trajectory is on another clock, by about {abs(late)} frames: correct "
-            f"the times or read.clock_offset_s, {_WITHOUT}"
+            f"the times or read.clock_offset_s, {_ADVICE}"
         )
     raise GsbaError(
         f"{text}: the trajectory is of another recording or on another clock; "
-        f"give the right one, {_WITHOUT}"
+        f"give the right one, {_ADVICE}"
     )
 
 
-def _lateness(
+def _delay_in_frames(
     coarse: CoarsePoses, found: Steps, judged: np.ndarray, settings: VerifySettings
 ) -> tuple[int, float]:
-    """By how many frames the trajectory's steps are late, and how many steps that explains.
+    """Delay in frames of the trajectory's steps, and the share of steps that it explains.
 
-    0 where no shift in time explains what a reading has to.
+    The delay is 0 if no shift explains enough steps.
     """
     steps, best = _steps(coarse.world_T_rigs), (0, 0.0)
     own = coarse.sources[:-1] == PoseSource.SLAM
@@ -103,19 +107,19 @@ def _lateness(
         both = seen.directed & own[theirs]
         if late == 0 or both.sum() < max(_MIN_STEPS, 0.5 * judged.sum()):
             continue
-        share = _agreeing(steps[theirs], seen, both, settings)
-        if share >= _EXPLAINS and share * both.sum() > best[1]:
+        share = _agreeing_share(steps[theirs], seen, both, settings)
+        if share >= _MIN_EXPLAINED_SHARE and share * both.sum() > best[1]:
             best = late, share * float(both.sum())
     return best
 
 
-def _judged(coarse: CoarsePoses, found: Steps) -> np.ndarray:
-    """Steps (F - 1,) bool between SLAM poses, in a direction that the images tell."""
+def _judged_steps(coarse: CoarsePoses, found: Steps) -> np.ndarray:
+    """Steps (F - 1,) bool between SLAM poses, with a direction known from images."""
     own = coarse.sources == PoseSource.SLAM
     return found.directed & own[:-1] & own[1:]
 
 
-def _contradicted(share: float, judged: np.ndarray) -> str:
+def _contradiction_text(share: float, judged: np.ndarray) -> str:
     total = int(judged.sum())
     return f"the images contradict {round((1 - share) * total)} of {total} steps"
 
@@ -125,8 +129,8 @@ def _steps(poses: np.ndarray) -> np.ndarray:
     return inverse(poses[:-1]) @ poses[1:]
 
 
-def _readings(world_T_rigs: np.ndarray) -> dict[str, np.ndarray]:
-    """What a trajectory's steps (F - 1, 4, 4) would be if it had been written otherwise."""
+def _steps_in_other_conventions(world_T_rigs: np.ndarray) -> dict[str, np.ndarray]:
+    """Steps (F - 1,) of a trajectory in other conventions."""
     steps = _steps(world_T_rigs)
     readings = {
         "": steps,
@@ -150,10 +154,10 @@ def _flipped(steps: np.ndarray, signs: np.ndarray | list[int]) -> np.ndarray:
     return flip @ steps @ flip
 
 
-def _agreeing(
+def _agreeing_share(
     steps: np.ndarray, found: Steps, judged: np.ndarray, settings: VerifySettings
 ) -> float:
-    """Part of the judged steps that the images do not contradict."""
+    """Share of the judged steps that agree with the images."""
     between = np.swapaxes(steps[:, :3, :3], 1, 2) @ found.f_T_nexts[:, :3, :3]
     moved, seen = steps[:, :3, 3], found.f_T_nexts[:, :3, 3]
     across = np.linalg.norm(np.cross(moved, seen), axis=1)

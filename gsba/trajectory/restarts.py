@@ -1,4 +1,4 @@
-"""Trajectories in several pieces: several files, or a map that was begun anew within one."""
+"""Trajectories in several pieces: several files, or a map that was restarted within one."""
 
 import logging
 from collections.abc import Sequence
@@ -13,20 +13,21 @@ from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
 
 _log = logging.getLogger(__name__)
 
-_JUMP = 4.0  # median speeds: no step of the walk itself
-_ALONE = 12  # entries on either side without another jump: two of them are an excursion and back
-_NEAR_ORIGIN = 3.0  # median steps
-_NEAR_ORIGIN_DEG = 20.0
-_IDENTITY = 1e-9  # no tracked pose is that close to the origin by chance
-_LEAST_ENTRIES = 3  # of a piece that is a map of its own
+_MIN_JUMP_SPEEDS = 4.0  # median speeds: faster than any step of the walk itself
+_MIN_ENTRIES_BETWEEN_JUMPS = 12  # entries on either side without another jump: two nearby jumps are
+# false poses
+_NEAR_ORIGIN_STEPS = 3.0  # distance of a new map's first entry from the origin, in median steps
+_NEAR_ORIGIN_DEG = 20.0  # rotation of a new map's first entry
+_IDENTITY_TOLERANCE = 1e-9  # no tracked pose is this close to the identity by chance
+_MIN_ENTRIES = 3  # least entries of a piece with a map of its own
 
 
 def split_restarts(trajectory: Trajectory) -> list[Trajectory]:
     """Pieces of a trajectory whose SLAM lost its map and began another.
 
-    A new map begins at the origin: an entry that is exactly the identity, or one near it that only
-    a jump leads to, while the entries around keep the pace. A jump and another one back soon
-    after are false poses, not a map.
+    A new map begins at the origin: an entry that is exactly the identity, or one near it behind a
+    jump, while the entries around keep the pace. A jump and another one back soon after are false
+    poses, not a new map.
 
     Args:
         trajectory: N entries.
@@ -40,17 +41,17 @@ def split_restarts(trajectory: Trajectory) -> list[Trajectory]:
     if not (speeds > 0).any():
         return [trajectory]
     pace = float(np.median(speeds[speeds > 0]))
-    jumps = np.flatnonzero(speeds > _JUMP * pace)
+    jumps = np.flatnonzero(speeds > _MIN_JUMP_SPEEDS * pace)
     away, turned = np.linalg.norm(poses[:, :3, 3], axis=1), rotation_angle(poses[:, :3, :3])
     step = pace * float(np.median(intervals))
-    exactly = (away < _IDENTITY) & (turned < _IDENTITY)
-    nearly = (away < _NEAR_ORIGIN * step) & (turned < np.deg2rad(_NEAR_ORIGIN_DEG))
+    exactly = (away < _IDENTITY_TOLERANCE) & (turned < _IDENTITY_TOLERANCE)
+    nearly = (away < _NEAR_ORIGIN_STEPS * step) & (turned < np.deg2rad(_NEAR_ORIGIN_DEG))
     starts = [0]
     for n in range(1, len(poses)):
         fresh = exactly[n] and not exactly[n - 1]
         if n - 1 in jumps and nearly[n]:
-            fresh |= np.count_nonzero(np.abs(jumps - (n - 1)) <= _ALONE) == 1
-        if fresh and min(n - starts[-1], len(poses) - n) >= _LEAST_ENTRIES:
+            fresh |= np.count_nonzero(np.abs(jumps - (n - 1)) <= _MIN_ENTRIES_BETWEEN_JUMPS) == 1
+        if fresh and min(n - starts[-1], len(poses) - n) >= _MIN_ENTRIES:
             starts.append(n)
     ends = [*starts[1:], len(poses)]
     return [Trajectory(times[a:b], poses[a:b]) for a, b in zip(starts, ends, strict=True)]
@@ -61,8 +62,8 @@ def associate_pieces(
 ) -> CoarsePoses:
     """Coarse poses from pieces of a trajectory on one clock, each frame in its piece's own world.
 
-    A frame between two pieces belongs to the nearer one. Where pieces overlap in time the one that
-    begins first leads.
+    A frame between two pieces belongs to the nearer one. Where pieces overlap in time, the one that
+    begins first is used.
 
     Args:
         frames: F frames.
@@ -100,7 +101,7 @@ def associate_pieces(
 
 
 def _in_turn(pieces: Sequence[Trajectory]) -> list[Trajectory]:
-    """Pieces in order of time, without what an earlier one covers already."""
+    """Pieces in order of time, without those within the time of an earlier one."""
     kept: list[Trajectory] = []
     for piece in sorted(pieces, key=lambda piece: float(piece.timestamps[0])):
         later = piece.timestamps > kept[-1].timestamps[-1] if kept else slice(None)

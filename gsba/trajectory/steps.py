@@ -1,8 +1,8 @@
-"""Relative poses of frames that follow one another, from the images alone.
+"""Relative poses of consecutive frames, from images alone.
 
-Two such frames share so much that their relative rotation and direction of motion can be had
+Such frames overlap so much that their relative rotation and direction of motion can be estimated
 from the images. The length of a step, which two views leave open, follows from its neighbours':
-a point that two steps see must be equally far in both.
+a point common to two steps must have the same depth in both.
 """
 
 from dataclasses import dataclass
@@ -12,38 +12,41 @@ import numpy as np
 from gsba.geometry import inverse, nearest_rotation
 from gsba.types import Keypoints, VerifiedPairs
 
-_MIN_COMMON = 8  # points that two steps must share to compare their lengths
-_ALIKE = 0.15  # of logarithms of ratios: points of rigid scenes are within that, half of them .02
-_MIN_POINT_PARALLAX = np.deg2rad(1.0)  # of a point, or its depth is not worth comparing
-_STILL = np.deg2rad(0.1)  # median: what a mere turn leaves over of bearings
-_RATIO_SIGMA = 0.02  # least noise of the logarithm of a ratio of lengths
-_SMOOTH_SIGMA = 0.5  # of the same where nothing is measured: walkers keep their pace
-_LENGTH_ROUNDS = 20  # of reweighting
+_MIN_COMMON = 8  # least common points of two steps whose lengths are compared
+_MAX_LOG_DEVIATION = 0.15  # largest deviation of log ratios: points of rigid scenes are within it,
+# half of them within .02
+_MIN_TRIANGULATION_ANGLE_RAD = np.deg2rad(1.0)  # least triangulation angle of a point whose depth
+# is compared
+_MAX_STILL_RESIDUAL_RAD = np.deg2rad(0.1)  # median bearing residual after a mere rotation, below
+# which the camera stands still
+_MIN_LOG_RATIO_SIGMA = 0.02  # least standard deviation of the logarithm of a ratio of lengths
+_PRIOR_LOG_RATIO_SIGMA = 0.5  # prior standard deviation of that logarithm: walkers keep their pace
+_NUM_LENGTH_ROUNDS = 20  # reweighting rounds
 
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Relative poses of frames that follow one another, from the images alone."""
+    """Relative poses of consecutive frames, from images alone."""
 
     f_T_nexts: np.ndarray  # (F - 1, 4, 4) float64, translation of unit length
-    verified: np.ndarray  # (F - 1,) bool: the images gave one
+    verified: np.ndarray  # (F - 1,) bool: estimated from images
     direction_sigmas: np.ndarray  # (F - 1,) float64, radians, of the directions; infinite = the
     # camera may have turned only
 
     @property
     def directed(self) -> np.ndarray:
-        """Steps (F - 1,) bool whose direction is known."""
+        """Steps (F - 1,) bool with a known direction of motion."""
         return np.isfinite(self.direction_sigmas)
 
 
 def image_steps(pairs: VerifiedPairs, keypoints: Keypoints) -> Steps:
-    """Relative poses of neighbours among verified pairs.
+    """Relative poses of consecutive frames among verified pairs.
 
-    Where a step is too short to have a direction, it has that of the closest pairs over it.
+    A step too short to have a direction takes that of the closest pairs over it.
 
     Args:
-        pairs: of frames at most a few apart.
-        keypoints: of all frames.
+        pairs: pairs of frames at most a few apart.
+        keypoints: keypoints of all frames.
     """
     num = max(len(keypoints.starts) - 2, 0)
     f_T_nexts = np.tile(np.eye(4), (num, 1, 1))
@@ -55,15 +58,15 @@ def image_steps(pairs: VerifiedPairs, keypoints: Keypoints) -> Steps:
         rays0, bearings1 = keypoints.matched(pairs.matches.pairs[p], pairs.matches.of(p))
         f_T_nexts[f0], verified[f0], sigmas[f0] = f0_T_f1, True, pairs.direction_sigmas[p]
         turn = nearest_rotation(rays0.T @ bearings1)
-        if np.median(np.linalg.norm(rays0 - bearings1 @ turn.T, axis=1)) < _STILL:
-            f_T_nexts[f0, :3, :3] = turn  # an essential matrix knows it less well
+        if np.median(np.linalg.norm(rays0 - bearings1 @ turn.T, axis=1)) < _MAX_STILL_RESIDUAL_RAD:
+            f_T_nexts[f0, :3, :3] = turn  # an essential matrix determines it less well
     short = verified & ~np.isfinite(sigmas)
     if short.any():
-        _direct(f_T_nexts, sigmas, short, verified, pairs)
+        _set_short_directions(f_T_nexts, sigmas, short, verified, pairs)
     return Steps(f_T_nexts, verified, sigmas)
 
 
-def _direct(
+def _set_short_directions(
     f_T_nexts: np.ndarray,
     sigmas: np.ndarray,
     short: np.ndarray,
@@ -97,14 +100,14 @@ def _direct(
 
 
 def off_steps(pairs: VerifiedPairs, found: Steps) -> np.ndarray:
-    """How far pairs over two steps are from what those steps, whatever their lengths, allow.
+    """Angles by which pairs over two steps violate the directions of those steps.
 
-    Frame f + 2 lies, as f sees it, between the directions of both steps. A pair that repeated
-    structure made up agrees with neither, though it may be within what the trajectory allows.
+    Frame f + 2 lies, as seen from f, between the directions of both steps. A false pair from
+    repeated structure agrees with neither, though it may be within the trajectory's tolerance.
 
     Returns:
-        (P,) radians, less what the directions are unsure by (three standard deviations); 0 for
-        other pairs, and where a direction is not known.
+        (P,) radians, less three standard deviations of the directions; 0 for other pairs, and if a
+        direction is unknown.
     """
     out = np.zeros(len(pairs.matches.pairs))
     for p, (f0, f2) in enumerate(pairs.matches.pairs):
@@ -131,14 +134,14 @@ def _angle_to_arc(direction: np.ndarray, start: np.ndarray, end: np.ndarray) -> 
 def length_ratios(
     pairs: VerifiedPairs, found: Steps, keypoints: Keypoints, least_alike: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Length of each step over that of the step before, from points that both see.
+    """Length of each step relative to the step before, from common points.
 
     Args:
-        pairs: of frames at most a few apart.
+        pairs: pairs of frames at most a few apart.
         found: steps of these pairs.
-        keypoints: of all frames.
+        keypoints: keypoints of all frames.
         least_alike: points that suffice if they agree on one ratio to 15 %; None = eight points,
-            whatever they agree on.
+            however they agree.
 
     Returns:
         Logarithms (F - 2,) of the ratios and their standard deviations, infinite where unknown.
@@ -164,24 +167,24 @@ def length_ratios(
         ratios = np.log(back / ahead)
         ratios = ratios[np.isfinite(ratios)]
         if least_alike is not None and len(ratios):
-            ratios = ratios[np.abs(ratios - np.median(ratios)) < _ALIKE]
+            ratios = ratios[np.abs(ratios - np.median(ratios)) < _MAX_LOG_DEVIATION]
         if len(ratios) < (_MIN_COMMON if least_alike is None else least_alike):
             continue
         logs[f - 1] = np.median(ratios)
         spread = 1.4826 * np.median(np.abs(ratios - logs[f - 1]))
-        sigmas[f - 1] = max(1.25 * spread / np.sqrt(len(ratios)), _RATIO_SIGMA)
+        sigmas[f - 1] = max(1.25 * spread / np.sqrt(len(ratios)), _MIN_LOG_RATIO_SIGMA)
     return logs, sigmas
 
 
 def given_up(open_at: set[int], matches: np.ndarray) -> set[int]:
-    """Steps to give up so that no frame joins two of which neither tells the other's length.
+    """Steps to drop so that no two consecutive steps remain without a known ratio of lengths.
 
     Args:
-        open_at: frames between two such steps.
-        matches: (F - 1,) of each step; of two steps, that of fewer matches is given up.
+        open_at: frames between two steps whose ratio is unknown.
+        matches: (F - 1,) matches of each step; of two steps, the one with fewer is dropped.
 
     Returns:
-        First frames of the steps.
+        First frames of the dropped steps.
     """
     out, left = set[int](), set(open_at)
     while left:
@@ -208,12 +211,12 @@ def matches_of_steps(pairs: VerifiedPairs, num_frames: int) -> np.ndarray:
 
 
 def ray_depths(rays0: np.ndarray, rays1: np.ndarray, f0_T_f1: np.ndarray) -> np.ndarray:
-    """Distances (m,) from frame 0 along its rays to where both rays meet; NaN where unclear."""
+    """Depths (m,) along rays of frame 0 at which both rays meet; NaN if uncertain."""
     across = rays1 @ f0_T_f1[:3, :3].T
     cosine = np.einsum("mi,mi->m", rays0, across)
     sine2 = 1 - cosine**2
     along0, along1 = rays0 @ f0_T_f1[:3, 3], across @ f0_T_f1[:3, 3]
-    clear = sine2 > np.sin(_MIN_POINT_PARALLAX) ** 2
+    clear = sine2 > np.sin(_MIN_TRIANGULATION_ANGLE_RAD) ** 2
     safe = np.where(clear, sine2, 1)
     depth0, depth1 = (along0 - cosine * along1) / safe, (cosine * along0 - along1) / safe
     return np.where(clear & (depth0 > 0) & (depth1 > 0), depth0, np.nan)
@@ -225,14 +228,14 @@ def step_lengths(
     logs: np.ndarray,
     sigmas: np.ndarray,
 ) -> np.ndarray:
-    """Lengths of steps that agree with their measured ratios and, where right, the trajectory's.
+    """Lengths of steps that fit their measured ratios and, if consistent, the trajectory's lengths.
 
     The most probable logarithms of the lengths under Gaussian ratios and Cauchy-distributed
     errors of the trajectory, by reweighting from wide to narrow (graduated non-convexity).
 
     Args:
         slam_lengths: (N,) lengths in the trajectory, map units.
-        slam_sigmas: (N,) noise of their logarithms; infinite = not to be used.
+        slam_sigmas: (N,) standard deviations of their logarithms; infinite = unused.
         logs, sigmas: (N - 1,) see `length_ratios`.
 
     Returns:
@@ -243,12 +246,14 @@ def step_lengths(
     positive = slam_lengths[slam_lengths > 0]
     typical = float(np.median(positive)) if len(positive) else 1.0
     target = np.log(np.maximum(slam_lengths, 1e-3 * typical))
-    links = np.where(np.isfinite(sigmas), 1 / np.minimum(sigmas, 1e3) ** 2, _SMOOTH_SIGMA**-2)
+    links = np.where(
+        np.isfinite(sigmas), 1 / np.minimum(sigmas, 1e3) ** 2, _PRIOR_LOG_RATIO_SIGMA**-2
+    )
     logs = np.where(np.isfinite(sigmas), logs, 0)
     information = np.where(np.isfinite(slam_sigmas), slam_sigmas**-2.0, 0)
-    width = 30.0  # of the loss, standard deviations
+    width = 30.0  # width of the loss, standard deviations
     lengths = np.full(len(target), np.median(target))
-    for _ in range(_LENGTH_ROUNDS):
+    for _ in range(_NUM_LENGTH_ROUNDS):
         misfit = (target - lengths) ** 2 * information
         weights = information / (1 + misfit / width**2) + 1e-9
         bands = np.zeros((2, len(target)))
@@ -265,7 +270,7 @@ def step_lengths(
 
 
 def chained(steps: np.ndarray) -> np.ndarray:
-    """Poses (F, 4, 4) that follow steps (F - 1, 4, 4), the first the identity."""
+    """Poses (F, 4, 4) chained from steps (F - 1, 4, 4), the first the identity."""
     poses = [np.eye(4)]
     for step in steps:
         poses.append(poses[-1] @ step)

@@ -380,7 +380,7 @@ def test_bad_terms_are_named(world):
 
 def test_landmarks_are_eliminated_in_runs_of_any_length(world, monkeypatch):
     whole = world.block().linearize(world.values)
-    monkeypatch.setattr(landmarks, "_VISITS", 7)
+    monkeypatch.setattr(landmarks, "_MAX_VISITS_AT_ONCE", 7)
     block = world.block()
     assert len(block._visits) > 20
     parts = block.linearize(world.values)

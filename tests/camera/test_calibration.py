@@ -13,7 +13,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 from two_fisheyes import back_from_front, made_pair, turned
 
-from gsba.camera.calibration import calibration_json, fitted, read_calibration
+from gsba.camera.calibration import calibration_json, read_calibration, scaled_to_size
 from gsba.camera.fisheye import Pair, project, rotation_of
 from gsba.geometry import pose, quaternion_from_rotation
 from gsba.log import GsbaError
@@ -255,7 +255,9 @@ def test_kalibr_omni_is_taken_where_it_is_nearly_ours(tmp_path: Path) -> None:
 @pytest.mark.parametrize("distortion", [[0.0, 0, 0.01, 0], [0.0, 60.0, 0, 0]])
 def test_kalibr_omni_is_refused_where_it_is_not(tmp_path: Path, distortion: list[float]) -> None:
     path = _write(tmp_path / "c.yaml", _omni(_kalibr(), distortion))
-    with pytest.raises(GsbaError, match=r"cam0 is omni with radtan, [\d.]+ pixels from.*-equi$"):
+    with pytest.raises(
+        GsbaError, match=r"cam0 is omni with radtan, [\d.]+ pixels from the.*-equi$"
+    ):
         read_calibration(path)
     path = _write(tmp_path / "c.yaml", _omni(_kalibr(), [0.0, 0, 0, 0], 0.05))
     with pytest.raises(GsbaError, match=r"cam0: its omni model ends before 95 degrees"):
@@ -266,14 +268,14 @@ BAD_OURS = {
     "no lens": (lambda t: t["lenses"].pop("back"), "it has no 'back'"),
     "no focal length": (lambda t: t["lenses"]["back"].pop("f"), "it has no 'f'"),
     "of text": (lambda t: t["lenses"]["back"].update(f="wide"), "could not convert"),
-    "no number": (lambda t: t["lenses"]["back"].update(f=float("nan")), "are to be numbers"),
+    "no number": (lambda t: t["lenses"]["back"].update(f=float("nan")), "must be numbers"),
     "endless": (lambda t: t["lenses"]["back"].update(width=1e999), "OverflowError"),
     "negative": (lambda t: t["lenses"]["front"].update(f=-3), "f above 0"),
     "too many terms": (lambda t: t["lenses"]["front"].update(k=[0] * 5), "up to four k"),
     "turns over": (lambda t: t["lenses"]["front"].update(k=[-0.3]), "does not grow"),
     "beside": (
         lambda t: t["lenses"]["back"].update(cx=360.0),
-        r"principal point \(360, .*\) is outside of its picture, 240x240",
+        r"principal point \(360, .*\) is outside the picture of 240x240",
     ),
     "no pose": (lambda t: t["lenses"]["front"].update(rig_T_lens=[1, 2]), "reshape"),
     "bent pose": (
@@ -290,7 +292,7 @@ BAD_OURS = {
     ),
     "both ahead": (
         lambda t: t["lenses"]["back"].update(rig_T_lens=np.eye(4).tolist()),
-        "the front lens is to look along z of the rig and the back one the other way",
+        "the front lens must look along z of the rig and the back one the other way",
     ),
     "something else": (lambda t: t.pop("lenses"), "it has no 'lenses'.*Kalibr camchain"),
 }
@@ -316,7 +318,7 @@ BAD_KALIBR = {
     "three cameras": (lambda t: t.update(cam2=t["cam0"]), "holds cam0, cam1, cam2"),
     "radtan": (
         lambda t: t["cam0"].update(distortion_model="radtan"),
-        "cam0 is pinhole with radtan; pinhole with equidistant is wanted",
+        "cam0 is pinhole with radtan; it must be pinhole with equidistant",
     ),
     "double sphere": (lambda t: t["cam1"].update(camera_model="ds"), "cam1 is ds with equi"),
     "not square": (
@@ -359,11 +361,11 @@ BAD_RIG = {
     "no front": (lambda t: t[0]["cameras"][0].pop("ref_sensor"), "0 of them a ref_sensor"),
     "no size": (
         lambda t: t[0]["cameras"][1].pop("width"),
-        "how large the pictures of the back lens are: write width and height, pixels, beside",
+        "no picture size for the back lens: write width and height, pixels, beside",
     ),
     "pinhole": (
         lambda t: t[0]["cameras"][0].update(camera_model_name="PINHOLE"),
-        "front lens is PINHOLE; OPENCV_FISHEYE is wanted",
+        "front lens is PINHOLE, but must be OPENCV_FISHEYE",
     ),
     "no model": (lambda t: t[0]["cameras"][0].pop("camera_model_name"), "camera_model_name"),
     "few params": (lambda t: t[0]["cameras"][0]["camera_params"].pop(), "k1, k2, k3, k4"),
@@ -394,7 +396,7 @@ def test_refused_models(tmp_path: Path) -> None:
     _check_refused(tmp_path / "empty", "is no COLMAP model that can be read .*give the folder")
     _check_refused(_model(tmp_path / "alone", True, rig=False), "holds 2 cameras in 2 rigs")
     panoramas = _model(tmp_path / "erp", True, "EQUIRECTANGULAR")
-    _check_refused(panoramas, "front lens is EQUIRECTANGULAR; OPENCV_FISHEYE is wanted")
+    _check_refused(panoramas, "front lens is EQUIRECTANGULAR, but must be OPENCV_FISHEYE")
     damaged = _model(tmp_path / "damaged", False)
     (damaged / "cameras.bin").write_bytes((damaged / "cameras.bin").read_bytes()[:50])
     _check_refused(damaged, "is no COLMAP model that can be read")
@@ -428,15 +430,16 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
 
 def test_pictures_of_another_size(tmp_path: Path) -> None:
     path = tmp_path / "c.json"
-    twice = fitted(PAIR, (480, 480), path)
+    twice = scaled_to_size(PAIR, (480, 480), path)
     for lens, large in zip(PAIR, twice, strict=True):
         directions = np.random.default_rng(0).normal(size=(20, 3))
         found = project(large, directions)
         np.testing.assert_allclose(found, 2 * project(lens, directions), atol=1e-9)
         assert (large.width, large.height, large.centre) == (480, 480, lens.centre)
-    assert [astuple(lens) for lens in fitted(PAIR, (240, 240), path)] == [*map(astuple, PAIR)]
+    same = scaled_to_size(PAIR, (240, 240), path)
+    assert [astuple(lens) for lens in same] == [*map(astuple, PAIR)]
     message = (
-        f"{re.escape(str(path))}: is of pictures of 240x240, but these are 480x360: of another"
+        f"{re.escape(str(path))}: calibrates pictures of 240x240, but these are 480x360: another"
     )
     with pytest.raises(GsbaError, match=message):
-        fitted(PAIR, (480, 360), path)
+        scaled_to_size(PAIR, (480, 360), path)

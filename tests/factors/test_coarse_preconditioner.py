@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
 
-from factors import BearingTerm, LandmarkBlock, RobustLoss, groups, reduced
+from factors import BearingTerm, LandmarkBlock, RobustLoss, pose_clusters, reduced_camera_system
 from factors._schur_kernels import GROUP_DIM
 from factors._terms import pose_rows
 from factors.pose_clusters import Groups, covisible_groups
@@ -69,8 +69,8 @@ def world() -> World:
 @pytest.fixture
 def held(monkeypatch) -> None:
     """Nothing is written out, groups are small."""
-    monkeypatch.setattr(reduced, "_MOST_OPERATIONS", 0)
-    monkeypatch.setattr(reduced, "_MOST_OF_INVERSE", 0)
+    monkeypatch.setattr(reduced_camera_system, "_MAX_OPERATIONS", 0)
+    monkeypatch.setattr(reduced_camera_system, "_MAX_INVERSE_OPERATIONS", 0)
 
 
 def dense(world: World) -> np.ndarray:
@@ -104,7 +104,7 @@ def test_groups_feel_what_their_frames_feel_together(world, held) -> None:
     assert 1 < found.num < NUM_FRAMES
     damped = system._written + 0.1 * np.eye(6)
     given = system._off_diagonal, system._pairs, system._complements, found, system._bases
-    coarse = reduced.coarse_system(damped, *given)
+    coarse = reduced_camera_system.coarse_system(damped, *given)
     assert coarse is not None
     H = dense(world).reshape(NUM_FRAMES, 6, NUM_FRAMES, 6)
     for f, diagonal in enumerate(damped):
@@ -123,9 +123,9 @@ def test_groups_feel_what_their_frames_feel_together(world, held) -> None:
 
 
 def test_a_step_is_that_of_a_factorization(world, held, monkeypatch) -> None:
-    monkeypatch.setattr(reduced, "_STEP_TOLERANCE", 1e-10)
+    monkeypatch.setattr(reduced_camera_system, "_STEP_TOLERANCE", 1e-10)
     iterated = world.system()
-    monkeypatch.setattr(reduced, "_MOST_OPERATIONS", np.inf)
+    monkeypatch.setattr(reduced_camera_system, "_MAX_OPERATIONS", np.inf)
     direct = world.system()
     assert iterated._held and not direct._held
     for damping in (1e-3, 1e-6):  # the second one by the groups' system of the first
@@ -138,7 +138,7 @@ def test_a_step_is_that_of_a_factorization(world, held, monkeypatch) -> None:
 def test_the_optimum_is_the_same(world, held, monkeypatch) -> None:
     tight = SolverSettings(relative_tolerance=1e-12, max_iterations=200)
     iterated = optimize(world.graph, [world.block()], world.values, tight)
-    monkeypatch.setattr(reduced, "_MOST_OPERATIONS", np.inf)
+    monkeypatch.setattr(reduced_camera_system, "_MAX_OPERATIONS", np.inf)
     direct = optimize(world.graph, [world.block()], world.values, tight)
     assert iterated.cost == pytest.approx(direct.cost, rel=1e-9)
     for key in world.keys:
@@ -147,7 +147,7 @@ def test_the_optimum_is_the_same(world, held, monkeypatch) -> None:
 
 
 def test_threads_change_nothing(world, held, monkeypatch) -> None:
-    monkeypatch.setattr("factors.landmarks._VISITS", 100)  # several runs
+    monkeypatch.setattr("factors.landmarks._MAX_VISITS_AT_ONCE", 100)  # several runs
     one, three = (world.system(num_threads=n) for n in (1, 3))
     assert len(one._complements[0][0].runs) > 3
     assert one.solve(1e-3).tobytes() == three.solve(1e-3).tobytes()
@@ -156,7 +156,7 @@ def test_threads_change_nothing(world, held, monkeypatch) -> None:
 def test_errors_that_are_drawn_spread_as_the_inverse_says(world, held, monkeypatch) -> None:
     pairs = [(X(f), X(f + 1)) for f in range(NUM_FRAMES - 1)]
     iterated = ReducedSystem(world.graph, [world.block()], world.values, pairs)
-    monkeypatch.setattr(reduced, "_MOST_OF_INVERSE", np.inf)
+    monkeypatch.setattr(reduced_camera_system, "_MAX_INVERSE_OPERATIONS", np.inf)
     direct = ReducedSystem(world.graph, [world.block()], world.values, pairs)
     assert iterated._held and not direct._held
     found, expected = [], []
@@ -196,7 +196,7 @@ def test_a_group_moves_as_one(world) -> None:
 
 
 def test_groups_hold_what_shares_the_most(monkeypatch) -> None:
-    monkeypatch.setattr(groups, "_LEAST_SIZE", 3)
+    monkeypatch.setattr(pose_clusters, "_MIN_GROUP_SIZE", 3)
     rows = np.array([[0, 1], [1, 2], [0, 2], [2, 3], [3, 4], [4, 5], [5, 3], [6, 7]])
     shared = np.array([9, 9, 9, 1, 9, 9, 9, 5])
     found = covisible_groups(9, [(rows, shared)])

@@ -10,7 +10,7 @@ from synthetic import unit
 
 from factors import RobustLoss, jacobian_errors
 from factors.patch_windows import PatchPixels, PatchTable, PatchViews, patch_axes, planes_from
-from factors.photometric import _LEAST_RUN, FAMILY, PhotometricBlock
+from factors.photometric import _MIN_THREAD_OBSERVATIONS, FAMILY, PhotometricBlock
 from factors.photometric_factor import PhotometricFactor, photometric_residuals
 from factors.sphere_image import SphereImage
 from factors.threads import balanced_ranges
@@ -246,7 +246,7 @@ def test_gain_and_offset_change_nothing() -> None:
 
 def test_threads_change_nothing() -> None:
     world = make_ball_world(8, 3, 200)
-    assert len(balanced_ranges(world.pixels.table.offsets, _LEAST_RUN)) > 2
+    assert len(balanced_ranges(world.pixels.table.offsets, _MIN_THREAD_OBSERVATIONS)) > 2
     one, two = (block_of(world, num_threads=n).linearize(world.values()) for n in (1, 2))
     assert np.array_equal(one.diagonal, two.diagonal)
     assert np.array_equal(one.off_diagonal, two.off_diagonal)

@@ -37,7 +37,7 @@ def _start(folder: Path, **more) -> Pair:
 @pytest.mark.parametrize(
     ("true", "said"),
     [
-        (WINDOWED, "directions to 1.5 degrees, one lens against the other to 1.5), which both"),
+        (WINDOWED, "directions 1.5 degrees, rotation between lenses 1.5), which both"),
         (WHOLE, "the whole sensor in the picture"),
     ],
 )

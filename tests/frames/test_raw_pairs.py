@@ -119,7 +119,7 @@ def test_lenses_of_unknown_make(
         assert lens.focal * HALF_FOV == pytest.approx(true.focal * HALF_FOV, abs=0.5)
         np.testing.assert_allclose(rotation_of(lens), rotation_of(true), atol=1e-9)
         assert lens.radial == (0, 0, 0, 0) and lens.centre == (0, 0, 0)
-    assert "unknown lenses, taken for 200 degrees in circles" in caplog.text
+    assert "unknown lenses, assumed to cover 200 degrees in circles" in caplog.text
     assert ("side by side" in caplog.text) == (layout == "beside")
 
 
@@ -153,7 +153,9 @@ def _flat(shift: float):
 @pytest.mark.parametrize("seen", [_four_alike, _flat])
 def test_what_does_not_tell_a_turn_is_refused(tmp_path: Path, seen) -> None:
     root = _write_pairs(tmp_path / "raw", "front", _nominal(), seen=seen)
-    with pytest.raises(GsbaError, match=r"does not tell how one is turned .* --calibration FILE"):
+    with pytest.raises(
+        GsbaError, match=r"does not determine how one is turned .* --calibration FILE"
+    ):
         scan(root, fps=1)
     assert scan(root, fps=1, calibration=_calibration(tmp_path / "c.json")).fisheyes is not None
 
@@ -383,7 +385,7 @@ def test_panoramas_are_no_circles(
     with caplog.at_level(logging.INFO):
         assert scan(tmp_path, fps=1).layout == "erp"
     black = kind in ("black above and below", "night", "black")
-    assert ("around no circles: taken for a panorama" in caplog.text) == black
+    assert ("around no circles: read as a panorama" in caplog.text) == black
 
 
 def test_no_more_pictures_are_looked_at_than_needed() -> None:
@@ -439,14 +441,14 @@ def test_a_calibration_of_another_shape_or_size(tmp_path: Path, layout: str) -> 
     for lens in tree["lenses"].values():
         lens["height"] = 270
     (tmp_path / "c.json").write_text(json.dumps(tree))
-    message = r"c\.json: is of pictures of 480x270, but these are 240x240: of another shape"
+    message = r"c\.json: calibrates pictures of 480x270, but these are 240x240: another aspect"
     with pytest.raises(GsbaError, match=message):
         scan(root, fps=1, calibration=tmp_path / "c.json")
 
 
 def test_panoramas_are_wanted_where_lenses_are_not(tmp_path: Path) -> None:
     raw = _write_pairs(tmp_path / "raw", "beside", _nominal())
-    with pytest.raises(GsbaError, match=r"raw fisheyes side by side; panoramas are wanted here"):
+    with pytest.raises(GsbaError, match=r"raw fisheyes side by side; give a folder of"):
         find_panoramas(raw)
     with pytest.raises(GsbaError, match=r"holds no panoramas"):
         find_panoramas(_write_pairs(tmp_path / "folders", "front"))

@@ -116,7 +116,7 @@ def test_where_readings_end_or_pause_nothing_is_said() -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_another_ride_is_not_believed(seed: int) -> None:
     found = _aligned(ride(seed=seed), ride(seed=seed + 10).readings())
-    assert "at no offset" in found.reason
+    assert "at no clock offset" in found.reason
 
 
 def test_a_mirrored_sensor_is_not_believed() -> None:
@@ -129,7 +129,7 @@ def test_a_mirrored_sensor_is_not_believed() -> None:
 def test_turns_too_poor_to_tell_are_named() -> None:
     on = ride(8)
     assert (
-        "turns of images"
+        "rotations are known from images"
         in align(on.timestamps[:4], on.steps()[:3], np.ones(3, bool), on.readings()).reason
     )
     still = np.tile(np.eye(3), (49, 1, 1))

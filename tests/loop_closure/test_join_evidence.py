@@ -61,7 +61,7 @@ def test_places_out_of_sight_say_nothing() -> None:
     found = _weighed(pose(np.eye(3), np.array([0.0, 40.0, 0.0])))
     assert found.witnesses == 0
     assert not (found.confirmed or found.refuted or found.absent)
-    assert "no frames of both" in str(found)
+    assert "no frames of the two maps overlap" in str(found)
 
 
 def test_frames_around_one_are_of_its_group() -> None:

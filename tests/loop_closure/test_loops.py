@@ -12,7 +12,7 @@ from gsba.features import detection
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.loop_closure import loops
 from gsba.loop_closure.pose_graph import Loop
-from gsba.loop_closure.retrieval import _aggregate, _drawn, global_descriptors
+from gsba.loop_closure.retrieval import _aggregate, _sampled_descriptors, global_descriptors
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.similarity import relative_map
 from gsba.store.shards import Threads
@@ -118,7 +118,7 @@ def test_a_map_torn_in_two_is_joined_where_it_meets(heading: float) -> None:
 
 
 def test_descriptors_that_are_drawn_hold_no_others() -> None:
-    drawn = _drawn(np.eye(50, dtype=np.float32), 3, share=4, seed=0)
+    drawn = _sampled_descriptors(np.eye(50, dtype=np.float32), 3, share=4, seed=0)
     assert drawn.shape == (4, 50) and drawn.base is None
 
 

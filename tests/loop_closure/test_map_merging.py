@@ -107,7 +107,7 @@ def test_what_the_trajectory_puts_into_a_place_that_looks_otherwise_is_apart() -
     held[HALF - 1] = True
     found = map_merging.merge(context, whole, _halves(), held, ~BREAK, TIMES)
     np.testing.assert_array_equal(found.components, np.arange(NUM) >= HALF)
-    assert found.reasons[0] == "" and "not where the trajectory has it" in found.reasons[1]
+    assert found.reasons[0] == "" and "contradict its pose in the trajectory" in found.reasons[1]
 
 
 def test_a_join_that_asks_for_more_than_drift_is_not_believed_against_the_trajectory() -> None:

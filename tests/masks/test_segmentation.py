@@ -113,7 +113,7 @@ def test_masks_meet_the_directions_of_their_faces(tmp_path: Path, frames: FrameS
     ("code", "message"),
     [
         ("sys.exit('out of memory')", "failed with exit code 1: out of memory"),
-        ("sys.exit(3)", "failed with exit code 3: it said nothing"),
+        ("sys.exit(3)", "failed with exit code 3: it printed nothing"),
         (f"{_ALL}\n(masks / 'f1_up.png').unlink()", r"wrote no mask f1_up.png \(1 of 18 missing\)"),
         ("pass", r"wrote no mask f0_front.png \(18 of 18 missing\)"),
         (f"{_ALL}\ncv2.imwrite(str(masks / 'f2_up.png'), np.zeros((9, 8), np.uint8))", "is 8x9"),

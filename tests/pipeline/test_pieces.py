@@ -133,7 +133,7 @@ def test_what_is_counted_is_what_is_exported(
     assert (summary["refined"], summary["exported"], summary["maps"]) == (NUM_FRAMES, NUM_FRAMES, 2)
     assert (summary["frames_in_other_maps"], summary["frames_in_no_map"]) == (OTHERS, 0)
     assert largest["spans"] == [[NAMES[0], NAMES[NUM_FRAMES - 1]]]
-    assert other["spans"] == [[NAMES[NUM_FRAMES], NAMES[-1]]] and "doubtful" in other["reason"]
+    assert other["spans"] == [[NAMES[NUM_FRAMES], NAMES[-1]]] and "not certain" in other["reason"]
     main, _ = load_run(out)
     assert summary["points"] == largest["points"] == len(main.points_world)
     assert summary["observations"] == len(main.observation_points)

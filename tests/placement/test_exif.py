@@ -133,7 +133,7 @@ def test_damage_is_told_apart_from_absence(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="damaged EXIF data"):
         gps_of(_jpeg(tmp_path / "endless.jpg", endless))
     (tmp_path / "text.jpg").write_text("no picture")
-    with pytest.raises(GsbaError, match=r"text\.jpg: is no picture"):
+    with pytest.raises(GsbaError, match=r"text\.jpg: cannot be read as a picture"):
         gps_of(tmp_path / "text.jpg")
 
 

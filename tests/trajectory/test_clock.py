@@ -117,7 +117,7 @@ def test_a_turn_that_repeats_leaves_several_clocks() -> None:
     known = np.ones(len(steps), bool)
     trajectory = Trajectory(long + 2.5, poses)
     found = clock.estimate(TIMES, Steps(steps, known, known), trajectory, 0.0, 10.0)
-    assert found.verdict == "unclear" and "several clocks fit" in found.note
+    assert found.verdict == "unclear" and "several clock offsets fit" in found.note
 
 
 def test_too_few_steps_tell_no_clock() -> None:
