@@ -53,8 +53,8 @@ def covisible_groups(num: int, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -
 
     Args:
         num: N variables.
-        pairs: rows (P, 2) of variables, and the number (P,) that each two share, normalised by the
-            sums over either variable's pairs. Variables without a pair stay alone.
+        pairs: rows (P, 2) of variables, and the number (P,) of landmarks that each two share, which
+            is normalised by both variables' totals. Variables without a pair stay alone.
     """
     rows = np.concatenate([p for p, _ in pairs])
     shared = np.concatenate([s for _, s in pairs]).astype(np.float64)
