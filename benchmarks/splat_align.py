@@ -20,7 +20,7 @@ from gsba.config import SplatSettings
 from gsba.evaluate.trajectory import evaluate, format_table
 from gsba.log import show_log
 from gsba.splat import read_ply
-from gsba.splat.alignment import align
+from gsba.splat.alignment import align_to_splat
 from gsba.splat.backend import choose_backend
 from gsba.splat.scene import near_of
 from gsba.store.finished import load_run
@@ -72,7 +72,7 @@ def main() -> None:
         found = start
         if joined is not None:
             run = reconstruction if joined else None
-            found = align(gaussians, frames, start, near, backend, options.sizes, run)
+            found = align_to_splat(gaussians, frames, start, near, backend, options.sizes, run)
         rows[name] = evaluate(Trajectory(frames.timestamps, found), truth)
     print(format_table(rows))
     print(f"{time.process_time() - started:.0f} CPU s; path {path:.2f} map units")

@@ -191,7 +191,7 @@ class Lenses:
     def _directions_in_panorama(
         self, points: np.ndarray, frames: np.ndarray, signs: np.ndarray | None
     ) -> np.ndarray:
-        """Vectors (N, 3) along the directions in which a stitcher shows points (N, 3), rig frame."""
+        """Vectors (N, 3) along the directions in which a stitcher shows points (N, 3)."""
         origins = self.origins(points, frames, signs)
         vectors = points - origins
         if self.reference_calibration is not None and self.fisheyes is not None:

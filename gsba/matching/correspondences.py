@@ -149,11 +149,11 @@ def verified(
     context: MatchContext,
     rivals: bool = False,
 ) -> VerifiedPairs:
-    """Matches that fit a verified relative pose, see `verification.verify`."""
+    """Matches that fit a verified relative pose, see `verification.verify_pairs`."""
     verify, seed = context.settings.verify, context.settings.seed
     chances = np.array([gate.chance(np.deg2rad(verify.max_error_deg)) for gate in gates])
     given = found, context.keypoints, f0_T_f1s, sigmas, verify, seed
-    return verification.verify(*given, context.workers, chances, rivals)
+    return verification.verify_pairs(*given, context.workers, chances, rivals)
 
 
 def _estimates(found: Matches, gate: Gate, context: MatchContext) -> list[RelativePose | None]:
@@ -161,7 +161,7 @@ def _estimates(found: Matches, gate: Gate, context: MatchContext) -> list[Relati
     verify, seed = context.settings.verify, context.settings.seed
     chances = np.full(len(found.pairs), gate.chance(np.deg2rad(verify.max_error_deg)))
     given = found, context.keypoints, verify, seed
-    return verification.estimate(*given, context.workers, chances)
+    return verification.estimate_relative_poses(*given, context.workers, chances)
 
 
 def _inlier_ratios(found: Matches, kept: VerifiedPairs) -> np.ndarray:

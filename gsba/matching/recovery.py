@@ -168,7 +168,7 @@ def check_clock(
     steps = image_steps(guided, context.keypoints)
     misread.refuse_misread(coarse, steps, settings.verify)
     reach = settings.read.max_clock_shift_s
-    return clock.estimate(timestamps, steps, trajectory, coarse.time_offset, reach)
+    return clock.estimate_clock(timestamps, steps, trajectory, coarse.time_offset, reach)
 
 
 def _match_along(
@@ -240,7 +240,7 @@ def _check_steps(
 ) -> StepChecks:
     steps = image_steps(found, keypoints)
     logs, sigmas = _length_ratios(found, steps, keypoints, coarse.absent)
-    return judgement.judge(coarse, steps, logs, sigmas, settings.verify, settings.priors)
+    return judgement.check_steps(coarse, steps, logs, sigmas, settings.verify, settings.priors)
 
 
 def _length_ratios(

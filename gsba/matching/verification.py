@@ -44,7 +44,7 @@ class RelativePose:
     rivalled: bool  # True if another pose explains about as many of the other matches
 
 
-def verify(
+def verify_pairs(
     matches: Matches,
     keypoints: Keypoints,
     prior_f0_T_f1s: np.ndarray | None,
@@ -66,9 +66,11 @@ def verify(
         settings: thresholds.
         seed: of the sampling.
         workers: threads or processes that run it.
-        chances, rivals: see `estimate`.
+        chances, rivals: see `estimate_relative_poses`.
     """
-    estimates = estimate(matches, keypoints, settings, seed, workers, chances, rivals)
+    estimates = estimate_relative_poses(
+        matches, keypoints, settings, seed, workers, chances, rivals
+    )
     return agree_with_prior(matches, estimates, prior_f0_T_f1s, position_sigmas, settings)
 
 
@@ -82,8 +84,8 @@ def agree_with_prior(
     """Keep pairs that agree with the prior.
 
     Args:
-        estimates: result of `estimate` for each pair.
-        matches, prior_f0_T_f1s, position_sigmas, settings: as for `verify`.
+        estimates: result of `estimate_relative_poses` for each pair.
+        matches, prior_f0_T_f1s, position_sigmas, settings: as for `verify_pairs`.
     """
     kept, kept_poses = [], []
     dropped: dict[str, int] = {
@@ -132,7 +134,7 @@ def _why_prior_contradicts(
     return "" if angle < allowed else "direction contradicts"
 
 
-def estimate(
+def estimate_relative_poses(
     matches: Matches,
     keypoints: Keypoints,
     settings: VerifySettings,
@@ -144,7 +146,7 @@ def estimate(
     """`relative_pose` of every pair, without any prior.
 
     Args:
-        matches, keypoints, settings, seed, workers: as for `verify`.
+        matches, keypoints, settings, seed, workers: as for `verify_pairs`.
         chances: (P,) probability that a false match that passed the gate agrees with a pose near
             the predicted one; 0 = nothing was predicted.
         rivals: True if rival poses are searched too.
@@ -199,7 +201,7 @@ def relative_pose(
         bearings0, bearings1: (m, 3) unit, rays of the matches in each frame.
         settings: thresholds.
         seed: of the sampling.
-        chance, rivals: see `estimate`.
+        chance, rivals: see `estimate_relative_poses`.
     """
     found = _significant_pose(bearings0, bearings1, settings, seed, chance)
     if found is None:

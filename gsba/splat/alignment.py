@@ -46,7 +46,7 @@ class Captured:
     # equal
 
 
-def align(
+def align_to_splat(
     gaussians: Gaussians,
     frames: FrameSet,
     world_T_rigs: np.ndarray,

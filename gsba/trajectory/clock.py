@@ -61,7 +61,7 @@ class ClockEstimate:
     note: str  # for the user; empty if the clocks agree
 
 
-def estimate(
+def estimate_clock(
     timestamps: np.ndarray,
     found: Steps,
     trajectory: Trajectory,

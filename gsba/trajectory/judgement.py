@@ -58,7 +58,7 @@ class StepChecks:
         return self.unseen_steps & ~self.false_steps
 
 
-def judge(
+def check_steps(
     coarse: CoarsePoses,
     found: Steps,
     logs: np.ndarray,

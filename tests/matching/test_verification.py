@@ -151,7 +151,7 @@ def _run(
     )
     spread = np.zeros(len(views)) if sigmas is None else np.array(sigmas)
     how = SETTINGS, 0, Threads(1), np.zeros(len(views))
-    return verification.verify(matches, keypoints, np.array(priors), spread, *how)
+    return verification.verify_pairs(matches, keypoints, np.array(priors), spread, *how)
 
 
 def _turned(f0_T_f1: np.ndarray, degrees: float) -> np.ndarray:

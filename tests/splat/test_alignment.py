@@ -10,7 +10,7 @@ from gsba.camera.views import rig_views
 from gsba.config import SplatSettings
 from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import pose
-from gsba.splat.alignment import align, bearing_block, render_view
+from gsba.splat.alignment import align_to_splat, bearing_block, render_view
 from gsba.splat.backend import CpuBackend
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.scene import load_faces, make_views, near_of, start_cloud
@@ -45,8 +45,8 @@ def test_perturbed_poses_come_back(case: Case, splat: Gaussians) -> None:
     moved = np.stack(
         [gtsam.Pose3(p).retract(rng.normal(0, [0.003] * 3 + [0.02] * 3)).matrix() for p in poses]
     )
-    alone = align(splat, frames, moved, near, BACKEND, (24, 48))
-    both = align(splat, frames, moved, near, BACKEND, (24, 48), reconstruction)
+    alone = align_to_splat(splat, frames, moved, near, BACKEND, (24, 48))
+    both = align_to_splat(splat, frames, moved, near, BACKEND, (24, 48), reconstruction)
     start, first = (np.median(distances(p, poses)) for p in (moved, alone))
     assert first < 0.6 * start
     times = frames.timestamps

@@ -54,7 +54,7 @@ def _judge(
     found = image_steps(pairs, keypoints)
     logs, sigmas = length_ratios(pairs, found, keypoints)
     coarse = CoarsePoses(slam, sources, 0.0)
-    return judgement.judge(coarse, found, logs, sigmas, VERIFY, PRIORS)
+    return judgement.check_steps(coarse, found, logs, sigmas, VERIFY, PRIORS)
 
 
 def _slam(seed: int = 0) -> np.ndarray:
@@ -199,7 +199,7 @@ def test_a_turn_on_the_spot_is_seen_as_one() -> None:
     assert error < 0.01  # 80 bearings of 0.017 degrees
     slam = np.stack([np.eye(4), pose(np.eye(3), np.array([0.0, 0, 2]))])
     coarse = CoarsePoses(slam, np.full(2, PoseSource.SLAM, np.uint8), 0.0)
-    trust = judgement.judge(coarse, found, np.zeros(0), np.zeros(0), VERIFY, PRIORS)
+    trust = judgement.check_steps(coarse, found, np.zeros(0), np.zeros(0), VERIFY, PRIORS)
     assert trust.turning_only and trust.false_steps.all()
     between = trust.world_T_rigs[0, :3, :3].T @ trust.world_T_rigs[1, :3, :3]
     assert np.degrees(rotation_angle(between.T @ turn)) < 0.01
