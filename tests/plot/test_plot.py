@@ -227,5 +227,5 @@ def test_curves_of_trainings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with caplog.at_level("INFO"):
         _write_curves(tmp_path / "none", results)
-    assert "no curves: figures need matplotlib" in caplog.text
+    assert "curves are not plotted: figures need matplotlib" in caplog.text
     assert not (tmp_path / "none").exists()

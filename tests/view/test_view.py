@@ -135,7 +135,7 @@ def test_placements_survive_their_file(tmp_path: Path) -> None:
     assert read_placement(tmp_path / "transform.json").to_json() == placed.to_json()
     for content in ("{}", "no json", "[1]", json.dumps({**PLACED.to_json(), "rotation": [1]})):
         (tmp_path / "transform.json").write_text(content)
-        with pytest.raises(GsbaError, match=r"transform\.json: not a transform\.json of gsba"):
+        with pytest.raises(GsbaError, match=r"transform\.json is not a transform\.json of gsba"):
             read_placement(tmp_path / "transform.json")
 
 
