@@ -16,6 +16,7 @@ from gsba.export import ExportFormat, export_all, of_one_lens, write_points
 from gsba.pipeline.map import Map
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
+from gsba.pipeline.state import State
 from gsba.placement.placement import Placement, metres_per_unit, place
 from gsba.report import findings
 from gsba.report.camera_findings import of_camera, of_lenses
@@ -68,12 +69,15 @@ class RunResult:
         return is_partial(self.maps, len(self.frames))
 
 
-def write(run: Run, prior: Prior, world: Map, result: Reconstruction, lenses: Lenses) -> RunResult:
+def write(state: State, result: Reconstruction, lenses: Lenses) -> RunResult:
     """Poses, cloud, report and datasets; of several maps that nothing ties together the largest.
 
     Args:
+        state: of the run at its end.
+        result: what its map became in the trajectory's world.
         lenses: in the result's unit.
     """
+    run, prior, world = state.run, state.prior, state.map
     store, settings, coarse = run.store, run.settings, prior.coarse
     frames, out, rows = world.straightened(run.frames), store.root, result.largest_map()
     main, shown = result.of_map(1), frames.taken(rows)
@@ -91,7 +95,7 @@ def write(run: Run, prior: Prior, world: Map, result: Reconstruction, lenses: Le
     baseline = settings.camera.baseline()
     placement = place(main, shown, settings.placement, baseline, settings.gps)
     _export(run, main, shown, placement, lenses.taken(rows))
-    report = _report(run, prior, world, result)
+    report = _report(state, result)
     write_json(out / "report.json", report)
     page = report | {"frames": [report["frames"][f] for f in rows]}
     write_html(out / "report.html", shown, start, main, page)
@@ -119,8 +123,9 @@ def _calibration(
     return calibration_json(pair, centre, "map" if metres is None else "m", more)
 
 
-def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[str, Any]:
+def _report(state: State, result: Reconstruction) -> dict[str, Any]:
     """The content of report.json."""
+    run, prior, world = state.run, state.prior, state.map
     frames, coarse, journal = run.frames, prior.coarse, run.journal
     trajectory, notes = findings.of_trajectory(
         prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.absent
@@ -138,8 +143,7 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
             frames.timed,
         )
         if frames.fisheyes is not None:
-            found = world.lenses, world.calibrated, world.covariances
-            camera["lenses"], of_raw = of_lenses(*found)
+            camera["lenses"], of_raw = of_lenses(world.lenses, world.calibrated, world.covariances)
             more += of_raw
         notes += more
     gyro = None
@@ -147,10 +151,11 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
         gyro, more = of_gyro(prior.gyro, prior.turning, world.readout, world.solution.world_T_rigs)
         notes += more
     gps = None
-    if run.fixes is not None:
+    fixes = run.evidence.fixes
+    if fixes is not None:
         poses = world.solution.world_T_rigs
-        anchors = anchor(poses, run.fixes, run.settings.gps, prior.parts)
-        gps, more = of_gps(run.fixes, anchors, poses, frames)
+        anchors = anchor(poses, fixes, run.settings.gps, prior.parts)
+        gps, more = of_gps(fixes, anchors, poses, frames)
         notes += more
     most = run.settings.weak_frames.max_scale_sigma
     notes += findings.of_frames(frames, coarse, result, world.frame_weights, most)
@@ -172,15 +177,16 @@ def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[
         gps=gps,
         reasons=_reasons(prior),
     )
-    report["families"] = _of_families(run, prior, world)
+    report["families"] = _of_families(state)
     report["residual_sphere"] = plain(residual_sphere(result), digits=4)
     return report
 
 
-def _of_families(run: Run, prior: Prior, world: Map) -> dict[str, Any]:
+def _of_families(state: State) -> dict[str, Any]:
     """The report of each family of the caller and of packages, by its name."""
-    snapshot = run.families.snapshot(world.solution, prior.parts)
-    return {family.name: plain(family.report(snapshot)) for family in run.families.members}
+    families = state.run.families
+    snapshot = families.snapshot(state.solution, state.prior.parts)
+    return {family.name: plain(family.report(snapshot)) for family in families.members}
 
 
 def _gauge(run: Run, prior: Prior) -> str:
