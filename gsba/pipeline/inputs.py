@@ -21,6 +21,7 @@ from gsba.log import GsbaError
 from gsba.masks.merging import Choice
 from gsba.odometry.files import write_chosen, write_odometry
 from gsba.odometry.walk import Odometry
+from gsba.pipeline.stage_titles import title_of
 from gsba.placement import EXIF, check, fixes_of_frames, read_fixes
 from gsba.store.store import RunStore, fingerprint
 from gsba.trajectory.association import without_trajectory
@@ -234,7 +235,7 @@ def extract_frames(
     if fps is not None:
         chosen = chosen.model_copy(update={"fps": check_fps(fps), "every": None, "at": None})
     found: Odometry | None = None
-    with RunStore(out, dict(origin), fresh) as store:
+    with RunStore(out, dict(origin), fresh, title_of=title_of) as store:
         if by_odometry is not None:
             found = _follow(store, origin["frames"], settings, by_odometry, calibration)
         if found is not None:

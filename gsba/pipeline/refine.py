@@ -31,6 +31,7 @@ from gsba.pipeline import (
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Evidence, Journal, Run
+from gsba.pipeline.stage_titles import title_of
 from gsba.pipeline.state import State
 from gsba.placement import check
 from gsba.report.html import add_odometry
@@ -108,7 +109,7 @@ def refine(
     found = scan(frames, timestamps, fps, chosen.given, not given, calibration, image_circles)
     evidence = Evidence(tuple(given), readings, families=tuple(families))
     start = _Start.of(found, evidence, settings)
-    with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
+    with RunStore(out, origin, fresh, cluster.hire(client, frames, settings), title_of) as store:
         return _refine(store, settings, chosen, evidence, start, origin["frames"], walk)
 
 

@@ -66,6 +66,8 @@ class RunStore:
         fresh: forget an earlier run in `root`: delete what gsba wrote there, and only that.
         hire: makes the workers that stages are shared out among, from the folder of shards; None =
             one thread.
+        title_of: says in words what the stage of a name does, for the log.
+
     Raises:
         GsbaError: the folder belongs to another run, to something else, or to a live process.
     """
@@ -76,8 +78,10 @@ class RunStore:
         origin: Mapping[str, Path],
         fresh: bool = False,
         hire: Callable[[Path], Workers] | None = None,
+        title_of: Callable[[str], str] = str,
     ) -> None:
         self.root = root
+        self._title_of = title_of
         self.records: dict[str, StageRecord] = {}  # stages of this call, in order
         self._types: dict[str, object] = {}  # of results, by the stage's name
         self._prefix = ""
@@ -216,7 +220,9 @@ class RunStore:
     def _note(self, record: StageRecord) -> None:
         self.records[record.name] = record
         how = "resumed, computed in" if record.resumed else "done in"
-        logger.info("%s: %s %.1f s, %.0f MB", record.name, how, record.seconds, record.peak_mb)
+        title, name = self._title_of(record.name), record.name
+        shown = title if title == name else f"{title} [{name}]"
+        logger.info("%s: %s %.1f s, %.0f MB", shown, how, record.seconds, record.peak_mb)
 
 
 class Chain:
