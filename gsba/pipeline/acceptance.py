@@ -12,7 +12,28 @@ MIN_STEP_SIGMAS = 3.0  # median length of a map's steps, in standard deviations;
 # rendered walks have 40 and more
 
 
-def require_motion(frames: FrameSet, result: Reconstruction, in_pieces: bool) -> None:
+def refuse_vehicle_in_pieces(frames: FrameSet) -> None:
+    """Refuse a way in pieces seen from a vehicle.
+
+    Matches across a gap are then of what rides along or is far away, so that lengths on both sides
+    of it do not agree.
+
+    Args:
+        frames: of a run whose odometry lost the camera on the way, with their masks.
+
+    Raises:
+        GsbaError: a vehicle carries the camera.
+    """
+    share = _masked_share(frames)
+    if share >= VEHICLE_SHARE:
+        raise GsbaError(
+            f"{_riding_along(share)}, and the camera was lost on the way: how its parts lie to one "
+            "another cannot be told; nothing is written: give a part that holds together (--set "
+            "video.from_s=..., video.to_s=...), --masks of the vehicle, or a trajectory"
+        )
+
+
+def require_motion(frames: FrameSet, result: Reconstruction) -> None:
     """Refuse positions that images alone do not determine, and turns seen from a vehicle.
 
     A camera on a vehicle whose surroundings are blurred or far sees the vehicle stand still. Its
@@ -22,18 +43,13 @@ def require_motion(frames: FrameSet, result: Reconstruction, in_pieces: bool) ->
     Args:
         frames: of the run, with their masks.
         result: what was solved from the images alone.
-        in_pieces: whether odometry lost the camera in between. On a vehicle, matches across such a
-            gap are of what rides along or is far away, so that lengths on both sides do not agree.
 
     Raises:
         GsbaError: the images determine no positions.
     """
     main = result.of_map(1)
     share = _masked_share(frames)
-    where = (
-        f"{100 * share:.0f} % of the picture turn with the camera, as a vehicle does (see "
-        "carrier_check.jpg)"
-    )
+    where = _riding_along(share)
     if not len(main.points_world):
         if share < VEHICLE_SHARE:
             return
@@ -41,12 +57,6 @@ def require_motion(frames: FrameSet, result: Reconstruction, in_pieces: bool) ->
             f"nothing but turns can be told from these pictures: {where}, and what passes by "
             "shows no parallax: it is blurred or far away, or the vehicle stands; give more "
             "frames per second, --masks of the vehicle, or a trajectory"
-        )
-    if in_pieces and share >= VEHICLE_SHARE:
-        raise GsbaError(
-            f"{where}, and the camera was lost on the way: how its parts lie to one another cannot "
-            "be told; nothing is written: give a part that holds together (--set video.from_s=..., "
-            "video.to_s=...), --masks of the vehicle, or a trajectory"
         )
     sigmas = step_sigmas(main)
     if not len(sigmas) or np.median(sigmas) >= MIN_STEP_SIGMAS:
@@ -78,3 +88,11 @@ def _masked_share(frames: FrameSet) -> float:
     """Part of the sphere's panorama that the mask of the first frame leaves out."""
     mask = load_mask(frames, 0)
     return 0.0 if mask is None else 1 - float(np.mean(mask))
+
+
+def _riding_along(share: float) -> str:
+    """A clause that names a vehicle by its share of the picture."""
+    return (
+        f"{100 * share:.0f} % of the picture turn with the camera, as a vehicle does (see "
+        "carrier_check.jpg)"
+    )

@@ -153,7 +153,7 @@ def _refine(
     state = _solve_raw(_begin(store, settings, chosen, start))
     result = backend.reconstruct(state)
     if walk is not None or state.prior.absent:  # the images alone have to show motion
-        acceptance.require_motion(state.run.frames, result, start.coarse.segments is not None)
+        acceptance.require_motion(state.run.frames, result)
     lenses = camera.keep_lenses(state, result)
     written = outputs.write(state, result, lenses)
     if walk is not None:
@@ -170,7 +170,13 @@ def _with_fetched(
     video_file: Path,
     walk: Odometry,
 ) -> _Start:
-    """The start with more frames of a video where the map of features is weak."""
+    """The start with more frames of a video where the map of features is weak.
+
+    Raises:
+        GsbaError: the odometry is in pieces, and a vehicle carries the camera.
+    """
+    if start.coarse.segments is not None:
+        acceptance.refuse_vehicle_in_pieces(_begin(store, settings, chosen, start).frames)
 
     def measure(some: FrameSet) -> Prior:
         run = _begin(store, settings, chosen, _Start.of(some, given, settings))

@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from gsba.log import GsbaError
-from gsba.pipeline.acceptance import MIN_STEP_SIGMAS, require_motion, step_sigmas
+from gsba.pipeline.acceptance import (
+    MIN_STEP_SIGMAS,
+    refuse_vehicle_in_pieces,
+    require_motion,
+    step_sigmas,
+)
 from gsba.types import FrameSet, JointErrors, Reconstruction
 
 NUM, SIGMA = 8, 0.02
@@ -60,23 +65,21 @@ def test_steps_are_measured_by_their_own_noise() -> None:
 def test_positions_that_images_do_not_determine_are_refused(tmp_path: Path) -> None:
     noise = np.sqrt(6) * SIGMA
     hand = _frames(tmp_path, 4)
-    require_motion(hand, _result(1.1 * MIN_STEP_SIGMAS * noise), False)
+    require_motion(hand, _result(1.1 * MIN_STEP_SIGMAS * noise))
     with pytest.raises(GsbaError, match=r"the images determine no positions.*hardly moves"):
-        require_motion(hand, _result(0.9 * MIN_STEP_SIGMAS * noise), False)
+        require_motion(hand, _result(0.9 * MIN_STEP_SIGMAS * noise))
     vehicle = _frames(tmp_path, 16)
     with pytest.raises(GsbaError, match="50 % of the picture turn with the camera, as a vehicle"):
-        require_motion(vehicle, _result(0.0), False)
+        require_motion(vehicle, _result(0.0))
 
 
 def test_turns_alone_are_a_result_but_not_on_a_vehicle(tmp_path: Path) -> None:
-    require_motion(_frames(tmp_path, 8), _result(0.0, num_points=0), False)
+    require_motion(_frames(tmp_path, 8), _result(0.0, num_points=0))
     with pytest.raises(GsbaError, match=r"nothing but turns.*as a vehicle does"):
-        require_motion(_frames(tmp_path, 16), _result(0.0, num_points=0), False)
+        require_motion(_frames(tmp_path, 16), _result(0.0, num_points=0))
 
 
 def test_a_way_in_pieces_is_refused_on_a_vehicle(tmp_path: Path) -> None:
-    require_motion(_frames(tmp_path, 8), _result(1.0), in_pieces=True)
-    vehicle = _frames(tmp_path, 16)
-    require_motion(vehicle, _result(1.0), in_pieces=False)
-    with pytest.raises(GsbaError, match="the camera was lost on the way"):
-        require_motion(vehicle, _result(1.0), in_pieces=True)
+    refuse_vehicle_in_pieces(_frames(tmp_path, 8))
+    with pytest.raises(GsbaError, match=r"the camera was lost on the way.*a part that holds"):
+        refuse_vehicle_in_pieces(_frames(tmp_path, 16))
