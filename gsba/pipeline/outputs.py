@@ -24,7 +24,7 @@ from gsba.report.gps_findings import of_gps
 from gsba.report.html import residual_sphere, write_html
 from gsba.report.imu_findings import of_gyro
 from gsba.report.maps import MapSummary, is_partial, summarize_maps
-from gsba.report.report import build_report, plain, write_poses
+from gsba.report.report import Findings, StageLog, build_report, plain, write_poses
 from gsba.trajectory.files import write_tum
 from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
 
@@ -125,61 +125,54 @@ def _calibration(
 
 def _report(state: State, result: Reconstruction) -> dict[str, Any]:
     """The content of report.json."""
-    run, prior, world = state.run, state.prior, state.map
-    frames, coarse, journal = run.frames, prior.coarse, run.journal
+    run, rounds = state.run, state.run.journal.rounds
+    solver = [{"stage": name, "rounds": some} for name, some in rounds.items()]
+    stages = StageLog(tuple(run.store.records.values()), run.journal.counts, solver)
+    gauge, found = _gauge(run, state.prior), _findings(state, result)
+    coarse = state.prior.coarse
+    report = build_report(run.settings, run.frames, coarse, result, stages, gauge, found)
+    report["families"] = _of_families(state)
+    report["residual_sphere"] = plain(residual_sphere(result), digits=4)
+    return report
+
+
+def _findings(state: State, result: Reconstruction) -> Findings:
+    """Sections of the report on trajectory, camera and sensors, and notes on all that is odd."""
+    run, prior, map_, poses = state.run, state.prior, state.map, state.solution.world_T_rigs
+    frames, evidence = run.frames, run.evidence
     trajectory, notes = findings.of_trajectory(
         prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.absent
     )
     camera = None
-    if world.centres is not None:
+    if map_.centres is not None:
         camera, more = of_camera(
-            world.centres,
-            world.readout,
-            world.axes,
-            world.radius,
-            world.covariances,
-            world_scale(world.solution, result),
+            map_.centres,
+            map_.readout,
+            map_.axes,
+            map_.radius,
+            map_.covariances,
+            world_scale(state.solution, result),
             run.settings.camera,
             frames.timed,
         )
         if frames.fisheyes is not None:
-            camera["lenses"], of_raw = of_lenses(world.lenses, world.calibrated, world.covariances)
+            camera["lenses"], of_raw = of_lenses(map_.lenses, map_.calibrated, map_.covariances)
             more += of_raw
         notes += more
     gyro = None
     if prior.gyro is not None:
-        gyro, more = of_gyro(prior.gyro, prior.turning, world.readout, world.solution.world_T_rigs)
+        gyro, more = of_gyro(prior.gyro, prior.turning, map_.readout, poses)
         notes += more
     gps = None
-    fixes = run.evidence.fixes
-    if fixes is not None:
-        poses = world.solution.world_T_rigs
-        anchors = anchor(poses, fixes, run.settings.gps, prior.parts)
-        gps, more = of_gps(fixes, anchors, poses, frames)
+    if evidence.fixes is not None:
+        anchors = anchor(poses, evidence.fixes, run.settings.gps, prior.parts)
+        gps, more = of_gps(evidence.fixes, anchors, poses, frames)
         notes += more
     most = run.settings.weak_frames.max_scale_sigma
-    notes += findings.of_frames(frames, coarse, result, world.frame_weights, most)
-    report = build_report(
-        settings=run.settings,
-        frames=frames,
-        coarse=coarse,
-        reconstruction=result,
-        stages=run.store.records.values(),
-        counts=journal.counts,
-        solver=[{"stage": name, "rounds": rounds} for name, rounds in journal.rounds.items()],
-        gauge=_gauge(run, prior),
-        notes=notes,
-        trajectory=trajectory,
-        moves=world.moves,
-        stitching=world.stitching and findings.of_field(world.stitching),
-        camera=camera,
-        gyro=gyro,
-        gps=gps,
-        reasons=_reasons(prior),
-    )
-    report["families"] = _of_families(state)
-    report["residual_sphere"] = plain(residual_sphere(result), digits=4)
-    return report
+    notes += findings.of_frames(frames, prior.coarse, result, map_.frame_weights, most)
+    stitching = map_.stitching and findings.of_field(map_.stitching)
+    reasons = _reasons(prior)
+    return Findings(notes, trajectory, stitching, camera, gyro, gps, map_.moves, reasons)
 
 
 def _of_families(state: State) -> dict[str, Any]:

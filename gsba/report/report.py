@@ -1,4 +1,4 @@
-"""What a run did and how good it is: report.json and poses.csv."""
+"""report.json and poses.csv: settings, costs, results and accuracy of a run."""
 
 import csv
 import dataclasses
@@ -6,7 +6,7 @@ import logging
 import math
 import os
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from enum import Enum
 from importlib.metadata import PackageNotFoundError, version
@@ -32,7 +32,7 @@ _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # of a pose covariance
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class FrameQuality:
-    """How well the images support each pose."""
+    """Observations, residuals and standard deviations of each pose."""
 
     num_observations: np.ndarray  # (F,) int64
     median_residuals_deg: np.ndarray  # (F,) float64, degrees; NaN without observations
@@ -58,9 +58,9 @@ def frame_quality(reconstruction: Reconstruction) -> FrameQuality:
 
 
 def median_residual_deg(reconstruction: Reconstruction, world_T_rigs: np.ndarray) -> float:
-    """Median angular residual in degrees that the same observations leave under other poses.
+    """Median angular residual in degrees of the reconstruction's observations under other poses.
 
-    Each point is placed anew, nearest to the rays of its observations. NaN without observations.
+    Each point is triangulated again from the rays of its observations. NaN without observations.
     """
     if len(reconstruction.observation_frames) == 0:
         return math.nan
@@ -79,59 +79,73 @@ def angular_residuals(reconstruction: Reconstruction) -> np.ndarray:
     )
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class Findings:
+    """What a run found beside poses and points, each as a section of report.json."""
+
+    notes: Sequence[str] = ()  # for the user: frames without images, unmatched frames, ...
+    trajectory: Mapping[str, Any] | None = None  # checks by images, see `findings.of_trajectory`
+    stitching: Mapping[str, Any] | None = None  # its field, see `findings.of_field`
+    camera: Mapping[str, Any] | None = None  # two lenses, see `camera_findings.of_camera`
+    gyro: Mapping[str, Any] | None = None  # see `imu_findings.of_gyro`
+    gps: Mapping[str, Any] | None = None  # see `gps_findings.of_gps`
+    moves: Sequence[object] = ()  # of the poses by a splat, see `gsba.splat.refinement.Move`
+    reasons: Sequence[str] = ()  # why maps were not joined, see `maps.summarize_maps`
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class StageLog:
+    """What the stages of a run cost, received and kept."""
+
+    costs: Sequence[StageRecord] = ()  # in order
+    counts: Mapping[str, Sequence[Counts]] = dataclasses.field(
+        default_factory=dict
+    )  # by stage name
+    solver: Sequence[object] = ()  # a record for each round, with its iterations' cost by family
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Cost and counts of each stage."""
+        return [
+            {**dataclasses.asdict(stage), "counts": self.counts.get(stage.name, ())}
+            for stage in self.costs
+        ]
+
+
 def build_report(
-    *,
     settings: BaseModel,
     frames: FrameSet,
     coarse: CoarsePoses,
     reconstruction: Reconstruction,
-    stages: Iterable[StageRecord],
-    counts: Mapping[str, Sequence[Counts]],
-    solver: Sequence[object],
+    stages: StageLog,
     gauge: str,
-    notes: Sequence[str] = (),
-    trajectory: Mapping[str, Any] | None = None,
-    moves: Sequence[object] = (),
-    stitching: Mapping[str, Any] | None = None,
-    camera: Mapping[str, Any] | None = None,
-    gyro: Mapping[str, Any] | None = None,
-    gps: Mapping[str, Any] | None = None,
-    reasons: Sequence[str] = (),
+    found: Findings,
 ) -> dict[str, Any]:
     """Content of report.json: plain values only.
 
     Args:
-        settings: as resolved.
-        stages: cost of each stage, in order.
-        counts: stage name -> what it received, kept and dropped.
-        solver: one record for each round, holding its iterations with their cost by family.
-        gauge: a sentence on where the refined map sits.
-        notes: what the user should know: frames without images, unmatched frames, ...
-        trajectory: the images' judgement of it, see `gsba.report.findings.of_trajectory`.
-        moves: of the poses against a splat, see `gsba.splat.refinement.Move`.
-        stitching: the field of directions, see `gsba.report.findings.of_field`.
-        camera: where its lenses are, see `gsba.report.findings.of_camera`.
-        gyro, gps: see `gsba.report.imu_findings.of_gyro` and `gsba.report.gps_findings.of_gps`.
-        reasons: why maps were not joined, see `gsba.report.maps.summarize_maps`.
+        settings: settings of the run.
+        frames: its frames.
+        coarse: their initial poses.
+        reconstruction: the result.
+        stages: their costs and counts.
+        gauge: a sentence on the gauge of the refined map.
+        found: findings beside the result.
     """
     quality = frame_quality(reconstruction)
-    stage_rows = [
-        {**dataclasses.asdict(stage), "counts": counts.get(stage.name, ())} for stage in stages
-    ]
+    optional = {"camera": found.camera, "gyro": found.gyro, "gps": found.gps}
     report = {
         "gsba": __version__,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "summary": _summary(frames, coarse, reconstruction),
-        "maps": summarize_maps(reconstruction, frames, reasons),
+        "maps": summarize_maps(reconstruction, frames, found.reasons),
         "gauge": gauge,
-        "notes": notes,
-        "trajectory": trajectory,
-        "stitching": stitching,
-        **({} if camera is None else {"camera": camera}),
-        **{name: said for name, said in (("gyro", gyro), ("gps", gps)) if said is not None},
-        "stages": stage_rows,
-        "solver": solver,
-        "splat": moves,
+        "notes": found.notes,
+        "trajectory": found.trajectory,
+        "stitching": found.stitching,
+        **{name: section for name, section in optional.items() if section is not None},
+        "stages": stages.rows(),
+        "solver": stages.solver,
+        "splat": found.moves,
         "frames": _frame_rows(frames, coarse, reconstruction, quality),
         "settings": settings,
         "machine": _machine(),
@@ -143,7 +157,7 @@ def build_report(
 def _summary(
     frames: FrameSet, coarse: CoarsePoses, reconstruction: Reconstruction
 ) -> dict[str, Any]:
-    """Counts of a run's frames, and counts and residuals of the map that is exported."""
+    """Counts of a run's frames, and counts and residuals of the exported map."""
     rows, main = reconstruction.largest_map(), reconstruction.of_map(1)
     residuals = np.degrees(angular_residuals(main))
     lengths = np.bincount(main.observation_points, minlength=len(main.points_world))
@@ -170,8 +184,8 @@ def write_poses(
 
     Covariances are of the tangent [rotation (radians), translation (map units)] in the rig frame;
     the upper triangle is written row by row. Cells of unknown values are empty. Frames of the same
-    `map` share a world; 1 is the largest, and frames that are in none have an empty cell. `fetched`
-    is 1 for frames that strengthen the map and are in no dataset, see `FrameSet`.
+    `map` share a world; map 1 is the largest; the cell is empty for frames in no map. `fetched` is
+    1 for frames that were added to strengthen the map and are in no dataset, see `FrameSet`.
     """
     quality = frame_quality(reconstruction)
     rows, columns = np.triu_indices(6)
@@ -259,8 +273,8 @@ def _version(package: str) -> str | None:
 
 
 def plain(value: Any, digits: int = 17) -> Any:
-    """Values JSON can hold, floats to `digits`; what is not finite becomes null."""
-    if type(value) is float:  # nearly all of them
+    """Value as JSON can hold it: floats with `digits`, null for numbers that are not finite."""
+    if type(value) is float:  # the most frequent type
         if not math.isfinite(value):
             return None
         return value if digits >= 17 else float(f"{value:.{digits}g}")
