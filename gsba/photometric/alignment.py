@@ -14,13 +14,15 @@ from gsba.frames import panorama
 from gsba.photometric import frame_jobs, surfaces
 from gsba.photometric.references import references, visible_frames
 from gsba.store.shards import Workers
-from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
+from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution, Tracks
 
-_UNCERTAIN = "position too uncertain"
-_AT_ONCE = 1 << 17  # sightings that are judged together: some 80 MB
-_ENOUGH = 100  # aligned observations with which a frame does without points that no patch confirms
-_WIDER = 1.4  # pixels to a step of patches that lie on their surfaces; 1 of those facing the host
-_LEAST_SIGMA = 0.03  # pixels: what sampling and a plane for the surface cost the best of patches
+_TOO_UNCERTAIN = "position too uncertain"
+_SIGHTINGS_AT_ONCE = 1 << 17  # sightings processed together: some 80 MB
+_ENOUGH_OBSERVATIONS = 100  # aligned observations of a frame from which points without aligned
+# patches are dropped
+_TILTED_STEP_PX = 1.4  # pixels to a step of patches tilted with their surfaces; 1 of patches facing
+# the host
+_MIN_SIGMA_PX = 0.03  # pixels, noise of the best patches: sampling, and a plane as the surface
 
 _STRAIGHT = SphereField.none()
 
@@ -37,64 +39,69 @@ class _Observed:
 
 @dataclass(frozen=True, slots=True)
 class _Planes:
-    """Plane patches around points, as their hosts observe them."""
+    """Plane patches around points, in their hosts."""
 
     origins: np.ndarray  # (J, 3) unit bearings
     spreads: np.ndarray  # (J, 3, 2) steps across them, radians
     slopes: np.ndarray  # (J, 2) relative depth that a step adds; 0 = the patch faces its host
     tilted: np.ndarray  # (J, 3, 2) steps on the surface, at unit distance, rig frame of the host
-    axes_world: np.ndarray  # (J, 3, 2) the same at the point, map units
+    axes_world: np.ndarray  # (J, 3, 2) those steps at the point, map units
     rays_world: np.ndarray  # (J, 3) from the host to the point, map units
 
 
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """Observations of a map's points, and what earlier alignments have shown of them."""
+
+    keypoints: Keypoints  # as pictures show them
+    aligned: np.ndarray | None = None  # (N,) bool, keypoints confirmed by patches; None = none
+    normals_rig: np.ndarray | None = None  # (N, 3) of the surfaces that they show, as in `Sighted`;
+    # None = unknown
+    field: SphereField = _STRAIGHT  # errors of stitching: the map is corrected by it
+
+
 def align(
-    landmarks: Landmarks,
-    world_T_rigs: np.ndarray,
-    keypoints: Keypoints,
-    noise: float,
+    solved: Solution,
+    observed: Observations,
     greys: panorama.Greys,
     rig: CubeRig,
-    name: str,
-    aligned: np.ndarray | None,
     settings: PatchSettings,
     workers: Workers,
-    field: SphereField = _STRAIGHT,
     lenses: Lenses = ONE_CENTRE,
-    normals_rig: np.ndarray | None = None,
+    name: str = "align",
 ) -> Sighted:
-    """Observe every point anew, in the frames that should show it.
+    """Observe every point again, in the frames that should show it.
 
-    The patch around a point is cut from the middle frame of its views, as a plane that faces it or
-    lies on the surface, where that is known; poses and depth carry it into others, where shift,
-    affine part, gain and offset are found. These affine parts tell how surfaces lie.
+    The patch around a point is cut from the middle frame of its views, facing it or tilted with the
+    surface, where that is known; poses and depth project it into other frames, where shift, affine
+    part, gain and offset are estimated. The affine parts determine the surfaces' normals.
 
     Args:
-        landmarks: points and their observations so far.
-        world_T_rigs: (F, 4, 4) poses they were solved with.
-        keypoints: of those observations.
-        noise: of those, in units of their sigmas.
+        solved: points, poses, and the noise of the observations so far.
+        observed: these observations.
         greys: the frames' images.
         rig: faces that pixels are given on.
-        name: beside the progress bar.
-        aligned: (N,) bool, which of the keypoints patches have confirmed; None = none.
         settings: limits and sizes.
         workers: who work on frames.
-        field: of the camera; keypoints are as observed, the map as corrected.
-        lenses: that see the points; nothing is looked for where two pictures are blended.
-        normals_rig: (N, 3) of the surfaces that keypoints show, as in `Sighted`; None = unknown.
+        lenses: lenses of the camera; the band where two pictures are blended is left out.
+        name: beside the progress bar.
 
     Returns:
-        Tracks of aligned observations, and of former ones where a point was not aligned.
+        Tracks of aligned observations, and of former ones where alignment failed.
     """
+    landmarks, world_T_rigs = solved.landmarks, solved.world_T_rigs
+    keypoints, field = observed.keypoints, observed.field
     rows = references(landmarks, world_T_rigs)
     hosts = landmarks.tracks.frames[rows].astype(np.int64)
     own, pixel = keypoints.rows(landmarks.tracks)[rows], 2 * np.pi / greys.width
-    normals = np.zeros((len(rows), 3)) if normals_rig is None else normals_rig[own]
+    normals = np.zeros((len(rows), 3))
+    if observed.normals_rig is not None:
+        normals = observed.normals_rig[own]
     planes = _planes(landmarks, world_T_rigs, hosts, normals, pixel, field, lenses)
-    extended = _extended(landmarks, keypoints, aligned, settings.min_track_length)
+    extended = _confirmed_points(landmarks, keypoints, observed.aligned, settings.min_track_length)
     views = visible_frames(landmarks, world_T_rigs, rows, extended, settings)
     points, seeing = _unblended(landmarks, planes, world_T_rigs, hosts, *views, lenses)
-    at, across, rays = _carried(landmarks, planes, world_T_rigs, points, seeing, lenses)
+    at, across, rays = _projected_patches(landmarks, planes, world_T_rigs, points, seeing, lenses)
     sightings = expect(points, field.observed(at), across)
     title, cut = f"{name}: templates", (planes.origins, planes.tilted)
     patches = frame_jobs.cut(title, greys, hosts, *cut, settings, workers)
@@ -103,7 +110,9 @@ def align(
     at_hosts = _at_hosts(patches, sightings, kept, hosts, planes, pixel)
     normals_world = _normals_world(sightings, kept, rays, planes, world_T_rigs[hosts])
     del patches, sightings, planes, cut, at, across, rays  # gigabytes, of thousands of frames
-    former = _former(landmarks, keypoints, noise, [found, at_hosts], greys.num_frames)
+    former = _former_observations(
+        landmarks, keypoints, solved.noise, [found, at_hosts], greys.num_frames
+    )
     parts, colors = [found, at_hosts, former], keypoints.colors[own]
     counts = Counts(len(seeing), len(found.points), "observations", dropped)
     return _pack(parts, colors, normals_world, world_T_rigs, rig, counts)
@@ -118,7 +127,7 @@ def _planes(
     field: SphereField,
     lenses: Lenses,
 ) -> _Planes:
-    """Plane patches around the points (J), as their hosts observe them.
+    """Plane patches around the points (J,), in their hosts.
 
     Args:
         normals_rig: (J, 3) of the surfaces, zero = unknown.
@@ -132,7 +141,7 @@ def _planes(
     depths = np.linalg.norm(local, axis=1)
     origins = field.observed(local / np.maximum(depths, 1e-300)[:, None])
     spreads = pixel * np.swapaxes(tangent_basis(origins), 1, 2)
-    spreads[normals_rig.any(axis=1)] *= _WIDER
+    spreads[normals_rig.any(axis=1)] *= _TILTED_STEP_PX
     slopes = surfaces.slopes_of(normals_rig, origins, spreads)
     tilted = spreads + origins[:, :, None] * slopes[:, None, :]
     away = world_T_hosts[:, :3, :3] * depths[:, None, None]
@@ -149,15 +158,15 @@ def _unblended(
     frames: np.ndarray,
     lenses: Lenses,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of views of points (O,) in frames (O,), those clear of where two pictures are blended."""
+    """Views of points (O,) in frames (O,) outside the band where two pictures are blended."""
     if not lenses:
         return points, frames
-    at, _, _ = _carried(landmarks, planes, world_T_rigs, points, frames, lenses)
+    at, _, _ = _projected_patches(landmarks, planes, world_T_rigs, points, frames, lenses)
     clear = ~(lenses.blended(planes.origins, hosts)[points] | lenses.blended(at, frames))
     return points[clear], frames[clear]
 
 
-def _carried(
+def _projected_patches(
     landmarks: Landmarks,
     planes: _Planes,
     world_T_rigs: np.ndarray,
@@ -165,8 +174,8 @@ def _carried(
     frames: np.ndarray,
     lenses: Lenses,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Patches of points (O,) in the rigs of the frames (O,) that see them, at unit distance:
-    bearings (O, 3), axes (O, 3, 2), and rays (O, 3) to them from their hosts."""
+    """Patches of points (O,) in the rigs of their frames (O,), at unit distance: bearings (O, 3),
+    axes (O, 3, 2), and rays (O, 3) to them from their hosts."""
     rotations = world_T_rigs[frames, :3, :3]
     away = landmarks.points_world[points] - world_T_rigs[frames, :3, 3]
     origins = np.einsum("oba,ob->oa", rotations, away)
@@ -185,39 +194,39 @@ def _accepted(
     pixel: float,
     settings: PatchSettings,
 ) -> tuple[np.ndarray, _Observed, dict[str, int]]:
-    """Rows (N,) of the sightings to believe, as observations, and why others fell."""
-    parts, dropped = [], dict.fromkeys([*REASONS.values(), _UNCERTAIN], 0)
-    for first in range(0, max(len(seeing), 1), _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
+    """Accepted rows (N,) of the sightings, as observations, and counts of rejections by reason."""
+    parts, dropped = [], dict.fromkeys([*REASONS.values(), _TOO_UNCERTAIN], 0)
+    for first in range(0, max(len(seeing), 1), _SIGHTINGS_AT_ONCE):
+        some = slice(first, first + _SIGHTINGS_AT_ONCE)
         there = Sightings(*(array[some] for array in sightings))
-        kept, bearings, covariances = _believed(patches, there, pixel, settings, dropped)
+        kept, bearings, covariances = _accepted_rows(patches, there, pixel, settings, dropped)
         parts.append((first + kept, bearings, covariances))
     kept, bearings, covariances = (np.concatenate(column) for column in zip(*parts, strict=True))
     found = _Observed(sightings.templates[kept], seeing[kept], bearings, covariances)
     return kept, found, dropped
 
 
-def _believed(
+def _accepted_rows(
     patches: PatchSet,
     sightings: Sightings,
     pixel: float,
     settings: PatchSettings,
     dropped: dict[str, int],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows (N,) of the sightings to believe, their bearings (N, 3) and covariances (N, 2, 2); why
-    others fell is added to what was dropped."""
+    """Accepted rows (N,) of the sightings, their bearings (N, 3) and covariances (N, 2, 2);
+    rejections are added to `dropped`."""
     bearings, by_shift = found_at(sightings)
     axes = tangent_basis(bearings) @ by_shift
     of_shifts = patches.shift_covariances(sightings.templates, sightings.variances)
     covariances = axes @ of_shifts @ np.swapaxes(axes, 1, 2)
-    covariances += (_LEAST_SIGMA * pixel) ** 2 * np.eye(2)
+    covariances += (_MIN_SIGMA_PX * pixel) ** 2 * np.eye(2)
     worst = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, 1], 0))
     shifts = np.linalg.norm(np.cross(sightings.origins, bearings), axis=1)
     tests = {reason: sightings.states != state for state, reason in REASONS.items()}
     aligned = sightings.states == ALIGNED
     tests["look different"] &= ~aligned | (sightings.scores > settings.min_zncc)
     tests["found too far off"] &= ~aligned | (shifts < settings.max_shift_px * pixel)
-    tests[_UNCERTAIN] = ~aligned | (worst < settings.max_sigma_px * pixel)
+    tests[_TOO_UNCERTAIN] = ~aligned | (worst < settings.max_sigma_px * pixel)
     left = np.ones(len(bearings), bool)
     for reason, passed in tests.items():
         dropped[reason] += int(np.count_nonzero(left & ~passed))
@@ -234,7 +243,7 @@ def _at_hosts(
     planes: _Planes,
     pixel: float,
 ) -> _Observed:
-    """Observations of the templates found again, in the frames they are from.
+    """Observations of aligned templates in their host frames.
 
     A template's place is exact by definition; its noise, which all its alignments share, is
     counted here, with the mean residual of those alignments.
@@ -246,7 +255,7 @@ def _at_hosts(
     of_shifts = patches.shift_covariances(used, sums[used] / times[used])
     axes = tangent_basis(planes.origins[used]) @ planes.spreads[used]
     covariances = axes @ of_shifts @ np.swapaxes(axes, 1, 2)
-    covariances += (_LEAST_SIGMA * pixel) ** 2 * np.eye(2)
+    covariances += (_MIN_SIGMA_PX * pixel) ** 2 * np.eye(2)
     return _Observed(used, hosts[used], planes.origins[used], covariances)
 
 
@@ -257,16 +266,16 @@ def _normals_world(
     planes: _Planes,
     world_T_hosts: np.ndarray,
 ) -> np.ndarray:
-    """Normals (J, 3) of the surfaces that patches turned out to lie on, zero = unknown."""
+    """Normals (J, 3) of the surfaces, from the patches' alignments, zero = unknown."""
     laid = planes.slopes, planes.origins, planes.spreads
     shown = surfaces.normals(sightings, kept, rays[kept], *laid)
     return np.einsum("jab,jb->ja", world_T_hosts[:, :3, :3], shown)
 
 
-def _extended(
+def _confirmed_points(
     landmarks: Landmarks, keypoints: Keypoints, aligned: np.ndarray | None, min_length: int
 ) -> np.ndarray:
-    """Points (J,) that many observations or a patch confirm: worth looking for elsewhere."""
+    """Points (J,) confirmed by many observations or a patch: searched in further frames."""
     tracks = landmarks.tracks
     out = np.bincount(tracks.points, minlength=tracks.num_points) >= min_length
     if aligned is not None:
@@ -274,23 +283,23 @@ def _extended(
     return out
 
 
-def _former(
+def _former_observations(
     landmarks: Landmarks,
     keypoints: Keypoints,
     noise: float,
     found: list[_Observed],
     num_frames: int,
 ) -> _Observed:
-    """The observations so far, where there are none now.
+    """The former observations of points in frames where alignment failed.
 
-    Points that no patch confirms are kept only for frames that have few which one does.
+    Points without an aligned patch are kept only in frames with few aligned ones.
     """
     tracks = landmarks.tracks
     known = np.concatenate([part.points * num_frames + part.frames for part in found])
     cells = tracks.points.astype(np.int64) * num_frames + tracks.frames
     wanted = np.zeros(tracks.num_points, bool)
     wanted[found[0].points] = True
-    scarce = np.bincount(known % num_frames, minlength=num_frames) < _ENOUGH
+    scarce = np.bincount(known % num_frames, minlength=num_frames) < _ENOUGH_OBSERVATIONS
     wanted[tracks.points[scarce[tracks.frames]]] = True
     chosen = np.flatnonzero(wanted[tracks.points] & ~np.isin(cells, known))
     rows = keypoints.rows(tracks)[chosen]
@@ -312,7 +321,7 @@ def _pack(
 ) -> Sighted:
     """Observations, the last part being former ones, as keypoints frame by frame and as tracks.
 
-    Points seen once are left out.
+    Points observed once are left out.
     """
     points, frames, bearings, covariances = (
         np.concatenate([getattr(part, name) for part in parts])

@@ -8,6 +8,7 @@ import numpy as np
 from gsba.bundle import adjustment, self_calibration, settling, stitching
 from gsba.bundle.stitching import Stitching
 from gsba.photometric import alignment
+from gsba.photometric.alignment import Observations
 from gsba.pipeline import camera, gyro
 from gsba.pipeline.state import State
 from gsba.types import Keypoints, Sighted, Solution
@@ -69,24 +70,19 @@ def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State |
 
 def _align(state: State, name: str) -> Sighted:
     """Points observed anew."""
-    run, map_, solution = state.run, state.map, state.solution
-    settings = run.settings.patches
+    run, map_, settings = state.run, state.map, state.run.settings.patches
 
     def compute() -> Sighted:
+        observed = Observations(map_.observed, map_.aligned, map_.normals_rig, map_.field)
         return alignment.align(
-            solution.landmarks,
-            solution.world_T_rigs,
-            map_.observed,
-            solution.noise,
+            map_.solution,
+            observed,
             run.greys,
             run.rig,
-            name,
-            map_.aligned,
             settings,
             run.store.workers,
-            map_.field,
             map_.lenses,
-            map_.normals_rig,
+            name,
         )
 
     return run.stage(name, settings.model_dump(exclude={"rounds"}), compute, Sighted)
