@@ -1,4 +1,4 @@
-"""From poses to correspondences: neighbours in time, closed loops, and the map itself."""
+"""Correspondences from poses: between neighbours in time, across loops, and with map points."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -12,23 +12,25 @@ from gsba.matching.guided_search import Gate, MatchContext
 from gsba.matching.verification import RelativePose
 from gsba.types import Matches, Solution, VerifiedPairs
 
-_ROTATION_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # frames between those matched
-_JOIN = np.deg2rad(4.0)  # that parts of a map may be off as they were joined
-_ROTATION_DEG = 2.0  # around where a chain of turns sees a keypoint
+_ROTATION_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # gaps in frames between
+# matched pairs
+_MAX_JOIN_ERROR_RAD = np.deg2rad(4.0)  # largest error of a joined part's pose, as an angle at the
+# median depth
+_ROTATION_RADIUS_DEG = 2.0  # radius of the search around a keypoint's rotated bearing
 
 
 def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
-    """Match frames next to one another in time, guided by the coarse poses, and verify them.
+    """Match neighbours in time, guided by the coarse poses, and verify them.
 
-    Where many matches of a step disagree, repeated structure may have won with few: people who walk
-    along hide what would contradict it. Such steps are decided by all keypoints.
+    Where many matches of a step disagree, repeated structure may have won with few: people walking
+    along hide the evidence against it. Such steps are matched again with all keypoints.
     """
     world_T_rigs, settings = start.world_T_rigs, context.settings
     chosen = pairs.adjacent(len(world_T_rigs))
     prior = settings.pairs.prior
     gate = _gate(prior.rotation_deg, prior.direction, settings)
 
-    # The strongest keypoints are enough to find a pair's geometry, at a tenth of the cost.
+    # The strongest keypoints suffice for a pair's geometry, at a tenth of the cost.
     found = context.match(chosen, world_T_rigs, [gate] * len(chosen), strongest=True)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
     agreeing = partial(
@@ -41,24 +43,24 @@ def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
     neighbours = agreeing(found, estimates)
     scarce = np.diff(found.offsets) < settings.pairs.scarce_matches
     steps = chosen[:, 1] - chosen[:, 0] == 1
-    doubtful = steps & (_shares(found, neighbours) < settings.pairs.least_agreement)
+    doubtful = steps & (_inlier_ratios(found, neighbours) < settings.pairs.least_agreement)
     rows = np.flatnonzero(scarce | doubtful)
     if len(rows) == 0:
         return neighbours
     again = context.match(chosen[rows], world_T_rigs, [gate] * len(rows))
     for p, estimate in zip(rows, _estimates(again, gate, context), strict=True):
         estimates[p] = estimate
-    return agreeing(_replaced(found, rows, again), estimates)
+    return agreeing(_with_replaced(found, rows, again), estimates)
 
 
 def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     """Match frames close in space but far in time, as far as drift leaves them predictable.
 
-    Only known points are looked for, as far around their predicted bearing as drift can have moved
-    them. What repeats at a distance, arches or columns, is further off than that.
+    Only known points are searched, within the distance from their predicted bearing that drift
+    allows. Repeated structure in the distance, arches or columns, is further off than that.
 
     Args:
-        context: of the run.
+        context: features and settings of the run.
         solved: poses and points that are right between neighbours.
     """
     settings, keypoints = context.settings, context.keypoints
@@ -95,36 +97,38 @@ def match_along_epipolars(context: MatchContext, solved: Solution) -> Matches:
 def match_across(
     context: MatchContext, solved: Solution, parts: np.ndarray, met: np.ndarray
 ) -> VerifiedPairs:
-    """Match frames of parts of a map that were joined, close in space, and verify them.
+    """Match frames of joined map parts that are close in space, and verify them.
 
-    Known points are looked for as far around their predicted bearing as a join may be off.
+    Known points are searched within the error of a join around their predicted bearing.
 
     Args:
-        context: of the run.
+        context: features and settings of the run.
         solved: the joined map.
-        parts: (F,) the part that each frame was in before.
-        met: (F,) bool, frames whose part images have joined, not the trajectory alone.
+        parts: (F,) each frame's part before the join.
+        met: (F,) bool, frames whose part was joined by images, not by the trajectory alone.
     """
     poses, depth = solved.world_T_rigs, solved.median_depth()
     chosen = np.concatenate(pairs.covisible(poses[:, :3, 3], depth, context.settings.pairs))
     chosen = chosen[(parts[chosen[:, 0]] != parts[chosen[:, 1]]) & met[chosen].all(axis=1)]
-    gates = [Gate.around_points(_JOIN)] * len(chosen)
+    gates = [Gate.around_points(_MAX_JOIN_ERROR_RAD)] * len(chosen)
     known = solved.points_by_keypoint(context.keypoints)
     found = context.match(chosen, poses, gates, known)
     f0_T_f1s = inverse(poses[chosen[:, 0]]) @ poses[chosen[:, 1]]
-    return verified(found, gates, f0_T_f1s, np.full(len(chosen), _JOIN * depth), context)
+    return verified(
+        found, gates, f0_T_f1s, np.full(len(chosen), _MAX_JOIN_ERROR_RAD * depth), context
+    )
 
 
 def match_known_points(context: MatchContext, solved: Solution, loops_closed: bool) -> Matches:
-    """Match frames further apart only where a known point must appear.
+    """Match frames further apart, around the predicted bearings of known points only.
 
-    Prediction is the verification: what merely looks alike elsewhere, a column further on, is not
-    a candidate.
+    The prediction verifies the match: repeated structure elsewhere, such as the next column, is no
+    candidate.
 
     Args:
-        context: of the run.
+        context: features and settings of the run.
         solved: the current solution.
-        loops_closed: whether frames far apart in time are predictable too.
+        loops_closed: True if frames far apart in time are predictable too.
     """
     poses, settings = solved.world_T_rigs, context.settings.pairs
     near, loops = pairs.covisible(poses[:, :3, 3], solved.median_depth(), settings)
@@ -133,7 +137,7 @@ def match_known_points(context: MatchContext, solved: Solution, loops_closed: bo
         chosen = np.concatenate([chosen, loops])
     gates = [Gate.around_points(np.deg2rad(settings.point_deg))] * len(chosen)
     known = solved.points_by_keypoint(context.keypoints)
-    # Where a point is known this well, no network knows better.
+    # A learned matcher adds nothing where a point is known this well.
     return context.match(chosen, poses, gates, known, guided_only=True)
 
 
@@ -145,23 +149,33 @@ def verified(
     context: MatchContext,
     rivals: bool = False,
 ) -> VerifiedPairs:
-    """Matches whose geometry holds: see `verification.verify`."""
-    verify, seed = context.settings.verify, context.settings.seed
-    chances = np.array([gate.chance(np.deg2rad(verify.max_error_deg)) for gate in gates])
-    given = found, context.keypoints, f0_T_f1s, sigmas, verify, seed
-    return verification.verify(*given, context.workers, chances, rivals)
+    """Matches that fit one relative pose of their pair, which agrees with the prior.
+
+    Args:
+        found: putative matches.
+        gates: (P) that they were found within.
+        f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = no prior.
+        sigmas: (P,) standard deviations of their positions, map units; None = no prior.
+        context: features and settings of the run.
+        rivals: see `verification.estimate`.
+    """
+    settings, seed = context.settings.verify, context.settings.seed
+    chances = np.array([gate.chance(np.deg2rad(settings.max_error_deg)) for gate in gates])
+    estimates = verification.estimate(
+        found, context.keypoints, settings, seed, context.workers, chances, rivals
+    )
+    return verification.agree_with_prior(found, estimates, f0_T_f1s, sigmas, settings)
 
 
 def _estimates(found: Matches, gate: Gate, context: MatchContext) -> list[RelativePose | None]:
-    """The geometry of each pair within a gate, whatever the trajectory says."""
+    """The relative pose of each pair within a gate, without the trajectory as prior."""
     verify, seed = context.settings.verify, context.settings.seed
     chances = np.full(len(found.pairs), gate.chance(np.deg2rad(verify.max_error_deg)))
-    given = found, context.keypoints, verify, seed
-    return verification.estimate(*given, context.workers, chances)
+    return verification.estimate(found, context.keypoints, verify, seed, context.workers, chances)
 
 
-def _shares(found: Matches, kept: VerifiedPairs) -> np.ndarray:
-    """Part (P,) of the matches of each pair that its geometry explains; 0 for pairs dropped."""
+def _inlier_ratios(found: Matches, kept: VerifiedPairs) -> np.ndarray:
+    """Inlier ratio (P,) of each pair's matches under its relative pose; 0 for pairs dropped."""
     index = {(int(f0), int(f1)): p for p, (f0, f1) in enumerate(found.pairs)}
     rows = [index[int(f0), int(f1)] for f0, f1 in kept.matches.pairs]
     shares = np.zeros(len(found.pairs))
@@ -169,8 +183,8 @@ def _shares(found: Matches, kept: VerifiedPairs) -> np.ndarray:
     return shares / np.maximum(np.diff(found.offsets), 1)
 
 
-def _replaced(matches: Matches, indices: np.ndarray, others: Matches) -> Matches:
-    """Matches with those of some pairs exchanged."""
+def _with_replaced(matches: Matches, indices: np.ndarray, others: Matches) -> Matches:
+    """Matches with the rows of some pairs replaced."""
     rows = [matches.of(p) for p in range(len(matches.pairs))]
     for n, p in enumerate(indices):
         rows[p] = others.of(n)
@@ -182,12 +196,12 @@ def _gate(rotation_deg: float, direction: float, settings: RefineSettings) -> Ga
 
 
 def match_for_rotations(context: MatchContext, world_T_rigs: np.ndarray) -> Matches:
-    """Matches of frames near and far in time, where their rotations say."""
+    """Matches of frames near and far in time, around bearings predicted by their rotations."""
     num = len(world_T_rigs)
     chosen = [(f, f + gap) for gap in _ROTATION_GAPS for f in range(num - gap)]
     pairs = np.array(chosen, np.int32).reshape(-1, 2)
     still = world_T_rigs.copy()
     still[:, :3, 3] = 0
-    gates = [Gate.around_points(np.deg2rad(_ROTATION_DEG))] * len(pairs)
+    gates = [Gate.around_points(np.deg2rad(_ROTATION_RADIUS_DEG))] * len(pairs)
     directions = [context.keypoints.bearings_of(f) for f in range(num)]
     return context.match(pairs, still, gates, directions)

@@ -1,6 +1,6 @@
 """Two-view verification on bearings.
 
-A relative pose is believed where chance does not explain its inliers, no other pose explains about
+A relative pose is accepted if chance does not explain its inliers, no other pose explains about
 as many of the other matches, and the trajectory does not contradict it.
 """
 
@@ -17,54 +17,31 @@ from gsba.significance import least_agreeing, outweighs
 from gsba.store.shards import ITEMS, Workers, even_blocks
 from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
 
-_SAMPLE = 5  # matches that determine a relative pose
-_CELLS = 16  # along a face's side: all matches within one cell, 6 degrees, are one witness
-_BAND = 3.0  # inlier thresholds around the epipolar planes of a pose: no rival has matches there
-_MODEL_SIGMA = np.deg2rad(0.15)  # of bearings from one centre: lenses are centimetres apart
-_MEDIANS = 1.3863, 0.4549  # of chi-square distributions with two and with one degree of freedom
-_RATIO_SIGMA = 2.75  # standard deviation of the logarithm of the ratio of two such sample medians,
-# times the root of the sample's size
-_TURN_SIGMAS = 4.75  # of that ratio: one turn in a million is taken for a walk
-_REFITS = 5  # of a rotation, without the matches that are furthest off
+_SAMPLE_SIZE = 5  # size of a minimal sample
+_CELLS_PER_SIDE = 16  # cells along a face's side: all matches within one, 6 degrees, count as one
+# witness
+_RIVAL_FREE_BAND = 3.0  # inlier thresholds around a pose's epipolar planes within which matches
+# support no rival
+_MODEL_SIGMA_RAD = np.deg2rad(0.15)  # noise of bearings assumed to have one centre: lenses are
+# centimetres apart
+_CHI_SQUARE_MEDIANS = 1.3863, 0.4549  # medians of chi-square distributions with two and with one
+# degree of freedom
+_LOG_MEDIAN_RATIO_SIGMA = 2.75  # standard deviation of the logarithm of the ratio of two such
+# sample medians, times the root of the sample's size
+_MIN_TRANSLATION_SIGMAS = 4.75  # threshold on that ratio: one rotation in a million passes for a
+# translation
+_NUM_ROTATION_REFITS = 5  # refits of a rotation without the matches that are furthest off
 
 
 @dataclass(frozen=True, slots=True)
 class RelativePose:
-    """How one frame lies in another, as their matches say."""
+    """Relative pose of two frames, estimated from their matches."""
 
     f0_T_f1: np.ndarray  # (4, 4) float64, translation of unit length
     inliers: np.ndarray  # (m,) bool
     direction_sigma: float  # radians, of the translation's direction; infinite = the camera may
     # have turned only
-    rivalled: bool  # another pose explains about as many of the other matches
-
-
-def verify(
-    matches: Matches,
-    keypoints: Keypoints,
-    prior_f0_T_f1s: np.ndarray | None,
-    position_sigmas: np.ndarray | None,
-    settings: VerifySettings,
-    seed: int,
-    workers: Workers,
-    chances: np.ndarray,
-    rivals: bool = False,
-) -> VerifiedPairs:
-    """Estimate a relative pose per pair by LO-RANSAC and keep pairs that agree with the prior.
-
-    Args:
-        matches: putative matches.
-        keypoints: of all frames.
-        prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = none is believed.
-        position_sigmas: (P,) how far the prior's relative position may be off, map units; decides
-            how much its direction is worth.
-        settings: thresholds.
-        seed: of the sampling.
-        workers: who do it.
-        chances, rivals: see `estimate`.
-    """
-    estimates = estimate(matches, keypoints, settings, seed, workers, chances, rivals)
-    return agree_with_prior(matches, estimates, prior_f0_T_f1s, position_sigmas, settings)
+    rivalled: bool  # True if another pose explains about as many of the other matches
 
 
 def agree_with_prior(
@@ -74,11 +51,15 @@ def agree_with_prior(
     position_sigmas: np.ndarray | None,
     settings: VerifySettings,
 ) -> VerifiedPairs:
-    """Keep pairs that agree with the prior.
+    """Keep pairs that have one relative pose, which agrees with the prior.
 
     Args:
-        estimates: of `estimate`, for each pair.
-        matches, prior_f0_T_f1s, position_sigmas, settings: as for `verify`.
+        matches: putative matches.
+        estimates: result of `estimate` for each pair.
+        prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = no prior.
+        position_sigmas: (P,) standard deviation of the prior's relative position, map units; it
+            sets the tolerance of the direction.
+        settings: thresholds.
     """
     kept, kept_poses = [], []
     dropped: dict[str, int] = {
@@ -95,7 +76,7 @@ def agree_with_prior(
         elif prior_f0_T_f1s is None or position_sigmas is None:
             reason = ""
         else:
-            reason = _contradiction(found, prior_f0_T_f1s[p], position_sigmas[p], settings)
+            reason = _why_prior_contradicts(found, prior_f0_T_f1s[p], position_sigmas[p], settings)
         if found is None or reason:
             dropped[reason] += 1
         else:
@@ -110,17 +91,17 @@ def agree_with_prior(
     )
 
 
-def _contradiction(
+def _why_prior_contradicts(
     found: RelativePose, prior: np.ndarray, position_sigma: float, settings: VerifySettings
 ) -> str:
-    """Why a pose does not fit a prior (4, 4) whose position is known to `position_sigma`; "" = it
-    fits."""
+    """Reason why a pose does not fit a prior (4, 4) with standard deviation `position_sigma`; "" =
+    it fits."""
     turn = rotation_angle(prior[:3, :3].T @ found.f0_T_f1[:3, :3])
     if turn > np.deg2rad(settings.max_rotation_deg):
         return "rotation contradicts"
     direction, length = found.f0_T_f1[:3, 3], float(np.linalg.norm(prior[:3, 3]))
     if length <= 3 * position_sigma or np.isinf(found.direction_sigma):
-        return ""  # the prior or the images do not know the direction
+        return ""  # the prior or the images leave the direction open
     allowed = np.deg2rad(settings.max_direction_deg) + 3 * found.direction_sigma
     allowed += np.arcsin(3 * position_sigma / length)
     angle = np.arctan2(np.linalg.norm(np.cross(prior[:3, 3], direction)), prior[:3, 3] @ direction)
@@ -136,13 +117,17 @@ def estimate(
     chances: np.ndarray,
     rivals: bool = False,
 ) -> list[RelativePose | None]:
-    """`relative_pose` of every pair, whatever the prior says.
+    """`relative_pose` of every pair by LO-RANSAC, without any prior.
 
     Args:
-        matches, keypoints, settings, seed, workers: as for `verify`.
-        chances: (P,) probability that a false match which the search let pass agrees with a pose
-            near the predicted one; 0 = nothing was predicted.
-        rivals: whether to look for other poses that speak against these.
+        matches: putative matches.
+        keypoints: keypoints of all frames.
+        settings: thresholds.
+        seed: of the sampling.
+        workers: threads or processes that run it.
+        chances: (P,) probability that a false match that passed the gate agrees with a pose near
+            the predicted one; 0 = nothing was predicted.
+        rivals: True if rival poses are searched too.
     """
 
     def rays(p: int) -> tuple[np.ndarray, np.ndarray]:
@@ -157,7 +142,7 @@ class _PoseJob:
     """The job of estimating relative poses."""
 
     num: int
-    rays: Callable[[int], tuple[np.ndarray, np.ndarray]]  # of a pair, (m, 3) in either frame
+    rays: Callable[[int], tuple[np.ndarray, np.ndarray]]  # of a pair, (m, 3) in either frame's axes
     settings: VerifySettings
     seed: int
     chances: np.ndarray
@@ -188,15 +173,15 @@ def relative_pose(
     chance: float = 0.0,
     rivals: bool = False,
 ) -> RelativePose | None:
-    """The relative pose that most matches agree on, or None where chance explains as many.
+    """The relative pose with the most inliers, or None if chance explains as many.
 
     Args:
-        bearings0, bearings1: (m, 3) unit, rays of the matches in either frame.
+        bearings0, bearings1: (m, 3) unit, rays of the matches in each frame.
         settings: thresholds.
         seed: of the sampling.
         chance, rivals: see `estimate`.
     """
-    found = _significant(bearings0, bearings1, settings, seed, chance)
+    found = _significant_pose(bearings0, bearings1, settings, seed, chance)
     if found is None:
         return None
     f0_T_f1, inliers = found
@@ -205,39 +190,40 @@ def relative_pose(
     return RelativePose(f0_T_f1, inliers, sigma, rivalled)
 
 
-def _significant(
+def _significant_pose(
     bearings0: np.ndarray,
     bearings1: np.ndarray,
     settings: VerifySettings,
     seed: int,
     chance: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """f0_T_f1 (4, 4) with unit translation and inliers (m,) bool of the best pose; None where
-    chance explains as many."""
-    largest, num = np.sin(np.deg2rad(settings.max_error_deg)), witnesses(bearings0, _CELLS)
+    """f0_T_f1 (4, 4) with unit translation and inliers (m,) bool of the best pose; None if chance
+    explains as many."""
+    largest, num = np.sin(np.deg2rad(settings.max_error_deg)), witnesses(bearings0, _CELLS_PER_SIDE)
 
     def needed(of_match: float) -> int:
         of_witness = 1 - (1 - of_match) ** (len(bearings0) / num)
-        return least_agreeing(num, of_witness, _SAMPLE, settings.max_false_alarms)
+        return least_agreeing(num, of_witness, _SAMPLE_SIZE, settings.max_false_alarms)
 
-    if len(bearings0) <= _SAMPLE or needed(max(chance, largest)) > num:
+    if len(bearings0) <= _SAMPLE_SIZE or needed(max(chance, largest)) > num:
         return None
     found = _ransac(bearings0, bearings1, needed(max(chance, largest)), settings, seed)
     if found is None:
         return None
-    # Where bearings crowd around one plane, any of them agrees with poses along it.
+    # Where bearings crowd around one plane, many agree with poses along it by chance.
     sines = _normals(found[0], bearings0) @ (found[0][:3, :3] @ bearings1.T)
     np.fill_diagonal(sines, np.inf)
     agreeing = np.count_nonzero(np.abs(sines) < largest) / (sines.size - len(sines))
-    enough = witnesses(bearings0[found[1]], _CELLS) >= needed(max(chance, agreeing, largest))
+    enough = witnesses(bearings0[found[1]], _CELLS_PER_SIDE) >= needed(
+        max(chance, agreeing, largest)
+    )
     return found if enough else None
 
 
 def _ransac(
     bearings0: np.ndarray, bearings1: np.ndarray, least: int, settings: VerifySettings, seed: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """f0_T_f1 (4, 4) and inliers (m,) bool of the pose that most matches agree with, `least` of
-    them or more."""
+    """f0_T_f1 (4, 4) and inliers (m,) bool of the pose with the most inliers, at least `least`."""
     import pycolmap
 
     options = pycolmap.RANSACOptions()
@@ -268,43 +254,43 @@ def _is_rivalled(
     settings: VerifySettings,
     seed: int,
 ) -> bool:
-    """Whether matches that a pose does not explain agree on another that explains about as many.
+    """True if outliers of a pose agree on another pose that explains about as many matches.
 
-    A pose that repeated structure makes up has the true one as its rival, and the other way round.
+    A false pose from repeated structure has the true one as its rival, and vice versa.
     """
     sines = np.sum(_normals(f0_T_f1, bearings0) * (bearings1 @ f0_T_f1[:3, :3].T), axis=1)
-    rest = np.abs(sines) > np.sin(_BAND * np.deg2rad(settings.max_error_deg))
-    rival = _significant(bearings0[rest], bearings1[rest], settings, seed)
+    rest = np.abs(sines) > np.sin(_RIVAL_FREE_BAND * np.deg2rad(settings.max_error_deg))
+    rival = _significant_pose(bearings0[rest], bearings1[rest], settings, seed)
     if rival is None:
         return False
     support, against = bearings0[inliers], bearings0[rest][rival[1]]
-    numbers = witnesses(support, _CELLS), witnesses(against, _CELLS)
+    numbers = witnesses(support, _CELLS_PER_SIDE), witnesses(against, _CELLS_PER_SIDE)
     return not outweighs(*numbers, settings.max_error_rate)
 
 
 def _direction_sigma(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.ndarray) -> float:
-    """Standard deviation (rad) of the translation's direction; infinite where a rotation will do.
+    """Standard deviation (rad) of the translation's direction; infinite if a rotation suffices.
 
-    Under a rotation alone, what it leaves over of bearings is noise in two directions; under a
-    translation, only what lies across the epipolar planes is. Medians of both are compared.
+    Residuals of a pure rotation are noise in two directions; under a translation, only those across
+    the epipolar planes are. Medians of both are compared.
     """
     rotation, planes = f0_T_f1[:3, :3], _normals(f0_T_f1, bearings0)
     across = np.sum(planes * (bearings1 @ rotation.T), axis=1)
     turned = bearings1 @ _rotation(bearings0, bearings1).T
-    left = np.median(np.sum((bearings0 - turned) ** 2, axis=1)) / _MEDIANS[0]
-    noise = np.median(across**2) / _MEDIANS[1]
-    noise, left = noise + _MODEL_SIGMA**2, left + _MODEL_SIGMA**2
-    num = witnesses(bearings0, _CELLS)
-    if np.log(left / noise) < _TURN_SIGMAS * _RATIO_SIGMA / np.sqrt(num):
+    left = np.median(np.sum((bearings0 - turned) ** 2, axis=1)) / _CHI_SQUARE_MEDIANS[0]
+    noise = np.median(across**2) / _CHI_SQUARE_MEDIANS[1]
+    noise, left = noise + _MODEL_SIGMA_RAD**2, left + _MODEL_SIGMA_RAD**2
+    num = witnesses(bearings0, _CELLS_PER_SIDE)
+    if np.log(left / noise) < _MIN_TRANSLATION_SIGMAS * _LOG_MEDIAN_RATIO_SIGMA / np.sqrt(num):
         return np.inf
     return _direction_error(f0_T_f1, bearings0, bearings1) * np.sqrt(noise * len(bearings0) / num)
 
 
 def _rotation(bearings0: np.ndarray, bearings1: np.ndarray) -> np.ndarray:
-    """f0_R_f1 (3, 3) that carries most bearings (m, 3) of frame 1 onto those of frame 0."""
+    """f0_R_f1 (3, 3) that best rotates most bearings (m, 3) of frame 1 onto those of frame 0."""
     near = np.ones(len(bearings0), bool)
     rotation = np.eye(3)
-    for _ in range(_REFITS):
+    for _ in range(_NUM_ROTATION_REFITS):
         rotation = nearest_rotation(bearings0[near].T @ bearings1[near])
         off = np.linalg.norm(bearings0 - bearings1 @ rotation.T, axis=1)
         near = off <= np.median(off)
@@ -312,13 +298,13 @@ def _rotation(bearings0: np.ndarray, bearings1: np.ndarray) -> np.ndarray:
 
 
 def _direction_error(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.ndarray) -> float:
-    """Largest standard deviation of the direction for bearings with noise of one radian."""
+    """Largest standard deviation of the direction per radian of noise of the bearings."""
     rotation, direction = f0_T_f1[:3, :3], f0_T_f1[:3, 3]
     planes, rays1 = _normals(f0_T_f1, bearings0), bearings1 @ rotation.T
     lengths = np.linalg.norm(np.cross(direction, bearings0), axis=1, keepdims=True)
     by_direction = np.cross(bearings0, rays1) / np.maximum(lengths, 1e-6)
-    basis = np.linalg.svd(direction[None])[2][1:]  # of the plane across the direction
+    basis = np.linalg.svd(direction[None])[2][1:]  # of the plane orthogonal to the direction
     jacobian = np.hstack([np.cross(rays1, planes), by_direction @ basis.T])
     information = jacobian.T @ jacobian
-    information += 1e-9 * np.trace(information) * np.eye(_SAMPLE)
+    information += 1e-9 * np.trace(information) * np.eye(_SAMPLE_SIZE)
     return float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(information)[3:, 3:])[-1]))
