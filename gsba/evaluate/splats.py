@@ -1,9 +1,10 @@
-"""What poses are worth to a splat: one training on several of them, measured on held-out frames.
+"""Comparison of poses by splats that are trained on them and measured on held-out frames.
 
-Every source trains on the same frames with the same settings and seed, from the run's tracks
-triangulated under its own poses, and is measured on panoramas it never saw, at its own poses.
-All are carried into the run's world first: a splat's Gaussians begin along the axes of its world,
-and walls along them are worth some 0.2 dB that no pose has earned.
+Splats of all sources of poses are trained on the same frames with the same settings and seed. The
+start cloud is the run's tracks, triangulated under the source's poses. Splats are measured on
+held-out panoramas at the source's own poses. All sources are aligned to the run's world first:
+Gaussians start along the axes of the world, and walls along these axes gain some 0.2 dB that do not
+come from the poses.
 """
 
 import json
@@ -47,24 +48,44 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 NO_LPIPS = "not computed: no weights"
-_CURVE_POINTS = 10  # measurements during a training
+_NUM_CURVE_POINTS = 10  # measurements during a training
 
 
 @dataclass(frozen=True, slots=True)
 class SourceResult:
-    """One source of poses."""
+    """Scores of the splat of one source of poses."""
 
     frames: Mapping[str, Score]  # of the held-out frames, by name
-    mean: Score
-    curve: Mapping[int, Score]  # mean over held-out frames, by the steps made
+    mean: Score  # over held-out frames
+    curve: Mapping[int, Score]  # training steps -> mean over held-out frames
     num_gaussians: int
+
+
+@dataclass(frozen=True, slots=True)
+class PosedViews:
+    """Views of frames at the poses of one source, some of them held out of the training."""
+
+    poses: np.ndarray  # (F, 4, 4) float64, world_T_rig
+    split: Split  # training and held-out frames
+    training: Views
+    held_out: Views
+
+    @classmethod
+    def of(cls, poses: np.ndarray, split: Split, training: Faces, held_out: Faces) -> "PosedViews":
+        """Views of the faces of either part at poses (F, 4, 4)."""
+        return cls(
+            poses,
+            split,
+            make_views(training, poses[split.training]),
+            make_views(held_out, poses[split.held_out]),
+        )
 
 
 def poses_for(frames: FrameSet, trajectory: Trajectory, tolerance_s: float = 0.01) -> np.ndarray:
     """Pose (F, 4, 4) of each frame by time; NaN where the trajectory has none.
 
     Raises:
-        GsbaError: no time fits.
+        GsbaError: no pose is within the tolerance of a frame's time.
     """
     expected = Trajectory(frames.timestamps, np.tile(np.eye(4), (len(frames), 1, 1)))
     rows, which = matched_in_time(trajectory, expected, tolerance_s)
@@ -88,19 +109,19 @@ def compare(
     lpips: Distance | None = None,
     optics: Optics = ONE_EYE,
 ) -> dict[str, SourceResult]:
-    """Train and measure a splat for each source of poses; resumes what is done.
+    """Train and measure a splat for each source of poses; finished trainings are not repeated.
 
     Writes `out`/SOURCE/point_cloud.ply and checkpoint.npz, results.json, table.txt, curves.png and
-    .svg, and pictures/FRAME.jpg: the faces as captured, then as each source has them.
+    .svg, and pictures/FRAME.jpg: the captured faces, and below them the faces of each source.
 
     Args:
-        reconstruction, frames: of a finished run; its tracks make the start clouds.
+        reconstruction, frames: result of a finished run; its tracks make the start clouds.
         sources: name -> world_T_rigs (F, 4, 4), each in any world and scale, NaN = no pose.
-        settings: of all trainings alike.
+        settings: settings of all trainings.
         backend: the renderer.
         out: folder to write.
-        lpips: distance of images for the last measurement; None = leave it out.
-        optics: of the frames, in the run's unit; with two lenses, faces are of one of them each.
+        lpips: perceptual distance for the last measurement; None = do not compute it.
+        optics: optics of the frames, in the run's unit; of two lenses each face is of one lens.
 
     Raises:
         GsbaError: too few frames have a pose in every source, or a training fails.
@@ -111,37 +132,25 @@ def compare(
     split = split_frames(usable, settings.held_out_every)
     own = reconstruction.world_T_rigs[usable]
     sources = {name: _beside(poses, usable, own) for name, poses in sources.items()}
-    faces = [
-        load_faces(frames, part, settings.face_size, optics)
-        for part in (split.training, split.held_out)
-    ]
+    size = settings.face_size
+    training = load_faces(frames, split.training, size, optics)
+    held_out = load_faces(frames, split.held_out, size, optics)
     results, splats = {}, {}
     for name, poses in sources.items():
         logger.info("splat on %s poses, %d frames", name, len(split.training))
-        training = make_views(faces[0], poses[split.training])
-        held_out = make_views(faces[1], poses[split.held_out])
+        source = PosedViews.of(poses, split, training, held_out)
         files = fingerprint([p[0] for p in frames.paths])
         key = digest(files, poses.tolist(), settings, backend.name, *_key_of(optics))
         splats[name], results[name] = train_and_measure(
-            reconstruction,
-            frames,
-            poses,
-            split,
-            training,
-            held_out,
-            settings,
-            backend,
-            out / name,
-            key,
-            lpips,
+            reconstruction, frames, source, settings, backend, out / name, key, lpips
         )
     _write(out, results, settings, lpips is not None)
-    _write_pictures(out / "pictures", frames, split, faces[1], sources, splats, settings, backend)
+    _write_pictures(out / "pictures", frames, split, held_out, sources, splats, settings, backend)
     return results
 
 
 def _key_of(optics: Optics) -> list[object]:
-    """What faces depend on beside their frames."""
+    """Values of the optics, which faces depend on."""
     if not optics:
         return []
     values = (getattr(optics.lenses, entry.name) for entry in fields(optics.lenses))
@@ -149,17 +158,17 @@ def _key_of(optics: Optics) -> list[object]:
 
 
 def _beside(poses: np.ndarray, usable: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Poses (F, 4, 4) in the world and scale of the run's `own` ones of the `usable` frames."""
+    """Poses (F, 4, 4) aligned to the run's poses `own` of the `usable` frames."""
     try:
         return pose_similarity(poses[usable], own).poses(poses)
     except NoSimilarityError:
-        return poses  # nothing to lay them by: they are measured as they are
+        return poses  # they cannot be aligned, and are measured in their own world
 
 
 def _write(
     out: Path, results: Mapping[str, SourceResult], settings: SplatSettings, with_lpips: bool
 ) -> None:
-    """Table, numbers and curves."""
+    """Write table, numbers and curves."""
     lines = format_table(results)
     measured = "computed" if with_lpips else NO_LPIPS
     content = {"lpips": measured, "settings": settings.model_dump(), "sources": to_json(results)}
@@ -171,42 +180,40 @@ def _write(
 def train_and_measure(
     reconstruction: Reconstruction,
     frames: FrameSet,
-    poses: np.ndarray,
-    split: Split,
-    training: Views,
-    held_out: Views,
+    source: PosedViews,
     settings: SplatSettings,
     backend: Backend,
     out: Path,
     key: str,
-    lpips: Distance | None,
+    lpips: Distance | None = None,
 ) -> tuple[Gaussians, SourceResult]:
-    """Train on one source of poses, and measure on the way.
+    """Train a splat on one source of poses, and measure it during and after the training.
 
     Args:
-        reconstruction, frames: as for `compare`.
-        poses: (F, 4, 4) of the source.
-        split: of the frames.
-        training, held_out: views of either part, from these poses.
-        settings, backend: of the training.
+        reconstruction, frames: see `compare`.
+        source: views of the frames at poses of one source.
+        settings, backend: settings and renderer of the training.
         out: folder to write, see `compare`.
-        key: what the training depends on; what another one left is not taken up.
+        key: hash of everything the training depends on; checkpoints of another key are ignored.
         lpips: see `compare`.
     """
+    poses, split = source.poses, source.split
     near = near_of(poses[split.training], settings)
     curve = _read_curve(out / "curve.json", key)
-    every = max(settings.iterations // _CURVE_POINTS, 1)
+    every = max(settings.iterations // _NUM_CURVE_POINTS, 1)
 
     def watch(step: int, gaussians: Gaussians) -> None:
         if step // every > max(curve, default=0) // every:
-            curve[step] = mean_score(measure(gaussians, held_out, settings, near, backend).values())
+            curve[step] = mean_score(
+                measure(gaussians, source.held_out, settings, near, backend).values()
+            )
             content = {"key": key, "curve": {s: asdict(score) for s, score in curve.items()}}
             write_text(out / "curve.json", json.dumps(content))
 
     start = start_cloud(reconstruction, poses, split.training, settings.sh_degree)
-    splat = train(start, training, settings, backend, out / "checkpoint.npz", key, watch)
+    splat = train(start, source.training, settings, backend, out / "checkpoint.npz", key, watch)
     write_ply(out / "point_cloud.ply", splat)
-    scores = measure(splat, held_out, settings, near, backend, lpips)
+    scores = measure(splat, source.held_out, settings, near, backend, lpips)
     by_frame = {frames.names[split.held_out[i]]: score for i, score in scores.items()}
     return splat, SourceResult(by_frame, mean_score(scores.values()), curve, len(splat))
 
@@ -227,7 +234,7 @@ def to_json(results: Mapping[str, SourceResult]) -> dict[str, object]:
 
 
 def format_table(results: Mapping[str, SourceResult]) -> str:
-    """Text table with a line per source; the first source is what the others are compared with."""
+    """Text table with a line per source; differences are to the first source."""
     rows = [
         ["", "PSNR", "SSIM", "LPIPS", "PSNR exp.", "vs. first", "Gaussians"],
         ["", "dB", "", "", "dB", "dB", ""],
@@ -248,8 +255,8 @@ def format_table(results: Mapping[str, SourceResult]) -> str:
     ]
     num = len(next(iter(results.values())).frames)
     notes = [
-        f"Means over {num} held-out panoramas at each source's own poses. exp.: after the gain",
-        "of each channel that fits best. vs. first: PSNR less that of the first source.",
+        f"Means over {num} held-out panoramas at each source's own poses. exp.: with the best gain",
+        "of each channel. vs. first: PSNR less that of the first source.",
     ]
     if any(result.mean.lpips is None for result in results.values()):
         notes.append(f"LPIPS {NO_LPIPS}.")
@@ -266,7 +273,7 @@ def _write_pictures(
     settings: SplatSettings,
     backend: Backend,
 ) -> None:
-    """One row of faces for what was captured, then one for each source."""
+    """Write an image of each held-out frame: a row of captured faces, then a row per source."""
     each = len(captured.views)
     for i, f in enumerate(split.held_out):
         rows = [_side_by_side(captured.images[each * i : each * (i + 1)])]
@@ -286,7 +293,7 @@ def _side_by_side(images: Images) -> np.ndarray:
 
 
 def _write_curves(out: Path, results: Mapping[str, SourceResult]) -> None:
-    """PSNR of held-out frames over steps, a line for each source, as curves.png and curves.svg."""
+    """Plot PSNR of held-out frames over steps, a line per source, as curves.png and curves.svg."""
     lines = {
         name: np.array([(step, score.psnr) for step, score in sorted(result.curve.items())])
         for name, result in results.items()
@@ -305,4 +312,4 @@ def _write_curves(out: Path, results: Mapping[str, SourceResult]) -> None:
     try:
         charts.write([out / f"curves.{kind}" for kind in ("png", "svg")], (6.0, 3.6), fill)
     except charts.NoMatplotlibError as error:
-        logger.info("no curves: %s", error)
+        logger.info("curves are not plotted: %s", error)
