@@ -1,8 +1,9 @@
-"""One door to every export format."""
+"""Export of a reconstruction in every format."""
 
 import logging
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
@@ -25,14 +26,27 @@ logger = logging.getLogger(__name__)
 
 
 class ExportFormat(StrEnum):
-    """What `export` can write; see the module of each for its layout and conventions."""
+    """Formats of `export`; the module of each documents its layout and conventions."""
 
     COLMAP = "colmap"  # rig of pinhole faces
-    COLMAP_FLAT = "colmap-flat"  # the same with unique base names, for splat trainers
+    COLMAP_FLAT = "colmap-flat"  # pinhole faces with unique base names, for splat trainers
     COLMAP_ERP = "colmap-erp"  # one equirectangular camera
     NERFSTUDIO = "nerfstudio"  # transforms.json: pinhole faces, and panoramas
     PLY = "ply"  # points3D.ply, the start cloud of splat trainers
     TUM = "tum"  # trajectory.tum, and panoramas on request
+
+
+@dataclass(frozen=True, slots=True)
+class ExportOptions:
+    """Choices of an export, see `export`."""
+
+    face_size: int | None = None  # pixels of a cube face; None = by the frames
+    placement: Placement | None = None  # of the exported world; None = the run's world
+    link: bool = False  # hard links to unchanged frames
+    lenses: Lenses = ONE_CENTRE  # of the frames, in the unit of the reconstruction
+    images: str = "auto"  # the setting `export.images`
+    map_number: int = 1  # 1 = the largest map
+    fetched: bool = False  # with the frames that were added where the map was weak
 
 
 def export(
@@ -49,74 +63,74 @@ def export(
     map_number: int = 1,
     fetched: bool = False,
 ) -> None:
-    """Write a reconstruction in another program's format, all frames of one of its maps.
+    """Write one map of a reconstruction in another program's format.
+
+    An interrupted export resumes when it is called again with the same arguments.
 
     Args:
-        reconstruction: poses and cloud; nerfstudio's format alone turns its world, as the
-            `applied_transform` there states.
+        reconstruction: poses and cloud; only nerfstudio's format rotates their world, by its
+            `applied_transform`.
         frames: the frames it was made from, still on disk.
-        out: folder to write; an earlier export there is replaced, anything else refused.
+        out: folder to write; an earlier export there is replaced, other folders are refused.
         to: the format.
         face_size: pixels of a cube face; None = see `gsba.export.images.face_size_for`.
-        placement: where to put the world; None = where the run has it. `transform.json` states it.
-        link: hard links to the frames where these leave unchanged, not copies: who edits one edits
-            the other.
-        lenses: of the frames, in the unit of the reconstruction: faces are of one lens each then,
-            and panoramas stitched at the map's depth.
-        images: as `export.images` says it: fisheye for raw ones as they are, panorama for panoramas
-            alone, else faces.
-        workers: who write pictures; None = threads here.
-        map_number: which map of a reconstruction that holds several, 1 = the largest.
-        fetched: write the frames, too, that were fetched where the map was weak (see `FrameSet`).
+        placement: placement of the exported world, which `transform.json` states; None = the run's
+            world.
+        link: make hard links to frames that are exported unchanged, not copies: an edit of one is
+            an edit of the other.
+        lenses: lenses of the frames, in the unit of the reconstruction: each face is of one lens
+            then, and panoramas are stitched at the map's depth.
+        images: the setting `export.images`: fisheye for raw fisheyes, panorama for panoramas alone,
+            else faces.
+        workers: workers that write images; None = threads of this process.
+        map_number: number of the map, 1 = the largest.
+        fetched: also write the frames that were added where the map was weak (see `FrameSet`).
 
     Raises:
         GsbaError: `out` is in use or not seen by a worker, the format does not fit the frames,
-            there is no such map, or the disk refuses; nothing is left behind then. An interrupted
-            export goes on where it was when it is called again in the same way.
+            there is no such map, or the disk cannot be written; nothing is left behind then.
     """
-    given = reconstruction, frames, {to: out}, face_size, placement, link, lenses, images
-    export_all(*given, workers, map_number, fetched)
+    options = ExportOptions(face_size, placement, link, lenses, images, map_number, fetched)
+    export_all(reconstruction, frames, {to: out}, options, workers)
 
 
 def export_all(
     reconstruction: Reconstruction,
     frames: FrameSet,
     outs: Mapping[ExportFormat, Path],
-    face_size: int | None = None,
-    placement: Placement | None = None,
-    link: bool = False,
-    lenses: Lenses = ONE_CENTRE,
-    images: str = "auto",
+    options: ExportOptions | None = None,
     workers: Workers | None = None,
-    map_number: int = 1,
-    fetched: bool = False,
 ) -> None:
-    """As `export`, in several formats at once: every picture is read, cut and encoded once.
+    """Write one map in several formats; every image is read, cut and encoded once.
 
     Args:
+        reconstruction, frames: see `export`.
         outs: folder of each format.
-        reconstruction, frames, face_size, placement, link, lenses, images, workers, map_number,
-            fetched: as of `export`.
+        options: choices that hold for all formats.
+        workers: see `export`.
 
     Raises:
-        GsbaError: as of `export`; none of the folders is written then.
+        GsbaError: see `export`; none of the folders is written then.
     """
+    options = options or ExportOptions()
+    face_size, link, images = options.face_size, options.link, options.images
+    map_number, lenses = options.map_number, options.lenses
     for to in outs:
         _require_fitting(to, frames, images)
     whole = reconstruction
     reconstruction, frames = one_map(whole, frames, map_number, "the reconstruction")
     if lenses:
         lenses = lenses_of_map(lenses, whole, map_number)
-    if not fetched and any(frames.fetched):
+    if not options.fetched and any(frames.fetched):
         rows = frames.chosen()
         reconstruction, frames = reconstruction.taken(rows), frames.taken(rows)
         lenses = lenses.taken(rows)
     _warn_of_gaps(reconstruction, frames)
-    placement = placement or Placement(map_number=map_number)
+    placement = options.placement or Placement(map_number=map_number)
     reconstruction = placement.apply(reconstruction)
     seen_by, z_up = lenses.scaled(placement.similarity.scale), placement.up == "z"
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)
-    read = fingerprint(path for path in files if path and path.exists())  # not all formats do
+    read = fingerprint(path for path in files if path and path.exists())  # some formats read none
     key = __version__, reconstruction, frames, read, face_size, z_up, link, seen_by, images
     writers: list[FrameWriter] = []
     with ExitStack() as folders:
@@ -138,14 +152,14 @@ def export_all(
 
 
 def _warn_of_gaps(reconstruction: Reconstruction, frames: FrameSet) -> None:
-    """Say what a trainer will miss: refined poses, points."""
+    """Warn of unrefined poses and of a missing point cloud."""
     unrefined = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
     if len(unrefined):
         names = ", ".join(frames.names[f] for f in unrefined[:5])
-        more = ", ..." if len(unrefined) > 5 else ""
-        logger.warning("%d frames go out with unrefined poses: %s%s", len(unrefined), names, more)
+        more = ", ... (all in poses.csv)" if len(unrefined) > 5 else ""
+        logger.warning("%d exported frames have unrefined poses: %s%s", len(unrefined), names, more)
     if len(reconstruction.points_world) == 0:
-        logger.warning("no points: the poses alone go out, and trainers need a start cloud")
+        logger.warning("the export holds poses but no points, and splat trainers need points")
 
 
 def _write_raw(
@@ -187,7 +201,7 @@ def _write_panoramas(
 
 
 def _require_fitting(to: ExportFormat, frames: FrameSet, images: str) -> None:
-    """Refuse images that a format has no place for, and panoramas of what are none."""
+    """Refuse images that the format cannot hold, and panoramas of frames that are cube faces."""
     fitting = FORMATS_OF.get(images, (to.value,))
     if to.value not in fitting:
         choices = ", ".join(fitting)

@@ -12,7 +12,7 @@ from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.disk import write_json, write_text
-from gsba.export import ExportFormat, export_all, of_one_lens, write_points
+from gsba.export import ExportFormat, ExportOptions, export_all, of_one_lens, write_points
 from gsba.pipeline.map import Map
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
@@ -210,8 +210,8 @@ def _export(
 
     def compute() -> Counts:
         if waiting:
-            how = {"lenses": seen_by, "images": images, "workers": store.workers}
-            export_all(main, shown, waiting, size, placement, fetched=fetched, **how)
+            options = ExportOptions(size, placement, lenses=seen_by, images=images, fetched=fetched)
+            export_all(main, shown, waiting, options, store.workers)
             waiting.clear()
         apart = len(run.frames) - len(shown)
         dropped = {"in another map or in none": apart} if apart else {}
