@@ -1,4 +1,6 @@
-"""SLAM-like errors for an exact trajectory."""
+"""SLAM-like errors added to an exact trajectory."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -7,8 +9,17 @@ from scipy.spatial.transform import Rotation
 from gsba.geometry import inverse, pose
 from gsba.types import Trajectory
 
-SMOOTHING = 1.5  # frames, standard deviation: drift is smooth, jitter is apart
-MAX_GAP = 3  # frames lost in a row
+SMOOTHING = 1.5  # frames, standard deviation of the filter that smooths drift
+MAX_GAP = 3  # most successive frames that are lost
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """Largest values of the random walks that a trajectory's errors are."""
+
+    rotation_deg: float = 2.0  # angle
+    translation: float = 0.015  # offset, part of the path length; the others bend the path further
+    scale: float = 0.02  # relative change
 
 
 def degrade(
@@ -16,52 +27,48 @@ def degrade(
     seed: int = 0,
     *,
     scale: float = 0.4,
-    rotation_drift_deg: float = 2.0,
-    translation_drift: float = 0.015,
-    scale_drift: float = 0.02,
+    drift: Drift | None = None,
     jitter: float = 1e-3,
     num_jumps: int = 0,
     num_lost: int = 0,
 ) -> Trajectory:
-    """A monocular SLAM trajectory of the same motion: drifting, its loop left open.
+    """Trajectory like that of monocular SLAM on the same motion: with drift, no loop closure.
 
-    Rotation, position and scale err by smooth random walks along the path; poses are expressed in
-    the world of the first one, which becomes the identity.
+    Errors of rotation, position and scale are smooth random walks along the path. The first pose
+    is the identity.
 
     Args:
         truth: N exact poses.
-        seed: of all draws.
+        seed: seed of all random numbers.
         scale: SLAM units per unit of `truth`.
-        rotation_drift_deg: largest angle of the rotation's random walk.
-        translation_drift: largest offset by the position's own random walk, of the path length
-            (rotation and scale drift bend the path besides).
-        scale_drift: largest relative change of scale.
-        jitter: standard deviation of each pose on its own, per axis: of the mean step length in
-            position, radians in rotation.
-        num_jumps: sudden displacements of all later poses, as by a bad relocalisation, each half
-            a step and half a degree.
-        num_lost: poses missing, in gaps of up to MAX_GAP, never the first or last.
+        drift: errors that grow along the path; None = those of a good SLAM system.
+        jitter: standard deviation of each pose's independent error, per axis: part of the mean step
+            length in position, radians in rotation.
+        num_jumps: number of sudden displacements of all later poses, like wrong relocalisations,
+            of half a step and half a degree each.
+        num_lost: number of missing poses, in gaps of up to MAX_GAP, never the first or last.
 
     Returns:
         Trajectory of N - num_lost poses.
     """
+    drift = drift or Drift()
     rng = np.random.default_rng(seed)
     count = len(truth.timestamps)
     rotations, positions = truth.world_T_rigs[:, :3, :3], truth.world_T_rigs[:, :3, 3]
     steps = np.diff(positions, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
-    angles = _random_walk(rng, lengths, 3, np.radians(rotation_drift_deg))
-    offsets = _random_walk(rng, lengths, 3, translation_drift * lengths.sum())
-    log_scales = _random_walk(rng, lengths, 1, np.log1p(scale_drift))
+    angles = _random_walk(rng, lengths, 3, np.radians(drift.rotation_deg))
+    offsets = _random_walk(rng, lengths, 3, drift.translation * lengths.sum())
+    log_scales = _random_walk(rng, lengths, 1, np.log1p(drift.scale))
     for frame in rng.choice(np.arange(1, count), num_jumps, replace=False):
         angles[frame:] += np.radians(0.5) * _unit(rng)
         offsets[frame:] += 0.5 * lengths.mean() * _unit(rng)
-    drift = Rotation.from_rotvec(angles)
-    bent = np.exp(log_scales[:-1]) * drift[:-1].apply(steps)
+    turns = Rotation.from_rotvec(angles)
+    bent = np.exp(log_scales[:-1]) * turns[:-1].apply(steps)
     positions = np.concatenate([np.zeros((1, 3)), np.cumsum(bent, axis=0)]) + offsets
     positions += jitter * lengths.mean() * rng.standard_normal((count, 3))
     shake = Rotation.from_rotvec(jitter * rng.standard_normal((count, 3)))
-    rotations = (drift * Rotation.from_matrix(rotations) * shake).as_matrix()
+    rotations = (turns * Rotation.from_matrix(rotations) * shake).as_matrix()
     kept = _kept(rng, count, num_lost)
     world_T_rigs = pose(rotations, positions)[kept]
     first_T_rigs = inverse(world_T_rigs[0]) @ world_T_rigs
@@ -72,7 +79,7 @@ def degrade(
 def _random_walk(
     rng: np.random.Generator, lengths: np.ndarray, dimensions: int, largest: float
 ) -> np.ndarray:
-    """Smooth random walk (N, dimensions) over N - 1 path steps, from 0, of `largest` excursion."""
+    """Smooth random walk (N, dimensions) over N - 1 path steps, from 0, up to norm `largest`."""
     increments = np.sqrt(lengths)[:, None] * rng.standard_normal((len(lengths), dimensions))
     walk = np.concatenate([np.zeros((1, dimensions)), np.cumsum(increments, axis=0)])
     walk = gaussian_filter1d(walk, SMOOTHING, axis=0, mode="nearest")
@@ -86,7 +93,7 @@ def _unit(rng: np.random.Generator) -> np.ndarray:
 
 
 def _kept(rng: np.random.Generator, count: int, num_lost: int) -> np.ndarray:
-    """Mask (count,) of the poses kept; the first and last always are."""
+    """Mask (count,) bool of the kept poses, the first and last one among them."""
     kept = np.ones(count, dtype=bool)
     num_lost = min(num_lost, count - 3)
     while (left := num_lost - np.count_nonzero(~kept)) > 0:
