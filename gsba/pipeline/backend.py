@@ -152,10 +152,10 @@ def merge_maps(state: State, parts: np.ndarray) -> State:
 def measure_strength(state: State) -> State:
     """What images hold well goes without priors; the rest are worth what the others show."""
     run, prior, solution = state.run, state.prior, state.solution
-    limits, settings, trust = run.settings.weak_frames, run.settings.priors, prior.trust
+    limits, trust = run.settings.weak_frames, prior.trust
 
     def compute() -> MapStrength:
-        context = state.context_of_images(settings.faint())
+        context = state.context_of_images(run.settings.priors.faint())
         covariances, joint = adjustment.pose_covariances(
             solution, state.observed.keypoints, context, prior.parts
         )
@@ -166,8 +166,7 @@ def measure_strength(state: State) -> State:
             prior.coarse.world_T_rigs,
             ~trust.unseen_steps,
             ~trust.false_steps,
-            limits,
-            settings,
+            run.settings,
             prior.parts,
         )
 
@@ -241,15 +240,18 @@ def reconstruct(state: State) -> Reconstruction:
             solution,
             covariances,
             observed,
-            prior.coarse,
+            None if run.families.fixing_gauge.members else prior.coarse,
             run.settings.rounds.min_observations,
             prior.trust.false_frames,
-            frames.correction,
             prior.parts,
             joint,
-            stays=bool(run.families.fixing_gauge.members),
         )
-        result = replace(result, fisheyes=frames.fisheyes, vertical=_vertical(state, result))
+        result = replace(
+            result,
+            correction=frames.correction,
+            fisheyes=frames.fisheyes,
+            vertical=_vertical(state, result),
+        )
         if not map_.lenses or map_.centres is None:
             return result
         baseline = baseline_of(map_.centres, world_scale(solution, result))
