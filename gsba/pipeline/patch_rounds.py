@@ -46,7 +46,8 @@ def _round(state: State, number: int) -> State:
     better = _adjust_under_lenses(state, sighted, number)
     if better is None:
         return state
-    # The gyro is aligned to the poses of a whole round.
+    # Alignments of the gyro to camera estimates within a round are let go: `align` makes the next
+    # one from the poses of the whole round.
     return _straighten(replace(better, prior=state.prior), sighted, number)
 
 

@@ -46,7 +46,7 @@ class State:
     """All that a stage may read of a run: the inputs, and the results of the stages before it."""
 
     run: Run  # inputs, settings and the store: no stage changes them
-    prior: Prior  # what is believed of the trajectory
+    prior: Prior  # the trajectory, as far as images confirm it, and the gyro
     observed: ObservedFrames  # keypoints, as rays of the lenses that features have shown so far
     map: Map  # poses, points and camera; at the start the poses of the trajectory
     verified: VerifiedPairs  # neighbours in time with their relative poses
@@ -54,7 +54,7 @@ class State:
 
     @classmethod
     def begin(cls, run: Run, observed: ObservedFrames) -> "State":
-        """The state before the first match: the trajectory is believed as it is."""
+        """The state before the first match, with the trajectory as it was read as the prior."""
         prior, none = Prior.of(run.coarse), VerifiedPairs.none()
         start = Map.of(prior.start(), observed.shown)
         return cls(run, prior, observed, start, none, MapMatches(none.matches))
@@ -65,7 +65,7 @@ class State:
         return self.map.solution
 
     def start_from(self, prior: Prior) -> "State":
-        """The state with another belief, its map the poses that this starts from."""
+        """The state with another prior, its map the poses that this prior starts from."""
         return replace(self, prior=prior, map=Map.of(prior.start(), self.observed.shown))
 
     def with_verified(self, verified: VerifiedPairs) -> "State":
