@@ -55,7 +55,7 @@ def agree_with_prior(
 
     Args:
         matches: putative matches.
-        estimates: result of `estimate` for each pair.
+        estimates: result of `estimate_relative_poses` for each pair.
         prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = no prior.
         position_sigmas: (P,) standard deviation of the prior's relative position, map units; it
             sets the tolerance of the direction.
@@ -108,7 +108,7 @@ def _why_prior_contradicts(
     return "" if angle < allowed else "direction contradicts"
 
 
-def estimate(
+def estimate_relative_poses(
     matches: Matches,
     keypoints: Keypoints,
     settings: VerifySettings,
@@ -179,7 +179,7 @@ def relative_pose(
         bearings0, bearings1: (m, 3) unit, rays of the matches in each frame.
         settings: thresholds.
         seed: of the sampling.
-        chance, rivals: see `estimate`.
+        chance, rivals: see `estimate_relative_poses`.
     """
     found = _significant_pose(bearings0, bearings1, settings, seed, chance)
     if found is None:

@@ -1,10 +1,9 @@
-"""Stage results kept under their key: resume, and re-running just what a change affects.
+"""Store of stage results under keys: it resumes runs and recomputes only changed stages.
 
 A stage's key is the hash of everything its result depends on: its name and settings, the input
-files, the keys of the stages before it, and the version of gsba. A stored result whose key still
-matches is taken as it is; anything else (other settings, another version, a damaged file) is
-computed again. Results lie in `RUN/stages/NAME.npz`, those of a per-frame stage in
-`RUN/stages/NAME/FRAME.npz`.
+files, the keys of the stages before it, and the version of gsba. A stored result whose key matches
+is used; a stage with other settings, another version or a damaged file is computed again. Results
+are in `RUN/stages/NAME.npz`, those of a per-frame stage in `RUN/stages/NAME/FRAME.npz`.
 """
 
 import dataclasses
@@ -39,37 +38,36 @@ from gsba.store.shards import Spent, StoredRecords, Threads, Workers, even_block
 from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
-_SHARDS = "shards"  # folder of pieces of the stage that is being computed
+_SHARDS = "shards"  # folder of shards of the stage that is being computed
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
 
 
 @dataclass(frozen=True, slots=True)
 class StageRecord:
-    """What a stage cost. A resumed stage shows the cost of the call that computed it."""
+    """Cost of a stage. A resumed stage shows the cost of the call that computed it."""
 
     name: str
     key: str  # hash of all the result depends on
-    resumed: bool  # taken from an earlier call
+    resumed: bool  # True = the result is of an earlier call
     seconds: float  # wall clock
-    cpu_seconds: float  # all threads of the process, and of workers elsewhere
+    cpu_seconds: float  # all threads of the process, and of remote workers
     peak_mb: float  # high-water mark of the process's resident memory when the stage ended
-    workers: int = 0  # elsewhere, that took part
+    workers: int = 0  # number of remote workers that took part
 
 
 class RunStore:
-    """One run's folder, held by one process at a time; use as a context manager.
+    """One run's folder, locked by one process at a time; use as a context manager.
 
     Args:
         root: folder of the run, made if missing.
-        origin: what the run is about, e.g. `{"frames": path, "trajectory": path}`.
-        fresh: forget an earlier run in `root`: delete what gsba wrote there, and only that.
-        hire: makes the workers that stages are shared out among, from the folder of shards; None =
-            one thread.
-        title_of: says in words what the stage of a name does, for the log.
+        origin: inputs of the run, e.g. `{"frames": path, "trajectory": path}`.
+        fresh: delete the files that gsba wrote for an earlier run in `root`, and only these.
+        hire: makes the workers of the stages from the folder of shards; None = one thread.
+        title_of: gives the title of a stage by its name, for the log.
 
     Raises:
-        GsbaError: the folder belongs to another run, to something else, or to a live process.
+        GsbaError: the folder is of another run, is no run, or is locked by another process.
     """
 
     def __init__(
@@ -83,7 +81,7 @@ class RunStore:
         self.root = root
         self._title_of = title_of
         self.records: dict[str, StageRecord] = {}  # stages of this call, in order
-        self._types: dict[str, object] = {}  # of results, by the stage's name
+        self._types: dict[str, object] = {}  # stage -> type of its result
         self._prefix = ""
         self._lock = open_run_folder(root, origin, fresh)
         try:
@@ -102,7 +100,7 @@ class RunStore:
 
     @contextmanager
     def named(self, prefix: str) -> Iterator[None]:
-        """Meanwhile stages, and those they come after, are named `prefix-NAME`."""
+        """Name stages within this context, and the stages they follow, `prefix-NAME`."""
         before, self._prefix = self._prefix, f"{prefix}-"
         try:
             yield
@@ -133,7 +131,7 @@ class RunStore:
         key = self._key(name, settings, after)
         name = self._prefix + name
         if self._types.setdefault(name, returns) != returns:
-            raise ValueError(f"stage {name} has results of two types: name one of them otherwise")
+            raise ValueError(f"stage {name} has results of two types: rename one of them")
         path = _stage_path(self.root, name)
         stored = _load_if_current(path, key, returns)
         if stored is not None:
@@ -147,7 +145,7 @@ class RunStore:
         save_record(path, value, dataclasses.asdict(record))
         self._forget_shards()
         self._note(record)
-        give_back_freed_memory()  # of this stage's threads: others do not use it
+        give_back_freed_memory()  # freed by this stage's threads: other threads do not reuse it
         return value
 
     def per_frame(
@@ -160,15 +158,14 @@ class RunStore:
         after: Sequence[str] = (),
         alone: bool = False,
     ) -> "PerFrame[T]":
-        """Results of a stage that treats every frame alone, one file each, resumed frame by frame.
+        """Results of a stage that computes every frame independently, one file each.
 
         Args:
-            items: frame name -> what this frame's result depends on besides `settings`, e.g.
+            items: frame name -> inputs of this frame's result besides `settings`, e.g.
                 `fingerprint(paths)`; only frames whose entry changed are computed again.
-            compute: makes the result of the named frame; see `Taken` for what workers elsewhere
-                need of it.
-            name, settings, returns, after: as for `stage`.
-            alone: one frame at a time, here.
+            compute: makes the result of the named frame; remote workers need it to be a `Taken`.
+            name, settings, returns, after: see `stage`.
+            alone: compute one frame at a time, in this process.
         """
         base = self._key(name, settings, after)
         name = self._prefix + name
@@ -195,22 +192,22 @@ class RunStore:
     def stored(
         self, name: str, settings: object, returns: type[T], after: Sequence[str] = ()
     ) -> T | None:
-        """What `stage` would find stored; None where it would compute."""
+        """Stored result that `stage` would return; None if it would compute one."""
         key = self._key(name, settings, after)
         found = _load_if_current(_stage_path(self.root, self._prefix + name), key, returns)
         return None if found is None else found[0]
 
     def forget(self, name: str) -> None:
-        """Drop the stored result of a stage, so that it is computed again."""
+        """Delete the stored result of a stage, so that it is computed again."""
         _stage_path(self.root, name).unlink(missing_ok=True)
 
     def _forget_shards(self) -> None:
-        """Delete the pieces of a stage that is stored now."""
+        """Delete the shards of a stage whose result is stored."""
         for path in (self.root / STAGES / _SHARDS).glob("*"):
             path.unlink(missing_ok=True)
 
     def claim(self, path: Path) -> None:
-        """Note a final output (a file, or a folder with all its files) as written by gsba."""
+        """List a final output (a file, or a folder with all its files) as written by gsba."""
         claim(self.root, path)
 
     def _key(self, name: str, settings: object, after: Sequence[str]) -> str:
@@ -226,10 +223,10 @@ class RunStore:
 
 
 class Chain:
-    """Stages of which each rests on the one before; `stage` alone goes on.
+    """Stages that each depend on the one before.
 
     Args:
-        store: of the run.
+        store: store of the run.
     """
 
     def __init__(self, store: RunStore) -> None:
@@ -244,7 +241,7 @@ class Chain:
         returns: type[T],
         also: Sequence[str] = (),
     ) -> T:
-        """As `RunStore.stage`, after the stage before and those named in `also`."""
+        """Result of `RunStore.stage` after the latest stage and those named in `also`."""
         after = [*self.latest, *also]
         result = self._store.stage(name, settings, compute, returns, after)
         self.latest = [name]
@@ -253,21 +250,21 @@ class Chain:
 
 @runtime_checkable
 class Taken(Protocol[T_co]):
-    """A per-frame computation that knows what some frames need of it."""
+    """Per-frame computation that can be restricted to some frames, for remote workers."""
 
     def __call__(self, name: str) -> T_co:
-        """The named frame's result."""
+        """Result of the named frame."""
         ...
 
     def taken(self, names: Sequence[str]) -> "Taken[T_co]":
-        """What computes these alone; it can be pickled."""
+        """Computation of these frames alone; it can be pickled."""
         ...
 
 
 class PerFrame(Generic[T]):
-    """Results of a per-frame stage: frame name -> record, read from disk whenever asked for.
+    """Results of a per-frame stage: frame name -> record, read from disk on each access.
 
-    Nothing is held in memory. A missing, outdated or damaged file is computed again.
+    A missing, outdated or damaged file is computed again.
     """
 
     def __init__(
@@ -296,26 +293,26 @@ class PerFrame(Generic[T]):
         return value
 
     def is_stored(self, name: str) -> bool:
-        """Whether a result with the right key lies on disk."""
+        """True if a result with the current key is on disk."""
         try:
             return read_info(self._path(name)).get("key") == self._keys[name]
         except RecordError:
             return False
 
     def taken(self, names: Sequence[str]) -> "PerFrame[T]":
-        """Those of some frames, as workers elsewhere can compute them."""
+        """Results of some frames, with absolute paths for remote workers."""
         compute = self._compute.taken(names) if isinstance(self._compute, Taken) else self._compute
         keys = {name: self._keys[name] for name in names}
         return PerFrame(self._folder.absolute(), keys, compute, self._returns)
 
     def records(self, names: Mapping[int, str]) -> StoredRecords[T]:
-        """What is stored of some frames, by numbers that are given to them."""
+        """Stored records of frames, by the numbers that `names` gives them."""
         paths = {number: self._path(name).absolute() for number, name in names.items()}
         keys = {number: self._keys[name] for number, name in names.items()}
         return StoredRecords(paths, keys, self._returns)
 
     def discard_others(self) -> None:
-        """Delete results of frames that are no longer asked for."""
+        """Delete results of frames that are not among these."""
         for path in set(self._folder.glob("*.npz")) - {self._path(name) for name in self}:
             path.unlink()
 
@@ -325,7 +322,7 @@ class PerFrame(Generic[T]):
 
 @dataclass(frozen=True, slots=True)
 class _Missing:
-    """The job of computing frames that are not stored yet, and of storing them."""
+    """Job that computes and stores the frames without a stored result."""
 
     title: str
     frames: PerFrame[Any]
@@ -347,7 +344,7 @@ class _Missing:
 
 
 def load_stage(root: Path, name: str, returns: type[T]) -> T:
-    """Result of a finished stage of a run, whatever its settings; for export and evaluate.
+    """Result of a finished stage of a run with any settings, for export and evaluate.
 
     Raises:
         GsbaError: `root` is no gsba run or holds links, or the stage is missing or damaged.
@@ -371,7 +368,7 @@ def digest(*parts: object) -> str:
 
 
 def fingerprint(paths: Iterable[Path | None]) -> tuple[tuple[str, int, int], ...]:
-    """(path, bytes, modification time in ns) of input files: cheap to take and to compare."""
+    """Path, size in bytes and modification time in ns of each input file."""
     stats = ((path, path.stat()) for path in paths if path is not None)
     return tuple((str(path), stat.st_size, stat.st_mtime_ns) for path, stat in stats)
 
@@ -400,7 +397,7 @@ def _stage_path(root: Path, name: str) -> Path:
 
 
 def _load_if_current(path: Path, key: str, returns: type[T]) -> tuple[T, StageRecord] | None:
-    """The stored result and its cost, or None where there is none that can be used."""
+    """Stored result and its cost; None if there is no usable result with this key."""
     if not path.exists():
         return None
     try:
@@ -416,11 +413,11 @@ def _load_if_current(path: Path, key: str, returns: type[T]) -> tuple[T, StageRe
 
 @dataclass(frozen=True, slots=True)
 class _Clocks:
-    """When a stage began, for all that work on it."""
+    """Clocks of this process and of remote workers at the start of a stage."""
 
-    wall: float
-    cpu: float
-    elsewhere: Spent
+    wall: float  # seconds
+    cpu: float  # seconds, of this process
+    elsewhere: Spent  # work of remote workers
 
     @classmethod
     def now(cls, workers: Workers) -> "_Clocks":
@@ -429,7 +426,7 @@ class _Clocks:
     def measured(
         self, name: str, key: str, workers: Workers, spent: StageRecord | None = None
     ) -> StageRecord:
-        """Cost since then, on top of what an interrupted call has `spent`."""
+        """Cost since the start, added to the cost `spent` by an interrupted call."""
         elsewhere, before = workers.spent(), self.elsewhere
         seconds = time.perf_counter() - self.wall
         cpu_seconds = time.process_time() - self.cpu

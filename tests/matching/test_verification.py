@@ -150,8 +150,9 @@ def _run(
         np.concatenate([np.zeros((0, 2), np.int32), *rows]),
     )
     spread = np.zeros(len(views)) if sigmas is None else np.array(sigmas)
-    chances = np.zeros(len(views))
-    found = verification.estimate(matches, keypoints, SETTINGS, 0, Threads(1), chances)
+    found = verification.estimate_relative_poses(
+        matches, keypoints, SETTINGS, 0, Threads(1), np.zeros(len(views))
+    )
     return verification.agree_with_prior(matches, found, np.array(priors), spread, SETTINGS)
 
 
