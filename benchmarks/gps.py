@@ -34,7 +34,7 @@ from gsba.bundle.fixes import FrameFixes
 from gsba.bundle.optimizer import marginal_covariances
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import GpsSettings, RefineSettings
-from gsba.demo.degrade import degrade
+from gsba.demo.degrade import Drift, degrade
 from gsba.geometry import furthest, inverse, pose
 from gsba.placement.gps_fit import fit_fixes
 from gsba.types import Keypoints, Solution, Tracks, Trajectory
@@ -116,7 +116,8 @@ def make_walk(
         int(compact.max()) + 1,
     )
     times = t * length / SPEED
-    slam = degrade(Trajectory(times, level_T_rigs), seed, rotation_drift_deg=20.0, scale_drift=0.3)
+    drift = Drift(rotation_deg=20.0, scale=0.3)
+    slam = degrade(Trajectory(times, level_T_rigs), seed, drift=drift)
     return Walk(level_T_rigs, times, keypoints, tracks, slam.world_T_rigs)
 
 

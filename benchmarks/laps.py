@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from benchmarks.common import measure, refine_command, write_table
-from gsba.demo.degrade import degrade
+from gsba.demo.degrade import Drift, degrade
 from gsba.evaluate import evaluate
 from gsba.export import ExportFormat
 from gsba.trajectory import read_trajectory, write_tum
@@ -61,9 +61,7 @@ def cut(
     spoiled = degrade(
         truth,
         seed,
-        rotation_drift_deg=2.0 * growth,
-        translation_drift=0.015 / growth,  # of the path's length
-        scale_drift=0.02 * growth,
+        drift=Drift(2.0 * growth, 0.015 / growth, 0.02 * growth),
         num_jumps=2,
         num_lost=num // 50,
     )

@@ -29,7 +29,7 @@ from gsba.config import ExportSettings, SplatSettings
 from gsba.demo import make_walk
 from gsba.demo.people import make_people, paste_people
 from gsba.disk import write_image
-from gsba.evaluate.splats import train_and_measure
+from gsba.evaluate.splats import PosedViews, train_and_measure
 from gsba.evaluate.trajectory import evaluate
 from gsba.frames.files import decode
 from gsba.frames.masks import load_mask
@@ -37,7 +37,7 @@ from gsba.frames.pixels import load_erp
 from gsba.frames.scan import find_panoramas, scan
 from gsba.masks.carrier import carrier_mask, find_carrier
 from gsba.splat.backend import choose_backend
-from gsba.splat.scene import load_faces, make_views, refined_frames, split_frames
+from gsba.splat.scene import load_faces, refined_frames, split_frames
 from gsba.store.store import digest, fingerprint
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet, Reconstruction
@@ -148,15 +148,12 @@ def splat_psnr(
     )
     split = split_frames(refined_frames(reconstruction), settings.held_out_every)
     poses, backend = reconstruction.world_T_rigs, choose_backend("cpu", 2)
-    seen, unseen = (
-        make_views(load_faces(source, part, FACE_SIZE), poses[part])
-        for source, part in ((frames, split.training), (clean, split.held_out))
-    )
+    seen = load_faces(frames, split.training, FACE_SIZE)
+    unseen = load_faces(clean, split.held_out, FACE_SIZE)
+    source = PosedViews.of(poses, split, seen, unseen)
     files = fingerprint([*(p[0] for p in frames.paths), *frames.mask_paths])
     key = digest(files, poses.tolist(), settings)
-    _, found = train_and_measure(
-        reconstruction, frames, poses, split, seen, unseen, settings, backend, out, key, None
-    )
+    _, found = train_and_measure(reconstruction, frames, source, settings, backend, out, key)
     return found.mean.psnr
 
 

@@ -9,6 +9,7 @@ known positions. Only the process that aligns patches is measured.
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -22,7 +23,7 @@ from gsba.frames.scan import scan
 from gsba.geometry import pose
 from gsba.photometric import alignment
 from gsba.store.shards import Threads
-from gsba.types import Counts, Keypoints, Landmarks, Tracks
+from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
 
 POINTS, DISTANCE = 60, 1e4  # points per frame, and their distance, units: without parallax
 
@@ -81,9 +82,9 @@ def run(folder: Path, num_threads: int) -> dict[str, float]:
     settings = PatchSettings()
     greys = panorama.Greys(frames, settings.max_width)
     before = peak_mb()
-    sighted = alignment.align(
-        landmarks, poses, keypoints, 1.0, greys, rig, "align", None, settings, Threads(num_threads)
-    )
+    solved = replace(Solution.without_points(poses), landmarks=landmarks)
+    observed, workers = alignment.Observations(keypoints), Threads(num_threads)
+    sighted = alignment.align(solved, observed, greys, rig, settings, workers)
     kept, received = sighted.counts.kept, sighted.counts.received
     return {"frames": len(frames), "before_mb": before, "peak_mb": peak_mb(),
             "kept": kept, "received": received}  # fmt: skip

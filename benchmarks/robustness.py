@@ -25,6 +25,7 @@ from gsba import refine
 from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.demo import degrade, make_walk
+from gsba.demo.degrade import Drift
 from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import inverse
 from gsba.log import GsbaError
@@ -58,7 +59,7 @@ def spoiled(truth: Trajectory, seed: int) -> Iterator[tuple[str, float, Trajecto
     base = degrade(truth, seed)
     for amount in DRIFTS:
         turn = TURN_DEG_PER_DRIFT * amount
-        drifting = degrade(truth, seed, rotation_drift_deg=turn, translation_drift=amount)
+        drifting = degrade(truth, seed, drift=Drift(turn, amount))
         yield "drift", amount, drifting, []
     for amount in OUTLIERS:
         poses, frames = with_outliers(base.world_T_rigs, amount, seed)
@@ -73,7 +74,7 @@ def spoiled(truth: Trajectory, seed: int) -> Iterator[tuple[str, float, Trajecto
         times = offset + rate * base.timestamps
         yield f"clock, rate {rate:g}", offset, Trajectory(times, base.world_T_rigs), []
     turn = TURN_DEG_PER_DRIFT * MISSING_DRIFT
-    drifting = degrade(truth, seed, rotation_drift_deg=turn, translation_drift=MISSING_DRIFT)
+    drifting = degrade(truth, seed, drift=Drift(turn, MISSING_DRIFT))
     for missing in MISSING:
         left = slice(0, -missing)
         open_end = Trajectory(drifting.timestamps[left], drifting.world_T_rigs[left])

@@ -44,7 +44,7 @@ from gsba.demo import make_walk
 from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.disk import write_text
-from gsba.evaluate.splats import train_and_measure
+from gsba.evaluate.splats import PosedViews, train_and_measure
 from gsba.frames.cubemap import cut
 from gsba.log import GsbaError, show_log
 from gsba.pipeline.refine import refine
@@ -111,16 +111,14 @@ def run_seed(
         if row in ("lenses", "middle", "longer"):  # ten views a frame
             chosen = settings.model_copy(update={"iterations": settings.iterations * 10 // 6})
         poses, size = reconstruction.world_T_rigs, settings.face_size
-        training = make_views(
-            load_faces(frames, split.training, size, taken), poses[split.training]
-        )
-        held_out = make_views(load_faces(frames, split.held_out, size, seen), poses[split.held_out])
+        training = load_faces(frames, split.training, size, taken)
+        held_out = load_faces(frames, split.held_out, size, seen)
+        source = PosedViews.of(poses, split, training, held_out)
         backend, folder = choose_backend("cpu", threads), out / f"splat{seed}-{row}"
         key = digest(row, poses.tolist(), chosen)
         splat, result = train_and_measure(
-            reconstruction, frames, poses, split, training, held_out, chosen, backend, folder, key,
-            None,
-        )  # fmt: skip
+            reconstruction, frames, source, chosen, backend, folder, key
+        )
         near, there = (
             near_of(poses[split.training], chosen),
             make_views(exact, poses[split.held_out]),

@@ -70,9 +70,14 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
         solved, observed, aligned, field = bearing, keypoints, None, none
         for number in (1, 2):
             sighted = alignment.align(
-                solved.landmarks, solved.world_T_rigs, observed, solved.noise, greys, rig,
-                f"{name} {number}", aligned, settings.patches, workers, field,
-            )  # fmt: skip
+                solved,
+                alignment.Observations(observed, aligned, field=field),
+                greys,
+                rig,
+                settings.patches,
+                workers,
+                name=f"{name} {number}",
+            )
             there = replace(sighted, keypoints=stitching.corrected(sighted.keypoints, field, rig))
             solved, found = adjustment.adjust_sighted(
                 there, solved, problem, settings.rounds.aligned
@@ -88,10 +93,11 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
         variants.append(Variant(name, solved, field))
     last = variants[-1]
     placed = place(last, held.tracks, keypoints, settings)
+    solved = replace(last.solved, landmarks=placed, noise=start.noise)
+    observed = alignment.Observations(keypoints, field=last.field)
     sighted = alignment.align(
-        placed, last.solved.world_T_rigs, keypoints, start.noise, greys, rig, "held out", None,
-        settings.patches, workers, last.field,
-    )  # fmt: skip
+        solved, observed, greys, rig, settings.patches, workers, name="held out"
+    )
     return variants, sighted
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.config import PriorSettings, WeakFrameSettings
+from gsba.config import PriorSettings, RefineSettings
 from gsba.geometry import inverse, rotation_angle, step_covariances
 from gsba.types import Counts, JointErrors, StepNoise
 
@@ -43,8 +43,7 @@ def measure(
     coarse_world_T_rigs: np.ndarray,
     seen: np.ndarray,
     believed: np.ndarray,
-    weak_frames: WeakFrameSettings,
-    priors: PriorSettings,
+    settings: RefineSettings,
     components: np.ndarray | None = None,
 ) -> MapStrength:
     """Judge a solution by the joint covariance of its poses under priors next to nothing.
@@ -56,11 +55,11 @@ def measure(
         coarse_world_T_rigs: (F, 4, 4) the trajectory.
         seen: (F - 1,) bool, steps that images show.
         believed: (F - 1,) bool, steps of the trajectory that they do not contradict.
-        weak_frames: limits, and how far around a weak place frames count as near.
-        priors: noise of the trajectory's steps, as far as the images do not know it.
+        settings: weak_frames: limits, and how far around a weak place frames count as near; priors:
+            noise of the trajectory's steps, as far as the images do not know it.
         components: (F,) map of each frame, from 0; None = there is one.
     """
-    num = len(world_T_rigs)
+    num, weak_frames, priors = len(world_T_rigs), settings.weak_frames, settings.priors
     maps = np.zeros(num, np.int32) if components is None else components
     drift = np.array(
         [_drift(world_T_rigs[maps == m], joint.draws[:, maps == m]) for m in range(maps.max() + 1)]

@@ -23,13 +23,11 @@ def assemble(
     adjustment: Solution,
     covariances: np.ndarray,
     keypoints: Keypoints,
-    coarse: CoarsePoses,
+    coarse: CoarsePoses | None,
     min_observations: int,
     false_frames: np.ndarray | None = None,
-    correction: tuple[float, ...] = (),
     components: np.ndarray | None = None,
     joint_errors: JointErrors | None = None,
-    stays: bool = False,
 ) -> Reconstruction:
     """Carry the solution back to the trajectory's world and gather what exports need.
 
@@ -37,23 +35,23 @@ def assemble(
         adjustment: the last solution.
         covariances: (F, 6, 6) of its poses.
         keypoints: of all frames.
-        coarse: poses that define the world; interpolated ones have no say in it.
+        coarse: poses that define the world, unless they are interpolated; None = world and scale
+            of the solution are those of the result.
         min_observations: frames with fewer count as unrefined.
         false_frames: (F,) bool, frames whose coarse pose has no say either.
-        correction: of the frames, which the keypoints have.
         components: (F,) map of each frame, each carried to its own coarse poses; None = one map.
         joint_errors: of the poses; None = not known.
-        stays: whether world and scale are already those of the result.
 
     Raises:
         GsbaError: not where the trajectory has its frames, or residuals that no solution leaves.
     """
     landmarks, seen = adjustment.landmarks, adjustment.observations()
     refined = seen >= min_observations
-    known = refined & (coarse.sources == PoseSource.SLAM)
-    known &= True if false_frames is None else ~false_frames
+    known = refined if false_frames is None else refined & ~false_frames
+    targets = None
+    if coarse is not None:
+        known, targets = known & (coarse.sources == PoseSource.SLAM), coarse.world_T_rigs
     groups = np.zeros(len(seen), np.int32) if components is None else components
-    targets = None if stays else coarse.world_T_rigs
     placed, points_world, stretch = _placed(adjustment, targets, known, groups)
     rows, points = keypoints.rows(landmarks.tracks), landmarks.tracks.points
     lengths = np.maximum(np.bincount(points, minlength=len(landmarks.points_world)), 1)
@@ -73,10 +71,11 @@ def assemble(
         landmarks.tracks.frames,
         bearings,
         adjustment.noise * keypoints.sigmas_rad[rows],
-        correction,
-        components,
-        joint_errors and joint_errors.scaled(stretch),
-        None if origins is None else stretch[landmarks.tracks.frames, 3:] * origins,
+        components=components,
+        joint_errors=joint_errors and joint_errors.scaled(stretch),
+        observation_origins=None
+        if origins is None
+        else stretch[landmarks.tracks.frames, 3:] * origins,
         map_scales=None if components is None else _map_scales(stretch[:, 3], components),
     )
 

@@ -1,5 +1,7 @@
 """SLAM-like errors added to an exact trajectory."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
@@ -11,14 +13,21 @@ SMOOTHING = 1.5  # frames, standard deviation of the filter that smooths drift
 MAX_GAP = 3  # most successive frames that are lost
 
 
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """Largest values of the random walks that a trajectory's errors are."""
+
+    rotation_deg: float = 2.0  # angle
+    translation: float = 0.015  # offset, part of the path length; the others bend the path further
+    scale: float = 0.02  # relative change
+
+
 def degrade(
     truth: Trajectory,
     seed: int = 0,
     *,
     scale: float = 0.4,
-    rotation_drift_deg: float = 2.0,
-    translation_drift: float = 0.015,
-    scale_drift: float = 0.02,
+    drift: Drift | None = None,
     jitter: float = 1e-3,
     num_jumps: int = 0,
     num_lost: int = 0,
@@ -32,10 +41,7 @@ def degrade(
         truth: N exact poses.
         seed: seed of all random numbers.
         scale: SLAM units per unit of `truth`.
-        rotation_drift_deg: largest angle of the rotation's random walk.
-        translation_drift: largest offset by the position's random walk, part of the path length;
-            rotation and scale drift bend the path further.
-        scale_drift: largest relative change of scale.
+        drift: errors that grow along the path; None = those of a good SLAM system.
         jitter: standard deviation of each pose's independent error, per axis: part of the mean step
             length in position, radians in rotation.
         num_jumps: number of sudden displacements of all later poses, like wrong relocalisations,
@@ -45,23 +51,24 @@ def degrade(
     Returns:
         Trajectory of N - num_lost poses.
     """
+    drift = drift or Drift()
     rng = np.random.default_rng(seed)
     count = len(truth.timestamps)
     rotations, positions = truth.world_T_rigs[:, :3, :3], truth.world_T_rigs[:, :3, 3]
     steps = np.diff(positions, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
-    angles = _random_walk(rng, lengths, 3, np.radians(rotation_drift_deg))
-    offsets = _random_walk(rng, lengths, 3, translation_drift * lengths.sum())
-    log_scales = _random_walk(rng, lengths, 1, np.log1p(scale_drift))
+    angles = _random_walk(rng, lengths, 3, np.radians(drift.rotation_deg))
+    offsets = _random_walk(rng, lengths, 3, drift.translation * lengths.sum())
+    log_scales = _random_walk(rng, lengths, 1, np.log1p(drift.scale))
     for frame in rng.choice(np.arange(1, count), num_jumps, replace=False):
         angles[frame:] += np.radians(0.5) * _unit(rng)
         offsets[frame:] += 0.5 * lengths.mean() * _unit(rng)
-    drift = Rotation.from_rotvec(angles)
-    bent = np.exp(log_scales[:-1]) * drift[:-1].apply(steps)
+    turns = Rotation.from_rotvec(angles)
+    bent = np.exp(log_scales[:-1]) * turns[:-1].apply(steps)
     positions = np.concatenate([np.zeros((1, 3)), np.cumsum(bent, axis=0)]) + offsets
     positions += jitter * lengths.mean() * rng.standard_normal((count, 3))
     shake = Rotation.from_rotvec(jitter * rng.standard_normal((count, 3)))
-    rotations = (drift * Rotation.from_matrix(rotations) * shake).as_matrix()
+    rotations = (turns * Rotation.from_matrix(rotations) * shake).as_matrix()
     kept = _kept(rng, count, num_lost)
     world_T_rigs = pose(rotations, positions)[kept]
     first_T_rigs = inverse(world_T_rigs[0]) @ world_T_rigs

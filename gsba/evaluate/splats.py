@@ -61,6 +61,26 @@ class SourceResult:
     num_gaussians: int
 
 
+@dataclass(frozen=True, slots=True)
+class PosedViews:
+    """Views of frames at the poses of one source, some of them held out of the training."""
+
+    poses: np.ndarray  # (F, 4, 4) float64, world_T_rig
+    split: Split  # training and held-out frames
+    training: Views
+    held_out: Views
+
+    @classmethod
+    def of(cls, poses: np.ndarray, split: Split, training: Faces, held_out: Faces) -> "PosedViews":
+        """Views of the faces of either part at poses (F, 4, 4)."""
+        return cls(
+            poses,
+            split,
+            make_views(training, poses[split.training]),
+            make_views(held_out, poses[split.held_out]),
+        )
+
+
 def poses_for(frames: FrameSet, trajectory: Trajectory, tolerance_s: float = 0.01) -> np.ndarray:
     """Pose (F, 4, 4) of each frame by time; NaN where the trajectory has none.
 
@@ -112,32 +132,20 @@ def compare(
     split = split_frames(usable, settings.held_out_every)
     own = reconstruction.world_T_rigs[usable]
     sources = {name: _beside(poses, usable, own) for name, poses in sources.items()}
-    faces = [
-        load_faces(frames, part, settings.face_size, optics)
-        for part in (split.training, split.held_out)
-    ]
+    size = settings.face_size
+    training = load_faces(frames, split.training, size, optics)
+    held_out = load_faces(frames, split.held_out, size, optics)
     results, splats = {}, {}
     for name, poses in sources.items():
         logger.info("splat on %s poses, %d frames", name, len(split.training))
-        training = make_views(faces[0], poses[split.training])
-        held_out = make_views(faces[1], poses[split.held_out])
+        source = PosedViews.of(poses, split, training, held_out)
         files = fingerprint([p[0] for p in frames.paths])
         key = digest(files, poses.tolist(), settings, backend.name, *_key_of(optics))
         splats[name], results[name] = train_and_measure(
-            reconstruction,
-            frames,
-            poses,
-            split,
-            training,
-            held_out,
-            settings,
-            backend,
-            out / name,
-            key,
-            lpips,
+            reconstruction, frames, source, settings, backend, out / name, key, lpips
         )
     _write(out, results, settings, lpips is not None)
-    _write_pictures(out / "pictures", frames, split, faces[1], sources, splats, settings, backend)
+    _write_pictures(out / "pictures", frames, split, held_out, sources, splats, settings, backend)
     return results
 
 
@@ -172,42 +180,40 @@ def _write(
 def train_and_measure(
     reconstruction: Reconstruction,
     frames: FrameSet,
-    poses: np.ndarray,
-    split: Split,
-    training: Views,
-    held_out: Views,
+    source: PosedViews,
     settings: SplatSettings,
     backend: Backend,
     out: Path,
     key: str,
-    lpips: Distance | None,
+    lpips: Distance | None = None,
 ) -> tuple[Gaussians, SourceResult]:
     """Train a splat on one source of poses, and measure it during and after the training.
 
     Args:
         reconstruction, frames: see `compare`.
-        poses: (F, 4, 4) poses of the source.
-        split: training and held-out frames.
-        training, held_out: views of either part at these poses.
+        source: views of the frames at poses of one source.
         settings, backend: settings and renderer of the training.
         out: folder to write, see `compare`.
         key: hash of everything the training depends on; checkpoints of another key are ignored.
         lpips: see `compare`.
     """
+    poses, split = source.poses, source.split
     near = near_of(poses[split.training], settings)
     curve = _read_curve(out / "curve.json", key)
     every = max(settings.iterations // _NUM_CURVE_POINTS, 1)
 
     def watch(step: int, gaussians: Gaussians) -> None:
         if step // every > max(curve, default=0) // every:
-            curve[step] = mean_score(measure(gaussians, held_out, settings, near, backend).values())
+            curve[step] = mean_score(
+                measure(gaussians, source.held_out, settings, near, backend).values()
+            )
             content = {"key": key, "curve": {s: asdict(score) for s, score in curve.items()}}
             write_text(out / "curve.json", json.dumps(content))
 
     start = start_cloud(reconstruction, poses, split.training, settings.sh_degree)
-    splat = train(start, training, settings, backend, out / "checkpoint.npz", key, watch)
+    splat = train(start, source.training, settings, backend, out / "checkpoint.npz", key, watch)
     write_ply(out / "point_cloud.ply", splat)
-    scores = measure(splat, held_out, settings, near, backend, lpips)
+    scores = measure(splat, source.held_out, settings, near, backend, lpips)
     by_frame = {frames.names[split.held_out[i]]: score for i, score in scores.items()}
     return splat, SourceResult(by_frame, mean_score(scores.values()), curve, len(splat))
 

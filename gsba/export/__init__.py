@@ -4,8 +4,8 @@ Takes a result, its frames, and its placement.
 Gives a folder that the other program reads without conversion.
 """
 
-from gsba.export.formats import ExportFormat, export, export_all
+from gsba.export.formats import ExportFormat, ExportOptions, export, export_all
 from gsba.export.images import of_one_lens
 from gsba.export.ply import write_points
 
-__all__ = ["ExportFormat", "export", "export_all", "of_one_lens", "write_points"]
+__all__ = ["ExportFormat", "ExportOptions", "export", "export_all", "of_one_lens", "write_points"]

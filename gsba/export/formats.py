@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
@@ -33,6 +34,19 @@ class ExportFormat(StrEnum):
     NERFSTUDIO = "nerfstudio"  # transforms.json: pinhole faces, and panoramas
     PLY = "ply"  # points3D.ply, the start cloud of splat trainers
     TUM = "tum"  # trajectory.tum, and panoramas on request
+
+
+@dataclass(frozen=True, slots=True)
+class ExportOptions:
+    """Choices of an export, see `export`."""
+
+    face_size: int | None = None  # pixels of a cube face; None = by the frames
+    placement: Placement | None = None  # of the exported world; None = the run's world
+    link: bool = False  # hard links to unchanged frames
+    lenses: Lenses = ONE_CENTRE  # of the frames, in the unit of the reconstruction
+    images: str = "auto"  # the setting `export.images`
+    map_number: int = 1  # 1 = the largest map
+    fetched: bool = False  # with the frames that were added where the map was weak
 
 
 def export(
@@ -76,45 +90,43 @@ def export(
         GsbaError: `out` is in use or not seen by a worker, the format does not fit the frames,
             there is no such map, or the disk cannot be written; nothing is left behind then.
     """
-    given = reconstruction, frames, {to: out}, face_size, placement, link, lenses, images
-    export_all(*given, workers, map_number, fetched)
+    options = ExportOptions(face_size, placement, link, lenses, images, map_number, fetched)
+    export_all(reconstruction, frames, {to: out}, options, workers)
 
 
 def export_all(
     reconstruction: Reconstruction,
     frames: FrameSet,
     outs: Mapping[ExportFormat, Path],
-    face_size: int | None = None,
-    placement: Placement | None = None,
-    link: bool = False,
-    lenses: Lenses = ONE_CENTRE,
-    images: str = "auto",
+    options: ExportOptions | None = None,
     workers: Workers | None = None,
-    map_number: int = 1,
-    fetched: bool = False,
 ) -> None:
     """Write one map in several formats; every image is read, cut and encoded once.
 
     Args:
+        reconstruction, frames: see `export`.
         outs: folder of each format.
-        reconstruction, frames, face_size, placement, link, lenses, images, workers, map_number,
-            fetched: see `export`.
+        options: choices that hold for all formats.
+        workers: see `export`.
 
     Raises:
         GsbaError: see `export`; none of the folders is written then.
     """
+    options = options or ExportOptions()
+    face_size, link, images = options.face_size, options.link, options.images
+    map_number, lenses = options.map_number, options.lenses
     for to in outs:
         _require_fitting(to, frames, images)
     whole = reconstruction
     reconstruction, frames = one_map(whole, frames, map_number, "the reconstruction")
     if lenses:
         lenses = lenses_of_map(lenses, whole, map_number)
-    if not fetched and any(frames.fetched):
+    if not options.fetched and any(frames.fetched):
         rows = frames.chosen()
         reconstruction, frames = reconstruction.taken(rows), frames.taken(rows)
         lenses = lenses.taken(rows)
     _warn_of_gaps(reconstruction, frames)
-    placement = placement or Placement(map_number=map_number)
+    placement = options.placement or Placement(map_number=map_number)
     reconstruction = placement.apply(reconstruction)
     seen_by, z_up = lenses.scaled(placement.similarity.scale), placement.up == "z"
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)

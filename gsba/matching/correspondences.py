@@ -149,19 +149,31 @@ def verified(
     context: MatchContext,
     rivals: bool = False,
 ) -> VerifiedPairs:
-    """Matches that fit a verified relative pose, see `verification.verify_pairs`."""
-    verify, seed = context.settings.verify, context.settings.seed
-    chances = np.array([gate.chance(np.deg2rad(verify.max_error_deg)) for gate in gates])
-    given = found, context.keypoints, f0_T_f1s, sigmas, verify, seed
-    return verification.verify_pairs(*given, context.workers, chances, rivals)
+    """Matches that fit one relative pose of their pair, which agrees with the prior.
+
+    Args:
+        found: putative matches.
+        gates: gate of each pair (P,).
+        f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = no prior.
+        sigmas: (P,) standard deviations of their positions, map units; None = no prior.
+        context: features and settings of the run.
+        rivals: see `verification.estimate_relative_poses`.
+    """
+    settings, seed = context.settings.verify, context.settings.seed
+    chances = np.array([gate.chance(np.deg2rad(settings.max_error_deg)) for gate in gates])
+    estimates = verification.estimate_relative_poses(
+        found, context.keypoints, settings, seed, context.workers, chances, rivals
+    )
+    return verification.agree_with_prior(found, estimates, f0_T_f1s, sigmas, settings)
 
 
 def _estimates(found: Matches, gate: Gate, context: MatchContext) -> list[RelativePose | None]:
     """The relative pose of each pair within a gate, without the trajectory as prior."""
     verify, seed = context.settings.verify, context.settings.seed
     chances = np.full(len(found.pairs), gate.chance(np.deg2rad(verify.max_error_deg)))
-    given = found, context.keypoints, verify, seed
-    return verification.estimate_relative_poses(*given, context.workers, chances)
+    return verification.estimate_relative_poses(
+        found, context.keypoints, verify, seed, context.workers, chances
+    )
 
 
 def _inlier_ratios(found: Matches, kept: VerifiedPairs) -> np.ndarray:

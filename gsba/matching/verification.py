@@ -44,36 +44,6 @@ class RelativePose:
     rivalled: bool  # True if another pose explains about as many of the other matches
 
 
-def verify_pairs(
-    matches: Matches,
-    keypoints: Keypoints,
-    prior_f0_T_f1s: np.ndarray | None,
-    position_sigmas: np.ndarray | None,
-    settings: VerifySettings,
-    seed: int,
-    workers: Workers,
-    chances: np.ndarray,
-    rivals: bool = False,
-) -> VerifiedPairs:
-    """Estimate a relative pose per pair by LO-RANSAC and keep pairs that agree with the prior.
-
-    Args:
-        matches: putative matches.
-        keypoints: keypoints of all frames.
-        prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = no prior.
-        position_sigmas: (P,) standard deviation of the prior's relative position, map units; it
-            sets the tolerance of the direction.
-        settings: thresholds.
-        seed: of the sampling.
-        workers: threads or processes that run it.
-        chances, rivals: see `estimate_relative_poses`.
-    """
-    estimates = estimate_relative_poses(
-        matches, keypoints, settings, seed, workers, chances, rivals
-    )
-    return agree_with_prior(matches, estimates, prior_f0_T_f1s, position_sigmas, settings)
-
-
 def agree_with_prior(
     matches: Matches,
     estimates: Sequence[RelativePose | None],
@@ -81,11 +51,15 @@ def agree_with_prior(
     position_sigmas: np.ndarray | None,
     settings: VerifySettings,
 ) -> VerifiedPairs:
-    """Keep pairs that agree with the prior.
+    """Keep pairs that have one relative pose, which agrees with the prior.
 
     Args:
+        matches: putative matches.
         estimates: result of `estimate_relative_poses` for each pair.
-        matches, prior_f0_T_f1s, position_sigmas, settings: as for `verify_pairs`.
+        prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = no prior.
+        position_sigmas: (P,) standard deviation of the prior's relative position, map units; it
+            sets the tolerance of the direction.
+        settings: thresholds.
     """
     kept, kept_poses = [], []
     dropped: dict[str, int] = {
@@ -143,10 +117,14 @@ def estimate_relative_poses(
     chances: np.ndarray,
     rivals: bool = False,
 ) -> list[RelativePose | None]:
-    """`relative_pose` of every pair, without any prior.
+    """`relative_pose` of every pair by LO-RANSAC, without any prior.
 
     Args:
-        matches, keypoints, settings, seed, workers: as for `verify_pairs`.
+        matches: putative matches.
+        keypoints: keypoints of all frames.
+        settings: thresholds.
+        seed: of the sampling.
+        workers: threads or processes that run it.
         chances: (P,) probability that a false match that passed the gate agrees with a pose near
             the predicted one; 0 = nothing was predicted.
         rivals: True if rival poses are searched too.

@@ -14,7 +14,7 @@ from gsba.frames import panorama
 from gsba.photometric import frame_jobs, surfaces
 from gsba.photometric.references import references, visible_frames
 from gsba.store.shards import Workers
-from gsba.types import Counts, Keypoints, Landmarks, Sighted, Tracks
+from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution, Tracks
 
 _TOO_UNCERTAIN = "position too uncertain"
 _SIGHTINGS_AT_ONCE = 1 << 17  # sightings processed together: some 80 MB
@@ -49,20 +49,26 @@ class _Planes:
     rays_world: np.ndarray  # (J, 3) from the host to the point, map units
 
 
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """Observations of a map's points, and what earlier alignments have shown of them."""
+
+    keypoints: Keypoints  # as pictures show them
+    aligned: np.ndarray | None = None  # (N,) bool, keypoints confirmed by patches; None = none
+    normals_rig: np.ndarray | None = None  # (N, 3) of the surfaces that they show, as in `Sighted`;
+    # None = unknown
+    field: SphereField = _STRAIGHT  # errors of stitching: the map is corrected by it
+
+
 def align(
-    landmarks: Landmarks,
-    world_T_rigs: np.ndarray,
-    keypoints: Keypoints,
-    noise: float,
+    solved: Solution,
+    observed: Observations,
     greys: panorama.Greys,
     rig: CubeRig,
-    name: str,
-    aligned: np.ndarray | None,
     settings: PatchSettings,
     workers: Workers,
-    field: SphereField = _STRAIGHT,
     lenses: Lenses = ONE_CENTRE,
-    normals_rig: np.ndarray | None = None,
+    name: str = "align",
 ) -> Sighted:
     """Observe every point again, in the frames that should show it.
 
@@ -71,29 +77,28 @@ def align(
     part, gain and offset are estimated. The affine parts determine the surfaces' normals.
 
     Args:
-        landmarks: points and their observations so far.
-        world_T_rigs: (F, 4, 4) poses of their solution.
-        keypoints: keypoints of those observations.
-        noise: noise of those observations, in units of their sigmas.
+        solved: points, poses, and the noise of the observations so far.
+        observed: these observations.
         greys: the frames' images.
         rig: faces that pixels are given on.
-        name: beside the progress bar.
-        aligned: (N,) bool, keypoints confirmed by patches; None = none.
         settings: limits and sizes.
         workers: who work on frames.
-        field: stitching field; keypoints are as observed, the map is corrected.
         lenses: lenses of the camera; the band where two pictures are blended is left out.
-        normals_rig: (N, 3) of the surfaces that keypoints show, as in `Sighted`; None = unknown.
+        name: beside the progress bar.
 
     Returns:
         Tracks of aligned observations, and of former ones where alignment failed.
     """
+    landmarks, world_T_rigs = solved.landmarks, solved.world_T_rigs
+    keypoints, field = observed.keypoints, observed.field
     rows = references(landmarks, world_T_rigs)
     hosts = landmarks.tracks.frames[rows].astype(np.int64)
     own, pixel = keypoints.rows(landmarks.tracks)[rows], 2 * np.pi / greys.width
-    normals = np.zeros((len(rows), 3)) if normals_rig is None else normals_rig[own]
+    normals = np.zeros((len(rows), 3))
+    if observed.normals_rig is not None:
+        normals = observed.normals_rig[own]
     planes = _planes(landmarks, world_T_rigs, hosts, normals, pixel, field, lenses)
-    extended = _confirmed_points(landmarks, keypoints, aligned, settings.min_track_length)
+    extended = _confirmed_points(landmarks, keypoints, observed.aligned, settings.min_track_length)
     views = visible_frames(landmarks, world_T_rigs, rows, extended, settings)
     points, seeing = _unblended(landmarks, planes, world_T_rigs, hosts, *views, lenses)
     at, across, rays = _projected_patches(landmarks, planes, world_T_rigs, points, seeing, lenses)
@@ -105,7 +110,9 @@ def align(
     at_hosts = _at_hosts(patches, sightings, kept, hosts, planes, pixel)
     normals_world = _normals_world(sightings, kept, rays, planes, world_T_rigs[hosts])
     del patches, sightings, planes, cut, at, across, rays  # gigabytes, of thousands of frames
-    former = _former_observations(landmarks, keypoints, noise, [found, at_hosts], greys.num_frames)
+    former = _former_observations(
+        landmarks, keypoints, solved.noise, [found, at_hosts], greys.num_frames
+    )
     parts, colors = [found, at_hosts, former], keypoints.colors[own]
     counts = Counts(len(seeing), len(found.points), "observations", dropped)
     return _pack(parts, colors, normals_world, world_T_rigs, rig, counts)

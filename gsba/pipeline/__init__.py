@@ -8,6 +8,7 @@ from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.refine import refine, solve
-from gsba.pipeline.run import Run
+from gsba.pipeline.run import Evidence, Run
+from gsba.pipeline.state import State
 
-__all__ = ["Map", "Prior", "Run", "RunResult", "refine", "solve"]
+__all__ = ["Evidence", "Map", "Prior", "Run", "RunResult", "State", "refine", "solve"]

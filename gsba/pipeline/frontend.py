@@ -1,70 +1,50 @@
 """The front end of a run: keypoints as bearings, their matches, and what these say of the start."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from gsba import learned
-from gsba.camera.lens import Lenses
 from gsba.config import RefineSettings
 from gsba.features import detection, extraction
 from gsba.features.extraction import FrameFeatures
 from gsba.frames import panorama
-from gsba.imu.alignment import Alignment, align, turning_of
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, loops
 from gsba.loop_closure.loops import Closed
-from gsba.loop_closure.merged_map import Registered
 from gsba.matching import correspondences, recovery
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
 from gsba.pipeline import inputs
+from gsba.pipeline.observed_frames import ObservedFrames
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
+from gsba.pipeline.state import MapMatches, State
 from gsba.store.store import PerFrame
 from gsba.trajectory.clock import ClockEstimate
-from gsba.trajectory.steps import image_steps
-from gsba.types import Features, Keypoints, Matches, Solution, Trajectory, VerifiedPairs
+from gsba.types import Features, Keypoints, Matches, VerifiedPairs
 
 _DARK = 32  # of 255
 
 
-@dataclass(frozen=True, slots=True)
-class ObservedFrames:
-    """What was found in the frames."""
-
-    features: tuple[PerFrame[Features], ...]  # (F,) stage that holds each frame's
-    shown: Keypoints  # of all frames, where pictures show them
-    context: MatchContext  # what matches them
-    lenses: Lenses = field(default_factory=Lenses)  # that its keypoints are seen through
-
-    @property
-    def keypoints(self) -> Keypoints:
-        """Of all frames, as rays of the lenses."""
-        return self.context.keypoints
-
-    def through(self, lenses: Lenses) -> "ObservedFrames":
-        """The same, its keypoints as rays that start at these lenses."""
-        context = replace(self.context, keypoints=lenses.seen(self.shown), lenses=lenses)
-        return replace(self, context=context, lenses=lenses)
-
-
-def extract(run: Run) -> ObservedFrames:
-    """Keypoints of all frames."""
+def extract(run: Run) -> State:
+    """Keypoints of all frames: the first state of a run."""
     found = _extract(run, run.settings)
-    return _see(run, "keypoints", [found] * len(run.frames), "features")
+    return State.begin(run, _observe(run, "keypoints", [found] * len(run.frames), "features"))
 
 
-def extract_more(run: Run, seen: ObservedFrames, weak: np.ndarray) -> ObservedFrames:
+def extract_more(state: State, weak: np.ndarray) -> State:
     """More keypoints at some frames (F,) bool, and those of the others as they were."""
+    run, before = state.run, state.observed
     more = run.settings.weak_frames.model_dump(include={"max_per_face", "contrast_threshold"})
     enlarged = run.settings.features.model_copy(update=more)
     settings = run.settings.model_copy(update={"features": enlarged})
     found = _extract(run, settings, "features_closer", weak)
-    each = [found if more else before for more, before in zip(weak, seen.features, strict=True)]
-    return _see(run, "keypoints_closer", each, "features_closer").through(seen.lenses)
+    each = [found if more else old for more, old in zip(weak, before.features, strict=True)]
+    observed = _observe(run, "keypoints_closer", each, "features_closer")
+    return state.with_keypoints(observed.through(before.lenses))
 
 
 def _extract(
@@ -75,7 +55,9 @@ def _extract(
     return extraction.extract(run.store, run.frames, run.rig, settings, make, files, name, chosen)
 
 
-def _see(run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str) -> ObservedFrames:
+def _observe(
+    run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str
+) -> ObservedFrames:
     """Features of each frame (F,), ready to be matched; `stage`: the last one they are of."""
     frames, settings = run.frames, run.matching_settings
 
@@ -96,55 +78,53 @@ def _see(run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str) -
     return ObservedFrames(tuple(found), keypoints, context)
 
 
-def match_neighbours(
-    run: Run, seen: ObservedFrames, prior: Prior, given: Sequence[Trajectory]
-) -> tuple[Prior, VerifiedPairs]:
+def match_neighbours(state: State) -> State:
     """Verified matches of frames next to one another in time, the clock set right first.
 
-    Args:
-        run, seen, prior: of the run; the start is at the right times afterwards.
-        given: all entries of the trajectory; of several, each piece may have a clock of its own,
-            and all are taken as they are.
+    The start is at the right times afterwards. Of several trajectories each may have a clock of its
+    own: they are taken as they are.
 
     Raises:
         GsbaError: a trajectory that turns otherwise than the images.
     """
-    near = _match_neighbours(run, seen, prior, "neighbours")
-    if len(given) != 1 or prior.absent or run.settings.read.clock == "given":
-        return prior, near
-    (trajectory,), times = given, run.frames.timestamps
+    run, prior, trajectories = state.run, state.prior, state.run.evidence.trajectories
+    state = _match_neighbours(state, "neighbours")
+    if len(trajectories) != 1 or prior.absent or run.settings.read.clock == "given":
+        return state
+    (trajectory,), times = trajectories, run.frames.timestamps
+    context, near = state.observed.context, state.verified
 
     def compute() -> ClockEstimate:
-        return recovery.check_clock(seen.context, near, prior.coarse, times, trajectory)
+        return recovery.check_clock(context, near, prior.coarse, times, trajectory)
 
     key = [trajectory.timestamps.tolist(), trajectory.world_T_rigs.tolist()]
     estimate = run.stage("clock", key, compute, ClockEstimate)
     if estimate.verdict != "corrected":
-        return replace(prior, clock=estimate), near
+        return replace(state, prior=replace(prior, clock=estimate))
     settled = run.settings.read.model_copy(update={"clock_offset_s": 0.0})
     settings = run.settings.model_copy(update={"read": settled})
     coarse = inputs.coarse_poses(run.frames, [estimate.clock.on_frames(trajectory)], settings)
-    prior = replace(Prior.of(coarse), clock=estimate)
-    return prior, _match_neighbours(run, seen, prior, "neighbours_on_time")
+    state = state.start_from(replace(Prior.of(coarse), clock=estimate))
+    return _match_neighbours(state, "neighbours_on_time")
 
 
-def _match_neighbours(run: Run, seen: ObservedFrames, prior: Prior, name: str) -> VerifiedPairs:
-    if prior.absent:
-        return VerifiedPairs.none()
-    compute = partial(correspondences.match_neighbours, seen.context, prior.start())
-    return run.stage(name, run.matching_key(), compute, VerifiedPairs)
+def _match_neighbours(state: State, name: str) -> State:
+    if state.prior.absent:
+        return state.with_verified(VerifiedPairs.none())
+    run, context = state.run, state.observed.context
+    compute = partial(correspondences.match_neighbours, context, state.prior.start())
+    return state.with_verified(run.stage(name, run.matching_key(), compute, VerifiedPairs))
 
 
-def judge_trajectory(
-    run: Run, seen: ObservedFrames, prior: Prior, near: VerifiedPairs
-) -> tuple[Prior, VerifiedPairs]:
+def judge_trajectory(state: State) -> State:
     """The trajectory without what images contradict; neighbours once more where it misled.
 
     Raises:
         GsbaError: images contradict most of the trajectory, or match nowhere.
     """
-    times = run.frames.timestamps
-    compute = partial(recovery.recover, seen.context, near, prior.coarse, times)
+    run, prior, times = state.run, state.prior, state.run.frames.timestamps
+    context = state.observed.context
+    compute = partial(recovery.recover, context, state.verified, prior.coarse, times)
     key = [run.matching_key(), run.settings.priors]
     found = run.stage("steps", key, compute, Recovered)
     near, trust, coarse = found.neighbours, found.trust, found.coarse
@@ -157,23 +137,7 @@ def judge_trajectory(
     prior = replace(prior, coarse=coarse, trust=trust, joints=found.joints, parts=parts)
     if prior.absent:
         coarse = replace(coarse, world_T_rigs=trust.world_T_rigs)
-    return replace(prior, coarse=coarse), near
-
-
-def align_imu(run: Run, seen: ObservedFrames, prior: Prior, near: VerifiedPairs) -> Prior:
-    """What a gyro says of the frames' turning, found from how neighbours turn."""
-    readings, times = run.imu, run.frames.timestamps
-    if readings is None:
-        return prior
-    steps = image_steps(near, seen.keypoints)
-
-    def compute() -> Alignment:
-        return align(times, steps.f_T_nexts[:, :3, :3], steps.verified, readings)
-
-    found = run.stage("imu", readings.digest, compute, Alignment)
-    if found.reason:
-        return replace(prior, gyro=found)
-    return replace(prior, gyro=found, turning=turning_of(readings, found, times))
+    return state.start_from(replace(prior, coarse=coarse)).with_verified(near)
 
 
 def _hindrance(run: Run) -> str:
@@ -187,59 +151,61 @@ def _hindrance(run: Run) -> str:
     return "frames must follow one another closely and show texture"
 
 
-def match_along_epipolars(
-    run: Run, seen: ObservedFrames, solved: Solution, name: str = "adjacent"
-) -> Matches:
-    """Matches of neighbours in time along their solved epipolar lines."""
-    compute = partial(correspondences.match_along_epipolars, seen.context, solved)
-    return run.stage(name, run.matching_key(), compute, Matches)
+def match_along_epipolars(state: State, name: str = "adjacent") -> State:
+    """Matches of neighbours in time along their solved epipolar lines, for those before."""
+    run, context = state.run, state.observed.context
+    compute = partial(correspondences.match_along_epipolars, context, state.solution)
+    found = run.stage(name, run.matching_key(), compute, Matches)
+    return replace(state, matches=replace(state.matches, neighbours=found))
 
 
-def match_across(run: Run, seen: ObservedFrames, merged: Registered, parts: np.ndarray) -> Matches:
-    """Verified matches of frames whose parts (F,) of the map were joined by images."""
-    given = seen.context, merged.solved, parts, merged.met
-    compute = partial(correspondences.match_across, *given)
-    return run.stage("across", run.matching_key(), compute, VerifiedPairs).matches
+def match_across(state: State, parts: np.ndarray) -> State:
+    """Verified matches of frames whose parts (F,) of the map were joined by images.
+
+    Other matches between these parts are dropped: they did not tie them together.
+    """
+    run, context, merged = state.run, state.observed.context, state.prior.merged
+    assert merged is not None
+    compute = partial(correspondences.match_across, context, state.solution, parts, merged.met)
+    found = run.stage("across", run.matching_key(), compute, VerifiedPairs).matches
+    return replace(state, matches=replace(state.matches.within(parts), across=found))
 
 
-def match_known_points(
-    run: Run, seen: ObservedFrames, solved: Solution, name: str, loops_closed: bool = True
-) -> Matches:
-    """Matches of solved points in frames further apart."""
-    compute = partial(correspondences.match_known_points, seen.context, solved, loops_closed)
-    return run.stage(name, run.matching_key(), compute, Matches)
+def match_known_points(state: State, name: str, loops_closed: bool = True) -> State:
+    """Matches of the map's points in frames further apart, for all but those of neighbours."""
+    run, context = state.run, state.observed.context
+    compute = partial(correspondences.match_known_points, context, state.solution, loops_closed)
+    found = run.stage(name, run.matching_key(), compute, Matches)
+    return replace(state, matches=MapMatches(state.matches.neighbours, known_points=found))
 
 
-def close_loops(
-    run: Run, seen: ObservedFrames, prior: Prior, solved: Solution
-) -> tuple[Prior, Solution, Matches]:
+def close_loops(state: State) -> State:
     """Matches of places met again, and the map, bent first where drift had hidden them."""
-    near = _match_loops(run, seen, solved, "loops")
-    prior, bent = _meet_places(run, seen, prior, solved, near)
-    if bent is not solved:
-        near = _match_loops(run, seen, bent, "loops2")
-    return prior, bent, near.matches
+    near = _match_loops(state, "loops")
+    bent = _meet_places(state, near)
+    if bent is not state:
+        near = _match_loops(bent, "loops2")
+    return replace(bent, matches=replace(bent.matches, loops=near.matches))
 
 
-def _match_loops(run: Run, seen: ObservedFrames, solved: Solution, name: str) -> VerifiedPairs:
+def _match_loops(state: State, name: str) -> VerifiedPairs:
     """Verified matches of frames that met the same place again."""
-    compute = partial(correspondences.match_loops, seen.context, solved)
+    run, context = state.run, state.observed.context
+    compute = partial(correspondences.match_loops, context, state.solution)
     return run.stage(name, run.matching_key(), compute, VerifiedPairs)
 
 
-def _meet_places(
-    run: Run, seen: ObservedFrames, prior: Prior, solved: Solution, near: VerifiedPairs
-) -> tuple[Prior, Solution]:
+def _meet_places(state: State, near: VerifiedPairs) -> State:
     """The map bent so that places met again meet, where guided search could not reach them."""
-    trust = prior.trust
+    run, prior, trust = state.run, state.prior, state.prior.trust
     unseen = trust.unseen_steps if prior.merged is None else np.zeros_like(trust.unseen_steps)
     pairs = near.matches.pairs
     if loops.connected(unseen, pairs) and len(pairs):
-        return prior, solved
-    compute = partial(loops.close, seen.context, solved, unseen)
+        return state
+    compute = partial(loops.close, state.observed.context, state.solution, unseen)
     closed = run.stage("places", run.matching_key(), compute, Closed)
     if len(closed.pairs) == 0:
-        return prior, solved
+        return state
     # Places met again know better than a step that no image shows.
     trust = replace(trust, false_steps=trust.false_steps | unseen)
-    return replace(prior, trust=trust), closed.solved
+    return replace(state, prior=replace(prior, trust=trust)).with_solution(closed.solved)

@@ -21,6 +21,7 @@ from gsba.log import GsbaError
 from gsba.masks.merging import Choice
 from gsba.odometry.files import write_chosen, write_odometry
 from gsba.odometry.walk import Odometry
+from gsba.pipeline.stage_titles import title_of
 from gsba.placement import EXIF, check, fixes_of_frames, read_fixes
 from gsba.store.store import RunStore, fingerprint
 from gsba.trajectory.association import without_trajectory
@@ -188,41 +189,17 @@ def positions_of(frames: FrameSet, settings: RefineSettings) -> FrameFixes | Non
     return fixes
 
 
-def follows(settings: VideoSettings, fps: float | None, odometry: bool | None) -> bool:
+def follows(
+    settings: VideoSettings, fps: float | None, odometry: bool | None, given: Sequence[Trajectory]
+) -> bool:
     """Whether a video is followed by odometry: as asked, else where nothing says which frames of it
-    to take."""
+    to take; never where trajectories are given."""
+    if given:
+        return False
     if odometry is not None:
         return odometry
     asked = (settings.fps, settings.every, settings.at)
     return fps is None and asked == (VideoSettings().fps, None, None) and not settings.sharpest
-
-
-def take_frames(
-    out: Path,
-    origin: Mapping[str, Path],
-    given: list[Trajectory],
-    settings: RefineSettings,
-    fps: float | None,
-    fresh: bool,
-    odometry: bool | None,
-    masks: Choice,
-    calibration: Path | None,
-) -> tuple[list[Trajectory], RefineSettings, Odometry | None]:
-    """Frames of the video that a run is about, in `out`/frames; its start, settings for that, and
-    the odometry that it comes from.
-
-    Args:
-        given: trajectories; where there is none, the video may be followed by odometry.
-        odometry: whether it is; None = where nothing says which frames to take.
-        out, origin, settings, fps, fresh, masks, calibration: as for `extract_frames`.
-    """
-    follow = follows(settings.video, fps, odometry) and not given
-    asked = settings, fps, fresh, masks if follow else None, calibration
-    found = extract_frames(out, origin, *asked)
-    if found is None:
-        return given, settings, None
-    # Made of these very images: no evidence beside them.
-    return found.pieces(), settings.with_faint_priors(), found
 
 
 def extract_frames(
@@ -258,7 +235,7 @@ def extract_frames(
     if fps is not None:
         chosen = chosen.model_copy(update={"fps": check_fps(fps), "every": None, "at": None})
     found: Odometry | None = None
-    with RunStore(out, dict(origin), fresh) as store:
+    with RunStore(out, dict(origin), fresh, title_of=title_of) as store:
         if by_odometry is not None:
             found = _follow(store, origin["frames"], settings, by_odometry, calibration)
         if found is not None:
@@ -277,11 +254,11 @@ def _follow(
 ) -> Odometry | None:
     """Odometry of a video, its trajectory and chosen frames written to the run's folder; None
     where it lost the camera in most of the video."""
-    part = (settings.video.from_s, settings.video.to_s)
+    start, end = settings.video.from_s, settings.video.to_s
     width, seed = settings.odometry.width, settings.seed
 
     def compute() -> Odometry:
-        panoramas = odometry.of_video(video_file, width, calibration, *part)
+        panoramas = odometry.of_video(video_file, width, calibration, start, end)
         if masks.given is not None and masks.given.is_file():
             panoramas = odometry.masked(panoramas, masks.given)
         if masks.carrier:
@@ -290,7 +267,7 @@ def _follow(
         return odometry.track_panoramas(panoramas, seed, checkpoint=unfinished)
 
     files = fingerprint([*files_of(video_file), calibration, masks.given])
-    key = [width, seed, part, masks.carrier, files]
+    key = [width, seed, (start, end), masks.carrier, files]
     found = store.stage("odometry", key, compute, Odometry)
     if not found.usable():
         logger.warning("the odometry lost the camera in most of the video: frames at a fixed rate")

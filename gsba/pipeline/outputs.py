@@ -12,10 +12,11 @@ from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.disk import write_json, write_text
-from gsba.export import ExportFormat, export_all, of_one_lens, write_points
+from gsba.export import ExportFormat, ExportOptions, export_all, of_one_lens, write_points
 from gsba.pipeline.map import Map
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
+from gsba.pipeline.state import State
 from gsba.placement.placement import Placement, metres_per_unit, place
 from gsba.report import findings
 from gsba.report.camera_findings import of_camera, of_lenses
@@ -23,7 +24,7 @@ from gsba.report.gps_findings import of_gps
 from gsba.report.html import residual_sphere, write_html
 from gsba.report.imu_findings import of_gyro
 from gsba.report.maps import MapSummary, is_partial, summarize_maps
-from gsba.report.report import build_report, plain, write_poses
+from gsba.report.report import Findings, StageLog, build_report, plain, write_poses
 from gsba.trajectory.files import write_tum
 from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
 
@@ -68,12 +69,15 @@ class RunResult:
         return is_partial(self.maps, len(self.frames))
 
 
-def write(run: Run, prior: Prior, world: Map, result: Reconstruction, lenses: Lenses) -> RunResult:
+def write(state: State, result: Reconstruction, lenses: Lenses) -> RunResult:
     """Poses, cloud, report and datasets; of several maps that nothing ties together the largest.
 
     Args:
+        state: of the run at its end.
+        result: what its map became in the trajectory's world.
         lenses: in the result's unit.
     """
+    run, prior, world = state.run, state.prior, state.map
     store, settings, coarse = run.store, run.settings, prior.coarse
     frames, out, rows = world.straightened(run.frames), store.root, result.largest_map()
     main, shown = result.of_map(1), frames.taken(rows)
@@ -91,7 +95,7 @@ def write(run: Run, prior: Prior, world: Map, result: Reconstruction, lenses: Le
     baseline = settings.camera.baseline()
     placement = place(main, shown, settings.placement, baseline, settings.gps)
     _export(run, main, shown, placement, lenses.taken(rows))
-    report = _report(run, prior, world, result)
+    report = _report(state, result)
     write_json(out / "report.json", report)
     page = report | {"frames": [report["frames"][f] for f in rows]}
     write_html(out / "report.html", shown, start, main, page)
@@ -119,68 +123,63 @@ def _calibration(
     return calibration_json(pair, centre, "map" if metres is None else "m", more)
 
 
-def _report(run: Run, prior: Prior, world: Map, result: Reconstruction) -> dict[str, Any]:
+def _report(state: State, result: Reconstruction) -> dict[str, Any]:
     """The content of report.json."""
-    frames, coarse, journal = run.frames, prior.coarse, run.journal
-    trajectory, notes = findings.of_trajectory(
-        prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.absent
-    )
-    camera = None
-    if world.centres is not None:
-        camera, more = of_camera(
-            world.centres,
-            world.readout,
-            world.axes,
-            world.radius,
-            world.covariances,
-            world_scale(world.solution, result),
-            run.settings.camera,
-            frames.timed,
-        )
-        if frames.fisheyes is not None:
-            found = world.lenses, world.calibrated, world.covariances
-            camera["lenses"], of_raw = of_lenses(*found)
-            more += of_raw
-        notes += more
-    gyro = None
-    if prior.gyro is not None:
-        gyro, more = of_gyro(prior.gyro, prior.turning, world.readout, world.solution.world_T_rigs)
-        notes += more
-    gps = None
-    if run.fixes is not None:
-        poses = world.solution.world_T_rigs
-        anchors = anchor(poses, run.fixes, run.settings.gps, prior.parts)
-        gps, more = of_gps(run.fixes, anchors, poses, frames)
-        notes += more
-    most = run.settings.weak_frames.max_scale_sigma
-    notes += findings.of_frames(frames, coarse, result, world.frame_weights, most)
-    report = build_report(
-        settings=run.settings,
-        frames=frames,
-        coarse=coarse,
-        reconstruction=result,
-        stages=run.store.records.values(),
-        counts=journal.counts,
-        solver=[{"stage": name, "rounds": rounds} for name, rounds in journal.rounds.items()],
-        gauge=_gauge(run, prior),
-        notes=notes,
-        trajectory=trajectory,
-        moves=world.moves,
-        stitching=world.stitching and findings.of_field(world.stitching),
-        camera=camera,
-        gyro=gyro,
-        gps=gps,
-        reasons=_reasons(prior),
-    )
-    report["families"] = _of_families(run, prior, world)
+    run, rounds = state.run, state.run.journal.rounds
+    solver = [{"stage": name, "rounds": some} for name, some in rounds.items()]
+    stages = StageLog(tuple(run.store.records.values()), run.journal.counts, solver)
+    gauge, found = _gauge(run, state.prior), _findings(state, result)
+    coarse = state.prior.coarse
+    report = build_report(run.settings, run.frames, coarse, result, stages, gauge, found)
+    report["families"] = _of_families(state)
     report["residual_sphere"] = plain(residual_sphere(result), digits=4)
     return report
 
 
-def _of_families(run: Run, prior: Prior, world: Map) -> dict[str, Any]:
+def _findings(state: State, result: Reconstruction) -> Findings:
+    """Sections of the report on trajectory, camera and sensors, and notes on all that is odd."""
+    run, prior, map_, poses = state.run, state.prior, state.map, state.solution.world_T_rigs
+    frames, evidence = run.frames, run.evidence
+    trajectory, notes = findings.of_trajectory(
+        prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.absent
+    )
+    camera = None
+    if map_.centres is not None:
+        camera, more = of_camera(
+            map_.centres,
+            map_.readout,
+            map_.axes,
+            map_.radius,
+            map_.covariances,
+            world_scale(state.solution, result),
+            run.settings.camera,
+            frames.timed,
+        )
+        if frames.fisheyes is not None:
+            camera["lenses"], of_raw = of_lenses(map_.lenses, map_.calibrated, map_.covariances)
+            more += of_raw
+        notes += more
+    gyro = None
+    if prior.gyro is not None:
+        gyro, more = of_gyro(prior.gyro, prior.turning, map_.readout, poses)
+        notes += more
+    gps = None
+    if evidence.fixes is not None:
+        anchors = anchor(poses, evidence.fixes, run.settings.gps, prior.parts)
+        gps, more = of_gps(evidence.fixes, anchors, poses, frames)
+        notes += more
+    most = run.settings.weak_frames.max_scale_sigma
+    notes += findings.of_frames(frames, prior.coarse, result, map_.frame_weights, most)
+    stitching = map_.stitching and findings.of_field(map_.stitching)
+    reasons = _reasons(prior)
+    return Findings(notes, trajectory, stitching, camera, gyro, gps, map_.moves, reasons)
+
+
+def _of_families(state: State) -> dict[str, Any]:
     """The report of each family of the caller and of packages, by its name."""
-    snapshot = run.families.snapshot(world.solution, prior.parts)
-    return {family.name: plain(family.report(snapshot)) for family in run.families.members}
+    families = state.run.families
+    snapshot = families.snapshot(state.solution, state.prior.parts)
+    return {family.name: plain(family.report(snapshot)) for family in families.members}
 
 
 def _gauge(run: Run, prior: Prior) -> str:
@@ -211,8 +210,8 @@ def _export(
 
     def compute() -> Counts:
         if waiting:
-            how = {"lenses": seen_by, "images": images, "workers": store.workers}
-            export_all(main, shown, waiting, size, placement, fetched=fetched, **how)
+            options = ExportOptions(size, placement, lenses=seen_by, images=images, fetched=fetched)
+            export_all(main, shown, waiting, options, store.workers)
             waiting.clear()
         apart = len(run.frames) - len(shown)
         dropped = {"in another map or in none": apart} if apart else {}

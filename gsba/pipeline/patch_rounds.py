@@ -5,218 +5,150 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsba.bundle import (
-    adjustment,
-    lens_axes,
-    readout,
-    self_calibration,
-    settling,
-    stitching,
-    triangulation,
-)
-from gsba.bundle.camera_system import CameraSystem
-from gsba.bundle.lens_axes import LensAxes
-from gsba.bundle.readout import CameraEstimate
-from gsba.bundle.self_calibration import SelfCalibration
+from gsba.bundle import adjustment, self_calibration, settling, stitching
 from gsba.bundle.stitching import Stitching
 from gsba.photometric import alignment
-from gsba.pipeline import backend
-from gsba.pipeline.map import Map
-from gsba.pipeline.prior import Prior
-from gsba.pipeline.run import Run
+from gsba.photometric.alignment import Observations
+from gsba.pipeline import camera, gyro
+from gsba.pipeline.state import State
 from gsba.types import Keypoints, Sighted, Solution
 
 logger = logging.getLogger(__name__)
 
-_CAMERA_ROUNDS = 3  # of what aligned patches say of the camera, and the adjustment under it
+_CAMERA_ROUNDS = 3  # estimates of the camera from aligned patches, each with an adjustment under it
 _CAMERA_SETTLES = 2  # rounds of aligning after which it needs but one adjustment in each
-_CALIBRATIONS = 10  # the same of raw lenses, at most
-_CALIBRATED = np.deg2rad(0.001)  # change of what their pixels show that is no more worth another
-_SETTLED = 1.0  # standard deviations of steps: poses that a round moves by less are left there
+_MAX_RECALIBRATIONS = 10  # of raw lenses in a round, each with an adjustment under them
+_MIN_RECALIBRATION_RAD = np.deg2rad(0.001)  # stop when bearings change by less
+_SETTLED_SIGMAS = 1.0  # of steps: poses that a round moves by less are left there
 
 
-def align(run: Run, prior: Prior, world: Map) -> tuple[Prior, Map]:
+def align(state: State) -> State:
     """Rounds of patches aligned and the map solved anew: more where images hold it poorly."""
-    settings, before = run.settings.patches, world
+    settings, before = state.run.settings.patches, state
     most = settings.rounds
-    if most and prior.weak_frames().any():
+    if most and state.prior.weak_frames().any():
         most = max(most, settings.weak_rounds)
     for n in range(1, most + 1):
-        if n > settings.rounds and _is_settled(run, prior, before, world, n):
+        if n > settings.rounds and _is_settled(before, state, n):
             break
         if n > 1:
-            prior = backend.align_imu(run, prior, world.solution, f"imu_aligned{n}")
-        before, world = world, _round(run, prior, world, n)
-    return prior, world
+            state = gyro.align_to_map(state, f"imu_aligned{n}")
+        before, state = state, _round(state, n)
+    return state
 
 
-def _round(run: Run, prior: Prior, world: Map, number: int) -> Map:
+def _round(state: State, number: int) -> State:
     """Patches around the map's points aligned to its frames, solved, straightened.
 
     The map stays as it was where that explains less.
     """
-    sighted = _align(run, world, f"align{number}")
-    better = _adjust_under_lenses(run, prior, world, sighted, number)
+    sighted = _align(state, f"align{number}")
+    better = _adjust_under_lenses(state, sighted, number)
     if better is None:
-        return world
-    return _straighten(run, prior, better, sighted, number)
+        return state
+    # Alignments of the gyro to camera estimates within a round are let go: `align` makes the next
+    # one from the poses of the whole round.
+    return _straighten(replace(better, prior=state.prior), sighted, number)
 
 
-def _adjust_under_lenses(
-    run: Run, prior: Prior, world: Map, sighted: Sighted, number: int
-) -> Map | None:
+def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State | None:
     """Bundle adjustment of aligned observations, the camera found from them beside it."""
     name = f"aligned{number}"
-    if not world.lenses:
-        return _adjust_aligned(run, prior, world, sighted, name)
-    for n in range(_CALIBRATIONS):
-        prior = backend.align_imu(run, prior, world.solution, f"imu_{name}_{n}", with_noise=False)
-        seen = _see_anew(run, prior, world, sighted, name, n)
-        better = _adjust_aligned(run, prior, seen, sighted, f"{name}_{n}" if n else name)
+    if not state.map.lenses:
+        return _adjust_aligned(state, sighted, name)
+    for n in range(_MAX_RECALIBRATIONS):
+        state = gyro.align_to_map(state, f"imu_{name}_{n}", with_noise=False)
+        trial = camera.estimate_from_patches(state, sighted, name, n)
+        better = _adjust_aligned(trial, sighted, f"{name}_{n}" if n else name)
         if better is None:
-            return world if n else None
-        done, world = self_calibration.apart(world.lenses, better.lenses) < _CALIBRATED, better
-        if n + 1 >= (_CAMERA_ROUNDS if number <= _CAMERA_SETTLES else 1) and done:
+            return state if n else None
+        change = self_calibration.apart(state.map.lenses, better.map.lenses)
+        state, rounds = better, _CAMERA_ROUNDS if number <= _CAMERA_SETTLES else 1
+        if n + 1 >= rounds and change < _MIN_RECALIBRATION_RAD:
             break
-    return world
+    return state
 
 
-def _align(run: Run, world: Map, name: str) -> Sighted:
+def _align(state: State, name: str) -> Sighted:
     """Points observed anew."""
-    settings, solved = run.settings.patches, world.solution
+    run, map_, settings = state.run, state.map, state.run.settings.patches
 
     def compute() -> Sighted:
+        observed = Observations(map_.observed, map_.aligned, map_.normals_rig, map_.field)
         return alignment.align(
-            solved.landmarks,
-            solved.world_T_rigs,
-            world.observed,
-            solved.noise,
+            map_.solution,
+            observed,
             run.greys,
             run.rig,
-            name,
-            world.aligned,
             settings,
             run.store.workers,
-            world.field,
-            world.lenses,
-            world.normals_rig,
+            map_.lenses,
+            name,
         )
 
     return run.stage(name, settings.model_dump(exclude={"rounds"}), compute, Sighted)
 
 
-def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, number: int) -> Map:
-    """The map with the camera that aligned patches ask for; its poses are yet to follow."""
-
-    def placed_anew() -> tuple[Solution, Keypoints]:
-        there = replace(sighted, keypoints=world.rays(sighted.keypoints, run.rig))
-        there = adjustment.rescale_noise(there, world.solution, run.settings)
-        placed = triangulation.place(
-            there.tracks,
-            there.keypoints,
-            world.solution.world_T_rigs,
-            run.settings.rounds.aligned[0],
-            run.settings.triangulate,
-            run.num_threads,
-        )
-        return replace(world.solution, noise=1.0, landmarks=placed), there.keypoints
-
-    def axes() -> LensAxes:
-        solved, keypoints = placed_anew()
-        problem = run.problem(prior, solved)
-        return lens_axes.loosened(solved.landmarks, keypoints, solved, world.lenses, problem)
-
-    shown = stitching.corrected(sighted.keypoints, world.field, run.rig).bearings_rig
-    times = run.frames.timestamps
-
-    def rows() -> CameraEstimate:
-        solved, keypoints = placed_anew()
-        around, problem = solved.landmarks, run.problem(prior, solved)
-        return readout.estimate(around, keypoints, shown, solved, world.lenses, times, problem)
-
-    def settle() -> CameraEstimate:
-        solved, keypoints = placed_anew()
-        problem = run.problem(prior, solved)
-        return CameraSystem(solved, keypoints, shown, world.camera(), times, problem).step()
-
-    def lenses() -> SelfCalibration:
-        solved, keypoints = placed_anew()
-        around, problem = solved.landmarks, run.problem(prior, solved)
-        given = around, keypoints, shown, solved, world.lenses, problem
-        return self_calibration.estimate(*given, run.frames.lenses_nominal)
-
-    key = backend.camera_key(run)
-    if number == 0 and world.lenses.readout_motion is None:
-        world = world.with_camera(run.stage(f"readout_{name}", key, rows, CameraEstimate))
-    raw = run.frames.fisheyes is not None
-    if number == 1 and raw and world.lenses.fisheyes is None:  # the rest has settled
-        known = run.stage(f"calibrated_{name}", key, lenses, SelfCalibration)
-        world = replace(world, calibrated=known)
-        world = world.with_camera(replace(world.camera(), lenses=known.lenses))
-    if number == 1 and not run.frames.lens_axes_known and world.lenses.axes is None:
-        found = run.stage(f"axes_{name}", key, axes, LensAxes)
-        world = replace(world, axes=found).with_camera(replace(world.camera(), lenses=found.lenses))
-    return world.with_camera(
-        run.stage(f"camera_{name}_{number}", key, settle, CameraEstimate, noted=False)
-    )
-
-
-def _adjust_aligned(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str) -> Map | None:
+def _adjust_aligned(state: State, sighted: Sighted, name: str) -> State | None:
     """Bundle adjustment of aligned observations; None where that explains less."""
-    gates = run.settings.rounds.aligned
+    run, map_, gates = state.run, state.map, state.run.settings.rounds.aligned
 
     def compute() -> tuple[Solution, Keypoints]:
-        there = replace(sighted, keypoints=world.rays(sighted.keypoints, run.rig))
-        problem = run.problem(prior, world.solution)
-        solved, found = adjustment.adjust_sighted(there, world.solution, problem, gates)
+        there = replace(sighted, keypoints=map_.rays(sighted.keypoints, run.rig))
+        context = state.adjustment_context()
+        solved, found = adjustment.adjust_sighted(there, map_.solution, context, gates)
         return solved, stitching.with_noise_of(sighted.keypoints, found)
 
     key = [run.solving_key(), gates]
     solved, keypoints = run.stage(name, key, compute, tuple[Solution, Keypoints])
-    if not solved.carries(world.solution, run.settings.rounds.min_observations):
+    if not solved.carries(map_.solution, run.settings.rounds.min_observations):
         return None
-    shown = {"aligned": sighted.aligned, "normals_rig": sighted.normals_rig}
-    return replace(world, solution=solved, observed=keypoints, **shown)
+    map_ = replace(
+        map_,
+        solution=solved,
+        observed=keypoints,
+        aligned=sighted.aligned,
+        normals_rig=sighted.normals_rig,
+    )
+    return replace(state, map=map_)
 
 
-def _straighten(run: Run, prior: Prior, world: Map, sighted: Sighted, number: int) -> Map:
+def _straighten(state: State, sighted: Sighted, number: int) -> State:
     """The map with what stitching bends taken out, where all frames share it."""
-    name, settings = f"stitching{number}", run.settings
-    looked_for = number == 1 or world.field
+    run, map_, settings = state.run, state.map, state.run.settings
+    looked_for = number == 1 or map_.field
     stitched = run.frames.layout in ("erp", "eac")
     if settings.stitching.mode == "off" or not stitched or not looked_for:
-        return world
+        return state
 
     def compute() -> Stitching:
+        context, solution = state.adjustment_context(), map_.solution
         return stitching.estimate(
-            sighted,
-            world.observed,
-            world.solution,
-            world.field,
-            run.problem(prior, world.solution),
-            world.lenses,
+            sighted, map_.observed, solution, map_.field, context, map_.lenses
         )
 
     key = [run.solving_key(), settings.stitching, settings.rounds.aligned]
-    found = run.stage(name, key, compute, Stitching)
+    found = run.stage(f"stitching{number}", key, compute, Stitching)
     if not found.field:
-        return replace(world, stitching=found)
-    if not found.adjustment.carries(world.solution, settings.rounds.min_observations):
-        return world
-    if world.stitching is not None:  # what it gained is known best from where none was
-        found = replace(found, part_gains=world.stitching.part_gains)
-    return replace(world, solution=found.adjustment, observed=found.keypoints, stitching=found)
+        return replace(state, map=replace(map_, stitching=found))
+    if not found.adjustment.carries(map_.solution, settings.rounds.min_observations):
+        return state
+    if map_.stitching is not None:  # what it gained is known best from where none was
+        found = replace(found, part_gains=map_.stitching.part_gains)
+    map_ = replace(map_, solution=found.adjustment, observed=found.keypoints, stitching=found)
+    return replace(state, map=map_)
 
 
-def _is_settled(run: Run, prior: Prior, before: Map, world: Map, number: int) -> bool:
+def _is_settled(before: State, state: State, number: int) -> bool:
     """Whether the last round of aligning patches moved steps by less than their noise."""
+    run, prior, solution = state.run, state.prior, state.solution
 
     def compute() -> float:
-        solved, problem = world.solution, run.problem(prior, world.solution)
-        known = adjustment.pose_covariances(solved, world.keypoints(run.rig), problem, prior.parts)
+        keypoints, context = state.map.keypoints(run.rig), state.adjustment_context()
+        covariances, joint = adjustment.pose_covariances(solution, keypoints, context, prior.parts)
         former = before.solution.world_T_rigs
-        return settling.step_motion(former, solved.world_T_rigs, *known)
+        return settling.step_motion(former, solution.world_T_rigs, covariances, joint)
 
     moved = run.stage(f"settled_aligned{number}", run.solving_key(), compute, float)
     logger.info("aligned %d times, steps moved by %.2f sigma", number - 1, moved)
-    return not moved > _SETTLED
+    return not moved > _SETTLED_SIGMAS

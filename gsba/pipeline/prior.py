@@ -72,8 +72,9 @@ class Prior:
         if strength is not None:
             false, noise = false | strength.held_steps, strength.noise
         first = trust.world_T_rigs[0] if first is None else first
-        given = believed, settings, false, trust.false_frames, first, noise, gauge
-        graph = prior_factors.build(*given)
+        graph = prior_factors.build(
+            believed, settings, false, trust.false_frames, first, noise, gauge
+        )
         if self.turning is not None:
             extent = float(np.linalg.norm(np.ptp(believed[:, :3, 3], axis=0)))
             graph.push_back(prior_factors.turns(self.turning, extent, settings.loss_sigmas))

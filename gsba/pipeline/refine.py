@@ -1,62 +1,51 @@
 """A run from frames and a coarse trajectory to refined poses, a cloud and datasets."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from gsba import video
-from gsba.bundle import self_calibration
 from gsba.bundle.families import Family
-from gsba.bundle.fixes import FrameFixes
-from gsba.camera.fisheye import Pair, turned
-from gsba.camera.lens import Lenses
+from gsba.camera.fisheye import Pair
 from gsba.config import RefineSettings
-from gsba.frames.dual_fisheye import SEAM
 from gsba.frames.scan import scan
-from gsba.imu.readings import Readings
-from gsba.loop_closure import connectivity
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
 from gsba.odometry import Odometry
 from gsba.photometric import direct
-from gsba.pipeline import acceptance, backend, densify, frontend, inputs, outputs, patch_rounds
-from gsba.pipeline.frontend import ObservedFrames
-from gsba.pipeline.map import Map
+from gsba.pipeline import (
+    acceptance,
+    backend,
+    camera,
+    densify,
+    frontend,
+    gyro,
+    inputs,
+    outputs,
+    patch_rounds,
+)
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
-from gsba.pipeline.run import Journal, Run
+from gsba.pipeline.run import Evidence, Journal, Run
+from gsba.pipeline.stage_titles import title_of
+from gsba.pipeline.state import State
 from gsba.placement import check
 from gsba.report.html import add_odometry
 from gsba.store import cluster
 from gsba.store.store import RunStore
-from gsba.trajectory.axes import quarter_turn
-from gsba.types import (
-    CoarsePoses,
-    FrameSet,
-    Matches,
-    PoseSource,
-    Solution,
-    Trajectory,
-    VerifiedPairs,
-)
+from gsba.types import CoarsePoses, FrameSet
 
 if TYPE_CHECKING:
     from distributed import Client
 
 logger = logging.getLogger(__name__)
 
-_Cut = tuple[Pair, bool]
-_PASSES = 3  # over raw pairs, from the pictures
-_RECUT = np.deg2rad(0.03)  # change of what their pixels show that is worth another
-_CALIBRATIONS = 4  # of raw lenses, and the map matched anew under them, at most
-_CALIBRATED = np.deg2rad(0.01)  # change of what pixels show that is no more worth another
-_CAMERA_ROUNDS = 2  # of all that is to know of it, and the adjustment under it
+_Cut = tuple[Pair, bool]  # calibration to cut raw frames by, and whether it was estimated
+_MAX_PASSES = 3  # over raw pairs, from the pictures
 
 __all__ = ["RunResult", "refine", "solve"]
 
@@ -109,43 +98,77 @@ def refine(
     check(settings.placement, baseline=settings.camera.baseline())
     chosen, readings = merging.choose(masks, segment), inputs.read_gyro(imu, frames)
     origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
-    given = inputs.read_trajectories(origin, timestamps)  # fails before hours of decoding
-    walk, asked = None, (fps, fresh, odometry, chosen, calibration)
+    given, walk = inputs.read_trajectories(origin, timestamps), None  # fails before decoding
     if video.is_video(frames):
-        given, settings, walk = inputs.take_frames(out, origin, given, settings, *asked)
+        by_odometry = chosen if inputs.follows(settings.video, fps, odometry, given) else None
+        walk = inputs.extract_frames(out, origin, settings, fps, fresh, by_odometry, calibration)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
-    lenses = calibration, inputs.given_circles(circles, calibration)
-    found = scan(frames, timestamps, fps, chosen.given, not given, *lenses)
-    start = _start_of(found, given, settings)
-    with RunStore(out, origin, fresh, cluster.hire(client, frames, settings)) as store:
-        begin = partial(_begin, store, given, settings, chosen, families, readings)
-        if walk is not None:
-            start = _with_fetched(store, origin["frames"], walk, start, given, settings, begin)
-        return _refine(*begin(start), given, len(origin) == 1, walk)
+    if walk is not None:  # made of these very images: no evidence beside them
+        given, settings = walk.pieces(), settings.with_faint_priors()
+    image_circles = inputs.given_circles(circles, calibration)
+    found = scan(frames, timestamps, fps, chosen.given, not given, calibration, image_circles)
+    evidence = Evidence(tuple(given), readings, families=tuple(families))
+    start = _Start.of(found, evidence, settings)
+    with RunStore(out, origin, fresh, cluster.hire(client, frames, settings), title_of) as store:
+        return _refine(store, settings, chosen, evidence, start, origin["frames"], walk)
 
 
 @dataclass(frozen=True, slots=True)
 class _Start:
-    """Frames and what is known of where they are."""
+    """Frames, where trajectories put them, and what else is known of them."""
 
     frames: FrameSet
     coarse: CoarsePoses
-    fixes: FrameFixes | None  # by GPS; None = there are none
+    evidence: Evidence
+
+    @classmethod
+    def of(cls, frames: FrameSet, evidence: Evidence, settings: RefineSettings) -> "_Start":
+        """With the GPS fixes and the families of packages that settings ask for."""
+        fixes = inputs.positions_of(frames, settings)
+        coarse = inputs.coarse_poses(frames, evidence.trajectories, settings)
+        families = (*evidence.families, *inputs.families_of(frames, settings))
+        return cls(frames, coarse, replace(evidence, fixes=fixes, families=families))
 
 
-def _start_of(frames: FrameSet, given: Sequence[Trajectory], settings: RefineSettings) -> _Start:
-    fixes = inputs.positions_of(frames, settings)
-    return _Start(frames, inputs.coarse_poses(frames, given, settings), fixes)
+def _refine(
+    store: RunStore,
+    settings: RefineSettings,
+    chosen: merging.Choice,
+    given: Evidence,
+    start: _Start,
+    source: Path,
+    walk: Odometry | None,
+) -> RunResult:
+    """A run from its frames to what it leaves behind.
+
+    Args:
+        given: the evidence that does not depend on the frames.
+        start: the frames.
+        source: folder or video that they come from.
+        walk: the odometry of the video; None = frames were not chosen by it.
+        store, settings, chosen: of the run.
+    """
+    if walk is not None:
+        start = _with_fetched(store, settings, chosen, given, start, source, walk)
+    state = _solve_raw(_begin(store, settings, chosen, start))
+    result = backend.reconstruct(state)
+    if walk is not None or state.prior.absent:  # the images alone have to show motion
+        acceptance.require_motion(state.run.frames, result)
+    lenses = camera.keep_lenses(state, result)
+    written = outputs.write(state, result, lenses)
+    if walk is not None:
+        add_odometry(written.out / "report.html", walk)
+    return written
 
 
 def _with_fetched(
     store: RunStore,
+    settings: RefineSettings,
+    chosen: merging.Choice,
+    given: Evidence,
+    start: _Start,
     video_file: Path,
     walk: Odometry,
-    start: _Start,
-    given: Sequence[Trajectory],
-    settings: RefineSettings,
-    begin: Callable[[_Start], tuple[Run, Prior]],
 ) -> _Start:
     """The start with more frames of a video where the map of features is weak.
 
@@ -153,68 +176,52 @@ def _with_fetched(
         GsbaError: the odometry is in pieces, and a vehicle carries the camera.
     """
     if start.coarse.segments is not None:
-        acceptance.refuse_vehicle_in_pieces(begin(start)[0].frames)
+        acceptance.refuse_vehicle_in_pieces(_begin(store, settings, chosen, start).frames)
 
     def measure(some: FrameSet) -> Prior:
-        run, prior = begin(_start_of(some, given, settings))
-        return _map_features(run, frontend.extract(run), prior, given)[0]
+        run = _begin(store, settings, chosen, _Start.of(some, given, settings))
+        return _map_features(frontend.extract(run)).prior
 
-    given_frames = start.frames
-    whole = densify.fetch_where_weak(store, video_file, walk, given_frames, settings, measure)
-    return start if whole is given_frames else _start_of(whole, given, settings)
+    frames = start.frames
+    whole = densify.fetch_where_weak(store, video_file, walk, frames, settings, measure)
+    return start if whole is frames else _Start.of(whole, given, settings)
 
 
-def _begin(
-    store: RunStore,
-    given: Sequence[Trajectory],
-    settings: RefineSettings,
-    chosen: merging.Choice,
-    families: Sequence[Family],
-    readings: Readings | None,
-    start: _Start,
-) -> tuple[Run, Prior]:
-    """A run on frames that are masked as asked, and what is believed of the trajectory at first."""
-    families = [*families, *inputs.families_of(start.frames, settings)]
-    coarse, journal = start.coarse, Journal()
-    frames = merging.before(store, start.frames, chosen)
+def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, start: _Start) -> Run:
+    """A run on frames that are masked as asked."""
+    journal, frames = Journal(), merging.before(store, start.frames, chosen)
     if chosen.distractors:
-        how = settings, journal, families
-        frames = _without_distractors(store, frames, coarse, given, *how)
-    sensors = readings, start.fixes, families
-    run = Run.begin(store, frames, coarse, settings, journal, False, *sensors)
-    return run, Prior.of(coarse)
+        frames = _without_distractors(store, settings, replace(start, frames=frames), journal)
+    return Run.begin(store, frames, start.coarse, settings, start.evidence, journal)
 
 
-def _refine(
-    run: Run,
-    prior: Prior,
-    given: Sequence[Trajectory],
-    images_alone: bool,
-    walk: Odometry | None,
-) -> RunResult:
-    """A run from its frames to what it leaves behind, its video's odometry in the report."""
-    run, seen, prior, world = _solve_raw(run, prior, given)
-    result = backend.reconstruct(run, seen, prior, world)
-    if images_alone or prior.absent:
-        acceptance.require_motion(run.frames, result)
-    lenses = backend.keep_lenses(run, world, result)
-    written = outputs.write(run, prior, world, result, lenses)
-    if walk is not None:
-        add_odometry(written.out / "report.html", walk)
-    return written
+def _without_distractors(
+    store: RunStore, settings: RefineSettings, start: _Start, journal: Journal
+) -> FrameSet:
+    """Frames without what a first solution, plainer than the last, does not explain."""
+    frames, evidence = start.frames, replace(start.evidence, imu=None, fixes=None)
+    direct.check(frames, settings)  # before the first solution, not after
+    with store.named("first"):
+        run = Run.begin(store, frames, start.coarse, settings.plainer(), evidence)
+        state = solve(frontend.extract(run))
+    if state.prior.turning_only:
+        return frames
+    first = f"first-{run.chain.latest[0]}"
+    frames, counts = merging.after(store, frames, state.solution, first)
+    journal.note("distractors", counts)
+    return frames
 
 
-def _solve_raw(
-    run: Run, prior: Prior, given: Sequence[Trajectory]
-) -> tuple[Run, ObservedFrames, Prior, Map]:
+def _solve_raw(run: Run) -> State:
     """The method; raw pairs anew, cut by what their lenses turned out to be, where that is far off.
 
     Returns:
-        The run that it was in the end, its keypoints, and what `solve` gives.
+        The state after the last pass, whose run has the frames as they were cut for it.
     """
+    evidence = run.evidence
     known = [run.settings.model_dump(exclude={"export", "placement"}), run.families.digests()]
-    known += [] if run.imu is None else [run.imu.digest]
-    known += [] if run.fixes is None else [run.fixes.digest()]
+    known += [] if evidence.imu is None else [evidence.imu.digest]
+    known += [] if evidence.fixes is None else [evidence.fixes.digest()]
     counts, frames = dict(run.journal.counts), run.frames
     n, best = 0, None  # the pass before: what it rests on, steps without matches, its result
     while True:
@@ -223,289 +230,118 @@ def _solve_raw(
         if frames.fisheyes is not None and not kept:
             better = run.store.stored(name, known, _Cut, after)
         if better is None:
-            seen = frontend.extract(run)
-            believed, world = solve(run, seen, prior, given)
-            unseen = int(believed.trust.unseen_steps.sum())
+            state = solve(frontend.extract(run))
+            unseen = int(state.prior.trust.unseen_steps.sum())
             if best is not None and unseen > best[1]:
                 logger.info("frames cut anew match at fewer steps: the pass before is kept")
                 run.store.stage(f"recut{n - 1}_undone", known, lambda: True, bool, best[0])
                 return best[2]
-            best = after, unseen, (run, seen, believed, world)
-            better = None if kept or n == _PASSES - 1 else _cut_better(prior.coarse, world)
+            best, last = (after, unseen, state), bool(kept) or n == _MAX_PASSES - 1
+            better = None if last else camera.better_calibration(run.coarse, state.map)
             if better is None:
-                return best[2]
+                return state
             run.store.stage(name, known, lambda found=better: found, _Cut, after)
         n, (fisheyes, found) = n + 1, better
         again = Journal(dict(counts))
         frames = replace(frames, fisheyes=fisheyes, lenses_nominal=False)
         frames = merging.recut(run.store, frames, n)
-        beside = run.imu, run.fixes, run.families.members
-        run = Run.begin(run.store, frames, prior.coarse, run.settings, again, found, *beside)
+        run = Run.begin(run.store, frames, run.coarse, run.settings, evidence, again, found)
 
 
-def _cut_better(coarse: CoarsePoses, world: Map) -> _Cut | None:
-    """What raw pairs are better cut by, in the trajectory's axes, and whether that was found, not
-    given; None = they are cut well."""
-    lenses = world.lenses
-    if lenses.reference_calibration is None:
-        return None
-    found, turn = self_calibration.now(lenses), np.eye(3)
-    if (coarse.sources == PoseSource.SLAM).any():
-        turn = quarter_turn(coarse, world.solution.world_T_rigs)
-    off = self_calibration.apart(lenses, replace(lenses, fisheyes=None))
-    if off < _RECUT and np.array_equal(turn, np.eye(3)):
-        return None
-    logger.info("lenses are %.2f deg from what panoramas were cut by: all anew", np.rad2deg(off))
-    return turned(found, turn), lenses.fisheyes is not None
-
-
-def solve(
-    run: Run, seen: ObservedFrames, prior: Prior, given: Sequence[Trajectory]
-) -> tuple[Prior, Map]:
+def solve(state: State) -> State:
     """The method: from keypoints and a coarse trajectory to poses and points.
 
-    A stage that is optional takes a map and gives one: it is left out by leaving out its line.
+    A stage takes a state and gives one. One that is optional is left out by leaving out its line.
 
     Args:
-        run: what no stage changes.
-        seen: keypoints of the frames.
-        prior: what is believed of the trajectory at first.
-        given: its files, for a clock to be set right.
+        state: keypoints of the frames and the trajectory, as `frontend.extract` gives it.
 
     Returns:
-        What is believed in the end, and the map; of a camera that only turned one without points.
+        The state with the final map; of a camera that only turned, a map without points.
 
     Raises:
         GsbaError: images that do not match, or that contradict the trajectory.
     """
-    families = run.settings.direct_families()
-    prior, seen, world, along = _map_features(run, seen, prior, given)
-    if prior.turning_only:
-        return prior, world
-    seen, solved, along = _look_closer(run, seen, prior, world.solution, along)
+    families = state.run.settings.direct_families()
+    state = _map_features(state)
+    if state.prior.turning_only:
+        return state
+    state = _add_keypoints_where_weak(state)
     # The map matched anew from itself; lenses that neighbours hide may show in it.
-    solved, matches = _match_from_itself(run, seen, prior, solved, along)
-    if not world.lenses and run.frames.fisheyes is None:
-        seen, world = _find_camera(run, seen, prior, matches, solved, "again_")
-        if world.lenses:
-            solved, _ = _match_from_itself(run, seen, prior, world.solution, along, "again_")
+    state = _match_from_itself(state)
+    if not state.map.lenses and state.run.frames.fisheyes is None:
+        state = camera.find_camera(state, "again_")
+        if state.map.lenses:
+            state = _match_from_itself(state, "again_")
     # Below a pixel: patches, pixels, splats.
-    world = replace(world, solution=solved, observed=seen.shown)
-    prior, world = patch_rounds.align(run, prior, world)
+    state = patch_rounds.align(state.without_matches())
     if "photometric" in families:
-        world = backend.refine_photometric(run, prior, world)
+        state = backend.refine_photometric(state)
     if "splat" in families:
-        world = backend.refine_on_splat(run, prior, world)
-    prior = backend.align_imu(run, prior, world.solution, "imu_final", with_noise=False)
-    return prior, backend.measure_camera(run, prior, world)
+        state = backend.refine_on_splat(state)
+    state = gyro.align_to_map(state, "imu_final", with_noise=False)
+    return camera.measure_camera(state)
 
 
-def _map_features(
-    run: Run, seen: ObservedFrames, prior: Prior, given: Sequence[Trajectory]
-) -> tuple[Prior, ObservedFrames, Map, Matches]:
-    """One map of all frames' features, the camera that sees them, and how well images hold it.
-
-    Returns:
-        What is believed by then, the keypoints through that camera, the map, and the matches of
-        neighbours.
-    """
-    rounds = run.settings.rounds
+def _map_features(state: State) -> State:
+    """One map of all frames' features, the camera that sees them, and how well images hold it."""
+    rounds = state.run.settings.rounds
     # Neighbours in time, and what they say of the trajectory and its clock.
-    prior, near = frontend.match_neighbours(run, seen, prior, given)
-    prior, near = frontend.judge_trajectory(run, seen, prior, near)
-    prior = frontend.align_imu(run, seen, prior, near)
-    if prior.turning_only:
-        return prior, seen, Map.of(prior.start(), seen.shown), near.matches
+    state = frontend.match_neighbours(state)
+    state = frontend.judge_trajectory(state)
+    state = gyro.align_to_neighbours(state)
+    if state.prior.turning_only:
+        return state
     # A chain of relative poses, then all that neighbours have in common.
-    prior, start = backend.align_gauge(run, prior, prior.start(), "gauge")
-    solved = backend.adjust(run, seen, prior, "chain", [near.matches], start, rounds.chain)
-    along = frontend.match_along_epipolars(run, seen, solved)
-    known = frontend.match_known_points(run, seen, solved, "near", loops_closed=False)
-    solved = backend.adjust(run, seen, prior, "dense", [along, known], solved, rounds.dense)
+    state = backend.align_gauge(state, "gauge")
+    state = backend.adjust(state, "chain", rounds.chain)
+    state = frontend.match_along_epipolars(state)
+    state = frontend.match_known_points(state, "near", loops_closed=False)
+    state = backend.adjust(state, "dense", rounds.dense)
     # One map, its loops closed, and the camera.
-    prior, solved, matches = _merge_maps(run, seen, prior, near, solved, [along, known])
-    prior, solved, loops = frontend.close_loops(run, seen, prior, solved)
-    along, matches = matches[0], [*matches, loops]
-    prior, solved = backend.align_gauge(run, prior, solved, "gauge_closed")
-    solved = backend.adjust(run, seen, prior, "closed", matches, solved, rounds.loops)
-    prior = backend.align_imu(run, prior, solved, "imu_closed")
-    seen, world = _find_camera(run, seen, prior, matches, solved)
-    solved = world.solution
-    prior = backend.align_imu(run, prior, solved, "imu_camera", with_noise=bool(world.lenses))
-    prior = backend.measure_strength(run, seen, prior, solved)
-    return prior, seen, world, along
+    state = _merge_maps(state)
+    state = frontend.close_loops(state)
+    state = backend.align_gauge(state, "gauge_closed")
+    state = backend.adjust(state, "closed", rounds.loops)
+    state = gyro.align_to_map(state, "imu_closed")
+    state = camera.find_camera(state)
+    state = gyro.align_to_map(state, "imu_camera", with_noise=bool(state.map.lenses))
+    return backend.measure_strength(state)
 
 
-def _match_from_itself(
-    run: Run, seen: ObservedFrames, prior: Prior, solved: Solution, along: Matches, prefix: str = ""
-) -> tuple[Solution, list[Matches]]:
-    """The map after its own points were looked for everywhere, and the matches it is made of."""
-    rounds, matches = run.settings.rounds, [along]
-    for n in range(1, rounds.map_passes + 1):
-        wide = frontend.match_known_points(run, seen, solved, f"{prefix}everywhere{n}")
-        final = n == rounds.map_passes and not run.settings.patches.rounds
-        name, matches = f"{prefix}refined{n}", [along, wide]
-        solved = backend.adjust(run, seen, prior, name, matches, solved, rounds.refined, final)
-    return solved, matches
-
-
-def _merge_maps(
-    run: Run,
-    seen: ObservedFrames,
-    prior: Prior,
-    near: VerifiedPairs,
-    solved: Solution,
-    matches: list[Matches],
-) -> tuple[Prior, Solution, list[Matches]]:
+def _merge_maps(state: State) -> State:
     """Parts of the map that nothing ties together, joined where they meet; and their matches."""
-    parts = backend.scattered(run, prior, near, solved)
+    parts = backend.separate_parts(state)
     if parts is None:
-        return prior, solved, matches
-    prior, merged = backend.merge_maps(run, seen, prior, solved, parts)
-    across = frontend.match_across(run, seen, merged, parts)
-    along, known = (connectivity.within(some, parts) for some in matches)
-    matches, gates = [along, known, across], run.settings.rounds.loops
-    solved = backend.adjust(run, seen, prior, "joined", matches, merged.solved, gates)
-    along = frontend.match_along_epipolars(run, seen, solved, "adjacent2")
-    return prior, solved, [along, known, across]
+        return state
+    state = backend.merge_maps(state, parts)
+    state = frontend.match_across(state, parts)
+    state = backend.adjust(state, "joined", state.run.settings.rounds.loops)
+    return frontend.match_along_epipolars(state, "adjacent2")
 
 
-def _find_camera(
-    run: Run,
-    seen: ObservedFrames,
-    prior: Prior,
-    matches: Sequence[Matches],
-    solved: Solution,
-    prefix: str = "",
-) -> tuple[ObservedFrames, Map]:
-    """Lenses and readout, before gates take what tells of them; and the map that these give.
+def _add_keypoints_where_weak(state: State) -> State:
+    """More keypoints where images hold the map poorly, and the map that these give."""
+    weak = state.prior.weak_frames()
+    if state.run.settings.weak_frames.mode == "off" or not weak.any():
+        return state
+    state = frontend.extract_more(state, weak)
+    state = frontend.match_along_epipolars(state, "adjacent_closer")
+    state = backend.place_points(state, "placed_closer")
+    state = frontend.match_known_points(state, "wide_closer")
+    return backend.adjust(state, "dense_closer", state.run.settings.rounds.dense)
+
+
+def _match_from_itself(state: State, prefix: str = "") -> State:
+    """The map after its own points were looked for everywhere.
 
     Args:
+        state: of the run.
         prefix: of the names of stages.
     """
-    settings = run.settings
-    if settings.camera.model == "central" or not run.frames.panoramic:
-        return seen, Map.of(solved, seen.shown)
-    if run.frames.fisheyes is not None:
-        return _find_raw_camera(run, seen, prior, matches, solved)
-    looking = seen.through(Lenses())
-    guess = None
-    if not run.frames.lens_axes_known:
-        guess = backend.guess_axes(run, looking, prior, f"{prefix}axes", matches, solved)
-        looking = seen.through(guess.lenses)
-    band, better, gates = np.deg2rad(settings.camera.seam_deg), solved, settings.rounds.loops
-    looking = seen.through(replace(looking.lenses, band_rad=float(band)))
-    for n in range(2):  # on trial, then judged by what is matched with them
-        name = f"{prefix}lenses{n}"
-        found = backend.find_lenses(run, looking, prior, name, matches, better)
-        if not found.lenses:
-            return seen, Map.of(solved, seen.shown, found)
-        looking, name = seen.through(found.lenses), f"{prefix}lensed{n}"
-        better = backend.adjust(run, looking, prior, name, matches, better, gates)
-        gates = settings.rounds.dense
-        if n == 0:
-            name = f"{prefix}adjacent_lenses"
-            along = frontend.match_along_epipolars(run, looking, better, name)
-            wide = frontend.match_known_points(run, looking, better, f"{prefix}wide_lenses")
-            matches = [along, wide]
-    name = f"{prefix}stitch_radius"
-    radius = backend.find_stitch_radius(run, looking, prior, name, matches, better)
-    if not radius.reason:
-        looking, name = seen.through(radius.lenses), f"{prefix}lensed2"
-        better = backend.adjust(run, looking, prior, name, matches, better, gates)
-    world = replace(Map.of(better, seen.shown, found), axes=guess, radius=radius)
-    return _settle_camera(run, looking, prior, matches, world, f"{prefix}settled")
-
-
-def _find_raw_camera(
-    run: Run, seen: ObservedFrames, prior: Prior, matches: Sequence[Matches], solved: Solution
-) -> tuple[ObservedFrames, Map]:
-    """As `_find_camera`, of raw pairs: where their lenses are, and what they are."""
-    looking = seen.through(Lenses(band_rad=float(SEAM), reference_calibration=run.frames.fisheyes))
-    better, gates = solved, run.settings.rounds.loops
-    for n in range(2):
-        found = backend.find_lenses(run, looking, prior, f"lenses{n}", matches, better)
-        looking = seen.through(found.lenses)
-        better = backend.adjust(run, looking, prior, f"lensed{n}", matches, better, gates)
-        gates = run.settings.rounds.dense
-    world = Map.of(better, seen.shown, found)
-    looking, world = _settle_camera(run, looking, prior, matches, world, "settled")
-    if run.lenses_found:  # patches say more of them than features do
-        read = world.camera()
-        free = replace(read.lenses, fisheyes=read.lenses.reference_calibration)
-        return looking, world.with_camera(replace(read, lenses=free))
-    known = backend.self_calibrate_lenses(
-        run, looking, prior, "calibrated", matches, world.solution
-    )
-    world = replace(world, calibrated=known)
-    for n in range(0 if known.reason else _CALIBRATIONS):
-        world = world.with_camera(replace(world.camera(), lenses=known.lenses)) if n == 0 else world
-        looking, better = seen.through(world.lenses), world.solution
-        better = backend.adjust(run, looking, prior, f"recalibrated{n}", matches, better, gates)
-        along = frontend.match_along_epipolars(run, looking, better, f"adjacent_raw{n}")
-        wide = frontend.match_known_points(run, looking, better, f"wide_raw{n}")
-        world, matches = replace(world, solution=better), [along, wide]
-        before = world.lenses
-        looking, world = _settle_camera(run, looking, prior, matches, world, f"calibrated{n}")
-        if self_calibration.apart(before, world.lenses) < _CALIBRATED:
-            break
-    return looking, world
-
-
-def _settle_camera(
-    run: Run,
-    looking: ObservedFrames,
-    prior: Prior,
-    matches: Sequence[Matches],
-    world: Map,
-    name: str,
-) -> tuple[ObservedFrames, Map]:
-    """All that is known of the camera found together, how rows are read first."""
-    gates, solved, read = run.settings.rounds.dense, world.solution, world.camera()
-    if read.lenses.readout_motion is None:
-        read = backend.find_readout(run, looking, prior, f"{name}_readout", matches, solved)
-    for n in range(_CAMERA_ROUNDS):
-        looking = looking.through(read.lenses)
-        key = f"{name}_camera{n}"
-        read = backend.settle_camera(run, looking, prior, key, matches, solved, read)
-        looking = looking.through(read.lenses)
-        solved = backend.adjust(run, looking, prior, f"{name}{n}", matches, solved, gates)
-    return looking, replace(world, solution=solved).with_camera(read)
-
-
-def _look_closer(
-    run: Run, seen: ObservedFrames, prior: Prior, solved: Solution, along: Matches
-) -> tuple[ObservedFrames, Solution, Matches]:
-    """More keypoints where images hold the map poorly, and the map that these give."""
-    weak = prior.weak_frames()
-    if run.settings.weak_frames.mode == "off" or not weak.any():
-        return seen, solved, along
-    seen = frontend.extract_more(run, seen, weak)
-    along = frontend.match_along_epipolars(run, seen, solved, "adjacent_closer")
-    placed = backend.place(run, seen, prior, "placed_closer", [along], solved)
-    wide = frontend.match_known_points(run, seen, placed, "wide_closer")
-    gates = run.settings.rounds.dense
-    solved = backend.adjust(run, seen, prior, "dense_closer", [along, wide], placed, gates)
-    return seen, solved, along
-
-
-def _without_distractors(
-    store: RunStore,
-    frames: FrameSet,
-    coarse: CoarsePoses,
-    given: Sequence[Trajectory],
-    settings: RefineSettings,
-    journal: Journal,
-    families: Sequence[Family],
-) -> FrameSet:
-    """Frames without what a first solution, plainer than the last, does not explain."""
-    direct.check(frames, settings)  # before the first solution, not after
-    with store.named("first"):
-        run = Run.begin(store, frames, coarse, settings.plainer(), families=families)
-        prior, world = solve(run, frontend.extract(run), Prior.of(coarse), given)
-    if prior.turning_only:
-        return frames
-    first = f"first-{run.chain.latest[0]}"
-    frames, counts = merging.after(store, frames, world.solution, first)
-    journal.note("distractors", counts)
-    return frames
+    rounds, patches = state.run.settings.rounds, state.run.settings.patches.rounds
+    for n in range(1, rounds.map_passes + 1):
+        state = frontend.match_known_points(state, f"{prefix}everywhere{n}")
+        final = n == rounds.map_passes and not patches
+        state = backend.adjust(state, f"{prefix}refined{n}", rounds.refined, final=final)
+    return state

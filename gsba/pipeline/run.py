@@ -1,6 +1,6 @@
 """A run: what no stage changes, how a stage is kept, and the journal that the report reads."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -8,20 +8,17 @@ from typing import TypeVar
 import numpy as np
 
 from gsba import learned
-from gsba.bundle import gps_factors
-from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.families import Families, Family
 from gsba.bundle.fixes import FrameFixes
 from gsba.camera.rig import CubeRig
-from gsba.config import PriorSettings, RefineSettings
+from gsba.config import RefineSettings
 from gsba.frames import cubemap
 from gsba.frames.panorama import Greys
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError
 from gsba.photometric import direct
-from gsba.pipeline.prior import Prior
 from gsba.store.store import Chain, RunStore, fingerprint
-from gsba.types import CoarsePoses, Counts, FrameSet, Round, Solution
+from gsba.types import CoarsePoses, Counts, FrameSet, Round, Trajectory
 
 T = TypeVar("T")
 
@@ -50,6 +47,16 @@ class Journal:
 
 
 @dataclass(frozen=True, slots=True)
+class Evidence:
+    """What a run is given beside its images."""
+
+    trajectories: tuple[Trajectory, ...] = ()  # files, in pieces that each have their own world
+    imu: Readings | None = None  # of a gyro that rode along; None = there are none
+    fixes: FrameFixes | None = None  # of frames by GPS, for its factors; None = there are none
+    families: tuple[Family, ...] = ()  # residuals of the caller, or of packages
+
+
+@dataclass(frozen=True, slots=True)
 class Run:
     """What no stage changes."""
 
@@ -57,15 +64,16 @@ class Run:
     chain: Chain  # of stages, each resting on the one before
     journal: Journal
     frames: FrameSet  # as read, not straightened
+    coarse: CoarsePoses  # start poses, as the trajectories say
+    evidence: Evidence
     settings: RefineSettings
     rig: CubeRig  # faces that keypoints are found on
     greys: Greys  # pictures for patches
     weights: Mapping[str, Path]  # stage -> file of a learned network
     num_threads: int
-    lenses_found: bool = False  # whether what raw pairs are cut by was found, so that it is free
-    imu: Readings | None = None  # of a gyro that rode along; None = there are none
-    fixes: FrameFixes | None = None  # of frames by GPS, for its factors; None = there are none
-    families: Families = field(default_factory=Families)  # of the caller, or of packages
+    families: Families  # those of the evidence, bound to the frames
+    lenses_found: bool = False  # whether the calibration that raw pairs are cut by was estimated by
+    # a pass before, so that it is free
 
     @classmethod
     def begin(
@@ -74,11 +82,9 @@ class Run:
         frames: FrameSet,
         coarse: CoarsePoses,
         settings: RefineSettings,
+        evidence: Evidence | None = None,
         journal: Journal | None = None,
         lenses_found: bool = False,
-        imu: Readings | None = None,
-        fixes: FrameFixes | None = None,
-        families: Sequence[Family] = (),
     ) -> "Run":
         """Start a run, or take it up, on these frames and poses.
 
@@ -88,7 +94,8 @@ class Run:
         direct.check(frames, settings)
         if settings.camera.model == "two_lens" and not frames.panoramic:
             raise GsbaError("camera.model = two_lens is for panoramas: cube faces hide the seam")
-        if imu is not None and not frames.timed:
+        evidence = evidence or Evidence()
+        if evidence.imu is not None and not frames.timed:
             raise GsbaError("--imu: nothing says when frames are from: pass --timestamps or --fps")
         chain = Chain(store)
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
@@ -102,15 +109,15 @@ class Run:
             chain=chain,
             journal=journal or Journal(),
             frames=frames,
+            coarse=coarse,
+            evidence=evidence,
             settings=settings,
             rig=cubemap.rig_for(frames, settings.cubemap),
             greys=Greys(frames, settings.patches.max_width),
             weights=learned.find_weights(settings),
             num_threads=settings.solver.threads(),
+            families=Families(evidence.families, frames.names, frames.timestamps),
             lenses_found=lenses_found,
-            imu=imu,
-            fixes=fixes,
-            families=Families(tuple(families), frames.names, frames.timestamps),
         )
 
     def stage(
@@ -132,31 +139,6 @@ class Run:
         if noted:
             self.journal.note(name, result)
         return result
-
-    def problem(
-        self, prior: Prior, solved: Solution | None, noise: PriorSettings | None = None
-    ) -> AdjustmentContext:
-        """What adjustments share while this is believed of the trajectory.
-
-        Args:
-            solved: poses so far, that GPS fixes are carried to; None = without GPS and families.
-            noise: of the trajectory; None = as in the settings.
-        """
-        settings, noise = self.settings, noise or self.settings.priors
-        anchors, first, ungauged = None, None, None
-        families = Families() if solved is None else self.families
-        freed = bool(families.fixing_gauge.members)
-        if self.fixes is not None and solved is not None:
-            poses = solved.world_T_rigs
-            first = poses[0]
-            anchors = gps_factors.anchor(poses, self.fixes, settings.gps, prior.parts)
-            freed |= anchors is not None and anchors.holds(0, prior.parts)
-        if solved is not None and (freed or anchors is not None):
-            ungauged = prior.graph(noise, solved.world_T_rigs[0], gauge=not freed)
-        graph = prior.graph(noise, first)
-        settings = settings if self.frames.timed else settings.untimed()
-        given = graph, self.rig, settings, self.num_threads, prior.turning
-        return AdjustmentContext(*given, anchors, ungauged, families, prior.parts)
 
     @property
     def matching_settings(self) -> RefineSettings:
@@ -182,6 +164,6 @@ class Run:
         relevant = [settings.triangulate, settings.rounds, settings.priors, settings.solver]
         families = [f for f in settings.factors if f not in ("photometric", "splat")]
         known = []
-        if self.fixes is not None:
-            known = [settings.gps.loss_sigmas, self.fixes.digest()]
+        if self.evidence.fixes is not None:
+            known = [settings.gps.loss_sigmas, self.evidence.fixes.digest()]
         return [*relevant, families, self.families.digests(), *known]

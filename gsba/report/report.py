@@ -6,7 +6,7 @@ import logging
 import math
 import os
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from enum import Enum
 from importlib.metadata import PackageNotFoundError, version
@@ -79,24 +79,46 @@ def angular_residuals(reconstruction: Reconstruction) -> np.ndarray:
     )
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class Findings:
+    """What a run found beside poses and points, each as a section of report.json."""
+
+    notes: Sequence[str] = ()  # for the user: frames without images, unmatched frames, ...
+    trajectory: Mapping[str, Any] | None = None  # checks by images, see `findings.of_trajectory`
+    stitching: Mapping[str, Any] | None = None  # its field, see `findings.of_field`
+    camera: Mapping[str, Any] | None = None  # two lenses, see `camera_findings.of_camera`
+    gyro: Mapping[str, Any] | None = None  # see `imu_findings.of_gyro`
+    gps: Mapping[str, Any] | None = None  # see `gps_findings.of_gps`
+    moves: Sequence[object] = ()  # of the poses by a splat, see `gsba.splat.refinement.Move`
+    reasons: Sequence[str] = ()  # why maps were not joined, see `maps.summarize_maps`
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class StageLog:
+    """What the stages of a run cost, received and kept."""
+
+    costs: Sequence[StageRecord] = ()  # in order
+    counts: Mapping[str, Sequence[Counts]] = dataclasses.field(
+        default_factory=dict
+    )  # by stage name
+    solver: Sequence[object] = ()  # a record for each round, with its iterations' cost by family
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Cost and counts of each stage."""
+        return [
+            {**dataclasses.asdict(stage), "counts": self.counts.get(stage.name, ())}
+            for stage in self.costs
+        ]
+
+
 def build_report(
-    *,
     settings: BaseModel,
     frames: FrameSet,
     coarse: CoarsePoses,
     reconstruction: Reconstruction,
-    stages: Iterable[StageRecord],
-    counts: Mapping[str, Sequence[Counts]],
-    solver: Sequence[object],
+    stages: StageLog,
     gauge: str,
-    notes: Sequence[str] = (),
-    trajectory: Mapping[str, Any] | None = None,
-    moves: Sequence[object] = (),
-    stitching: Mapping[str, Any] | None = None,
-    camera: Mapping[str, Any] | None = None,
-    gyro: Mapping[str, Any] | None = None,
-    gps: Mapping[str, Any] | None = None,
-    reasons: Sequence[str] = (),
+    found: Findings,
 ) -> dict[str, Any]:
     """Content of report.json: plain values only.
 
@@ -105,36 +127,25 @@ def build_report(
         frames: its frames.
         coarse: their initial poses.
         reconstruction: the result.
-        stages: cost of each stage, in order.
-        counts: stage name -> numbers of items that it received, kept and dropped.
-        solver: one record for each round, holding its iterations with their cost by family.
+        stages: their costs and counts.
         gauge: a sentence on the gauge of the refined map.
-        notes: notes for the user: frames without images, unmatched frames, ...
-        trajectory: checks of it by images, see `gsba.report.findings.of_trajectory`.
-        moves: updates of the poses by a splat, see `gsba.splat.refinement.Move`.
-        stitching: the stitching field, see `gsba.report.findings.of_field`.
-        camera: its two lenses, see `gsba.report.camera_findings.of_camera`.
-        gyro, gps: see `gsba.report.imu_findings.of_gyro` and `gsba.report.gps_findings.of_gps`.
-        reasons: reasons why maps were not joined, see `gsba.report.maps.summarize_maps`.
+        found: findings beside the result.
     """
     quality = frame_quality(reconstruction)
-    stage_rows = [
-        {**dataclasses.asdict(stage), "counts": counts.get(stage.name, ())} for stage in stages
-    ]
+    optional = {"camera": found.camera, "gyro": found.gyro, "gps": found.gps}
     report = {
         "gsba": __version__,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "summary": _summary(frames, coarse, reconstruction),
-        "maps": summarize_maps(reconstruction, frames, reasons),
+        "maps": summarize_maps(reconstruction, frames, found.reasons),
         "gauge": gauge,
-        "notes": notes,
-        "trajectory": trajectory,
-        "stitching": stitching,
-        **({} if camera is None else {"camera": camera}),
-        **{name: found for name, found in (("gyro", gyro), ("gps", gps)) if found is not None},
-        "stages": stage_rows,
-        "solver": solver,
-        "splat": moves,
+        "notes": found.notes,
+        "trajectory": found.trajectory,
+        "stitching": found.stitching,
+        **{name: section for name, section in optional.items() if section is not None},
+        "stages": stages.rows(),
+        "solver": stages.solver,
+        "splat": found.moves,
         "frames": _frame_rows(frames, coarse, reconstruction, quality),
         "settings": settings,
         "machine": _machine(),

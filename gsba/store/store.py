@@ -64,6 +64,8 @@ class RunStore:
         origin: inputs of the run, e.g. `{"frames": path, "trajectory": path}`.
         fresh: delete the files that gsba wrote for an earlier run in `root`, and only these.
         hire: makes the workers of the stages from the folder of shards; None = one thread.
+        title_of: gives the title of a stage by its name, for the log.
+
     Raises:
         GsbaError: the folder is of another run, is no run, or is locked by another process.
     """
@@ -74,8 +76,10 @@ class RunStore:
         origin: Mapping[str, Path],
         fresh: bool = False,
         hire: Callable[[Path], Workers] | None = None,
+        title_of: Callable[[str], str] = str,
     ) -> None:
         self.root = root
+        self._title_of = title_of
         self.records: dict[str, StageRecord] = {}  # stages of this call, in order
         self._types: dict[str, object] = {}  # stage -> type of its result
         self._prefix = ""
@@ -213,7 +217,9 @@ class RunStore:
     def _note(self, record: StageRecord) -> None:
         self.records[record.name] = record
         how = "resumed, computed in" if record.resumed else "done in"
-        logger.info("%s: %s %.1f s, %.0f MB", record.name, how, record.seconds, record.peak_mb)
+        title, name = self._title_of(record.name), record.name
+        shown = title if title == name else f"{title} [{name}]"
+        logger.info("%s: %s %.1f s, %.0f MB", shown, how, record.seconds, record.peak_mb)
 
 
 class Chain:

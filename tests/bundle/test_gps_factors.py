@@ -30,7 +30,7 @@ def _fixes(world: World, seed: int, noise: float = 1.0) -> FrameFixes:
 
 
 def _problem(coarse: np.ndarray, poses: np.ndarray, fixes: FrameFixes | None) -> AdjustmentContext:
-    """As `gsba.pipeline.run.Run.problem` has it."""
+    """As `gsba.pipeline.state.State.adjustment_context` has it."""
     settings = RefineSettings()
     given = coarse, settings.priors, None, None, poses[0]
     problem = AdjustmentContext(prior_factors.build(*given), RIG, settings, 1)

@@ -6,14 +6,15 @@ from synthetic import drifted, loop_walk, unit
 
 from gsba.bundle import map_strength, prior_factors
 from gsba.bundle.map_strength import MapStrength
-from gsba.config import PriorSettings, WeakFrameSettings
+from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle, step_covariances
 from gsba.types import JointErrors, StepNoise
 
 NUM = 24
 POSES = loop_walk(NUM)
 LENGTHS = np.linalg.norm(np.diff(POSES[:, :3, 3], axis=0), axis=1)
-CLOSER, PRIORS = WeakFrameSettings(), PriorSettings()
+SETTINGS = RefineSettings()
+CLOSER, PRIORS = SETTINGS.weak_frames, SETTINGS.priors
 ALL = np.ones(NUM - 1, bool)
 
 
@@ -31,16 +32,17 @@ def _chained(scale_sigma: np.ndarray, num_draws: int = 2000) -> tuple[np.ndarray
 
 
 def _measured(scale_sigma: np.ndarray, coarse: np.ndarray = POSES) -> MapStrength:
-    return map_strength.measure(POSES, *_chained(scale_sigma), coarse, ALL, ALL, CLOSER, PRIORS)
+    return map_strength.measure(POSES, *_chained(scale_sigma), coarse, ALL, ALL, SETTINGS)
 
 
 def test_a_map_that_hardly_drifts_is_left_alone() -> None:
     covariances, joint = _chained(np.full(NUM - 2, 2e-3))
-    given = POSES, ALL, ALL, CLOSER, PRIORS
-    loose = map_strength.measure(POSES, covariances, joint, *given)
+    given = POSES, ALL, ALL
+    loose = map_strength.measure(POSES, covariances, joint, *given, SETTINGS)
     assert loose.drift[0] > CLOSER.max_drift and loose.weak.any()
     calm = CLOSER.model_copy(update={"max_drift": 2 * loose.drift[0]})
-    found = map_strength.measure(POSES, covariances, joint, *given[:3], calm, PRIORS)
+    settings = SETTINGS.model_copy(update={"weak_frames": calm})
+    found = map_strength.measure(POSES, covariances, joint, *given, settings)
     assert not found.weak.any() and found.held_steps.all()
 
 
@@ -74,14 +76,14 @@ def test_nothing_is_looked_for_where_no_image_shows_a_step() -> None:
     made[9] = 2e-3
     seen = ALL.copy()
     seen[10] = False
-    found = map_strength.measure(POSES, *_chained(made), POSES, seen, ALL, CLOSER, PRIORS)
+    found = map_strength.measure(POSES, *_chained(made), POSES, seen, ALL, SETTINGS)
     assert not found.weak.any() and not found.held_steps[10]
 
 
 def test_a_trajectory_that_is_not_believed_leaves_weak_places_to_be_found() -> None:
     made = np.full(NUM - 2, 4e-4)
     made[9] = 2e-3
-    found = map_strength.measure(POSES, *_chained(made), POSES, ALL, ~ALL, CLOSER, PRIORS)
+    found = map_strength.measure(POSES, *_chained(made), POSES, ALL, ~ALL, SETTINGS)
     assert found.weak.any() and found.noise is None
 
 

@@ -17,6 +17,7 @@ from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.cli import app
 from gsba.cli.refining import _found_lenses
 from gsba.demo import degrade, make_walk
+from gsba.demo.degrade import Drift
 from gsba.demo.gait import KNOTS, poses_during
 from gsba.demo.mesh import MeshBuilder
 from gsba.demo.raycast import ranges
@@ -252,9 +253,7 @@ def test_walk_poses_follow_their_path(path, heading):
 
 
 def test_degraded_truth_without_errors_is_a_similarity_of_it():
-    clean = degrade(
-        TRUTH, scale=0.4, rotation_drift_deg=0, translation_drift=0, scale_drift=0, jitter=0
-    )
+    clean = degrade(TRUTH, scale=0.4, drift=Drift(0, 0, 0), jitter=0)
     expected = inverse(TRUTH.world_T_rigs[0]) @ TRUTH.world_T_rigs
     expected[:, :3, 3] *= 0.4
     np.testing.assert_allclose(clean.world_T_rigs, expected, atol=1e-12)

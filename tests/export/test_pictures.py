@@ -17,7 +17,7 @@ from shard_jobs import Parts
 from factors.sphere_field import num_harmonics
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig
-from gsba.export import ExportFormat, export, export_all, images, pictures
+from gsba.export import ExportFormat, ExportOptions, export, export_all, images, pictures
 from gsba.frames import cubemap, masks, pixels
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError
@@ -87,7 +87,7 @@ def test_files_are_the_same_together_and_alone(tmp_path, monkeypatch, kind, lens
     rows, outs = np.arange(3, 7), {to: tmp_path / "all" / to for to in FORMATS}
     frames, scene = _frames(tmp_path, kind).taken(rows), reconstruction().taken(rows)
     _threads(monkeypatch, 4)
-    export_all(scene, frames, outs, face_size=64, lenses=lenses)
+    export_all(scene, frames, outs, ExportOptions(face_size=64, lenses=lenses))
     _threads(monkeypatch, 1)
     for to in FORMATS:
         export(scene, frames, tmp_path / "one" / to, to, 64, lenses=lenses)

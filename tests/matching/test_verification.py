@@ -150,8 +150,10 @@ def _run(
         np.concatenate([np.zeros((0, 2), np.int32), *rows]),
     )
     spread = np.zeros(len(views)) if sigmas is None else np.array(sigmas)
-    how = SETTINGS, 0, Threads(1), np.zeros(len(views))
-    return verification.verify_pairs(matches, keypoints, np.array(priors), spread, *how)
+    found = verification.estimate_relative_poses(
+        matches, keypoints, SETTINGS, 0, Threads(1), np.zeros(len(views))
+    )
+    return verification.agree_with_prior(matches, found, np.array(priors), spread, SETTINGS)
 
 
 def _turned(f0_T_f1: np.ndarray, degrees: float) -> np.ndarray:

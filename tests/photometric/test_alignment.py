@@ -15,6 +15,7 @@ from gsba.config import PatchSettings, RefineSettings
 from gsba.frames.panorama import Greys
 from gsba.geometry import inverse, pose
 from gsba.photometric import alignment
+from gsba.photometric.alignment import Observations
 from gsba.store.shards import Threads
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Sighted, Solution, Tracks
 
@@ -107,18 +108,12 @@ def _run(
 ) -> Sighted:
     frames, world_T_rigs = walk
     landmarks, keypoints = _start(world_T_rigs, sigma_px)
-    return alignment.align(
-        landmarks,
-        world_T_rigs,
-        keypoints,
-        1.0,
-        Greys(frames, 4096),
-        RIG,
-        "align",
-        aligned,
-        settings,
-        Threads(2),
-    )
+    solved, observed = _solved(landmarks, world_T_rigs), Observations(keypoints, aligned)
+    return alignment.align(solved, observed, Greys(frames, 4096), RIG, settings, Threads(2))
+
+
+def _solved(landmarks: Landmarks, world_T_rigs: np.ndarray) -> Solution:
+    return replace(Solution.without_points(world_T_rigs), landmarks=landmarks)
 
 
 def _errors_px(sighted: Sighted, world_T_rigs: np.ndarray) -> np.ndarray:
@@ -178,10 +173,8 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
     )
     problem, gates = AdjustmentContext(priors, RIG, settings, 2), (6.0, 3.0)
     before = adjustment.adjust(landmarks.tracks, keypoints, start, problem, gates)
-    sighted = alignment.align(
-        before.landmarks, before.world_T_rigs, keypoints, before.noise, Greys(frames, 4096), RIG,
-        "align", None, SETTINGS, Threads(2),
-    )  # fmt: skip
+    greys, workers = Greys(frames, 4096), Threads(2)
+    sighted = alignment.align(before, Observations(keypoints), greys, RIG, SETTINGS, workers)
     after, known = adjustment.adjust_sighted(sighted, before, problem, gates)
     assert np.median(rotation_errors(after)) < 0.5 * np.median(rotation_errors(before))
     assert 0.5 <= after.noise < 2 and all(step.accepted for step in after.rounds)
@@ -224,10 +217,9 @@ def test_points_at_a_centre_and_behind_walls_do_no_harm(walk) -> None:
     points[50:100] *= 50
     points[100] = world_T_rigs[landmarks.tracks.frames[300], :3, 3]
     moved = replace(landmarks, points_world=points)
-    sighted = alignment.align(
-        moved, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None, SETTINGS,
-        Threads(2),
-    )  # fmt: skip
+    solved, greys = _solved(moved, world_T_rigs), Greys(frames, 4096)
+    observed, workers = Observations(keypoints), Threads(2)
+    sighted = alignment.align(solved, observed, greys, RIG, SETTINGS, workers)
     assert np.isfinite(sighted.keypoints.bearings_rig).all()
     assert np.isfinite(sighted.keypoints.sqrt_infos).all()
 
@@ -259,10 +251,9 @@ def test_no_points_are_no_observations(walk) -> None:
     frames, world_T_rigs = walk
     none = Solution.without_points(world_T_rigs).landmarks
     _, keypoints = _start(world_T_rigs)
-    sighted = alignment.align(
-        none, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None, SETTINGS,
-        Threads(2),
-    )  # fmt: skip
+    solved, greys = _solved(none, world_T_rigs), Greys(frames, 4096)
+    observed, workers = Observations(keypoints), Threads(2)
+    sighted = alignment.align(solved, observed, greys, RIG, SETTINGS, workers)
     assert len(sighted.tracks) == 0 and sighted.counts.received == 0
 
 
@@ -327,8 +318,9 @@ def test_patches_come_to_lie_on_their_surfaces(tmp_path: Path) -> None:
         bearings[keypoints.rows(tracks)[rows]] = bearings_of(towards, world_T_rigs[f])
     keypoints = replace(keypoints, bearings_rig=bearings)
     for _ in range(2):
-        given = landmarks, world_T_rigs, keypoints, 1.0, Greys(frames, 4096), RIG, "align", None
-        found = alignment.align(*given, SETTINGS, Threads(2), normals_rig=normals)
+        solved, observed = _solved(landmarks, world_T_rigs), Observations(keypoints, None, normals)
+        greys, workers = Greys(frames, 4096), Threads(2)
+        found = alignment.align(solved, observed, greys, RIG, SETTINGS, workers)
         own = found.keypoints.rows(found.tracks)
         where, there = found.keypoints.bearings_rig[own], found.tracks.frames
         shown = [_walls(world_T_rigs[f, :3, 3], b) for f, b in zip(there, where, strict=True)]

@@ -18,7 +18,7 @@ from gsba.camera.sphere import bearings_from_erp
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
 from gsba.report.html import add_scan, figures, pictures, residual_sphere, write_html
-from gsba.report.report import build_report
+from gsba.report.report import Findings, StageLog, build_report
 from gsba.store.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseStatus, Reconstruction
 
@@ -46,11 +46,13 @@ def _write(folder: Path, frames: FrameSet, result: Reconstruction) -> tuple[Path
         frames=frames,
         coarse=coarse,
         reconstruction=result,
-        stages=[StageRecord("verify", "key", False, 1.5, 2.5, 300.0)],
-        counts=counts,
-        solver=[{"stage": "chain", "rounds": [ROUND, {**ROUND, "accepted": False}]}],
+        stages=StageLog(
+            [StageRecord("verify", "key", False, 1.5, 2.5, 300.0)],
+            counts,
+            [{"stage": "chain", "rounds": [ROUND, {**ROUND, "accepted": False}]}],
+        ),
         gauge="the world of the trajectory",
-        notes=["a note with <b>markup</b> & </script>"],
+        found=Findings(["a note with <b>markup</b> & </script>"]),
     )
     report["residual_sphere"] = residual_sphere(result)
     path = folder / "report.html"
@@ -268,11 +270,9 @@ def test_several_maps_are_listed_and_the_largest_is_drawn(tmp_path: Path) -> Non
         frames=frames,
         coarse=coarse,
         reconstruction=result,
-        stages=[],
-        counts={},
-        solver=[],
+        stages=StageLog(),
         gauge="",
-        reasons=("", "</script> two surfaces"),
+        found=Findings(reasons=("", "</script> two surfaces")),
     )
     report["residual_sphere"] = residual_sphere(result)
     rows, path = result.largest_map(), tmp_path / "report.html"

@@ -10,7 +10,7 @@ import pytest
 
 from gsba.config import RefineSettings
 from gsba.report.maps import MapSummary, format_outcome, is_partial, summarize_maps
-from gsba.report.report import build_report
+from gsba.report.report import Findings, StageLog, build_report
 from gsba.types import CoarsePoses, PoseStatus, Reconstruction
 
 COMPONENTS = np.array([0, 0, 1, 2, 0, 0, 1, 0, 3], np.int32)  # two maps, and two frames alone
@@ -41,11 +41,9 @@ def _report(tmp_path: Path, result: Reconstruction, reasons: tuple[str, ...] = (
         frames=scene.panoramas(tmp_path),
         coarse=coarse,
         reconstruction=result,
-        stages=[],
-        counts={},
-        solver=[],
+        stages=StageLog(),
         gauge="",
-        reasons=reasons,
+        found=Findings(reasons=reasons),
     )
     return json.loads(json.dumps(report))
 

@@ -11,7 +11,14 @@ import pytest
 from gsba.config import RefineSettings
 from gsba.disk import write_json
 from gsba.geometry import inverse, pose, rotation_from_quaternion
-from gsba.report.report import build_report, frame_quality, median_residual_deg, write_poses
+from gsba.report.report import (
+    Findings,
+    StageLog,
+    build_report,
+    frame_quality,
+    median_residual_deg,
+    write_poses,
+)
 from gsba.store.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
 
@@ -97,10 +104,13 @@ def test_report_is_valid_json(tmp_path: Path) -> None:
         frames=frames,
         coarse=coarse,
         reconstruction=reconstruction,
-        stages=[stage],
-        counts={"verify": [Counts(10, 7, "pairs", {"too few inliers": 3})]},
-        solver=[(_Iteration({"bearing": np.float64(2.0), "priors": np.nan}, 1e-4),)],
+        stages=StageLog(
+            [stage],
+            {"verify": [Counts(10, 7, "pairs", {"too few inliers": 3})]},
+            [(_Iteration({"bearing": np.float64(2.0), "priors": np.nan}, 1e-4),)],
+        ),
         gauge="the world and scale of the trajectory",
+        found=Findings(),
     )
     write_json(tmp_path / "report.json", report)
     text = (tmp_path / "report.json").read_text(encoding="utf-8")

@@ -1,0 +1,133 @@
+"""The state of a run between two stages: a stage takes one, and gives the one after it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsba.bundle import gps_factors
+from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.readout import CameraEstimate
+from gsba.camera.lens import Lenses
+from gsba.config import PriorSettings
+from gsba.loop_closure import connectivity
+from gsba.pipeline.map import Map
+from gsba.pipeline.observed_frames import ObservedFrames
+from gsba.pipeline.prior import Prior
+from gsba.pipeline.run import Run
+from gsba.types import Matches, Solution, VerifiedPairs
+
+
+@dataclass(frozen=True, slots=True)
+class MapMatches:
+    """Keypoint matches that tracks of the map are made of."""
+
+    neighbours: Matches  # of frames next to one another in time
+    known_points: Matches | None = None  # of points of the map, in frames further apart
+    across: Matches | None = None  # of frames of parts of the map that were joined
+    loops: Matches | None = None  # of frames that met the same place again
+
+    def sets(self) -> list[Matches]:
+        """The sets that there are, in the order in which tracks are built."""
+        every = self.neighbours, self.known_points, self.across, self.loops
+        return [matches for matches in every if matches is not None]
+
+    def within(self, parts: np.ndarray) -> "MapMatches":
+        """Matches of neighbours and of known points whose frames are in one part (F,)."""
+        known = self.known_points
+        return replace(
+            self,
+            neighbours=connectivity.within(self.neighbours, parts),
+            known_points=None if known is None else connectivity.within(known, parts),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """All that a stage may read of a run: the inputs, and the results of the stages before it."""
+
+    run: Run  # inputs, settings and the store: no stage changes them
+    prior: Prior  # the trajectory, as far as images confirm it, and the gyro
+    observed: ObservedFrames  # keypoints, as rays of the lenses that features have shown so far
+    map: Map  # poses, points and camera; at the start the poses of the trajectory
+    verified: VerifiedPairs  # neighbours in time with their relative poses
+    matches: MapMatches  # that the map is made of
+
+    @classmethod
+    def begin(cls, run: Run, observed: ObservedFrames) -> "State":
+        """The state before the first match, with the trajectory as it was read as the prior."""
+        prior, none = Prior.of(run.coarse), VerifiedPairs.none()
+        start = Map.of(prior.start(), observed.shown)
+        return cls(run, prior, observed, start, none, MapMatches(none.matches))
+
+    @property
+    def solution(self) -> Solution:
+        """Poses and points of the map."""
+        return self.map.solution
+
+    def start_from(self, prior: Prior) -> "State":
+        """The state with another prior, its map the poses that this prior starts from."""
+        return replace(self, prior=prior, map=Map.of(prior.start(), self.observed.shown))
+
+    def with_verified(self, verified: VerifiedPairs) -> "State":
+        """The state with other matches of neighbours, and none beside these."""
+        return replace(self, verified=verified, matches=MapMatches(verified.matches))
+
+    def without_matches(self) -> "State":
+        """The state with a map that is not built anew: its matches are let go, for their memory."""
+        return self.with_verified(VerifiedPairs.none())
+
+    def with_solution(self, solution: Solution) -> "State":
+        """The state with other poses and points."""
+        return replace(self, map=replace(self.map, solution=solution))
+
+    def with_keypoints(self, observed: ObservedFrames) -> "State":
+        """The state with other keypoints, which the map is to be made of."""
+        map_ = replace(self.map, observed=observed.shown)
+        return replace(self, observed=observed, map=map_)
+
+    def with_camera(self, camera: CameraEstimate) -> "State":
+        """The state with another camera of the map; keypoints stay rays of the lenses before."""
+        return replace(self, map=self.map.with_camera(camera))
+
+    def through(self, lenses: Lenses) -> "State":
+        """The state with its keypoints as rays of these lenses; the map's camera stays."""
+        return replace(self, observed=self.observed.through(lenses))
+
+    def adjustment_context(self) -> AdjustmentContext:
+        """Priors, GPS fixes, families and settings of an adjustment of this map."""
+        run, prior, poses = self.run, self.prior, self.solution.world_T_rigs
+        noise = run.settings.priors
+        anchors, first, ungauged = None, None, None
+        freed = bool(run.families.fixing_gauge.members)
+        fixes = run.evidence.fixes
+        if fixes is not None:
+            first = poses[0]
+            anchors = gps_factors.anchor(poses, fixes, run.settings.gps, prior.parts)
+            freed |= anchors is not None and anchors.holds(0, prior.parts)
+        if freed or anchors is not None:
+            ungauged = prior.graph(noise, poses[0], gauge=not freed)
+        return replace(
+            self.context_of_images(noise, first),
+            anchors=anchors,
+            ungauged=ungauged,
+            families=run.families,
+        )
+
+    def context_of_images(
+        self, noise: PriorSettings, first: np.ndarray | None = None
+    ) -> AdjustmentContext:
+        """The context of an adjustment without GPS fixes and families.
+
+        Args:
+            noise: of the trajectory's steps and poses.
+            first: (4, 4) where to fix the first pose; None = where the start has it.
+        """
+        run, prior = self.run, self.prior
+        return AdjustmentContext(
+            priors=prior.graph(noise, first),
+            rig=run.rig,
+            settings=run.settings if run.frames.timed else run.settings.untimed(),
+            num_threads=run.num_threads,
+            turning=prior.turning,
+            maps=prior.parts,
+        )
