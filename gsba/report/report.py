@@ -101,10 +101,8 @@ def build_report(
     """Content of report.json: plain values only.
 
     Args:
-        settings: settings of the run.
-        frames: its frames.
-        coarse: their initial poses.
-        reconstruction: the result.
+        settings, reconstruction: settings and result of the run.
+        frames, coarse: its frames and their initial poses.
         stages: cost of each stage, in order.
         counts: stage name -> numbers of items that it received, kept and dropped.
         solver: one record for each round, holding its iterations with their cost by family.
