@@ -105,17 +105,14 @@ def export(
     ] = None,
     face_size: Annotated[int | None, typer.Option(help="Width of a cube face in pixels.")] = None,
     images: Images = "auto",
-    up: Annotated[
-        str, typer.Option(help="auto: rotate the world upright; none: keep its rotation.")
-    ] = "none",
+    up: Annotated[str, typer.Option(help="auto: turn the world upright; none: do not.")] = "none",
     scale: Length = None,
     baseline: Millimetres = None,
     between: Between = None,
     gps: Gps = None,
     gps_sigma: GpsSigma = None,
     align: Annotated[
-        str | None,
-        typer.Option(help="True poses: export in their world and unit.", metavar="TRUTH.tum"),
+        str | None, typer.Option(help="True poses: export in their world.", metavar="TRUTH.tum")
     ] = None,
     align_scan: AlignScan = None,
     pairs: Pairs = None,

@@ -53,9 +53,7 @@ def of_camera(
     notes, baseline = [], settings.baseline()
     if not centres.lenses:
         if baseline is not None:
-            notes.append(
-                f"two lenses were not found, so that the baseline gives no scale: {centres.reason}"
-            )
+            notes.append(f"two lenses were not found: no scale by the baseline: {centres.reason}")
         return content, notes
     notes.append(f"the two lenses are {length:.5g} map units apart (sigma {sigma:.1g})")
     if baseline is not None:
