@@ -97,9 +97,9 @@ def test_a_walk_there_and_back_closes_its_loop(walk: RenderedWalk) -> None:
     there = walk.at(order)
     found = _followed(there.frames)
     assert len(found.loops) >= 1 and len(np.unique(found.maps)) == 1
-    positions = there.world_T_rigs[:, :3, 3]
+    positions = found.world_T_rigs[:, :3, 3]
     met = np.linalg.norm(positions[found.loops[:, 0]] - positions[found.loops[:, 1]], axis=1)
-    assert met.max() < 1.0
+    assert met.max() < 1.0  # median distances of what is seen
     assert _ate(found, there.world_T_rigs) < 0.005
     assert "closed" in found.summary()
     assert found.covariances is not None
