@@ -8,13 +8,14 @@ import numpy as np
 from factors._camera_kernels import see_range
 from factors._observations import covisible_pairs
 from factors._terms import pose_rows
+from factors.bearing import tangent_basis
 from factors.block import PoseSystem
-from factors.camera_rows import DIM, CameraRows, CameraVariables, Sightings
+from factors.camera_rows import DIM, CameraRows, CameraVariables, Columns, Sightings
 from factors.elimination import Eliminated
 from factors.robust import RobustLoss
 from factors.threads import balanced_ranges, map_in_threads
 
-_POLISH_TOLERANCE = 1e-6  # of a landmark's cost: further steps gain less than the others do
+_POLISH_TOLERANCE = 1e-8  # of a landmark's cost: further steps gain less than the others do
 _LEAST_HESSIAN = 1e-12  # of a landmark's trace
 _FLATTEST = 0.3  # part of a robust loss's weights that its curvature is taken for, at least
 
@@ -291,3 +292,33 @@ def sightings_of(
     kinds: Sequence[type] = (np.int64, np.int64, float, float, float, float)
     sorted_ = [np.asarray(row)[order].astype(kind) for row, kind in zip(rows, kinds, strict=True)]
     return Sightings(offsets, *sorted_), order
+
+
+def pixels_of(
+    directions: np.ndarray, signs: np.ndarray, calibration: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (O, 3) that raw lenses show directions in, as `Sightings` has them, and how these
+    move, on their tangent_basis, with the pixels (O, 2, 2).
+
+    Args:
+        directions: (O, 3) unit, rig frame.
+        signs: (O,) of the lenses that see them, 1 = front, -1 = back.
+        calibration: (2, 16) the lenses, as in `CameraRows`.
+    """
+    num = len(directions)
+    frames, rows = np.zeros(num, np.int64), np.arange(num)
+    plain = np.zeros((num, 3)), np.tile(np.eye(2), (num, 1, 1)), signs, np.zeros(num)
+    sightings, _ = sightings_of(frames, rows, num, *plain)
+    camera = CameraRows(
+        np.zeros((1, 6)), np.zeros((1, 6)), np.eye(3)[None], np.zeros((1, 3, 2)), np.zeros(3), 0.0,
+        np.zeros(3), np.ascontiguousarray(calibration), np.ones((2, 7)), np.eye(3),
+    )  # fmt: skip
+    pose, residuals = np.array([[*np.eye(3).ravel(), 0, 0, 0]]), np.empty((num, 2))
+    by_direction, nothing = np.empty((num, 2, 3)), np.zeros((0, 2, 0))
+    columns = Columns(-1, -1, -1, 3, -1)
+    see_range(
+        0, num, sightings, camera, columns, np.ascontiguousarray(directions), pose, residuals,
+        by_direction, nothing, nothing,
+    )  # fmt: skip
+    along = by_direction @ np.swapaxes(tangent_basis(directions), 1, 2)
+    return np.column_stack([residuals, np.zeros(num)]), np.linalg.inv(along)

@@ -66,8 +66,8 @@ class CameraVariables:
     motions: Sequence[int] | None = None  # (F,) keys (6,): what frames move beside their velocity
     velocities: np.ndarray | None = None  # (F, 6) per s
     radius: int | None = None  # key (1,): inverse of the stitching radius, 1 / map units
-    radius_per_centre: float = 0.0  # where it is no variable: the inverse radius by the distance of
-    # the lens's centre, 1 / map units^2
+    front_by_radius: float = 0.0  # where it is no variable: the distance of the lens's centre, part
+    # of the stitching radius; 0 = infinity
     lenses: Sequence[int] | None = None  # 5 keys of raw pairs: (3,) relative change of focal length
     # and principal point in parts of the focal length, (4,) of k1 to k4; the same of the back
     # lens, and its turn (3,) rad
@@ -138,11 +138,12 @@ class CameraVariables:
             axes = axes @ Rotation.from_rotvec(turns).as_matrix()
             by_turn = np.ascontiguousarray(-(axes @ _cross(centre) @ _right(turns))[:, :, :2])
         length = float(np.linalg.norm(centre))
-        inverse, by_centre = self.radius_per_centre * length, np.zeros(3)
+        inverse, by_centre = 0.0, np.zeros(3)
         if self.radius is not None:
             inverse = float(vector(values, self.radius)[0])
-        elif inverse:
-            by_centre = self.radius_per_centre * centre / length
+        elif self.front_by_radius:
+            inverse = self.front_by_radius / length
+            by_centre = -inverse * centre / length**2
         given = motions, velocities, axes, by_turn, centre, inverse, by_centre
         return CameraRows(*given, *self._lenses(values))
 

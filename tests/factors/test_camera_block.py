@@ -36,7 +36,7 @@ def _variables(kind: str) -> tuple[CameraVariables, gtsam.Values]:
         given["radius"] = N(0)
         values.insert(N(0), np.array([0.4]))
     if kind == "said radius":
-        given["radius_per_centre"] = 4.0
+        given["front_by_radius"] = 0.03
     if kind in ("readout", "all", "raw"):
         velocities = rng.normal(size=(FRAMES, 6)) * np.repeat([0.3, 1.0], 3)
         given |= {"readout": D(0), "motions": [W(f) for f in frames], "velocities": velocities}
@@ -87,7 +87,7 @@ def _predicted(
         r = lens[0] * np.exp(change[0]) * (theta + (lens[3:7] + radial) @ powers)
         return lens[1:3] + lens[0] * change[1:] + r * np.array([x, y]) / across
     inverse = vector(values, N(0))[0] if camera.radius is not None else 0.0
-    inverse += camera.radius_per_centre * np.linalg.norm(centre)
+    inverse += camera.front_by_radius / np.linalg.norm(centre)
     unit, near = away / np.linalg.norm(away), inverse * origin
     along = near @ unit
     return near + (np.sqrt(1 + along**2 - near @ near) - along) * unit
@@ -277,7 +277,7 @@ def test_optimum_is_that_of_gtsam_on_the_same_factors(kind: str) -> None:
     params.setRelativeErrorTol(1e-12)
     params.setMaxIterations(50)
     reference = gtsam.LevenbergMarquardtOptimizer(whole, start, params).optimize()
-    assert found.cost == pytest.approx(whole.error(reference), rel=1e-8)
+    assert found.cost == pytest.approx(whole.error(reference), rel=1e-7)
     for key in block.keys:
         if key in camera.poses:
             np.testing.assert_allclose(
