@@ -19,6 +19,7 @@ import numpy as np
 from factors.compiled import kernel_and_part
 
 _EPS = 1e-300  # guards divisions by a squared norm
+_LEAST_HESSIAN = 1e-12  # of a landmark's trace
 _BEHIND = 1e-12  # sine of the angle below which no direction leads back to the measured one
 
 _kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
@@ -171,7 +172,7 @@ def _pixel_residual(measured, whitener, lens, away, r, by_away, by_lens):
 
 
 @_part
-def _by_motion(tau, motion, e, moved, by_e, by_d, out):
+def _by_motion(tau, e, moved, by_e, by_d, out):
     """Row (6,) by the motion during the readout from rows by e and by d - s m.
 
     Args:
@@ -185,6 +186,98 @@ def _by_motion(tau, motion, e, moved, by_e, by_d, out):
         out[3 + i] = -tau * by_d[i]
 
 
+@_part
+def _array(values, out):
+    """Components as an array (3,), which is written and given back."""
+    out[0], out[1], out[2] = values
+    return out
+
+
+@_part
+def _scratch():
+    """Arrays that `_see` writes to."""
+    return (
+        np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3),
+        np.empty(3), np.empty((2, 3)), np.zeros((2, 3)), np.empty((2, 3)), np.empty((2, 7)),
+        np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(6),
+    )  # fmt: skip
+
+
+@_part
+def _see(
+    o, sightings, camera, columns, X, pose, scratch, residual, by_point, by_frame, by_shared, asked
+):  # fmt: skip
+    """Residual (2,) of observation o of a point X, and its Jacobian (2, 3) by that.
+
+    Where `asked`, also those by coordinates of the frame (2, K) and of all frames (2, S).
+    """
+    (
+        turn, d, q, e, own, origin, away, by_away, by_n, by_p, by_lens, by_d, by_origin, n, moved,
+        motion_row,
+    ) = scratch  # fmt: skip
+    f, sign, tau = sightings.frames[o], sightings.signs[o], sightings.fractions[o]
+    x, y, z = X[0] - pose[9], X[1] - pose[10], X[2] - pose[11]
+    for i in range(3):
+        d[i] = pose[i] * x + pose[3 + i] * y + pose[6 + i] * z
+    motion = camera.motions[f]
+    for i in range(3):
+        moved[i], q[i] = tau * motion[i], d[i] - tau * motion[3 + i]
+    _set_rotation(moved[0], moved[1], moved[2], turn)
+    _times_transposed(turn, q, e)
+    _times(camera.axes[f], camera.centre, own)
+    for i in range(3):
+        origin[i] = sign * own[i]
+        away[i] = e[i] - origin[i]
+        n[i] = camera.inverse_radius * origin[i]
+    lens, measured, whitener = 0 if sign > 0 else 1, sightings.measured[o], sightings.whiteners[o]
+    if columns.lenses >= 0:
+        _pixel_residual(measured, whitener, camera.lenses[lens], away, residual, by_away, by_lens)
+    else:
+        _stitched_residual(measured, whitener, n, away, residual, by_away, by_n, by_p)
+    for r in range(2):
+        by_e = by_away[r]
+        _times(turn, by_e, by_d)
+        for i in range(3):
+            by_point[r, i] = (
+                pose[3 * i] * by_d[0] + pose[3 * i + 1] * by_d[1] + pose[3 * i + 2] * by_d[2]
+            )
+        if not asked:
+            continue
+        row, shared = by_frame[r], by_shared[r]
+        row[0], row[1], row[2] = _cross(by_d, d)
+        row[3], row[4], row[5] = -by_d[0], -by_d[1], -by_d[2]
+        by_radius = 0.0
+        for i in range(3):
+            by_origin[i] = sign * (camera.inverse_radius * by_n[r, i] - by_e[i])
+            by_radius += by_n[r, i] * origin[i]
+        _times_transposed(camera.axes[f], by_origin, own)
+        for i in range(3):
+            shared[i] = own[i] + by_radius * camera.radius_by_centre[i]
+        if columns.radius >= 0:
+            shared[columns.radius] = by_radius
+        if columns.motion >= 0:
+            _by_motion(tau, e, moved, by_e, by_d, motion_row)
+            slope = 0.0
+            for i in range(6):
+                row[columns.motion + i] = motion_row[i]
+                slope += motion_row[i] * camera.velocities[f, i]
+            shared[columns.readout] = slope
+        if columns.turns >= 0:
+            _times_transposed(camera.by_turn[f], by_origin, own)
+            row[columns.turns], row[columns.turns + 1] = own[0], own[1]
+        if columns.lenses >= 0:
+            start = columns.lenses + 7 * lens
+            for i in range(7):
+                shared[start + i] = by_lens[r, i] * camera.steps[lens, i]
+                shared[columns.lenses + 7 * (1 - lens) + i] = 0.0
+            for i in range(3):
+                shared[columns.lenses + 14 + i] = 0.0
+            if lens == 1:
+                _times_transposed(camera.by_back_turn, _array(_cross(by_e, away), q), own)
+                for i in range(3):
+                    shared[start + 7 + i] = own[i]
+
+
 @_kernel
 def see_range(
     first, last, sightings, camera, columns, points, poses, residuals, by_point, by_frame, by_shared
@@ -194,88 +287,148 @@ def see_range(
     Args:
         sightings, camera, columns: see `factors.camera_rows`.
         points (J, 3), poses (F, 12): as in `factors._kernels`.
-        residuals (O, 2), by_point (O, 2, 3).
-        by_frame (O, 2, K), by_shared (O, 2, S): zeros before; (0, 2, K) = not asked for.
+        residuals (O, 2), by_point (O, 2, 3), by_frame (O, 2, K), by_shared (O, 2, S).
     """
-    turn, q, e = np.empty((3, 3)), np.empty(3), np.empty(3)
-    own, origin, away, n, d = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    by_away, by_n, by_p = np.empty((2, 3)), np.zeros((2, 3)), np.empty((2, 3))
-    by_lens, by_d, by_origin, moved = np.empty((2, 7)), np.empty(3), np.empty(3), np.zeros(3)
-    by_own, motion_row = np.empty(3), np.empty(6)
+    scratch = _scratch()
     for o in range(first, last):
-        at, f, sign = o - first, sightings.frames[o], sightings.signs[o]
-        pose, X, tau = poses[f], points[sightings.points[o]], sightings.fractions[o]
-        x, y, z = X[0] - pose[9], X[1] - pose[10], X[2] - pose[11]
-        for i in range(3):
-            d[i] = pose[i] * x + pose[3 + i] * y + pose[6 + i] * z
-        motion = camera.motions[f]
-        for i in range(3):
-            moved[i], q[i] = tau * motion[i], d[i] - tau * motion[3 + i]
-        _set_rotation(moved[0], moved[1], moved[2], turn)
-        _times_transposed(turn, q, e)
-        _times(camera.axes[f], camera.centre, own)
-        for i in range(3):
-            origin[i] = sign * own[i]
-            away[i] = e[i] - origin[i]
-            n[i] = camera.inverse_radius * origin[i]
-        lens = 0 if sign > 0 else 1
-        if columns.lenses >= 0:
-            _pixel_residual(
-                sightings.measured[o], sightings.whiteners[o], camera.lenses[lens], away,
-                residuals[at], by_away, by_lens,
-            )  # fmt: skip
-        else:
-            measured = sightings.measured[o, 0], sightings.measured[o, 1], sightings.measured[o, 2]
-            _stitched_residual(
-                measured, sightings.whiteners[o], n, away, residuals[at], by_away, by_n, by_p
-            )
-        for r in range(2):
-            by_e = by_away[r]
-            _times(turn, by_e, by_d)
-            for i in range(3):
-                by_point[at, r, i] = (
-                    pose[3 * i] * by_d[0] + pose[3 * i + 1] * by_d[1] + pose[3 * i + 2] * by_d[2]
-                )
-            if len(by_frame) == 0:
-                continue
-            row, shared = by_frame[at, r], by_shared[at, r]
-            row[0], row[1], row[2] = _cross(by_d, d)
-            row[3], row[4], row[5] = -by_d[0], -by_d[1], -by_d[2]
-            by_radius = 0.0
-            for i in range(3):
-                by_origin[i] = sign * (camera.inverse_radius * by_n[r, i] - by_e[i])
-                by_radius += by_n[r, i] * origin[i]
-            _times_transposed(camera.axes[f], by_origin, by_own)
-            for i in range(3):
-                shared[i] = by_own[i] + by_radius * camera.radius_by_centre[i]
-            if columns.radius >= 0:
-                shared[columns.radius] = by_radius
-            if columns.motion >= 0:
-                _by_motion(tau, motion, e, moved, by_e, by_d, motion_row)
-                slope = 0.0
-                for i in range(6):
-                    row[columns.motion + i] = motion_row[i]
-                    slope += motion_row[i] * camera.velocities[f, i]
-                shared[columns.readout] = slope
-            if columns.turns >= 0:
-                for c in range(2):
-                    row[columns.turns + c] = (
-                        by_origin[0] * camera.by_turn[f, 0, c]
-                        + by_origin[1] * camera.by_turn[f, 1, c]
-                        + by_origin[2] * camera.by_turn[f, 2, c]
-                    )
-            if columns.lenses >= 0:
-                start = columns.lenses + 7 * lens
-                for i in range(7):
-                    shared[start + i] = by_lens[r, i] * camera.steps[lens, i]
-                if lens == 1:
-                    _times_transposed(camera.by_back_turn, _array(_cross(by_e, away), own), by_own)
-                    for i in range(3):
-                        shared[start + 7 + i] = by_own[i]
+        at = o - first
+        _see(
+            o, sightings, camera, columns, points[sightings.points[o]], poses[sightings.frames[o]],
+            scratch, residuals[at], by_point[at], by_frame[at], by_shared[at], True,
+        )  # fmt: skip
 
 
 @_part
-def _array(values, out):
-    for i in range(3):
-        out[i] = values[i]
-    return out
+def _rho_and_weight(code, scale, squared):
+    """As `factors._kernels.rho_and_weight`."""
+    c2 = scale * scale
+    if code == 1 and squared > c2:
+        norm = np.sqrt(squared)
+        return scale * (norm - 0.5 * scale), scale / norm
+    if code == 2:
+        return 0.5 * c2 * np.log1p(squared / c2), c2 / (c2 + squared)
+    if code == 3:
+        weight = c2 / (c2 + squared)
+        return 0.5 * squared * weight, weight * weight
+    return 0.5 * squared, 1.0
+
+
+@_part
+def _add_normal(normal, residual, by_point, weight):
+    """Add to a landmark's Hessian (00 01 02 11 12 22) and gradient (3) in `normal (9,)`."""
+    for r in range(2):
+        a, b, c = by_point[r, 0], by_point[r, 1], by_point[r, 2]
+        wa, wb, wc, w = weight * a, weight * b, weight * c, weight * residual[r]
+        normal[0] += wa * a
+        normal[1] += wa * b
+        normal[2] += wa * c
+        normal[3] += wb * b
+        normal[4] += wb * c
+        normal[5] += wc * c
+        normal[6] += w * a
+        normal[7] += w * b
+        normal[8] += w * c
+
+
+@_part
+def _step_of(normal, damping):
+    """Gauss-Newton step of a landmark, negated, damped by part of its Hessian's trace."""
+    eps = (_LEAST_HESSIAN + damping) * (normal[0] + normal[3] + normal[5]) + 1e-200
+    a, b, c, d = normal[0] + eps, normal[1], normal[2], normal[3] + eps
+    l00 = np.sqrt(a)
+    l10, l20 = b / l00, c / l00
+    l11 = np.sqrt(max(d - l10 * l10, eps))
+    l21 = (normal[4] - l10 * l20) / l11
+    l22 = np.sqrt(max(normal[5] + eps - l20 * l20 - l21 * l21, eps))
+    x = normal[6] / l00
+    y = (normal[7] - l10 * x) / l11
+    z = (normal[8] - l20 * x - l21 * y) / (l22 * l22)
+    y = (y - l21 * z) / l11
+    return (x - l10 * y - l20 * z) / l00, y, z
+
+
+@_part
+def _substitute(
+    j, sightings, camera, columns, X, poses, own_steps, shared_steps, loss, scale, scratch, rows,
+    normal, out,
+):  # fmt: skip
+    """Write where landmark j goes with steps of frames (F, K) and of what they share (S,)."""
+    residual, by_point, by_frame, by_shared = rows
+    normal[:] = 0.0
+    for o in range(sightings.offsets[j], sightings.offsets[j + 1]):
+        f = sightings.frames[o]
+        _see(
+            o, sightings, camera, columns, X, poses[f], scratch, residual, by_point, by_frame,
+            by_shared, True,
+        )  # fmt: skip
+        squared = residual[0] * residual[0] + residual[1] * residual[1]
+        weight = _rho_and_weight(loss, scale, squared)[1]
+        for r in range(2):
+            for k in range(own_steps.shape[1]):
+                residual[r] += by_frame[r, k] * own_steps[f, k]
+            for k in range(len(shared_steps)):
+                residual[r] += by_shared[r, k] * shared_steps[k]
+        _add_normal(normal, residual, by_point, weight)
+    x, y, z = _step_of(normal, 0.0)
+    out[0], out[1], out[2] = X[0] - x, X[1] - y, X[2] - z
+
+
+@_kernel
+def polish_range(
+    first, last, sightings, camera, columns, points, poses, old_camera, old_poses, own_steps,
+    shared_steps, substitute, loss, scale, num_steps, tolerance, point_costs, trial_points,
+    trial_costs,
+):  # fmt: skip
+    """Move landmarks first..last to (near) their optimum with a camera and poses.
+
+    With `substitute`, they first take the linear step that goes with steps of what frames have
+    (F, K) and share (S,) from the old camera and poses; where that makes a landmark worse than its
+    old cost, it starts from its old place if that is better. Then up to `num_steps` damped
+    Gauss-Newton steps that never raise the cost, ended where the next would gain less than
+    `tolerance` of it. Writes `trial_points (J, 3)` and `trial_costs (J,)`.
+    """
+    scratch = _scratch()
+    rows = (
+        np.empty(2), np.empty((2, 3)), np.zeros((2, own_steps.shape[1])),
+        np.zeros((2, len(shared_steps))),
+    )  # fmt: skip
+    residual, by_point, by_frame, by_shared = rows
+    normal, trial_normal, here, there = np.empty(9), np.empty(9), np.empty(3), np.empty(3)
+    for j in range(first, last):
+        there[:] = points[j]
+        if substitute:
+            _substitute(
+                j, sightings, old_camera, columns, points[j], old_poses, own_steps, shared_steps,
+                loss, scale, scratch, rows, normal, there,
+            )  # fmt: skip
+        cost, damping, steps, stayed = np.inf, 0.0, 0, not substitute
+        while True:
+            trial = 0.0
+            trial_normal[:] = 0.0
+            for o in range(sightings.offsets[j], sightings.offsets[j + 1]):
+                _see(
+                    o, sightings, camera, columns, there, poses[sightings.frames[o]], scratch,
+                    residual, by_point, by_frame, by_shared, False,
+                )  # fmt: skip
+                squared = residual[0] * residual[0] + residual[1] * residual[1]
+                rho, weight = _rho_and_weight(loss, scale, squared)
+                trial += rho
+                _add_normal(trial_normal, residual, by_point, weight)
+            if trial < cost or cost == np.inf:
+                cost, here, there, normal, trial_normal = trial, there, here, trial_normal, normal
+                damping *= 0.1
+            else:
+                damping = max(1e-3, 10.0 * damping)
+            if not stayed:
+                stayed, damping = True, 0.0
+                if not cost <= point_costs[j]:
+                    there[:] = points[j]
+                    continue
+            x, y, z = _step_of(normal, damping)
+            gain = 0.5 * (x * normal[6] + y * normal[7] + z * normal[8])
+            if steps == num_steps or not gain > tolerance * cost:
+                break
+            steps += 1
+            there[0], there[1], there[2] = here[0] - x, here[1] - y, here[2] - z
+        trial_points[j, 0], trial_points[j, 1], trial_points[j, 2] = here[0], here[1], here[2]
+        trial_costs[j] = cost

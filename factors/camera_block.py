@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from factors._camera_kernels import see_range
+from factors._camera_kernels import polish_range, see_range
 from factors._observations import covisible_pairs
 from factors._terms import pose_rows
 from factors.bearing import tangent_basis
@@ -13,10 +13,9 @@ from factors.block import PoseSystem
 from factors.camera_rows import DIM, CameraRows, CameraVariables, Columns, Sightings
 from factors.elimination import Eliminated
 from factors.robust import RobustLoss
-from factors.threads import balanced_ranges, map_in_threads
+from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 
-_POLISH_TOLERANCE = 1e-8  # of a landmark's cost: further steps gain less than the others do
-_LEAST_HESSIAN = 1e-12  # of a landmark's trace
+_POLISH_TOLERANCE = 1e-6  # of a landmark's cost: further steps gain less than the others do
 _FLATTEST = 0.3  # part of a robust loss's weights that its curvature is taken for, at least
 
 
@@ -38,7 +37,7 @@ class CameraBlock:
         points_world: np.ndarray,
         loss: RobustLoss | None = None,
         num_threads: int = 1,
-        polish_steps: int = 4,
+        polish_steps: int = 3,
     ) -> None:
         """Fix the pattern.
 
@@ -54,13 +53,13 @@ class CameraBlock:
         self.stretch = 1.0  # of the Hessian: see `curvature`
         self._sightings = sightings
         self._points = np.array(points_world, dtype=np.float64).reshape(-1, 3)
-        self._trial: np.ndarray | None = None
+        self._point_costs = np.full(len(self._points), np.inf)
+        self._trial: tuple[np.ndarray, np.ndarray] | None = None
+        self._at: tuple[CameraRows, np.ndarray] | None = None  # where it was linearized
         num, kinds = len(camera.poses), len(camera.of_frames)
         self.keys = [int(key) for frame in zip(*camera.of_frames, strict=True) for key in frame]
         self.keys += [int(key) for key, _ in camera.shared]
-        self._starts, self._columns, _ = covisible_pairs(
-            sightings.offsets, sightings.frames, num
-        )
+        self._starts, self._columns, _ = covisible_pairs(sightings.offsets, sightings.frames, num)
         rows = np.repeat(np.arange(num), np.diff(self._starts))
         self.pairs = _pairs(num, kinds, len(camera.shared), rows, self._columns)
         self._ranges = balanced_ranges(sightings.offsets)
@@ -75,48 +74,57 @@ class CameraBlock:
 
     def linearize(self, values: gtsam.Values) -> PoseSystem:
         """Second-order model at `values`: robust weights, landmarks eliminated."""
-        camera, poses = self.camera.rows(values), pose_rows(values, self.camera.poses)
+        self._at = self.camera.rows(values), pose_rows(values, self.camera.poses)
         own, common = len(self.camera.own_places), len(self.camera.shared_places)
-        sums, cost = Eliminated.zeros(self._starts, self._columns, own, common), 0.0
+        sums, at = Eliminated.zeros(self._starts, self._columns, own, common), self._at
 
-        def weighted(i: int) -> tuple[float, tuple[np.ndarray, ...]]:
-            found = self._see(self._ranges[i], camera, poses, self._points, True)
-            squares = np.einsum("oi,oi->o", found[0], found[0])
+        def weighted(i: int) -> tuple[np.ndarray, ...]:
+            found = self._see(self._ranges[i], *at)
+            squares = np.sum(found[0] ** 2, axis=1)
             roots = np.sqrt(self.loss.weights(squares))
             for part in found:
                 part *= roots.reshape(-1, *[1] * (part.ndim - 1))
-            return float(self.loss.rho(squares).sum()), found
+            return self.loss.rho(squares), *found
 
         parts = map_in_threads(weighted, len(self._ranges), self.num_threads)
-        for (first, last), (more, found) in zip(self._ranges, parts, strict=True):
+        for (first, last), (losses, *found) in zip(self._ranges, parts, strict=True):
             offsets = self._sightings.offsets[first : last + 1]
-            frames = self._sightings.frames[offsets[0] : offsets[-1]]
-            sums.add(offsets - offsets[0], frames, *found)
-            cost += more
-        return self._in_blocks(sums, cost)
+            rows = slice(offsets[0], offsets[-1])
+            sums.add(offsets - offsets[0], self._sightings.frames[rows], *found)
+            owners = self._sightings.points[rows] - first
+            self._point_costs[first:last] = np.bincount(owners, losses, last - first)
+        return self._in_blocks(sums, float(self._point_costs.sum()))
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
-        """Robust cost at `values`, landmarks moved along."""
-        self._trial, cost = self._polished(values, self.polish_steps, _POLISH_TOLERANCE)
-        return cost
+        """Robust cost at `values`, `steps` from the linearization, landmarks moved along."""
+        if self._at is None:
+            raise RuntimeError("propose() needs linearize() before it")
+        self._trial = self._moved(values, steps, self.polish_steps, _POLISH_TOLERANCE)
+        return float(self._trial[1].sum())
 
     def accept(self) -> None:
         """Keep the landmarks of the last proposal."""
         if self._trial is not None:
-            self._points, self._trial = self._trial, None
+            (self._points, self._point_costs), self._trial = self._trial, None
 
     def polish(self, values: gtsam.Values, num_steps: int = 50) -> float:
         """Move the landmarks to their optimum at fixed values; returns the robust cost."""
-        self._points, cost = self._polished(values, num_steps, 1e-12)
-        return cost
+        self._points, self._point_costs = self._moved(values, None, num_steps, 1e-12)
+        return float(self._point_costs.sum())
+
+    def jacobians(self, values: gtsam.Values) -> tuple[np.ndarray, ...]:
+        """Whitened residuals (O, 2) and Jacobians (O, 2, ...) by the landmark (3), by coordinates
+        of the frame's variables (K) and of the shared ones (S)."""
+        camera, poses = self.camera.rows(values), pose_rows(values, self.camera.poses)
+        return self._see((0, len(self._points)), camera, poses)
 
     def residuals(self, values: gtsam.Values) -> np.ndarray:
         """Whitened residuals (O, 2) at the current landmarks, robust weights left out."""
-        return self._seen(values, self._points)[0]
+        return self.jacobians(values)[0]
 
     def costs(self, values: gtsam.Values) -> dict[str, float]:
         """Robust cost at the current landmarks."""
-        return {"bearing": self._cost(self.residuals(values))}
+        return {"bearing": float(self._moved(values, None, 0, 0.0)[1].sum())}
 
     def curvature(self, values: gtsam.Values) -> float:
         """Curvature of the robust loss, part of its weights: steps by these fall as short."""
@@ -126,94 +134,48 @@ class CameraBlock:
         bent = (self.loss.weights(squares * (1 + step)) - weights) / step
         return max(1 + float(bent.sum()) / max(float(weights.sum()), 1e-300), _FLATTEST)
 
-    def jacobians(self, values: gtsam.Values) -> tuple[np.ndarray, ...]:
-        """Whitened residuals (O, 2) and Jacobians (O, 2, ...) by the landmark (3), by coordinates
-        of the frame's variables (K) and of the shared ones (S)."""
-        camera, poses = self.camera.rows(values), pose_rows(values, self.camera.poses)
-        return self._see((0, len(self._points)), camera, poses, self._points, True)
-
     def _see(
-        self,
-        landmarks: tuple[int, int],
-        camera: CameraRows,
-        poses: np.ndarray,
-        points: np.ndarray,
-        with_camera: bool,
+        self, landmarks: tuple[int, int], camera: CameraRows, poses: np.ndarray
     ) -> tuple[np.ndarray, ...]:
         """Residuals and Jacobians, as `jacobians`, of a run of landmarks."""
         first, last = self._sightings.offsets[list(landmarks)]
-        num = last - first
-        asked, own = num if with_camera else 0, len(self.camera.own_places)
+        num, own = last - first, len(self.camera.own_places)
         residuals, by_point = np.empty((num, 2)), np.empty((num, 2, 3))
-        by_frame = np.zeros((asked, 2, own))
-        by_shared = np.zeros((asked, 2, len(self.camera.shared_places)))
+        by_frame = np.empty((num, 2, own))
+        by_shared = np.empty((num, 2, len(self.camera.shared_places)))
         see_range(
-            first, last, self._sightings, camera, self.camera.columns, points, poses, residuals,
-            by_point, by_frame, by_shared,
+            first, last, self._sightings, camera, self.camera.columns, self._points, poses,
+            residuals, by_point, by_frame, by_shared,
         )  # fmt: skip
         return residuals, by_point, by_frame, by_shared
 
-    def _seen(self, values: gtsam.Values, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (O, 2) and Jacobians (O, 2, 3) by the landmarks."""
-        camera, poses = self.camera.rows(values), pose_rows(values, self.camera.poses)
-
-        def work(i: int) -> tuple[np.ndarray, ...]:
-            return self._see(self._ranges[i], camera, poses, points, False)[:2]
-
-        parts = map_in_threads(work, len(self._ranges), self.num_threads)
-        residuals, by_point = zip(*parts, strict=True)
-        return np.concatenate(residuals), np.concatenate(by_point)
-
-    def _polished(
-        self, values: gtsam.Values, num_steps: int, tolerance: float
-    ) -> tuple[np.ndarray, float]:
-        """Landmarks after damped Gauss-Newton steps that never raise their costs, and the cost."""
-        points = self._points
-        residuals, by_point = self._seen(values, points)
-        costs, damping = self._point_costs(residuals), np.zeros(len(points))
-        for _ in range(num_steps):
-            steps, gains = self._point_steps(residuals, by_point, damping)
-            open_ = gains > tolerance * costs
-            if not open_.any():
-                break
-            trial = points + np.where(open_[:, None], steps, 0.0)
-            at_trial, by_trial = self._seen(values, trial)
-            after = self._point_costs(at_trial)
-            better = open_ & (after < costs)
-            points = np.where(better[:, None], trial, points)
-            costs = np.where(better, after, costs)
-            damping = np.where(better, 0.1 * damping, np.maximum(1e-3, 10 * damping))
-            taken = better[self._sightings.points]
-            residuals = np.where(taken[:, None], at_trial, residuals)
-            by_point = np.where(taken[:, None, None], by_trial, by_point)
-        return points, float(costs.sum())
-
-    def _point_steps(
-        self, residuals: np.ndarray, by_point: np.ndarray, damping: np.ndarray
+    def _moved(
+        self, values: gtsam.Values, steps: np.ndarray | None, num_steps: int, tolerance: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Steps (J, 3) of landmarks, damped by their traces, and the decreases they promise."""
-        weights = self.loss.weights(np.einsum("oi,oi->o", residuals, residuals))
-        weighted = weights[:, None, None] * by_point
-        hessians = self._summed(np.einsum("oij,oik->ojk", weighted, by_point))
-        gradients = self._summed(np.einsum("oij,oi->oj", weighted, residuals))
-        traces = np.einsum("jii->j", hessians)
-        hessians += ((_LEAST_HESSIAN + damping) * traces + 1e-200)[:, None, None] * np.eye(3)
-        steps = -np.linalg.solve(hessians, gradients[:, :, None])[:, :, 0]
-        return steps, -0.5 * np.einsum("ji,ji->j", steps, gradients)
+        """Landmarks (J, 3) at their best with `values`, and their costs (J,)."""
+        camera, poses = self.camera.rows(values), pose_rows(values, self.camera.poses)
+        points, costs = np.empty_like(self._points), np.empty(len(self._points))
+        own, shared = self._steps_of(steps)
+        old = (camera, poses) if self._at is None else self._at
 
-    def _summed(self, rows: np.ndarray) -> np.ndarray:
-        """Sums of what observations (O, ...) say, by landmark (J, ...)."""
-        out, offsets = np.zeros((len(self._points), *rows.shape[1:])), self._sightings.offsets
-        seen = np.flatnonzero(np.diff(offsets))
-        if len(seen):
-            out[seen] = np.add.reduceat(rows, offsets[seen], axis=0)
-        return out
+        def work(i: int) -> None:
+            polish_range(
+                *self._ranges[i], self._sightings, camera, self.camera.columns, self._points,
+                poses, *old, own, shared, steps is not None, self.loss.code,
+                float(self.loss.scale), num_steps, tolerance, self._point_costs, points, costs,
+            )  # fmt: skip
 
-    def _point_costs(self, residuals: np.ndarray) -> np.ndarray:
-        return self._summed(self.loss.rho(np.einsum("oi,oi->o", residuals, residuals)))
+        run_in_threads(work, len(self._ranges), self.num_threads)
+        return points, costs
 
-    def _cost(self, residuals: np.ndarray) -> float:
-        return float(self._point_costs(residuals).sum())
+    def _steps_of(self, steps: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Steps (F, K) of what frames have and (S,) of what they share, of those of all keys."""
+        places, common = self.camera.own_places, self.camera.shared_places
+        num, kinds = len(self.camera.poses), len(self.camera.of_frames)
+        if steps is None:
+            return np.zeros((num, len(places))), np.zeros(len(common))
+        own = steps[: num * kinds].reshape(num, DIM * kinds)[:, places]
+        return np.ascontiguousarray(own), steps[num * kinds :].ravel()[common]
 
     def _in_blocks(self, sums: Eliminated, cost: float) -> PoseSystem:
         """The sums as 6x6 blocks of all keys."""
@@ -310,15 +272,15 @@ def pixels_of(
     plain = np.zeros((num, 3)), np.tile(np.eye(2), (num, 1, 1)), signs, np.zeros(num)
     sightings, _ = sightings_of(frames, rows, num, *plain)
     camera = CameraRows(
-        np.zeros((1, 6)), np.zeros((1, 6)), np.eye(3)[None], np.zeros((1, 3, 2)), np.zeros(3), 0.0,
+        np.zeros((1, 6)), np.zeros((1, 6)), np.eye(3)[None], np.zeros((1, 3, 3)), np.zeros(3), 0.0,
         np.zeros(3), np.ascontiguousarray(calibration), np.ones((2, 7)), np.eye(3),
     )  # fmt: skip
     pose, residuals = np.array([[*np.eye(3).ravel(), 0, 0, 0]]), np.empty((num, 2))
-    by_direction, nothing = np.empty((num, 2, 3)), np.zeros((0, 2, 0))
+    by_direction, unused = np.empty((num, 2, 3)), np.empty((num, 2, 20))
     columns = Columns(-1, -1, -1, 3, -1)
     see_range(
         0, num, sightings, camera, columns, np.ascontiguousarray(directions), pose, residuals,
-        by_direction, nothing, nothing,
+        by_direction, unused, unused,
     )  # fmt: skip
     along = by_direction @ np.swapaxes(tangent_basis(directions), 1, 2)
     return np.column_stack([residuals, np.zeros(num)]), np.linalg.inv(along)

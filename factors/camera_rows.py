@@ -34,7 +34,7 @@ class CameraRows(NamedTuple):
     motions: np.ndarray  # (F, 6): of each frame during its readout, [rotation rad, translation]
     velocities: np.ndarray  # (F, 6): their derivative by the readout's duration
     axes: np.ndarray  # (F, 3, 3): rig_R_lenses
-    by_turn: np.ndarray  # (F, 3, 2): derivative of axes @ centre by the frame's turn
+    by_turn: np.ndarray  # (F, 3, 3): derivative of axes @ centre by the frame's turn
     centre: np.ndarray  # (3,) of the front lens, lenses' frame, map units
     inverse_radius: float  # of the stitching, 1 / map units
     radius_by_centre: np.ndarray  # (3,) its derivative by the centre, where it goes with that
@@ -129,14 +129,14 @@ class CameraVariables:
             velocities = np.ascontiguousarray(self.velocities, dtype=np.float64)
             motions = np.array([vector(values, key) for key in self.motions])
             motions += vector(values, self.readout)[0] * velocities
-        axes, by_turn = np.tile(np.eye(3), (num, 1, 1)), np.zeros((num, 3, 2))
+        axes, by_turn = np.tile(np.eye(3), (num, 1, 1)), np.zeros((num, 3, 3))
         if self.axes is not None:
             axes = np.ascontiguousarray(self.axes, dtype=np.float64)
         if self.turns is not None:
             turns = np.zeros((num, 3))
             turns[:, :2] = [vector(values, key) for key in self.turns]
             axes = axes @ Rotation.from_rotvec(turns).as_matrix()
-            by_turn = np.ascontiguousarray(-(axes @ _cross(centre) @ _right(turns))[:, :, :2])
+            by_turn = np.ascontiguousarray(-(axes @ _cross(centre) @ _right(turns)))
         length = float(np.linalg.norm(centre))
         inverse, by_centre = 0.0, np.zeros(3)
         if self.radius is not None:

@@ -38,9 +38,7 @@ class Eliminated:
     cost: float = 0.0  # half the squares that no landmark takes up
 
     @classmethod
-    def zeros(
-        cls, starts: np.ndarray, columns: np.ndarray, own: int, common: int
-    ) -> "Eliminated":
+    def zeros(cls, starts: np.ndarray, columns: np.ndarray, own: int, common: int) -> "Eliminated":
         """Nothing added yet, of `own` variables of each frame and `common` ones of all."""
         num, pairs = len(starts) - 1, len(columns)
         sums = np.zeros((num, own, own)), np.zeros((pairs, own, own)), np.zeros((num, own, common))

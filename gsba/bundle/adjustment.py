@@ -302,9 +302,7 @@ def _placed(
 ) -> Landmarks:
     """Points of tracks within a gate, in the keypoints' own standard deviations."""
     settings = problem.settings.triangulate
-    return triangulation.place(
-        tracks, keypoints, world_T_rigs, gate, settings, problem.num_threads
-    )
+    return triangulation.place(tracks, keypoints, world_T_rigs, gate, settings, problem.num_threads)
 
 
 def _solver(settings: RefineSettings, last: bool) -> SolverSettings:

@@ -14,7 +14,7 @@ from factors.quadratic_block import QuadraticBlock
 from factors.reduced_camera_system import ReducedSystem
 from gsba.bundle import readout
 from gsba.bundle.adjustment import DRAWS, AdjustmentContext
-from gsba.bundle.camera_variables import OF_LENSES, CameraUnknowns, C, D, N, W
+from gsba.bundle.camera_variables import OF_LENSES, C, CameraUnknowns, D, N, W
 from gsba.bundle.optimizer import marginal_covariances
 from gsba.bundle.readout import CameraEstimate
 from gsba.types import JointErrors, Keypoints, Solution

@@ -1,7 +1,6 @@
 """The camera's unknowns as variables of the graph: their keys, start values, priors, and the block
 of the observations that they act on."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -15,8 +14,8 @@ from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.prior_factors import X
 from gsba.bundle.readout import CameraEstimate
 from gsba.camera.fisheye import Pair, rotation_of
-from gsba.camera.lens import Lenses, facing
-from gsba.types import Keypoints, Landmarks, Solution
+from gsba.camera.lens import facing
+from gsba.types import Keypoints, Landmarks
 
 A = gtsam.symbol_shorthand.A  # turn (2,) rad of a frame's lenses, about x and y of their frame
 B = gtsam.symbol_shorthand.B  # turn (3,) rad of the back lens of raw pairs in the rig
@@ -229,8 +228,5 @@ def _add(
 def _rows(pair: Pair) -> np.ndarray:
     """Lenses as `factors.camera_rows` has them (2, 16)."""
     return np.array(
-        [
-            [lens.focal, *lens.principal, *lens.radial, *rotation_of(lens).ravel()]
-            for lens in pair
-        ]
+        [[lens.focal, *lens.principal, *lens.radial, *rotation_of(lens).ravel()] for lens in pair]
     )

@@ -21,6 +21,7 @@ from gsba.bundle import (
     triangulation,
 )
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.camera_adjustment import solve_with_camera
 from gsba.bundle.camera_system import CameraCovariances, CameraSystem
 from gsba.bundle.gauge import Gauge
 from gsba.bundle.lens_axes import LensAxes
@@ -220,15 +221,18 @@ def settle_camera(
     matches: Sequence[Matches],
     solved: Solution,
     camera: CameraEstimate,
-) -> CameraEstimate:
-    """The camera that was found, from the same, and each frame's own motion and axes."""
+) -> tuple[Solution, CameraEstimate]:
+    """The map of the same matches, solved with all that was taken of the camera."""
+    rounds = run.settings.rounds
+    gates = rounds.gate_scale, *rounds.dense  # a camera that is off throws observations off
 
-    def found(wide: Solution) -> CameraEstimate:
-        shown, times = seen.shown.bearings_rig, run.frames.timestamps
-        problem = run.problem(prior, wide)
-        return CameraSystem(wide, seen.keypoints, shown, camera, times, problem).step()
+    def compute() -> tuple[Solution, CameraEstimate]:
+        found, problem = _tracks(seen, prior, matches), run.problem(prior, solved)
+        given = found, seen.shown, camera, run.frames.timestamps, solved, problem, gates
+        return solve_with_camera(*given, final=False)
 
-    return _of_matches(run, seen, prior, name, matches, solved, found, CameraEstimate)
+    key = [camera_key(run), gates]
+    return run.stage(name, key, compute, tuple[Solution, CameraEstimate])
 
 
 def _under_lenses(
@@ -435,15 +439,9 @@ def measure_camera(run: Run, prior: Prior, world: Map) -> Map:
 
     def compute() -> CameraCovariances:
         straight = stitching.corrected(world.observed, world.field, run.rig)
-        system = CameraSystem(
-            world.solution,
-            world.lenses.seen(straight),
-            straight.bearings_rig,
-            world.camera(),
-            run.frames.timestamps,
-            run.problem(prior, world.solution),
-        )
-        return system.covariances(prior.parts)
+        solved, times = world.solution, run.frames.timestamps
+        given = solved, straight, world.camera(), times, run.problem(prior, solved)
+        return CameraSystem(*given).covariances(prior.parts)
 
     found = run.stage("camera", camera_key(run), compute, CameraCovariances, noted=False)
     centres = replace(world.centres, covariance=found.centre)

@@ -3,8 +3,6 @@
 import logging
 from dataclasses import replace
 
-import numpy as np
-
 from gsba.bundle import (
     adjustment,
     lens_axes,
@@ -14,7 +12,7 @@ from gsba.bundle import (
     stitching,
     triangulation,
 )
-from gsba.bundle.camera_system import CameraSystem
+from gsba.bundle.camera_adjustment import solve_sighted_with_camera
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.self_calibration import SelfCalibration
@@ -28,10 +26,6 @@ from gsba.types import Keypoints, Sighted, Solution
 
 logger = logging.getLogger(__name__)
 
-_CAMERA_ROUNDS = 3  # of what aligned patches say of the camera, and the adjustment under it
-_CAMERA_SETTLES = 2  # rounds of aligning after which it needs but one adjustment in each
-_CALIBRATIONS = 10  # the same of raw lenses, at most
-_CALIBRATED = np.deg2rad(0.001)  # change of what their pixels show that is no more worth another
 _SETTLED = 1.0  # standard deviations of steps: poses that a round moves by less are left there
 
 
@@ -69,15 +63,15 @@ def _adjust_under_lenses(
     name = f"aligned{number}"
     if not world.lenses:
         return _adjust_aligned(run, prior, world, sighted, name)
-    for n in range(_CALIBRATIONS):
+    for n in range(2):
         prior = backend.align_imu(run, prior, world.solution, f"imu_{name}_{n}", with_noise=False)
-        seen = _see_anew(run, prior, world, sighted, name, n)
-        better = _adjust_aligned(run, prior, seen, sighted, f"{name}_{n}" if n else name)
+        seen = _take_parts(run, prior, world, sighted, name, n)
+        if n and seen.lenses.parts == world.lenses.parts:
+            return seen
+        better = _adjust_with_camera(run, prior, seen, sighted, f"{name}_{n}" if n else name)
         if better is None:
             return world if n else None
-        done, world = self_calibration.apart(world.lenses, better.lenses) < _CALIBRATED, better
-        if n + 1 >= (_CAMERA_ROUNDS if number <= _CAMERA_SETTLES else 1) and done:
-            break
+        world = better
     return world
 
 
@@ -105,8 +99,11 @@ def _align(run: Run, world: Map, name: str) -> Sighted:
     return run.stage(name, settings.model_dump(exclude={"rounds"}), compute, Sighted)
 
 
-def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, number: int) -> Map:
-    """The map with the camera that aligned patches ask for; its poses are yet to follow."""
+def _take_parts(
+    run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, number: int
+) -> Map:
+    """The map with the parts of a camera that aligned patches turn out to show: how rows are read,
+    then, once that was solved for, raw lenses and axes. Poses are yet to follow."""
 
     def placed_anew() -> tuple[Solution, Keypoints]:
         there = replace(sighted, keypoints=world.rays(sighted.keypoints, run.rig))
@@ -134,11 +131,6 @@ def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, n
         around, problem = solved.landmarks, run.problem(prior, solved)
         return readout.estimate(around, keypoints, shown, solved, world.lenses, times, problem)
 
-    def settle() -> CameraEstimate:
-        solved, keypoints = placed_anew()
-        problem = run.problem(prior, solved)
-        return CameraSystem(solved, keypoints, shown, world.camera(), times, problem).step()
-
     def lenses() -> SelfCalibration:
         solved, keypoints = placed_anew()
         around, problem = solved.landmarks, run.problem(prior, solved)
@@ -156,9 +148,27 @@ def _see_anew(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str, n
     if number == 1 and not run.frames.lens_axes_known and world.lenses.axes is None:
         found = run.stage(f"axes_{name}", key, axes, LensAxes)
         world = replace(world, axes=found).with_camera(replace(world.camera(), lenses=found.lenses))
-    return world.with_camera(
-        run.stage(f"camera_{name}_{number}", key, settle, CameraEstimate, noted=False)
-    )
+    return world
+
+
+def _adjust_with_camera(
+    run: Run, prior: Prior, world: Map, sighted: Sighted, name: str
+) -> Map | None:
+    """Aligned observations solved for poses and camera; None where that explains less."""
+    gates = run.settings.rounds.aligned
+
+    def compute() -> tuple[Solution, Keypoints, CameraEstimate]:
+        shown = stitching.corrected(sighted.keypoints, world.field, run.rig)
+        there, before = replace(sighted, keypoints=shown), world.solution
+        problem, times = run.problem(prior, before), run.frames.timestamps
+        given = there, world.camera(), times, before, problem, gates
+        solved, found, camera = solve_sighted_with_camera(*given)
+        return solved, stitching.with_noise_of(sighted.keypoints, found), camera
+
+    key, returns = [*backend.camera_key(run), gates], tuple[Solution, Keypoints, CameraEstimate]
+    solved, keypoints, camera = run.stage(name, key, compute, returns)
+    better = _carried(run, world, sighted, solved, keypoints)
+    return None if better is None else better.with_camera(camera)
 
 
 def _adjust_aligned(run: Run, prior: Prior, world: Map, sighted: Sighted, name: str) -> Map | None:
@@ -173,6 +183,13 @@ def _adjust_aligned(run: Run, prior: Prior, world: Map, sighted: Sighted, name: 
 
     key = [run.solving_key(), gates]
     solved, keypoints = run.stage(name, key, compute, tuple[Solution, Keypoints])
+    return _carried(run, world, sighted, solved, keypoints)
+
+
+def _carried(
+    run: Run, world: Map, sighted: Sighted, solved: Solution, keypoints: Keypoints
+) -> Map | None:
+    """The map of aligned observations; None where that explains less."""
     if not solved.carries(world.solution, run.settings.rounds.min_observations):
         return None
     shown = {"aligned": sighted.aligned, "normals_rig": sighted.normals_rig}

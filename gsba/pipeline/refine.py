@@ -56,7 +56,6 @@ _PASSES = 3  # over raw pairs, from the pictures
 _RECUT = np.deg2rad(0.03)  # change of what their pixels show that is worth another
 _CALIBRATIONS = 4  # of raw lenses, and the map matched anew under them, at most
 _CALIBRATED = np.deg2rad(0.01)  # change of what pixels show that is no more worth another
-_CAMERA_ROUNDS = 2  # of all that is to know of it, and the adjustment under it
 
 __all__ = ["RunResult", "refine", "solve"]
 
@@ -433,15 +432,17 @@ def _find_raw_camera(
         run, looking, prior, "calibrated", matches, world.solution
     )
     world = replace(world, calibrated=known)
-    for n in range(0 if known.reason else _CALIBRATIONS):
-        world = world.with_camera(replace(world.camera(), lenses=known.lenses)) if n == 0 else world
-        looking, better = seen.through(world.lenses), world.solution
-        better = backend.adjust(run, looking, prior, f"recalibrated{n}", matches, better, gates)
-        along = frontend.match_along_epipolars(run, looking, better, f"adjacent_raw{n}")
-        wide = frontend.match_known_points(run, looking, better, f"wide_raw{n}")
-        world, matches = replace(world, solution=better), [along, wide]
-        before = world.lenses
-        looking, world = _settle_camera(run, looking, prior, matches, world, f"calibrated{n}")
+    if known.reason:
+        return looking, world
+    world = world.with_camera(replace(world.camera(), lenses=known.lenses))
+    looking = seen.through(world.lenses)
+    looking, world = _settle_camera(run, looking, prior, matches, world, "recalibrated")
+    for n in range(_CALIBRATIONS):
+        before, solved = world.lenses, world.solution
+        along = frontend.match_along_epipolars(run, looking, solved, f"adjacent_raw{n}")
+        wide = frontend.match_known_points(run, looking, solved, f"wide_raw{n}")
+        matches, name = [along, wide], f"calibrated{n}"
+        looking, world = _settle_camera(run, looking, prior, matches, world, name)
         if self_calibration.apart(before, world.lenses) < _CALIBRATED:
             break
     return looking, world
@@ -456,16 +457,12 @@ def _settle_camera(
     name: str,
 ) -> tuple[ObservedFrames, Map]:
     """All that is known of the camera found together, how rows are read first."""
-    gates, solved, read = run.settings.rounds.dense, world.solution, world.camera()
+    solved, read = world.solution, world.camera()
     if read.lenses.readout_motion is None:
         read = backend.find_readout(run, looking, prior, f"{name}_readout", matches, solved)
-    for n in range(_CAMERA_ROUNDS):
-        looking = looking.through(read.lenses)
-        key = f"{name}_camera{n}"
-        read = backend.settle_camera(run, looking, prior, key, matches, solved, read)
-        looking = looking.through(read.lenses)
-        solved = backend.adjust(run, looking, prior, f"{name}{n}", matches, solved, gates)
-    return looking, replace(world, solution=solved).with_camera(read)
+    looking = looking.through(read.lenses)
+    solved, read = backend.settle_camera(run, looking, prior, name, matches, solved, read)
+    return looking.through(read.lenses), replace(world, solution=solved).with_camera(read)
 
 
 def _look_closer(

@@ -1,10 +1,8 @@
 """The way lenses look: the panorama's own, or one that turns below a stabilised panorama."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from lens_world import placed, problem_of, seen_through, solved_under, solved_with, times
+from lens_world import placed, problem_of, seen_through, solved_under, solved_with
 from scipy.spatial.transform import Rotation
 from synthetic import loop_walk
 

@@ -1,7 +1,5 @@
 """What raw lenses are, found from a map: with their centre, and only where it predicts."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from lens_world import placed, problem_of, seen_through, solved_under, solved_with, times
