@@ -38,6 +38,7 @@ class CameraBlock:
         loss: RobustLoss | None = None,
         num_threads: int = 1,
         polish_steps: int = 3,
+        curved: bool = False,
     ) -> None:
         """Fix the pattern.
 
@@ -47,10 +48,12 @@ class CameraBlock:
             points_world: (J, 3) start values, world.
             loss: robust loss on each whitened residual norm; None is plain least squares.
             polish_steps: Gauss-Newton steps on the landmarks after each proposed step.
+            curved: scale the Hessian by the mean curvature of the loss, part of its weights: steps
+                by these alone fall as short.
         """
         self.camera, self.loss = camera, loss or RobustLoss()
         self.num_threads, self.polish_steps = num_threads, polish_steps
-        self.stretch = 1.0  # of the Hessian: see `curvature`
+        self.curved = curved
         self._sightings = sightings
         self._points = np.array(points_world, dtype=np.float64).reshape(-1, 3)
         self._point_costs = np.full(len(self._points), np.inf)
@@ -78,22 +81,28 @@ class CameraBlock:
         own, common = len(self.camera.own_places), len(self.camera.shared_places)
         sums, at = Eliminated.zeros(self._starts, self._columns, own, common), self._at
 
+        weights, bent = 0.0, 0.0
+
         def weighted(i: int) -> tuple[np.ndarray, ...]:
             found = self._see(self._ranges[i], *at)
             squares = np.sum(found[0] ** 2, axis=1)
             roots = np.sqrt(self.loss.weights(squares))
             for part in found:
                 part *= roots.reshape(-1, *[1] * (part.ndim - 1))
-            return self.loss.rho(squares), *found
+            return squares, *found
 
         parts = map_in_threads(weighted, len(self._ranges), self.num_threads)
-        for (first, last), (losses, *found) in zip(self._ranges, parts, strict=True):
+        for (first, last), (squares, *found) in zip(self._ranges, parts, strict=True):
             offsets = self._sightings.offsets[first : last + 1]
             rows = slice(offsets[0], offsets[-1])
             sums.add(offsets - offsets[0], self._sightings.frames[rows], *found)
             owners = self._sightings.points[rows] - first
+            losses, curvatures = self.loss.rho(squares), self.loss.curvatures(squares)
             self._point_costs[first:last] = np.bincount(owners, losses, last - first)
-        return self._in_blocks(sums, float(self._point_costs.sum()))
+            weights += float(self.loss.weights(squares).sum())
+            bent += float(curvatures.sum())
+        stretch = max(bent / max(weights, 1e-300), _FLATTEST) if self.curved else 1.0
+        return self._in_blocks(sums, stretch, float(self._point_costs.sum()))
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Robust cost at `values`, `steps` from the linearization, landmarks moved along."""
@@ -125,14 +134,6 @@ class CameraBlock:
     def costs(self, values: gtsam.Values) -> dict[str, float]:
         """Robust cost at the current landmarks."""
         return {"bearing": float(self._moved(values, None, 0, 0.0)[1].sum())}
-
-    def curvature(self, values: gtsam.Values) -> float:
-        """Curvature of the robust loss, part of its weights: steps by these fall as short."""
-        squares = np.sum(self.residuals(values) ** 2, axis=1)
-        weights = self.loss.weights(squares)
-        step = 1e-4  # of a squared residual; the loss bends by its derivative
-        bent = (self.loss.weights(squares * (1 + step)) - weights) / step
-        return max(1 + float(bent.sum()) / max(float(weights.sum()), 1e-300), _FLATTEST)
 
     def _see(
         self, landmarks: tuple[int, int], camera: CameraRows, poses: np.ndarray
@@ -177,8 +178,8 @@ class CameraBlock:
         own = steps[: num * kinds].reshape(num, DIM * kinds)[:, places]
         return np.ascontiguousarray(own), steps[num * kinds :].ravel()[common]
 
-    def _in_blocks(self, sums: Eliminated, cost: float) -> PoseSystem:
-        """The sums as 6x6 blocks of all keys."""
+    def _in_blocks(self, sums: Eliminated, stretch: float, cost: float) -> PoseSystem:
+        """The sums, their Hessian stretched, as 6x6 blocks of all keys."""
         own, common = self.camera.own_places, self.camera.shared_places
         num, kinds, shared = len(sums.gradient), len(self.camera.of_frames), len(self.camera.shared)
         among = _spread(sums.diagonal, own, own, kinds, kinds)
@@ -199,7 +200,7 @@ class CameraBlock:
         whole = np.concatenate([gradient.ravel(), rest]).reshape(-1, DIM)
         diagonal, off_diagonal = np.concatenate([of_frames, of_all]), np.concatenate(off)
         costs = {"bearing": cost}
-        return PoseSystem(self.stretch * diagonal, self.stretch * off_diagonal, whole, costs)
+        return PoseSystem(stretch * diagonal, stretch * off_diagonal, whole, costs)
 
 
 def _pairs(num: int, kinds: int, shared: int, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:

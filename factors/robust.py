@@ -60,3 +60,10 @@ class RobustLoss:
             return np.ones_like(squared, dtype=np.float64)
         weights = c2 / (c2 + squared)
         return weights if self.kind == "cauchy" else weights**2
+
+    def curvatures(self, squared: np.ndarray) -> np.ndarray:
+        """Second derivatives (N,) of the loss along residuals, 2 rho'(s) + 4 s rho''(s), by how
+        residuals spread in the plane: halfway to the weights, which are those across."""
+        step = 1e-4  # of a squared residual; the loss bends by its derivative
+        weights = self.weights(squared)
+        return weights + (self.weights(squared * (1 + step)) - weights) / step

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from gsba.bundle import prior_factors
 from gsba.bundle.adjustment import (
     AdjustmentContext,
     Terms,
@@ -17,6 +18,9 @@ from gsba.bundle.camera_variables import CameraUnknowns
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.stitching import with_noise_of
 from gsba.types import Keypoints, Sighted, Solution, Tracks
+
+_SCALE_SIGMA = 1e-3  # of each map's extent, where nothing knows it: else frames' own motion, which
+# is drawn to none, would shrink the map
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +54,10 @@ class CameraView:
         terms.values.insert(unknowns.values)
         graph = gtsam.NonlinearFactorGraph(terms.graph)
         graph.push_back(unknowns.graph)
-        block = unknowns.block(solved.landmarks, self.shown, noise)
+        if problem.ungauged is None:
+            poses, maps = solved.world_T_rigs, problem.maps
+            graph.push_back(prior_factors.fixed_scale(poses, maps, _SCALE_SIGMA))
+        block = unknowns.block(solved.landmarks, self.shown, noise, curved=True)
 
         def after(values: gtsam.Values) -> "CameraView":
             found = unknowns.estimate(values)

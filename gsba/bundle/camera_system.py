@@ -92,9 +92,8 @@ class CameraSystem:
         """At poses and camera as they are, points at their best."""
         unknowns, terms = self._unknowns(), self.problem.terms(self.solved)
         terms.values.insert(unknowns.values)
-        block = unknowns.block(self.solved.landmarks, self.shown, self.solved.noise)
+        block = unknowns.block(self.solved.landmarks, self.shown, self.solved.noise, curved=True)
         block.polish(terms.values)
-        block.stretch = block.curvature(terms.values)
         whole = block.linearize(terms.values)
         blocks = (QuadraticBlock(block.keys, block.pairs, whole), *terms.blocks)
         return _Linearized(unknowns, terms.graph, blocks, terms.values)

@@ -112,13 +112,16 @@ class CameraUnknowns:
                 _add(values, graph, A(f), np.zeros(2), np.full(2, lens_axes.TURNS[-1]))
         return cls(camera, CameraVariables(**given), values, graph, own, problem)
 
-    def block(self, landmarks: Landmarks, shown: Keypoints, noise: float) -> CameraBlock:
+    def block(
+        self, landmarks: Landmarks, shown: Keypoints, noise: float, curved: bool = False
+    ) -> CameraBlock:
         """The observations of some points, to be explained by poses and camera.
 
         Args:
             landmarks: points and what observes them.
             shown: keypoints as pictures show them.
             noise: of the observations, in units of the keypoints' own sigmas.
+            curved: see `CameraBlock`.
         """
         tracks, rows = landmarks.tracks, shown.rows(landmarks.tracks)
         lenses, directions = self.camera.lenses, shown.bearings_rig[rows]
@@ -140,6 +143,7 @@ class CameraUnknowns:
             landmarks.points_world,
             RobustLoss(solver.loss, solver.loss_sigmas),
             self.problem.num_threads,
+            curved=curved,
         )
 
     def spread_as(self, sigmas: np.ndarray) -> "CameraUnknowns":
