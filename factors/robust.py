@@ -62,8 +62,9 @@ class RobustLoss:
         return weights if self.kind == "cauchy" else weights**2
 
     def curvatures(self, squared: np.ndarray) -> np.ndarray:
-        """Second derivatives (N,) of the loss along residuals, 2 rho'(s) + 4 s rho''(s), by how
-        residuals spread in the plane: halfway to the weights, which are those across."""
-        step = 1e-4  # of a squared residual; the loss bends by its derivative
+        """Second derivatives (N,) of the loss by a residual in the plane, the mean of those along
+        it and across it: 2 rho'(s) + 2 s rho''(s). Weights alone are those across.
+        """
+        step = 1e-4  # of a squared residual
         weights = self.weights(squared)
         return weights + (self.weights(squared * (1 + step)) - weights) / step

@@ -213,7 +213,7 @@ def _own_motion(
     if turning is None or not camera.by_gyro:
         return OwnMotion(beside, sigmas, np.zeros(len(beside), bool), np.inf)
     sigma = max(camera.readout_s * turning.rate_sigma, _LEAST_TURN)
-    return OwnMotion(beside, sigmas, np.isfinite(turning.rates).all(axis=1), sigma)
+    return OwnMotion(beside, sigmas, np.all(np.isfinite(turning.rates), axis=1), sigma)
 
 
 def _add(

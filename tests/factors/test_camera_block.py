@@ -64,13 +64,13 @@ def _predicted(
 ) -> np.ndarray:  # fmt: skip
     """Where a camera shows a point: a unit direction, or the pixel of a raw lens. Plain numpy."""
     d = values.atPose3(X(frame)).transformTo(point)
-    if camera.motions is not None:
+    if camera.velocities is not None:
         motion = vector(values, D(0))[0] * camera.velocities[frame] + vector(values, W(frame))
         turn = Rotation.from_rotvec(fraction * motion[:3]).as_matrix()
         d = turn.T @ (d - fraction * motion[3:])
     centre = vector(values, C(0))
     origin = sign * centre
-    if camera.turns is not None:
+    if camera.axes is not None:
         turn = Rotation.from_rotvec([*vector(values, A(frame)), 0]).as_matrix()
         origin = camera.axes[frame] @ turn @ origin
     away = d - origin
@@ -101,8 +101,12 @@ def _world(kind: str, noise: float = 2e-3, loss: RobustLoss | None = None):
     points *= (rng.uniform(2, 5, POINTS) / np.linalg.norm(points, axis=1))[:, None]
     frames, which = np.divmod(np.arange(FRAMES * POINTS), POINTS)
     signs, fractions = np.where(points[which, 2] > 0, 1.0, -1.0), rng.uniform(-0.5, 0.5, len(which))
-    given = list(zip(frames, points[which], signs, fractions, strict=True))
-    shown = np.array([_predicted(camera, values, *one) for one in given])
+    shown = np.array(
+        [
+            _predicted(camera, values, int(f), points[j], float(sign), float(fraction))
+            for f, j, sign, fraction in zip(frames, which, signs, fractions, strict=True)
+        ]
+    )
     measured, whiteners = np.zeros((len(which), 3)), rng.normal(size=(len(which), 2, 2))
     whiteners += 3 * np.eye(2)
     if kind == "raw":
@@ -141,7 +145,7 @@ def test_residuals_are_those_of_plain_numpy(kind: str) -> None:
     block, values, order, (frames, which, _, measured, whiteners, signs, fractions) = _world(kind)
     points = block.points_world[which]
     for row, found in zip(order, block.residuals(values), strict=True):
-        one = frames[row], points[row], signs[row], fractions[row]
+        one = int(frames[row]), points[row], float(signs[row]), float(fractions[row])
         shown = _predicted(block.camera, values, *one)
         if kind == "raw":
             expected = shown - measured[row, :2]
@@ -201,7 +205,10 @@ def test_the_system_is_the_dense_one_without_landmarks(kind: str) -> None:
         wide[o][:, 6 * kinds * f + camera.own_places] = roots[o] * by_frame[o]
         wide[o][:, 6 * kinds * FRAMES + camera.shared_places] = roots[o] * by_shared[o]
         of_points[o][:, 3 * j : 3 * j + 3] = roots[o] * by_point[o]
-    r, x, p = (roots[:, None] * residuals).ravel(), np.vstack(wide), np.vstack(of_points)
+    r, x, p = (
+        (roots[:, None] * residuals).ravel(),
+        *(part.reshape(2 * num, -1) for part in (wide, of_points)),
+    )
     left = np.eye(len(p)) - p @ np.linalg.solve(p.T @ p, p.T)
     system = block.linearize(values)
     H = np.zeros((len(block.keys), len(block.keys), 6, 6))
