@@ -204,6 +204,38 @@ def _scratch():
 
 
 @_part
+def _look(tau, sign, motion, axes, camera, X, pose, turn, d, q, e, own, origin, away, n, moved):
+    """Write where a point is: d, e, the lens's o and n, l = e - o, and Q and s w."""
+    x, y, z = X[0] - pose[9], X[1] - pose[10], X[2] - pose[11]
+    for i in range(3):
+        d[i] = pose[i] * x + pose[3 + i] * y + pose[6 + i] * z
+        moved[i], q[i] = tau * motion[i], d[i] - tau * motion[3 + i]
+    _set_rotation(moved[0], moved[1], moved[2], turn)
+    _times_transposed(turn, q, e)
+    _times(axes, camera.centre, own)
+    for i in range(3):
+        origin[i] = sign * own[i]
+        away[i] = e[i] - origin[i]
+        n[i] = camera.inverse_radius * origin[i]
+
+
+@_part
+def _set_by_lenses(columns, camera, lens, by_lens, turning, own, shared):
+    """Write a row's columns by what raw lenses are, from those by the one that sees the point.
+
+    Args:
+        by_lens: (7,) row of `_pixel_residual`.
+        turning: (3,) row by a left turn of the lens.
+    """
+    start, other = columns.lenses + 7 * lens, columns.lenses + 7 * (1 - lens)
+    for i in range(7):
+        shared[start + i], shared[other + i] = by_lens[i] * camera.steps[lens, i], 0.0
+    _times_transposed(camera.by_back_turn, turning, own)
+    for i in range(3):  # the front lens's axes are the rig's
+        shared[columns.lenses + 14 + i] = own[i] if lens == 1 else 0.0
+
+
+@_part
 def _see(
     o, sightings, camera, columns, X, pose, scratch, residual, by_point, by_frame, by_shared, asked
 ):  # fmt: skip
@@ -216,19 +248,10 @@ def _see(
         motion_row,
     ) = scratch  # fmt: skip
     f, sign, tau = sightings.frames[o], sightings.signs[o], sightings.fractions[o]
-    x, y, z = X[0] - pose[9], X[1] - pose[10], X[2] - pose[11]
-    for i in range(3):
-        d[i] = pose[i] * x + pose[3 + i] * y + pose[6 + i] * z
-    motion = camera.motions[f]
-    for i in range(3):
-        moved[i], q[i] = tau * motion[i], d[i] - tau * motion[3 + i]
-    _set_rotation(moved[0], moved[1], moved[2], turn)
-    _times_transposed(turn, q, e)
-    _times(camera.axes[f], camera.centre, own)
-    for i in range(3):
-        origin[i] = sign * own[i]
-        away[i] = e[i] - origin[i]
-        n[i] = camera.inverse_radius * origin[i]
+    _look(
+        tau, sign, camera.motions[f], camera.axes[f], camera, X, pose, turn, d, q, e, own, origin,
+        away, n, moved,
+    )  # fmt: skip
     lens, measured, whitener = 0 if sign > 0 else 1, sightings.measured[o], sightings.whiteners[o]
     if columns.lenses >= 0:
         _pixel_residual(measured, whitener, camera.lenses[lens], away, residual, by_away, by_lens)
@@ -266,16 +289,8 @@ def _see(
             _times_transposed(camera.by_turn[f], by_origin, own)
             row[columns.turns], row[columns.turns + 1] = own[0], own[1]
         if columns.lenses >= 0:
-            start = columns.lenses + 7 * lens
-            for i in range(7):
-                shared[start + i] = by_lens[r, i] * camera.steps[lens, i]
-                shared[columns.lenses + 7 * (1 - lens) + i] = 0.0
-            for i in range(3):
-                shared[columns.lenses + 14 + i] = 0.0
-            if lens == 1:
-                _times_transposed(camera.by_back_turn, _array(_cross(by_e, away), q), own)
-                for i in range(3):
-                    shared[start + 7 + i] = own[i]
+            turning = _array(_cross(by_e, away), q)
+            _set_by_lenses(columns, camera, lens, by_lens[r], turning, own, shared)
 
 
 @_kernel
