@@ -2,6 +2,7 @@
 of the observations that they act on."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -17,14 +18,15 @@ from gsba.camera.fisheye import Pair, rotation_of
 from gsba.camera.lens import facing
 from gsba.types import Keypoints, Landmarks
 
-A = gtsam.symbol_shorthand.A  # turn (2,) rad of a frame's lenses, about x and y of their frame
-B = gtsam.symbol_shorthand.B  # turn (3,) rad of the back lens of raw pairs in the rig
-C = gtsam.symbol_shorthand.C  # the front lens's centre (3,), lenses' frame, map units
-D = gtsam.symbol_shorthand.D  # duration (1,) of the readout, s
-F = gtsam.symbol_shorthand.F  # relative focal length and principal point (3,) of a lens
-K = gtsam.symbol_shorthand.K  # radial terms (4,) of a lens
-N = gtsam.symbol_shorthand.N  # inverse of the stitching radius (1,), 1 / map units
-W = gtsam.symbol_shorthand.W  # own motion (6,) of a frame, beside that of its velocity
+# Small letters: capital ones are of poses and of families that others add.
+A = partial(gtsam.symbol, "a")  # turn (2,) rad of a frame's lenses, about their x and y
+B = partial(gtsam.symbol, "b")  # turn (3,) rad of the back lens of raw pairs in the rig
+C = partial(gtsam.symbol, "c")  # the front lens's centre (3,), lenses' frame, map units
+D = partial(gtsam.symbol, "d")  # duration (1,) of the readout, s
+F = partial(gtsam.symbol, "f")  # relative focal length and principal point (3,) of a lens
+K = partial(gtsam.symbol, "k")  # radial terms (4,) of a lens
+N = partial(gtsam.symbol, "n")  # inverse of the stitching radius (1,), 1 / map units
+W = partial(gtsam.symbol, "w")  # own motion (6,) of a frame, beside that of its velocity
 
 OF_LENSES = F(0), K(0), F(1), K(1), B(0)  # in the order of `self_calibration`
 _LEAST_TURN = 1e-6  # rad, standard deviation
@@ -53,7 +55,7 @@ class CameraUnknowns:
     camera: CameraEstimate  # to start from
     variables: CameraVariables
     values: gtsam.Values  # of the camera alone
-    graph: gtsam.NonlinearFactorGraph  # priors on these
+    shared: gtsam.NonlinearFactorGraph  # priors on these, but for frames' own motion
     own: OwnMotion | None  # None = frames are taken at one instant
     problem: AdjustmentContext
 
@@ -105,12 +107,23 @@ class CameraUnknowns:
                 graph.add(gtsam.PriorFactorVector(D(0), np.array([said[0]]), model))
             own = _own_motion(camera, velocities, problem)
             for f in frames:
-                _add(values, graph, W(f), own.values[f], own.sigmas_of(f))
+                values.insert(W(f), np.array(own.values[f]))
         if lenses.axes is not None:
             given["turns"] = [A(f) for f in frames]
             for f in frames:
                 _add(values, graph, A(f), np.zeros(2), np.full(2, lens_axes.TURNS[-1]))
         return cls(camera, CameraVariables(**given), values, graph, own, problem)
+
+    @property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """Priors on the camera's variables."""
+        graph, own = gtsam.NonlinearFactorGraph(self.shared), self.own
+        if own is None:
+            return graph
+        for f in range(len(own.values)):
+            model = gtsam.noiseModel.Diagonal.Sigmas(own.sigmas_of(f))
+            graph.add(gtsam.PriorFactorVector(W(f), np.zeros(6), model))
+        return graph
 
     def block(
         self, landmarks: Landmarks, shown: Keypoints, noise: float, curved: bool = False
@@ -149,21 +162,12 @@ class CameraUnknowns:
     def spread_as(self, sigmas: np.ndarray) -> "CameraUnknowns":
         """The same with frames' own motion spread (6,) otherwise."""
         assert self.own is not None
-        own = replace(self.own, sigmas=sigmas)
-        motions, graph = {W(f) for f in range(len(own.values))}, gtsam.NonlinearFactorGraph()
-        for n in range(self.graph.size()):
-            if self.graph.at(n).keys()[0] not in motions:
-                graph.add(self.graph.at(n))
-        for f in range(len(own.values)):
-            model = gtsam.noiseModel.Diagonal.Sigmas(own.sigmas_of(f))
-            graph.add(gtsam.PriorFactorVector(W(f), np.zeros(6), model))
         camera = replace(self.camera, own_sigmas=sigmas)
-        return replace(self, camera=camera, graph=graph, own=own)
+        return replace(self, camera=camera, own=replace(self.own, sigmas=sigmas))
 
     def estimate(self, values: gtsam.Values) -> CameraEstimate:
         """The camera at values of its variables."""
-        lenses, variables = self.camera.lenses, self.variables
-        found = replace(self.camera)
+        found, lenses, variables = self.camera, self.camera.lenses, self.variables
         lenses = replace(lenses, centre=vector(values, C(0)).copy())
         if variables.radius is not None:
             inverse = max(float(vector(values, N(0))[0]), 0.0)

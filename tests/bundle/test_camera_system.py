@@ -11,8 +11,10 @@ from synthetic import loop_walk
 from factors import PoseSystem
 from factors.quadratic_block import QuadraticBlock
 from factors.reduced_camera_system import ReducedSystem
+from gsba import Family, MapSnapshot
 from gsba.bundle import adjustment
 from gsba.bundle.camera_system import CameraSystem
+from gsba.bundle.families import Families
 from gsba.bundle.readout import CameraEstimate
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
@@ -115,6 +117,34 @@ def test_covariances_are_those_of_errors_and_wider_than_of_a_known_camera() -> N
     alone, _ = adjustment.pose_covariances(given[0], given[2].lenses.seen(given[1]), given[4])
     ratio = np.trace(measured.poses[1:], axis1=1, axis2=2) / np.trace(alone[1:], axis1=1, axis2=2)
     assert (ratio > 1).all()
+
+
+class Duration(Family):
+    """A variable under the letter that the readout's duration has, tied to a pose."""
+
+    name, digest = "duration", "1"
+
+    def variables(self, snapshot: MapSnapshot) -> gtsam.Values:
+        values = gtsam.Values()
+        values.insert(gtsam.symbol("D", 0), np.zeros(1))
+        return values
+
+    def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
+        graph, unit = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Unit.Create(1)
+        graph.add(gtsam.PriorFactorVector(gtsam.symbol("D", 0), np.array([3.0]), unit))
+        return graph
+
+
+def test_variables_of_families_are_solved_beside_the_camera() -> None:
+    world, shown = seen_through(LENSES)
+    names = tuple(str(f) for f in range(24))
+    problem = replace(problem_of(world), families=Families((Duration(),), names, times(24)))
+    start = Solution.without_points(world.world_T_rigs)
+    solved, found = solved_with(world, shown, CameraEstimate(LENSES, READOUT_S), start, problem)
+    assert solved.variables is not None and solved.variables.data == pytest.approx([3.0])
+    assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
+    measured = CameraSystem(solved, shown, found, times(24), problem).covariances()
+    assert np.isfinite(measured.readout_sigma)
 
 
 def test_a_quadratic_block_is_what_it_was_made_of() -> None:
