@@ -29,9 +29,11 @@ _kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
 def _set_rotation(x, y, z, out):
     """Write the rotation matrix (3, 3) of a rotation vector, by Rodrigues' formula."""
     t2 = x * x + y * y + z * z
-    t = np.sqrt(t2)
-    a = np.sin(t) / t if t > 1e-4 else 1.0 - t2 / 6.0
-    b = (1.0 - np.cos(t)) / t2 if t > 1e-4 else 0.5 - t2 / 24.0
+    a = 1.0 - t2 * (1 / 6 - t2 * (1 / 120 - t2 / 5040))  # a readout turns by a degree or so
+    b = 0.5 - t2 * (1 / 24 - t2 * (1 / 720 - t2 / 40320))
+    if t2 > 0.01:
+        t = np.sqrt(t2)
+        a, b = np.sin(t) / t, (1.0 - np.cos(t)) / t2
     out[0, 0], out[0, 1], out[0, 2] = 1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
     out[1, 0], out[1, 1], out[1, 2] = b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x
     out[2, 0], out[2, 1], out[2, 2] = b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)
