@@ -84,7 +84,7 @@ def solved_with(
     """Map and camera adjusted together, from the tracks that the camera sees."""
     tracks = camera.lenses.clear(world.tracks, camera.lenses.seen(shown))
     given = tracks, shown, camera, times(len(start.world_T_rigs)), start, problem
-    return solve_with_camera(*given, (30.0, 8.0))
+    return solve_with_camera(*given, (30.0, 8.0, 8.0))
 
 
 def placed(solved: Solution, keypoints: Keypoints, tracks: Tracks) -> Landmarks:

@@ -10,6 +10,8 @@ from gsba.bundle import prior_factors
 from gsba.bundle.adjustment import (
     AdjustmentContext,
     Terms,
+    adjust,
+    adjust_sighted,
     adjust_sighted_through,
     adjust_through,
 )
@@ -79,6 +81,8 @@ def solve_with_camera(
 ) -> tuple[Solution, CameraEstimate]:
     """Poses, points and all that was taken of a camera, solved for together.
 
+    The last round, of the tightest gate, is of poses and points alone.
+
     Args:
         tracks: candidate tracks.
         shown: keypoints as pictures show them.
@@ -86,9 +90,11 @@ def solve_with_camera(
         timestamps: (F,) seconds.
         start, problem, gates, final: see `adjustment.adjust`.
     """
+    wide, last = _split(gates)
     view = CameraView.of(shown, camera, timestamps)
-    solved, view = adjust_through(view, tracks, start, problem, gates, final)
-    return solved, view.camera
+    found, view = adjust_through(view, tracks, start, problem, wide, final)
+    solved = adjust(tracks, view.keypoints, found, problem, last, final)
+    return replace(solved, rounds=found.rounds + solved.rounds), view.camera
 
 
 def solve_sighted_with_camera(
@@ -107,6 +113,19 @@ def solve_sighted_with_camera(
     Returns:
         The solution, the keypoints with the noise that they turned out to have, and the camera.
     """
+    wide, last = _split(gates)
     view = CameraView.of(sighted.keypoints, camera, timestamps)
-    solved, view = adjust_sighted_through(view, sighted, before, problem, gates)
-    return solved, view.shown, view.camera
+    found, view = adjust_sighted_through(view, sighted, before, problem, wide)
+    seen = replace(sighted, keypoints=view.keypoints)
+    solved, keypoints = adjust_sighted(seen, found, problem, last)
+    solved = replace(solved, rounds=found.rounds + solved.rounds)
+    return solved, view.with_noise_of(keypoints).shown, view.camera
+
+
+def _split(gates: Sequence[float]) -> tuple[Sequence[float], Sequence[float]]:
+    """Gates of the rounds that solve for the camera, and of the last one, that leaves it as it is.
+
+    The tightest gate chooses observations by the camera so far, and these would confirm it: raw
+    lenses came out worse by them.
+    """
+    return gates[:-1] or gates, gates[-1:]
