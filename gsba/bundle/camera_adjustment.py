@@ -21,8 +21,8 @@ from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.stitching import with_noise_of
 from gsba.types import Keypoints, Sighted, Solution, Tracks
 
-_SCALE_SIGMA = 1e-3  # of each map's extent, where nothing knows it: else frames' own motion, which
-# is drawn to none, would shrink the map
+_SCALE_SIGMA = 1e-3  # of each map's extent about what it was: no image knows it, and frames' own
+# motion, which is drawn to none, would shrink the map
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +56,8 @@ class CameraView:
         terms.values.insert(unknowns.values)
         graph = gtsam.NonlinearFactorGraph(terms.graph)
         graph.push_back(unknowns.graph)
-        if problem.ungauged is None:
-            poses, maps = solved.world_T_rigs, problem.maps
-            graph.push_back(prior_factors.fixed_scale(poses, maps, _SCALE_SIGMA))
+        poses, maps = solved.world_T_rigs, problem.maps
+        graph.push_back(prior_factors.fixed_scale(poses, maps, _SCALE_SIGMA))
         block = unknowns.block(solved.landmarks, self.shown, noise, curved=True)
 
         def after(values: gtsam.Values) -> "CameraView":

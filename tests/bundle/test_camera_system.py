@@ -11,7 +11,7 @@ from synthetic import loop_walk
 from factors import PoseSystem
 from factors.quadratic_block import QuadraticBlock
 from factors.reduced_camera_system import ReducedSystem
-from gsba import Family, MapSnapshot
+from gsba import Family, MapSnapshot, X
 from gsba.bundle import adjustment
 from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.families import Families
@@ -117,6 +117,19 @@ def test_covariances_are_those_of_errors_and_wider_than_of_a_known_camera() -> N
     alone, _ = adjustment.pose_covariances(given[0], given[2].lenses.seen(given[1]), given[4])
     ratio = np.trace(measured.poses[1:], axis1=1, axis2=2) / np.trace(alone[1:], axis1=1, axis2=2)
     assert (ratio > 1).all()
+
+
+def test_frames_own_motion_does_not_shrink_a_map_of_no_known_scale() -> None:
+    """It is drawn to none, and less of it is left in a smaller map."""
+    world, shown = seen_through(LENSES)
+    gauge, tight = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    gauge.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(world.world_T_rigs[0]), tight))
+    problem, start = problem_of(world), Solution.without_points(world.world_T_rigs)
+    given = CameraEstimate(LENSES, READOUT_S), start, replace(problem, priors=gauge)
+    solved, found = solved_with(world, shown, *given)
+    scale = pose_similarity(solved.world_T_rigs, world.world_T_rigs).scale
+    assert scale == pytest.approx(1, abs=0.01)
+    assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
 
 
 class Duration(Family):
