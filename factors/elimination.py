@@ -20,6 +20,52 @@ class LinearSystem:
     hessian: csr_array  # (F K + S, F K + S)
 
 
+@dataclass(slots=True)
+class Eliminated:
+    """Sums of a linear least-squares problem whose landmarks are eliminated, run by run.
+
+    Variables are K of each frame and S of all frames.
+    """
+
+    starts: np.ndarray  # (F + 1,) int64 and
+    columns: np.ndarray  # (P,) int64: covisible frame pairs f < g as sorted CSR rows
+    diagonal: np.ndarray  # (F, K, K) float64
+    off_diagonal: np.ndarray  # (P, K, K)
+    to_shared: np.ndarray  # (F, K, S)
+    shared: np.ndarray  # (S, S)
+    gradient: np.ndarray  # (F, K)
+    shared_gradient: np.ndarray  # (S,)
+    cost: float = 0.0  # half the squares that no landmark takes up
+
+    @classmethod
+    def zeros(cls, starts: np.ndarray, columns: np.ndarray, own: int, common: int) -> "Eliminated":
+        """Nothing added yet, of `own` variables of each frame and `common` ones of all."""
+        num, pairs = len(starts) - 1, len(columns)
+        sums = np.zeros((num, own, own)), np.zeros((pairs, own, own)), np.zeros((num, own, common))
+        of_all = np.zeros((common, common)), np.zeros((num, own)), np.zeros(common)
+        return cls(starts, columns, *sums, *of_all)
+
+    def add(
+        self,
+        offsets: np.ndarray,
+        frames: np.ndarray,
+        residuals: np.ndarray,
+        by_point: np.ndarray,
+        by_frame: np.ndarray,
+        by_shared: np.ndarray,
+    ) -> None:
+        """Add landmarks: each has observations offsets[j] to offsets[j + 1], sorted by frame.
+
+        Args: see `eliminate`.
+        """
+        self.cost += eliminate_linear_range(
+            0, len(offsets) - 1, offsets, frames, residuals, by_point, by_frame, by_shared,
+            _RELATIVE_DAMPING, int(np.diff(offsets).max(initial=0)), self.starts, self.columns,
+            self.diagonal, self.off_diagonal, self.to_shared, self.shared, self.gradient,
+            self.shared_gradient,
+        )  # fmt: skip
+
+
 def eliminate(
     num_frames: int,
     frames: np.ndarray,
@@ -44,18 +90,14 @@ def eliminate(
     frames, points = np.asarray(frames)[order].astype(np.int64), np.asarray(points)[order]
     offsets = np.flatnonzero(np.diff(points, prepend=-1, append=-1))
     starts, columns, _ = covisible_pairs(offsets, frames, num_frames)
-    diagonal, gradient = np.zeros((num_frames, own, own)), np.zeros((num_frames, own))
-    upper, to_shared = np.zeros((len(columns), own, own)), np.zeros((num_frames, own, common))
-    shared, shared_gradient = np.zeros((common, common)), np.zeros(common)
-    cost = eliminate_linear_range(
-        0, len(offsets) - 1, offsets, frames, residuals[order], by_point[order], by_frame[order],
-        by_shared[order], _RELATIVE_DAMPING, int(np.diff(offsets).max(initial=0)), starts, columns,
-        diagonal, upper, to_shared, shared, gradient, shared_gradient,
-    )  # fmt: skip
+    sums = Eliminated.zeros(starts, columns, own, common)
+    sums.add(offsets, frames, residuals[order], by_point[order], by_frame[order], by_shared[order])
     size, rows = num_frames * own, np.arange(num_frames + 1)
-    above = bsr_array((upper, columns, starts), shape=(size, size))
-    among = above + above.T + bsr_array((diagonal, rows[:-1], rows), shape=(size, size))
-    across = to_shared.reshape(size, common)
-    hessian = block_array([[among, csr_array(across)], [csr_array(across.T), csr_array(shared)]])
-    whole = np.concatenate([gradient.ravel(), shared_gradient])
-    return LinearSystem(cost, whole, csr_array(hessian))
+    above = bsr_array((sums.off_diagonal, columns, starts), shape=(size, size))
+    among = above + above.T + bsr_array((sums.diagonal, rows[:-1], rows), shape=(size, size))
+    across = sums.to_shared.reshape(size, common)
+    hessian = block_array(
+        [[among, csr_array(across)], [csr_array(across.T), csr_array(sums.shared)]]
+    )
+    whole = np.concatenate([sums.gradient.ravel(), sums.shared_gradient])
+    return LinearSystem(sums.cost, whole, csr_array(hessian))

@@ -296,7 +296,7 @@ class ReducedSystem:
         all, which may be gigabytes, is not copied."""
         if len(parts) == 1:
             slots, flip = self._block_slots[0]
-            if len(slots) == len(self._pairs) and not flip.any():
+            if np.array_equal(slots, np.arange(len(self._pairs))) and not flip.any():
                 return parts[0]
         out = np.zeros((len(self._pairs), DIM, DIM))
         for part, (slots, flip) in zip(parts, self._block_slots, strict=True):

@@ -60,3 +60,11 @@ class RobustLoss:
             return np.ones_like(squared, dtype=np.float64)
         weights = c2 / (c2 + squared)
         return weights if self.kind == "cauchy" else weights**2
+
+    def curvatures(self, squared: np.ndarray) -> np.ndarray:
+        """Second derivatives (N,) of the loss by a residual in the plane, the mean of those along
+        it and across it: 2 rho'(s) + 2 s rho''(s). Weights alone are those across.
+        """
+        step = 1e-4  # of a squared residual
+        weights = self.weights(squared)
+        return weights + (self.weights(squared * (1 + step)) - weights) / step

@@ -8,6 +8,8 @@ from synthetic import RIG, World, make_world, unit, with_noise
 
 from gsba.bundle import adjustment, prior_factors, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.camera_adjustment import solve_with_camera
+from gsba.bundle.readout import CameraEstimate
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import owner_faces
 from gsba.config import CameraSettings, RefineSettings
@@ -70,6 +72,19 @@ def solved_under(
     gates = (30.0, 8.0)
     solved = adjustment.adjust(tracks, keypoints, start, problem_of(world), gates)
     return solved, keypoints, tracks
+
+
+def solved_with(
+    world: World,
+    shown: Keypoints,
+    camera: CameraEstimate,
+    start: Solution,
+    problem: AdjustmentContext,
+) -> tuple[Solution, CameraEstimate]:
+    """Map and camera adjusted together, from the tracks that the camera sees."""
+    tracks = camera.lenses.clear(world.tracks, camera.lenses.seen(shown))
+    given = tracks, shown, camera, times(len(start.world_T_rigs)), start, problem
+    return solve_with_camera(*given, (30.0, 8.0, 8.0))
 
 
 def placed(solved: Solution, keypoints: Keypoints, tracks: Tracks) -> Landmarks:

@@ -1,9 +1,10 @@
 """Rounds of triangulation, bundle adjustment and filtering over one set of tracks."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Protocol, Self, TypeVar
 
 import gtsam
 import numpy as np
@@ -49,7 +50,7 @@ _LEAST_LEFT = 1e-3  # share of a residual that a point leaves over, or it says n
 
 @dataclass(frozen=True, slots=True)
 class Terms:
-    """Factors and blocks that an adjustment minimises beside those of images, and its start."""
+    """Factors and blocks that an adjustment minimises, and its start."""
 
     graph: gtsam.NonlinearFactorGraph
     blocks: tuple[Block, ...]
@@ -115,6 +116,54 @@ class AdjustmentContext:
         return graph
 
 
+class View(Protocol):
+    """What sees the observations of an adjustment: known rays, or a camera that is solved for."""
+
+    @property
+    def keypoints(self) -> Keypoints:
+        """The rays so far."""
+        ...
+
+    def with_noise_of(self, keypoints: Keypoints) -> Self:
+        """The same, observations as noisy as keypoints of the same rows."""
+        ...
+
+    def terms(
+        self, solved: Solution, noise: float, problem: AdjustmentContext
+    ) -> "tuple[Terms, Callable[[gtsam.Values], Self]]":
+        """What an adjustment from a solution minimises, and the view at the values it finds.
+
+        Args:
+            solved: poses, and the points to use.
+            noise: of the observations, in units of the keypoints' own sigmas.
+        """
+        ...
+
+
+V = TypeVar("V", bound=View)
+
+
+@dataclass(frozen=True, slots=True)
+class FixedRays:
+    """Rays that are known."""
+
+    keypoints: Keypoints
+
+    def with_noise_of(self, keypoints: Keypoints) -> "FixedRays":
+        """These, which are the same rays."""
+        return FixedRays(keypoints)
+
+    def terms(
+        self, solved: Solution, noise: float, problem: AdjustmentContext
+    ) -> tuple[Terms, Callable[[gtsam.Values], "FixedRays"]]:
+        """Their block beside priors and families; rays stay."""
+        block, terms = (
+            landmark_block(solved.landmarks, self.keypoints, noise, problem),
+            problem.terms(solved),
+        )
+        return replace(terms, blocks=(block, *terms.blocks)), lambda _: self
+
+
 def adjust_sighted(
     sighted: Sighted, before: Solution, problem: AdjustmentContext, gates: Sequence[float]
 ) -> tuple[Solution, Keypoints]:
@@ -123,19 +172,29 @@ def adjust_sighted(
     Returns:
         The solution, and its keypoints with the noise that they turned out to have.
     """
+    view = FixedRays(sighted.keypoints)
+    solved, seen = adjust_sighted_through(view, sighted, before, problem, gates)
+    return solved, seen.keypoints
+
+
+def adjust_sighted_through(
+    view: V, sighted: Sighted, before: Solution, problem: AdjustmentContext, gates: Sequence[float]
+) -> tuple[Solution, V]:
+    """As `adjust_sighted`, through a camera that may be solved for, too.
+
+    Args:
+        view: of the observations.
+        sighted: their tracks, and which of them are aligned.
+    """
     solved, rounds, settings = before, [], problem.settings
     for number, gate in enumerate(gates, 1):
-        sighted = rescale_noise(sighted, solved, settings)
-        tracks, keypoints, start = (
-            sighted.tracks,
-            sighted.keypoints,
-            replace(solved, noise=1.0),
-        )
+        there = rescale_noise(replace(sighted, keypoints=view.keypoints), solved, settings)
+        view, start = view.with_noise_of(there.keypoints), replace(solved, noise=1.0)
         solver = _solver(settings, last=number == len(gates))
         so_far = replace(problem, settings=settings.model_copy(update={"solver": solver}))
-        solved = adjust(tracks, keypoints, start, so_far, (gate,))
+        solved, view = adjust_through(view, sighted.tracks, start, so_far, (gate,))
         rounds += solved.rounds
-    return replace(solved, rounds=tuple(rounds)), sighted.keypoints
+    return replace(solved, rounds=tuple(rounds)), view
 
 
 def rescale_noise(sighted: Sighted, before: Solution, settings: RefineSettings) -> Sighted:
@@ -184,44 +243,66 @@ def adjust(
         gates: of each round, in standard deviations of the noise.
         final: whether the last round is solved to the end; others lose observations anyway.
     """
-    world_T_rigs, noise, rounds = start.world_T_rigs, start.noise, []
-    settings, variables = problem.settings, start.variables
-    rows = keypoints.rows(tracks)
-    bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
-    shared = {
-        "settings": settings.triangulate,
-        "num_threads": problem.num_threads,
-        "origins_rig": keypoints.origins_of(rows),
-    }
-    place = partial(triangulation.triangulate, tracks, bearings, sigmas, **shared)
-    last_gate = gates[-1] * noise
-    support = len(place(world_T_rigs, last_gate).tracks)
+    return adjust_through(FixedRays(keypoints), tracks, start, problem, gates, final)[0]
+
+
+def adjust_through(
+    view: V,
+    tracks: Tracks,
+    start: Solution,
+    problem: AdjustmentContext,
+    gates: Sequence[float],
+    final: bool = True,
+) -> tuple[Solution, V]:
+    """As `adjust`, through a camera that may be solved for beside the poses.
+
+    Returns:
+        The solution and the view that belongs to it.
+    """
+    solved, rounds, settings = replace(start, rounds=()), [], problem.settings
+    place = partial(_placed, tracks, problem=problem)
+    last_gate = gates[-1] * start.noise
+    support = len(place(view.keypoints, solved.world_T_rigs, last_gate).tracks)
     for number, gate in enumerate(gates, 1):
-        landmarks = place(world_T_rigs, gate * noise)
-        spread = noise * max(1.0, gate / settings.rounds.gate_scale)
-        block = landmark_block(landmarks, keypoints, spread, problem)
+        landmarks = place(view.keypoints, solved.world_T_rigs, gate * solved.noise)
+        spread = solved.noise * max(1.0, gate / settings.rounds.gate_scale)
         solver = _solver(settings, last=final and number == len(gates))
         if problem.anchors is not None:
             finer = {"lambda_initial": _GPS_DAMPING, "relative_tolerance": _GPS_TOLERANCE}
             solver = solver.model_copy(update=finer)
-        so_far = replace(start, world_T_rigs=world_T_rigs, landmarks=landmarks, variables=variables)
-        terms = problem.terms(so_far)
-        result = optimize(terms.graph, [block, *terms.blocks], terms.values, solver)
-        poses = poses_of(result.values, len(world_T_rigs))
-        new_support = len(place(poses, last_gate).tracks)
+        here = replace(solved, landmarks=landmarks)
+        terms, after = view.terms(here, spread, problem)
+        result = optimize(terms.graph, terms.blocks, terms.values, solver)
+        poses, then = poses_of(result.values, len(solved.world_T_rigs)), after(result.values)
+        new_support = len(place(then.keypoints, poses, last_gate).tracks)
         accepted = new_support >= settings.rounds.min_support * support
         if accepted:
-            world_T_rigs, support = poses, new_support
+            view, support = then, new_support
             variables = terms.own.variables(result.values)
-            placed = place(poses, gate * noise)
+            solved = replace(solved, world_T_rigs=poses, variables=variables)
+            placed = place(view.keypoints, poses, gate * solved.noise)
             if len(placed.tracks):
-                noise = max(_noise(placed, keypoints, poses), settings.rounds.min_noise)
+                noise = max(_noise(placed, view.keypoints, poses), settings.rounds.min_noise)
+                solved = replace(solved, noise=noise)
         used = len(landmarks.tracks), landmarks.tracks.num_points
         outcome = accepted, result.history, result.reason
-        rounds.append(Round(gate, noise, *used, new_support, *outcome))
+        rounds.append(Round(gate, solved.noise, *used, new_support, *outcome))
         logger.debug("round: %s", rounds[-1])
-    placed = place(world_T_rigs, gates[-1] * noise)
-    return Solution(world_T_rigs, placed, noise, tuple(rounds), variables)
+    placed = place(view.keypoints, solved.world_T_rigs, gates[-1] * solved.noise)
+    return replace(solved, landmarks=placed, rounds=tuple(rounds)), view
+
+
+def _placed(
+    tracks: Tracks,
+    keypoints: Keypoints,
+    world_T_rigs: np.ndarray,
+    gate: float,
+    *,
+    problem: AdjustmentContext,
+) -> Landmarks:
+    """Points of tracks within a gate, in the keypoints' own standard deviations."""
+    settings = problem.settings.triangulate
+    return triangulation.place(tracks, keypoints, world_T_rigs, gate, settings, problem.num_threads)
 
 
 def _solver(settings: RefineSettings, last: bool) -> SolverSettings:

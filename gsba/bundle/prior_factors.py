@@ -125,7 +125,7 @@ def _step_covariance(f_T_next: np.ndarray, length: float, noise: StepNoise) -> n
 
 
 def fixed_scale(
-    world_T_rigs: np.ndarray, components: np.ndarray | None = None
+    world_T_rigs: np.ndarray, components: np.ndarray | None = None, sigma: float = 1e-6
 ) -> gtsam.NonlinearFactorGraph:
     """A tight factor on the distance from the first frame to the one furthest from it.
 
@@ -133,6 +133,7 @@ def fixed_scale(
         world_T_rigs: (F, 4, 4).
         components: (F,) map of each frame; each gets such a factor, and those behind the first
             frame's a fixed pose besides. None = there is one.
+        sigma: of the distance, part of it.
     """
     held = gtsam.NonlinearFactorGraph()
     if components is None:
@@ -142,10 +143,10 @@ def fixed_scale(
         first = int(rows[0])
         far, distance = furthest(world_T_rigs[rows, :3, 3])
         if distance > 0:
-            noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-6 * distance)
+            noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma * distance)
             held.add(gtsam.RangeFactorPose3(X(first), X(int(rows[far])), distance, noise))
         if first > 0:
-            sigmas = np.array([1e-6] * 3 + [1e-6 * max(distance, 1e-12)] * 3)
+            sigmas = np.array([sigma] * 3 + [sigma * max(distance, 1e-12)] * 3)
             fixed = gtsam.Pose3(world_T_rigs[first])
             noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
             held.add(gtsam.PriorFactorPose3(X(first), fixed, noise))

@@ -2,7 +2,7 @@
 
 Each lens is read in a way of its own: a ray's time follows from its row. The duration that makes
 what frames move meanwhile their velocity is found as other parameters that all frames share, and
-believed where it predicts; `camera_system` then finds each frame's own motion.
+believed where it predicts; `camera_adjustment` then finds each frame's own motion.
 """
 
 import logging

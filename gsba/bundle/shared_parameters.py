@@ -147,9 +147,7 @@ def weighted(
     loss = RobustLoss(solver.loss, solver.loss_sigmas)
     squares = np.sum(whitened**2, axis=1)
     weights = loss.weights(squares)
-    step = 1e-4  # of a squared residual; the loss bends by its derivative
-    bent = (loss.weights(squares * (1 + step)) - weights) / step
-    curvature = 1 + float(np.sum(bent)) / max(float(np.sum(weights)), 1e-300)
+    curvature = float(np.sum(loss.curvatures(squares))) / max(float(np.sum(weights)), 1e-300)
     roots = np.sqrt(weights)[:, None, None] * roots / solved.noise
     return Weighted(rows, residuals, by_pose, by_point, roots, max(curvature, _LEAST_CURVATURE))
 

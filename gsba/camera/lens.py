@@ -49,6 +49,11 @@ class Lenses:
     def __bool__(self) -> bool:
         return bool(self.centre.any()) or self.fisheyes is not None
 
+    @property
+    def parts(self) -> tuple[bool, ...]:
+        """Which parts were taken: a readout, axes of frames' own, raw lenses of their own."""
+        return tuple(part is not None for part in (self.readout_motion, self.axes, self.fisheyes))
+
     def own(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
         """Directions (N, 3) in the rig frames of frames (N,), rotated into the lenses' frame."""
         if self.axes is None:

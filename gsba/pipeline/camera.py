@@ -21,6 +21,7 @@ from gsba.bundle import (
     triangulation,
 )
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.camera_adjustment import solve_sighted_with_camera, solve_with_camera
 from gsba.bundle.camera_system import CameraCovariances, CameraSystem
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius
@@ -42,7 +43,6 @@ T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 _WIDE_GATE_SIGMAS = 30.0  # gate of observations that a wrong camera threw off
-_CAMERA_ROUNDS = 2  # estimates of the whole camera from features, each with an adjustment under it
 _MAX_RECALIBRATIONS = 4  # of raw lenses from features, and the map matched anew under them
 _MIN_RECALIBRATION_RAD = np.deg2rad(0.01)  # stop when bearings change by less
 _MIN_RECUT_RAD = np.deg2rad(0.03)  # change of bearings for which raw frames are cut anew
@@ -110,9 +110,9 @@ def _find_raw_camera(state: State) -> State:
     if known.reason:
         return trial
     trial = trial.with_camera(replace(trial.map.camera(), lenses=known.lenses))
+    trial = _settle_camera(trial.through(trial.map.lenses), "recalibrated")
     for n in range(_MAX_RECALIBRATIONS):
         before = trial.map.lenses
-        trial = backend.adjust(trial.through(before), f"recalibrated{n}", gates)
         trial = frontend.match_along_epipolars(trial, f"adjacent_raw{n}")
         trial = frontend.match_known_points(trial, f"wide_raw{n}")
         trial = _settle_camera(trial, f"calibrated{n}")
@@ -122,21 +122,34 @@ def _find_raw_camera(state: State) -> State:
 
 
 def _settle_camera(state: State, name: str) -> State:
-    """The whole camera estimated together, after a first estimate of how rows are read."""
-    gates, camera = state.run.settings.rounds.dense, state.map.camera()
+    """Map and camera solved together, after a first estimate of how rows are read."""
+    run, camera = state.run, state.map.camera()
     if camera.lenses.readout_motion is None:
         found = f"{name}_readout"
         camera = _from_features(state, found, _readout, CameraEstimate, noted=True)
-    for n in range(_CAMERA_ROUNDS):
-        state = state.through(camera.lenses)
-        found = f"{name}_camera{n}"
-        camera = _from_features(state, found, _whole_camera, CameraEstimate, camera)
-        state = backend.adjust(state.through(camera.lenses), f"{name}{n}", gates)
-    return state.with_camera(camera)
+    rounds = run.settings.rounds
+    gates = rounds.gate_scale, *rounds.dense  # a camera that is off throws observations off
+    state = state.through(camera.lenses)
+
+    def compute() -> tuple[Solution, CameraEstimate]:
+        return solve_with_camera(
+            backend.tracks_of(state),
+            state.observed.shown,
+            camera,
+            run.frames.timestamps,
+            state.solution,
+            state.adjustment_context(),
+            gates,
+            final=False,
+        )
+
+    key = [_settings_of_camera(run), gates]
+    solved, camera = run.stage(name, key, compute, tuple[Solution, CameraEstimate])
+    return state.with_solution(solved).with_camera(camera).through(camera.lenses)
 
 
-def estimate_from_patches(state: State, sighted: Sighted, name: str, number: int) -> State:
-    """The map with the camera that aligned patches ask for; its poses are yet to follow.
+def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: int) -> State:
+    """The map with the parts of a camera that aligned patches show; its poses are yet to follow.
 
     Args:
         state: of the run; its map has two lenses.
@@ -160,8 +173,38 @@ def estimate_from_patches(state: State, sighted: Sighted, name: str, number: int
         axes = _from_patches(state, sighted, f"axes_{name}", _loose_axes, LensAxes, noted=True)
         state = replace(state, map=replace(state.map, axes=axes))
         state = state.with_camera(replace(state.map.camera(), lenses=axes.lenses))
-    found = f"camera_{name}_{number}"
-    return state.with_camera(_from_patches(state, sighted, found, _whole_camera, CameraEstimate))
+    return state
+
+
+def adjust_with_patches(
+    state: State, sighted: Sighted, name: str
+) -> tuple[Solution, Keypoints, CameraEstimate]:
+    """Aligned observations solved for poses, points and camera.
+
+    Args:
+        state: of the run; its map has two lenses.
+        sighted: observations that patches were aligned to.
+        name: of the stage.
+
+    Returns:
+        The solution, the keypoints with the noise that they turned out to have, and the camera.
+    """
+    run, map_, gates = state.run, state.map, state.run.settings.rounds.aligned
+
+    def compute() -> tuple[Solution, Keypoints, CameraEstimate]:
+        shown = stitching.corrected(sighted.keypoints, map_.field, run.rig)
+        solved, found, camera = solve_sighted_with_camera(
+            replace(sighted, keypoints=shown),
+            map_.camera(),
+            run.frames.timestamps,
+            map_.solution,
+            state.adjustment_context(),
+            gates,
+        )
+        return solved, stitching.with_noise_of(sighted.keypoints, found), camera
+
+    returns = tuple[Solution, Keypoints, CameraEstimate]
+    return run.stage(name, [*_settings_of_camera(run), gates], compute, returns)
 
 
 def measure_camera(state: State) -> State:
@@ -172,10 +215,9 @@ def measure_camera(state: State) -> State:
 
     def compute() -> CameraCovariances:
         straight = stitching.corrected(map_.observed, map_.field, state.run.rig)
-        observations = _Observations(
-            map_.solution, map_.lenses.seen(straight), straight, map_.camera(), state
-        )
-        return observations.system().covariances(state.prior.parts)
+        times, context = state.run.frames.timestamps, state.adjustment_context()
+        system = CameraSystem(map_.solution, straight, map_.camera(), times, context)
+        return system.covariances(state.prior.parts)
 
     key = _settings_of_camera(state.run)
     found = state.run.stage("camera", key, compute, CameraCovariances, noted=False)
@@ -238,12 +280,6 @@ class _Observations:
         """Of the frames, (F,) float64, seconds."""
         return self.state.run.frames.timestamps
 
-    def system(self) -> CameraSystem:
-        """Map and camera, to be adjusted together."""
-        return CameraSystem(
-            self.solution, self.keypoints, self.shown, self.camera, self.times, self.context
-        )
-
 
 def _guessed_axes(of: _Observations) -> LensAxes:
     return lens_axes.guess(
@@ -287,16 +323,11 @@ def _readout(of: _Observations) -> CameraEstimate:
     )
 
 
-def _whole_camera(of: _Observations) -> CameraEstimate:
-    return of.system().step()
-
-
 def _from_features(
     state: State,
     name: str,
     estimate: Callable[[_Observations], T],
     returns: type[T],
-    camera: CameraEstimate | None = None,
     *,
     noted: bool = False,
 ) -> T:
@@ -309,7 +340,6 @@ def _from_features(
         state: of the run.
         name, returns, noted: of the stage, see `Run.stage`.
         estimate: makes the result.
-        camera: so far; None = the lenses that keypoints are seen through.
     """
     run, observed, solution = state.run, state.observed, state.solution
     least = run.settings.rounds.gate_scale
@@ -325,8 +355,8 @@ def _from_features(
             run.num_threads,
         )
         wide = replace(solution, landmarks=placed, noise=solution.noise * gate / least)
-        so_far = camera or CameraEstimate(observed.lenses)
-        return estimate(_Observations(wide, observed.keypoints, observed.shown, so_far, state))
+        camera = CameraEstimate(observed.lenses)
+        return estimate(_Observations(wide, observed.keypoints, observed.shown, camera, state))
 
     return run.stage(name, _settings_of_camera(run), compute, returns, noted=noted)
 

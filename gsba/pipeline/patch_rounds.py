@@ -3,9 +3,7 @@
 import logging
 from dataclasses import replace
 
-import numpy as np
-
-from gsba.bundle import adjustment, self_calibration, settling, stitching
+from gsba.bundle import adjustment, settling, stitching
 from gsba.bundle.stitching import Stitching
 from gsba.photometric import alignment
 from gsba.photometric.alignment import Observations
@@ -15,10 +13,6 @@ from gsba.types import Keypoints, Sighted, Solution
 
 logger = logging.getLogger(__name__)
 
-_CAMERA_ROUNDS = 3  # estimates of the camera from aligned patches, each with an adjustment under it
-_CAMERA_SETTLES = 2  # rounds of aligning after which it needs but one adjustment in each
-_MAX_RECALIBRATIONS = 10  # of raw lenses in a round, each with an adjustment under them
-_MIN_RECALIBRATION_RAD = np.deg2rad(0.001)  # stop when bearings change by less
 _SETTLED_SIGMAS = 1.0  # of steps: poses that a round moves by less are left there
 
 
@@ -56,16 +50,17 @@ def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State |
     name = f"aligned{number}"
     if not state.map.lenses:
         return _adjust_aligned(state, sighted, name)
-    for n in range(_MAX_RECALIBRATIONS):
+    for n in range(2):
         state = gyro.align_to_map(state, f"imu_{name}_{n}", with_noise=False)
-        trial = camera.estimate_from_patches(state, sighted, name, n)
-        better = _adjust_aligned(trial, sighted, f"{name}_{n}" if n else name)
+        trial = camera.take_parts_from_patches(state, sighted, name, n)
+        if n and trial.map.lenses.parts == state.map.lenses.parts:
+            return trial
+        stage = f"{name}_{n}" if n else name
+        solved, keypoints, found = camera.adjust_with_patches(trial, sighted, stage)
+        better = _carried(trial, sighted, solved, keypoints)
         if better is None:
             return state if n else None
-        change = self_calibration.apart(state.map.lenses, better.map.lenses)
-        state, rounds = better, _CAMERA_ROUNDS if number <= _CAMERA_SETTLES else 1
-        if n + 1 >= rounds and change < _MIN_RECALIBRATION_RAD:
-            break
+        state = better.with_camera(found)
     return state
 
 
@@ -101,10 +96,17 @@ def _adjust_aligned(state: State, sighted: Sighted, name: str) -> State | None:
 
     key = [run.solving_key(), gates]
     solved, keypoints = run.stage(name, key, compute, tuple[Solution, Keypoints])
-    if not solved.carries(map_.solution, run.settings.rounds.min_observations):
+    return _carried(state, sighted, solved, keypoints)
+
+
+def _carried(
+    state: State, sighted: Sighted, solved: Solution, keypoints: Keypoints
+) -> State | None:
+    """The state with the map of aligned observations; None where that explains less."""
+    if not solved.carries(state.solution, state.run.settings.rounds.min_observations):
         return None
     map_ = replace(
-        map_,
+        state.map,
         solution=solved,
         observed=keypoints,
         aligned=sighted.aligned,

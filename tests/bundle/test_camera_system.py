@@ -5,14 +5,16 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from lens_world import motion, placed, problem_of, seen_through, solved_under, times
-from scipy.sparse import csr_matrix
+from lens_world import motion, problem_of, seen_through, solved_with, times
 from synthetic import loop_walk
 
+from factors import PoseSystem
 from factors.quadratic_block import QuadraticBlock
 from factors.reduced_camera_system import ReducedSystem
+from gsba import Family, MapSnapshot, X
 from gsba.bundle import adjustment
 from gsba.bundle.camera_system import CameraSystem
+from gsba.bundle.families import Families
 from gsba.bundle.readout import CameraEstimate
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
@@ -28,19 +30,14 @@ def _settled(
     camera: Lenses,
     known: CameraEstimate,
     seed: int = 0,
-    rounds: int = 5,
     said: CameraSettings | None = None,
     turning: GyroConstraints | None = None,
 ):
     world, shown = seen_through(camera, seed)
     solved = Solution.without_points(world.world_T_rigs)
     problem = replace(problem_of(world, said), turning=turning)
-    for _ in range(rounds):
-        solved, keypoints, tracks = solved_under(world, shown, known.lenses, solved)
-        there = replace(solved, landmarks=placed(solved, keypoints, tracks))
-        given = there, keypoints, shown.bearings_rig, known, times(24), problem
-        known = CameraSystem(*given).step()
-    return world, known, given
+    solved, known = solved_with(world, shown, known, solved, problem)
+    return world, known, (solved, shown, known, times(24), problem)
 
 
 def test_all_of_a_camera_is_found_from_a_start_that_is_off() -> None:
@@ -87,7 +84,7 @@ def test_frames_turn_while_they_are_read_as_a_gyro_says() -> None:
     still = replace(LENSES, readout_motion=LENSES.readout_motion * np.repeat([0.0, 1.0], 3))
     start, off = CameraEstimate(still, 0.8 * READOUT_S), {}
     for gyro in (None, _turning(LENSES.readout_motion, known)):
-        _, found, _ = _settled(LENSES, start, rounds=4, turning=gyro)
+        _, found, _ = _settled(LENSES, start, turning=gyro)
         assert found.by_gyro is (None if gyro is None else True)
         assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
         off[gyro is None] = np.abs(found.lenses.readout_motion - LENSES.readout_motion)[:, :3]
@@ -100,7 +97,7 @@ def test_a_gyro_that_images_contradict_is_not_followed() -> None:
     still = replace(LENSES, readout_motion=LENSES.readout_motion * np.repeat([0.0, 1.0], 3))
     readout_motion = []
     for gyro in (None, _turning(LENSES.readout_motion[::-1], np.ones(24, bool))):
-        _, found, _ = _settled(LENSES, CameraEstimate(still, READOUT_S), rounds=2, turning=gyro)
+        _, found, _ = _settled(LENSES, CameraEstimate(still, READOUT_S), turning=gyro)
         assert not found.by_gyro
         readout_motion.append(found.lenses.readout_motion)
     np.testing.assert_array_equal(*readout_motion)
@@ -109,17 +106,58 @@ def test_a_gyro_that_images_contradict_is_not_followed() -> None:
 def test_covariances_are_those_of_errors_and_wider_than_of_a_known_camera() -> None:
     errors = []
     for seed in range(4):
-        world, _, given = _settled(LENSES, CameraEstimate(LENSES, READOUT_S), seed, 4)
+        world, _, given = _settled(LENSES, CameraEstimate(LENSES, READOUT_S), seed)
         measured = CameraSystem(*given).covariances()
         scale = pose_similarity(given[0].world_T_rigs, world.world_T_rigs).scale
-        off = scale * given[3].lenses.centre - CENTRE
+        off = scale * given[2].lenses.centre - CENTRE
         errors.append(off / (scale * np.sqrt(np.diagonal(measured.centre))))
-        errors.append([(given[3].readout_s - READOUT_S) / measured.readout_sigma])
+        errors.append([(given[2].readout_s - READOUT_S) / measured.readout_sigma])
     spread = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
     assert 0.5 < spread < 2.0  # of 16
-    alone, _ = adjustment.pose_covariances(given[0], given[1], given[5])
+    alone, _ = adjustment.pose_covariances(given[0], given[2].lenses.seen(given[1]), given[4])
     ratio = np.trace(measured.poses[1:], axis1=1, axis2=2) / np.trace(alone[1:], axis1=1, axis2=2)
     assert (ratio > 1).all()
+
+
+def test_frames_own_motion_does_not_shrink_a_map_of_no_known_scale() -> None:
+    """It is drawn to none, and less of it is left in a smaller map."""
+    world, shown = seen_through(LENSES)
+    gauge, tight = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    gauge.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(world.world_T_rigs[0]), tight))
+    problem, start = problem_of(world), Solution.without_points(world.world_T_rigs)
+    given = CameraEstimate(LENSES, READOUT_S), start, replace(problem, priors=gauge)
+    solved, found = solved_with(world, shown, *given)
+    scale = pose_similarity(solved.world_T_rigs, world.world_T_rigs).scale
+    assert scale == pytest.approx(1, abs=0.01)
+    assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
+
+
+class Duration(Family):
+    """A variable under the letter that the readout's duration has, tied to a pose."""
+
+    name, digest = "duration", "1"
+
+    def variables(self, snapshot: MapSnapshot) -> gtsam.Values:
+        values = gtsam.Values()
+        values.insert(gtsam.symbol("D", 0), np.zeros(1))
+        return values
+
+    def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
+        graph, unit = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Unit.Create(1)
+        graph.add(gtsam.PriorFactorVector(gtsam.symbol("D", 0), np.array([3.0]), unit))
+        return graph
+
+
+def test_variables_of_families_are_solved_beside_the_camera() -> None:
+    world, shown = seen_through(LENSES)
+    names = tuple(str(f) for f in range(24))
+    problem = replace(problem_of(world), families=Families((Duration(),), names, times(24)))
+    start = Solution.without_points(world.world_T_rigs)
+    solved, found = solved_with(world, shown, CameraEstimate(LENSES, READOUT_S), start, problem)
+    assert solved.variables is not None and solved.variables.data == pytest.approx([3.0])
+    assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
+    measured = CameraSystem(solved, shown, found, times(24), problem).covariances()
+    assert np.isfinite(measured.readout_sigma)
 
 
 def test_a_quadratic_block_is_what_it_was_made_of() -> None:
@@ -129,7 +167,10 @@ def test_a_quadratic_block_is_what_it_was_made_of() -> None:
     keys, values = [3, 1, 2], gtsam.Values()
     for key in keys:
         values.insert(key, np.zeros(6))
-    block = QuadraticBlock(keys, csr_matrix(hessian), gradient, 2.0)
+    tiles, pairs = hessian.reshape(3, 6, 3, 6).swapaxes(1, 2), np.array([[1, 2], [0, 2], [0, 1]])
+    own = tiles[np.arange(3), np.arange(3)]
+    model = PoseSystem(own, tiles[tuple(pairs.T)], gradient.reshape(3, 6), {"quadratic": 2.0})
+    block = QuadraticBlock(keys, pairs, model)
     system = ReducedSystem(gtsam.NonlinearFactorGraph(), [block], values)
     assert system.linearize(values) == {"quadratic": 2.0}
     steps = system.solve(0.0)

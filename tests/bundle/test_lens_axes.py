@@ -1,15 +1,12 @@
 """The way lenses look: the panorama's own, or one that turns below a stabilised panorama."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from lens_world import placed, problem_of, seen_through, solved_under, times
+from lens_world import placed, problem_of, seen_through, solved_under, solved_with
 from scipy.spatial.transform import Rotation
 from synthetic import loop_walk
 
 from gsba.bundle import lens_axes, lens_centres
-from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.lens_axes import upright
 from gsba.bundle.readout import CameraEstimate
 from gsba.camera.lens import Lenses
@@ -53,11 +50,7 @@ def test_axes_below_a_stabilised_panorama_are_found(seed: int) -> None:
     found = lens_centres.estimate(around, keypoints, solved, lenses, problem)
     assert not found.reason
     camera = CameraEstimate(found.lenses)
-    for _ in range(5):
-        solved, keypoints, tracks = solved_under(world, shown, camera.lenses, solved)
-        there = replace(solved, landmarks=placed(solved, keypoints, tracks))
-        rays = keypoints, shown.bearings_rig
-        camera = CameraSystem(there, *rays, camera, times(NUM), problem).step()
+    solved, camera = solved_with(world, shown, camera, solved, problem)
     assert camera.lenses.axes is not None
     assert np.median(_off_deg(camera.lenses.axes, truth)) < 1
     scale = pose_similarity(solved.world_T_rigs, world.world_T_rigs).scale  # no image knows it

@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lens_world import motion, placed, problem_of, seen_through, solved_under, times
+from lens_world import motion, placed, problem_of, seen_through, solved_under, solved_with, times
 from synthetic import loop_walk
 
 from gsba.bundle import readout
-from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.readout import CameraEstimate
 from gsba.camera.lens import Lenses
 from gsba.types import Fisheye, Solution
@@ -20,18 +19,15 @@ SWEEPS = np.array([[-1.0, 0, 0], [0, 1.0, 0]])
 TWISTS = motion(loop_walk(24), READOUT_S)
 
 
-def _found(camera: Lenses, seed: int, rounds: int = 5) -> tuple[CameraEstimate, float]:
+def _found(camera: Lenses, seed: int) -> tuple[CameraEstimate, float]:
     world, shown = seen_through(camera, seed)
     start, moments = Solution.without_points(world.world_T_rigs), times(len(world.world_T_rigs))
     solved, keypoints, tracks = solved_under(world, shown, LENSES, start)
     around, problem = placed(solved, keypoints, tracks), problem_of(world)
     known = keypoints, shown.bearings_rig
     found = readout.estimate(around, *known, solved, LENSES, moments, problem)
-    for _ in range(0 if found.reason else rounds):
-        solved, keypoints, tracks = solved_under(world, shown, found.lenses, solved)
-        there = replace(solved, landmarks=placed(solved, keypoints, tracks))
-        rays = keypoints, shown.bearings_rig
-        found = CameraSystem(there, *rays, found, moments, problem).step()
+    if not found.reason:
+        solved, found = solved_with(world, shown, found, solved, problem)
     return found, solved.noise
 
 

@@ -1,10 +1,8 @@
 """What raw lenses are, found from a map: with their centre, and only where it predicts."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from lens_world import placed, problem_of, seen_through, solved_under, times
+from lens_world import placed, problem_of, seen_through, solved_under, solved_with, times
 
 from factors.bearing import bearing_residuals
 from gsba.bundle import self_calibration
@@ -90,12 +88,9 @@ def test_the_graph_settles_lenses_beside_poses_and_says_how_well() -> None:
     solved, problem = Solution.without_points(world.world_T_rigs), problem_of(world)
     near = self_calibration.moved(Lenses(CENTRE, reference_calibration=CUT), _step_to(TRUE, 0.7))
     seeing = CameraEstimate(near)
-    for _ in range(5):
-        solved, keypoints, tracks = solved_under(world, shown, seeing.lenses, solved)
-        there = replace(solved, landmarks=placed(solved, keypoints, tracks))
-        system = CameraSystem(there, keypoints, shown.bearings_rig, seeing, times(24), problem)
-        seeing = system.step()
+    solved, seeing = solved_with(world, shown, seeing, solved, problem)
     assert _off_deg(seeing.lenses.fisheyes) < 0.03
+    system = CameraSystem(solved, shown, seeing, times(24), problem)
     sigmas = system.covariances().lens_sigmas
     assert sigmas is not None
     off = self_calibration.from_calibrated(seeing.lenses) - _step_to(TRUE, 1.0)

@@ -1,0 +1,130 @@
+"""Bundle adjustment through a camera that is solved for: one graph of poses, points and camera."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from gsba.bundle import prior_factors
+from gsba.bundle.adjustment import (
+    AdjustmentContext,
+    Terms,
+    adjust,
+    adjust_sighted,
+    adjust_sighted_through,
+    adjust_through,
+)
+from gsba.bundle.camera_system import CameraSystem
+from gsba.bundle.camera_variables import CameraUnknowns
+from gsba.bundle.readout import CameraEstimate
+from gsba.bundle.stitching import with_noise_of
+from gsba.types import Keypoints, Sighted, Solution, Tracks
+
+_SCALE_SIGMA = 1e-3  # of each map's extent about what it was: no image knows it, and frames' own
+# motion, which is drawn to none, would shrink the map
+
+
+@dataclass(frozen=True, slots=True)
+class CameraView:
+    """Observations through a camera whose variables are solved for; see `adjustment.View`."""
+
+    shown: Keypoints  # as pictures show them
+    keypoints: Keypoints  # the same as rays of the camera so far
+    camera: CameraEstimate
+    timestamps: np.ndarray  # (F,) seconds
+
+    @classmethod
+    def of(cls, shown: Keypoints, camera: CameraEstimate, timestamps: np.ndarray) -> "CameraView":
+        """Keypoints as pictures show them, through a camera that was found."""
+        return cls(shown, camera.lenses.seen(shown), camera, timestamps)
+
+    def with_noise_of(self, keypoints: Keypoints) -> "CameraView":
+        """The same, observations as noisy as keypoints of the same rows."""
+        shown = with_noise_of(self.shown, keypoints)
+        return replace(self, shown=shown, keypoints=self.camera.lenses.seen(shown))
+
+    def terms(
+        self, solved: Solution, noise: float, problem: AdjustmentContext
+    ) -> tuple[Terms, Callable[[gtsam.Values], "CameraView"]]:
+        """Poses and camera as variables of one graph."""
+        camera = self.camera
+        if noise <= solved.noise:  # under wide gates next to nothing contradicts a gyro
+            camera = CameraSystem(solved, self.shown, camera, self.timestamps, problem).prepared()
+        unknowns = CameraUnknowns.of(camera, solved.world_T_rigs, self.timestamps, problem)
+        terms = problem.terms(solved)
+        terms.values.insert(unknowns.values)
+        graph = gtsam.NonlinearFactorGraph(terms.graph)
+        graph.push_back(unknowns.graph)
+        poses, maps = solved.world_T_rigs, problem.maps
+        graph.push_back(prior_factors.fixed_scale(poses, maps, _SCALE_SIGMA))
+        block = unknowns.block(solved.landmarks, self.shown, noise, curved=True)
+
+        def after(values: gtsam.Values) -> "CameraView":
+            found = unknowns.estimate(values)
+            seen = found.lenses.seen(self.shown)
+            return replace(self, keypoints=seen, camera=found)
+
+        return replace(terms, graph=graph, blocks=(block, *terms.blocks)), after
+
+
+def solve_with_camera(
+    tracks: Tracks,
+    shown: Keypoints,
+    camera: CameraEstimate,
+    timestamps: np.ndarray,
+    start: Solution,
+    problem: AdjustmentContext,
+    gates: Sequence[float],
+    final: bool = True,
+) -> tuple[Solution, CameraEstimate]:
+    """Poses, points and all that was taken of a camera, solved for together.
+
+    The last round, of the tightest gate, is of poses and points alone.
+
+    Args:
+        tracks: candidate tracks.
+        shown: keypoints as pictures show them.
+        camera: to start from; what it leaves out (a readout, axes, raw lenses) is left out.
+        timestamps: (F,) seconds.
+        start, problem, gates, final: see `adjustment.adjust`.
+    """
+    wide, last = _split(gates)
+    view = CameraView.of(shown, camera, timestamps)
+    found, view = adjust_through(view, tracks, start, problem, wide, final)
+    solved = adjust(tracks, view.keypoints, found, problem, last, final)
+    return replace(solved, rounds=found.rounds + solved.rounds), view.camera
+
+
+def solve_sighted_with_camera(
+    sighted: Sighted,
+    camera: CameraEstimate,
+    timestamps: np.ndarray,
+    before: Solution,
+    problem: AdjustmentContext,
+    gates: Sequence[float],
+) -> tuple[Solution, Keypoints, CameraEstimate]:
+    """As `solve_with_camera`, of aligned and former observations, as `adjust_sighted` takes them.
+
+    Args:
+        sighted: observations as pictures show them.
+
+    Returns:
+        The solution, the keypoints with the noise that they turned out to have, and the camera.
+    """
+    wide, last = _split(gates)
+    view = CameraView.of(sighted.keypoints, camera, timestamps)
+    found, view = adjust_sighted_through(view, sighted, before, problem, wide)
+    seen = replace(sighted, keypoints=view.keypoints)
+    solved, keypoints = adjust_sighted(seen, found, problem, last)
+    solved = replace(solved, rounds=found.rounds + solved.rounds)
+    return solved, view.with_noise_of(keypoints).shown, view.camera
+
+
+def _split(gates: Sequence[float]) -> tuple[Sequence[float], Sequence[float]]:
+    """Gates of the rounds that solve for the camera, and of the last one, that leaves it as it is.
+
+    The tightest gate chooses observations by the camera so far, and these would confirm it: raw
+    lenses came out worse by them.
+    """
+    return gates[:-1] or gates, gates[-1:]
