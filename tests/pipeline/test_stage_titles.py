@@ -11,7 +11,7 @@ from tests.tiny_run import Case
     [
         ("everywhere1", "match known points, pass 1"),
         ("lenses0", "estimate lens centres, round 1"),
-        ("calibrated31", "adjust under the camera, under calibration 4, round 2"),
+        ("calibrated3", "adjust poses and calibrated lenses, matched anew, round 4"),
         ("aligned12_3", "adjust aligned patches, round 12, camera estimate 4"),
         ("first-refined2", "first solution: adjust with known points, pass 2"),
         ("again_axes", "once more: choose lens axes"),
