@@ -19,19 +19,20 @@ class WheelOdometry(Family):
 
     name = "wheels"
     fixes_gauge = True  # poses and points of the result are in metres
+    loss = gtsam.noiseModel.mEstimator.Cauchy.Create(2.0)  # a slipping wheel is an outlier
 
     def __init__(self, metres: np.ndarray, relative_sigma: float) -> None:
         self.metres, self.relative_sigma = metres, relative_sigma
         self.digest = hashlib.sha256(metres.tobytes() + str(relative_sigma).encode()).hexdigest()
 
     def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
-        """GTSAM's range factors under a robust loss, for which a slipping wheel is an outlier."""
-        graph, loss = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.mEstimator.Cauchy.Create(2.0)
+        """GTSAM's range factors under the robust loss."""
+        graph = gtsam.NonlinearFactorGraph()
         typical = float(np.median(self.metres))
         for f, metres in enumerate(self.metres.tolist()):
             sigma = self.relative_sigma * max(metres, 0.1 * typical)
             noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
-            robust = gtsam.noiseModel.Robust.Create(loss, noise)
+            robust = gtsam.noiseModel.Robust.Create(self.loss, noise)
             graph.add(gtsam.RangeFactorPose3(X(f), X(f + 1), metres, robust))
         return graph
 

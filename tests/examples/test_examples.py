@@ -114,6 +114,26 @@ def test_wheels_set_the_scale(walk: Path, tmp_path: Path) -> None:
     assert "wheels" in result.report["gauge"]
 
 
+def test_a_loss_of_ones_own_gives_up_slipped_steps(walk: Path, tmp_path: Path) -> None:
+    import robust_loss
+
+    result = robust_loss.main(walk, tmp_path / "run")
+    scale, error = _scale_and_error(walk, result.reconstruction.world_T_rigs)
+    assert 2.5 * scale == pytest.approx(1.0, rel=0.01)
+    assert error < 5e-3
+
+
+def test_the_general_loss_is_the_integral_of_its_weight() -> None:
+    from robust_loss import GeneralLoss
+
+    for shape in (1.0, -2.0, -4.0):
+        loss, step = GeneralLoss(shape, 1.5), 1e-5
+        assert loss.weight(0.0) == pytest.approx(1.0)
+        for residual in (0.3, 1.4, 6.0):
+            slope = (loss.loss(residual + step) - loss.loss(residual - step)) / (2 * step)
+            assert slope == pytest.approx(loss.weight(residual) * residual, rel=1e-6)
+
+
 def test_a_floor_finds_its_plane(walk: Path, tmp_path: Path) -> None:
     import floor_plane
 
