@@ -17,6 +17,7 @@ def test_whitening_weighs_with_the_inverse_covariance(seed: int) -> None:
         np.testing.assert_allclose(white[:, axis].T @ white[:, axis], wanted, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every_s", [0.1, 1.0, 30.0, 600.0])
 def test_independent_errors_say_as_much_of_a_mean(every_s: float) -> None:
     """Over a walk of thirty time constants; those of its ends are what is off."""

@@ -427,6 +427,7 @@ def test_a_camera_of_two_lenses_walks_the_same_way(walk, tmp_path):
     assert np.median(ratio[ahead < -10]) == pytest.approx(0.97, abs=0.01)
 
 
+@pytest.mark.slow
 def test_demo_compares_one_centre_with_two_lenses(tmp_path):
     few = ["--frames", "3", "--width", "256", "--out", str(tmp_path / "demo")]
     result = CliRunner().invoke(app, ["-q", "demo", "--camera", "two-lens", *few])
@@ -453,6 +454,7 @@ def test_demo_says_what_was_found_beside_what_is_true():
     assert line.endswith("true 32), rows read in 12.30 ms (sigma 0.20; true 12).")
 
 
+@pytest.mark.slow
 def test_demo_ends_like_refine_where_its_walk_falls_apart(tmp_path, monkeypatch):
     refine = pipeline.refine
 

@@ -50,6 +50,7 @@ def _overlap(found: np.ndarray, true: np.ndarray) -> float:
     return float(np.sum(found & true) / np.sum(found | true))
 
 
+@pytest.mark.slow
 def test_people_are_found_and_nothing_else(case: Case, tmp_path: Path) -> None:
     frames, true = _populated(case, tmp_path / "people")
     assert 0.01 < true.mean() < 0.1
@@ -96,6 +97,7 @@ def test_what_is_masked_already_is_not_judged(case: Case, tmp_path: Path) -> Non
     assert not (found & true[2]).any() and found.mean() < 0.02
 
 
+@pytest.mark.slow
 def test_a_run_masks_people_in_a_second_pass(case: Case, tmp_path: Path) -> None:
     """The given mask is kept, no observation is masked, and the second call resumes it all."""
     frames, true = _populated(case, tmp_path / "people")

@@ -56,6 +56,7 @@ def _write(folder: Path, poses: dict[str, Trajectory]) -> list[Path]:
     return [folder / name for name in poses]
 
 
+@pytest.mark.slow
 def test_two_files_with_worlds_of_their_own_are_joined(case: Case, tmp_path: Path) -> None:
     slam = read_trajectory(case.slam)
     half, times = NUM_FRAMES // 2, slam.timestamps

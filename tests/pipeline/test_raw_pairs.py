@@ -30,6 +30,8 @@ from gsba.store.finished import load_lenses, load_run
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Fisheye, Trajectory
 
+pytestmark = pytest.mark.slow
+
 BASELINE, NUM_FRAMES, SIZE = 0.05, 16, 448
 BEND = (-0.025, 0.0018, 0.0, 0.0)
 LENS = Fisheye(SIZE, SIZE, 0.30457 * SIZE, (SIZE / 2, SIZE / 2), BEND, (0.0, 0.0, 0.0))
@@ -225,7 +227,6 @@ def test_a_circle_goes_without_a_calibration(walk: Path, tmp_path: Path) -> None
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not (REAL / "fusion_wood").is_dir(), reason="real captures are not here")
 def test_a_fusion_capture_runs_from_its_own_files(tmp_path: Path) -> None:
     result = refine(REAL / "fusion_wood", None, tmp_path / "run", fps=1.0)

@@ -10,6 +10,8 @@ from tiny_run import SETTINGS, Case
 
 import gsba
 
+pytestmark = pytest.mark.slow
+
 _OUTPUTS = ("trajectory.tum", "poses.csv", "points.ply")
 _REFINE = """
 import sys
@@ -35,7 +37,6 @@ def test_threads_change_nothing(case: Case, tmp_path: Path) -> None:
     assert _outputs(runs[0]) == _outputs(runs[1])
 
 
-@pytest.mark.slow
 def test_compiling_kernels_changes_nothing(case: Case, tmp_path: Path) -> None:
     path, cache = str(Path(gsba.__file__).parents[1]), tmp_path / "kernels"
     environment = {**os.environ, "PYTHONPATH": path, "NUMBA_CACHE_DIR": str(cache)}

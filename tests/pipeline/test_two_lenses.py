@@ -26,6 +26,8 @@ from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet
 from gsba.view import faces_of, load_scene
 
+pytestmark = pytest.mark.slow
+
 BASELINE, NUM_FRAMES, WIDTH = 0.05, 16, 768
 WALK_SETTINGS = SETTINGS.model_copy(update={"patches": RefineSettings().patches})
 

@@ -17,6 +17,7 @@ from gsba.video import extract
 av = pytest.importorskip("av", reason="PyAV is not installed")
 
 
+@pytest.mark.slow
 def test_video_and_folder_give_the_same(case: Case, tmp_path: Path) -> None:
     video = tmp_path / "walk.mp4"
     walk = case.result.frames
