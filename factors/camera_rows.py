@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 DIM = 6
 MOTION, TURNS = 6, 2  # coordinates of what frames have of their own
 FRONT, BACK = 7, 10  # coordinates of what raw lenses are: the back one is turned, too
-OF_LENSES = (3, 4, 3, 4, 3)  # the same by variable: focal length and principal point, radial terms
+OF_LENSES = (3, 4, 3, 4, 3)  # of each variable of raw lenses: focal length and principal point,
+# radial terms, those of the back lens, its turn
 
 
 class Sightings(NamedTuple):
@@ -68,9 +69,9 @@ class CameraVariables:
     radius: int | None = None  # key (1,): inverse of the stitching radius, 1 / map units
     front_by_radius: float = 0.0  # where it is no variable: the distance of the lens's centre, part
     # of the stitching radius; 0 = infinity
-    lenses: Sequence[int] | None = None  # 5 keys of raw pairs: (3,) relative change of focal length
-    # and principal point in parts of the focal length, (4,) of k1 to k4; the same of the back
-    # lens, and its turn (3,) rad
+    lenses: Sequence[int] | None = None  # 5 keys of raw pairs: changes of the front lens's focal
+    # length and principal point (3,), relative to the focal length, and of its k1 to k4 (4,); the
+    # back lens's changes (3,), (4,), and its rotation (3,) rad
     calibration: np.ndarray | None = None  # (2, 16) rows as in CameraRows, at no change
 
     def __post_init__(self) -> None:

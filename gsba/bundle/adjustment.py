@@ -117,7 +117,7 @@ class AdjustmentContext:
 
 
 class View(Protocol):
-    """What sees the observations of an adjustment: known rays, or a camera that is solved for."""
+    """Source of an adjustment's rays: known rays, or a camera that is solved for."""
 
     @property
     def keypoints(self) -> Keypoints:
@@ -131,7 +131,7 @@ class View(Protocol):
     def terms(
         self, solved: Solution, noise: float, problem: AdjustmentContext
     ) -> "tuple[Terms, Callable[[gtsam.Values], Self]]":
-        """What an adjustment from a solution minimises, and the view at the values it finds.
+        """Terms that an adjustment from a solution minimises, and the view at the values it finds.
 
         Args:
             solved: poses, and the points to use.

@@ -49,10 +49,9 @@ class CameraSystem:
     problem: AdjustmentContext  # priors, loss
 
     def prepared(self) -> CameraEstimate:
-        """The same camera, a gyro believed or not, its frames' own motion as widely spread as it
-        turns out to be.
+        """The camera with a decision on the gyro, and the estimated spread of frames' own motion.
 
-        By steps of expectation and maximisation: squares of the deviations plus their variances.
+        The spread is estimated by expectation maximisation: squared deviations plus variances.
         """
         if self.camera.lenses.readout_motion is None:
             return self.camera
@@ -73,7 +72,7 @@ class CameraSystem:
         return system.unknowns.camera
 
     def _agrees(self, rates: np.ndarray) -> bool:
-        """Whether frames turn while they are read as a gyro's rates (F, 3) say, by images alone."""
+        """True if images alone confirm a gyro's rates (F, 3) of frames during their readout."""
         alone = replace(self, camera=replace(self.camera, by_gyro=False))._linearized()
         motion, variances = alone.own_motion(), alone.own_variances()
         told = np.isfinite(rates).all(axis=1)

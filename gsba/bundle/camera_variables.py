@@ -34,7 +34,7 @@ _LEAST_TURN = 1e-6  # rad, standard deviation
 
 @dataclass(frozen=True, slots=True)
 class OwnMotion:
-    """What is believed of each frame's motion during its readout, beside that of its velocity."""
+    """Prior on each frame's motion during its readout, beside that of its velocity."""
 
     values: np.ndarray  # (F, 6) to start from
     sigmas: np.ndarray  # (6,) about zero
@@ -160,7 +160,7 @@ class CameraUnknowns:
         )
 
     def spread_as(self, sigmas: np.ndarray) -> "CameraUnknowns":
-        """The same with frames' own motion spread (6,) otherwise."""
+        """The unknowns with other standard deviations (6,) of frames' own motion."""
         assert self.own is not None
         camera = replace(self.camera, own_sigmas=sigmas)
         return replace(self, camera=camera, own=replace(self.own, sigmas=sigmas))
@@ -197,13 +197,13 @@ def velocities_of(
     timestamps: np.ndarray,
     problem: AdjustmentContext,
 ) -> np.ndarray:
-    """How frames move, as far as poses and a gyro that is believed tell (F, 6)."""
+    """Velocities (F, 6) of frames, from poses, and from a gyro that is believed."""
     turning = problem.turning if camera.by_gyro else None
     return readout.velocities(world_T_rigs, timestamps, turning)
 
 
 def split_lenses(columns: np.ndarray) -> list[np.ndarray]:
-    """What is said (..., FREE) of raw lenses, by variable."""
+    """Parameters (..., FREE) of raw lenses, split by variable."""
     return np.split(columns, np.cumsum([3, 4, 3, 4]), axis=-1)
 
 

@@ -13,7 +13,7 @@ from gsba.odometry.panoramas import SmallPanoramas
 from gsba.odometry.places import compressed
 from gsba.odometry.tracker import Tracker
 from gsba.odometry.tracker_state import TrackerState
-from gsba.store.records import RecordError, load_record, read_info, save_record
+from gsba.store.records import load_checkpoint, save_record
 from gsba.store.shards import content_digest
 from gsba.store.store import fingerprint
 from gsba.video.likeness import sharpness
@@ -51,11 +51,12 @@ def track_frames(panoramas: SmallPanoramas, seed: int, checkpoint: Path | None) 
     num, interval = len(panoramas), float(np.median(np.diff(panoramas.timestamps)))
     patience = max(_MIN_PATIENCE, round(_PATIENCE_S / interval))
     key = _key(panoramas, seed, patience) if checkpoint is not None else ""
-    found = _resumed(checkpoint, key)
+    found = load_checkpoint(checkpoint, key, Tracking, "tracking begins anew") or Tracking()
+    if found.rows:
+        logger.info("tracking goes on after %d frames, from %s", len(found.rows), checkpoint)
     state, first = found.state, found.rows[-1] + 1 if found.rows else 0
     tracker = Tracker(panoramas.width, panoramas.usable, seed, patience, state)
-    gone, before = _DistanceGone(state), time.monotonic()
-    wait = _CHECKPOINT_S
+    gone, due = _DistanceGone(state), time.monotonic() + _CHECKPOINT_S
     pictures = panoramas.read(range(first, num), False)
     for row, grey in track(pictures, "tracking", num, first, gone):
         began = time.thread_time()
@@ -65,26 +66,27 @@ def track_frames(panoramas: SmallPanoramas, seed: int, checkpoint: Path | None) 
         while len(state.keyframe_frames) > len(found.pictures):
             found.pictures.append(compressed(grey))
         found.cpu_s += time.thread_time() - began
-        if checkpoint is not None and time.monotonic() - before > wait:
-            before = time.monotonic()
+        if checkpoint is not None and (began := time.monotonic()) > due:
             save_record(checkpoint, found, {"key": key})
-            wait = max(_CHECKPOINT_S, (time.monotonic() - before) / _MAX_SAVING_SHARE)
-            before = time.monotonic()
+            now = time.monotonic()
+            due = now + max(_CHECKPOINT_S, (now - began) / _MAX_SAVING_SHARE)
     return found
 
 
 @dataclass(slots=True)
 class _DistanceGone:
-    """Length of the path so far, for the progress bar."""
+    """Length of the path so far, for the progress bar; from one map to the next there is none."""
 
     state: TrackerState
     keyframes: int = 1  # that are counted
     length: float = 0.0  # map units
 
     def __call__(self) -> str:
-        poses = self.state.keyframe_poses
+        state, poses = self.state, self.state.keyframe_poses
         for n in range(self.keyframes, len(poses)):
-            self.length += float(np.linalg.norm(poses[n][:3, 3] - poses[n - 1][:3, 3]))
+            ends = state.keyframe_frames[n - 1 : n + 1]
+            if len({state.records[f].map_number for f in ends}) == 1:
+                self.length += float(np.linalg.norm(poses[n][:3, 3] - poses[n - 1][:3, 3]))
         self.keyframes = max(len(poses), 1)
         return f"{self.length:.1f} units gone"
 
@@ -96,17 +98,3 @@ def _key(panoramas: SmallPanoramas, seed: int, patience: int) -> str:
     files = fingerprint([source]) if source.is_file() else str(source)
     what = panoramas.width, seed, patience, __version__
     return content_digest(files, panoramas.timestamps, usable, what)
-
-
-def _resumed(checkpoint: Path | None, key: str) -> Tracking:
-    """The tracking of a checkpoint, or one that begins."""
-    if checkpoint is None or not checkpoint.exists():
-        return Tracking()
-    try:
-        if read_info(checkpoint).get("key") == key:
-            found = load_record(checkpoint, Tracking)
-            logger.info("tracking goes on after %d frames, from %s", len(found.rows), checkpoint)
-            return found
-    except RecordError as error:
-        logger.warning("tracking begins anew: %s", error)
-    return Tracking()

@@ -12,7 +12,6 @@ from gsba.bundle import (
     map_strength,
     rotation_only,
     tracks,
-    triangulation,
 )
 from gsba.bundle.gauge import Gauge
 from gsba.bundle.lens_centres import baseline_of
@@ -77,18 +76,13 @@ def align_gauge(state: State, name: str) -> State:
 
 def place_points(state: State, name: str) -> State:
     """Points of the matches of neighbours, under poses as they are."""
-    run, solution, settings = state.run, state.solution, state.run.settings
+    run, solution = state.run, state.solution
 
     def compute() -> Solution:
         neighbours = replace(state, matches=MapMatches(state.matches.neighbours))
-        placed = triangulation.place(
-            tracks_of(neighbours),
-            state.observed.keypoints,
-            solution.world_T_rigs,
-            settings.rounds.dense[-1] * solution.noise,
-            settings.triangulate,
-            run.num_threads,
-        )
+        gate = run.settings.rounds.dense[-1] * solution.noise
+        found, keypoints = tracks_of(neighbours), state.observed.keypoints
+        placed = state.triangulated(found, keypoints, gate)
         return replace(solution, landmarks=placed)
 
     key = [run.solving_key()]

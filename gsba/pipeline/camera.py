@@ -18,7 +18,6 @@ from gsba.bundle import (
     readout,
     self_calibration,
     stitching,
-    triangulation,
 )
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.camera_adjustment import solve_sighted_with_camera, solve_with_camera
@@ -346,14 +345,8 @@ def _from_features(
     gate = least if observed.lenses else _WIDE_GATE_SIGMAS
 
     def compute() -> T:
-        placed = triangulation.place(
-            backend.tracks_of(state),
-            observed.keypoints,
-            solution.world_T_rigs,
-            gate * solution.noise,
-            run.settings.triangulate,
-            run.num_threads,
-        )
+        tracks = backend.tracks_of(state)
+        placed = state.triangulated(tracks, observed.keypoints, gate * solution.noise)
         wide = replace(solution, landmarks=placed, noise=solution.noise * gate / least)
         camera = CameraEstimate(observed.lenses)
         return estimate(_Observations(wide, observed.keypoints, observed.shown, camera, state))
@@ -376,14 +369,8 @@ def _from_patches(
     def compute() -> T:
         there = replace(sighted, keypoints=map_.rays(sighted.keypoints, run.rig))
         there = adjustment.rescale_noise(there, map_.solution, run.settings)
-        placed = triangulation.place(
-            there.tracks,
-            there.keypoints,
-            map_.solution.world_T_rigs,
-            run.settings.rounds.aligned[0],
-            run.settings.triangulate,
-            run.num_threads,
-        )
+        gate = run.settings.rounds.aligned[0]
+        placed = state.triangulated(there.tracks, there.keypoints, gate)
         solution = replace(map_.solution, noise=1.0, landmarks=placed)
         shown = stitching.corrected(sighted.keypoints, map_.field, run.rig)
         return estimate(_Observations(solution, there.keypoints, shown, map_.camera(), state))

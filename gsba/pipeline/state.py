@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsba.bundle import gps_factors
+from gsba.bundle import gps_factors, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.readout import CameraEstimate
 from gsba.camera.lens import Lenses
@@ -14,7 +14,7 @@ from gsba.pipeline.map import Map
 from gsba.pipeline.observed_frames import ObservedFrames
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
-from gsba.types import Matches, Solution, VerifiedPairs
+from gsba.types import Keypoints, Landmarks, Matches, Solution, Tracks, VerifiedPairs
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +92,17 @@ class State:
     def through(self, lenses: Lenses) -> "State":
         """The state with its keypoints as rays of these lenses; the map's camera stays."""
         return replace(self, observed=self.observed.through(lenses))
+
+    def triangulated(self, tracks: Tracks, keypoints: Keypoints, gate: float) -> Landmarks:
+        """Points of tracks under the poses as they are.
+
+        Args:
+            tracks: candidates, of rows of `keypoints`.
+            gate: largest residual, in the keypoints' own standard deviations.
+        """
+        poses, run = self.solution.world_T_rigs, self.run
+        settings, threads = run.settings.triangulate, run.num_threads
+        return triangulation.place(tracks, keypoints, poses, gate, settings, threads)
 
     def adjustment_context(self) -> AdjustmentContext:
         """Priors, GPS fixes, families and settings of an adjustment of this map."""

@@ -36,7 +36,7 @@ from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.scene import Faces, Split, load_faces, make_views, near_of, split_frames
 from gsba.splat.scores import face_psnrs
 from gsba.splat.train import State, advance, begin
-from gsba.store.records import RecordError, load_record, read_info, save_record
+from gsba.store.records import load_checkpoint, save_record
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Round, Solution
 
 logger = logging.getLogger(__name__)
@@ -119,11 +119,13 @@ def refine(
     dropped = {"held out": len(split.held_out), "unrefined": int(np.count_nonzero(~usable))}
     counts = Counts(len(frames), len(split.training), "frames", dropped)
     turns = _Turns(keypoints, start, problem, further, split)
-    progress = _resume(checkpoint, key)
+    progress = load_checkpoint(checkpoint, key, _Progress, "the splat refinement starts anew")
     if progress is None:
         cloud = _cloud(start.landmarks, keypoints, chosen.sh_degree)
         first = begin(cloud, turns.training(0))
         progress = _Progress(0, -1, start.world_T_rigs, first, (), ())
+    else:
+        logger.info("resuming after %d moves of %s", len(progress.moves), checkpoint)
     while progress.level < len(chosen.sizes):
         turns.look(frames, progress.level, optics)
         while progress.turns < chosen.moves:
@@ -134,20 +136,6 @@ def refine(
                 break
         progress = replace(progress, level=progress.level + 1, turns=-1)
     return SplatResult(turns.adjusted(progress), (counts,), progress.moves)
-
-
-def _resume(checkpoint: Path | None, key: str) -> _Progress | None:
-    if checkpoint is None or not checkpoint.exists():
-        return None
-    try:
-        if read_info(checkpoint).get("key") != key:
-            return None
-        progress = load_record(checkpoint, _Progress)
-    except RecordError as error:
-        logger.warning("the splat refinement starts anew: %s", error)
-        return None
-    logger.info("resuming after %d moves of %s", len(progress.moves), checkpoint)
-    return progress
 
 
 def _cloud(landmarks: Landmarks, keypoints: Keypoints, sh_degree: int) -> Gaussians:

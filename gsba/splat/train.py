@@ -22,7 +22,7 @@ from gsba.splat.camera import FaceCamera
 from gsba.splat.density import DensityLimits, Pull, densify, reset_opacity
 from gsba.splat.gaussians import Gaussians, num_parameters
 from gsba.splat.lesson import Lesson
-from gsba.store.records import RecordError, load_record, read_info, save_record
+from gsba.store.records import load_checkpoint, save_record
 
 logger = logging.getLogger(__name__)
 
@@ -121,9 +121,11 @@ def train(
         GsbaError: all pixels are masked, there is no Gaussian, or parameters are no longer finite;
             the last checkpoint with finite ones is kept.
     """
-    state = _resume(checkpoint, key)
+    state = load_checkpoint(checkpoint, key, State, "training starts anew")
     if state is None:
         state = begin(start, settings)
+    else:
+        logger.info("resuming at step %d of %s", state.step, checkpoint)
     trainer = Trainer(views, settings, backend)
     saved = time.monotonic()
     steps = range(state.step, settings.iterations)
@@ -185,23 +187,6 @@ def _require_finite(state: State, checkpoint: Path | None) -> None:
     if not state.gaussians.is_finite():
         kept = "" if checkpoint is None else f"; the last good state is in {checkpoint}"
         raise GsbaError(f"the splat is no longer finite at step {state.step}{kept}")
-
-
-def _resume(checkpoint: Path | None, key: str) -> State | None:
-    if checkpoint is None or not checkpoint.exists():
-        return None
-    try:
-        if read_info(checkpoint).get("key") != key:
-            logger.info(
-                "%s was made with other inputs or settings: training starts anew", checkpoint
-            )
-            return None
-        state = load_record(checkpoint, State)
-    except RecordError as error:
-        logger.warning("training starts anew: %s", error)
-        return None
-    logger.info("resuming at step %d of %s", state.step, checkpoint)
-    return state
 
 
 def most_gaussians(views: Views, settings: SplatSettings, backend: Backend) -> tuple[int, str]:

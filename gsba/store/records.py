@@ -8,6 +8,7 @@ zip checksums reveal truncated or flipped bytes.
 """
 
 import json
+import logging
 import os
 import tokenize
 import types
@@ -26,6 +27,8 @@ import numpy as np
 from gsba.disk import atomic_write
 
 T = TypeVar("T")
+
+logger = logging.getLogger(__name__)
 
 FORMAT = 1  # raised whenever the layout below changes
 HEADER_ERRORS = (SyntaxError, tokenize.TokenError, RecursionError)  # of a damaged .npy or JSON
@@ -75,6 +78,29 @@ def load_record(path: Path, returns: type[T]) -> T:
     """
     with _reading(path) as archive:
         return _decode(_manifest(archive)["value"], returns, archive)
+
+
+def load_checkpoint(path: Path | None, key: str, returns: type[T], anew: str) -> T | None:
+    """Read what interrupted work saved, if it was saved with this `key` in its info.
+
+    Args:
+        path: file written by `save_record`; None = there is none.
+        key: digest of all that the work depends on.
+        returns: type of the record.
+        anew: clause for the log if the file cannot be used, e.g. "training starts anew".
+
+    Returns:
+        The record; None = there is none that can be used.
+    """
+    if path is None or not path.exists():
+        return None
+    try:
+        if read_info(path).get("key") == key:
+            return load_record(path, returns)
+        logger.info("%s was made with other inputs or settings: %s", path, anew)
+    except RecordError as error:
+        logger.warning("%s: %s", anew, error)
+    return None
 
 
 @contextmanager
