@@ -9,13 +9,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from factors.bearing import tangent_basis
+from gsba.camera.projections import FisheyeProjection
 from gsba.types import Fisheye
 
 Pair = tuple[Fisheye, Fisheye]  # front, back
 
 PARAMETERS = 10  # of a lens: relative focal length, principal point (2) in units of the focal
 # length, radial terms (4), rotation (3) in the rig
-_NUM_NEWTON_STEPS = 8  # enough for angles to converge in double precision
 
 
 def rotation_of(lens: Fisheye) -> np.ndarray:
@@ -25,25 +26,19 @@ def rotation_of(lens: Fisheye) -> np.ndarray:
     return Rotation.from_rotvec(lens.rotation).as_matrix()
 
 
+def projection_of(lens: Fisheye) -> FisheyeProjection:
+    """The projection of a lens, without its place in the rig."""
+    return FisheyeProjection(lens.width, lens.height, lens.focal, lens.principal, lens.radial)
+
+
 def project(lens: Fisheye, directions: np.ndarray) -> np.ndarray:
     """Pixels (..., 2), corner origin, of vectors (..., 3) in the rig frame."""
-    local = directions @ rotation_of(lens)
-    across = np.hypot(local[..., 0], local[..., 1])
-    radii = lens.focal * _distorted_radii(lens, np.arctan2(across, local[..., 2]))[0]
-    away = local[..., :2] / np.maximum(across, 1e-300)[..., None]
-    return np.asarray(lens.principal) + radii[..., None] * away
+    return projection_of(lens).project(directions @ rotation_of(lens))
 
 
 def unproject(lens: Fisheye, pixels: np.ndarray) -> np.ndarray:
     """Unit directions (..., 3) in the rig frame of pixels (..., 2), corner origin."""
-    away = (pixels - np.asarray(lens.principal)) / lens.focal
-    radii = np.hypot(away[..., 0], away[..., 1])
-    angles = radii.copy()
-    for _ in range(_NUM_NEWTON_STEPS):
-        bent, slope = _distorted_radii(lens, angles)
-        angles = np.clip(angles - (bent - radii) / np.maximum(slope, 0.1), 0, np.pi)
-    across = (np.sin(angles) / np.maximum(radii, 1e-300))[..., None] * away
-    return np.concatenate([across, np.cos(angles)[..., None]], axis=-1) @ rotation_of(lens).T
+    return projection_of(lens).unproject(pixels) @ rotation_of(lens).T
 
 
 def by_parameters(lens: Fisheye, directions: np.ndarray) -> np.ndarray:
@@ -53,23 +48,11 @@ def by_parameters(lens: Fisheye, directions: np.ndarray) -> np.ndarray:
         lens: its current parameters.
         directions: (N, 3) unit, rig frame, of the pixels.
     """
-    turn = rotation_of(lens)
-    local = directions @ turn
-    across = np.hypot(local[:, 0], local[:, 1])
-    angles = np.arctan2(across, local[:, 2])
-    bent, slope = _distorted_radii(lens, angles)
-    away = local[:, :2] / np.maximum(across, 1e-300)[:, None]
-    beside = np.stack([-away[:, 1], away[:, 0]], axis=1)
-    powers = angles[:, None] ** np.array([3, 5, 7, 9])
-    by_angle = np.concatenate([-bent[:, None], -away, -powers], axis=1) / slope[:, None]
-    around = np.zeros_like(by_angle)  # sine of the angle times the derivative by a rotation about
-    # the axis
-    shrunk = np.divide(across, bent, out=np.ones_like(bent), where=bent > 1e-9)
-    around[:, 1:3] = -beside * shrunk[:, None]
-    outwards = np.concatenate([np.cos(angles)[:, None] * away, -across[:, None]], axis=1)
-    sideways = np.concatenate([beside, np.zeros((len(beside), 1))], axis=1)
-    moved = outwards[:, :, None] * by_angle[:, None] + sideways[:, :, None] * around[:, None]
-    return np.concatenate([np.einsum("ij,njk->nik", turn, moved), -_cross(directions)], axis=2)
+    rig_R_lens = rotation_of(lens)
+    by_local, by_own = projection_of(lens).jacobians(directions @ rig_R_lens)
+    basis = tangent_basis(directions)  # (N, 2, 3) float64: a unit direction moves on it only
+    moves = -np.linalg.solve(by_local @ rig_R_lens.T @ np.swapaxes(basis, 1, 2), by_own)
+    return np.concatenate([np.swapaxes(basis, 1, 2) @ moves, -_cross(directions)], axis=2)
 
 
 def changed(lens: Fisheye, step: np.ndarray) -> Fisheye:
@@ -77,14 +60,9 @@ def changed(lens: Fisheye, step: np.ndarray) -> Fisheye:
     from scipy.spatial.transform import Rotation
 
     turn = Rotation.from_rotvec(step[7:]) * Rotation.from_rotvec(lens.rotation)
-    x, y = np.asarray(lens.principal) + lens.focal * step[1:3]
-    k1, k2, k3, k4 = np.asarray(lens.radial) + step[3:7]
-    bent = replace(
-        lens,
-        focal=float(lens.focal * np.exp(step[0])),
-        principal=(float(x), float(y)),
-        radial=(float(k1), float(k2), float(k3), float(k4)),
-    )
+    own = projection_of(lens).stepped(step[:7])
+    k1, k2, k3, k4 = own.radial
+    bent = replace(lens, focal=own.focal, principal=own.principal, radial=(k1, k2, k3, k4))
     return _with_rotation(bent, turn.as_rotvec())
 
 
@@ -139,15 +117,6 @@ def recalibrated(
 def _with_rotation(lens: Fisheye, rotation: np.ndarray) -> Fisheye:
     a, b, c = (float(v) for v in rotation)
     return replace(lens, rotation=(a, b, c))
-
-
-def _distorted_radii(lens: Fisheye, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance from the principal point in focal lengths, and its derivative, at angles (rad)."""
-    squares = angles * angles
-    bent, slope = np.zeros_like(angles), np.zeros_like(angles)
-    for power, k in zip((9, 7, 5, 3, 1), (*lens.radial[::-1], 1.0), strict=True):
-        bent, slope = bent * squares + k, slope * squares + power * k
-    return bent * angles, slope
 
 
 def _cross(vectors: np.ndarray) -> np.ndarray:

@@ -1,0 +1,263 @@
+"""Projections: how lenses map directions to pixels, with Jacobians and parameters with priors.
+
+A projection is one component of a camera. It has the lens's own axes (x right, y down, z ahead) and
+knows nothing of where the lens is. Each is a `Projection`: the perspective lens, the fisheye, the
+panorama. A lens that is symmetric about its axis is a `RadialProjection` with one formula, the
+distance of a ray's picture from the principal point as a function of its angle from the axis.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import ClassVar, Protocol, Self
+
+import numpy as np
+
+from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+
+_NUM_NEWTON_STEPS = 8  # enough for angles to converge in double precision
+_MIN_SLOPE = 0.1  # of the radius by the angle, in Newton's steps beyond a polynomial's own range
+_ON_AXIS = 1e-9  # sine of the angle below which a ray counts as the axis
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A parameter of a camera's component, as a variable of the graph."""
+
+    name: str
+    size: int  # coordinates
+    sigmas: tuple[float, ...]  # (size,) of the prior around the value that is given
+
+
+class Projection(Protocol):
+    """How one lens maps directions in its frame to pixels, (u, v) from the picture's corner."""
+
+    @property
+    def width(self) -> int:
+        """Pixels of the picture."""
+        ...
+
+    @property
+    def height(self) -> int:
+        """Pixels of the picture."""
+        ...
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """What can be estimated, in the order of `jacobians` and `stepped`."""
+        ...
+
+    def project(self, directions: np.ndarray) -> np.ndarray:
+        """Pixels (..., 2) of vectors (..., 3) of any length; NaN where the lens cannot see."""
+        ...
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Unit directions (..., 3) of pixels (..., 2)."""
+        ...
+
+    def jacobians(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Jacobians (N, 2, 3) of pixels by vectors (N, 3), and (N, 2, K) by the parameters."""
+        ...
+
+    def stepped(self, step: np.ndarray) -> Self:
+        """The projection after a step (K,) of its parameters."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class RadialProjection(ABC):
+    """A lens that is symmetric about its axis: r pixels from the principal point at each angle.
+
+    Its parameters are the relative focal length (a factor's logarithm), the principal point in
+    units of the focal length, and the radial terms.
+    """
+
+    width: int  # pixels
+    height: int  # pixels
+    focal: float  # pixels per radian on the axis
+    principal: tuple[float, float]  # pixels, corner origin
+    radial: tuple[float, ...] = ()  # terms of the formula
+
+    radial_sigmas: ClassVar[tuple[float, ...]] = ()  # of the priors on the radial terms
+    max_angle: ClassVar[float] = np.pi  # rad from the axis: nothing is seen from there on
+
+    @abstractmethod
+    def radii(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distance from the principal point in focal lengths at angles (rad) from the axis, and its
+        derivative by the angle."""
+
+    def by_radial(self, angles: np.ndarray) -> np.ndarray:
+        """Derivatives (N, len(radial)) of `radii` by the radial terms at angles (N,)."""
+        return np.zeros((len(angles), 0))
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Relative focal length, principal point in focal lengths, radial terms."""
+        found = Parameter("focal", 1, (0.05,)), Parameter("principal", 2, (0.02, 0.02))
+        if not self.radial:
+            return found
+        return *found, Parameter("radial", len(self.radial), self.radial_sigmas)
+
+    def project(self, directions: np.ndarray) -> np.ndarray:
+        """See `Projection`."""
+        across = np.hypot(directions[..., 0], directions[..., 1])
+        angles = np.arctan2(across, directions[..., 2])
+        if self.max_angle < np.pi:
+            angles = np.where(angles < self.max_angle, angles, np.nan)
+        radii = self.focal * self.radii(angles)[0]
+        away = directions[..., :2] / np.maximum(across, 1e-300)[..., None]
+        return np.asarray(self.principal) + radii[..., None] * away
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """See `Projection`."""
+        away = (pixels - np.asarray(self.principal)) / self.focal
+        radii = np.hypot(away[..., 0], away[..., 1])
+        angles, most = radii.copy(), self.max_angle
+        for _ in range(_NUM_NEWTON_STEPS):
+            reached, slope = self.radii(angles)
+            angles = np.clip(angles - (reached - radii) / np.maximum(slope, _MIN_SLOPE), 0, most)
+        across = (np.sin(angles) / np.maximum(radii, 1e-300))[..., None] * away
+        return np.concatenate([across, np.cos(angles)[..., None]], axis=-1)
+
+    def jacobians(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `Projection`."""
+        x, y, z = directions.T
+        across, squares = np.hypot(x, y), np.sum(directions**2, axis=1)
+        angles = np.arctan2(across, z)
+        reached, slope = self.radii(angles)
+        near = across <= _ON_AXIS * np.sqrt(squares)
+        safe = np.where(near, 1.0, across)
+        away = np.where(near[:, None], [1.0, 0.0], directions[:, :2] / safe[:, None])
+        stretch = np.where(near, slope / np.where(near, z, 1.0), reached / safe)
+        out = np.zeros((len(directions), 2, 3))
+        outer = np.einsum("ni,nj->nij", away, away)
+        out[:, :, :2] = (slope * z / squares - stretch)[:, None, None] * outer
+        out[:, [0, 1], [0, 1]] += stretch[:, None]
+        out[:, :, 2] = -(slope * across / squares)[:, None] * away
+        along = np.concatenate([reached[:, None], self.by_radial(angles)], axis=1)
+        along = away[:, :, None] * along[:, None]
+        ones = np.broadcast_to(np.eye(2), (len(directions), 2, 2))
+        by_parameters = np.concatenate([along[:, :, :1], ones, along[:, :, 1:]], axis=2)
+        return self.focal * out, self.focal * by_parameters
+
+    def stepped(self, step: np.ndarray) -> Self:
+        """See `Projection`."""
+        x, y = np.asarray(self.principal) + self.focal * step[1:3]
+        terms = np.asarray(self.radial) + step[3:]
+        return replace(
+            self,
+            focal=float(self.focal * np.exp(step[0])),
+            principal=(float(x), float(y)),
+            radial=tuple(float(term) for term in terms),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FisheyeProjection(RadialProjection):
+    """r = f (th + k1 th^3 + k2 th^5 + k3 th^7 + k4 th^9) (Kannala and Brandt, PAMI 2006).
+
+    Without radial terms it is the equidistant lens.
+    """
+
+    radial_sigmas: ClassVar[tuple[float, ...]] = (0.05, 0.02, 0.005, 0.001)
+
+    def radii(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `RadialProjection`."""
+        return _odd_polynomial(angles, self.radial)
+
+    def by_radial(self, angles: np.ndarray) -> np.ndarray:
+        """See `RadialProjection`."""
+        return angles[:, None] ** np.arange(3, 3 + 2 * len(self.radial), 2)
+
+
+@dataclass(frozen=True, slots=True)
+class PerspectiveProjection(RadialProjection):
+    """r = f (t + k1 t^3 + k2 t^5), t = tan th (Brown, Photogrammetric Engineering 1966)."""
+
+    radial_sigmas: ClassVar[tuple[float, ...]] = (0.1, 0.05)
+    max_angle: ClassVar[float] = np.pi / 2 - 1e-6
+
+    def radii(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `RadialProjection`."""
+        tangents = np.tan(angles)
+        reached, slope = _odd_polynomial(tangents, self.radial)
+        return reached, slope * (1 + tangents**2)
+
+    def by_radial(self, angles: np.ndarray) -> np.ndarray:
+        """See `RadialProjection`."""
+        return np.tan(angles)[:, None] ** np.arange(3, 3 + 2 * len(self.radial), 2)
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """See `Projection`; Newton's steps are taken in the tangent, which is nearly linear."""
+        away = (pixels - np.asarray(self.principal)) / self.focal
+        radii = np.hypot(away[..., 0], away[..., 1])
+        tangents = radii.copy()
+        for _ in range(_NUM_NEWTON_STEPS):
+            reached, slope = _odd_polynomial(tangents, self.radial)
+            tangents = tangents - (reached - radii) / np.maximum(slope, _MIN_SLOPE)
+        scale = np.divide(tangents, radii, out=np.ones_like(radii), where=radii > 0)
+        rays = np.concatenate([scale[..., None] * away, np.ones_like(radii)[..., None]], axis=-1)
+        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+@dataclass(frozen=True, slots=True)
+class EquirectangularProjection:
+    """A 2:1 panorama: longitude across, latitude down. It has no parameters."""
+
+    width: int  # pixels
+    height: int  # pixels, half the width
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """None."""
+        return ()
+
+    def project(self, directions: np.ndarray) -> np.ndarray:
+        """See `Projection`."""
+        return erp_from_bearings(directions, self.width, self.height)
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """See `Projection`."""
+        return bearings_from_erp(pixels, self.width, self.height)
+
+    def jacobians(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `Projection`; not finite at the poles, where a longitude has no derivative."""
+        x, y, z = directions.T
+        level = x**2 + z**2
+        radius, squares = np.sqrt(level), level + y**2
+        out = np.zeros((len(directions), 2, 3))
+        across, down = self.width / (2 * np.pi), self.height / np.pi
+        out[:, 0, 0], out[:, 0, 2] = across * z / level, -across * x / level
+        out[:, 1, 1] = down * radius / squares
+        out[:, 1, 0], out[:, 1, 2] = (-down * y * part / (radius * squares) for part in (x, z))
+        return out, np.zeros((len(directions), 2, 0))
+
+    def stepped(self, step: np.ndarray) -> "EquirectangularProjection":
+        """The projection itself."""
+        return self
+
+
+PROJECTIONS: dict[str, Callable[..., RadialProjection]] = {  # by "model" in calibration files
+    "kannala-brandt": FisheyeProjection,
+    "perspective": PerspectiveProjection,
+}
+
+
+def projection_of_model(model: str) -> Callable[..., RadialProjection]:
+    """The projection that a calibration file names; what follows a colon explains it.
+
+    Raises:
+        ValueError: no such projection is known.
+    """
+    name = model.split(":")[0].strip().lower()
+    if name not in PROJECTIONS:
+        known = ", ".join(PROJECTIONS)
+        raise ValueError(f"its model is '{name}', which is none of {known}")
+    return PROJECTIONS[name]
+
+
+def _odd_polynomial(x: np.ndarray, terms: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """x + terms[0] x^3 + terms[1] x^5 + ..., and its derivative."""
+    squares = x * x
+    value, slope = np.zeros_like(x), np.zeros_like(x)
+    powers = range(2 * len(terms) + 1, 0, -2)
+    for power, k in zip(powers, (*terms[::-1], 1.0), strict=True):
+        value, slope = value * squares + k, slope * squares + power * k
+    return value * x, slope
