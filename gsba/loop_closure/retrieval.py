@@ -25,18 +25,23 @@ def global_descriptors(
     frames: SearchableFrames, num_frames: int, seed: int, workers: Workers
 ) -> np.ndarray:
     """Global descriptors (F, D) float32 of all panoramas, of unit length, invariant to heading."""
-    share = max(_NUM_SAMPLES // max(num_frames, 1), 8)
-    draw = partial(_sampled_descriptors, share=share, seed=seed)
-    everyone = np.arange(num_frames)
-    sample = np.concatenate(
-        list(workers.map_shards(_DescriptorJob("sampling", frames, everyone, draw)))
-    )
-    words = _vocabulary(sample, np.random.default_rng(seed))
+    words, everyone = visual_words(frames, num_frames, seed, workers), np.arange(num_frames)
     job = _DescriptorJob("looks", frames, everyone, partial(_descriptor_of, words=words))
     looks = np.empty((num_frames, words.size), np.float32)
     for row, look in zip(looks, workers.map_shards(job), strict=True):
         row[:] = look
     return looks
+
+
+def visual_words(
+    frames: SearchableFrames, num_frames: int, seed: int, workers: Workers
+) -> np.ndarray:
+    """Vocabulary (W, D) float32 of the descriptors of all frames, for `aggregate`."""
+    share = max(_NUM_SAMPLES // max(num_frames, 1), 8)
+    draw = partial(_sampled_descriptors, share=share, seed=seed)
+    job = _DescriptorJob("sampling", frames, np.arange(num_frames), draw)
+    sample = np.concatenate(list(workers.map_shards(job)))
+    return _vocabulary(sample, np.random.default_rng(seed))
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +76,7 @@ def _sampled_descriptors(descriptors: np.ndarray, frame: int, share: int, seed: 
 
 def _descriptor_of(descriptors: np.ndarray, _frame: int, words: np.ndarray) -> np.ndarray:
     """The global descriptor of a frame."""
-    return _aggregate(descriptors, words)
+    return aggregate(descriptors, words)
 
 
 def _vocabulary(sample: np.ndarray, rng: np.random.Generator, rounds: int = 12) -> np.ndarray:
@@ -95,8 +100,9 @@ def _sums_by_group(rows: np.ndarray, groups: np.ndarray, num: int) -> np.ndarray
     return csr_matrix((ones, groups, starts), shape=(len(rows), num)).T @ rows
 
 
-def _aggregate(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
-    """Sums of the differences from the nearest words, normalised word by word."""
+def aggregate(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
+    """Global descriptor (W D,) of descriptors (K, D): sums of the differences from the nearest
+    words (W, D), normalised word by word."""
     nearest = _nearest(descriptors, words)
     sums = _sums_by_group(descriptors - words[nearest], nearest, len(words))
     lengths = np.linalg.norm(sums, axis=1, keepdims=True)

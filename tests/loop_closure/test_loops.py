@@ -12,7 +12,7 @@ from gsba.features import detection
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.loop_closure import loops
 from gsba.loop_closure.pose_graph import Loop
-from gsba.loop_closure.retrieval import _aggregate, _sampled_descriptors, global_descriptors
+from gsba.loop_closure.retrieval import _sampled_descriptors, aggregate, global_descriptors
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.similarity import relative_map
 from gsba.store.shards import Threads
@@ -81,7 +81,7 @@ def test_looks_do_not_depend_on_heading() -> None:
     straight, turned = _scene()[0], _scene(heading=2.0)[0]
     words = straight[0].descriptors[:64]
     for f in range(NUM_FRAMES):
-        one, other = (_aggregate(frames[f].descriptors, words) for frames in (straight, turned))
+        one, other = (aggregate(frames[f].descriptors, words) for frames in (straight, turned))
         np.testing.assert_allclose(one, other, atol=1e-5)
 
 

@@ -1,0 +1,189 @@
+"""Factor block of pictures that show known points: poses, and cameras that pictures share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from factors import PoseSystem, RobustLoss, tangent_basis
+from gsba.bundle.prior_factors import X
+from gsba.camera.projections import Projection
+
+_BEHIND = 1e3  # whitened residual of a point that the picture cannot show
+_FAMILY = "known_points"
+
+
+def K(camera: int) -> int:
+    """GTSAM key of a camera: the steps of its projection's parameters so far, a vector."""
+    return gtsam.symbol("k", camera)
+
+
+def num_parameters(projection: Projection) -> int:
+    """Number of a projection's parameters."""
+    return sum(parameter.size for parameter in projection.parameters())
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """Points of a map in one picture, a panorama or a photo."""
+
+    points_world: np.ndarray  # (N, 3) float64, map units
+    covariances: np.ndarray  # (N, 3, 3) float64, of the points, map units^2
+    measured: np.ndarray  # (N, 3) unit bearings, rig frame, of a panorama; (N, 2) pixels of a photo
+    sigmas: np.ndarray  # (N,) per axis, radians or pixels
+    origins_rig: np.ndarray | None = None  # (N, 3) origins of rays, rig frame; None = the centre
+    camera: int | None = None  # number of a photo's camera; None = a panorama
+
+    def taken(self, rows: np.ndarray) -> "Sightings":
+        """Sightings `rows` (M,), int or bool."""
+        origins = self.origins_rig
+        return replace(
+            self,
+            points_world=self.points_world[rows],
+            covariances=self.covariances[rows],
+            measured=self.measured[rows],
+            sigmas=self.sigmas[rows],
+            origins_rig=None if origins is None else origins[rows],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Residuals:
+    """Residuals of sightings and their derivatives, not whitened."""
+
+    values: np.ndarray  # (N, 2) radians or pixels
+    by_pose: np.ndarray  # (N, 2, 6), tangent [rotation, translation] on the right
+    by_camera: np.ndarray  # (N, 2, C), steps of the projection's parameters
+    covariances: np.ndarray  # (N, 2, 2), of keypoints and points
+    behind: np.ndarray  # (N,) bool, points that the picture cannot show
+
+
+def residuals_of(
+    seen: Sightings, world_T_rig: np.ndarray, projection: Projection | None
+) -> Residuals:
+    """Residuals of sightings at a pose (4, 4): in a panorama on the bearing's tangent plane, in a
+    photo in pixels."""
+    rotation = world_T_rig[:3, :3]
+    local = (seen.points_world - world_T_rig[:3, 3]) @ rotation
+    vectors = local if seen.origins_rig is None else local - seen.origins_rig
+    if projection is None:
+        lengths = np.maximum(np.linalg.norm(vectors, axis=1), 1e-12)
+        units, axes = vectors / lengths[:, None], tangent_basis(seen.measured)
+        values = np.einsum("nij,nj->ni", axes, units)
+        by_vector = (axes - values[:, :, None] * units[:, None]) / lengths[:, None, None]
+        by_camera = np.zeros((len(values), 2, 0))
+        behind = np.sum(units * seen.measured, axis=1) <= 0
+    else:
+        behind = ~(vectors[:, 2] > 1e-9) | ~np.isfinite(projection.project(vectors)).all(axis=1)
+        shown = np.where(behind[:, None], [0.0, 0.0, 1.0], vectors)
+        values = projection.project(shown) - seen.measured
+        by_vector, by_camera = projection.jacobians(shown)
+    turned = np.cross(by_vector, local[:, None])  # d(vector) = local x rotation - translation
+    by_pose = np.concatenate([turned, -by_vector], axis=2)
+    by_point = by_vector @ rotation.T
+    spread = by_point @ seen.covariances @ np.swapaxes(by_point, 1, 2)
+    spread[:, [0, 1], [0, 1]] += seen.sigmas[:, None] ** 2
+    return Residuals(values, by_pose, by_camera, spread, behind)
+
+
+class KnownPointBlock:
+    """Robust residuals of sightings over the poses of pictures and the cameras that they share.
+
+    The noise of a residual, which holds what a point is uncertain by, is taken at accepted values.
+
+    Args:
+        pictures: sightings of each picture (P).
+        projections: (C) of each camera, where its steps are zero.
+        loss: on a residual's norm, in standard deviations.
+    """
+
+    def __init__(
+        self, pictures: Sequence[Sightings], projections: Sequence[Projection], loss: RobustLoss
+    ) -> None:
+        self._pictures, self._loss = tuple(pictures), loss
+        # Cameras at accepted values, and these: steps lead on from there.
+        self._projections: list[Projection] = list(projections)
+        self._at = [np.zeros(num_parameters(one)) for one in projections]
+        self._roots: list[np.ndarray] = []  # (N, 2, 2) inverse square root of each covariance
+        self.keys: list[int] = [X(p) for p in range(len(pictures))]
+        self.keys += [K(c) for c in range(len(projections))]
+        num = len(pictures)
+        rows = [(p, num + seen.camera) for p, seen in enumerate(pictures) if seen.camera is not None]
+        self.pairs = np.array(rows, np.int64).reshape(-1, 2)
+
+    def refresh(self, values: gtsam.Values) -> None:
+        """Take cameras, and the noise of residuals, at accepted values."""
+        for c in range(len(self._projections)):
+            self._projections[c] = self._projection(c, values)
+            self._at[c] = values.atVector(K(c))
+        self._roots = [
+            np.linalg.inv(np.linalg.cholesky(self._residuals(p, values).covariances))
+            for p in range(len(self._pictures))
+        ]
+
+    def linearize(self, values: gtsam.Values) -> PoseSystem:
+        """Model of the cost at accepted values."""
+        num = len(self.keys)
+        diagonal, gradient = np.zeros((num, 6, 6)), np.zeros((num, 6))
+        mixed, cost, pair = np.zeros((len(self.pairs), 6, 6)), 0.0, 0
+        for p, seen in enumerate(self._pictures):
+            whitened, by_pose, by_camera, weights = self._whitened(p, values)
+            cost += float(self._loss.rho(np.sum(whitened**2, axis=1)).sum())
+            weighted = weights[:, None, None] * by_pose
+            diagonal[p] += np.einsum("nri,nrj->ij", weighted, by_pose)
+            gradient[p] += np.einsum("nri,nr->i", weighted, whitened)
+            if seen.camera is None:
+                continue
+            row, size = len(self._pictures) + seen.camera, by_camera.shape[2]
+            scaled = weights[:, None, None] * by_camera
+            diagonal[row, :size, :size] += np.einsum("nri,nrj->ij", scaled, by_camera)
+            gradient[row, :size] += np.einsum("nri,nr->i", scaled, whitened)
+            mixed[pair, :, :size] = np.einsum("nri,nrj->ij", weighted, by_camera)
+            pair += 1
+        return PoseSystem(diagonal, mixed, gradient, {_FAMILY: cost})
+
+    def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
+        """Cost at tentative values."""
+        return self.costs(values)[_FAMILY]
+
+    def accept(self) -> None:
+        """Nothing is inside of the block."""
+
+    def costs(self, values: gtsam.Values) -> dict[str, float]:
+        """Cost, under the noise of the accepted values."""
+        squares = [np.sum(self._whitened(p, values)[0] ** 2, axis=1) for p in self._numbers()]
+        return {_FAMILY: float(sum(self._loss.rho(part).sum() for part in squares))}
+
+    def squared_residuals(self, values: gtsam.Values) -> list[np.ndarray]:
+        """Squared whitened residuals (N,) of each picture."""
+        self.refresh(values)
+        return [np.sum(self._whitened(p, values)[0] ** 2, axis=1) for p in self._numbers()]
+
+    def projections(self, values: gtsam.Values) -> list[Projection]:
+        """Projections (C) of the cameras."""
+        return [self._projection(c, values) for c in range(len(self._projections))]
+
+    def _projection(self, camera: int, values: gtsam.Values) -> Projection:
+        step = values.atVector(K(camera)) - self._at[camera]
+        return self._projections[camera].stepped(step)
+
+    def _numbers(self) -> range:
+        return range(len(self._pictures))
+
+    def _residuals(self, picture: int, values: gtsam.Values) -> Residuals:
+        seen = self._pictures[picture]
+        projection = None if seen.camera is None else self._projection(seen.camera, values)
+        return residuals_of(seen, values.atPose3(X(picture)).matrix(), projection)
+
+    def _whitened(
+        self, picture: int, values: gtsam.Values
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Whitened residuals (N, 2), derivatives by pose (N, 2, 6) and camera (N, 2, C), weights
+        (N,) of the loss."""
+        found, roots = self._residuals(picture, values), self._roots[picture]
+        whitened = np.einsum("nij,nj->ni", roots, found.values)
+        whitened[found.behind] = [_BEHIND, 0.0]
+        weights = self._loss.weights(np.sum(whitened**2, axis=1))
+        weights[found.behind] = 0.0
+        return whitened, roots @ found.by_pose, roots @ found.by_camera, weights

@@ -1,0 +1,269 @@
+"""Localisation of new frames in a finished run: recognised places, known points, a pose fit."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from factors.sphere_field import SphereField
+from gsba.bundle.stitching import corrected
+from gsba.camera.rig import owner_faces
+from gsba.camera.sphere import dense_enough
+from gsba.features.detection import extract, gather
+from gsba.frames import cubemap
+from gsba.geometry import inverse
+from gsba.localization.known_points import Sightings
+from gsba.localization.place_index import PlaceIndex, open_index
+from gsba.localization.pose_fit import PoseFit, fit
+from gsba.localization.pose_search import (
+    Candidates,
+    FoundPose,
+    is_rivalled,
+    is_significant,
+    search_pose,
+)
+from gsba.localization.run_map import RunMap
+from gsba.log import GsbaError
+from gsba.matching.guided_search import Gate, Searchable, match_pair, searchable
+from gsba.types import Features, FrameSet, Keypoints
+
+_NUM_PLACES = 5  # keyframes that look most like a frame
+_NUM_MORE_PLACES = 16  # where these do not suffice
+_NUM_NEAREST = 10  # keyframes whose points are searched along predicted bearings
+_WIDE_GATE_RAD, _NARROW_GATE_RAD = np.deg2rad(1.0), np.deg2rad(0.4)  # around predicted bearings
+_MIN_POINTS = 20  # inliers of a fit
+_MAX_POSITION_SIGMA = 0.05  # of a position, in median distances of points
+
+NO_PLACE = "no place of the map looks like it"
+TWO_PLACES = "two places of the map look like it"
+NOT_DETERMINED = "the points that it shows do not determine its pose"
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizedFrame:
+    """A frame in a run's map, or the reason why it is not found there."""
+
+    name: str
+    world_T_rig: np.ndarray  # (4, 4) float64, world of the run, map units; NaN = not localised
+    covariance: np.ndarray  # (6, 6) float64, tangent [rotation rad, translation], rig frame, given
+    # the map; NaN = not localised
+    num_points: int  # points of the map that it shows
+    noise_rad: float  # standard deviation of its keypoints per axis; NaN = not localised
+    nearest: str  # name of the nearest keyframe; "" = not localised
+    reason: str  # why it is not localised; "" = it is
+
+    @property
+    def found(self) -> bool:
+        """True if the frame is localised."""
+        return not self.reason
+
+    @classmethod
+    def refused(cls, name: str, reason: str) -> "LocalizedFrame":
+        """A frame that is not localised."""
+        nothing = np.full((4, 4), np.nan), np.full((6, 6), np.nan)
+        return cls(name, *nothing, 0, np.nan, "", reason)
+
+
+@dataclass(frozen=True, slots=True)
+class Query:
+    """Keypoints of a picture to localise."""
+
+    features: Features
+    bearings: np.ndarray  # (K, 3) unit, corrected directions of the keypoints, rig frame
+    origins_rig: np.ndarray | None  # (K, 3) origins of their rays; None = the centre
+    strongest: Searchable  # prepared for matching
+    all: Searchable
+
+
+class Localizer:
+    """Localises pictures of the run's camera; open it once, then localise one after the other.
+
+    Args:
+        run: folder of a finished run, which is only read. The index of its places is kept beside
+            it, in the folder RUN-index.
+        map_number: number of the map to localise in, 1 = the largest.
+
+    Raises:
+        GsbaError: no finished run, or one of another version of gsba.
+    """
+
+    def __init__(self, run: Path | str, map_number: int = 1) -> None:
+        self.map = RunMap.open(Path(run), map_number)
+        self.index: PlaceIndex = open_index(self.map)
+        self._extractor = self.map.make_extractor()
+        self._depth = self.map.median_depth()
+        self._field = SphereField(np.array(self.map.result.correction))
+
+    def localize(self, image: Path | str | np.ndarray, name: str = "") -> LocalizedFrame:
+        """Pose of one panorama of the run's camera.
+
+        Args:
+            image: file, or (H, 2H, 3) uint8 RGB.
+            name: of the frame; default: the file's.
+
+        Raises:
+            GsbaError: the image cannot be read, or is no panorama like those of the run.
+        """
+        if isinstance(image, np.ndarray):
+            return self._localize_features(name or "image", self._features_of(image))
+        from gsba.localization.pictures import load_panorama
+
+        return self.localize(load_panorama(Path(image)), name or Path(image).stem)
+
+    def localize_frame(self, frames: FrameSet, frame: int) -> LocalizedFrame:
+        """Pose of one frame of a scanned folder, with its mask.
+
+        Args:
+            frames: of the layout of the run's frames.
+            frame: its number.
+        """
+        images, masks = cubemap.load(replace(frames, correction=()), frame, self.map.rig)
+        features = extract(images, masks, self.map.rig, self._extractor)
+        return self._localize_features(frames.names[frame], features)
+
+    def _features_of(self, erp: np.ndarray) -> Features:
+        """Keypoints of a panorama (H, 2H, 3)."""
+        import cv2
+
+        if erp.ndim != 3 or erp.shape[1] != 2 * erp.shape[0] or erp.shape[2] != 3:
+            raise GsbaError(f"an image of shape {erp.shape} is no panorama: (H, 2H, 3) is needed")
+        width = dense_enough(erp.shape[1], self.map.rig.focal)
+        if width < erp.shape[1]:
+            erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
+        return extract(cubemap.cut(erp, self.map.rig), None, self.map.rig, self._extractor)
+
+    def _localize_features(self, name: str, features: Features) -> LocalizedFrame:
+        query = self._query(features)
+        start, reason = self._recognise(query)
+        if start is None:
+            return LocalizedFrame.refused(name, reason)
+        world_T_rig, fitted, seen = start.world_T_rig, None, None
+        for gate in (_WIDE_GATE_RAD, _NARROW_GATE_RAD):
+            candidates = self.candidates_around(query, world_T_rig, gate)
+            if len(candidates) < _MIN_POINTS:
+                return LocalizedFrame.refused(name, NO_PLACE)
+            seen = self._sightings(query, candidates)
+            fitted = fit([seen], world_T_rig[None])
+            world_T_rig = fitted.world_T_rigs[0]
+        assert fitted is not None and seen is not None
+        return self._judged(name, fitted, seen, candidates)
+
+    def _query(self, features: Features) -> Query:
+        """Keypoints ready to be matched, where they really point."""
+        map_ = self.map
+        seen: Keypoints = corrected(gather([features]), self._field, map_.rig)
+        origins = None
+        if map_.lenses and map_.lenses.axes is None:  # else nothing says how the lenses lie in it
+            still = replace(map_.lenses, readout_motion=None)
+            seen = still.seen(seen)
+            origins = seen.origins_rig
+        ready = replace(
+            features, bearings_rig=seen.bearings_rig, faces=owner_faces(seen.bearings_rig)
+        )
+        strongest = map_.settings.pairs.strongest_per_face
+        few, every = searchable(features, map_.axes, strongest), searchable(ready, map_.axes)
+        return Query(features, seen.bearings_rig, origins, few, every)
+
+    def _recognise(self, query: Query) -> tuple[FoundPose | None, str]:
+        """A first pose by the places that look most like a frame; or None, and the reason."""
+        settings, reason = self.map.settings, NO_PLACE
+        descriptors = query.all.descriptors
+        places = self.index.nearest_panoramas(descriptors, _NUM_MORE_PLACES)
+        max_error = np.deg2rad(settings.verify.max_error_deg)
+        for strongest, chosen in ((True, places[:_NUM_PLACES]), (False, places)):
+            candidates = self.candidates_of(query, chosen, strongest)
+            found = search_pose(candidates, max_error, settings.seed)
+            chance = (1 - np.cos(max_error)) / 2  # a disc's share of the sphere
+            if found is None or not is_significant(candidates.bearings, found.inliers, chance):
+                continue
+            left = candidates.taken(~found.inliers)
+            rival = search_pose(left, max_error, settings.seed)
+            if not is_rivalled(found, rival, candidates):
+                return found, ""
+            reason = TWO_PLACES
+        return None, reason
+
+    def candidates_of(self, query: Query, places: np.ndarray, strongest: bool) -> Candidates:
+        """Points of keyframes (N,) that look like keypoints, wherever they are."""
+        chosen = self.map.settings.matching
+
+        def match(place: int) -> np.ndarray:
+            keyframe = self.map.load_keyframe(place)
+            first = keyframe.strongest if strongest else keyframe.all
+            second = query.strongest if strongest else query.all
+            return match_pair(first, second, np.eye(4), Gate.anywhere(), chosen)
+
+        return self._gathered(query, places, match)
+
+    def candidates_around(
+        self, query: Query, world_T_rig: np.ndarray, gate_rad: float
+    ) -> Candidates:
+        """Points of the nearest keyframes that look like keypoints near their predicted
+        bearing."""
+        poses = self.map.result.world_T_rigs
+        distances = np.linalg.norm(poses[:, :3, 3] - world_T_rig[:3, 3], axis=1)
+        places = np.argsort(distances, kind="stable")[:_NUM_NEAREST]
+        gate, chosen = Gate.around_points(gate_rad), self.map.settings.matching
+
+        def match(place: int) -> np.ndarray:
+            keyframe, f0_T_f1 = self.map.load_keyframe(place), inverse(poses[place]) @ world_T_rig
+            known = keyframe.points_rig
+            return match_pair(keyframe.all, query.all, f0_T_f1, gate, chosen, known)
+
+        return self._gathered(query, places, match)
+
+    def _gathered(
+        self, query: Query, places: np.ndarray, match: Callable[[int], np.ndarray]
+    ) -> Candidates:
+        """Pairs of a keypoint and a point, each once, from the matches with several keyframes."""
+        pairs = [np.zeros((0, 2), np.int64)]
+        for place in places.tolist():
+            found = match(place)
+            points = self.map.load_keyframe(place).points[found[:, 0]]
+            pairs.append(np.column_stack([found[:, 1], points]))
+        keypoints, points = np.unique(np.concatenate(pairs), axis=0).T
+        positions = self.map.result.points_world[points]
+        return Candidates(keypoints, query.bearings[keypoints], points, positions)
+
+    def _sightings(self, query: Query, candidates: Candidates) -> Sightings:
+        rows, origins = candidates.keypoints, query.origins_rig
+        return Sightings(
+            candidates.points_world,
+            self.map.point_covariances[candidates.points],
+            query.bearings[rows],
+            query.features.sigmas_rad[rows],
+            None if origins is None else origins[rows],
+        )
+
+    def _judged(
+        self, name: str, fitted: PoseFit, seen: Sightings, candidates: Candidates
+    ) -> LocalizedFrame:
+        """The frame with its pose, if that is significant and determined."""
+        inliers, covariance = fitted.inliers[0], fitted.covariances[0]
+        world_T_rig, noise = fitted.world_T_rigs[0], float(fitted.noises[0])
+        sigma = noise * float(np.median(seen.sigmas))
+        chance = min((3.5 * sigma / _NARROW_GATE_RAD) ** 2, 0.5)
+        if not is_significant(candidates.bearings, inliers, chance):
+            return LocalizedFrame.refused(name, NO_PLACE)
+        offsets = candidates.points_world[inliers] - world_T_rig[:3, 3]
+        depth = float(np.median(np.linalg.norm(offsets, axis=1)))
+        if not np.isfinite(covariance).all() or (
+            np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) > _MAX_POSITION_SIGMA * depth
+        ):
+            return LocalizedFrame.refused(name, NOT_DETERMINED)
+        return LocalizedFrame(
+            name,
+            world_T_rig,
+            covariance,
+            len(np.unique(candidates.points[inliers])),
+            sigma,
+            self.nearest_keyframe(world_T_rig),
+            "",
+        )
+
+    def nearest_keyframe(self, world_T_rig: np.ndarray) -> str:
+        """Name of the keyframe nearest to a pose (4, 4)."""
+        positions = self.map.result.world_T_rigs[:, :3, 3]
+        distances = np.linalg.norm(positions - world_T_rig[:3, 3], axis=1)
+        return self.map.frames.names[int(np.argmin(distances))]

@@ -1,0 +1,99 @@
+"""Fit of pictures' poses, and of the cameras they share, to known points; with covariances."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from factors import RobustLoss
+from gsba.bundle.optimizer import marginal_covariances, optimize
+from gsba.bundle.prior_factors import X
+from gsba.camera.projections import Projection
+from gsba.config import SolverSettings
+from gsba.localization.known_points import K, KnownPointBlock, Sightings, num_parameters
+
+GATE_SIGMAS = 3.5  # of an inlier's residual
+_ANNEALED = (8.0, 2.0)  # scales of the loss in the first rounds, standard deviations
+_LAST_SCALE = 1.0  # of the loss in the last round
+_MEDIAN_OF_SQUARES = 1.3863  # of a chi-square distribution with two degrees of freedom
+_MIN_NOISE = 0.5  # of keypoints, in their own standard deviations
+_SOLVER = SolverSettings(max_iterations=20, relative_tolerance=1e-6, absolute_tolerance=1e-3)
+
+
+@dataclass(frozen=True, slots=True)
+class PoseFit:
+    """Poses of pictures, and cameras, fitted together."""
+
+    world_T_rigs: np.ndarray  # (P, 4, 4) float64, map units
+    covariances: np.ndarray  # (P, 6, 6), tangent [rotation rad, translation], NaN = not determined
+    inliers: tuple[np.ndarray, ...]  # (P) of (N,) bool
+    noises: np.ndarray  # (P,) of keypoints, in their own standard deviations
+    projections: tuple[Projection, ...]  # (C) of the cameras
+    camera_covariances: np.ndarray  # (C, 6, 6), of the projection's parameters, zero beyond these
+
+
+def fit(
+    pictures: Sequence[Sightings],
+    starts: np.ndarray,
+    projections: Sequence[Projection] = (),
+    sigmas: Sequence[np.ndarray] = (),
+) -> PoseFit:
+    """Minimise the robust residuals of known points over poses and cameras.
+
+    Args:
+        pictures: sightings of each picture (P); many may be false.
+        starts: (P, 4, 4) initial world_T_rigs.
+        projections: (C) initial cameras.
+        sigmas: (C) of (K,), standard deviations of the priors on their parameters.
+    """
+    values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
+    for p, start in enumerate(starts):
+        values.insert(X(p), gtsam.Pose3(start))
+    for c, (projection, spread) in enumerate(zip(projections, sigmas, strict=True)):
+        zero = np.zeros(num_parameters(projection))
+        values.insert(K(c), zero)
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(spread))
+        graph.push_back(gtsam.PriorFactorVector(K(c), zero, noise))
+    noises = np.ones(len(pictures))
+    for scale in (*_ANNEALED, _LAST_SCALE, _LAST_SCALE):
+        block = _block(pictures, noises, projections, scale)
+        values = optimize(graph, [block], values, _SOLVER).values
+        squares = block.squared_residuals(values)
+        if scale <= _ANNEALED[-1]:
+            noises = np.array([_rescaled(*pair) for pair in zip(noises, squares, strict=True)])
+    squares = _block(pictures, noises, projections, _LAST_SCALE).squared_residuals(values)
+    inliers = tuple(part < GATE_SIGMAS**2 for part in squares)
+    kept = [seen.taken(own) for seen, own in zip(pictures, inliers, strict=True)]
+    block = _block(kept, noises, projections, GATE_SIGMAS, "none")
+    block.refresh(values)
+    cameras = [K(c) for c in range(len(projections))]
+    keys = [X(p) for p in range(len(pictures))]
+    covariances, _ = marginal_covariances(graph, [block], values, keys, beside=cameras)
+    num = len(pictures)
+    poses = np.array([values.atPose3(key).matrix() for key in keys])
+    found = tuple(block.projections(values))
+    return PoseFit(poses, covariances[:num], inliers, noises, found, covariances[num:])
+
+
+def _block(
+    pictures: Sequence[Sightings],
+    noises: np.ndarray,
+    projections: Sequence[Projection],
+    scale: float,
+    loss: str = "cauchy",
+) -> KnownPointBlock:
+    """Block of pictures whose keypoints are `noises` (P,) times as noisy as they claim."""
+    scaled = [
+        replace(seen, sigmas=noise * seen.sigmas)
+        for seen, noise in zip(pictures, noises, strict=True)
+    ]
+    return KnownPointBlock(scaled, projections, RobustLoss(loss, scale))  # type: ignore[arg-type]
+
+
+def _rescaled(noise: float, squares: np.ndarray) -> float:
+    """Noise of a picture's keypoints after a fit with squared residuals (N,)."""
+    near = squares[squares < GATE_SIGMAS**2]
+    if not len(near):
+        return noise
+    return max(noise * float(np.sqrt(np.median(near) / _MEDIAN_OF_SQUARES)), _MIN_NOISE)

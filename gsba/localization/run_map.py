@@ -1,0 +1,228 @@
+"""A finished run as a map to localise in: its keyframes' keypoints with the points they show."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from factors import tangent_basis
+from factors.sphere_field import SphereField
+from gsba import learned
+from gsba.bundle.stitching import corrected
+from gsba.camera.lens import Lenses
+from gsba.camera.rig import CubeRig
+from gsba.config import RefineSettings
+from gsba.config_file import load_config
+from gsba.features.detection import Extractor, extract, gather
+from gsba.frames import cubemap
+from gsba.geometry import moved_to
+from gsba.log import GsbaError
+from gsba.matching.guided_search import Searchable, principal_axes, searchable
+from gsba.store.finished import load_lenses, load_run
+from gsba.store.folder import STAGES, read_marker
+from gsba.store.records import RecordError, load_record
+from gsba.types import Features, FrameSet, Reconstruction
+from gsba.version import __version__
+
+_NUM_KEPT = 64  # keyframes kept in memory
+_SAME_PLACE_SIGMAS = 6.0  # largest angle between a keypoint and the observation of a point that is
+# taken for the keypoint's, standard deviations of the keypoint
+_SAME_PLACE_RAD = np.deg2rad(0.25)  # and largest such angle
+_PRIOR_EXTENTS = 10.0  # standard deviation of a point before any observation, extents of the map
+_NUM_OBSERVATIONS_AT_ONCE = 1 << 18
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A frame of the map: the keypoints that show points of the map."""
+
+    features: Features  # (K)
+    strongest: Searchable  # the strongest of each face, prepared for matching
+    all: Searchable  # all of them, prepared for matching
+    points_rig: np.ndarray  # (K, 3) float64, point of each keypoint, rig frame, map units
+    points: np.ndarray  # (K,) int64, its number
+
+
+@dataclass(frozen=True, slots=True)
+class RunMap:
+    """Poses and points of one map of a finished run, and what reads the keypoints of its frames.
+
+    The run's folder is only read.
+    """
+
+    root: Path  # folder of the run
+    frames: FrameSet  # frames of the map
+    result: Reconstruction  # their poses, and the points
+    lenses: Lenses  # that see the frames
+    settings: RefineSettings  # of the run
+    rig: CubeRig  # faces on which keypoints are found
+    point_covariances: np.ndarray  # (J, 3, 3) float64, map units^2, of points given the poses
+    axes: np.ndarray  # (D, D) float32, axes of descriptors, see `searchable`
+    load_keyframe: Callable[[int], Keyframe]  # by the number of the frame; recent ones are kept
+
+    @classmethod
+    def open(cls, root: Path, map_number: int = 1) -> "RunMap":
+        """Read a finished run.
+
+        Args:
+            root: folder of the run.
+            map_number: number of the map, 1 = the largest.
+
+        Raises:
+            GsbaError: no finished run, one of another version of gsba, or one without points.
+        """
+        require_own_version(root)
+        result, frames = load_run(root, map_number)
+        if not len(result.points_world):
+            raise GsbaError(
+                f"{root} has no points (its camera turned on the spot): nothing can be localised "
+                "in it"
+            )
+        settings, lenses = load_config(root / "config.toml"), load_lenses(root, result, map_number)
+        rig = cubemap.rig_for(frames, settings.cubemap)
+        reader = _KeypointReader(root, frames, settings, rig)
+        first = reader(0).descriptors
+        if not len(first):
+            raise GsbaError(f"{root}: its first frame has no keypoints: refine again with --fresh")
+        axes = principal_axes(first)
+        observed = _ObservedPoints.of(result)
+        load = lru_cache(_NUM_KEPT)(
+            lambda f: _keyframe(f, reader(f), observed, result, lenses, settings, rig, axes)
+        )
+        covariances = point_covariances(result)
+        return cls(root, frames, result, lenses, settings, rig, covariances, axes, load)
+
+    def make_extractor(self) -> Extractor:
+        """Extractor of the kind that found the run's keypoints."""
+        weights = learned.find_weights(self.settings)
+        return learned.make_extractor(self.settings.features, weights)()
+
+    def median_depth(self) -> float:
+        """Median distance of points from the frames that observe them, map units."""
+        result = self.result
+        offsets = result.points_world[result.observation_points]
+        offsets = offsets - result.world_T_rigs[result.observation_frames, :3, 3]
+        return float(np.median(np.linalg.norm(offsets, axis=1)))
+
+
+def require_own_version(root: Path) -> None:
+    """Refuse a run that another version of gsba made.
+
+    Raises:
+        GsbaError: the run is of another version.
+    """
+    version = read_marker(root).get("gsba", __version__)
+    if version != __version__:
+        raise GsbaError(
+            f"{root} is a run of gsba {version}, this is gsba {__version__}: refine it again with "
+            f"--out {root}, or use gsba {version}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _KeypointReader:
+    """Keypoints of the map's frames: those that the run stored, else extracted again."""
+
+    root: Path
+    frames: FrameSet
+    settings: RefineSettings
+    rig: CubeRig
+
+    def __call__(self, frame: int) -> Features:
+        name = self.frames.names[frame]
+        for stage in ("features_closer", "features"):
+            path = self.root / STAGES / stage / f"{name}.npz"
+            if path.is_file():
+                try:
+                    return load_record(path, Features)
+                except RecordError:
+                    continue
+        raw = replace(self.frames, correction=())  # keypoints are corrected later
+        make = learned.make_extractor(self.settings.features, learned.find_weights(self.settings))
+        images, masks = cubemap.load(raw, frame, self.rig)
+        return extract(images, masks, self.rig, make())
+
+
+@dataclass(frozen=True, slots=True)
+class _ObservedPoints:
+    """Observations of a reconstruction, frame by frame."""
+
+    order: np.ndarray  # (O,) int64, rows of observations, sorted by frame
+    starts: np.ndarray  # (F + 1,) int64: frame f has rows order[starts[f]:starts[f + 1]]
+
+    @classmethod
+    def of(cls, result: Reconstruction) -> "_ObservedPoints":
+        order = np.argsort(result.observation_frames, kind="stable")
+        numbers = np.arange(len(result.world_T_rigs) + 1)
+        return cls(order, np.searchsorted(result.observation_frames[order], numbers))
+
+    def rows(self, frame: int) -> np.ndarray:
+        """Rows of the observations of one frame."""
+        return self.order[self.starts[frame] : self.starts[frame + 1]]
+
+
+def _keyframe(
+    frame: int,
+    features: Features,
+    observed: _ObservedPoints,
+    result: Reconstruction,
+    lenses: Lenses,
+    settings: RefineSettings,
+    rig: CubeRig,
+    axes: np.ndarray,
+) -> Keyframe:
+    """Keypoints of a frame that lie where the frame observes a point of the map."""
+    from scipy.spatial import KDTree
+
+    rows = observed.rows(frame)
+    seen = corrected(gather([features]), SphereField(np.array(result.correction)), rig)
+    seen = lenses.of_frame(frame).seen(seen) if lenses else seen
+    numbers = np.zeros(len(features), np.int64)
+    known = np.zeros(len(features), bool)
+    if len(rows) and len(features):
+        gaps, nearest = KDTree(result.observation_bearings[rows]).query(seen.bearings_rig)
+        allowed = np.minimum(_SAME_PLACE_SIGMAS * seen.sigmas_rad, _SAME_PLACE_RAD)
+        known = np.asarray(gaps) < allowed
+        numbers = result.observation_points[rows].astype(np.int64)[np.asarray(nearest)]
+    chosen = np.flatnonzero(known)
+    kept = taken(features, chosen)
+    world_T_rig = result.world_T_rigs[frame]
+    points = result.points_world[numbers[chosen]] - world_T_rig[:3, 3]
+    strongest = searchable(kept, axes, settings.pairs.strongest_per_face)
+    every = searchable(kept, axes)
+    return Keyframe(kept, strongest, every, points @ world_T_rig[:3, :3], numbers[chosen])
+
+
+def taken(features: Features, rows: np.ndarray) -> Features:
+    """Keypoints `rows` (K',), ascending."""
+    scores = features.scores
+    return Features(
+        features.pixels[rows],
+        features.faces[rows],
+        features.bearings_rig[rows],
+        features.sigmas_rad[rows],
+        features.descriptors[rows],
+        features.colors[rows],
+        None if scores is None else scores[rows],
+    )
+
+
+def point_covariances(result: Reconstruction) -> np.ndarray:
+    """Covariances (J, 3, 3) of points by their observations, the poses given, map units^2."""
+    poses, num = result.world_T_rigs, len(result.points_world)
+    positions = poses[:, :3, 3]
+    extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), 1e-12)
+    informations = np.tile(np.eye(3) / (_PRIOR_EXTENTS * extent) ** 2, (num, 1, 1))
+    for start in range(0, len(result.observation_points), _NUM_OBSERVATIONS_AT_ONCE):
+        some = slice(start, start + _NUM_OBSERVATIONS_AT_ONCE)
+        frames, points = result.observation_frames[some], result.observation_points[some]
+        origins = result.observation_origins
+        lenses = moved_to(poses[frames], None if origins is None else origins[some])
+        distances = np.linalg.norm(result.points_world[points] - lenses[:, :3, 3], axis=1)
+        scales = result.observation_sigmas[some] * np.maximum(distances, 1e-12)
+        axes = tangent_basis(result.observation_bearings[some]) / scales[:, None, None]
+        axes = axes @ np.swapaxes(lenses[:, :3, :3], 1, 2)
+        np.add.at(informations, points, np.swapaxes(axes, 1, 2) @ axes)
+    return np.linalg.inv(informations)
