@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from gsba.bundle.prior_factors import X
     from gsba.config import RefineSettings
     from gsba.config_file import load_config
+    from gsba.localization.localizer import LocalizedFrame, Localizer
     from gsba.log import GsbaError
     from gsba.pipeline.outputs import RunResult
     from gsba.pipeline.refine import refine
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 __all__ = [
     "Family",
     "GsbaError",
+    "LocalizedFrame",
+    "Localizer",
     "MapSnapshot",
     "RefineSettings",
     "RunResult",
@@ -37,6 +40,8 @@ __all__ = [
 _HOMES = {
     "Family": "gsba.bundle.families",
     "GsbaError": "gsba.log",
+    "LocalizedFrame": "gsba.localization.localizer",
+    "Localizer": "gsba.localization.localizer",
     "MapSnapshot": "gsba.bundle.families",
     "RefineSettings": "gsba.config",
     "RunResult": "gsba.pipeline.outputs",

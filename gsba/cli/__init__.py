@@ -3,6 +3,7 @@
 from gsba.cli import (
     checking,
     inspecting,
+    localizing,
     plotting,
     preparing,
     refining,
@@ -17,6 +18,7 @@ __all__ = [
     "app",
     "checking",
     "inspecting",
+    "localizing",
     "main",
     "plotting",
     "preparing",

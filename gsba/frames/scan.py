@@ -52,6 +52,7 @@ def scan(
     order_suffices: bool = False,
     calibration: Path | None = None,
     circles: Sequence[ImageCircle] = (),
+    min_frames: int = MIN_FRAMES,
 ) -> FrameSet:
     """The frames of a folder, in time order, checked by their headers.
 
@@ -68,14 +69,14 @@ def scan(
         order_suffices: use name order where no source gives times.
         calibration: calibration file of raw fisheyes, see `gsba.camera.calibration`.
         circles: image circles of raw fisheyes, front and back, or one for both; none = detect.
+        min_frames: fewer are refused.
 
     Raises:
         GsbaError: a file or frame cannot be used; the message names the first one.
     """
     _check_times(timestamps, fps)
     layout, faces, found = _find_frames(Path(folder))
-    if len(found) < MIN_FRAMES:
-        raise GsbaError(f"{folder}: {len(found)} frames; at least {MIN_FRAMES} are needed")
+    _check_number(folder, len(found), min_frames)
     names, times, timed = _in_time_order(Path(folder), found, timestamps, fps, order_suffices)
     paths = tuple(found[name] for name in names)
     tracks = track_size(Path(folder), paths) if layout == "eac" else None
@@ -104,6 +105,11 @@ def scan(
         tracks=tracks,
         lenses_nominal=nominal,
     )
+
+
+def _check_number(folder: Path, num: int, least: int) -> None:
+    if num < least:
+        raise GsbaError(f"{folder}: {num} frames; at least {least} are needed")
 
 
 def _check_times(timestamps: Path | None, fps: float | None) -> None:

@@ -109,7 +109,9 @@ class KnownPointBlock:
         self.keys: list[int] = [X(p) for p in range(len(pictures))]
         self.keys += [K(c) for c in range(len(projections))]
         num = len(pictures)
-        rows = [(p, num + seen.camera) for p, seen in enumerate(pictures) if seen.camera is not None]
+        rows = [
+            (p, num + seen.camera) for p, seen in enumerate(pictures) if seen.camera is not None
+        ]
         self.pairs = np.array(rows, np.int64).reshape(-1, 2)
 
     def refresh(self, values: gtsam.Values) -> None:

@@ -1,6 +1,6 @@
 """Localisation of new frames in a finished run: recognised places, known points, a pose fit."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,17 +14,19 @@ from gsba.features.detection import extract, gather
 from gsba.frames import cubemap
 from gsba.geometry import inverse
 from gsba.localization.known_points import Sightings
+from gsba.localization.pictures import Picture, load_panorama
 from gsba.localization.place_index import PlaceIndex, open_index
-from gsba.localization.pose_fit import PoseFit, fit
+from gsba.localization.pose_fit import COARSE, FINE, PoseFit, fit
 from gsba.localization.pose_search import (
     Candidates,
     FoundPose,
     is_rivalled,
     is_significant,
+    least_of_rival,
     search_pose,
 )
 from gsba.localization.run_map import RunMap
-from gsba.log import GsbaError
+from gsba.log import GsbaError, track
 from gsba.matching.guided_search import Gate, Searchable, match_pair, searchable
 from gsba.types import Features, FrameSet, Keypoints
 
@@ -107,8 +109,6 @@ class Localizer:
         """
         if isinstance(image, np.ndarray):
             return self._localize_features(name or "image", self._features_of(image))
-        from gsba.localization.pictures import load_panorama
-
         return self.localize(load_panorama(Path(image)), name or Path(image).stem)
 
     def localize_frame(self, frames: FrameSet, frame: int) -> LocalizedFrame:
@@ -139,12 +139,12 @@ class Localizer:
         if start is None:
             return LocalizedFrame.refused(name, reason)
         world_T_rig, fitted, seen = start.world_T_rig, None, None
-        for gate in (_WIDE_GATE_RAD, _NARROW_GATE_RAD):
+        for gate, scales in ((_WIDE_GATE_RAD, COARSE), (_NARROW_GATE_RAD, FINE)):
             candidates = self.candidates_around(query, world_T_rig, gate)
             if len(candidates) < _MIN_POINTS:
                 return LocalizedFrame.refused(name, NO_PLACE)
             seen = self._sightings(query, candidates)
-            fitted = fit([seen], world_T_rig[None])
+            fitted = fit([seen], world_T_rig[None], scales)
             world_T_rig = fitted.world_T_rigs[0]
         assert fitted is not None and seen is not None
         return self._judged(name, fitted, seen, candidates)
@@ -178,7 +178,7 @@ class Localizer:
             if found is None or not is_significant(candidates.bearings, found.inliers, chance):
                 continue
             left = candidates.taken(~found.inliers)
-            rival = search_pose(left, max_error, settings.seed)
+            rival = search_pose(left, max_error, settings.seed, least_of_rival(found))
             if not is_rivalled(found, rival, candidates):
                 return found, ""
             reason = TWO_PLACES
@@ -267,3 +267,18 @@ class Localizer:
         positions = self.map.result.world_T_rigs[:, :3, 3]
         distances = np.linalg.norm(positions - world_T_rig[:3, 3], axis=1)
         return self.map.frames.names[int(np.argmin(distances))]
+
+
+def localize_all(localizer: Localizer, pictures: Sequence[Picture]) -> list[LocalizedFrame]:
+    """Localise pictures one after the other; one that cannot be read is refused with the reason."""
+    found = []
+    for picture in track(pictures, "localising", len(pictures)):
+        try:
+            if picture.frames is not None:
+                found.append(localizer.localize_frame(picture.frames, picture.frame))
+            else:
+                assert picture.path is not None
+                found.append(localizer.localize(picture.path, picture.name))
+        except GsbaError as error:
+            found.append(LocalizedFrame.refused(picture.name, str(error)))
+    return found

@@ -1,11 +1,32 @@
-"""Pictures to localise: panoramas of the run's camera."""
+"""Pictures to localise: files, folders and videos, as panoramas of the run's camera."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from gsba.frames.files import decode, image_size
+from gsba import video
+from gsba.config import VideoSettings
+from gsba.frames.files import decode, image_size, is_image
+from gsba.frames.scan import scan
+from gsba.frames.times import frame_times
 from gsba.log import GsbaError
+from gsba.types import FrameSet
+
+_TIMES_FILE = "timestamps.csv"
+_CALIBRATION = "calibration.json"  # of raw fisheyes, in a run's folder
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture to localise."""
+
+    name: str  # without folder and extension
+    time: float  # seconds; the number of the picture where nothing gives times
+    path: Path | None  # a 2:1 panorama or a photo; None = a frame of `frames`
+    frames: FrameSet | None = None  # frames of several images each, in the layout of the run's
+    frame: int = 0  # its number among them
 
 
 def load_panorama(path: Path) -> np.ndarray:
@@ -18,3 +39,78 @@ def load_panorama(path: Path) -> np.ndarray:
     if width != 2 * height:
         raise GsbaError(f"{path}: is {width}x{height}; a panorama is 2:1")
     return decode(path, (width, height))
+
+
+def find_pictures(sources: Sequence[Path], run: Path, layout: str, work: Path) -> list[Picture]:
+    """The pictures of files, folders and videos, in this order.
+
+    Args:
+        sources: pictures, folders of them, or 360-degree videos.
+        run: folder of the run, with the calibration of raw fisheyes.
+        layout: of the run's frames, see `FrameSet`.
+        work: folder for the frames of videos, one a second.
+
+    Raises:
+        GsbaError: a source is missing, or holds no picture.
+    """
+    found: list[Picture] = []
+    for number, source in enumerate(sources):
+        if not source.exists():
+            raise GsbaError(f"{source}: no such file or folder")
+        if video.is_video(source):
+            folder = work / f"frames-{source.stem}" if number else work / "frames"
+            video.extract(source, folder, VideoSettings())
+            source = folder
+        in_files = layout == "erp" or (layout == "cube" and source.is_dir() and _images(source))
+        if source.is_dir() and not in_files:
+            found += _frames_of_several_images(source, run)
+        else:
+            found += _single_images(source)
+    return _with_own_names(found)
+
+
+def _images(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_file() and is_image(path))
+
+
+def _single_images(source: Path) -> list[Picture]:
+    """Panoramas or photos, one file each."""
+    if source.is_file():
+        return [Picture(source.stem, 0.0, source)]
+    paths = _images(source)
+    if not paths:
+        raise GsbaError(f"{source}: holds no JPEG, PNG, WebP or TIFF image")
+    names, table = [path.stem for path in paths], source / _TIMES_FILE
+    given = table if table.is_file() else None
+    tagged = [(path,) for path in paths] if all(map(_is_whole, paths)) else []
+    times, _ = frame_times(names, given, None, True, tagged)
+    order = np.argsort(times, kind="stable")
+    return [Picture(names[n], float(times[n]), paths[n]) for n in order]
+
+
+def _is_whole(path: Path) -> bool:
+    """True if an image can be read, as far as its header tells."""
+    try:
+        image_size(path)
+    except GsbaError:
+        return False
+    return True
+
+
+def _frames_of_several_images(folder: Path, run: Path) -> list[Picture]:
+    """Cube faces, tracks or raw fisheyes."""
+    calibration = run / _CALIBRATION
+    known = calibration if calibration.is_file() else None
+    frames = scan(folder, order_suffices=True, calibration=known, min_frames=1)
+    times = frames.timestamps.tolist()
+    return [Picture(n, times[f], None, frames, f) for f, n in enumerate(frames.names)]
+
+
+def _with_own_names(pictures: list[Picture]) -> list[Picture]:
+    """Pictures of several sources; those of one name are refused."""
+    seen: set[str] = set()
+    for picture in pictures:
+        if picture.name in seen:
+            raise GsbaError(f"two pictures are named '{picture.name}': localise them in two calls")
+        seen.add(picture.name)
+    return pictures

@@ -14,11 +14,12 @@ from gsba.config import SolverSettings
 from gsba.localization.known_points import K, KnownPointBlock, Sightings, num_parameters
 
 GATE_SIGMAS = 3.5  # of an inlier's residual
-_ANNEALED = (8.0, 2.0)  # scales of the loss in the first rounds, standard deviations
-_LAST_SCALE = 1.0  # of the loss in the last round
+COARSE = (8.0,)  # scales of the loss, round by round, standard deviations, of a first fit
+FINE = (2.0, 1.0)  # of the last one
+_KNOWN_NOISE = 2.0  # scale of the loss from which on residuals tell of the noise
 _MEDIAN_OF_SQUARES = 1.3863  # of a chi-square distribution with two degrees of freedom
 _MIN_NOISE = 0.5  # of keypoints, in their own standard deviations
-_SOLVER = SolverSettings(max_iterations=20, relative_tolerance=1e-6, absolute_tolerance=1e-3)
+_SOLVER = SolverSettings(max_iterations=20, relative_tolerance=1e-5, absolute_tolerance=1e-2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +37,7 @@ class PoseFit:
 def fit(
     pictures: Sequence[Sightings],
     starts: np.ndarray,
+    scales: Sequence[float],
     projections: Sequence[Projection] = (),
     sigmas: Sequence[np.ndarray] = (),
 ) -> PoseFit:
@@ -44,6 +46,7 @@ def fit(
     Args:
         pictures: sightings of each picture (P); many may be false.
         starts: (P, 4, 4) initial world_T_rigs.
+        scales: of the loss, round by round.
         projections: (C) initial cameras.
         sigmas: (C) of (K,), standard deviations of the priors on their parameters.
     """
@@ -56,13 +59,13 @@ def fit(
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(spread))
         graph.push_back(gtsam.PriorFactorVector(K(c), zero, noise))
     noises = np.ones(len(pictures))
-    for scale in (*_ANNEALED, _LAST_SCALE, _LAST_SCALE):
+    for scale in scales:
         block = _block(pictures, noises, projections, scale)
         values = optimize(graph, [block], values, _SOLVER).values
         squares = block.squared_residuals(values)
-        if scale <= _ANNEALED[-1]:
+        if scale <= _KNOWN_NOISE:
             noises = np.array([_rescaled(*pair) for pair in zip(noises, squares, strict=True)])
-    squares = _block(pictures, noises, projections, _LAST_SCALE).squared_residuals(values)
+    squares = _block(pictures, noises, projections, scales[-1]).squared_residuals(values)
     inliers = tuple(part < GATE_SIGMAS**2 for part in squares)
     kept = [seen.taken(own) for seen, own in zip(pictures, inliers, strict=True)]
     block = _block(kept, noises, projections, GATE_SIGMAS, "none")

@@ -1,6 +1,7 @@
 """Search for a picture's pose among candidate points: LO-RANSAC, significance, and rivals."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -8,6 +9,9 @@ from gsba.camera.rig import witnesses
 from gsba.camera.sphere import erp_from_bearings
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.significance import least_agreeing
+
+if TYPE_CHECKING:
+    import pycolmap
 
 PANORAMA_WIDTH_PX = 4096  # of the virtual panorama in whose pixels bearings are given to the solver
 _MAX_TRIALS = 10_000
@@ -47,13 +51,16 @@ class FoundPose:
     focal: float = 0.0  # pixels, if it was estimated
 
 
-def search_pose(candidates: Candidates, max_error_rad: float, seed: int) -> FoundPose | None:
+def search_pose(
+    candidates: Candidates, max_error_rad: float, seed: int, least: int = _MIN_WITNESSES
+) -> FoundPose | None:
     """Pose of a panorama with the most inliers; None if no pose has enough.
 
     Args:
         candidates: many may be false.
         max_error_rad: of an inlier.
         seed: of the sampling.
+        least: number of inliers that is enough.
     """
     import pycolmap
 
@@ -63,56 +70,53 @@ def search_pose(candidates: Candidates, max_error_rad: float, seed: int) -> Foun
     )
     pixels = erp_from_bearings(candidates.bearings, width, height)
     max_error_px = max_error_rad * width / (2 * np.pi)
-    return _ransac(pixels, candidates.points_world, camera, max_error_px, seed)
+    return _ransac(pixels, candidates.points_world, camera, max_error_px, seed, least)
 
 
 def search_focal(
     pixels: np.ndarray,
     points_world: np.ndarray,
-    size: tuple[int, int],
-    focal: float,
+    camera: "pycolmap.Camera",
     known: bool,
     max_error_px: float,
     seed: int,
+    least: int = _MIN_WITNESSES,
 ) -> FoundPose | None:
     """Pose of a photo without distortion, and its focal length if that is not known.
 
     Args:
         pixels: (m, 2) keypoints, corner origin.
         points_world: (m, 3) candidate point of each.
-        size: width and height, pixels.
-        focal: pixels; the start of an unknown one is not used.
-        known: whether the focal length is known.
+        camera: SIMPLE_PINHOLE.
+        known: whether its focal length is known.
         max_error_px: of an inlier.
         seed: of the sampling.
+        least: number of inliers that is enough.
     """
-    import pycolmap
-
-    params = (focal, size[0] / 2, size[1] / 2)
-    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=size[0], height=size[1], params=params)
-    return _ransac(pixels, points_world, camera, max_error_px, seed, not known)
+    return _ransac(pixels, points_world, camera, max_error_px, seed, least, not known)
 
 
 def _ransac(
     pixels: np.ndarray,
     points_world: np.ndarray,
-    camera,
+    camera: "pycolmap.Camera",
     max_error_px: float,
     seed: int,
+    least: int,
     estimate_focal: bool = False,
 ) -> FoundPose | None:
     import pycolmap
 
-    if len(pixels) < _MIN_WITNESSES:
+    if len(pixels) < least:
         return None
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = max_error_px
     options.ransac.min_num_trials, options.ransac.max_num_trials = 100, _MAX_TRIALS
-    options.ransac.min_inlier_ratio = max(_MIN_WITNESSES / len(pixels), _MIN_RATIO)
+    options.ransac.min_inlier_ratio = max(least / len(pixels), _MIN_RATIO)
     options.ransac.random_seed = seed
     options.estimate_focal_length = estimate_focal
     found = pycolmap.estimate_absolute_pose(pixels, points_world, camera, options)
-    if found is None or found["num_inliers"] < _MIN_WITNESSES:
+    if found is None or found["num_inliers"] < least:
         return None
     matrix = found["cam_from_world"].matrix()
     world_T_rig = inverse(pose(matrix[:, :3], matrix[:, 3]))
@@ -140,17 +144,20 @@ def is_significant(
     return agreeing >= max(needed, _MIN_WITNESSES)
 
 
-def is_rivalled(
-    found: FoundPose, rival: FoundPose | None, candidates: Candidates
-) -> bool:
+def least_of_rival(found: FoundPose) -> int:
+    """Number of inliers from which another pose counts as a rival of one that was found."""
+    return max(_MIN_WITNESSES, int(found.inliers.sum() / _MIN_RIVAL_RATIO))
+
+
+def is_rivalled(found: FoundPose, rival: FoundPose | None, candidates: Candidates) -> bool:
     """True if the candidates that a pose leaves over agree about as well on another place.
 
     Args:
         found: of all candidates.
-        rival: of those that it leaves over.
+        rival: of those that it leaves over, with `least_of_rival` inliers.
         candidates: all of them.
     """
-    if rival is None or found.inliers.sum() >= _MIN_RIVAL_RATIO * rival.inliers.sum():
+    if rival is None:
         return False
     offsets = candidates.points_world[found.inliers] - found.world_T_rig[:3, 3]
     depth = float(np.median(np.linalg.norm(offsets, axis=1)))

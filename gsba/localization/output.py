@@ -1,0 +1,94 @@
+"""Files of localised pictures: trajectory, table of poses with covariances, JSON."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsba.disk import atomic_write, write_json
+from gsba.geometry import quaternion_from_rotation
+from gsba.localization.localizer import LocalizedFrame
+from gsba.trajectory.files import write_tum
+from gsba.types import Trajectory
+from gsba.version import __version__
+
+_AXES = ("rx", "ry", "rz", "x", "y", "z")
+_UPPER = np.triu_indices(6)
+
+
+def write_localized(
+    folder: Path, run: Path, frames: Sequence[LocalizedFrame], times: Sequence[float]
+) -> None:
+    """Write `trajectory.tum`, `poses.csv` and `localized.json`, each whole or not at all.
+
+    Covariances are of the tangent [rotation (radians), translation (map units)] in the picture's
+    frame, given the map.
+
+    Args:
+        folder: made if missing.
+        run: folder of the run that they were localised in.
+        frames: all pictures, those that are not localised too.
+        times: of each, seconds.
+
+    Raises:
+        GsbaError: the disk cannot be written.
+    """
+    rows = [n for n, frame in enumerate(frames) if frame.found]
+    order = sorted(rows, key=lambda n: times[n])
+    if len({times[n] for n in rows}) == len(rows):
+        stamps = np.array([times[n] for n in order], np.float64)
+    else:  # several sources: their order stands for times
+        order, stamps = rows, np.array(rows, np.float64)
+    poses = np.array([frames[n].world_T_rig for n in order]).reshape(-1, 4, 4)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_tum(folder / "trajectory.tum", Trajectory(stamps, poses))
+    _write_table(folder / "poses.csv", frames, times)
+    content = {
+        "gsba": __version__,
+        "run": str(run.resolve()),
+        "pictures": [_as_json(frame, time) for frame, time in zip(frames, times, strict=True)],
+    }
+    write_json(folder / "localized.json", content)
+
+
+def _write_table(path: Path, frames: Sequence[LocalizedFrame], times: Sequence[float]) -> None:
+    header = ["picture", "timestamp", "status", "reason", "points", "noise_deg", "nearest_frame"]
+    header += ["tx", "ty", "tz", "qw", "qx", "qy", "qz"]
+    header += [f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in zip(*_UPPER, strict=True)]
+
+    def write(temporary: Path) -> None:
+        with temporary.open("w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file)
+            table.writerow(header)
+            for frame, time in zip(frames, times, strict=True):
+                status = "localised" if frame.found else "refused"
+                row = [frame.name, repr(float(time)), status, frame.reason]
+                numbers = [""] * (len(header) - len(row))
+                if frame.found:
+                    values = (*_position_and_rotation(frame), *frame.covariance[_UPPER])
+                    numbers = [frame.num_points, f"{np.degrees(frame.noise_rad):.6g}"]
+                    numbers += [frame.nearest, *(f"{value:.15g}" for value in values)]
+                table.writerow(row + numbers)
+
+    atomic_write(path, write)
+
+
+def _position_and_rotation(frame: LocalizedFrame) -> tuple[float, ...]:
+    """Position and quaternion wxyz."""
+    wxyz = quaternion_from_rotation(frame.world_T_rig[:3, :3])
+    return (*frame.world_T_rig[:3, 3].tolist(), *wxyz.tolist())
+
+
+def _as_json(frame: LocalizedFrame, time: float) -> dict[str, Any]:
+    content: dict[str, Any] = {"name": frame.name, "timestamp": time, "reason": frame.reason}
+    if frame.found:
+        content |= {
+            "world_T_picture": frame.world_T_rig.tolist(),
+            "covariance": frame.covariance.tolist(),
+            "points": frame.num_points,
+            "noise_deg": float(np.degrees(frame.noise_rad)),
+            "nearest_frame": frame.nearest,
+        }
+    return content
