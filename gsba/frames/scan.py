@@ -82,8 +82,7 @@ def scan(
     tracks = track_size(Path(folder), paths) if layout == "eac" else None
     width, height = tracks or _common_size(paths, layout)
     images, lens_size = [group[0] for group in paths], (width, height)
-    factory = find_factory_lenses(Path(folder), images) if calibration is None else None
-    known = calibration, circles, factory
+    known = calibration, circles, _factory_lenses(Path(folder), images, calibration)
     if layout == "erp" and (raw := _pair_size(Path(folder), images, lens_size, *known)) is not None:
         layout, lens_size = "fisheye", raw
         paths = tuple((path, path) for path in images)
@@ -105,6 +104,13 @@ def scan(
         tracks=tracks,
         lenses_nominal=nominal,
     )
+
+
+def _factory_lenses(
+    folder: Path, images: Sequence[Path], calibration: Path | None
+) -> FactoryLenses | None:
+    """The maker's calibration, unless another is given."""
+    return find_factory_lenses(folder, images) if calibration is None else None
 
 
 def _check_number(folder: Path, num: int, least: int) -> None:
