@@ -119,7 +119,7 @@ def test_uncertain_points_count_less() -> None:
 
 def _panorama(rng: np.random.Generator, num: int, sigma: float) -> tuple[Sightings, np.ndarray]:
     """Sightings of points around a panorama, and its pose."""
-    world_T_rig = pose(Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3))
+    world_T_rig = pose(Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3))
     bearings, distances = _units(rng, num), rng.uniform(1, 8, (num, 1))
     points = (bearings * distances) @ world_T_rig[:3, :3].T + world_T_rig[:3, 3]
     noisy = bearings + rng.normal(0, sigma, (num, 3))
@@ -129,7 +129,7 @@ def _panorama(rng: np.random.Generator, num: int, sigma: float) -> tuple[Sightin
 
 def _photo(rng: np.random.Generator, num: int, sigma_px: float) -> tuple[Sightings, np.ndarray]:
     """Sightings of points in a photo by CAMERA, and its pose."""
-    world_T_rig = pose(Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3))
+    world_T_rig = pose(Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3))
     pixels = rng.uniform([0, 0], [800, 600], (num, 2))
     local = CAMERA.unproject(pixels) * rng.uniform(1, 8, (num, 1))
     points = local @ world_T_rig[:3, :3].T + world_T_rig[:3, 3]
