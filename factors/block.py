@@ -7,6 +7,9 @@ from typing import Protocol
 import gtsam
 import numpy as np
 
+from factors._observations import Visits
+from factors.schur_complement import SchurComplement
+
 
 @dataclass(frozen=True, slots=True)
 class PoseSystem:
@@ -20,6 +23,27 @@ class PoseSystem:
     off_diagonal: np.ndarray  # (P, 6, 6) float64, blocks H[f, g] of the block's pairs (f, g), f < g
     gradient: np.ndarray  # (F, 6) float64
     costs: Mapping[str, float]  # family -> cost at the linearization point
+
+
+class Products(Protocol):
+    """The Hessian of a block in factored form, for solvers that need only its products."""
+
+    @property
+    def shared(self) -> np.ndarray:
+        """(P,) number of inner variables that each of the block's `pairs` shares."""
+        ...
+
+    @property
+    def visits(self) -> Sequence[Visits]:
+        """Which of the block's poses see which inner variables, in runs."""
+        ...
+
+    def eliminate(
+        self, values: gtsam.Values
+    ) -> tuple[SchurComplement, np.ndarray, dict[str, float]]:
+        """Hessian in factored form, gradient (F, 6), and cost of each family: the model of
+        `Block.linearize`."""
+        ...
 
 
 class Block(Protocol):
@@ -46,6 +70,11 @@ class Block(Protocol):
     def linearize(self, values: gtsam.Values) -> PoseSystem:
         """Model of the cost at accepted values, inner variables eliminated; the caller may
         change its arrays."""
+        ...
+
+    def products(self) -> Products | None:
+        """The Hessian in factored form, if all the block's variables are poses; None = it is only
+        written out."""
         ...
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:

@@ -104,6 +104,9 @@ class CameraBlock:
         stretch = max(bent / max(weights, 1e-300), _FLATTEST) if self.curved else 1.0
         return self._in_blocks(sums, stretch, float(self._point_costs.sum()))
 
+    def products(self) -> None:
+        """None: the Hessian is only written out."""
+
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Robust cost at `values`, `steps` from the linearization, landmarks moved along."""
         if self._at is None:

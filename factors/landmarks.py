@@ -24,7 +24,7 @@ from factors._observations import (
 )
 from factors._schur_kernels import project_visits
 from factors._terms import pose_rows
-from factors.block import PoseSystem
+from factors.block import PoseSystem, Products
 from factors.reduced_factor import reduced_factor
 from factors.robust import RobustLoss
 from factors.schur_complement import SchurComplement
@@ -125,6 +125,10 @@ class LandmarkBlock:
             len(self.families), self.num_threads,
         )  # fmt: skip
         return PoseSystem(*system, self._named(costs))
+
+    def products(self) -> Products:
+        """The block itself, whose `eliminate` gives the Hessian in factored form."""
+        return self
 
     def eliminate(
         self, values: gtsam.Values

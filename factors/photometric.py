@@ -137,6 +137,9 @@ class PhotometricBlock:
         self._schur = couplings, inverses, downs
         return PoseSystem(diagonal, off_diagonal, gradient, {FAMILY: float(self._costs.sum())})
 
+    def products(self) -> None:
+        """None: the Hessian is only written out."""
+
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Robust cost at `values`, `steps (F, 6)` from the linearization, with planes moved."""
         if self._schur is None:

@@ -23,6 +23,9 @@ class QuadraticBlock:
         """The function itself, whatever the values."""
         return replace(self._system, off_diagonal=self._system.off_diagonal.copy())
 
+    def products(self) -> None:
+        """None: the Hessian is only written out."""
+
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Cost at `steps (V, 6)`."""
         system, (first, second) = self._system, self.pairs.T

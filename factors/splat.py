@@ -122,6 +122,9 @@ class SplatBlock:
             cost += part
         return PoseSystem(diagonal, np.zeros((0, 6, 6)), gradient, {NAME: cost})
 
+    def products(self) -> None:
+        """None: the Hessian is only written out."""
+
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Robust cost at tentative values."""
         return self.costs(values)[NAME]

@@ -12,6 +12,7 @@ import numpy as np
 from factors import Block
 from factors.quadratic_block import QuadraticBlock
 from factors.reduced_camera_system import ReducedSystem
+from factors.system_choice import reduced_system
 from gsba.bundle import readout
 from gsba.bundle.adjustment import DRAWS, AdjustmentContext
 from gsba.bundle.camera_variables import OF_LENSES, C, CameraUnknowns, D, N, W
@@ -162,7 +163,7 @@ class _Linearized:
     def _system(self) -> ReducedSystem:
         graph = gtsam.NonlinearFactorGraph(self.graph)
         graph.push_back(self.unknowns.graph)
-        system = ReducedSystem(graph, self.blocks, self.values)
+        system = reduced_system(graph, self.blocks, self.values)
         system.linearize(self.values)
         return system
 

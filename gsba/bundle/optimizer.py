@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from factors import Block
 from factors.reduced_camera_system import ReducedSystem
+from factors.system_choice import reduced_system
 from gsba.config import SolverSettings
 from gsba.log import GsbaError
 from gsba.types import Iteration, JointErrors
@@ -108,7 +109,7 @@ def optimize(
     settings = settings or SolverSettings()
     for block in blocks:
         block.refresh(values)
-    system = ReducedSystem(graph, blocks, values)
+    system = reduced_system(graph, blocks, values)
     history = _History(callback)
 
     def result(converged: bool, reason: str) -> OptimizeResult:
@@ -188,7 +189,7 @@ def marginal_covariances(
         that nothing constrains, and for all where the rest is singular (the gauge is not fixed).
     """
     num = len(keys)
-    system = ReducedSystem(graph, blocks, values, list(pairwise(keys)))
+    system = reduced_system(graph, blocks, values, list(pairwise(keys)))
     system.linearize(values)
     found = system.covariances(num_draws, np.random.default_rng(seed))
     if found is None:

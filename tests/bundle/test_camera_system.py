@@ -10,7 +10,7 @@ from synthetic import loop_walk
 
 from factors import PoseSystem
 from factors.quadratic_block import QuadraticBlock
-from factors.reduced_camera_system import ReducedSystem
+from factors.system_choice import reduced_system
 from gsba import Family, MapSnapshot, X
 from gsba.bundle import adjustment
 from gsba.bundle.camera_system import CameraSystem
@@ -171,7 +171,7 @@ def test_a_quadratic_block_is_what_it_was_made_of() -> None:
     own = tiles[np.arange(3), np.arange(3)]
     model = PoseSystem(own, tiles[tuple(pairs.T)], gradient.reshape(3, 6), {"quadratic": 2.0})
     block = QuadraticBlock(keys, pairs, model)
-    system = ReducedSystem(gtsam.NonlinearFactorGraph(), [block], values)
+    system = reduced_system(gtsam.NonlinearFactorGraph(), [block], values)
     assert system.linearize(values) == {"quadratic": 2.0}
     steps = system.solve(0.0)
     assert steps is not None

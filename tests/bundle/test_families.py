@@ -94,6 +94,9 @@ class _SidewaysBlock:
         off = np.einsum("fi,j->fij", by[:-1], by[-1])
         return PoseSystem(diagonal, off, gradient, self.costs(values))
 
+    def products(self) -> None:
+        return None
+
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         return 0.5 * float(np.sum(self._residuals(values) ** 2))
 

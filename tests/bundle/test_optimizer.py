@@ -17,7 +17,8 @@ from factors import (
     RobustLoss,
     landmarks,
 )
-from factors.reduced_camera_system import ReducedSystem
+from factors.direct_system import DirectSystem
+from factors.system_layout import SystemLayout
 from gsba.bundle.optimizer import marginal_covariances, optimize
 from gsba.config import SolverSettings
 from gsba.log import GsbaError
@@ -390,8 +391,8 @@ def test_landmarks_are_eliminated_in_runs_of_any_length(world, monkeypatch):
 
 
 def test_steps_by_iterations_are_those_of_a_factorization(world):
-    def system() -> ReducedSystem:
-        out = ReducedSystem(world.graph, [world.block()], world.values)
+    def system() -> DirectSystem:
+        out = DirectSystem(SystemLayout(world.graph, [world.block()], world.values))
         out.linearize(world.values)
         return out
 

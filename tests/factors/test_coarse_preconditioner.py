@@ -5,11 +5,24 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
 
-from factors import BearingTerm, LandmarkBlock, RobustLoss, pose_clusters, reduced_camera_system
+from factors import (
+    BearingTerm,
+    LandmarkBlock,
+    RobustLoss,
+    coarse_preconditioner,
+    iterative_system,
+    pose_clusters,
+    system_choice,
+)
 from factors._schur_kernels import GROUP_DIM
 from factors._terms import pose_rows
+from factors.direct_system import DirectSystem
+from factors.iterative_system import IterativeSystem
 from factors.pose_clusters import Groups, covisible_groups
+from factors.quadratic_block import QuadraticBlock
 from factors.reduced_camera_system import ReducedSystem
+from factors.system_choice import reduced_system
+from factors.system_layout import SystemLayout
 from gsba.bundle.optimizer import optimize
 from gsba.config import SolverSettings
 
@@ -56,7 +69,7 @@ class World:
         return LandmarkBlock(self.keys, self.points, [term], RobustLoss("cauchy", 2.0), **options)
 
     def system(self, **options) -> ReducedSystem:
-        system = ReducedSystem(self.graph, [self.block(**options)], self.values)
+        system = reduced_system(self.graph, [self.block(**options)], self.values)
         system.linearize(self.values)
         return system
 
@@ -69,8 +82,8 @@ def world() -> World:
 @pytest.fixture
 def held(monkeypatch) -> None:
     """Nothing is written out, groups are small."""
-    monkeypatch.setattr(reduced_camera_system, "_MAX_OPERATIONS", 0)
-    monkeypatch.setattr(reduced_camera_system, "_MAX_INVERSE_OPERATIONS", 0)
+    monkeypatch.setattr(system_choice, "_MAX_OPERATIONS", 0)
+    monkeypatch.setattr(system_choice, "_MAX_INVERSE_OPERATIONS", 0)
 
 
 def dense(world: World) -> np.ndarray:
@@ -104,7 +117,7 @@ def test_groups_feel_what_their_frames_feel_together(world, held) -> None:
     assert 1 < found.num < NUM_FRAMES
     damped = system._written + 0.1 * np.eye(6)
     given = system._off_diagonal, system._pairs, system._complements, found, system._bases
-    coarse = reduced_camera_system.coarse_system(damped, *given)
+    coarse = coarse_preconditioner.coarse_system(damped, *given)
     assert coarse is not None
     H = dense(world).reshape(NUM_FRAMES, 6, NUM_FRAMES, 6)
     for f, diagonal in enumerate(damped):
@@ -123,11 +136,11 @@ def test_groups_feel_what_their_frames_feel_together(world, held) -> None:
 
 
 def test_a_step_is_that_of_a_factorization(world, held, monkeypatch) -> None:
-    monkeypatch.setattr(reduced_camera_system, "_STEP_TOLERANCE", 1e-10)
+    monkeypatch.setattr(iterative_system, "STEP_TOLERANCE", 1e-10)
     iterated = world.system()
-    monkeypatch.setattr(reduced_camera_system, "_MAX_OPERATIONS", np.inf)
+    monkeypatch.setattr(system_choice, "_MAX_OPERATIONS", np.inf)
     direct = world.system()
-    assert iterated._held and not direct._held
+    assert isinstance(iterated, IterativeSystem) and isinstance(direct, DirectSystem)
     for damping in (1e-3, 1e-6):  # the second one by the groups' system of the first
         steps = iterated.solve(damping)
         assert np.allclose(steps, direct.solve(damping), atol=1e-8)
@@ -135,10 +148,28 @@ def test_a_step_is_that_of_a_factorization(world, held, monkeypatch) -> None:
         assert iterated.predicted_decrease() == pytest.approx(expected, rel=1e-8)
 
 
+def test_blocks_without_products_are_written_out_beside_those_with(
+    world, held, monkeypatch
+) -> None:
+    monkeypatch.setattr(iterative_system, "STEP_TOLERANCE", 1e-10)
+    other = world.block()
+    written = QuadraticBlock(other.keys, other.pairs, other.linearize(world.values))
+    assert written.products() is None
+    args = world.graph, [written, world.block()], world.values
+    only = reduced_system(world.graph, [written], world.values)
+    joint = reduced_system(*args, [(X(0), X(1))])  # draws know no errors of a written block
+    assert isinstance(only, DirectSystem) and isinstance(joint, DirectSystem)
+    iterated, direct = reduced_system(*args), DirectSystem(SystemLayout(*args))
+    assert isinstance(iterated, IterativeSystem)
+    costs = [system.linearize(world.values) for system in (iterated, direct)]
+    assert costs[0] == pytest.approx(costs[1])
+    assert np.allclose(iterated.solve(1e-3), direct.solve(1e-3), atol=1e-8)
+
+
 def test_the_optimum_is_the_same(world, held, monkeypatch) -> None:
     tight = SolverSettings(relative_tolerance=1e-12, max_iterations=200)
     iterated = optimize(world.graph, [world.block()], world.values, tight)
-    monkeypatch.setattr(reduced_camera_system, "_MAX_OPERATIONS", np.inf)
+    monkeypatch.setattr(system_choice, "_MAX_OPERATIONS", np.inf)
     direct = optimize(world.graph, [world.block()], world.values, tight)
     assert iterated.cost == pytest.approx(direct.cost, rel=1e-9)
     for key in world.keys:
@@ -155,10 +186,10 @@ def test_threads_change_nothing(world, held, monkeypatch) -> None:
 
 def test_errors_that_are_drawn_spread_as_the_inverse_says(world, held, monkeypatch) -> None:
     pairs = [(X(f), X(f + 1)) for f in range(NUM_FRAMES - 1)]
-    iterated = ReducedSystem(world.graph, [world.block()], world.values, pairs)
-    monkeypatch.setattr(reduced_camera_system, "_MAX_INVERSE_OPERATIONS", np.inf)
-    direct = ReducedSystem(world.graph, [world.block()], world.values, pairs)
-    assert iterated._held and not direct._held
+    iterated = reduced_system(world.graph, [world.block()], world.values, pairs)
+    monkeypatch.setattr(system_choice, "_MAX_INVERSE_OPERATIONS", np.inf)
+    direct = reduced_system(world.graph, [world.block()], world.values, pairs)
+    assert isinstance(iterated, IterativeSystem) and isinstance(direct, DirectSystem)
     found, expected = [], []
     for system, out, num in ((iterated, found, 4000), (direct, expected, 2)):
         system.linearize(world.values)

@@ -1,0 +1,73 @@
+"""The reduced camera system by Cholesky factorization, which may precondition later steps."""
+
+import numpy as np
+
+from factors.cholesky import DIM, BlockCholesky
+from factors.conjugate_gradients import conjugate_gradients, multiply_blocks
+from factors.reduced_camera_system import STEP_TOLERANCE, ReducedSystem
+from factors.system_layout import SystemLayout
+
+_OPERATIONS_PER_BYTE = 4.0  # operations of a core on dense blocks in the time of reading a byte
+_MIN_ITERATIONS = 10  # conjugate-gradient iterations that must be cheaper than half a
+# factorization
+
+
+class DirectSystem(ReducedSystem):
+    """Normal equations that are written out and factorized.
+
+    If fill-in is large, the Cholesky factor of an earlier system preconditions conjugate
+    gradients; it is renewed when they would take longer than a factorization.
+    """
+
+    def __init__(self, layout: SystemLayout) -> None:
+        """Fix the pattern and that of its Cholesky factor."""
+        super().__init__(layout)
+        self._cholesky = BlockCholesky(layout.num, self._pairs)
+        self._factorized = False  # True if the Cholesky factor is of an earlier system
+        bytes_read = 8 * (2 * self._cholesky.num_entries + DIM * DIM * len(self._pairs))
+        cheaper = self.num_operations / (2 * _OPERATIONS_PER_BYTE * max(bytes_read, 1))
+        self._max_iterations = int(cheaper) if cheaper >= _MIN_ITERATIONS else 0
+
+    @property
+    def num_operations(self) -> float:
+        """Number of operations of a factorization."""
+        return self._cholesky.num_operations
+
+    def _step(self, added: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        damped = self._diagonal.copy()
+        np.einsum("nii->ni", damped)[:] += added
+        return self._step_by_iterations(damped) or self._step_by_factorization(damped)
+
+    def _step_by_iterations(self, damped: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Step and residual of the gradient; None if a factorization is cheaper."""
+        if not self._factorized or not self._max_iterations:
+            return None
+
+        def multiply(x: np.ndarray) -> np.ndarray:
+            return multiply_blocks(damped, self._off_diagonal, self._pairs, x)
+
+        def precondition(residual: np.ndarray) -> np.ndarray:
+            return self._cholesky.solve(residual[..., 0])[..., None]
+
+        right = -self._gradient[..., None]
+        return conjugate_gradients(
+            multiply, right, precondition, STEP_TOLERANCE, self._max_iterations
+        )
+
+    def _step_by_factorization(self, damped: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Step and zero residual; None if singular."""
+        self._factorized = self._cholesky.factorize(damped, self._off_diagonal)
+        if not self._factorized:
+            return None
+        steps = self._cholesky.solve(-self._gradient)
+        return (steps, np.zeros_like(steps)) if np.all(np.isfinite(steps)) else None
+
+    def _inverse(
+        self, diagonal: np.ndarray, num_draws: int, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        self._factorized = self._cholesky.factorize(diagonal, self._off_diagonal)
+        if not self._factorized:
+            return None
+        inverse, between = self._cholesky.inverse_blocks(self._layout.asked)
+        drawn = self._cholesky.draw(rng.normal(size=(num_draws, self._layout.num, DIM)))
+        return inverse, between, drawn

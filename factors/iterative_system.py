@@ -1,0 +1,164 @@
+"""The reduced camera system by conjugate gradients, without assembling it."""
+
+from collections.abc import Mapping
+
+import gtsam
+import numpy as np
+
+from factors._terms import pose_rows
+from factors.block import Products
+from factors.coarse_preconditioner import Coarse, Held, coarse_system
+from factors.conjugate_gradients import conjugate_gradients, multiply_blocks
+from factors.pose_clusters import covisible_groups
+from factors.reduced_camera_system import STEP_TOLERANCE, ReducedSystem
+from factors.schur_complement import group_visits
+from factors.system_layout import SystemLayout
+
+_NATIVE_FACTOR_WEIGHT = 1e-3  # landmarks that a native factor counts for when groups are formed
+_MAX_ITERATIONS = 300  # largest number of conjugate-gradient iterations; ten or twenty suffice
+_DRAW_TOLERANCE = 1e-3  # tolerance of drawn errors: no motion of thousands of frames may be missed
+_MIN_DRAWS = 200  # least number of draws whose spread gives a covariance
+_DRAWS_AT_ONCE = 20
+
+
+class IterativeSystem(ReducedSystem):
+    """Normal equations of which blocks that offer products of their Hessian are not written out.
+
+    Steps and covariances are computed by conjugate gradients (`factors.coarse_preconditioner`).
+    """
+
+    def __init__(self, layout: SystemLayout, products: Mapping[int, Products]) -> None:
+        """Form groups of covisible frames, and the visits of landmarks by groups.
+
+        Args:
+            layout: of the system.
+            products: of those of the layout's blocks, by index, that are not written out.
+        """
+        super().__init__(layout, products)
+        self._products = products
+        self._coarse: Coarse | None = None  # of an earlier system
+        shares = [
+            (layout.block_rows[i][layout.blocks[i].pairs], product.shared)
+            for i, product in products.items()
+        ]
+        poses = np.zeros(layout.num, bool)
+        for i in products:
+            poses[layout.block_rows[i]] = True
+        tied = layout.factor_pairs[poses[layout.factor_pairs].all(axis=1)]
+        self._groups = covisible_groups(
+            layout.num, [*shares, (tied, np.full(len(tied), _NATIVE_FACTOR_WEIGHT))]
+        )
+        self._visits = {
+            i: group_visits(
+                product.visits, self._groups.labels[layout.block_rows[i]], self._groups.num
+            )
+            for i, product in products.items()
+        }
+
+    def linearize(self, values: gtsam.Values) -> dict[str, float]:
+        """Assemble what is written out, the products and the gradient; returns families' costs."""
+        layout = self._layout
+        self._complements: list[Held] = []
+        costs = super().linearize(values)
+        self._written = self._diagonal  # without the products
+        self._diagonal = self._written.copy()
+        for complement, rows, _ in self._complements:
+            self._diagonal[rows] += complement.diagonal
+        poses = np.zeros((layout.num, 12))
+        for i in self._products:
+            poses[layout.block_rows[i]] = pose_rows(values, layout.blocks[i].keys)
+        self._bases = self._groups.bases(poses)
+        return costs
+
+    def _add_block(
+        self, i: int, values: gtsam.Values, parts: list[np.ndarray]
+    ) -> Mapping[str, float]:
+        if i not in self._products:
+            return super()._add_block(i, values, parts)
+        rows = self._layout.block_rows[i]
+        complement, gradient, costs = self._products[i].eliminate(values)
+        self._gradient[rows] += gradient
+        self._complements.append((complement, rows, self._visits[i]))
+        return costs
+
+    def _step(self, added: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Step preconditioned by an earlier groups' system, or by a new one if that is faster."""
+        right = -self._gradient[..., None]
+        if self._coarse is not None:
+            found = self._solve_products(added, right, STEP_TOLERANCE, self._max_iterations)
+            if found is not None:
+                return found
+            self._coarse = None
+        found = self._solve_products(added, right, STEP_TOLERANCE, truncate=True)
+        self._max_iterations = 2 * self._iterations
+        return found
+
+    def _solve_products(
+        self,
+        added: np.ndarray,
+        right: np.ndarray,
+        tolerance: float,
+        max_iterations: int = _MAX_ITERATIONS,
+        truncate: bool = False,
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Solutions (N, 6, R) with `added (N, 6)` on the diagonal, and the residuals of `right`.
+
+        None if they take too many iterations, or the groups' system is singular.
+        """
+        diagonal, written = self._diagonal.copy(), self._written.copy()
+        for blocks in (diagonal, written):
+            np.einsum("nii->ni", blocks)[:] += added
+        if self._coarse is None:
+            given = self._off_diagonal, self._pairs, self._complements, self._groups, self._bases
+            self._coarse = coarse_system(written, *given)
+        try:
+            inverses = np.linalg.inv(diagonal)
+        except np.linalg.LinAlgError:
+            return None
+        coarse, self._iterations = self._coarse, 0
+        if coarse is None:
+            return None
+
+        def multiply(x: np.ndarray) -> np.ndarray:
+            self._iterations += 1
+            out = multiply_blocks(written, self._off_diagonal, self._pairs, x)
+            for complement, rows, _ in self._complements:
+                out[rows] += complement.times(x[rows])
+            return out
+
+        def precondition(residual: np.ndarray) -> np.ndarray:
+            return inverses @ residual + coarse.solve(residual)
+
+        return conjugate_gradients(
+            multiply, right, precondition, tolerance, max_iterations, truncate
+        )
+
+    def _inverse(
+        self, diagonal: np.ndarray, num_draws: int, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        drawn = self._drawn(np.einsum("nii->ni", diagonal - self._diagonal), num_draws, rng)
+        if drawn is None:
+            return None
+        i, j = self._layout.asked.T
+        inverse = np.einsum("dnr,dnc->nrc", drawn, drawn) / len(drawn)
+        between = np.einsum("dnr,dnc->nrc", drawn[:, i], drawn[:, j]) / len(drawn)
+        return inverse, between, drawn
+
+    def _drawn(
+        self, added: np.ndarray, num_draws: int, rng: np.random.Generator
+    ) -> np.ndarray | None:
+        """Vectors (D, N, 6) of covariance (H + added)^-1: that inverse times J^T e, e of all
+        factors."""
+        layout, draws, self._coarse = self._layout, [], None
+        for _ in range(0, max(num_draws, _MIN_DRAWS), _DRAWS_AT_ONCE):
+            right = np.sqrt(added)[..., None] * rng.normal(size=(*added.shape, _DRAWS_AT_ONCE))
+            for complement, rows, _ in self._complements:
+                right[rows] += complement.draw(int(rng.integers(1 << 62)), _DRAWS_AT_ONCE)
+            errors = rng.normal(size=(len(self._jacobian.indptr) - 1, _DRAWS_AT_ONCE))
+            forces = self._jacobian.T @ errors
+            np.add.at(right, (layout.column_blocks, layout.column_offsets), forces)
+            found = self._solve_products(added, right, _DRAW_TOLERANCE)
+            if found is None:
+                return None
+            draws.append(np.moveaxis(found[0], 2, 0))
+        return np.concatenate(draws)
