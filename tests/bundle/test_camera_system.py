@@ -23,7 +23,8 @@ from gsba.types import GyroConstraints, Solution
 
 CENTRE, BAND, READOUT_S = np.array([0.004, -0.003, 0.05]), np.deg2rad(4), 0.03
 SWEEPS = np.array([[-1.0, 0, 0], [0, 1.0, 0]])
-LENSES = Lenses(CENTRE, 0.2, BAND, SWEEPS, motion(loop_walk(24), READOUT_S))
+MOTION = motion(loop_walk(24), READOUT_S)
+LENSES = Lenses(CENTRE, 0.2, BAND, SWEEPS, MOTION)
 
 
 def _settled(
@@ -45,7 +46,7 @@ def test_all_of_a_camera_is_found_from_a_start_that_is_off() -> None:
         LENSES,
         centre=0.8 * CENTRE,
         inverse_stitch_radius=0.1,
-        readout_motion=0.7 * LENSES.readout_motion,
+        readout_motion=0.7 * MOTION,
     )
     world, found, given = _settled(LENSES, CameraEstimate(start, 0.7 * READOUT_S))
     scale = pose_similarity(given[0].world_T_rigs, world.world_T_rigs).scale
@@ -81,22 +82,23 @@ def _turning(readout_motion: np.ndarray, known: np.ndarray) -> GyroConstraints:
 def test_frames_turn_while_they_are_read_as_a_gyro_says() -> None:
     """Nobody else knows that as well; frames that the gyro does not know are found as before."""
     known = np.arange(24) % 6 > 0
-    still = replace(LENSES, readout_motion=LENSES.readout_motion * np.repeat([0.0, 1.0], 3))
+    still = replace(LENSES, readout_motion=MOTION * np.repeat([0.0, 1.0], 3))
     start, off = CameraEstimate(still, 0.8 * READOUT_S), {}
-    for gyro in (None, _turning(LENSES.readout_motion, known)):
+    for gyro in (None, _turning(MOTION, known)):
         _, found, _ = _settled(LENSES, start, turning=gyro)
         assert found.by_gyro is (None if gyro is None else True)
         assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
-        off[gyro is None] = np.abs(found.lenses.readout_motion - LENSES.readout_motion)[:, :3]
+        assert found.lenses.readout_motion is not None
+        off[gyro is None] = np.abs(found.lenses.readout_motion - MOTION)[:, :3]
     assert np.median(off[False][known]) < 0.2 * np.median(off[True][known])
     assert np.median(off[False][~known]) < 1.2 * np.median(off[True][~known])
 
 
 def test_a_gyro_that_images_contradict_is_not_followed() -> None:
     """As if it were of another time: by as much, but otherwise."""
-    still = replace(LENSES, readout_motion=LENSES.readout_motion * np.repeat([0.0, 1.0], 3))
+    still = replace(LENSES, readout_motion=MOTION * np.repeat([0.0, 1.0], 3))
     readout_motion = []
-    for gyro in (None, _turning(LENSES.readout_motion[::-1], np.ones(24, bool))):
+    for gyro in (None, _turning(MOTION[::-1], np.ones(24, bool))):
         _, found, _ = _settled(LENSES, CameraEstimate(still, READOUT_S), turning=gyro)
         assert not found.by_gyro
         readout_motion.append(found.lenses.readout_motion)

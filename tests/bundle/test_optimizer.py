@@ -402,6 +402,7 @@ def test_steps_by_iterations_are_those_of_a_factorization(world):
     assert iterated.solve(1.0) is not None  # factorizes, which is far off as a preconditioner
     before = iterated._cholesky._fronts[0].lower.copy()
     exact, steps = direct.solve(1e-4), iterated.solve(1e-4)
+    assert exact is not None and steps is not None
     np.testing.assert_array_equal(iterated._cholesky._fronts[0].lower, before)  # not renewed
     assert 0 < np.abs(steps - exact).max() < 0.1 * np.abs(exact).max()
     # an inexact step gains less, hardly so, and says it itself
