@@ -386,7 +386,7 @@ class SplatFactorSettings(_Settings):
 # Formats that can store each kind of image other than cube faces.
 FORMATS_OF: dict[str, tuple[str, ...]] = {
     "fisheye": ("colmap", "colmap-flat", "nerfstudio"),
-    "panorama": ("colmap-erp", "nerfstudio", "tum"),
+    "panorama": ("colmap-erp", "nerfstudio", "metashape", "tum"),
 }
 
 
@@ -394,7 +394,10 @@ class ExportSettings(_Settings):
     """Datasets written at the end of a run."""
 
     formats: tuple[
-        Literal["colmap", "colmap-flat", "colmap-erp", "nerfstudio", "ply", "tum"], ...
+        Literal[
+            "colmap", "colmap-flat", "colmap-erp", "nerfstudio", "metashape", "gltf", "ply", "tum"
+        ],
+        ...,
     ] = ("colmap",)
     face_size: int | None = Field(
         default=None, ge=16, le=_MAX_FACE_PX

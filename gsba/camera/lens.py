@@ -115,6 +115,12 @@ class Lenses:
         along = np.einsum("ni,ni->n", across, np.asarray(row_directions)[lens, :2])
         return angles / (2 * _HALF_FOV_RAD) * along / np.maximum(radii, 1e-12)
 
+    def rows_down(self) -> np.ndarray:
+        """1 (2,) for the front and the back picture of a raw pair that is read from its top row
+        down, -1 for one that is read from its bottom row up."""
+        assert self.reference_calibration is not None and self.row_directions is not None
+        return np.sign(np.sum(rows_run(self.reference_calibration) * self.row_directions, axis=1))
+
     def swept(self, frame: int) -> np.ndarray:
         """Poses (2, 2, 4, 4) of the rig when the front and the back lens of a raw pair read their
         top and bottom edge, relative to the rig in the middle of the readout."""
@@ -123,8 +129,9 @@ class Lenses:
             and self.readout_motion is not None
             and self.row_directions is not None
         )
-        ways = np.sign(np.sum(rows_run(self.reference_calibration) * self.row_directions, axis=1))
-        moved = np.multiply.outer(np.outer(ways, [-0.5, 0.5]), self.readout_motion[frame])
+        moved = np.multiply.outer(
+            np.outer(self.rows_down(), [-0.5, 0.5]), self.readout_motion[frame]
+        )
         turns = _rotations(moved[..., :3].reshape(4, 3)).reshape(2, 2, 3, 3)
         return pose(turns, moved[..., 3:])
 

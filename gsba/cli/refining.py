@@ -57,8 +57,8 @@ Frames = Annotated[
 Trajectories = Annotated[
     list[Path] | None,
     typer.Argument(
-        help="TUM, KITTI or stella_vslam map.msg; several files are pieces of one trajectory. "
-        "Default: odometry on a video; pairs of images of stills."
+        help="TUM, KITTI, stella_vslam map.msg or Metashape cameras.xml; several files are pieces "
+        "of one trajectory. Default: odometry on a video; pairs of images of stills."
     ),
 ]
 Out = Annotated[

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from gsba.camera.lens import Lenses
     from gsba.config import GpsSettings
     from gsba.evaluate.consistency import Consistency
+    from gsba.export import Shutter
     from gsba.types import FrameSet, Reconstruction, Trajectory
 
 
@@ -80,6 +81,13 @@ MapNumber = Annotated[
         metavar="NUMBER",
     ),
 ]
+Exposure = Annotated[
+    float | None,
+    typer.Option(
+        help="Exposure of a frame in milliseconds, for trainers that model motion blur.",
+        metavar="MS",
+    ),
+]
 Pairs = Annotated[
     str | None,
     typer.Option(
@@ -96,7 +104,10 @@ def export(
     to: Annotated[
         str,
         typer.Option(
-            help="colmap, colmap-flat, colmap-erp, nerfstudio, ply or tum.", metavar="FORMAT"
+            help="colmap, colmap-flat, colmap-erp, nerfstudio, metashape, gltf, ply or tum; or a "
+            "program: inria, postshot, brush, lichtfeld, gsplat, opensplat, nerfstudio, "
+            "instant-ngp, 3dgs-deblur, blender.",
+            metavar="FORMAT",
         ),
     ],
     out: Annotated[
@@ -120,16 +131,16 @@ def export(
         bool, typer.Option("--link", help="Make hard links to unchanged frames, not copies.")
     ] = False,
     map_number: MapNumber = 1,
+    exposure_ms: Exposure = None,
     cluster: Cluster = None,
 ) -> None:
     """Write a finished run as a dataset for another program."""
     from gsba.config_file import validated
-    from gsba.export import ExportFormat
     from gsba.export import export as write
+    from gsba.export.trainers import format_of, how_to_start
     from gsba.store.folder import claim
 
-    if to not in list(ExportFormat):
-        raise GsbaError(f"--to {to} is not known: use one of {', '.join(ExportFormat)}")
+    name, to = to, format_of(to)
     world = {"up": up, "length": _length(scale), "between": between, "gps": gps, "align": align}
     world |= {"scan": align_scan, "pairs": pairs}
     dataset = {"face_size": face_size, "images": images, "formats": [to]}
@@ -140,17 +151,35 @@ def export(
 
     reconstruction, frames, *_ = load_run(run, map_number)
     lenses = _lenses(run, reconstruction, frames, images, map_number)
-    folder = out or run / (to if map_number == 1 else f"{to}-map{map_number}")
+    folder = out or run / (name if map_number == 1 else f"{name}-map{map_number}")
     known_baseline = _baseline(run, baseline) if scale == "lens" else None
     noise = _gps_noise(run, gps_sigma) if gps is not None else None
     placed = place(reconstruction, frames, settings, known_baseline, noise)
     placement = replace(placed, map_number=map_number)
-    given = reconstruction, frames, folder, ExportFormat(to), face_size, placement, link, lenses
+    given = reconstruction, frames, folder, to, face_size, placement, link, lenses
+    shutter = _shutter(run, exposure_ms)
     with connected(cluster) as client, hired(client, folder, frames) as workers:
-        write(*given, images=images, workers=workers)
+        write(*given, images=images, workers=workers, shutter=shutter)
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
     typer.echo(f"{to}: {folder}")
+    if start := how_to_start(name, folder):
+        typer.echo(f"{name}: {start}")
+
+
+def _shutter(run: Path, exposure_ms: float | None) -> "Shutter":
+    """Times of a picture's exposure: the readout that the run found, and the exposure as given."""
+    from gsba.export import Shutter
+
+    try:
+        camera = json.loads((run / "report.json").read_text(encoding="utf-8"))["camera"]
+        readout_ms = camera["readout"]["ms"]
+    except (OSError, ValueError, KeyError, TypeError):
+        readout_ms = None  # no report, or no readout in it
+    if exposure_ms is not None and not 0 < exposure_ms < 1000:
+        raise GsbaError(f"--exposure-ms {exposure_ms:g}: give the milliseconds that a row is lit")
+    given = (readout_ms, exposure_ms)
+    return Shutter(*(None if value is None else float(value) / 1e3 for value in given))
 
 
 def _lenses(

@@ -1,4 +1,4 @@
-"""Datasets for other programs: COLMAP, nerfstudio, PLY, TUM.
+"""Datasets for other programs: COLMAP, nerfstudio, Metashape, glTF, PLY, TUM.
 
 Takes a result, its frames, and its placement.
 Gives a folder that the other program reads without conversion.
@@ -6,6 +6,15 @@ Gives a folder that the other program reads without conversion.
 
 from gsba.export.formats import ExportFormat, ExportOptions, export, export_all
 from gsba.export.images import of_one_lens
+from gsba.export.motion import Shutter
 from gsba.export.ply import write_points
 
-__all__ = ["ExportFormat", "ExportOptions", "export", "export_all", "of_one_lens", "write_points"]
+__all__ = [
+    "ExportFormat",
+    "ExportOptions",
+    "Shutter",
+    "export",
+    "export_all",
+    "of_one_lens",
+    "write_points",
+]

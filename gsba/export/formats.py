@@ -13,6 +13,7 @@ from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import FORMATS_OF
 from gsba.export.folder import output_folder
 from gsba.export.images import write_pictures
+from gsba.export.motion import UNKNOWN, Shutter
 from gsba.export.pictures import FrameWriter
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement
@@ -32,6 +33,8 @@ class ExportFormat(StrEnum):
     COLMAP_FLAT = "colmap-flat"  # pinhole faces with unique base names, for splat trainers
     COLMAP_ERP = "colmap-erp"  # one equirectangular camera
     NERFSTUDIO = "nerfstudio"  # transforms.json: pinhole faces, and panoramas
+    METASHAPE = "metashape"  # cameras.xml: panoramas, or pinhole faces
+    GLTF = "gltf"  # scene.glb: cameras and cloud, no images
     PLY = "ply"  # points3D.ply, the start cloud of splat trainers
     TUM = "tum"  # trajectory.tum, and panoramas on request
 
@@ -47,6 +50,7 @@ class ExportOptions:
     images: str = "auto"  # the setting `export.images`
     map_number: int = 1  # 1 = the largest map
     fetched: bool = False  # with the frames that were added where the map was weak
+    shutter: Shutter = UNKNOWN  # for trainers that model blur and rolling rows
 
 
 def export(
@@ -62,6 +66,7 @@ def export(
     workers: Workers | None = None,
     map_number: int = 1,
     fetched: bool = False,
+    shutter: Shutter = UNKNOWN,
 ) -> None:
     """Write one map of a reconstruction in another program's format.
 
@@ -85,12 +90,15 @@ def export(
         workers: workers that write images; None = threads of this process.
         map_number: number of the map, 1 = the largest.
         fetched: also write the frames that were added where the map was weak (see `FrameSet`).
+        shutter: times of the exposure, which nerfstudio's format states.
 
     Raises:
         GsbaError: `out` is in use or not seen by a worker, the format does not fit the frames,
             there is no such map, or the disk cannot be written; nothing is left behind then.
     """
-    options = ExportOptions(face_size, placement, link, lenses, images, map_number, fetched)
+    options = ExportOptions(
+        face_size, placement, link, lenses, images, map_number, fetched, shutter
+    )
     export_all(reconstruction, frames, {to: out}, options, workers)
 
 
@@ -132,23 +140,32 @@ def export_all(
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)
     read = fingerprint(path for path in files if path and path.exists())  # some formats read none
     key = __version__, reconstruction, frames, read, face_size, z_up, link, seen_by, images
+    key = (*key, options.shutter)
     writers: list[FrameWriter] = []
     with ExitStack() as folders:
         for to, out in outs.items():
             folder = output_folder(out, to.value, content_digest(to.value, *key))
             partial = folders.enter_context(folder)
             given = partial, reconstruction, frames, to
-            if images == "fisheye":
-                writers += _write_raw(*given, z_up, link, seen_by)
-            elif images == "panorama":
+            shown_as = _images_of(to, images, frames)
+            if shown_as == "fisheye":
+                writers += _write_raw(*given, z_up, link, seen_by, options.shutter)
+            elif shown_as == "panorama":
                 writers += _write_panoramas(*given, z_up, link, seen_by)
             else:
-                writers += _write(*given, face_size, z_up, link, seen_by)
+                writers += _write(*given, face_size, z_up, link, seen_by, options.shutter)
             placement.write(partial / "transform.json")
         write_pictures(frames, writers, workers)
     for to, out in outs.items():
         num_points = len(reconstruction.points_world)
         logger.info("%s: %d frames, %d points, in %s", to, len(frames), num_points, out)
+
+
+def _images_of(to: ExportFormat, images: str, frames: FrameSet) -> str:
+    """Setting `export.images` of a format: what `auto` gives differs."""
+    if to == ExportFormat.METASHAPE and images == "auto" and frames.panoramic:
+        return "panorama"
+    return images
 
 
 def _warn_of_gaps(reconstruction: Reconstruction, frames: FrameSet) -> None:
@@ -170,11 +187,13 @@ def _write_raw(
     z_up: bool,
     link: bool,
     lenses: Lenses,
+    shutter: Shutter,
 ) -> list[FrameWriter]:
     from gsba.export import colmap, nerfstudio
 
     if to == ExportFormat.NERFSTUDIO:
-        return nerfstudio.write_nerfstudio_raw(partial, reconstruction, frames, lenses, z_up, link)
+        given = partial, reconstruction, frames, lenses, z_up, link
+        return nerfstudio.write_nerfstudio_raw(*given, shutter)
     flat = to == ExportFormat.COLMAP_FLAT
     return [colmap.write_colmap_raw(partial, reconstruction, frames, lenses, flat, link)]
 
@@ -188,10 +207,12 @@ def _write_panoramas(
     link: bool,
     lenses: Lenses,
 ) -> list[FrameWriter]:
-    from gsba.export import colmap, nerfstudio, panoramas
+    from gsba.export import colmap, metashape, nerfstudio, panoramas
 
     given = partial, reconstruction, frames
     match to:
+        case ExportFormat.METASHAPE:
+            return [metashape.write_metashape_panoramas(*given, link, lenses)]
         case ExportFormat.COLMAP_ERP:
             return [colmap.write_colmap_erp(*given, link, lenses)]
         case ExportFormat.NERFSTUDIO:
@@ -219,8 +240,9 @@ def _write(
     z_up: bool,
     link: bool,
     lenses: Lenses,
+    shutter: Shutter,
 ) -> list[FrameWriter]:
-    from gsba.export import colmap, nerfstudio, ply
+    from gsba.export import colmap, gltf, metashape, nerfstudio, ply
     from gsba.export.panoramas import write_poses
 
     given = partial, reconstruction, frames
@@ -232,7 +254,11 @@ def _write(
         case ExportFormat.COLMAP_ERP:
             return [colmap.write_colmap_erp(*given, link, lenses)]
         case ExportFormat.NERFSTUDIO:
-            return nerfstudio.write_nerfstudio(*given, face_size, z_up, link, lenses)
+            return nerfstudio.write_nerfstudio(*given, face_size, z_up, link, lenses, shutter)
+        case ExportFormat.METASHAPE:
+            return [metashape.write_metashape_faces(*given, face_size, link, lenses)]
+        case ExportFormat.GLTF:
+            gltf.write_gltf(partial / "scene.glb", reconstruction, frames, z_up)
         case ExportFormat.PLY:
             ply.write_splat_points(
                 partial / "points3D.ply", reconstruction.points_world, reconstruction.point_colors

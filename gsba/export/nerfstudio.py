@@ -14,7 +14,7 @@ also has `transform_matrix_start` and `transform_matrix_end`, the poses of the t
 edge of the image in the format of instant-ngp, and `rolling_shutter` is [0, 0, 1, 0]: the pose of a
 pixel is interpolated between them by its row over the height. That is gsplat's
 ROLLING_TOP_TO_BOTTOM, with the inverses (in axes y down, z forward) as `viewmats` and
-`viewmats_rs`, and k1 to k4 as `radial_coeffs`.
+`viewmats_rs`, and k1 to k4 as `radial_coeffs`. Velocities for 3dgs-deblur: `gsba.export.motion`.
 """
 
 import json
@@ -27,6 +27,7 @@ import numpy as np
 from gsba.camera.fisheye import rotation_of
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.views import Scenes, View, scenes_of, seen_from_lenses, views_for
+from gsba.export import motion
 from gsba.export.images import face_size_for, has_masks, panorama_writer, view_writer
 from gsba.export.pictures import Files, FrameWriter
 from gsba.export.ply import write_splat_points
@@ -49,6 +50,7 @@ def write_nerfstudio(
     z_up: bool = False,
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
+    shutter: motion.Shutter = motion.UNKNOWN,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of faces into `partial`, of panoramas transforms_erp.json,
     too, without images; returns their writers.
@@ -60,13 +62,14 @@ def write_nerfstudio(
         z_up: the world's z points up, so that it is not rotated.
         link: make hard links to images that are exported unchanged.
         lenses: lenses of the frames.
+        shutter: times of the exposure.
     """
     out_R_world = _write_cloud(partial, reconstruction, z_up)
     views = views_for(frames, face_size_for(frames, face_size), lenses)
     seen = seen_from_lenses(reconstruction, lenses)
     scenes = scenes_of(reconstruction)
     given = partial, seen, frames, views, out_R_world, link, lenses, scenes
-    writers = [_write_face_dataset(*given)]
+    writers = [_write_face_dataset(*given, shutter)]
     if frames.panoramic:
         given = partial, reconstruction, frames, lenses, out_R_world, link
         writers.append(_write_erp_dataset(*given, "_erp"))
@@ -94,6 +97,7 @@ def write_nerfstudio_raw(
     lenses: Lenses,
     z_up: bool = False,
     link: bool = False,
+    shutter: motion.Shutter = motion.UNKNOWN,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of raw fisheyes into `partial`, without images; returns
     their writers."""
@@ -101,6 +105,8 @@ def write_nerfstudio_raw(
     out_R_world = _write_cloud(partial, reconstruction, z_up)
     files = _files(partial, LENSES, masked=True)
     moving = lenses.readout_motion is not None and lenses.row_directions is not None
+    velocities = motion.rig_velocities(reconstruction, frames, lenses, shutter)
+    ways = lenses.rows_down() if moving else (1.0, 1.0)
     entries = []
     for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
         rigs = lenses.swept(f) if moving else None
@@ -112,10 +118,14 @@ def write_nerfstudio_raw(
                 for name, rig_T_rig in zip(("start", "end"), rigs[number], strict=True):
                     matrix = _matrix(out_R_world, world_T_rig @ rig_T_rig @ rig_T_lens)
                     entry[f"transform_matrix_{name}"] = matrix
+            if velocities is not None:  # rows are read from the top, at these velocities
+                entry |= motion.velocity_keys(ways[number] * velocities[f], rig_T_lens)
             entries.append({**entry, **_fisheye(lens), "mask_path": masks[number]})
     camera: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE", "is_fisheye": True}
     if moving:
         camera["rolling_shutter"] = [0, 0, 1, 0]
+    if velocities is not None:
+        camera |= motion.shutter_keys(shutter, rolling=moving)
     _write_transforms(partial / "transforms.json", camera, entries, len(frames), out_R_world)
     return [RawPictures(files, link, _MAX_AXIS_ANGLE_DEG)]
 
@@ -137,12 +147,16 @@ def _write_face_dataset(
     link: bool,
     lenses: Lenses,
     scenes: Scenes,
+    shutter: motion.Shutter,
 ) -> FrameWriter:
     files = _files(partial, [view.name for view in views], has_masks(frames))
     # OPENCV without distortion is a pinhole, by the only name that all readers know.
     camera = {"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
     if not lenses:
         camera |= _intrinsics(views[0])
+    velocities = motion.rig_velocities(reconstruction, frames, lenses, shutter)
+    if velocities is not None:
+        camera |= motion.shutter_keys(shutter, rolling=False)
     entries = []
     for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
         images, masks = files.images(frames, f), files.masks(frames, f)
@@ -152,6 +166,8 @@ def _write_face_dataset(
                 entry |= _intrinsics(view)
             if masks:
                 entry["mask_path"] = masks[number]
+            if velocities is not None:
+                entry |= motion.velocity_keys(velocities[f], view.rig_T_view)
             entries.append(entry)
     _write_transforms(partial / "transforms.json", camera, entries, len(frames), out_R_world)
     return view_writer(files, frames, views, lenses, link, scenes)

@@ -27,6 +27,7 @@ from gsba.store.store import RunStore, fingerprint
 from gsba.trajectory.association import without_trajectory
 from gsba.trajectory.files import read_trajectory
 from gsba.trajectory.keyframes import follow_keyframes
+from gsba.trajectory.metashape import NamedPoses, is_metashape, read_metashape
 from gsba.trajectory.misread import refuse_useless
 from gsba.trajectory.restarts import associate_pieces, split_restarts
 from gsba.types import CoarsePoses, FrameSet, Trajectory
@@ -50,14 +51,37 @@ def trajectory_files(
     return origin if keyframes is None else origin | {"keyframes": Path(keyframes)}
 
 
-def read_trajectories(origin: Mapping[str, Path], timestamps: Path | None) -> list[Trajectory]:
-    """The trajectories of the files of a run, in pieces that each have a world of their own."""
+def read_trajectories(
+    origin: Mapping[str, Path], timestamps: Path | None
+) -> list[Trajectory | NamedPoses]:
+    """The trajectories of the files of a run, in pieces that each have a world of their own; poses
+    of Metashape's cameras get their times by `timed`."""
     given = [path for name, path in origin.items() if name.startswith("trajectory")]
+    if any(map(is_metashape, given)):
+        if "keyframes" in origin:
+            raise GsbaError("--keyframes goes with a SLAM's trajectory, not with cameras.xml")
+        if not all(map(is_metashape, given)):
+            raise GsbaError("give either trajectories with times, or cameras.xml, not both")
+        if video.is_video(origin["frames"]):
+            raise GsbaError(
+                f"{given[0]}: its cameras go by file names: give the folder of the pictures that "
+                "were aligned, not a video"
+            )
+        return [component for path in given for component in read_metashape(path)]
     pieces = [read_trajectory(path, timestamps) for path in given]
     if "keyframes" in origin:
         keyframes = read_trajectory(origin["keyframes"], timestamps)
         pieces = [follow_keyframes(pieces[0], keyframes)]
     return [part for piece in pieces for part in split_restarts(piece)]
+
+
+def timed(given: Sequence[Trajectory | NamedPoses], frames: FrameSet) -> list[Trajectory]:
+    """Trajectories with the times of frames, where their poses go by file names.
+
+    Raises:
+        GsbaError: fewer than two frames have a pose of a file.
+    """
+    return [one.timed(frames) if isinstance(one, NamedPoses) else one for one in given]
 
 
 def coarse_poses(
@@ -190,7 +214,7 @@ def positions_of(frames: FrameSet, settings: RefineSettings) -> FrameFixes | Non
 
 
 def follows(
-    settings: VideoSettings, fps: float | None, odometry: bool | None, given: Sequence[Trajectory]
+    settings: VideoSettings, fps: float | None, odometry: bool | None, given: Sequence[object]
 ) -> bool:
     """Whether a video is followed by odometry: as asked, else where nothing says which frames of it
     to take; never where trajectories are given."""

@@ -74,8 +74,9 @@ def refine(
 
     Args:
         frames: folder of panoramas, raw fisheyes, .360 tracks or cube faces; or a video.
-        trajectory: TUM, KITTI or stella_vslam map.msg; T_world_rig. Several are pieces of one run
-            on one clock, and the first one's world is kept. None = start from the images alone.
+        trajectory: TUM, KITTI, stella_vslam map.msg or Metashape cameras.xml; T_world_rig. Several
+            are pieces of one run on one clock, and the first one's world is kept. None = start from
+            the images alone.
         out: folder of the run; a second call re-runs what depends on settings that changed.
         settings: see `gsba.config`.
         keyframes: trajectory file of the same run's keyframes: they lead.
@@ -107,7 +108,7 @@ def refine(
         given, settings = walk.pieces(), settings.with_faint_priors()
     image_circles = inputs.given_circles(circles, calibration)
     found = scan(frames, timestamps, fps, chosen.given, not given, calibration, image_circles)
-    evidence = Evidence(tuple(given), readings, families=tuple(families))
+    evidence = Evidence(tuple(inputs.timed(given, found)), readings, families=tuple(families))
     start = _Start.of(found, evidence, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings), title_of) as store:
         return _refine(store, settings, chosen, evidence, start, origin["frames"], walk)

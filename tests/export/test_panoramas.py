@@ -26,7 +26,7 @@ from two_fisheyes import made_pair
 from gsba.camera.fisheye import project, unproject
 from gsba.camera.lens import Lenses, rows_run
 from gsba.disk import write_image
-from gsba.export import ExportFormat, export
+from gsba.export import ExportFormat, Shutter, export
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
 from gsba.trajectory.files import read_trajectory
@@ -174,6 +174,13 @@ def _between(start: np.ndarray, end: np.ndarray, shares: np.ndarray) -> np.ndarr
     return pose(turns(shares).as_matrix(), start[:3, 3] + np.outer(shares, (end - start)[:3, 3]))
 
 
+def _moved(entry: dict, after_s: float) -> np.ndarray:
+    """Pose (y down, z forward) of a frame's camera after a time, by its velocities."""
+    turn, move = (np.array(entry[f"camera_{kind}_velocity"]) for kind in ("angular", "linear"))
+    step = pose(Rotation.from_rotvec(turn * after_s).as_matrix(), move * after_s)
+    return np.array(entry["transform_matrix"]) @ step @ np.diag([1.0, -1, -1, 1])
+
+
 def _image(path: Path) -> np.ndarray:
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert image is not None
@@ -183,8 +190,10 @@ def _image(path: Path) -> np.ndarray:
 def test_rows_of_raw_fisheyes_have_their_poses(tmp_path: Path) -> None:
     frames = _raw_frames(tmp_path / "frames")
     to = ExportFormat.NERFSTUDIO
-    export(_scene(RAW), frames, tmp_path / "out", to, lenses=RAW, images="fisheye")
+    shutter = Shutter(readout_s=0.02)
+    export(_scene(RAW), frames, tmp_path / "out", to, lenses=RAW, images="fisheye", shutter=shutter)
     meta = json.loads((tmp_path / "out/transforms.json").read_text())
+    assert meta["rolling_shutter_time"] == 0.02
     assert meta["camera_model"] == "OPENCV_FISHEYE" and meta["rolling_shutter"] == [0, 0, 1, 0]
     assert not {"fl_x", "cx", "w", "k1"} & set(meta)  # nerfstudio would take them for all frames
     points = POINTS @ np.array(meta["applied_transform"])[:, :3].T
@@ -206,6 +215,9 @@ def test_rows_of_raw_fisheyes_have_their_poses(tmp_path: Path) -> None:
             np.array(entry[f"transform_matrix{when}"]) @ np.diag([1.0, -1, -1, 1])
             for when in ("", "_start", "_end")  # y down, z forward
         )
+        for edge, sign in ((start, -1), (end, 1)):  # velocities say the same as these poses, but
+            # for the arc of a lens about the rig's centre, which is of second order in the turn
+            np.testing.assert_allclose(_moved(entry, sign * 0.01), edge, atol=2e-4)
         shares = np.floor(expected[:, 1]) / (entry["h"] - 1)
         cameras_T_world = {
             "instant-ngp": inverse(_between(start, end, expected[:, 1] / entry["h"])),

@@ -1,0 +1,131 @@
+"""The walk as glTF 2.0: scene.glb, which Blender, Unreal and other programs import as it is.
+
+It holds the cloud (points with colours), a camera for each frame, which looks along the rig's z
+axis with a field of view of 90 degrees, and the camera `walk`, which moves through all frames at
+their times. glTF's world has y up and its cameras have OpenGL axes. A world without a known
+vertical is taken for one whose y points down, as the world of a camera held level does.
+"""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsba.disk import write_bytes
+from gsba.geometry import quaternion_from_rotation
+from gsba.types import FrameSet, Reconstruction
+
+_CV_R_GL = np.diag([1.0, -1, -1])  # axes of a glTF camera in ours
+_GLTF_R_Y_DOWN = np.diag([1.0, -1, -1])
+_GLTF_R_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+_FLOAT, _UBYTE, _POINTS = 5126, 5121, 0  # glTF's numbers of component types and modes
+_YFOV_RAD, _NEAR_PER_EXTENT = np.pi / 2, 1e-4
+
+
+def write_gltf(
+    path: Path, reconstruction: Reconstruction, frames: FrameSet, z_up: bool = False
+) -> None:
+    """Write `path`, a binary glTF file.
+
+    Args:
+        path: file to write (.glb).
+        reconstruction, frames: poses and cloud, and their frames.
+        z_up: the world's z points up.
+
+    Raises:
+        GsbaError: the disk cannot be written.
+    """
+    gltf_R_world = _GLTF_R_Z_UP if z_up else _GLTF_R_Y_DOWN
+    rotations = gltf_R_world @ reconstruction.world_T_rigs[:, :3, :3] @ _CV_R_GL
+    positions = reconstruction.world_T_rigs[:, :3, 3] @ gltf_R_world.T
+    xyzw = _steady(quaternion_from_rotation(rotations))[:, [1, 2, 3, 0]]
+    scene = _Buffer()
+    extent = max(float(np.ptp(positions, axis=0).max()), 1e-3)
+    perspective = {"yfov": _YFOV_RAD, "aspectRatio": 1.0, "znear": _NEAR_PER_EXTENT * extent}
+    nodes: list[dict[str, Any]] = [
+        {"name": "walk", "camera": 0, **_placed(positions[0], xyzw[0])},
+        *(
+            {"name": name, "camera": 0, **_placed(at, turn)}
+            for name, at, turn in zip(frames.names, positions, xyzw, strict=True)
+        ),
+    ]
+    meshes = []
+    if len(reconstruction.points_world):
+        points = reconstruction.points_world @ gltf_R_world.T
+        opaque = np.full((len(points), 1), 255, np.uint8)
+        colors = np.hstack([reconstruction.point_colors, opaque])
+        attributes = {"POSITION": scene.add(points, "VEC3"), "COLOR_0": scene.add(colors, "VEC4")}
+        meshes = [{"name": "cloud", "primitives": [{"attributes": attributes, "mode": _POINTS}]}]
+        nodes.append({"name": "cloud", "mesh": 0})
+    times = scene.add((frames.timestamps - frames.timestamps[0])[:, None], "SCALAR")
+    samplers = [
+        {"input": times, "output": scene.add(values, kind), "interpolation": "LINEAR"}
+        for values, kind in ((positions, "VEC3"), (xyzw, "VEC4"))
+    ]
+    channels = [
+        {"sampler": number, "target": {"node": 0, "path": what}}
+        for number, what in enumerate(("translation", "rotation"))
+    ]
+    document = {
+        "asset": {"version": "2.0", "generator": "gsba"},
+        "scene": 0,
+        "scenes": [{"name": "gsba", "nodes": list(range(len(nodes)))}],
+        "nodes": nodes,
+        "cameras": [{"type": "perspective", "perspective": perspective}],
+        "animations": [{"name": "walk", "channels": channels, "samplers": samplers}],
+        **({"meshes": meshes} if meshes else {}),
+        **scene.tables(),
+    }
+    write_bytes(path, _glb(document, bytes(scene.content)))
+
+
+class _Buffer:
+    """Content of the one binary buffer, with its views and accessors."""
+
+    def __init__(self) -> None:
+        self.content = bytearray()
+        self._views: list[dict[str, int]] = []
+        self._accessors: list[dict[str, Any]] = []
+
+    def add(self, values: np.ndarray, kind: str) -> int:
+        """Number of the accessor of new values (N, D): uint8 colours, else float32."""
+        is_color = values.dtype == np.uint8
+        values = values if is_color else values.astype("<f4")
+        view = {"buffer": 0, "byteOffset": len(self.content), "byteLength": values.nbytes}
+        accessor = {"bufferView": len(self._views), "count": len(values), "type": kind}
+        accessor |= {"componentType": _UBYTE if is_color else _FLOAT}
+        if is_color:
+            accessor["normalized"] = True
+        else:
+            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+        self.content += values.tobytes()
+        self._views.append(view)
+        self._accessors.append(accessor)
+        return len(self._accessors) - 1
+
+    def tables(self) -> dict[str, Any]:
+        """The document's tables of the buffer."""
+        buffers = [{"byteLength": len(self.content)}]
+        return {"buffers": buffers, "bufferViews": self._views, "accessors": self._accessors}
+
+
+def _placed(position: np.ndarray, xyzw: np.ndarray) -> dict[str, list[float]]:
+    return {"translation": position.tolist(), "rotation": xyzw.tolist()}
+
+
+def _steady(wxyz: np.ndarray) -> np.ndarray:
+    """Quaternions (N, 4) with the signs that make each step a turn of less than 180 degrees."""
+    flips = np.where(np.sum(wxyz[1:] * wxyz[:-1], axis=1) < 0, -1.0, 1.0)
+    return wxyz * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+
+
+def _glb(document: dict[str, Any], content: bytes) -> bytes:
+    """File of a JSON and a binary chunk, each padded to four bytes."""
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    content += b"\0" * (-len(content) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
+    chunks += struct.pack("<II", len(content), 0x004E4942) + content
+    return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks

@@ -1,0 +1,86 @@
+"""How the camera moves while it takes each frame, for trainers that model blur and rolling rows.
+
+The keys are those of transforms.json of SpectacularAI's 3dgs-deblur (Seiskari et al., ECCV 2024):
+`camera_linear_velocity` and `camera_angular_velocity` of each frame in its camera's OpenGL axes,
+per second, and `rolling_shutter_time` and `exposure_time`, seconds, of all. A row of a picture is
+taken at (its height in the picture - 1/2) rolling_shutter_time after the frame's pose, and blurred
+over exposure_time around that.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gsba.camera.lens import Lenses
+from gsba.geometry import inverse
+from gsba.types import FrameSet, Reconstruction
+
+_MAX_INTERVAL_S = 0.25  # between frames whose poses tell how fast the camera moves in between
+_CV_R_GL = np.diag([1.0, -1, -1])  # OpenGL camera axes in our camera axes
+
+
+@dataclass(frozen=True, slots=True)
+class Shutter:
+    """Times of a picture's exposure."""
+
+    readout_s: float | None = None  # from the first row to the last one; None = not known
+    exposure_s: float | None = None  # of each row; None = not known
+
+
+UNKNOWN = Shutter()
+
+
+def rig_velocities(
+    reconstruction: Reconstruction, frames: FrameSet, lenses: Lenses, shutter: Shutter
+) -> np.ndarray | None:
+    """Velocities (F, 6), [rotation rad/s, translation map units/s], in the axes of exported rigs.
+
+    They are the motions during the readout where these are known; else the steps between
+    neighbouring frames where all are at most a quarter of a second apart. None = neither.
+
+    Args:
+        reconstruction: poses of the exported rigs, which have the lenses' axes.
+        frames: their frames.
+        lenses: lenses of the frames.
+        shutter: times of the exposure.
+    """
+    if lenses.readout_motion is not None and shutter.readout_s:
+        parts = lenses.readout_motion.reshape(-1, 2, 3) / shutter.readout_s
+        parts = parts if lenses.axes is None else parts @ lenses.axes
+        return parts.reshape(-1, 6)
+    steps = np.diff(frames.timestamps)
+    if len(steps) < 2 or steps.max() > _MAX_INTERVAL_S:
+        return None
+    from scipy.spatial.transform import Rotation
+
+    poses, times = reconstruction.world_T_rigs, frames.timestamps
+    last = np.arange(len(poses))
+    before, after = np.maximum(last - 1, 0), np.minimum(last + 1, len(poses) - 1)
+    moved = inverse(poses[before]) @ poses[after]
+    turns = Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()
+    moves = poses[after, :3, 3] - poses[before, :3, 3]
+    moves = np.einsum("fji,fj->fi", poses[:, :3, :3], moves)
+    return np.hstack([turns, moves]) / (times[after] - times[before])[:, None]
+
+
+def velocity_keys(rig_velocity: np.ndarray, rig_T_camera: np.ndarray) -> dict[str, Any]:
+    """Entries of a frame in transforms.json.
+
+    Args:
+        rig_velocity: (6,) of the rig, see `rig_velocities`.
+        rig_T_camera: (4, 4) of a camera with axes x right, y down, z forward.
+    """
+    camera_R_rig = (rig_T_camera[:3, :3] @ _CV_R_GL).T
+    turn, move = rig_velocity[:3], rig_velocity[3:]
+    moved = move + np.cross(turn, rig_T_camera[:3, 3])
+    return {
+        "camera_linear_velocity": (camera_R_rig @ moved).tolist(),
+        "camera_angular_velocity": (camera_R_rig @ turn).tolist(),
+    }
+
+
+def shutter_keys(shutter: Shutter, rolling: bool) -> dict[str, float]:
+    """Entries of all frames in transforms.json; faces have no rolling rows."""
+    readout_s = (shutter.readout_s or 0.0) if rolling else 0.0
+    return {"rolling_shutter_time": readout_s, "exposure_time": shutter.exposure_s or 0.0}

@@ -1,0 +1,117 @@
+"""Camera poses from Agisoft Metashape's cameras.xml, as coarse trajectories.
+
+A camera's transform is `chunk_T_camera`, row by row, with axes x right, y down, z forward, as in
+our rig. Cameras have labels in place of times, so that poses become trajectories once the times of
+the frames with these names are known. Each component is aligned by itself and has an origin and a
+scale of its own: it is a trajectory of its own.
+"""
+
+import logging
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsba.frames.times import stem_of
+from gsba.geometry import pose
+from gsba.log import GsbaError, brief
+from gsba.types import FrameSet, Trajectory
+
+_log = logging.getLogger(__name__)
+
+_ROTATION_TOLERANCE = 1e-3  # largest deviation of a 3x3 block from a rotation
+_FORMAT = "export the aligned panoramas by File > Export > Export Cameras, Agisoft XML"
+
+
+@dataclass(frozen=True, slots=True)
+class NamedPoses:
+    """Poses of one component's cameras."""
+
+    path: Path  # of the file, for messages
+    names: tuple[str, ...]  # file names of images without suffix
+    world_T_rigs: np.ndarray  # (N, 4, 4) float64, chunk units
+
+    def timed(self, frames: FrameSet) -> Trajectory:
+        """The poses of the frames with these names, at the frames' times.
+
+        Raises:
+            GsbaError: fewer than two frames have a pose.
+        """
+        rows = {name: row for row, name in enumerate(self.names)}
+        known = [(f, rows[name]) for f, name in enumerate(frames.names) if name in rows]
+        if len(known) < 2:
+            raise GsbaError(
+                f"{self.path}: {len(known)} of {len(self.names)} cameras are frames of this run: "
+                f"its first camera is '{brief(self.names[0])}', the first frame "
+                f"'{brief(frames.names[0])}'; give the pictures that were aligned"
+            )
+        _log.info("%s: poses of %d of %d frames", self.path, len(known), len(frames))
+        at, chosen = (list(column) for column in zip(*known, strict=True))
+        return Trajectory(frames.timestamps[at], self.world_T_rigs[chosen])
+
+
+def is_metashape(path: Path) -> bool:
+    """True if a file is XML by its first letter that is no blank."""
+    try:
+        with path.open("rb") as file:
+            return file.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+    except OSError:
+        return False  # whoever reads it says why
+
+
+def read_metashape(path: Path) -> list[NamedPoses]:
+    """Poses of the aligned spherical cameras of a cameras.xml, by component, the largest first.
+
+    Raises:
+        GsbaError: the file is damaged or of another program, no spherical camera is aligned, or
+            two cameras have one name.
+    """
+    try:
+        root = ET.parse(path).getroot()
+    except OSError as error:
+        raise GsbaError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except ET.ParseError as error:
+        raise GsbaError(f"{path}: damaged XML ({error})") from None
+    chunk = root.find("chunk")
+    sensors = () if chunk is None else chunk.findall("sensors/sensor")
+    if chunk is None or not sensors:
+        raise GsbaError(f"{path}: not Metashape's cameras.xml: {_FORMAT}")
+    spherical = {one.get("id") for one in sensors if one.get("type") == "spherical"}
+    if not spherical:
+        kinds = ", ".join(sorted({one.get("type") or "unknown" for one in sensors}))
+        raise GsbaError(
+            f"{path}: its cameras are of type {kinds}, and a pose of a frame needs type spherical: "
+            f"set it in Tools > Camera Calibration, or {_FORMAT}"
+        )
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for camera in chunk.iterfind("cameras//camera"):
+        transform, label = camera.findtext("transform"), camera.get("label") or ""
+        if transform is None or camera.get("sensor_id") not in spherical:
+            continue
+        name = stem_of(label)
+        if any(name in component for component in found.values()):
+            raise GsbaError(f"{path}: two cameras are named '{brief(label)}': rename one")
+        where = f"{path}: camera '{brief(label)}'"
+        of_component = found.setdefault(camera.get("component_id") or "", {})
+        of_component[name] = _pose(transform, where)
+    if not found:
+        raise GsbaError(f"{path}: none of its spherical cameras is aligned: align them first")
+    largest_first = sorted(found.values(), key=len, reverse=True)
+    return [NamedPoses(path, tuple(one), np.stack(list(one.values()))) for one in largest_first]
+
+
+def _pose(text: str, where: str) -> np.ndarray:
+    """World_T_rig (4, 4) from 16 numbers, row by row."""
+    try:
+        matrix = np.array(text.split(), np.float64).reshape(4, 4)
+    except ValueError:
+        raise GsbaError(f"{where}: its transform is not 16 numbers") from None
+    if not np.isfinite(matrix).all():
+        raise GsbaError(f"{where}: its transform is not finite")
+    u, _, vt = np.linalg.svd(matrix[:3, :3])
+    rotation = u @ vt
+    off = np.abs(rotation - matrix[:3, :3]).max()
+    if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise GsbaError(f"{where}: the left 3x3 block of its transform is not a rotation")
+    return pose(rotation, matrix[:3, 3])
