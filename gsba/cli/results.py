@@ -81,6 +81,15 @@ MapNumber = Annotated[
         metavar="NUMBER",
     ),
 ]
+Target = Annotated[
+    str,
+    typer.Option(
+        help="colmap, colmap-flat, colmap-erp, nerfstudio, metashape, gltf, ply or tum; or a "
+        "program: inria, postshot, brush, lichtfeld, gsplat, opensplat, nerfstudio, "
+        "instant-ngp, 3dgs-deblur, blender.",
+        metavar="FORMAT",
+    ),
+]
 Exposure = Annotated[
     float | None,
     typer.Option(
@@ -101,15 +110,7 @@ Pairs = Annotated[
 @command
 def export(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
-    to: Annotated[
-        str,
-        typer.Option(
-            help="colmap, colmap-flat, colmap-erp, nerfstudio, metashape, gltf, ply or tum; or a "
-            "program: inria, postshot, brush, lichtfeld, gsplat, opensplat, nerfstudio, "
-            "instant-ngp, 3dgs-deblur, blender.",
-            metavar="FORMAT",
-        ),
-    ],
+    to: Target,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder to write; default: RUN/FORMAT, of map 2 RUN/FORMAT-map2."),
@@ -155,16 +156,13 @@ def export(
     known_baseline = _baseline(run, baseline) if scale == "lens" else None
     noise = _gps_noise(run, gps_sigma) if gps is not None else None
     placed = place(reconstruction, frames, settings, known_baseline, noise)
-    placement = replace(placed, map_number=map_number)
-    given = reconstruction, frames, folder, to, face_size, placement, link, lenses
-    shutter = _shutter(run, exposure_ms)
+    placed, shutter = replace(placed, map_number=map_number), _shutter(run, exposure_ms)
+    given = reconstruction, frames, folder, to, face_size, placed, link, lenses
     with connected(cluster) as client, hired(client, folder, frames) as workers:
         write(*given, images=images, workers=workers, shutter=shutter)
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
-    typer.echo(f"{to}: {folder}")
-    if start := how_to_start(name, folder):
-        typer.echo(f"{name}: {start}")
+    typer.echo("\n".join([f"{to}: {folder}", *how_to_start(name, folder)]))
 
 
 def _shutter(run: Path, exposure_ms: float | None) -> "Shutter":

@@ -53,6 +53,6 @@ def format_of(name: str) -> ExportFormat:
     return ExportFormat(name)
 
 
-def how_to_start(name: str, out: Path) -> str:
-    """Line that starts the program of this name on an export; "" = it is the name of a format."""
-    return PROGRAMS[name].start.replace("{out}", str(out)) if name in PROGRAMS else ""
+def how_to_start(name: str, out: Path) -> list[str]:
+    """Lines on how the program of this name reads an export; [] = it is the name of a format."""
+    return [f"{name}: {PROGRAMS[name].start.format(out=out)}"] if name in PROGRAMS else []

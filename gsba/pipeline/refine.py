@@ -74,9 +74,8 @@ def refine(
 
     Args:
         frames: folder of panoramas, raw fisheyes, .360 tracks or cube faces; or a video.
-        trajectory: TUM, KITTI, stella_vslam map.msg or Metashape cameras.xml; T_world_rig. Several
-            are pieces of one run on one clock, and the first one's world is kept. None = start from
-            the images alone.
+        trajectory: T_world_rig, see `gsba.trajectory`. Several are pieces of one run on one clock,
+            and the first one's world is kept. None = start from the images alone.
         out: folder of the run; a second call re-runs what depends on settings that changed.
         settings: see `gsba.config`.
         keyframes: trajectory file of the same run's keyframes: they lead.
