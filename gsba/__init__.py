@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from gsba.localization.localizer import LocalizedFrame, Localizer
     from gsba.log import GsbaError
     from gsba.pipeline.outputs import RunResult
+    from gsba.pipeline.recording import Recording
+    from gsba.pipeline.recordings import refine_recordings
     from gsba.pipeline.refine import refine
     from gsba.store.finished import load_run
 
@@ -29,12 +31,14 @@ __all__ = [
     "LocalizedFrame",
     "Localizer",
     "MapSnapshot",
+    "Recording",
     "RefineSettings",
     "RunResult",
     "X",
     "load_config",
     "load_run",
     "refine",
+    "refine_recordings",
 ]
 
 _HOMES = {
@@ -43,12 +47,14 @@ _HOMES = {
     "LocalizedFrame": "gsba.localization.localizer",
     "Localizer": "gsba.localization.localizer",
     "MapSnapshot": "gsba.bundle.families",
+    "Recording": "gsba.pipeline.recording",
     "RefineSettings": "gsba.config",
     "RunResult": "gsba.pipeline.outputs",
     "X": "gsba.bundle.prior_factors",
     "load_config": "gsba.config_file",
     "load_run": "gsba.store.finished",
     "refine": "gsba.pipeline.refine",
+    "refine_recordings": "gsba.pipeline.recordings",
 }
 
 

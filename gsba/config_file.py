@@ -28,7 +28,7 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Refi
     Raises:
         GsbaError: unreadable file, unknown key, or a value out of range, with the allowed values.
     """
-    tree = _read_toml(path) if path else {}
+    tree = read_toml(path) if path else {}
     _check_keys(tree, RefineSettings, (), str(path))
     for override in overrides:
         keys, value = _parse_override(override)
@@ -44,7 +44,12 @@ def to_toml(settings: BaseModel) -> str:
     return "\n".join(_toml_lines(settings, ())) + "\n"
 
 
-def _read_toml(path: Path) -> dict[str, Any]:
+def read_toml(path: Path) -> dict[str, Any]:
+    """Content of a TOML file.
+
+    Raises:
+        GsbaError: the file cannot be read, or is not valid TOML.
+    """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

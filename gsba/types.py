@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 FACES = ("front", "right", "back", "left", "up", "down")
-_NO_FILE_NAME = re.compile(r"[/\x00-\x1f\x7f-\x9f\ud800-\udfff]|^\.{0,2}$")
+NO_FILE_NAME = re.compile(r"[/\x00-\x1f\x7f-\x9f\ud800-\udfff]|^\.{0,2}$")
 
 
 class PoseSource(IntEnum):
@@ -63,7 +63,8 @@ class FrameSet:
         ValueError: a name or a face that cannot be a file name; exported files carry them.
     """
 
-    names: tuple[str, ...]  # (F,) unique, without folder or extension
+    names: tuple[str, ...]  # (F,) unique, without folder or extension; RECORDING/NAME if the frames
+    # are of several recordings, whose frames follow one another
     paths: tuple[tuple[Path, ...], ...]  # (F,)(1) for "erp", (F,)(2) for "fisheye": front and
     # back, (F,)(2) for "eac": track 0 and the second one, (F,)(len(faces)) for "cube"
     timestamps: np.ndarray  # (F,) float64, seconds, strictly increasing
@@ -85,10 +86,13 @@ class FrameSet:
     # ideal lenses in the image circles, a factory calibration, or one that images contradict
     fetched: tuple[bool, ...] = ()  # (F,) frames of a video that were added where the map of the
     # chosen ones was weak: datasets leave them out; () = none
+    clock_shifts: tuple[float, ...] = ()  # (F,) seconds by which a frame's time on the clock of its
+    # recording was shifted, so that recordings follow one another; () = none was
 
     def __post_init__(self) -> None:
         for name in self.names:
-            if _NO_FILE_NAME.search(name):
+            parts = name.split("/") if self.clock_shifts else [name]
+            if len(parts) > 2 or any(map(NO_FILE_NAME.search, parts)):
                 raise ValueError(f"{name!r:.60} cannot be the name of a frame")
         for face in self.faces:
             if face not in FACES:
@@ -100,6 +104,14 @@ class FrameSet:
     def chosen(self) -> np.ndarray:
         """Frames (F',) int64 that datasets hold: all that were not added later (`fetched`)."""
         return np.flatnonzero(~np.array(self.fetched or (False,) * len(self), bool))
+
+    @property
+    def recordings(self) -> dict[str, np.ndarray]:
+        """Frames (R,) int64 of each recording by its name, in order; {} if there is only one."""
+        owners = np.array([name.rpartition("/")[0] for name in self.names])
+        return {
+            name: np.flatnonzero(owners == name) for name in dict.fromkeys(owners.tolist()) if name
+        }
 
     @property
     def panoramic(self) -> bool:
@@ -135,6 +147,7 @@ class FrameSet:
             timestamps=self.timestamps[rows],
             mask_paths=mask_paths,
             fetched=tuple(self.fetched[f] for f in rows) if self.fetched else (),
+            clock_shifts=tuple(self.clock_shifts[f] for f in rows) if self.clock_shifts else (),
         )
 
 

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gsba.cli.app import command, loading
+from gsba.cli.recordings import grouped, recordings_of
 from gsba.log import GsbaError
 
 if TYPE_CHECKING:
     from gsba.config import RefineSettings
     from gsba.demo.two_lenses import TwoLenses
-    from gsba.pipeline import RunResult
+    from gsba.pipeline import Recording, RunResult
 
 PARTIAL = 3  # exit code of a run whose exported map has less than nine tenths of its frames
 
@@ -49,7 +50,7 @@ Download = Annotated[
 ]
 
 Frames = Annotated[
-    Path,
+    Path | None,
     typer.Argument(
         help="Folder of 2:1 panoramas, raw fisheyes, .360 tracks or cube faces, or a video."
     ),
@@ -58,7 +59,17 @@ Trajectories = Annotated[
     list[Path] | None,
     typer.Argument(
         help="TUM, KITTI, stella_vslam map.msg or Metashape cameras.xml; several files are pieces "
-        "of one trajectory. Default: odometry on a video; pairs of images of stills."
+        "of one trajectory. Default: odometry on a video; pairs of images of stills. A further "
+        "folder or video is another recording of the place, and files after it are its trajectory."
+    ),
+]
+Recordings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--recording",
+        help="One of several recordings, with what belongs to it: name, trajectory, keyframes, "
+        "masks, timestamps, fps, calibration, imu, camera. Repeatable.",
+        metavar="PATH,KEY=VALUE,...",
     ),
 ]
 Out = Annotated[
@@ -157,9 +168,10 @@ Segment = Annotated[
 
 @command
 def refine(
-    frames: Frames,
+    frames: Frames = None,
     trajectory: Trajectories = None,
     out: Out = None,
+    recording: Recordings = None,
     keyframes: Keyframes = None,
     no_trajectory: NoTrajectory = False,
     config: Config = None,
@@ -185,28 +197,48 @@ def refine(
 
     The exit code is 3 if less than nine tenths of the frames are in the exported map.
     """
-    if trajectory and no_trajectory:
+    if frames is None and not recording:
+        raise GsbaError("give the FRAMES to refine: a folder or a video")
+    given = [] if frames is None else [frames, *(trajectory or ())]
+    several = bool(recording) or len(grouped(given)) > 1
+    if trajectory and no_trajectory and not several:
         raise GsbaError("a TRAJECTORY and --no-trajectory exclude each other: leave one out")
-    if keyframes is not None and not trajectory:
+    if keyframes is not None and not (trajectory or several):
         raise GsbaError("--keyframes needs the TRAJECTORY of the same SLAM run: pass that, too")
-    out = out or _run_folder(frames)
     overrides = [*_networks(weights, accept_noncommercial, download), *(overrides or ())]
-    if camera is not None:
-        overrides = [*overrides, f'camera.name="{camera}"']
-    if gps is not None:
-        overrides = [*overrides, f"gps.file={json.dumps(gps)}"]
-        factors = _with_gps(factors)
-    settings = _settings(config, overrides, factors)
+    settings = _settings(config, *_with_sensors(overrides, factors, camera, gps))
+    shared: dict[str, Any] = {"odometry": False if no_trajectory else None, "fps": fps}
+    shared |= {"masks": masks or "auto", "calibration": calibration}
+    shared["circles"] = [_circle(text) for text in circle or ()]
+    own: dict[str, Any] = {"keyframes": keyframes, "timestamps": timestamps, "imu": imu}
     with loading():
         from gsba import pipeline
         from gsba.store.cluster import connected
-    given: dict[str, Any] = {"odometry": False if no_trajectory else None}
-    given |= {"keyframes": keyframes, "segment": segment, "timestamps": timestamps, "fps": fps}
-    given |= {"masks": masks or "auto", "calibration": calibration, "imu": imu, "fresh": fresh}
-    given["circles"] = [_circle(text) for text in circle or ()]
     with connected(cluster) as client:
-        result = pipeline.refine(frames, trajectory, out, settings, client=client, **given)
+        run: dict[str, Any] = {"segment": segment, "fresh": fresh, "client": client}
+        if several:
+            recordings = recordings_of(given, recording or (), shared)
+            out = _several_run_folder(own, recordings, out)
+            result = pipeline.refine_recordings(recordings, out, settings, **run)
+        else:
+            out = out or _run_folder(given[0])
+            result = pipeline.refine(given[0], trajectory, out, settings, **run, **shared, **own)
     _conclude([result], allow_partial)
+
+
+def _several_run_folder(
+    own: dict[str, Path | None], recordings: "Sequence[Recording]", out: Path | None
+) -> Path:
+    """Folder of a run of several recordings; files `own` that only one can have are refused."""
+    for name, path in own.items():
+        if path is not None:
+            raise GsbaError(
+                f"--{name} {path}: is of one recording, and {len(recordings)} are given: pass "
+                f"--recording PATH,{name}={path}"
+            )
+    if out is None:
+        raise GsbaError("several recordings need a name for their run: pass --out RUN")
+    return out
 
 
 def _run_folder(frames: Path) -> Path:
@@ -403,6 +435,17 @@ def show_config(
     from gsba.config_file import to_toml
 
     typer.echo(to_toml(_settings(config, overrides, factors)), nl=False)
+
+
+def _with_sensors(
+    overrides: list[str], factors: str | None, camera: str | None, gps: str | None
+) -> tuple[list[str], str | None]:
+    """Overrides and families of residuals with those that --camera and --gps stand for."""
+    if camera is not None:
+        overrides = [*overrides, f'camera.name="{camera}"']
+    if gps is None:
+        return overrides, factors
+    return [*overrides, f"gps.file={json.dumps(gps)}"], _with_gps(factors)
 
 
 def _with_gps(factors: str | None) -> str:

@@ -1,6 +1,7 @@
 """Trajectory file and folder of panoramas, for programs without a format of their own.
 
-`gsba refine OUT/images OUT/trajectory.tum` reads them back.
+`gsba refine OUT/images OUT/trajectory.tum` reads them back, or those of one of several recordings
+from OUT/images/RECORDING.
 """
 
 import csv
@@ -27,15 +28,17 @@ def write_with_poses(
     lenses: Lenses,
     link: bool = False,
 ) -> FrameWriter:
-    """Write `trajectory.tum` and `images/timestamps.csv` into `partial`; returns the writer of the
-    images and masks."""
+    """Write `trajectory.tum` and `images/timestamps.csv`, one for each recording, into `partial`;
+    returns the writer of the images and masks."""
     write_poses(partial, reconstruction, frames)
-    images = partial / "images"
-    images.mkdir(exist_ok=True)
-    with (images / "timestamps.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["name", "timestamp"])
-        writer.writerows(zip(frames.names, map(float, frames.timestamps), strict=True))
+    for recording, rows in (frames.recordings or {"": range(len(frames))}).items():
+        images = partial / "images" / recording
+        images.mkdir(parents=True, exist_ok=True)
+        with (images / "timestamps.csv").open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(["name", "timestamp"])
+            names = (frames.names[f].rpartition("/")[2] for f in rows)
+            writer.writerows(zip(names, map(float, frames.timestamps[rows]), strict=True))
     mask = "masks/{name}.png" if has_masks(frames) else ""
     files = Files(partial, ("",), "images/{name}{suffix}", mask)
     return panorama_writer(files, frames, link, lenses, scenes_of(reconstruction))

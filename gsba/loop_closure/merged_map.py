@@ -7,7 +7,7 @@ import numpy as np
 from gsba.similarity import Sim3
 from gsba.trajectory.joining import PLACES, SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
-from gsba.types import CoarsePoses, Counts, Solution
+from gsba.types import CoarsePoses, Counts, PoseSource, Solution
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +58,7 @@ def follow(
     placed[:, :3, 3] -= registered.offsets
     if coarse.absent:
         return replace(coarse, world_T_rigs=placed), trust, joints
+    unguided = (coarse.sources == PoseSource.NONE)[:, None, None]  # have the poses of the map
     poses, followed = coarse.world_T_rigs.copy(), []
     in_main = registered.met & ~registered.alone & (registered.components == 0)
     for joint in joints:
@@ -69,4 +70,5 @@ def follow(
             own = move.after(Sim3.of(joint.scale, joint.world_T_own))
             joint = replace(joint, scale=own.scale, world_T_own=own.new_T_old, how=PLACES)
         followed.append(joint)
+    poses = np.where(unguided, placed, poses)
     return replace(coarse, world_T_rigs=poses), trust, tuple(followed)

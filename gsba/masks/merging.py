@@ -52,6 +52,7 @@ class Choice:
     distractors: bool
     segment: Segment | None
     carrier_required: bool = False  # True if an undetectable carrier is an error
+    without_carrier: tuple[str, ...] = ()  # of several recordings, those whose carrier stays
 
 
 def choose(masks: Masks, segment: Segment | None = None) -> Choice:
@@ -93,7 +94,11 @@ def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
         found = segmented(store, frames, choice.segment)
         parts.append(lambda f: load_segmented(found, frames, f))
         names.append("segmented")
-    if choice.carrier:
+    if choice.carrier and frames.recordings:
+        frames, more, stages = _carriers(store, frames, choice, alone=not parts)
+        parts += more
+        names += stages
+    elif choice.carrier:
         carrier = _carrier(store, frames, choice.carrier_required)
         if carrier.share and not (parts or carrier.turns.any() or any(frames.mask_paths)):
             frames = replace(frames, mask_paths=(store.root / "carrier.png",) * len(frames))
@@ -105,6 +110,38 @@ def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
     final = not choice.distractors
     folder = store.root / (_FOLDER if final else f"stages/first-{_FOLDER}")
     return _merge(store, folder, frames, parts, names)
+
+
+def _carriers(
+    store: RunStore, frames: FrameSet, choice: Choice, alone: bool
+) -> tuple[FrameSet, list[Callable[[int], np.ndarray | None]], list[str]]:
+    """Frames with the mask of each recording's carrier, or else parts of masks and their stages.
+
+    Args:
+        store, frames, choice: see `before`.
+        alone: True if frames have no other masks than given ones.
+    """
+    found: dict[str, Carrier] = {}
+    for name, rows in frames.recordings.items():
+        if name not in choice.without_carrier:
+            own = frames.taken(rows)
+            carrier = _carrier(store, own, choice.carrier_required, f"carrier@{name}")
+            if carrier.share:
+                found[name] = carrier
+    turning = any(carrier.turns.any() for carrier in found.values())
+    if alone and not (turning or any(frames.mask_paths)):
+        paths = [name.rpartition("/")[0] for name in frames.names]
+        masks = [store.root / f"carrier@{name}.png" if name in found else None for name in paths]
+        return replace(frames, mask_paths=tuple(masks)), [], []
+    first = {name: int(rows[0]) for name, rows in frames.recordings.items()}
+
+    def part(f: int) -> np.ndarray | None:
+        name = frames.names[f].rpartition("/")[0]
+        if name not in found:
+            return None
+        return carrier_mask(found[name], frames, f - first[name])
+
+    return frames, [part] if found else [], [f"carrier@{name}" for name in found]
 
 
 def after(

@@ -67,7 +67,7 @@ def segmented(store: RunStore, frames: FrameSet, segment: Segment) -> PerFrame[S
         else:
             ask()
             for c in present:
-                path = folder / "masks" / f"{name}_{FACES[c]}.png"
+                path = folder / "masks" / _face_file(name, c)
                 use[c] = decode(path, (size, size), gray=True) > 127
         return Segmented(np.packbits(use), size)
 
@@ -83,6 +83,11 @@ def load_segmented(found: PerFrame[Segmented], frames: FrameSet, frame: int) -> 
     one = found[frames.names[frame]]
     use = np.unpackbits(one.bits, count=len(FACES) * one.size**2) > 0
     return use[_places(one.size)]
+
+
+def _face_file(name: str, face: int) -> str:
+    """File name of a frame's face; folders are flat, whatever recordings the frames are of."""
+    return f"{name.replace('/', '@')}_{FACES[face]}.png"
 
 
 class _Once:
@@ -105,11 +110,11 @@ def _run(command: str, frames: FrameSet, rig: CubeRig, present: list[int], folde
     with disk_errors(folder):
         images.mkdir(parents=True)
         masks.mkdir()
-    names = [f"{name}_{FACES[c]}.png" for name in frames.names for c in present]
+    names = [_face_file(name, c) for name in frames.names for c in present]
     for f, name in enumerate(track(frames.names, "cutting faces")):
         faces, _ = cubemap.load(frames, f, rig)
         for c in present:
-            write_image(images / f"{name}_{FACES[c]}.png", faces[c])
+            write_image(images / _face_file(name, c), faces[c])
     words = _words(command)
     if any("{image}" in word or "{mask}" in word for word in words):
         for name in track(names, "segmenting"):

@@ -7,8 +7,21 @@ Gives refined poses, a cloud, datasets and a report.
 from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
+from gsba.pipeline.recording import Recording
+from gsba.pipeline.recordings import refine_recordings
 from gsba.pipeline.refine import refine, solve
 from gsba.pipeline.run import Evidence, Run
 from gsba.pipeline.state import State
 
-__all__ = ["Evidence", "Map", "Prior", "Run", "RunResult", "State", "refine", "solve"]
+__all__ = [
+    "Evidence",
+    "Map",
+    "Prior",
+    "Recording",
+    "Run",
+    "RunResult",
+    "State",
+    "refine",
+    "refine_recordings",
+    "solve",
+]

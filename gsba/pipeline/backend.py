@@ -114,9 +114,12 @@ def separate_parts(state: State) -> np.ndarray | None:
         )
     scarce = connectivity.starving(solution, state.run.settings.rounds.min_observations)
     nothing = np.zeros_like(state.prior.trust.held_steps)
-    if state.prior.absent:  # nothing but points hands the scale on
+    unguided = state.prior.unguided
+    if unguided.any():  # nothing but points hands the scale on
         matches = steps.matches_of_steps(near, len(scarce))
-        loose = connectivity.bridging(solution.landmarks.tracks, len(scarce)) < _MIN_BRIDGING
+        loose = unguided & (
+            connectivity.bridging(solution.landmarks.tracks, len(scarce)) < _MIN_BRIDGING
+        )
         loose[1:-1] &= (matches[:-1] > 0) & (matches[1:] > 0)
         loose[[0, -1]] = False
         open_at = set(np.flatnonzero(loose).tolist())
@@ -130,11 +133,14 @@ def merge_maps(state: State, parts: np.ndarray) -> State:
 
     def compute() -> Registered:
         held, shown = trust.held_steps, ~trust.unseen_steps
-        if prior.absent:  # images show a step between parts, but not how long it is
+        open_scale = prior.unguided[1:] & prior.unguided[:-1]
+        if open_scale.any():  # images show a step between parts, but not how long it is
             fed = ~connectivity.starving(solution, run.settings.rounds.min_observations)
-            shown &= ~((parts[1:] != parts[:-1]) & fed[1:] & fed[:-1])
+            shown &= ~((parts[1:] != parts[:-1]) & fed[1:] & fed[:-1] & open_scale)
         context, times = state.observed.context, run.frames.timestamps
-        return map_merging.merge(context, solution, parts, held, shown, times, prior.absent)
+        # No trajectory relates recordings: their maps are as free as those of images alone.
+        alone = prior.absent or bool(run.evidence.recordings)
+        return map_merging.merge(context, solution, parts, held, shown, times, alone)
 
     merged = run.stage("registered", run.matching_key(), compute, Registered)
     coarse, followed, joints = follow(merged, prior.coarse, trust, prior.joints)
@@ -234,7 +240,7 @@ def reconstruct(state: State) -> Reconstruction:
             solution,
             covariances,
             observed,
-            None if run.families.fixing_gauge.members else prior.coarse,
+            None if run.families.fixing_gauge.members else prior.worlds(),
             run.settings.rounds.min_observations,
             prior.trust.false_frames,
             prior.parts,

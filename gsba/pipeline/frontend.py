@@ -59,14 +59,21 @@ def _observe(
     run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str
 ) -> ObservedFrames:
     """Features of each frame (F,), ready to be matched; `stage`: the last one they are of."""
-    frames, settings = run.frames, run.matching_settings
-
+    frames = run.frames
     load = FrameFeatures(found, frames.names)
 
     def gather() -> Keypoints:
         return detection.gather(map(load, range(len(frames))))
 
     keypoints = run.chain.stage(name, None, gather, Keypoints, also=[stage])
+    return _matchable(run, found, keypoints)
+
+
+def _matchable(
+    run: Run, found: Sequence[PerFrame[Features]], keypoints: Keypoints
+) -> ObservedFrames:
+    """Features (F,) and keypoints of a run's frames, with the means to match them."""
+    settings, load = run.matching_settings, FrameFeatures(found, run.frames.names)
     context = MatchContext(
         SearchableFrames(load),
         SearchableFrames(load, settings.pairs.strongest_per_face),
@@ -76,6 +83,38 @@ def _observe(
         learned.make_matcher(settings, run.weights, run.rig.size),
     )
     return ObservedFrames(tuple(found), keypoints, context)
+
+
+def of_recording(state: State, number: int) -> State:
+    """The first state of one recording, from the first state of all recordings of a run.
+
+    Args:
+        state: keypoints of all frames, as `extract` gives them.
+        number: index of the recording.
+    """
+    run = state.run.of_recording(number)
+    rows = state.run.frames.recordings[state.run.evidence.recordings[number].name]
+    first, last = int(rows[0]), int(rows[-1])
+    features = state.observed.features[first : last + 1]
+    keypoints = _keypoints_of(state.observed.shown, first, last)
+    return State.begin(run, _matchable(run, features, keypoints))
+
+
+def _keypoints_of(keypoints: Keypoints, first: int, last: int) -> Keypoints:
+    """Keypoints of frames `first` to `last`, the latter included, which are numbered from 0."""
+    starts = keypoints.starts[first : last + 2]
+    own = slice(int(starts[0]), int(starts[-1]))
+    infos, origins = keypoints.sqrt_infos, keypoints.origins_rig
+    return Keypoints(
+        starts - starts[0],
+        keypoints.pixels[own],
+        keypoints.faces[own],
+        keypoints.bearings_rig[own],
+        keypoints.sigmas_rad[own],
+        keypoints.colors[own],
+        None if infos is None else infos[own],
+        None if origins is None else origins[own],
+    )
 
 
 def match_neighbours(state: State) -> State:

@@ -251,22 +251,54 @@ def extract_frames(
         The odometry that frames were chosen by; None where it was not asked for, or found too
         little.
     """
-    chosen = settings.video
+    check_positions(settings)
+    with RunStore(out, dict(origin), fresh, title_of=title_of) as store:
+        return extract_video(store, origin["frames"], settings, fps, by_odometry, calibration)
+
+
+def check_positions(settings: RefineSettings) -> None:
+    """Refuse positions that the frames of a video cannot have, before hours of decoding."""
     if EXIF in (settings.placement.gps, settings.gps.file):
         raise GsbaError("--gps exif: a video's frames have no tags; give positions as a file")
     if settings.gps.file is not None:
-        read_fixes(settings.gps.file)  # fails before hours of decoding
+        read_fixes(settings.gps.file)
+
+
+def extract_video(
+    store: RunStore,
+    video_file: Path,
+    settings: RefineSettings,
+    fps: float | None,
+    by_odometry: Choice | None = None,
+    calibration: Path | None = None,
+    name: str = "",
+) -> Odometry | None:
+    """Write the frames of a video to `frames` in the run's folder, see `extract_frames`.
+
+    Args:
+        store: of the run.
+        video_file: the video.
+        settings, fps, by_odometry, calibration: see `extract_frames`.
+        name: of one of several recordings, whose frames go to `frames`/`name`; "" = the only one.
+    """
+    chosen, folder = settings.video, store.root / "frames" / name
     if fps is not None:
         chosen = chosen.model_copy(update={"fps": check_fps(fps), "every": None, "at": None})
     found: Odometry | None = None
-    with RunStore(out, dict(origin), fresh, title_of=title_of) as store:
-        if by_odometry is not None:
-            found = _follow(store, origin["frames"], settings, by_odometry, calibration)
-        if found is not None:
-            chosen = chosen.model_copy(update={"at": str(out / CHOSEN), "sharpest": False})
-        video.extract(origin["frames"], out / "frames", chosen, replace=True)
-        store.claim(out / "frames")
+    if by_odometry is not None:
+        found = _follow(store, video_file, settings, by_odometry, calibration, name)
+    if found is not None:
+        at = store.root / chosen_frames(name)
+        chosen = chosen.model_copy(update={"at": str(at), "sharpest": False})
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    video.extract(video_file, folder, chosen, replace=True)
+    store.claim(folder)
     return found
+
+
+def chosen_frames(name: str = "") -> Path:
+    """File in a run's folder of the frames that the odometry of a recording has chosen."""
+    return CHOSEN.parent / name / CHOSEN.name
 
 
 def _follow(
@@ -275,11 +307,13 @@ def _follow(
     settings: RefineSettings,
     masks: Choice,
     calibration: Path | None,
+    name: str,
 ) -> Odometry | None:
     """Odometry of a video, its trajectory and chosen frames written to the run's folder; None
     where it lost the camera in most of the video."""
     start, end = settings.video.from_s, settings.video.to_s
     width, seed = settings.odometry.width, settings.seed
+    stage = f"odometry@{name}" if name else "odometry"
 
     def compute() -> Odometry:
         panoramas = odometry.of_video(video_file, width, calibration, start, end)
@@ -287,20 +321,21 @@ def _follow(
             panoramas = odometry.masked(panoramas, masks.given)
         if masks.carrier:
             panoramas = odometry.without_carrier(panoramas)
-        unfinished = store.root / "stages/odometry/unfinished.npz"
+        unfinished = store.root / "stages" / stage / "unfinished.npz"
         return odometry.track_panoramas(panoramas, seed, checkpoint=unfinished)
 
     files = fingerprint([*files_of(video_file), calibration, masks.given])
     key = [width, seed, (start, end), masks.carrier, files]
-    found = store.stage("odometry", key, compute, Odometry)
+    found = store.stage(stage, key, compute, Odometry)
     if not found.usable():
         logger.warning("the odometry lost the camera in most of the video: frames at a fixed rate")
         return None
     rows = odometry.choose_frames(found, settings.odometry)
     logger.info("%d of %d frames chosen by what they show", len(rows), len(found))
-    folder = store.root / CHOSEN.parent
+    at = store.root / chosen_frames(name)
+    folder = at.parent
     names = "walk.tum", "keyframes.tum", "poses.csv", "odometry.json"
     write_odometry(found, *(folder / name for name in names))
-    write_chosen(found, rows, store.root / CHOSEN)
+    write_chosen(found, rows, at)
     store.claim(folder)
     return found

@@ -13,6 +13,7 @@ from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.disk import write_json, write_text
 from gsba.export import ExportFormat, ExportOptions, export_all, of_one_lens, write_points
+from gsba.frames.recordings import own_timestamps
 from gsba.pipeline.map import Map
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
@@ -24,12 +25,18 @@ from gsba.report.gps_findings import of_gps
 from gsba.report.html import residual_sphere, write_html
 from gsba.report.imu_findings import of_gyro
 from gsba.report.maps import MapSummary, is_partial, summarize_maps
+from gsba.report.recordings import notes_on_recordings, of_recordings
 from gsba.report.report import Findings, StageLog, build_report, plain, write_poses
+from gsba.store.store import RunStore
 from gsba.trajectory.files import write_tum
 from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
 
 _GAUGE = (
     "Sim(3)-aligned to the coarse trajectory over its refined SLAM poses: its world and scale; "
+    "covariances hold the first pose and the distance to the frame furthest from it"
+)
+_FIRST_GAUGE = (
+    "Sim(3)-aligned to the trajectory of the first recording that has one: its world and scale; "
     "covariances hold the first pose and the distance to the frame furthest from it"
 )
 _OWN_GAUGE = (
@@ -41,6 +48,7 @@ _FAMILIES_GAUGE = (
     "to the frame furthest from it"
 )
 CALIBRATION = "calibration.json"
+TRAJECTORIES = "trajectories"  # folder of a trajectory file for each of several recordings
 _OUTPUTS = (
     "trajectory.tum",
     "coarse.tum",
@@ -86,6 +94,7 @@ def write(state: State, result: Reconstruction, lenses: Lenses) -> RunResult:
     (out / "coarse.tum").unlink(missing_ok=True)
     if not prior.absent:
         write_tum(out / "coarse.tum", Trajectory(shown.timestamps, start.world_T_rigs))
+    _write_trajectories(store, shown, main)
     write_poses(out / "poses.csv", frames, coarse, result)
     write_points(out / "points.ply", main)
     write_text(out / "config.toml", to_toml(settings))
@@ -103,6 +112,17 @@ def write(state: State, result: Reconstruction, lenses: Lenses) -> RunResult:
         store.claim(out / name)
     maps = summarize_maps(result, frames, _reasons(prior))
     return RunResult(out, frames, coarse, result, report, maps)
+
+
+def _write_trajectories(store: RunStore, shown: FrameSet, main: Reconstruction) -> None:
+    """A trajectory file for each of several recordings, on its own clock."""
+    folder, times = store.root / TRAJECTORIES, own_timestamps(shown)
+    for path in folder.glob("*.tum"):  # of an earlier call
+        path.unlink()
+    for name, rows in shown.recordings.items():
+        folder.mkdir(exist_ok=True)
+        write_tum(folder / f"{name}.tum", Trajectory(times[rows], main.world_T_rigs[rows]))
+        store.claim(folder / f"{name}.tum")
 
 
 def _reasons(prior: Prior) -> tuple[str, ...]:
@@ -171,8 +191,11 @@ def _findings(state: State, result: Reconstruction) -> Findings:
     most = run.settings.weak_frames.max_scale_sigma
     notes += findings.of_frames(frames, prior.coarse, result, map_.frame_weights, most)
     stitching = map_.stitching and findings.of_field(map_.stitching)
-    reasons = _reasons(prior)
-    return Findings(notes, trajectory, stitching, camera, gyro, gps, map_.moves, reasons)
+    clocks, sources = [one.clock for one in prior.of_recordings], prior.coarse.sources
+    recordings = of_recordings(frames, result, sources, clocks)
+    notes += notes_on_recordings(recordings)
+    found = Findings(notes, trajectory, stitching, camera, gyro, gps, map_.moves)
+    return replace(found, recordings=recordings, reasons=_reasons(prior))
 
 
 def _of_families(state: State) -> dict[str, Any]:
@@ -187,6 +210,8 @@ def _gauge(run: Run, prior: Prior) -> str:
     fixing = run.families.fixing_gauge.members
     if fixing:
         return _FAMILIES_GAUGE.format(names=", ".join(family.name for family in fixing))
+    if prior.of_recordings and not prior.absent:
+        return _FIRST_GAUGE
     return _OWN_GAUGE if prior.absent else _GAUGE
 
 

@@ -14,7 +14,9 @@ from gsba.loop_closure.merged_map import Registered, side_by_side
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
-from gsba.types import CoarsePoses, GyroConstraints, Solution
+from gsba.types import CoarsePoses, GyroConstraints, PoseSource, Solution
+
+_MIN_DEFINING_POSES = 3  # of a recording's trajectory, that define the world of a map
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +32,8 @@ class Prior:
     strength: MapStrength | None = None  # of the map, by images alone; None = not measured
     gyro: Alignment | None = None  # of the sensor that rides along; None = there is none
     turning: GyroConstraints | None = None  # what it says of the frames; None = it is not believed
+    of_recordings: tuple["Prior", ...] = ()  # of each of several recordings, before they were
+    # combined: clocks and gyros of their own; () = there is one recording
 
     @classmethod
     def of(cls, coarse: CoarsePoses) -> "Prior":
@@ -40,6 +44,11 @@ class Prior:
     def absent(self) -> bool:
         """Whether there is no trajectory."""
         return self.coarse.absent
+
+    @property
+    def unguided(self) -> np.ndarray:
+        """Frames (F,) bool of recordings without a trajectory."""
+        return self.coarse.sources == PoseSource.NONE
 
     @property
     def turning_only(self) -> bool:
@@ -90,6 +99,29 @@ class Prior:
             coarse=replace(coarse, world_T_rigs=gauge.poses(coarse.world_T_rigs, parts)),
             trust=replace(trust, world_T_rigs=start, lengths=lengths),
         )
+
+    def worlds(self) -> CoarsePoses:
+        """Coarse poses that define the worlds of the maps.
+
+        Of several recordings, each map has the world and scale of its first recording that has a
+        trajectory: poses of the others count as interpolated.
+        """
+        coarse, num = self.coarse, len(self.coarse.sources)
+        maps = np.zeros(num, np.int64) if self.parts is None else self.parts
+        poses, defining = coarse.world_T_rigs.copy(), np.zeros(num, bool)
+        begin = 0
+        for one in self.of_recordings:
+            rows = begin + np.flatnonzero(one.coarse.sources == PoseSource.SLAM)
+            if one.joints:  # further pieces of its trajectory have worlds of their own
+                rows = rows[rows < begin + one.joints[0].first]
+            for number in np.unique(maps[rows]).tolist():
+                own = rows[maps[rows] == number]
+                if len(own) >= _MIN_DEFINING_POSES and not defining[maps == number].any():
+                    poses[own], defining[own] = one.coarse.world_T_rigs[own - begin], True
+            begin += len(one.coarse.sources)
+        others = np.isin(maps, maps[defining]) & ~defining
+        sources = np.where(others, PoseSource.INTERPOLATED, coarse.sources).astype(np.uint8)
+        return replace(coarse, world_T_rigs=poses, sources=sources)
 
     def _side_by_side(self) -> np.ndarray:
         return side_by_side(self.coarse.world_T_rigs, self.merged)

@@ -22,6 +22,7 @@ from gsba.pipeline import (
     backend,
     camera,
     densify,
+    each_recording,
     frontend,
     gyro,
     inputs,
@@ -108,13 +109,13 @@ def refine(
     image_circles = inputs.given_circles(circles, calibration)
     found = scan(frames, timestamps, fps, chosen.given, not given, calibration, image_circles)
     evidence = Evidence(tuple(inputs.timed(given, found)), readings, families=tuple(families))
-    start = _Start.of(found, evidence, settings)
+    start = Start.of(found, evidence, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings), title_of) as store:
-        return _refine(store, settings, chosen, evidence, start, origin["frames"], walk)
+        return refine_from(store, settings, chosen, evidence, start, origin["frames"], walk)
 
 
 @dataclass(frozen=True, slots=True)
-class _Start:
+class Start:
     """Frames, where trajectories put them, and what else is known of them."""
 
     frames: FrameSet
@@ -122,20 +123,23 @@ class _Start:
     evidence: Evidence
 
     @classmethod
-    def of(cls, frames: FrameSet, evidence: Evidence, settings: RefineSettings) -> "_Start":
+    def of(cls, frames: FrameSet, evidence: Evidence, settings: RefineSettings) -> "Start":
         """With the GPS fixes and the families of packages that settings ask for."""
         fixes = inputs.positions_of(frames, settings)
-        coarse = inputs.coarse_poses(frames, evidence.trajectories, settings)
+        if evidence.recordings:
+            coarse = each_recording.joined_poses([one.coarse for one in evidence.recordings])
+        else:
+            coarse = inputs.coarse_poses(frames, evidence.trajectories, settings)
         families = (*evidence.families, *inputs.families_of(frames, settings))
         return cls(frames, coarse, replace(evidence, fixes=fixes, families=families))
 
 
-def _refine(
+def refine_from(
     store: RunStore,
     settings: RefineSettings,
     chosen: merging.Choice,
     given: Evidence,
-    start: _Start,
+    start: Start,
     source: Path,
     walk: Odometry | None,
 ) -> RunResult:
@@ -166,10 +170,10 @@ def _with_fetched(
     settings: RefineSettings,
     chosen: merging.Choice,
     given: Evidence,
-    start: _Start,
+    start: Start,
     video_file: Path,
     walk: Odometry,
-) -> _Start:
+) -> Start:
     """The start with more frames of a video where the map of features is weak.
 
     Raises:
@@ -179,15 +183,15 @@ def _with_fetched(
         acceptance.refuse_vehicle_in_pieces(_begin(store, settings, chosen, start).frames)
 
     def measure(some: FrameSet) -> Prior:
-        run = _begin(store, settings, chosen, _Start.of(some, given, settings))
+        run = _begin(store, settings, chosen, Start.of(some, given, settings))
         return _map_features(frontend.extract(run)).prior
 
     frames = start.frames
     whole = densify.fetch_where_weak(store, video_file, walk, frames, settings, measure)
-    return start if whole is frames else _Start.of(whole, given, settings)
+    return start if whole is frames else Start.of(whole, given, settings)
 
 
-def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, start: _Start) -> Run:
+def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, start: Start) -> Run:
     """A run on frames that are masked as asked."""
     journal, frames = Journal(), merging.before(store, start.frames, chosen)
     if chosen.distractors:
@@ -196,7 +200,7 @@ def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, st
 
 
 def _without_distractors(
-    store: RunStore, settings: RefineSettings, start: _Start, journal: Journal
+    store: RunStore, settings: RefineSettings, start: Start, journal: Journal
 ) -> FrameSet:
     """Frames without what a first solution, plainer than the last, does not explain."""
     frames, evidence = start.frames, replace(start.evidence, imu=None, fixes=None)
@@ -287,9 +291,12 @@ def _map_features(state: State) -> State:
     """One map of all frames' features, the camera that sees them, and how well images hold it."""
     rounds = state.run.settings.rounds
     # Neighbours in time, and what they say of the trajectory and its clock.
-    state = frontend.match_neighbours(state)
-    state = frontend.judge_trajectory(state)
-    state = gyro.align_to_neighbours(state)
+    if state.run.evidence.recordings:
+        state = each_recording.match_neighbours(state)
+    else:
+        state = frontend.match_neighbours(state)
+        state = frontend.judge_trajectory(state)
+        state = gyro.align_to_neighbours(state)
     if state.prior.turning_only:
         return state
     # A chain of relative poses, then all that neighbours have in common.

@@ -1,7 +1,7 @@
 """A run: what no stage changes, how a stage is kept, and the journal that the report reads."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,6 +14,7 @@ from gsba.camera.rig import CubeRig
 from gsba.config import RefineSettings
 from gsba.frames import cubemap
 from gsba.frames.panorama import Greys
+from gsba.frames.recordings import own_timestamps
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError
 from gsba.photometric import direct
@@ -47,6 +48,16 @@ class Journal:
 
 
 @dataclass(frozen=True, slots=True)
+class RecordingEvidence:
+    """Trajectory and gyro of one of several recordings, on the clock of that recording."""
+
+    name: str  # of the recording
+    coarse: CoarsePoses  # of its frames, in the trajectory's own world and unit
+    trajectories: tuple[Trajectory, ...] = ()  # in pieces that each have their own world
+    imu: Readings | None = None  # of a gyro that rode along; None = there are none
+
+
+@dataclass(frozen=True, slots=True)
 class Evidence:
     """What a run is given beside its images."""
 
@@ -54,6 +65,8 @@ class Evidence:
     imu: Readings | None = None  # of a gyro that rode along; None = there are none
     fixes: FrameFixes | None = None  # of frames by GPS, for its factors; None = there are none
     families: tuple[Family, ...] = ()  # residuals of the caller, or of packages
+    recordings: tuple[RecordingEvidence, ...] = ()  # of several recordings, in order of their
+    # frames, which then have their trajectories and gyros from here; () = there is one recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +87,7 @@ class Run:
     families: Families  # those of the evidence, bound to the frames
     lenses_found: bool = False  # whether the calibration that raw pairs are cut by was estimated by
     # a pass before, so that it is free
+    suffix: str = ""  # of the names of stages that only see one of several recordings
 
     @classmethod
     def begin(
@@ -95,7 +109,8 @@ class Run:
         if settings.camera.model == "two_lens" and not frames.panoramic:
             raise GsbaError("camera.model = two_lens is for panoramas: cube faces hide the seam")
         evidence = evidence or Evidence()
-        if evidence.imu is not None and not frames.timed:
+        sensors = [evidence.imu, *(one.imu for one in evidence.recordings)]
+        if any(imu is not None for imu in sensors) and not frames.timed:
             raise GsbaError("--imu: nothing says when frames are from: pass --timestamps or --fps")
         chain = Chain(store)
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
@@ -135,10 +150,32 @@ class Run:
             name, key, compute, returns: see `gsba.store.RunStore.stage`.
             noted: whether the report tells of it.
         """
+        name += self.suffix
         result = self.chain.stage(name, key, compute, returns)
         if noted:
             self.journal.note(name, result)
         return result
+
+    def of_recording(self, number: int) -> "Run":
+        """The run restricted to one of its recordings, on that recording's clock.
+
+        Its stages rest on the latest one of this run.
+
+        Args:
+            number: index of the recording.
+        """
+        given = self.evidence.recordings[number]
+        frames = self.frames.taken(self.frames.recordings[given.name])
+        times = own_timestamps(frames)
+        return replace(
+            self,
+            chain=Chain(self.store, self.chain.latest),
+            frames=replace(frames, timestamps=times, clock_shifts=(0.0,) * len(times)),
+            coarse=given.coarse,
+            evidence=Evidence(given.trajectories, given.imu),
+            families=Families((), frames.names, times),
+            suffix=f"@{given.name}",
+        )
 
     @property
     def matching_settings(self) -> RefineSettings:

@@ -88,6 +88,9 @@ def title_of(name: str) -> str:
     for prefix, words in _PREFIXES.items():
         if name.startswith(prefix):
             return words + title_of(name.removeprefix(prefix))
+    stage, _, recording = name.partition("@")
+    if recording:
+        return f"{title_of(stage)}, recording {recording}"
     for pattern, title in _TITLES.items():
         found = re.fullmatch(re.sub("[#+]", r"(\\d+?)", pattern), name)
         if found is not None:

@@ -6,6 +6,7 @@ import numpy as np
 
 from gsba.bundle.fixes import FrameFixes
 from gsba.config import GpsSettings
+from gsba.frames.recordings import own_timestamps
 from gsba.log import GsbaError
 from gsba.placement.exif import read_exif_gps
 from gsba.placement.gps import GpsFixes, local_from_geodetic, read_gps
@@ -73,7 +74,7 @@ def _between(
     source: str, fixes: GpsFixes, frames: FrameSet
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frames (G,) between fixes, their positions (G, 3) geodetic, and sigmas (G, 3) in metres."""
-    times, entries = frames.timestamps, fixes.timestamps
+    times, entries = own_timestamps(frames), fixes.timestamps
     assert entries is not None
     if not frames.timed:
         raise GsbaError(

@@ -40,7 +40,7 @@ def of_trajectory(
     """
     found, notes = _steps(trust, frames, absent)
     if clock is not None:
-        found |= {"clock": _clock(clock)}
+        found |= {"clock": clock_section(clock)}
         if clock.verdict == "corrected":
             logger.warning(clock.note)
             notes.append(clock.note)
@@ -105,10 +105,14 @@ def _maps(
         for joint in joints
     ]
     for joint in joints:
+        first, before = names[joint.first], names[joint.first - 1]
+        piece, begin = "piece", f"a new piece of the trajectory begins at {first}"
+        if first.rpartition("/")[0] != before.rpartition("/")[0]:
+            piece, begin = "recording", f"recording {first.rpartition('/')[0]}"
         alignment = f"joined by {joint.how}, scale {joint.scale:.4g}"
         if joint.how == GUESS:
-            alignment = "no images show how this piece is aligned to the others"
-        notes.append(f"a new piece of the trajectory begins at {names[joint.first]}: {alignment}")
+            alignment = f"no images show how this {piece} is aligned to the others"
+        notes.append(f"{begin}: {alignment}")
     judgement: dict[str, Any] = {"joints": pieces} if pieces else {}
     if registered is None:
         return judgement, notes
@@ -140,7 +144,7 @@ def _maps(
     return judgement, notes
 
 
-def _clock(estimate: ClockEstimate) -> dict[str, Any]:
+def clock_section(estimate: ClockEstimate) -> dict[str, Any]:
     """Clock estimate for the report: seconds, and degrees of a step's rotation."""
     return {
         "verdict": estimate.verdict,

@@ -90,6 +90,7 @@ class Findings:
     gyro: Mapping[str, Any] | None = None  # see `imu_findings.of_gyro`
     gps: Mapping[str, Any] | None = None  # see `gps_findings.of_gps`
     moves: Sequence[object] = ()  # of the poses by a splat, see `gsba.splat.refinement.Move`
+    recordings: Sequence[Mapping[str, Any]] = ()  # see `recordings.of_recordings`
     reasons: Sequence[str] = ()  # why maps were not joined, see `maps.summarize_maps`
 
 
@@ -132,7 +133,8 @@ def build_report(
         found: findings beside the result.
     """
     quality = frame_quality(reconstruction)
-    optional = {"camera": found.camera, "gyro": found.gyro, "gps": found.gps}
+    optional: dict[str, Any] = {"camera": found.camera, "gyro": found.gyro, "gps": found.gps}
+    optional["recordings"] = found.recordings or None
     report = {
         "gsba": __version__,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -227,11 +227,12 @@ class Chain:
 
     Args:
         store: store of the run.
+        latest: names of the stages that the first one depends on.
     """
 
-    def __init__(self, store: RunStore) -> None:
+    def __init__(self, store: RunStore, latest: Sequence[str] = ()) -> None:
         self._store = store
-        self.latest: list[str] = []  # name of the last stage; [] before the first
+        self.latest = list(latest)  # names of the last stages; [] before the first
 
     def stage(
         self,
@@ -246,6 +247,10 @@ class Chain:
         result = self._store.stage(name, settings, compute, returns, after)
         self.latest = [name]
         return result
+
+    def join(self, others: "Sequence[Chain]") -> None:
+        """Let the next stage depend on the latest stages of other chains, which branched off."""
+        self.latest = [name for chain in others for name in chain.latest]
 
 
 @runtime_checkable
@@ -313,7 +318,7 @@ class PerFrame(Generic[T]):
 
     def discard_others(self) -> None:
         """Delete results of frames that are not among these."""
-        for path in set(self._folder.glob("*.npz")) - {self._path(name) for name in self}:
+        for path in set(self._folder.rglob("*.npz")) - {self._path(name) for name in self}:
             path.unlink()
 
     def _path(self, name: str) -> Path:

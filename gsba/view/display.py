@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _BEFORE, _AFTER, _BAD = (217, 130, 43), (23, 105, 170), (192, 57, 43)  # colours of report.html
 _SEEN = (46, 125, 79)
+_RECORDINGS = (_AFTER, _BEFORE, _SEEN, (142, 79, 168), (160, 103, 47), (93, 125, 139))  # by turns
 _JPEG_QUALITY = 85
 
 
@@ -97,9 +98,10 @@ class View:
         """Add lines through the poses before and after, and a forward-facing pyramid per rig."""
         world_T_rigs = self.scene.reconstruction.world_T_rigs
         coarse = self.scene.coarse_T_rigs
-        self._add_line("/refined", world_T_rigs, _AFTER)
+        own = self._colors_by_recording()
+        self._add_line("/refined", world_T_rigs, own)
         if coarse is not None:
-            self._add_line("/coarse", coarse, _BEFORE)
+            self._add_line("/coarse", coarse, np.full_like(own, _BEFORE))
         wxyz = quaternion_from_rotation(world_T_rigs[:, :3, :3]).astype(np.float32)
         positions = (self.scale * world_T_rigs[:, :3, 3]).astype(np.float32)
         refined = self.scene.reconstruction.pose_statuses == PoseStatus.REFINED
@@ -108,7 +110,7 @@ class View:
             *_pyramid(0.22 * self.size),
             wxyz,
             positions,
-            batched_colors=np.where(refined[:, None], _AFTER, _BAD).astype(np.uint8),
+            batched_colors=np.where(refined[:, None], own, _BAD).astype(np.uint8),
             opacity=0.75,
             flat_shading=True,
             side="double",
@@ -127,11 +129,21 @@ class View:
             visible=False,
         )
 
-    def _add_line(self, name: str, world_T_rigs: np.ndarray, color: tuple[int, int, int]) -> None:
+    def _colors_by_recording(self) -> np.ndarray:
+        """Colour (F, 3) uint8 of the recording of each frame."""
+        colors = np.full((len(self.scene.frames), 3), _AFTER, np.uint8)
+        for n, rows in enumerate(self.scene.frames.recordings.values()):
+            colors[rows] = _RECORDINGS[n % len(_RECORDINGS)]
+        return colors
+
+    def _add_line(self, name: str, world_T_rigs: np.ndarray, colors: np.ndarray) -> None:
+        """Add a line through poses (F, 4, 4) in colours (F, 3), broken between recordings."""
         positions = (self.scale * world_T_rigs[:, :3, 3]).astype(np.float32)
-        segments = np.stack([positions[:-1], positions[1:]], axis=1)
+        ends = [rows[-1] for rows in self.scene.frames.recordings.values()]
+        kept = np.setdiff1d(np.arange(len(positions) - 1), ends)
+        segments = np.stack([positions[kept], positions[kept + 1]], axis=1)
         self.nodes[name] = self.server.scene.add_line_segments(
-            name, segments, color, thickness=0.03 * self.size
+            name, segments, np.stack([colors[kept]] * 2, axis=1), thickness=0.03 * self.size
         )
 
     def _add_splats(self) -> None:

@@ -21,18 +21,23 @@ function worldMap(canvas, across, up) {
       points.forEach((p, i) => { g.fillStyle = `rgb(${colors[i]})`; g.fillRect(X(p) - 1, Y(p) - 1, 2, 2); });
       g.globalAlpha = 1;
     }
-    const line = (path, colour, size) => {
-      g.strokeStyle = g.fillStyle = colour; g.lineWidth = 1.4; g.lineJoin = "round";
-      g.beginPath(); path.forEach((p, i) => i ? g.lineTo(X(p), Y(p)) : g.moveTo(X(p), Y(p))); g.stroke();
-      for (const p of path) { g.beginPath(); g.arc(X(p), Y(p), size, 0, 7); g.fill(); }
+    const line = (path, colourOf, size) => {  // one for each recording
+      g.lineWidth = 1.4; g.lineJoin = "round";
+      for (let first = 0, end; first < N; first = end) {
+        for (end = first; end < N && F.recording[end] === F.recording[first];) end++;
+        const own = path.slice(first, end);
+        g.strokeStyle = g.fillStyle = css(colourOf(F.recording[first]));
+        g.beginPath(); own.forEach((p, i) => i ? g.lineTo(X(p), Y(p)) : g.moveTo(X(p), Y(p))); g.stroke();
+        for (const p of own) { g.beginPath(); g.arc(X(p), Y(p), size, 0, 7); g.fill(); }
+      }
     };
     if (layers.before && layers.after) {
       g.strokeStyle = css("--quiet"); g.globalAlpha = .5; g.lineWidth = 1; g.beginPath();
       for (let f = 0; f < N; f++) { g.moveTo(X(before[f]), Y(before[f])); g.lineTo(X(after[f]), Y(after[f])); }
       g.stroke(); g.globalAlpha = 1;
     }
-    if (layers.before) line(before, css("--before"), 1.6);
-    if (layers.after) line(after, css("--after"), 2.2);
+    if (layers.before) line(before, () => D.recordings.length ? "--quiet" : "--before", 1.6);
+    if (layers.after) line(after, number => D.recordings.length ? COLOURS[number % 6] : "--after", 2.2);
     if (layers.after) for (let f = 0; f < N; f++) if (F.status[f]) {
       g.strokeStyle = css("--bad"); g.lineWidth = 1.5; g.beginPath(); g.arc(X(after[f]), Y(after[f]), 5, 0, 7); g.stroke();
     }

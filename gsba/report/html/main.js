@@ -36,6 +36,7 @@ function mapLegend() {
     box.addEventListener("change", () => { layers[key] = box.checked; redraw(); });
     el("map-legend").append(make("label", {}, box, key === "points" ? null : make("i", { style: `background:var(--${key})` }), text));
   }
+  D.recordings.forEach((name, i) => el("map-legend").append(make("span", {}, make("i", { style: `background:var(${COLOURS[i % 6]})` }), ` ${name}`)));
   if (D.map.up < .5) el("map-legend").append(make("span", {}, "the rigs have no common up axis: up is the direction of the path's smallest extent"));
 }
 

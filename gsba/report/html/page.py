@@ -49,6 +49,7 @@ def write_html(
         "sphere": report["residual_sphere"],
         "field": figures.field_sphere(reconstruction.correction),
         "erp_width": frames.panorama_width,
+        "recordings": list(frames.recordings),
         "worst": _worst(frames, reconstruction),
         "scan": None,
         "odometry": None,
@@ -117,6 +118,7 @@ def _frames(
     moved, turned = figures.displacements(coarse, reconstruction)
     return {
         "name": frames.names,
+        "recording": _recordings(frames),
         "time": frames.timestamps,
         "source": coarse.sources,
         "status": reconstruction.pose_statuses,
@@ -127,6 +129,14 @@ def _frames(
         "std_deg": np.linalg.norm(quality.std_rotations_deg, axis=1),
         "std": np.linalg.norm(quality.std_translations, axis=1),
     }
+
+
+def _recordings(frames: FrameSet) -> np.ndarray:
+    """Number (F,) of each frame's recording, from 0."""
+    numbers = np.zeros(len(frames), np.int64)
+    for number, rows in enumerate(frames.recordings.values()):
+        numbers[rows] = number
+    return numbers
 
 
 def _worst(frames: FrameSet, reconstruction: Reconstruction) -> list[dict[str, Any]]:

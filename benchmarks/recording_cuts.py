@@ -1,0 +1,78 @@
+"""Recordings for `benchmarks/recordings.py`: parts of a walk, each with its own clock and world."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gsba.demo import degrade
+from gsba.geometry import pose
+from gsba.similarity import Sim3
+from gsba.trajectory.files import read_trajectory, write_tum
+from gsba.types import Trajectory
+
+STEP = 4  # frames of the walk from one frame of a recording to the next
+_SHARE = 1.5  # part of the walk that all recordings cover together: neighbours overlap
+_SCALES = (0.4, 0.9, 1.7, 0.6, 1.2, 2.3)  # map units per metre of the trajectories
+
+
+class Cut(NamedTuple):
+    """A recording cut from a walk."""
+
+    folder: Path  # of its frames, with timestamps.csv
+    trajectory: Path  # TUM, with drift, in a world and scale of its own
+    rows: np.ndarray  # (R,) frames of the walk
+
+
+def cut(walk: Path, out: Path, num: int, exposures: tuple[float, ...] = ()) -> list[Cut]:
+    """Cut a walk into recordings that overlap their neighbours.
+
+    Recordings see the walk at other frames. Each has a clock from 0, and a trajectory that starts
+    at the identity of a tilted world.
+
+    Args:
+        walk: folder with `images/` and their timestamps.csv, and `groundtruth.tum`.
+        out: folder of the recordings.
+        num: number of recordings.
+        exposures: factors of the linear light of each recording's pictures; () = as they are.
+    """
+    truth = read_trajectory(walk / "groundtruth.tum")
+    table = (walk / "images/timestamps.csv").read_text().splitlines()[1:]
+    names = [row.partition(",")[0] for row in table]
+    images = {path.stem: path for path in (walk / "images").iterdir()}
+    length = min(int(_SHARE * len(names) / num), len(names))
+    starts = np.linspace(0, len(names) - length, num).astype(int)
+    cuts = []
+    for n, start in enumerate(starts.tolist()):
+        phase = (STEP // 2) * (n % 2)
+        rows = np.arange(start + phase, start + length, STEP)
+        folder = out / f"part{n + 1}"
+        folder.mkdir(parents=True, exist_ok=True)
+        for row in rows.tolist():
+            _copy(images[names[row]], folder, exposures[n] if exposures else 1.0)
+        times = truth.timestamps[rows] - truth.timestamps[rows[0]]
+        lines = [f"{names[row]},{time:.6f}" for row, time in zip(rows.tolist(), times, strict=True)]
+        (folder / "timestamps.csv").write_text("\n".join(["name,timestamp", *lines, ""]))
+        coarse = degrade(Trajectory(times, truth.world_T_rigs[rows]), n, scale=_SCALES[n % 6])
+        turn = Rotation.from_rotvec([0.3, 1.1 * n, -0.2]).as_matrix()
+        moved = Sim3.of(1.0, pose(turn, np.array([3.0 * n, -2.0, 5.0])))
+        path = out / f"part{n + 1}.tum"
+        write_tum(path, Trajectory(coarse.timestamps, moved.poses(coarse.world_T_rigs)))
+        cuts.append(Cut(folder, path, rows))
+    return cuts
+
+
+def _copy(image: Path, folder: Path, exposure: float) -> None:
+    """Link an image, or write it with its linear light multiplied."""
+    target = folder / image.name
+    target.unlink(missing_ok=True)
+    if exposure == 1.0:
+        target.symlink_to(image.resolve())
+        return
+    linear = (np.arange(256) / 255) ** 2.2 * exposure
+    curve = np.clip(255 * np.minimum(linear, 1.0) ** (1 / 2.2), 0, 255).astype(np.uint8)
+    pixels = cv2.imread(str(image))
+    assert pixels is not None
+    cv2.imwrite(str(target), curve[pixels], [cv2.IMWRITE_JPEG_QUALITY, 95])

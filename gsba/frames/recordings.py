@@ -1,0 +1,112 @@
+"""Frames of several recordings as one set: named by recording, one recording after the other."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from gsba.log import GsbaError
+from gsba.types import NO_FILE_NAME, FrameSet
+
+_GAP_INTERVALS = 100.0  # least time between two recordings, in the longest median interval
+_GAP_MULTIPLE_S = 100.0  # recordings begin at multiples of this many seconds
+_NUM_COMPARED = 3  # frames of two recordings whose files are compared, to tell one given twice
+
+
+def combine(recordings: Mapping[str, FrameSet]) -> FrameSet:
+    """The frames of several recordings, one recording after the other.
+
+    Names become `RECORDING/NAME`. Clocks of different recordings say nothing of one another: times
+    are shifted so that recordings follow one another, with a gap that no two neighbours have.
+
+    Args:
+        recordings: frames by the name of their recording, in order; each has its own clock.
+
+    Raises:
+        GsbaError: names that cannot be folders, one recording given twice, or frames of different
+            layouts or sizes.
+    """
+    _check_names(list(recordings))
+    for (name, one), (other_name, other) in combinations(recordings.items(), 2):
+        _refuse_same(name, one, other_name, other)
+        _refuse_other_camera(name, one, other_name, other)
+    parts = list(recordings.values())
+    gap = _GAP_INTERVALS * max(float(np.median(np.diff(part.timestamps))) for part in parts)
+    times, shifts, end = list[np.ndarray](), list[float](), -gap
+    for part in parts:
+        begin = _GAP_MULTIPLE_S * math.ceil((end + gap) / _GAP_MULTIPLE_S)
+        shift = begin - float(part.timestamps[0])
+        times.append(part.timestamps + shift)
+        shifts += [shift] * len(part)
+        end = float(times[-1][-1])
+    return replace(
+        parts[0],
+        names=tuple(f"{name}/{own}" for name, part in recordings.items() for own in part.names),
+        paths=tuple(paths for part in parts for paths in part.paths),
+        timestamps=np.concatenate(times),
+        mask_paths=tuple(path for part in parts for path in part.mask_paths),
+        timed=all(part.timed for part in parts),
+        lenses_nominal=any(part.lenses_nominal for part in parts),
+        clock_shifts=tuple(shifts),
+    )
+
+
+def own_timestamps(frames: FrameSet) -> np.ndarray:
+    """Times (F,) of frames on the clocks of their recordings, seconds."""
+    shifts = frames.clock_shifts
+    return frames.timestamps - np.array(shifts) if shifts else frames.timestamps
+
+
+def _check_names(names: list[str]) -> None:
+    """Refuse names of recordings that folders cannot have."""
+    for name in names:
+        if NO_FILE_NAME.search(name):
+            raise GsbaError(f"recording {name!r:.60}: the name cannot be that of a folder")
+
+
+def _refuse_same(name: str, one: FrameSet, other_name: str, other: FrameSet) -> None:
+    """Refuse two recordings whose pictures are the same files, or copies."""
+    common = set(one.paths) & set(other.paths)
+    if common:
+        shared = min(str(paths[0]) for paths in common)
+        raise GsbaError(
+            f"recordings '{name}' and '{other_name}' are the same ({shared}): give each one once"
+        )
+    if len(one) != len(other):
+        return
+    rows = np.unique(np.linspace(0, len(one) - 1, _NUM_COMPARED).astype(int))
+    pairs = [pair for f in rows for pair in zip(one.paths[f], other.paths[f], strict=False)]
+    if all(
+        a.stat().st_size == b.stat().st_size and a.read_bytes() == b.read_bytes() for a, b in pairs
+    ):
+        raise GsbaError(
+            f"recordings '{name}' and '{other_name}' hold the same pictures "
+            f"({pairs[0][0]} and {pairs[0][1]}): give each recording once"
+        )
+
+
+def _refuse_other_camera(name: str, one: FrameSet, other_name: str, other: FrameSet) -> None:
+    """Refuse recordings that one camera cannot have made in one mode."""
+    differing = [
+        what
+        for what, same in (
+            (f"layout ({one.layout} and {other.layout})", one.layout == other.layout),
+            (
+                f"size ({one.width}x{one.height} and {other.width}x{other.height})",
+                (one.width, one.height, one.tracks) == (other.width, other.height, other.tracks),
+            ),
+            ("faces", one.faces == other.faces),
+            (
+                "calibration",
+                one.fisheyes == other.fisheyes or one.lenses_nominal or other.lenses_nominal,
+            ),
+        )
+        if not same
+    ]
+    if differing:
+        raise GsbaError(
+            f"recordings '{name}' and '{other_name}' have frames of another {differing[0]}: "
+            "recordings of one run must be of one camera in one mode; convert one of them"
+        )

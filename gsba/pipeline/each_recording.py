@@ -1,0 +1,161 @@
+"""Several recordings: the neighbours of each, matched and judged alone, and their combination.
+
+Every recording has a clock, a trajectory with a world and a scale, and a gyro of its own; no frame
+of one is a neighbour in time of a frame of another. So the start of the front end sees them one by
+one. What it finds is laid back to back, each recording a part of the map that nothing ties to the
+others yet: map merging joins them by the places that they share.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gsba.log import GsbaError
+from gsba.loop_closure import connectivity
+from gsba.pipeline import frontend, gyro
+from gsba.pipeline.prior import Prior
+from gsba.pipeline.state import State
+from gsba.similarity import Sim3
+from gsba.trajectory import joining
+from gsba.trajectory.joining import SegmentAlignment
+from gsba.trajectory.judgement import StepChecks
+from gsba.types import CoarsePoses, GyroConstraints, VerifiedPairs
+
+
+def match_neighbours(state: State) -> State:
+    """Neighbours in time of every recording, and what they say of its trajectory, clock and gyro.
+
+    Args:
+        state: keypoints of the frames of several recordings.
+
+    Raises:
+        GsbaError: a recording whose images do not match or contradict its trajectory, or show no
+            motion; the message names the recording.
+    """
+    run = state.run
+    apart = [_match(state, number) for number in range(len(run.evidence.recordings))]
+    run.chain.join([one.run.chain for one in apart])
+    begins = np.cumsum([0, *(len(one.run.frames) for one in apart)]).tolist()
+    near = [_renumbered(one.verified, f) for one, f in zip(apart, begins, strict=False)]
+    verified = VerifiedPairs.joined(near)
+    prior = _combined([one.prior for one in apart])
+    parts = connectivity.parted(verified.matches.pairs, prior.trust.held_steps)
+    return state.start_from(replace(prior, parts=parts)).with_verified(verified)
+
+
+def _match(state: State, number: int) -> State:
+    """One recording with its neighbours matched, its trajectory judged, its gyro aligned."""
+    name = state.run.evidence.recordings[number].name
+    try:
+        found = frontend.match_neighbours(frontend.of_recording(state, number))
+        found = gyro.align_to_neighbours(frontend.judge_trajectory(found))
+    except GsbaError as error:
+        raise GsbaError(f"recording '{name}': {error}") from error
+    if found.prior.turning_only:
+        raise GsbaError(
+            f"recording '{name}': the camera only turned, so that its frames have no place among "
+            "those of others: leave it out"
+        )
+    return found
+
+
+def _renumbered(pairs: VerifiedPairs, first: int) -> VerifiedPairs:
+    """Pairs whose frames are numbered from `first` on instead of from 0."""
+    moved = (pairs.matches.pairs + first).astype(pairs.matches.pairs.dtype)
+    return replace(pairs, matches=replace(pairs.matches, pairs=moved))
+
+
+def _combined(priors: Sequence[Prior]) -> Prior:
+    """Priors of recordings as one, their worlds brought together by a guess.
+
+    No step leads from one recording to the next: those between them have no prior.
+    """
+    apart = joined_poses([one.coarse for one in priors])
+    coarse, guesses = joining.join(apart)
+    moves = [Sim3(), *(Sim3.of(guess.scale, guess.world_T_own) for guess in guesses)]
+    trusts = [one.trust for one in priors]
+    trust = StepChecks(
+        np.concatenate(
+            [move.poses(one.world_T_rigs) for move, one in zip(moves, trusts, strict=True)]
+        ),
+        _steps([one.false_steps for one in trusts], True),
+        np.concatenate([one.false_frames for one in trusts]),
+        _steps([one.unseen_steps for one in trusts], True),
+        _steps([move.scale * one.lengths for move, one in zip(moves, trusts, strict=True)], 0.0),
+        False,
+    )
+    joints = _joints(priors, guesses, moves)
+    return Prior(
+        replace(coarse, segments=None),
+        trust,
+        joints=joints,
+        turning=_turning([(one.turning, len(one.coarse.sources)) for one in priors]),
+        of_recordings=tuple(priors),
+    )
+
+
+def joined_poses(parts: Sequence[CoarsePoses]) -> CoarsePoses:
+    """Coarse poses of recordings back to back, each in its own world, a segment for each."""
+    sizes = [len(part.sources) for part in parts]
+    return CoarsePoses(
+        np.concatenate([part.world_T_rigs for part in parts]),
+        np.concatenate([part.sources for part in parts]),
+        0.0,
+        np.repeat(np.arange(len(parts), dtype=np.int32), sizes),
+    )
+
+
+def _steps(parts: Sequence[np.ndarray], between: object) -> np.ndarray:
+    """Values (F - 1,) of the steps of recordings, with a value for the steps between these."""
+    boundary = np.array([between], parts[0].dtype)
+    rows = [piece for part in parts for piece in (part, boundary)]
+    return np.concatenate(rows[:-1])
+
+
+def _joints(
+    priors: Sequence[Prior], guesses: Sequence[SegmentAlignment], moves: Sequence[Sim3]
+) -> tuple[SegmentAlignment, ...]:
+    """Alignments of all pieces of the trajectories of recordings but the very first one.
+
+    Args:
+        priors: of the recordings.
+        guesses: alignment of each recording but the first.
+        moves: the same as similarities, of all recordings.
+    """
+    joints, begin = list[SegmentAlignment](), 0
+    for number, (one, move) in enumerate(zip(priors, moves, strict=True)):
+        if number:
+            guess = guesses[number - 1]
+            last = begin + one.joints[0].first - 1 if one.joints else guess.last
+            joints.append(replace(guess, last=last))
+        for joint in one.joints:
+            own = move.after(Sim3.of(joint.scale, joint.world_T_own))
+            first, last = begin + joint.first, begin + joint.last
+            joints.append(SegmentAlignment(first, last, own.scale, own.new_T_old, joint.how))
+        begin += len(one.coarse.sources)
+    return tuple(joints)
+
+
+def _turning(parts: Sequence[tuple[GyroConstraints | None, int]]) -> GyroConstraints | None:
+    """Constraints by the gyros of recordings, given with their numbers of frames; None = no
+    recording has one that is believed."""
+    known = [turning for turning, _ in parts if turning is not None]
+    if not known:
+        return None
+    steps, sigmas, rates = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+    for turning, num in parts:
+        if turning is None:
+            steps.append(np.zeros((num, 3)))
+            sigmas.append(np.full(num, np.inf))
+            rates.append(np.full((num, 3), np.nan))
+            continue
+        steps += [turning.steps, np.zeros((1, 3))]
+        sigmas += [turning.step_sigmas, np.full(1, np.inf)]
+        rates.append(turning.rates)
+    return GyroConstraints(
+        np.concatenate(steps)[:-1],
+        np.concatenate(sigmas)[:-1],
+        np.concatenate(rates),
+        max(turning.rate_sigma for turning in known),
+    )

@@ -1,0 +1,205 @@
+"""A run from several recordings of a place to one world of refined poses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from threadpoolctl import threadpool_limits
+
+from gsba import video
+from gsba.bundle.families import Family
+from gsba.config import RefineSettings
+from gsba.frames.recordings import combine
+from gsba.frames.scan import scan
+from gsba.log import GsbaError
+from gsba.masks import merging
+from gsba.masks.segmentation import Segment
+from gsba.pipeline import inputs
+from gsba.pipeline.outputs import RunResult
+from gsba.pipeline.recording import Recording, names_of
+from gsba.pipeline.refine import Start, refine_from
+from gsba.pipeline.run import Evidence, RecordingEvidence
+from gsba.pipeline.stage_titles import title_of
+from gsba.placement import check
+from gsba.store import cluster
+from gsba.store.store import RunStore
+from gsba.types import FrameSet, Trajectory
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")  # frames have threads; sums keep their order
+def refine_recordings(
+    recordings: Sequence[Recording],
+    out: Path | str,
+    settings: RefineSettings | None = None,
+    *,
+    segment: Segment | None = None,
+    fresh: bool = False,
+    families: Sequence[Family] = (),
+    client: "Client | None" = None,
+) -> RunResult:
+    """Refine the poses of several recordings of a place in one world with one scale.
+
+    Recordings are joined by the places that they share; those that share none stay maps of their
+    own. The world is that of the first recording with a trajectory.
+
+    Args:
+        recordings: at least two, of one camera in one mode, each on a clock of its own.
+        out, settings, segment, fresh, families, client: see `gsba.refine`.
+
+    Raises:
+        GsbaError: a recording or a setting that cannot be used; the message names the recording.
+    """
+    out = Path(out)
+    if len(recordings) < 2:
+        raise GsbaError("give two recordings or more; gsba.refine refines one")
+    given = [
+        _Given.of(one, name) for one, name in zip(recordings, names_of(recordings), strict=True)
+    ]
+    settings = _with_camera(settings or RefineSettings(), given)
+    check(settings.placement, baseline=settings.camera.baseline())
+    chosen = _masks(given, segment)
+    origin = {name: path for one in given for name, path in one.files.items()}
+    given, fresh = _with_videos(given, out, origin, settings, fresh)
+    if any(one.followed for one in given):  # no evidence beside the images that they are made of
+        settings = settings.with_faint_priors()
+    found = {one.name: one.scanned() for one in given}
+    frames = combine(found)
+    evidence = Evidence(
+        families=tuple(families),
+        recordings=tuple(one.evidence(found[one.name], settings) for one in given),
+    )
+    start = Start.of(frames, evidence, settings)
+    hired = cluster.hire(client, frames.paths[0][0], settings)
+    with RunStore(out, origin, fresh, hired, title_of) as store:
+        return refine_from(store, settings, chosen, evidence, start, given[0].folder, None)
+
+
+@dataclass(frozen=True, slots=True)
+class _Given:
+    """A recording with its name, its files, and what was read of them."""
+
+    name: str
+    recording: Recording
+    files: dict[str, Path]  # inputs of the run by what they are
+    trajectories: tuple[Trajectory, ...]  # in pieces that each have a world of their own
+    folder: Path  # of its frames, or its video
+    extracted: bool = False  # True if its frames were extracted from a video
+    followed: bool = False  # True if the trajectory is odometry of its own images
+
+    @classmethod
+    def of(cls, recording: Recording, name: str) -> "_Given":
+        """A recording whose trajectory files are read, before any video is decoded."""
+        folder = Path(recording.frames)
+        poses = inputs.trajectory_files(recording.trajectory, _path(recording.keyframes))
+        try:
+            pieces = inputs.read_trajectories(poses, _path(recording.timestamps))
+        except GsbaError as error:
+            raise _named(name, error) from error
+        files = {f"{name}: {what}": path for what, path in ({"frames": folder} | poses).items()}
+        return cls(name, recording, files, tuple(pieces), folder)
+
+    def scanned(self) -> FrameSet:
+        """The frames in their folder."""
+        one, given = self.recording, merging.choose(self.recording.masks).given
+        timestamps, fps = (None, None) if self.extracted else (_path(one.timestamps), one.fps)
+        calibration = _path(one.calibration)
+        try:
+            circles = inputs.given_circles(one.circles, calibration)
+            by_order = not self.trajectories
+            return scan(self.folder, timestamps, fps, given, by_order, calibration, circles)
+        except GsbaError as error:
+            raise _named(self.name, error) from error
+
+    def evidence(self, frames: FrameSet, settings: RefineSettings) -> RecordingEvidence:
+        """Initial poses of its frames, and its gyro."""
+        try:
+            coarse = inputs.coarse_poses(frames, self.trajectories, settings)
+            imu = inputs.read_gyro(_path(self.recording.imu), Path(self.recording.frames))
+        except GsbaError as error:
+            raise _named(self.name, error) from error
+        return RecordingEvidence(self.name, coarse, self.trajectories, imu)
+
+
+def _path(given: Path | str | None) -> Path | None:
+    return None if given is None else Path(given)
+
+
+def _named(name: str, error: GsbaError) -> GsbaError:
+    """An error of one recording, with the recording's name."""
+    return GsbaError(f"recording '{name}': {error}")
+
+
+def _with_camera(settings: RefineSettings, given: Sequence[_Given]) -> RefineSettings:
+    """Settings with the camera model that recordings name and the baseline of a calibration.
+
+    Raises:
+        GsbaError: recordings name different camera models.
+    """
+    named = [(one.name, one.recording.camera) for one in given if one.recording.camera is not None]
+    for name, camera in named:
+        if camera != named[0][1]:
+            raise GsbaError(
+                f"recordings '{named[0][0]}' and '{name}' name different cameras "
+                f"({named[0][1]} and {camera}): recordings of one run must be of one camera"
+            )
+    if named:
+        camera = settings.camera.model_dump() | {"name": named[0][1]}
+        settings = RefineSettings.model_validate(settings.model_dump() | {"camera": camera})
+    for one in given:
+        settings = inputs.with_baseline(settings, _path(one.recording.calibration))
+    return settings
+
+
+def _masks(given: Sequence[_Given], segment: Segment | None) -> merging.Choice:
+    """Sources of masks of all recordings; files belong to each recording alone."""
+    choices = {one.name: merging.choose(one.recording.masks, segment) for one in given}
+    every = list(choices.values())
+    return merging.Choice(
+        None,
+        any(one.carrier for one in every),
+        any(one.distractors for one in every),
+        segment,
+        any(one.carrier_required for one in every),
+        tuple(name for name, one in choices.items() if not one.carrier),
+    )
+
+
+def _with_videos(
+    given: Sequence[_Given],
+    out: Path,
+    origin: dict[str, Path],
+    settings: RefineSettings,
+    fresh: bool,
+) -> tuple[list[_Given], bool]:
+    """Recordings with the frames of videos extracted, and whether to forget an earlier run yet.
+
+    Videos without a trajectory are followed by odometry, see `gsba.refine`.
+    """
+    if not any(video.is_video(one.folder) for one in given):
+        return list(given), fresh
+    inputs.check_positions(settings)
+    ready = []
+    with RunStore(out, origin, fresh, title_of=title_of) as store:
+        for one in given:
+            ready.append(_extracted(one, store, settings) if video.is_video(one.folder) else one)
+    return ready, False
+
+
+def _extracted(one: _Given, store: RunStore, settings: RefineSettings) -> _Given:
+    """A recording with its video's frames extracted, and followed where it has no trajectory."""
+    recording = one.recording
+    followed = inputs.follows(settings.video, recording.fps, recording.odometry, one.trajectories)
+    chosen = merging.choose(recording.masks) if followed else None
+    given = one.folder, settings, recording.fps, chosen, _path(recording.calibration), one.name
+    try:
+        walk = inputs.extract_video(store, *given)
+    except GsbaError as error:
+        raise _named(one.name, error) from error
+    ready = replace(one, folder=store.root / "frames" / one.name, extracted=True)
+    if walk is None:
+        return ready
+    return replace(ready, trajectories=tuple(walk.pieces()), followed=True)
