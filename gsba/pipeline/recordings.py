@@ -24,6 +24,7 @@ from gsba.pipeline.stage_titles import title_of
 from gsba.placement import check
 from gsba.store import cluster
 from gsba.store.store import RunStore
+from gsba.trajectory.metashape import NamedPoses
 from gsba.types import FrameSet, Trajectory
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ class _Given:
     name: str
     recording: Recording
     files: dict[str, Path]  # inputs of the run by what they are
-    trajectories: tuple[Trajectory, ...]  # in pieces that each have a world of their own
+    trajectories: tuple[Trajectory | NamedPoses, ...]  # in pieces, each with its own world
     folder: Path  # of its frames, or its video
     extracted: bool = False  # True if its frames were extracted from a video
     followed: bool = False  # True if the trajectory is odometry of its own images
@@ -117,11 +118,12 @@ class _Given:
     def evidence(self, frames: FrameSet, settings: RefineSettings) -> RecordingEvidence:
         """Initial poses of its frames, and its gyro."""
         try:
-            coarse = inputs.coarse_poses(frames, self.trajectories, settings)
+            trajectories = tuple(inputs.timed(self.trajectories, frames))
+            coarse = inputs.coarse_poses(frames, trajectories, settings)
             imu = inputs.read_gyro(_path(self.recording.imu), Path(self.recording.frames))
         except GsbaError as error:
             raise _named(self.name, error) from error
-        return RecordingEvidence(self.name, coarse, self.trajectories, imu)
+        return RecordingEvidence(self.name, coarse, trajectories, imu)
 
 
 def _path(given: Path | str | None) -> Path | None:
