@@ -75,4 +75,4 @@ def _copy(image: Path, folder: Path, exposure: float) -> None:
     curve = np.clip(255 * np.minimum(linear, 1.0) ** (1 / 2.2), 0, 255).astype(np.uint8)
     pixels = cv2.imread(str(image))
     assert pixels is not None
-    cv2.imwrite(str(target), curve[pixels], [cv2.IMWRITE_JPEG_QUALITY, 95])
+    cv2.imwrite(str(target), curve[np.asarray(pixels, np.uint8)], [cv2.IMWRITE_JPEG_QUALITY, 95])
