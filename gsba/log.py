@@ -1,9 +1,12 @@
-"""Expected failures, the log on the terminal, and progress bars."""
+"""Expected failures, the log on the terminal, progress bars, and events for other programs."""
 
+import json
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
+from contextlib import contextmanager, suppress
 from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
@@ -11,6 +14,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 T = TypeVar("T")
+
+EVENTS = "GSBA_EVENTS"  # environment variable that names the file of events
+_EVENT_INTERVAL_S = 0.5  # between two events on the progress of the same work
 
 
 class GsbaError(Exception):
@@ -39,7 +45,7 @@ def show_log(level: int = logging.INFO) -> None:
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%X"))
     for name in ("gsba", "factors"):
         logger = logging.getLogger(name)
-        logger.handlers[:] = [handler]
+        logger.handlers[:] = [handler, _EventHandler()]
         logger.setLevel(level)
         logger.propagate = False
 
@@ -50,6 +56,27 @@ def brief(text: str, most: int = 60) -> str:
     return text if len(text) <= most else f"{text[:kept]}...{text[-kept + 1 :]}"
 
 
+def event(kind: str, **values: object) -> None:
+    """Append an event, as one line of JSON, to the file that GSBA_EVENTS names.
+
+    Nothing is done if the variable is not set. A file that cannot be written ends no run.
+
+    Args:
+        kind: kind of the event, the entry "event" of the line; "time" is seconds since 1970.
+        values: further entries, plain values for JSON.
+    """
+    path = os.environ.get(EVENTS)
+    if not path:
+        return
+    line = json.dumps({"event": kind, "time": round(time.time(), 3), **values}) + "\n"
+    with suppress(OSError):
+        file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+        try:
+            os.write(file, line.encode())  # one call: lines of two processes do not mix
+        finally:
+            os.close(file)
+
+
 def track(
     items: Iterable[T],
     description: str,
@@ -57,7 +84,9 @@ def track(
     done: int = 0,
     note: Callable[[], str] | None = None,
 ) -> Iterator[T]:
-    """Yield `items` and show a progress bar on stderr, on a terminal unless the run is quiet.
+    """Yield `items` and show their progress, as a bar and as events.
+
+    The bar is on stderr, on a terminal unless the run is quiet. For events see `event`.
 
     Args:
         items: work to do.
@@ -66,9 +95,32 @@ def track(
         done: items that were done before.
         note: gives a text that stands behind the speed.
     """
-    if not (sys.stderr.isatty() and logging.getLogger("gsba").isEnabledFor(logging.INFO)):
+    with_bar = sys.stderr.isatty() and logging.getLogger("gsba").isEnabledFor(logging.INFO)
+    if not (with_bar or os.environ.get(EVENTS)):
         yield from items
         return
+    if total is None and isinstance(items, Sized):
+        total = len(items)
+    work = {"what": description, "total": total}
+    event("progress", **work, done=done, rate=None, note="")
+    began = told = time.monotonic()
+    with _bar(description, total, done) if with_bar else _no_bar() as show:
+        for count, item in enumerate(items, start=1):
+            yield item
+            now = time.monotonic()
+            due = now - told > _EVENT_INTERVAL_S or done + count == total
+            if not (with_bar or due):
+                continue
+            speed, more = count / max(now - began, 1e-6), "" if note is None else note()
+            show(done + count, f"{speed:.3g} a second" + (more and f", {more}"))
+            if due:
+                told = now
+                event("progress", **work, done=done + count, rate=round(speed, 4), note=more)
+
+
+@contextmanager
+def _bar(description: str, total: int | None, done: int) -> Iterator[Callable[[int, str], None]]:
+    """Show a progress bar; yields a function that takes the number of items done and a note."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -84,16 +136,21 @@ def track(
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
     )
-    if total is None and isinstance(items, Sized):
-        total = len(items)
-    began = time.monotonic()
     with Progress(*columns, console=_console(), transient=True) as bar:
         task = bar.add_task(description, total=total, completed=done, note="")
-        for count, item in enumerate(items, start=1):
-            yield item
-            speed = count / max(time.monotonic() - began, 1e-6)
-            more = "" if note is None else f", {note()}"
-            bar.update(task, completed=done + count, note=f"{speed:.3g} a second{more}")
+        yield lambda count, note: bar.update(task, completed=count, note=note)
+
+
+@contextmanager
+def _no_bar() -> Iterator[Callable[[int, str], None]]:
+    yield lambda count, note: None
+
+
+class _EventHandler(logging.Handler):
+    """Log handler that passes lines of the log on as events."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        event("log", level=record.levelname, text=record.getMessage())
 
 
 @cache

@@ -14,7 +14,7 @@ from typing import Annotated, NoReturn, ParamSpec
 import typer
 from typer.core import TyperCommand
 
-from gsba.log import GsbaError, brief, show_log
+from gsba.log import GsbaError, brief, event, show_log
 from gsba.version import __version__
 
 P = ParamSpec("P")
@@ -99,7 +99,9 @@ def _bug_message(error: Exception) -> str:
 def _fail(message: str, code: int = 1) -> NoReturn:
     """Print one line of limited length that any terminal can show, and exit."""
     line = " ".join(message.splitlines()).encode("utf-8", "backslashreplace").decode()
-    typer.echo(f"error: {brief(line, _MAX_MESSAGE_LENGTH)}", err=True)
+    message = brief(line, _MAX_MESSAGE_LENGTH)
+    typer.echo(f"error: {message}", err=True)
+    event("error", text=message)
     raise typer.Exit(code)
 
 
@@ -129,8 +131,16 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
 
     @wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
-        with _expected_failures():
-            function(*args, **kwargs)
+        code = 1
+        try:
+            with _expected_failures():
+                function(*args, **kwargs)
+            code = 0
+        except typer.Exit as ending:
+            code = ending.exit_code
+            raise
+        finally:
+            event("end", code=code)
 
     name = function.__name__.replace("_", "-")
     return app.command(name, cls=_Command)(run)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba import __version__
-from gsba.log import track
+from gsba.log import event, track
 from gsba.odometry.panoramas import SmallPanoramas
 from gsba.odometry.places import compressed
 from gsba.odometry.tracker import Tracker
@@ -23,6 +23,7 @@ logger = logging.getLogger(__name__)
 _PATIENCE_S, _MIN_PATIENCE = 1.5, 8  # seconds, and frames, before a lost camera begins a new map
 _CHECKPOINT_S = 60.0  # between checkpoints
 _MAX_SAVING_SHARE = 0.03  # of the time between checkpoints that writing one may take
+_POINTS_TOLD = 12  # most points of a keyframe that its event holds
 
 
 @dataclass(slots=True)
@@ -57,6 +58,8 @@ def track_frames(panoramas: SmallPanoramas, seed: int, checkpoint: Path | None) 
     state, first = found.state, found.rows[-1] + 1 if found.rows else 0
     tracker = Tracker(panoramas.width, panoramas.usable, seed, patience, state)
     gone, due = _DistanceGone(state), time.monotonic() + _CHECKPOINT_S
+    for number in range(len(state.keyframe_poses)):
+        _tell_keyframe(state, number)
     pictures = panoramas.read(range(first, num), False)
     for row, grey in track(pictures, "tracking", num, first, gone):
         began = time.thread_time()
@@ -65,12 +68,25 @@ def track_frames(panoramas: SmallPanoramas, seed: int, checkpoint: Path | None) 
         found.rows.append(row)
         while len(state.keyframe_frames) > len(found.pictures):
             found.pictures.append(compressed(grey))
+            _tell_keyframe(state, len(found.pictures) - 1)
         found.cpu_s += time.thread_time() - began
         if checkpoint is not None and (began := time.monotonic()) > due:
             save_record(checkpoint, found, {"key": key})
             now = time.monotonic()
             due = now + max(_CHECKPOINT_S, (now - began) / _MAX_SAVING_SHARE)
     return found
+
+
+def _tell_keyframe(state: TrackerState, number: int) -> None:
+    """Pass a keyframe on as an event: its map, its position, some of the points that it sees."""
+    ids, _ = state.keyframe_features[number]
+    points = state.points[ids]
+    points = points[np.isfinite(points).all(axis=1)]
+    points = points[:: max(1, -(-len(points) // _POINTS_TOLD))]
+    position = state.keyframe_poses[number][:3, 3]
+    map_number = state.records[state.keyframe_frames[number]].map_number
+    told = {"position": position.round(4).tolist(), "points": points.round(4).tolist()}
+    event("keyframe", map=map_number, **told)
 
 
 @dataclass(slots=True)

@@ -15,7 +15,7 @@ import types
 import typing
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
@@ -78,6 +78,29 @@ def load_record(path: Path, returns: type[T]) -> T:
     """
     with _reading(path) as archive:
         return _decode(_manifest(archive)["value"], returns, archive)
+
+
+def load_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
+    """Read arrays of a record by the names of their fields, whatever the record's type.
+
+    Args:
+        path: file written by `save_record`.
+        names: names of fields.
+
+    Returns:
+        The first array of each name, in the order of the record's fields; those it lacks are left
+        out.
+
+    Raises:
+        RecordError: missing, truncated or corrupt.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    with _reading(path) as archive:
+        for member in archive.namelist():
+            name = member.rpartition("/")[2].removesuffix(".npy")
+            if name in names and name not in arrays:
+                arrays[name] = _decode(member, np.ndarray, archive)
+    return arrays
 
 
 def load_checkpoint(path: Path | None, key: str, returns: type[T], anew: str) -> T | None:

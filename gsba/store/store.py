@@ -23,7 +23,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 from pydantic import BaseModel
 
 from gsba.disk import FullDiskError, write_text
-from gsba.log import GsbaError, brief
+from gsba.log import GsbaError, brief, event
 from gsba.memory import give_back_freed_memory
 from gsba.store.folder import (
     MARKER,
@@ -138,6 +138,7 @@ class RunStore:
             value, record = stored
             self._note(replace(record, resumed=True))
             return value
+        event("stage", name=name, title=self._title_of(name))
         clocks = _Clocks.now(self.workers)
         with _named_in_memory_errors(name):
             value = compute()
@@ -177,6 +178,8 @@ class RunStore:
         spent = _read_cost(folder / "cost.json", base) if len(missing) < len(keys) else None
         workers = Threads(1) if alone else self.workers
         clocks = _Clocks.now(workers)
+        if missing:
+            event("stage", name=name, title=self._title_of(name))
         try:
             with _named_in_memory_errors(name):
                 for _ in workers.map_shards(_Missing(name, frames, tuple(missing))):
@@ -220,6 +223,8 @@ class RunStore:
         title, name = self._title_of(record.name), record.name
         shown = title if title == name else f"{title} [{name}]"
         logger.info("%s: %s %.1f s, %.0f MB", shown, how, record.seconds, record.peak_mb)
+        cost = {"seconds": round(record.seconds, 3), "resumed": record.resumed}
+        event("done", name=name, title=title, **cost)
 
 
 class Chain:
