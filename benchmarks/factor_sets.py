@@ -1,7 +1,7 @@
 """Accuracy by sets of observations: bearings of features alone, and with aligned patches.
 
 `bearing` has the features that `aligned` starts from; `tuned bearing` has the finer ones of
-`configs/bearing.toml`, the best configuration without patches.
+`--config bearing`, the best configuration without patches.
 
     python benchmarks/factor_sets.py --data DATA --sequences aisle_loop,demo_rectangle --out WORK
 
@@ -38,7 +38,7 @@ WALKS = {
     "demo_oval": ("oval", "forward"),
     "demo_open": ("open", "forward"),
 }
-TUNED = Path(__file__).resolve().parents[1] / "configs/bearing.toml"  # the best without patches
+TUNED = Path("bearing")  # the best without patches
 DISTURBANCES = ("none", "exposure", "blur", "objects")
 
 

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ValidationError
 from gsba.config import RefineSettings
 from gsba.log import GsbaError, brief
 
+PRESETS = Path(__file__).parent / "presets"  # folder of settings that come with gsba, by name
 _NONE = "none"
 
 
@@ -23,7 +24,7 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Refi
     """Settings of a run: defaults, then the file, then the overrides.
 
     Args:
-        path: TOML file with a table per stage, holding overrides only.
+        path: TOML file with a table per stage, holding overrides only; or the name of a preset.
         overrides: `stage.key=value` each, the value written as in TOML; bare words are texts.
     Raises:
         GsbaError: unreadable file, unknown key, or a value out of range, with the allowed values.
@@ -44,12 +45,26 @@ def to_toml(settings: BaseModel) -> str:
     return "\n".join(_toml_lines(settings, ())) + "\n"
 
 
+def allowed_settings(settings: BaseModel, place: str = "") -> Iterator[tuple[str, str, str]]:
+    """Name `stage.key`, value as in TOML and allowed values, in words, of every setting."""
+    model = type(settings)
+    for key in model.model_fields:
+        value = getattr(settings, key)
+        if _nested_model(model, key) is not None:
+            yield from allowed_settings(value, f"{place}{key}.")
+        else:
+            yield f"{place}{key}", _toml_value(value), _allowed(_schema(model, key))
+
+
 def read_toml(path: Path) -> dict[str, Any]:
-    """Content of a TOML file.
+    """Content of a TOML file, or of the preset of this name.
 
     Raises:
         GsbaError: the file cannot be read, or is not valid TOML.
     """
+    preset = PRESETS / f"{path}.toml"
+    if path.parent == Path() and not path.exists() and preset.is_file():
+        path = preset
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

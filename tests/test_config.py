@@ -10,10 +10,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from gsba import config_file
 from gsba.cli.splat import splat_settings
 from gsba.config import RefineSettings
-from gsba.config_file import load_config, to_toml
+from gsba.config_file import PRESETS, load_config, to_toml
 from gsba.log import GsbaError
 
-CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.toml"))
+CONFIGS = sorted(PRESETS.glob("*.toml"))
 
 
 class _Mode(StrEnum):

@@ -15,7 +15,7 @@ import yaml
 from tiny_run import NUM_FRAMES, Case
 
 from gsba.cli import app
-from gsba.config_file import load_config
+from gsba.config_file import PRESETS, load_config
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -56,7 +56,6 @@ def test_library_and_readme_run(
 ) -> None:
     os.symlink(case.frames, tmp_path / "frames")
     os.symlink(case.slam, tmp_path / "frame_trajectory.txt")
-    os.symlink(ROOT / "configs", tmp_path / "configs")
     monkeypatch.chdir(tmp_path)
     for page in (ROOT / "README.md", DOCS / "library.md"):
         names: dict = {"__name__": page.stem}
@@ -156,9 +155,9 @@ def test_settings_exist(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=IDS)
-def test_config_files_exist(page: Path) -> None:
-    for name in re.findall(r"configs/([a-z]+\.toml)", page.read_text()):
-        assert (ROOT / "configs" / name).exists(), name
+def test_presets_exist(page: Path) -> None:
+    for name in re.findall(r"--config ([a-z]+)\b(?!\.)", page.read_text()):
+        assert (PRESETS / f"{name}.toml").exists(), name
 
 
 def _constants(node: ast.AST) -> Iterator[list[str]]:

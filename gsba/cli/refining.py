@@ -19,7 +19,14 @@ if TYPE_CHECKING:
 
 PARTIAL = 3  # exit code of a run whose exported map has less than nine tenths of its frames
 
-Config = Annotated[Path | None, typer.Option(help="TOML file of settings.", metavar="FILE")]
+Config = Annotated[
+    Path | None,
+    typer.Option(
+        help="TOML file of settings, or a preset: fast, accurate, bearing, photometric, "
+        "reprojection.",
+        metavar="FILE|PRESET",
+    ),
+]
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", help="Override a setting; repeatable.", metavar="STAGE.KEY=VALUE"),

@@ -19,6 +19,7 @@ _PURPOSES = {  # extra -> its purpose
     "learned": "ALIKED, DISK, XFeat, SuperPoint, LightGlue",
     "splat": "splats on a GPU",
     "view": "a run in the browser",
+    "app": "the page around all commands",
     "plot": "figures",
     "cluster": "work on other processes or machines",
     "imu": "gyros of raw videos",

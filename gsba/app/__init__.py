@@ -1,0 +1,11 @@
+"""A local page around the library: choose footage, run commands, watch them, look at results.
+
+Takes a folder whose files may be chosen, the forms of commands, and a port of this machine.
+Gives a server for browsers of this machine; jobs are processes that outlive it.
+"""
+
+from gsba.app.forms import Field, Form
+from gsba.app.hub import App, Choices
+from gsba.app.server import serve, state_folder
+
+__all__ = ["App", "Choices", "Field", "Form", "serve", "state_folder"]

@@ -1,0 +1,68 @@
+"""The file chooser: folders and files below one root, and nothing beyond it."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+from gsba.log import GsbaError, brief
+from gsba.store.folder import is_run_folder
+
+_MAX_ENTRIES = 1000
+_VIDEOS = {".mp4", ".mov", ".mkv", ".insv", ".360", ".avi", ".webm", ".m4v", ".lrv"}
+_IMAGES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".insp"}
+
+
+def inside(root: Path, name: str) -> Path:
+    """Path of a name relative to the root, links resolved.
+
+    Raises:
+        GsbaError: it leads out of the root.
+    """
+    if "\0" in name:
+        raise GsbaError("a path holds no NUL characters")
+    base = root.resolve()
+    path = (base / name).resolve()
+    if not path.is_relative_to(base):
+        raise GsbaError(
+            f"{brief(name)} is outside {base}: start gsba app in a folder that holds it"
+        )
+    return path
+
+
+def listing(root: Path, name: str) -> dict[str, Any]:
+    """Entries of a folder below the root: folders first, hidden ones left out.
+
+    Raises:
+        GsbaError: it is no folder, cannot be read, or leads out of the root.
+    """
+    folder = inside(root, name)
+    try:
+        paths = [Path(entry.path) for entry in os.scandir(folder) if not entry.name.startswith(".")]
+    except OSError as error:
+        raise GsbaError(f"{brief(name) or '.'} cannot be listed: {error.strerror}") from None
+    base = root.resolve()
+    entries = []
+    for path in paths:
+        if path.resolve().is_relative_to(base):
+            entries.append({"name": path.name, "path": _relative(base, path), "kind": _kind(path)})
+    entries.sort(key=lambda entry: (entry["kind"] not in ("run", "folder"), entry["name"].lower()))
+    here = _relative(base, folder)
+    return {
+        "path": here,
+        "parent": None if here == "." else _relative(base, folder.parent),
+        "kind": "run" if is_run_folder(folder) else "folder",
+        "images": sum(entry["kind"] == "image" for entry in entries),
+        "entries": entries[:_MAX_ENTRIES],
+        "left_out": max(0, len(entries) - _MAX_ENTRIES),
+    }
+
+
+def _kind(path: Path) -> str:
+    if path.is_dir():
+        return "run" if is_run_folder(path) else "folder"
+    suffix = path.suffix.lower()
+    return "video" if suffix in _VIDEOS else "image" if suffix in _IMAGES else "file"
+
+
+def _relative(base: Path, path: Path) -> str:
+    return path.relative_to(base).as_posix()

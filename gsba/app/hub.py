@@ -1,0 +1,124 @@
+"""What all pages of a server have in common: the root, the commands, the jobs, the viewers."""
+
+import secrets
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gsba.app.forms import Form
+from gsba.app.jobs import Job, Jobs
+from gsba.app.progress import Followed, Progress
+from gsba.app.worker import ensure_worker
+from gsba.disk import write_text
+from gsba.log import GsbaError, brief
+from gsba.view import load_scene
+from gsba.view import serve as serve_view
+
+if TYPE_CHECKING:
+    from gsba.view.display import View
+
+_INSPECTION_S = 60.0  # longest time that `gsba info` may take
+
+
+@dataclass(frozen=True, slots=True)
+class Choices:
+    """Known values of some fields, from the definitions of settings."""
+
+    cameras: tuple[str, ...]  # names for --camera
+    presets: tuple[tuple[str, str], ...]  # name for --config, and what it is for
+    masks: tuple[str, ...]  # words for --masks
+    exports: tuple[tuple[str, str], ...]  # trainer, and format for --to
+    settings: tuple[tuple[str, str, str], ...]  # name for --set, default, allowed values
+
+
+class App:
+    """The root, the commands, the jobs and the viewers behind a server.
+
+    Args:
+        root: folder below which files may be chosen; commands run in it.
+        state: folder of jobs and of the token.
+        forms: forms of the commands, by name.
+        choices: known values of fields.
+        check: refuses arguments that the command line would refuse, with a GsbaError.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        state: Path,
+        forms: Iterable[Form],
+        choices: Choices,
+        check: Callable[[Sequence[str]], None],
+    ) -> None:
+        if not root.is_dir():
+            raise GsbaError(f"{root} is no folder: give the folder of your footage")
+        self.root, self.jobs = root.resolve(), Jobs(state)
+        self.forms = {form.command: form for form in forms}
+        self.choices, self.check = choices, check
+        self.token = _kept_token(state / "token")
+        self._followed: dict[str, Followed] = {}
+        self._views: dict[Path, View] = {}
+        self._lock = threading.Lock()  # of viewers and of progress: requests come from threads
+        ensure_worker(self.jobs)
+
+    def progress(self, job: Job) -> Progress:
+        """Progress of a job by its events so far."""
+        with self._lock:
+            return self._followed.setdefault(job.id, Followed(job.events)).now()
+
+    def inspect(self, path: Path) -> str:
+        """JSON text of `gsba info` for a path below the root.
+
+        Raises:
+            GsbaError: it cannot be described.
+        """
+        name = path.relative_to(self.root).as_posix()
+        line = [sys.executable, "-P", "-c", "from gsba.cli import main; main()"]
+        try:
+            found = subprocess.run(
+                [*line, "-q", "info", "--json", f"./{name}"],
+                cwd=self.root,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=_INSPECTION_S,
+            )
+        except subprocess.TimeoutExpired:
+            raise GsbaError(f"gsba info took more than {_INSPECTION_S:.0f} s on {name}") from None
+        if found.returncode:
+            last = (found.stderr.strip().splitlines() or ["gsba info failed"])[-1]
+            raise GsbaError(brief(last.removeprefix("error: "), 500))
+        return found.stdout
+
+    def view(self, run: Path) -> str:
+        """Address of the viewer of a run, started if it is not shown yet.
+
+        Raises:
+            GsbaError: viser is missing, or the run is not finished.
+        """
+        with self._lock:
+            if run not in self._views:
+                self._views[run] = serve_view(load_scene(run), 0)
+            return self._views[run].address
+
+    def close(self) -> None:
+        """Stop the viewers; jobs go on."""
+        for view in self._views.values():
+            view.stop()
+
+
+def _kept_token(path: Path) -> str:
+    """Secret of the address; it is kept, so that an open page finds a server that was restarted."""
+    try:
+        token = path.read_text(encoding="ascii").strip()
+    except (OSError, ValueError):
+        token = ""
+    if len(token) < 16 or not token.replace("-", "").replace("_", "").isalnum():
+        token = secrets.token_urlsafe(16)
+        write_text(path, token)
+        path.chmod(0o600)
+    return token

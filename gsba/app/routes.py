@@ -1,0 +1,284 @@
+"""Requests of the page and their answers, as JSON and files."""
+
+import json
+import shlex
+from collections.abc import Awaitable, Callable
+from dataclasses import asdict
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import Headers
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from gsba.app import runs
+from gsba.app.browse import inside, listing
+from gsba.app.hub import App
+from gsba.app.jobs import ACTIVE, Command, Job
+from gsba.app.worker import ensure_worker
+from gsba.log import GsbaError
+from gsba.view.guard import allowed
+
+_MAX_BODY, _MAX_LOG = 256 * 1024, 64 * 1024  # bytes
+_PAGE = {"": "index.html", "app.css": "app.css", "app.js": "app.js", "plan.js": "plan.js"}
+_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
+_PAGE_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+# Reports may come from somebody else's run: they must not reach the page's requests.
+_REPORT_POLICY = (
+    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; img-src data:"
+)
+_SHOWN = {".html": "text/html", ".png": "image/png", ".svg": "image/svg+xml"}
+_HINT = "Forbidden: open the address that gsba app printed.\n"
+
+Handler = Callable[[App, Request], Any]
+
+
+def application(app: App) -> ASGIApp:
+    """The ASGI application of a server; every request needs the token as its first component."""
+    table: dict[str, tuple[str, Handler]] = {
+        "/api/start": ("GET", _start),
+        "/api/browse": ("GET", _browse),
+        "/api/info": ("GET", _info),
+        "/api/jobs": ("GET", _jobs),
+        "/api/jobs/{id}": ("GET", _job),
+        "/api/jobs/{id}/map": ("GET", _job_map),
+        "/api/jobs/{id}/log": ("GET", _job_log),
+        "/api/command": ("POST", _command),
+        "/api/run": ("GET", _run),
+        "/api/run/map": ("GET", _run_map),
+        "/api/add": ("POST", _add),
+        "/api/jobs/{id}/{action:str}": ("POST", _act),
+        "/api/view": ("POST", _view),
+        "/files/{path:path}": ("GET", _file),
+        "/{name}": ("GET", _page),
+        "/": ("GET", _page),
+    }
+    routes = [
+        Route(path, _answering(app, handler), methods=[method])
+        for path, (method, handler) in table.items()
+    ]
+    return _Guard(Starlette(routes=routes), app.token)
+
+
+class _Guard:
+    """ASGI application that refuses requests without the token, and strips it from the path."""
+
+    def __init__(self, inner: ASGIApp, token: str) -> None:
+        self._inner, self._token = inner, token
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+        headers = Headers(scope=scope)
+        hosts, origins = headers.getlist("host"), headers.getlist("origin")
+        path = scope["path"]
+        # A request that changes something must come from the page: a form of another page cannot
+        # send JSON without asking first.
+        kind = headers.get("content-type", "").partition(";")[0]
+        json_only = scope["method"] in ("GET", "HEAD") or kind == "application/json"
+        if not (json_only and allowed(hosts, origins, path, self._token)):
+            await PlainTextResponse(_HINT, 403)(scope, receive, send)
+            return
+        rest = path.removeprefix(f"/{self._token}")
+        inner = {**scope, "path": rest or "/", "raw_path": (rest or "/").encode()}
+
+        async def send_with_headers(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"] = [
+                    *message["headers"],
+                    (b"referrer-policy", b"no-referrer"),
+                    (b"x-content-type-options", b"nosniff"),
+                    (b"cache-control", b"no-store"),
+                ]
+            await send(message)
+
+        await self._inner(inner, receive, send_with_headers)
+
+
+def _answering(app: App, handler: Handler) -> Callable[[Request], Awaitable[Response]]:
+    """Endpoint whose handler runs in a thread and whose expected failures are one line."""
+
+    async def answer(request: Request) -> Response:
+        if request.method == "POST":
+            body = b""
+            async for chunk in request.stream():
+                body += chunk
+                if len(body) > _MAX_BODY:
+                    return JSONResponse({"error": "the request is too long"}, 413)
+            try:
+                request.state.body = json.loads(body or b"{}")
+                if not isinstance(request.state.body, dict):
+                    raise ValueError
+            except (ValueError, RecursionError):
+                return JSONResponse({"error": "the request is no JSON object"}, 400)
+        try:
+            found = await run_in_threadpool(handler, app, request)
+        except GsbaError as error:
+            return JSONResponse({"error": str(error)}, 400)
+        except OSError as error:
+            return JSONResponse({"error": f"{error.filename or ''}: {error.strerror}"}, 400)
+        return found if isinstance(found, Response) else JSONResponse(found)
+
+    return answer
+
+
+def _page(app: App, request: Request) -> Response:
+    name = _PAGE.get(request.path_params.get("name", ""))
+    if name is None:
+        return PlainTextResponse("Not found\n", 404)
+    content = (files("gsba.app") / "page" / name).read_bytes()
+    kind = _TYPES[Path(name).suffix]
+    return Response(content, media_type=kind, headers={"content-security-policy": _PAGE_POLICY})
+
+
+def _start(app: App, request: Request) -> Any:
+    """All that a page needs once: the forms of commands and known values of fields."""
+    forms = {name: asdict(form) for name, form in app.forms.items()}
+    return {"root": str(app.root), "forms": forms, "choices": asdict(app.choices)}
+
+
+def _browse(app: App, request: Request) -> Any:
+    return listing(app.root, request.query_params.get("path", ""))
+
+
+def _info(app: App, request: Request) -> Any:
+    path = inside(app.root, request.query_params.get("path", ""))
+    return json.loads(app.inspect(path))[0] | {"path": path.relative_to(app.root).as_posix()}
+
+
+def _jobs(app: App, request: Request) -> Any:
+    return {"jobs": [_row(app, job) for job in reversed(app.jobs.all())]}
+
+
+def _job(app: App, request: Request) -> Any:
+    job = app.jobs.get(request.path_params["id"])
+    found = _row(app, job) | {"progress": app.progress(job).table()}
+    if job.command.run is not None and job.command.arguments[0] == "refine":
+        run = inside(app.root, job.command.run)
+        found["camera"] = runs.camera_so_far(run, app.progress(job).names())
+    return found
+
+
+def _job_map(app: App, request: Request) -> Any:
+    job = app.jobs.get(request.path_params["id"])
+    return runs.map_so_far(inside(app.root, job.command.run or ""), app.progress(job))
+
+
+def _job_log(app: App, request: Request) -> Response:
+    job = app.jobs.get(request.path_params["id"])
+    content = job.log.read_bytes()[-_MAX_LOG:] if job.log.is_file() else b""
+    return PlainTextResponse(content.decode("utf-8", "replace"))
+
+
+def _command(app: App, request: Request) -> Any:
+    """The command line of a form's values, and why it would be refused, if it would."""
+    try:
+        arguments = _arguments(app, request.state.body)
+    except GsbaError as error:
+        return {"command": "", "error": str(error)}
+    try:
+        app.check(arguments)
+    except GsbaError as error:
+        return {"command": _line(arguments), "error": str(error)}
+    return {"command": _line(arguments), "error": ""}
+
+
+def _add(app: App, request: Request) -> Any:
+    body = request.state.body
+    arguments = _arguments(app, body)
+    app.check(arguments)
+    values = body.get("values", {})
+    run = values.get("out") if arguments[0] == "refine" else values.get("run")
+    if arguments[0] == "refine" and not (values.get("frames") or values.get("recording")):
+        raise GsbaError("frames are missing: choose a video or a folder")
+    if arguments[0] == "refine" and not run:
+        raise GsbaError("--out is missing: name the folder of the run")
+    job = app.jobs.add(Command(tuple(arguments), str(app.root), run))
+    ensure_worker(app.jobs)
+    return _row(app, job)
+
+
+def _arguments(app: App, body: dict[str, Any]) -> list[str]:
+    """Arguments of the form that a request names; paths must be below the root."""
+    form, values = app.forms.get(str(body.get("command"))), body.get("values")
+    if form is None or not isinstance(values, dict):
+        raise GsbaError("the request names no command of the page")
+    arguments = form.arguments(values)
+    for field in form.fields:
+        given = values.get(field.name)
+        for text in given if isinstance(given, list) else [given]:
+            if field.kind == "path" and isinstance(text, str):
+                inside(app.root, text)
+    return arguments
+
+
+def _act(app: App, request: Request) -> Any:
+    name, action = request.path_params["id"], request.path_params["action"]
+    if action == "stop":
+        return _row(app, app.jobs.stop(name))
+    if action == "go-on":
+        job = app.jobs.go_on(name)
+        ensure_worker(app.jobs)
+        return _row(app, job)
+    if action == "remove":
+        app.jobs.remove(name)
+        return {}
+    raise GsbaError(f"a job cannot {action}")
+
+
+def _run(app: App, request: Request) -> Any:
+    name = request.query_params.get("path", "")
+    return {"path": name} | runs.overview(inside(app.root, name))
+
+
+def _run_map(app: App, request: Request) -> Any:
+    return runs.finished_map(inside(app.root, request.query_params.get("path", "")))
+
+
+def _view(app: App, request: Request) -> Any:
+    return {"address": app.view(inside(app.root, str(request.state.body.get("path", ""))))}
+
+
+def _file(app: App, request: Request) -> Response:
+    """A file of a run: shown if it is a report or a figure, else a download."""
+    path = inside(app.root, unquote(request.path_params["path"]))
+    if not path.is_file():
+        return PlainTextResponse("Not found\n", 404)
+    kind = _SHOWN.get(path.suffix.lower())
+    if kind is None:
+        return FileResponse(path, filename=path.name)
+    return FileResponse(path, media_type=kind, headers={"content-security-policy": _REPORT_POLICY})
+
+
+def _row(app: App, job: Job) -> dict[str, Any]:
+    """A job for lists."""
+    state, progress = job.state, app.progress(job)
+    active = state.status in ACTIVE
+    return {
+        "id": job.id,
+        "kind": job.command.arguments[0],
+        "run": job.command.run,
+        "command": _line(job.command.arguments),
+        "status": state.status,
+        "code": state.code,
+        "began": state.began,
+        "ended": state.ended,
+        "forced": state.forced,
+        "stage": progress.stage["title"] if active and progress.stage else "",
+        "num_stages": len(progress.stages),
+        "error": "" if active or state.status == "waiting" else progress.error,
+    }
+
+
+def _line(arguments: Any) -> str:
+    return shlex.join(["gsba", *arguments])

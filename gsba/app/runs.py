@@ -1,0 +1,132 @@
+"""What a page shows of a run folder: figures of its report, the camera, its path from above."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from gsba.app.progress import Progress
+from gsba.bundle.lens_centres import LensCentres
+from gsba.bundle.readout import CameraEstimate
+from gsba.config import CameraSettings
+from gsba.report.camera_findings import of_camera
+from gsba.report.html.figures import viewing_axes
+from gsba.store.folder import STAGES, is_run_folder
+from gsba.store.records import RecordError, load_arrays, load_record
+
+T = TypeVar("T")
+
+_MAX_POINTS = 4000  # of a map from above
+_POSES, _POINTS, _COLORS = "world_T_rigs", "points_world", "point_colors"
+_FILES = ("report.html", "trajectory.tum", "points.ply", "poses.csv", "config.toml")
+
+
+def overview(run: Path) -> dict[str, Any]:
+    """Figures of a finished run for a page; "finished" is False where there is no report yet."""
+    try:
+        report = json.loads((run / "report.json").read_text(encoding="utf-8"))
+        summary, stages = report["summary"], report.get("stages", [])
+        seconds = sum(stage.get("seconds", 0.0) for stage in stages if isinstance(stage, dict))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return {"finished": False, "run": is_run_folder(run)}
+    return {
+        "finished": True,
+        "run": True,
+        "summary": summary,
+        "seconds": seconds,
+        "notes": report.get("notes", []),
+        "camera": report.get("camera"),
+        "files": [name for name in _FILES if (run / name).is_file()],
+        "figures": sorted(path.name for path in run.glob("figures/*.png")),
+    }
+
+
+def camera_so_far(run: Path, done: Sequence[str]) -> list[str]:
+    """Lines about the camera from the results of stages that have ended.
+
+    Args:
+        run: folder of the run.
+        done: names of these stages, in order.
+    """
+    centres = _latest(run, done, ("lenses1", "lenses0"), LensCentres)
+    if centres is None:
+        return []
+    readout = _latest(run, done, ("readout",), CameraEstimate)
+    nothing = (None, None, None, 1.0, CameraSettings(), True)
+    content, notes = of_camera(centres, readout, *nothing)
+    return notes if content["taken"] else [f"two lenses were not found: {content['reason']}"]
+
+
+def map_so_far(run: Path, progress: Progress) -> dict[str, Any]:
+    """The newest path and points of a run from above: of odometry, then of the latest stage.
+
+    Files of stages are renamed into place when they are whole; one that is replaced meanwhile is
+    left out.
+
+    Returns:
+        "stage", name of the stage or "odometry", "" where there is nothing; "path" (F, 2) and
+        "points" (P, 2) in two level axes, "colors" (P, 3) or None, "starts", the
+        rows at which a map of its own begins.
+    """
+    for name in reversed(progress.names()):
+        path = run / STAGES / f"{name}.npz"
+        try:
+            arrays = load_arrays(path, (_POSES, _POINTS, _COLORS)) if path.is_file() else {}
+        except (RecordError, OSError):
+            continue
+        if _POSES in arrays and arrays[_POSES].shape[1:] == (4, 4) and _POINTS in arrays:
+            axes, _ = viewing_axes(arrays[_POSES])
+            at = arrays[_POSES][:, :3, 3]
+            return {"stage": name} | _plan(at, arrays[_POINTS], axes, arrays.get(_COLORS), [0])
+    if not progress.keyframes:
+        return {"stage": "", "path": [], "points": [], "colors": None, "starts": []}
+    maps = [number for number, _ in progress.keyframes]
+    starts = [k for k in range(len(maps)) if k == 0 or maps[k] != maps[k - 1]]
+    at = np.array([position for _, position in progress.keyframes])
+    points = np.array(progress.points or np.zeros((0, 3)))
+    axes = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])  # level as the first frame is
+    return {"stage": "odometry"} | _plan(at, points, axes, None, starts)
+
+
+def finished_map(run: Path) -> dict[str, Any]:
+    """The map of a finished run from above, as `map_so_far` gives it."""
+    progress = Progress()
+    progress.add({"event": "done", "name": "reconstruction"})
+    return map_so_far(run, progress)
+
+
+def _plan(
+    at: np.ndarray,
+    points: np.ndarray,
+    axes: np.ndarray,
+    colors: np.ndarray | None,
+    starts: list[int],
+) -> dict[str, Any]:
+    """Positions (F, 3) and some of the points (P, 3) in level axes and up, as plain lists."""
+    finite = np.isfinite(at).all(axis=1)
+    centre = np.median(at[finite], axis=0) if finite.any() else np.zeros(3)
+    extent = float(np.ptp(at[finite], axis=0).max(initial=0.0)) or 1.0
+    rows = np.unique(np.linspace(0, len(points) - 1, min(len(points), _MAX_POINTS)).astype(int))
+    shown = (points[rows] - centre) @ axes.T if len(points) else np.zeros((0, 3))
+    near = np.all(np.abs(shown) < 2 * extent, axis=1)  # NaN is not
+    path = np.where(finite[:, None], (at - centre) @ axes.T, 0.0)
+    digits = max(0, 4 - int(np.floor(np.log10(extent))))
+    return {
+        "path": path[:, :2].round(digits).tolist(),
+        "points": shown[near, :2].round(digits).tolist(),
+        "colors": colors[rows][near].tolist() if colors is not None and len(points) else None,
+        "starts": starts,
+    }
+
+
+def _latest(run: Path, done: Sequence[str], ends: Sequence[str], returns: type[T]) -> T | None:
+    """Result of the latest stage of this type whose name ends so; None = there is none."""
+    for name in reversed(done):
+        if name.endswith(tuple(ends)) or any(f"{end}_" in name for end in ends):
+            try:
+                return load_record(run / STAGES / f"{name}.npz", returns)
+            except RecordError:
+                continue
+    return None
