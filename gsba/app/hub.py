@@ -31,7 +31,7 @@ class Choices:
     cameras: tuple[str, ...]  # names for --camera
     presets: tuple[tuple[str, str], ...]  # name for --config, and what it is for
     masks: tuple[str, ...]  # words for --masks
-    exports: tuple[tuple[str, str], ...]  # trainer, and format for --to
+    exports: tuple[str, ...]  # programs and formats for --to
     settings: tuple[tuple[str, str, str], ...]  # name for --set, default, allowed values
 
 

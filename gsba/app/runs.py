@@ -77,8 +77,7 @@ def map_so_far(run: Path, progress: Progress) -> dict[str, Any]:
         except (RecordError, OSError):
             continue
         if _POSES in arrays and arrays[_POSES].shape[1:] == (4, 4) and _POINTS in arrays:
-            axes, _ = viewing_axes(arrays[_POSES])
-            at = arrays[_POSES][:, :3, 3]
+            at, (axes, _) = arrays[_POSES][:, :3, 3], viewing_axes(arrays[_POSES])
             return {"stage": name} | _plan(at, arrays[_POINTS], axes, arrays.get(_COLORS), [0])
     if not progress.keyframes:
         return {"stage": "", "path": [], "points": [], "colors": None, "starts": []}
@@ -105,7 +104,7 @@ def _plan(
     starts: list[int],
 ) -> dict[str, Any]:
     """Positions (F, 3) and some of the points (P, 3) in level axes and up, as plain lists."""
-    finite = np.isfinite(at).all(axis=1)
+    finite = np.isfinite(at.sum(axis=1))
     centre = np.median(at[finite], axis=0) if finite.any() else np.zeros(3)
     extent = float(np.ptp(at[finite], axis=0).max(initial=0.0)) or 1.0
     rows = np.unique(np.linspace(0, len(points) - 1, min(len(points), _MAX_POINTS)).astype(int))

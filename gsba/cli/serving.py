@@ -74,25 +74,17 @@ def choices() -> "Choices":
     from gsba.app import Choices
     from gsba.config import CAMERAS, RefineSettings
     from gsba.config_file import PRESETS, allowed_settings
+    from gsba.export import ExportFormat
+    from gsba.export.trainers import PROGRAMS
 
     presets = [(path.stem, _first_sentence(path)) for path in sorted(PRESETS.glob("*.toml"))]
     return Choices(
         tuple(CAMERAS),
         tuple(presets),
         ("auto", "carrier", "distractors", "none"),
-        _TRAINERS,
+        tuple(dict.fromkeys([*PROGRAMS, *ExportFormat])),
         tuple(allowed_settings(RefineSettings())),
     )
-
-
-_TRAINERS = (  # as in docs/exports.md
-    ("3DGS (INRIA) and kin", "colmap-flat"),
-    ("COLMAP 3.12 and newer", "colmap"),
-    ("nerfstudio (splatfacto)", "nerfstudio"),
-    ("Trainers of panoramas", "colmap-erp"),
-    ("Point cloud (PLY)", "ply"),
-    ("Trajectory (TUM)", "tum"),
-)
 
 
 def _command(name: str) -> Any:

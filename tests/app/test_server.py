@@ -162,7 +162,7 @@ def test_forms_come_from_the_commands() -> None:
     assert (kinds["fresh"], kinds["fps"], kinds["masks"]) == ("flag", "number", "path")
     known = choices()
     assert {"fast", "accurate"} <= {name for name, _ in known.presets}
-    for _, target in known.exports:
+    for target in known.exports:
         check(["export", "run", "--to", target])
     with pytest.raises(GsbaError, match="has no option nope"):
         Form("refine", "", ()).arguments({"nope": 1})

@@ -445,10 +445,10 @@ async function results(where, run, current) {
         make("a", { href: `#compare/${encodeURIComponent(run)}` }, "Compare"),
         ...found.files.slice(1).map((name) => make("a", { href: link(`${run}/${name}`) }, name))),
       message),
-    card("Export for", make("div", { class: "row" }, ...start.choices.exports.map(([trainer, format]) =>
-      make("button", { type: "button", title: `gsba export ${run} --to ${format} --up auto`,
-        onclick: add("export", { run, to: format, up: "auto" }) }, trainer))),
-      make("p", { class: "faint" }, `Datasets are written to ${run}/FORMAT, and stand upright.`)),
+    card("Export for", make("div", { class: "row" }, ...start.choices.exports.map((to) =>
+      make("button", { type: "button", title: `gsba export ${run} --to ${to} --up auto`,
+        onclick: add("export", { run, to, up: "auto" }) }, to))),
+      make("p", { class: "faint" }, `Datasets are written into ${run}, and stand upright.`)),
     found.figures.length ? card("Figures", ...found.figures.map((name) =>
       make("img", { src: link(`${run}/figures/${name}`), alt: name, loading: "lazy" }))) : "");
 }
