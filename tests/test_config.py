@@ -47,12 +47,12 @@ class _Outer(BaseModel):
     """Stages of stages."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-    inner: _Stage = _Stage()
+    inner: _Stage = _Stage()  # type: ignore[call-arg]
 
 
 class _Everything(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
-    stage: _Stage = _Stage()
+    stage: _Stage = _Stage()  # type: ignore[call-arg]
     outer: _Outer = _Outer()
     seed: int = 0
 
