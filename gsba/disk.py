@@ -102,6 +102,52 @@ def encoded_image(image: "np.ndarray", path: Path, jpeg_quality: int = 95) -> by
     return encoded.tobytes()
 
 
+def write_vertices(path: Path, vertices: "np.ndarray") -> None:
+    """Write a binary little-endian PLY file with one element, `vertex`, atomically.
+
+    Args:
+        path: the file.
+        vertices: (N,) structured, one field for each property, in the file's order.
+
+    Raises:
+        GsbaError: the file cannot be written.
+    """
+    from plyfile import PlyData, PlyElement
+
+    file = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<")
+    atomic_write(path, lambda temporary: file.write(str(temporary)))
+
+
+def read_vertices(path: Path) -> "np.ndarray":
+    """The element `vertex` of a binary or ASCII PLY file.
+
+    Returns:
+        (N,) structured, one field for each property, mapped from a binary file.
+
+    Raises:
+        GsbaError: the file is unreadable, no PLY, truncated, or its points have lists.
+    """
+    from plyfile import PlyData, PlyHeaderParseError
+
+    try:
+        file = PlyData.read(str(path))
+    except (PlyHeaderParseError, UnicodeDecodeError) as error:
+        raise GsbaError(f"{path}: not a PLY file, or its header is damaged ({error})") from None
+    except OSError as error:
+        raise GsbaError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except Exception:  # the parser raises errors of many types
+        raise GsbaError(
+            f"{path}: truncated or damaged: it holds fewer points than its header claims; copy or "
+            "export it again"
+        ) from None
+    if "vertex" not in file:
+        raise GsbaError(f"{path}: holds no points: it has no element 'vertex'")
+    vertices = file["vertex"].data
+    if vertices.dtype.hasobject:
+        raise GsbaError(f"{path}: a property of its points is a list")
+    return vertices
+
+
 def remove_temporaries(folder: Path) -> None:
     """Delete temporary files that killed processes left under `folder`."""
     for path in folder.rglob(f"{_TEMPORARY}*"):

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from gsba.cli.app import command
+from gsba.log import GsbaError
 
 
 @command
@@ -16,7 +17,10 @@ def doctor(
 
     The exit code is 0 if everything that a run needs works, else 1; extras do not count.
     """
-    from gsba.doctor import examine
+    try:
+        from gsba.doctor import examine
+    except ModuleNotFoundError as error:  # of the parser of requirements
+        raise GsbaError(f"doctor needs {error.name}: pip install {error.name}") from None
 
     found = examine()
     typer.echo(json.dumps(found.table(), indent=1) if as_json else found.text())

@@ -6,7 +6,12 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
+from packaging.version import InvalidVersion, Version
+
 import gsba
+from packaging import requirements as requirements_of
 
 NEEDED = ""  # in place of an extra: packages that every run needs
 _MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "pyyaml": "yaml"}
@@ -19,22 +24,15 @@ class Requirement:
 
     name: str  # of the distribution
     module: str  # name of its module
-    range: str  # range of versions, such as ">=5,<6"
+    range: str  # of versions, such as ">=5,<6"
     extra: str  # "" = always needed
 
     def allows(self, version: str) -> bool:
         """True if a version is in the range, or is no number."""
-        found = _numbers(version)
-        tests = {
-            ">=": lambda bound: found >= bound,
-            "<=": lambda bound: found <= bound,
-            "<": lambda bound: found < bound,
-            ">": lambda bound: found > bound,
-            "==": lambda bound: found == bound,
-            "!=": lambda bound: found != bound,
-        }
-        bounds = re.findall(r"(>=|<=|==|!=|<|>)\s*([0-9.]+)", self.range)
-        return not found or all(tests[how](_numbers(bound)) for how, bound in bounds)
+        try:
+            return SpecifierSet(self.range).contains(Version(version), prereleases=True)
+        except InvalidVersion:
+            return True
 
 
 def requirements() -> tuple[Requirement, ...]:
@@ -52,23 +50,15 @@ def requirements() -> tuple[Requirement, ...]:
         lines = []
         for line in metadata.requires("gsba") or ():
             marker = re.search(r"extra\s*==\s*['\"]([^'\"]+)", line)
-            lines.append((line.partition(";")[0], marker[1] if marker else NEEDED))
+            lines.append((line, marker[1] if marker else NEEDED))
     kept = [(line, extra) for line, extra in lines if extra not in _NOT_EXAMINED]
     return tuple(_requirement(line, extra) for line, extra in kept)
 
 
 def _requirement(line: str, extra: str) -> Requirement:
     """Requirement from a line such as `laspy[lazrs]>=2.5`."""
-    match = re.match(r"\s*([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*\(?([^;)]*)", line)
-    assert match is not None
-    name = match[1].lower()
-    return Requirement(name, _MODULES.get(name, name.replace("-", "_")), match[2].strip(), extra)
-
-
-def _numbers(version: str) -> tuple[int, ...]:
-    """Numbers of a version without trailing zeros: (2, 13) of "2.13.0+cpu"."""
-    release = re.match(r"[0-9.]*", version)
-    numbers = [int(part) for part in (release[0] if release else "").split(".") if part]
-    while numbers and numbers[-1] == 0:
-        numbers.pop()
-    return tuple(numbers)
+    parsed = requirements_of.Requirement(line)
+    name = canonicalize_name(parsed.name)
+    return Requirement(
+        name, _MODULES.get(name, name.replace("-", "_")), str(parsed.specifier), extra
+    )

@@ -5,10 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.disk import write_bytes
+from gsba.disk import write_vertices
 from gsba.types import Reconstruction
-
-_PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 
 
 def write_points(path: Path, reconstruction: Reconstruction) -> None:
@@ -57,13 +55,9 @@ def _vectors(names: str, values: np.ndarray, dtype: str) -> dict[str, np.ndarray
 
 
 def _write(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Write a PLY file with one vertex element; columns have one length and are little-endian."""
-    vertices = np.empty(
-        len(next(iter(columns.values()))), dtype=[(name, c.dtype) for name, c in columns.items()]
-    )
+    """Write columns of one length as properties of points."""
+    fields = [(name, column.dtype) for name, column in columns.items()]
+    vertices = np.empty(len(next(iter(columns.values()))), fields)
     for name, column in columns.items():
         vertices[name] = column
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property {_PLY_TYPES[c.dtype.str[1:]]} {name}" for name, c in columns.items()]
-    text = "\n".join([*header, "end_header\n"])
-    write_bytes(path, text.encode() + vertices.tobytes())
+    write_vertices(path, vertices)

@@ -1,6 +1,10 @@
 """Headers of image files, read without decoding pixels: JPEG, PNG, WebP and TIFF.
 
 Sizes are those on display: the orientation tag of EXIF turns or mirrors the stored picture.
+
+Pillow, which reads the other tags (`gsba.frames.exif`), does not notice here that a file's end is
+missing, skips damaged tags of a TIFF, of equal ones takes the last where decoders take the first,
+and decodes a PNG to find a tag behind its pixels.
 """
 
 import mmap

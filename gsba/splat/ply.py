@@ -10,21 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.disk import write_bytes
+from gsba.disk import read_vertices, write_vertices
 from gsba.log import GsbaError
 from gsba.splat.gaussians import Gaussians
-
-_TYPES = {
-    **dict.fromkeys(("float", "float32"), "<f4"),
-    **dict.fromkeys(("double", "float64"), "<f8"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("ushort", "uint16"), "<u2"),
-    **dict.fromkeys(("short", "int16"), "<i2"),
-    **dict.fromkeys(("uint", "uint32"), "<u4"),
-    **dict.fromkeys(("int", "int32"), "<i4"),
-}
-_MAX_HEADER_BYTES = 1 << 16  # bytes
 
 
 def write_ply(path: Path, gaussians: Gaussians) -> None:
@@ -40,37 +28,25 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
     columns += [gaussians.opacity_logits[:, None], gaussians.log_scales]
     columns += [gaussians.quaternions / np.linalg.norm(gaussians.quaternions, axis=1)[:, None]]
     rows = np.concatenate(columns, axis=1).astype("<f4")
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {num}"]
-    header += [f"property float {name}" for name in names]
-    text = "\n".join([*header, "end_header\n"])
-    write_bytes(path, text.encode() + rows.tobytes())
+    vertices = rows.view([(name, rows.dtype) for name in names])[:, 0]
+    write_vertices(path, vertices)
 
 
 def read_ply(path: Path) -> Gaussians:
     """Read a splat of degree 0 to 3.
 
     Raises:
-        GsbaError: the file is unreadable, no binary little-endian PLY of a splat, truncated, or
-            holds values that are not finite.
+        GsbaError: the file is unreadable, no PLY of a splat, truncated, or holds values that are
+            not finite.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
-    num, dtype, start = _header(path, data)
-    names = dtype.names or ()
+    rows = read_vertices(path)
+    num, names = len(rows), rows.dtype.names or ()
     num_rest = sum(name.startswith("f_rest_") for name in names)
     if num_rest not in (0, 9, 24, 45):
         raise GsbaError(f"{path}: {num_rest} f_rest properties; a splat has 0, 9, 24 or 45")
     missing = [n for n in _names(num_rest // 3 + 1) if n not in names and n not in _NORMALS]
     if missing:
         raise GsbaError(f"{path}: not a Gaussian splat: it has no property {missing[0]!r}")
-    if len(data) < start + num * dtype.itemsize:
-        raise GsbaError(
-            f"{path}: truncated: {len(data) - start} of {num * dtype.itemsize} bytes of "
-            f"{num} Gaussians are there; copy or train it again"
-        )
-    rows = np.frombuffer(data, dtype, num, start)
 
     def gather(prefix: str, count: int) -> np.ndarray:
         columns = [rows[f"{prefix}{i}"] for i in range(count)]
@@ -95,27 +71,3 @@ def _names(num_harmonics: int) -> list[str]:
     names += [f"f_rest_{i}" for i in range(3 * (num_harmonics - 1))]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     return names
-
-
-def _header(path: Path, data: bytes) -> tuple[int, np.dtype, int]:
-    """Number of vertices, their type, and their offset in bytes; vertices come first in the
-    file."""
-    end = data.find(b"end_header\n", 0, _MAX_HEADER_BYTES)
-    if not data.startswith(b"ply\n") or end < 0:
-        raise GsbaError(f"{path}: not a PLY file, or its header is truncated")
-    lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()[1:]]
-    lines = [line for line in lines if line and line[0] not in ("comment", "obj_info")]
-    if not lines or lines[0] != ["format", "binary_little_endian", "1.0"]:
-        raise GsbaError(f"{path}: not a binary little-endian PLY; export the splat as such")
-    if len(lines) < 2 or lines[1][:2] != ["element", "vertex"] or not lines[1][-1].isdigit():
-        raise GsbaError(f"{path}: not a Gaussian splat: its first element is not 'vertex'")
-    properties = []
-    for line in lines[2:]:
-        if line[0] == "element":
-            break
-        if len(line) != 3 or line[1] not in _TYPES:
-            raise GsbaError(f"{path}: not a Gaussian splat: property {' '.join(line[1:])!r}")
-        properties.append((line[2], _TYPES[line[1]]))
-    if len({name for name, _ in properties}) < len(properties):
-        raise GsbaError(f"{path}: a property occurs twice")
-    return int(lines[1][-1]), np.dtype(properties), end + len(b"end_header\n")

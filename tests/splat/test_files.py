@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import plyfile
 import pytest
 
 from gsba.log import GsbaError
@@ -28,7 +29,6 @@ def test_file_comes_back_as_it_was(tmp_path: Path, harmonics: int) -> None:
 
 
 def test_layout_is_that_of_inria(tmp_path: Path) -> None:
-    plyfile = pytest.importorskip("plyfile")
     path, gaussians = tmp_path / "point_cloud.ply", some()
     write_ply(path, gaussians)
     vertex = plyfile.PlyData.read(path)["vertex"]
@@ -54,13 +54,17 @@ def test_properties_are_found_by_name(tmp_path: Path) -> None:
     ("spoil", "message"),
     [
         (lambda data: data[:-1], "truncated"),
-        (lambda data: data[:100], "header is truncated"),
+        (lambda data: data[:100], "header is damaged"),
         (lambda data: b"", "not a PLY"),
         (lambda data: b"\x89PNG" + data, "not a PLY"),
         (lambda data: data.replace(b"opacity", b"intense"), "no property 'opacity'"),
         (lambda data: data.replace(b"float f_rest_44", b"float some_thing"), "44 f_rest"),
-        (lambda data: data.replace(b"binary_little_endian", b"ascii"), "not a binary"),
-        (lambda data: data.replace(b"property float x", b"property list y x"), "property"),
+        (lambda data: data.replace(b"binary_little_endian", b"ascii"), "damaged"),
+        (lambda data: data.replace(b"property float x", b"property list y x"), "header is damaged"),
+        (lambda data: data.replace(b"property float x", b"property list int int x"), "."),
+        (lambda data: data.replace(b"element vertex", b"element corner"), "no element 'vertex'"),
+        (lambda data: data.replace(b"vertex 7", b"vertex " + b"9" * 50), "truncated or damaged"),
+        (lambda data: data.replace(b"vertex 7", b"vertex -1"), "damaged"),
         (lambda data: data[:-4] + b"\xff\xff\xff\xff", "not finite"),
     ],
 )
