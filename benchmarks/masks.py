@@ -22,12 +22,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 from common import machine
+from people import make_people, paste_people
 
 from gsba import RefineSettings, refine
 from gsba.camera.sphere import bearings_from_erp
 from gsba.config import ExportSettings, SplatSettings
 from gsba.demo import make_walk
-from gsba.demo.people import make_people, paste_people
 from gsba.disk import write_image
 from gsba.evaluate.splats import PosedViews, train_and_measure
 from gsba.evaluate.trajectory import evaluate

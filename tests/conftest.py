@@ -2,6 +2,7 @@
 
 import logging
 
+import numpy as np
 import pytest
 from tiny_run import Case, make_case
 
@@ -10,6 +11,12 @@ from tiny_run import Case, make_case
 def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     """A tiny rendered walk and its finished run; copy it before going on from it."""
     return make_case(tmp_path_factory.mktemp("pipeline"))
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A generator of the test's own: what it draws hangs on no other test."""
+    return np.random.default_rng(0)
 
 
 @pytest.fixture(autouse=True)

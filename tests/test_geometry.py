@@ -18,7 +18,6 @@ from gsba.geometry import (
 from gsba.similarity import NoSimilarityError, Sim3, pose_similarity, residuals_of, similarity
 from gsba.types import FACES
 
-RNG = np.random.default_rng(0)
 WIDTH, HEIGHT = 800, 400
 AXES = {
     "front": [0, 0, 1],
@@ -34,7 +33,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def _poses(num: int, rng: np.random.Generator = RNG) -> np.ndarray:
+def _poses(num: int, rng: np.random.Generator) -> np.ndarray:
     return pose(Rotation.random(num, rng).as_matrix(), rng.normal(size=(num, 3)))
 
 
@@ -77,8 +76,8 @@ def test_erp_round_trip(u: float, v: float) -> None:
     assert 0 <= back[0] <= WIDTH
 
 
-def test_quaternions_against_scipy() -> None:
-    rotations = Rotation.random(50, RNG)
+def test_quaternions_against_scipy(rng: np.random.Generator) -> None:
+    rotations = Rotation.random(50, rng)
     wxyz = rotations.as_quat(canonical=True)[:, [3, 0, 1, 2]]
     np.testing.assert_allclose(rotation_from_quaternion(wxyz), rotations.as_matrix(), atol=1e-15)
     np.testing.assert_allclose(
@@ -87,13 +86,13 @@ def test_quaternions_against_scipy() -> None:
 
 
 @pytest.mark.parametrize("angle", [0, 1e-9, 1e-4, 1.0, np.pi - 1e-9, np.pi])
-def test_rotation_angle_is_accurate_at_both_ends(angle: float) -> None:
-    rotations = Rotation.from_rotvec(angle * _unit(RNG.normal(size=(20, 3)))).as_matrix()
+def test_rotation_angle_is_accurate_at_both_ends(angle: float, rng: np.random.Generator) -> None:
+    rotations = Rotation.from_rotvec(angle * _unit(rng.normal(size=(20, 3)))).as_matrix()
     np.testing.assert_allclose(rotation_angle(rotations), angle, rtol=1e-6, atol=1e-15)
 
 
-def test_inverse_undoes() -> None:
-    world_T_rigs = _poses(7)
+def test_inverse_undoes(rng: np.random.Generator) -> None:
+    world_T_rigs = _poses(7, rng)
     identities = np.broadcast_to(np.eye(4), (7, 4, 4))
     np.testing.assert_allclose(inverse(world_T_rigs) @ world_T_rigs, identities, atol=1e-14)
 
@@ -103,9 +102,9 @@ def _sim3() -> tuple[float, np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("flat", [False, True])
-def test_similarity_recovers_a_known_one(flat: bool) -> None:
+def test_similarity_recovers_a_known_one(flat: bool, rng: np.random.Generator) -> None:
     scale, rotation, translation = _sim3()
-    source = RNG.normal(size=(30, 3)) * ([1, 1, 0] if flat else [1, 1, 1])
+    source = rng.normal(size=(30, 3)) * ([1, 1, 0] if flat else [1, 1, 1])
     target = scale * source @ rotation.T + translation
     found = similarity(source, target)
     assert found.scale == pytest.approx(scale, rel=1e-12)
@@ -113,15 +112,15 @@ def test_similarity_recovers_a_known_one(flat: bool) -> None:
     np.testing.assert_allclose(found.translation, translation, atol=1e-12)
 
 
-def test_similarity_never_mirrors() -> None:
-    source = RNG.normal(size=(30, 3))
+def test_similarity_never_mirrors(rng: np.random.Generator) -> None:
+    source = rng.normal(size=(30, 3))
     found = similarity(source, source * [-1, 1, 1])
     assert np.linalg.det(found.rotation) == pytest.approx(1)
 
 
-def test_similarity_is_the_least_squares_one() -> None:
-    source = RNG.normal(size=(40, 3))
-    target = 1.4 * source + RNG.normal(0, 0.3, source.shape)
+def test_similarity_is_the_least_squares_one(rng: np.random.Generator) -> None:
+    source = rng.normal(size=(40, 3))
+    target = 1.4 * source + rng.normal(0, 0.3, source.shape)
 
     def cost(fit: Sim3) -> float:
         return float(np.sum(residuals_of(fit, source, target) ** 2))
@@ -129,15 +128,15 @@ def test_similarity_is_the_least_squares_one() -> None:
     found = similarity(source, target)
     best = cost(found)
     for _ in range(50):
-        nudge = Rotation.from_rotvec(RNG.normal(0, 1e-3, 3)).as_matrix()
-        scale, shift = found.scale + RNG.normal(0, 1e-3), RNG.normal(0, 1e-3, 3)
+        nudge = Rotation.from_rotvec(rng.normal(0, 1e-3, 3)).as_matrix()
+        scale, shift = found.scale + rng.normal(0, 1e-3), rng.normal(0, 1e-3, 3)
         assert cost(Sim3(scale, nudge @ found.rotation, found.translation + shift)) >= best
 
 
 @pytest.mark.parametrize("path", ["room", "straight line", "one place"])
-def test_pose_similarity_recovers_a_known_one(path: str) -> None:
+def test_pose_similarity_recovers_a_known_one(path: str, rng: np.random.Generator) -> None:
     scale, rotation, translation = _sim3()
-    source = _poses(20)
+    source = _poses(20, rng)
     if path == "straight line":
         source[:, :3, 3] = np.linspace(0, 9, 20)[:, None] * [0.1, 0.2, 1]
     if path == "one place":  # no scale to be had: 1
@@ -201,9 +200,9 @@ def test_face_pixels_follow_the_pinhole_model() -> None:
 
 
 @pytest.mark.parametrize("hfov_deg", [90, 96, 120])
-def test_face_round_trip(hfov_deg: float) -> None:
+def test_face_round_trip(hfov_deg: float, rng: np.random.Generator) -> None:
     rig = CubeRig(320, np.deg2rad(hfov_deg))
-    pixels, faces = RNG.uniform(0, 320, (500, 2)), RNG.integers(0, 6, 500)
+    pixels, faces = rng.uniform(0, 320, (500, 2)), rng.integers(0, 6, 500)
     bearings = rig.bearings(pixels, faces)
     np.testing.assert_allclose(np.linalg.norm(bearings, axis=1), 1, atol=1e-14)
     np.testing.assert_allclose(rig.project(5 * bearings, faces), pixels, atol=1e-10)
@@ -215,9 +214,9 @@ def test_project_is_nan_behind_the_face() -> None:
     assert np.isnan(rig.project(np.array(AXES["right"], float), FACES.index("front"))).all()
 
 
-def test_every_bearing_has_an_owner_that_sees_it() -> None:
+def test_every_bearing_has_an_owner_that_sees_it(rng: np.random.Generator) -> None:
     rig = CubeRig(320, np.pi / 2)
-    bearings = _unit(RNG.normal(size=(2000, 3)))
+    bearings = _unit(rng.normal(size=(2000, 3)))
     owners = owner_faces(bearings)
     pixels = rig.project(bearings, owners)
     assert (np.abs(pixels - 160) <= 160 + 1e-9).all()

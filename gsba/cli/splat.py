@@ -22,7 +22,9 @@ MaxGaussians = Annotated[
     int | None,
     typer.Option(help="Most Gaussians; default: set by pixels and memory.", metavar="N"),
 ]
-BackendName = Annotated[str, typer.Option(help="Renderer: auto, gsplat or cpu.")]
+BackendName = Annotated[
+    str, typer.Option(help="Renderer: auto, gsplat (CUDA; untested on a GPU) or cpu.")
+]
 
 
 @command

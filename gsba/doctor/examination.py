@@ -156,7 +156,9 @@ def _gpu_note(answers: dict[str, Any]) -> tuple[str, str]:
         return f"the GPU's driver does not support CUDA {answers['torch_cuda']}: update it", (
             "nvidia-smi"
         )
-    devices = f"{', '.join(answers['devices'])}, CUDA {answers['torch_cuda']}"
+    devices = (
+        f"{', '.join(answers['devices'])}, CUDA {answers['torch_cuda']} (gsba is untested on it)"
+    )
     if answers["kernels"]:
         return devices, ""
     if answers["compiler"]:

@@ -55,19 +55,6 @@ def read_exif_gps(frames: FrameSet, settings: GpsSettings | None = None) -> GpsF
     return fixes
 
 
-def gps_of(path: Path) -> tuple[float, float, float] | None:
-    """Latitude and longitude (degrees) and altitude (metres, NaN = unknown) of an image.
-
-    None if it has no position, or if the receiver marked it as invalid.
-
-    Raises:
-        ValueError: the EXIF data are damaged.
-        GsbaError: the file cannot be read.
-    """
-    tag = read_exif(path).gps
-    return None if tag is None else (tag.latitude, tag.longitude, tag.altitude)
-
-
 def _first_tag(paths: Sequence[Path]) -> tuple[GpsTag | None, int]:
     """Position of the first image of a frame that has one, and the number of damaged images."""
     damaged = 0

@@ -91,9 +91,9 @@ def test_correction_is_an_arc_and_can_be_undone() -> None:
     assert not none and none.corrected(BEARINGS) is BEARINGS and none.observed(moved) is moved
 
 
-def test_jacobian_by_the_coefficients() -> None:
+def test_jacobian_by_the_coefficients(rng: np.random.Generator) -> None:
     """Against differences of the residual at the bearing that a field corrects."""
-    directions = unit(BEARINGS + RNG.normal(0, 1e-4, BEARINGS.shape))
+    directions = unit(BEARINGS + rng.normal(0, 1e-4, BEARINGS.shape))
     residuals, jacobian = field_residuals(BEARINGS, directions, 3)
     poses = np.tile(np.eye(4), (len(BEARINGS), 1, 1))
     expected = bearing_residuals(poses, directions, BEARINGS)[0]
@@ -112,11 +112,11 @@ def test_jacobian_by_the_coefficients() -> None:
     assert np.isfinite(jacobian).all()
 
 
-def test_information_turns_with_the_basis() -> None:
+def test_information_turns_with_the_basis(rng: np.random.Generator) -> None:
     """Also where the basis jumps, at z = 0."""
     field = _field(4, 0.01)
-    level = unit(np.column_stack([RNG.normal(size=(30, 2)), RNG.normal(0, 1e-3, 30)]))
-    roots = RNG.normal(size=(30, 2, 2))
+    level = unit(np.column_stack([rng.normal(size=(30, 2)), rng.normal(0, 1e-3, 30)]))
+    roots = rng.normal(size=(30, 2, 2))
     there = field.corrected(level)
     turned = field.corrected_roots(level, roots)
     in_space = [

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from people import make_people, paste_people
 from tiny_run import SETTINGS, Case, computed_stages
 
 from gsba import refine
 from gsba.camera.sphere import erp_from_bearings
-from gsba.demo.people import make_people, paste_people
 from gsba.disk import write_image
 from gsba.evaluate.trajectory import evaluate
 from gsba.frames.masks import levels_of, load_mask, load_weights
@@ -90,8 +90,7 @@ def test_frames_that_cannot_be_judged_are_left_alone(case: Case) -> None:
 def test_what_is_masked_already_is_not_judged(case: Case, tmp_path: Path) -> None:
     frames, true = _populated(case, tmp_path / "people")
     write_image(tmp_path / "own.png", np.where(true[2], 0, 255).astype(np.uint8))
-    masks = [None] * len(frames)
-    masks[2] = tmp_path / "own.png"
+    masks = [tmp_path / "own.png" if f == 2 else None for f in range(len(frames))]
     scene = _scene(case, dataclasses.replace(frames, mask_paths=tuple(masks)))
     found = distractor_mask(scene.find(2))
     assert not (found & true[2]).any() and found.mean() < 0.02
@@ -114,7 +113,8 @@ def test_a_run_masks_people_in_a_second_pass(case: Case, tmp_path: Path) -> None
         result.reconstruction.observation_bearings, frames.width, frames.height
     )
     columns, rows = np.minimum(seen.astype(int), [frames.width - 1, frames.height - 1]).T
-    used = np.stack([load_mask(result.frames, f) for f in range(len(frames))])
+    kept = [load_mask(result.frames, f) for f in range(len(frames))]
+    used = np.stack([mask for mask in kept if mask is not None])
     assert used[result.reconstruction.observation_frames, rows, columns].mean() > 0.999
     assert not used[:, -20:].any() and _overlap(~used[:, :-20], true[:, :-20]) >= 0.5
     assert (tmp_path / "run/masks_check.jpg").exists()

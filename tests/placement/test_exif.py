@@ -15,14 +15,21 @@ from walk_on_earth import ORIGIN, frame_set, geodetic_of, level_metres, walk_res
 
 from gsba.cli import app
 from gsba.config import PlacementSettings, RefineSettings
+from gsba.frames.exif import read_exif
 from gsba.log import GsbaError
 from gsba.pipeline import refine
-from gsba.placement.exif import gps_of, read_exif_gps
+from gsba.placement.exif import read_exif_gps
 from gsba.placement.placement import check, place
 from gsba.types import FrameSet
 
 MUNICH = (48.137154, 11.576124, 519.25)
 PIXELS = np.full((8, 16, 3), 90, np.uint8)
+
+
+def gps_of(path: Path) -> tuple[float, float, float] | None:
+    """Latitude, longitude and altitude of a picture's position; None = it has none."""
+    tag = read_exif(path).gps
+    return None if tag is None else (tag.latitude, tag.longitude, tag.altitude)
 
 
 def _ratios(value: float, whole: int = 10**6) -> list[tuple[int, int]]:

@@ -57,9 +57,9 @@ def test_masked_pixels_have_no_say() -> None:
 
 
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])
-def test_derivative_of_the_training_loss(ssim_weight: float) -> None:
+def test_derivative_of_the_training_loss(ssim_weight: float, rng: np.random.Generator) -> None:
     _, slope = training_loss(IMAGE, TRUTH, None, ssim_weight)
-    for pick in RNG.permutation(IMAGE.size)[:40]:
+    for pick in rng.permutation(IMAGE.size)[:40]:
         losses = []
         for step in (1e-6, -1e-6):
             moved = IMAGE.copy()
