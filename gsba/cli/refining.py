@@ -213,7 +213,7 @@ def refine(
     if keyframes is not None and not (trajectory or several):
         raise GsbaError("--keyframes needs the TRAJECTORY of the same SLAM run: pass that, too")
     overrides = [*_networks(weights, accept_noncommercial, download), *(overrides or ())]
-    settings = _settings(config, *_with_sensors(overrides, factors, camera, gps))
+    settings = settings_of(config, *_with_sensors(overrides, factors, camera, gps))
     shared: dict[str, Any] = {"odometry": False if no_trajectory else None, "fps": fps}
     shared |= {"masks": masks or "auto", "calibration": calibration}
     shared["circles"] = [_circle(text) for text in circle or ()]
@@ -228,9 +228,9 @@ def refine(
             out = _several_run_folder(own, recordings, out)
             result = pipeline.refine_recordings(recordings, out, settings, **run)
         else:
-            out = out or _run_folder(given[0])
+            out = out or run_folder(given[0])
             result = pipeline.refine(given[0], trajectory, out, settings, **run, **shared, **own)
-    _conclude([result], allow_partial)
+    conclude([result], allow_partial)
 
 
 def _several_run_folder(
@@ -248,7 +248,7 @@ def _several_run_folder(
     return out
 
 
-def _run_folder(frames: Path) -> Path:
+def run_folder(frames: Path) -> Path:
     """Folder of a run, in the working folder, named after its frames or its video."""
     name = frames.resolve().stem if frames.is_file() else f"{frames.resolve().name}-run"
     folder = Path(name)
@@ -258,7 +258,7 @@ def _run_folder(frames: Path) -> Path:
     return folder
 
 
-def _conclude(results: "Sequence[RunResult]", allow_partial: bool) -> None:
+def conclude(results: "Sequence[RunResult]", allow_partial: bool) -> None:
     """Print the outcome of finished runs; exit with PARTIAL if one of them is partial."""
     from gsba.report.maps import MIN_SHARE_IN_ONE_MAP, format_outcome
 
@@ -356,7 +356,7 @@ def _demo_of_video(out: Path, allow_partial: bool, **options: Any) -> None:
         f"{len(result.frames)} of {len(truth.timestamps)} frames of the video were refined, "
         f"without a trajectory. Video and truth in {out / 'walk'}, the run in {run}."
     )
-    _conclude([result] if len(result.maps) > 1 or result.partial else [], allow_partial)
+    conclude([result] if len(result.maps) > 1 or result.partial else [], allow_partial)
 
 
 def _demo_of_frames(
@@ -408,7 +408,7 @@ def _demo_of_frames(
         typer.echo(_found_lenses(report["camera"], rows["two lenses"].scale, walk.lenses))
         where += f", the run with one centre in {central}"
     typer.echo(f"Frames, trajectories and truth in {out / 'walk'}, {where}.")
-    _conclude(
+    conclude(
         [result for result in results if len(result.maps) > 1 or result.partial], allow_partial
     )
 
@@ -441,7 +441,7 @@ def show_config(
     """Print all settings as TOML, with their allowed values."""
     from gsba.config_file import to_toml
 
-    typer.echo(to_toml(_settings(config, overrides, factors)), nl=False)
+    typer.echo(to_toml(settings_of(config, overrides, factors)), nl=False)
 
 
 def _with_sensors(
@@ -493,9 +493,10 @@ def _networks(weights: list[Path] | None, accept_noncommercial: bool, download: 
     return changes
 
 
-def _settings(
+def settings_of(
     config: Path | None, overrides: list[str] | None, factors: str | None
 ) -> "RefineSettings":
+    """Settings of a run from the options of the command line."""
     from gsba.config_file import load_config
 
     changes = list(overrides or ())

@@ -151,12 +151,12 @@ def export(
     from gsba.store.finished import load_run
 
     reconstruction, frames, *_ = load_run(run, map_number)
-    lenses = _lenses(run, reconstruction, frames, images, map_number)
+    lenses = lenses_of(run, reconstruction, frames, images, map_number)
     folder = out or run / (name if map_number == 1 else f"{name}-map{map_number}")
     known_baseline = _baseline(run, baseline) if scale == "lens" else None
     noise = _gps_noise(run, gps_sigma) if gps is not None else None
     placed = place(reconstruction, frames, settings, known_baseline, noise)
-    placed, shutter = replace(placed, map_number=map_number), _shutter(run, exposure_ms)
+    placed, shutter = replace(placed, map_number=map_number), shutter_of(run, exposure_ms)
     given = reconstruction, frames, folder, to, face_size, placed, link, lenses
     with connected(cluster) as client, hired(client, folder, frames) as workers:
         write(*given, images=images, workers=workers, shutter=shutter)
@@ -165,7 +165,7 @@ def export(
     typer.echo("\n".join([f"{to}: {folder}", *how_to_start(name, folder)]))
 
 
-def _shutter(run: Path, exposure_ms: float | None) -> "Shutter":
+def shutter_of(run: Path, exposure_ms: float | None = None) -> "Shutter":
     """Times of a picture's exposure: the readout that the run found, and the exposure as given."""
     from gsba.export import Shutter
 
@@ -180,7 +180,7 @@ def _shutter(run: Path, exposure_ms: float | None) -> "Shutter":
     return Shutter(*(None if value is None else float(value) / 1e3 for value in given))
 
 
-def _lenses(
+def lenses_of(
     run: Path, reconstruction: "Reconstruction", frames: "FrameSet", images: str, map_number: int
 ) -> "Lenses":
     """Lenses that exported images are rendered from: one centre, or the run's two lenses."""

@@ -40,8 +40,12 @@ def train(
 
     The same call again resumes.
     """
-    settings = splat_settings(iterations, face_size, backend, max_gaussians)
-    results = _compare(run, {}, settings, run / "splat", lpips or [])
+    train_on(run, splat_settings(iterations, face_size, backend, max_gaussians), lpips or [])
+
+
+def train_on(run: Path, settings: "SplatSettings", lpips: Sequence[Path] = ()) -> None:
+    """Train a splat on a run's refined poses, and print how good it is and where it lies."""
+    results = _compare(run, {}, settings, run / "splat", lpips)
     mean = results["refined"].mean
     typer.echo(
         f"{results['refined'].num_gaussians} Gaussians, PSNR {mean.psnr:.2f} dB, SSIM "

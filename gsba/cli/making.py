@@ -1,0 +1,94 @@
+"""The command `splat`: from a video to a trained splat, or to a trainer's dataset, in one call."""
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gsba.cli.app import command, loading
+from gsba.cli.refining import (
+    AllowPartial,
+    Camera,
+    Config,
+    Out,
+    Overrides,
+    conclude,
+    run_folder,
+    settings_of,
+)
+from gsba.cli.results import lenses_of, shutter_of
+from gsba.cli.splat import BackendName, Iterations, splat_settings, train_on
+from gsba.log import GsbaError
+
+logger = logging.getLogger(__name__)
+
+
+@command
+def splat(
+    frames: Annotated[
+        Path, typer.Argument(help="A video, or a folder of frames, as of `gsba refine`.")
+    ],
+    out: Out = None,
+    to: Annotated[
+        str | None,
+        typer.Option(
+            help="Write a dataset for this program, as in `gsba export`; default: train a splat.",
+            metavar="TRAINER",
+        ),
+    ] = None,
+    config: Config = None,
+    overrides: Overrides = None,
+    camera: Camera = None,
+    face_size: Annotated[int | None, typer.Option(help="Width of a cube face in pixels.")] = None,
+    iterations: Iterations = None,
+    backend: BackendName = "auto",
+    allow_partial: AllowPartial = False,
+) -> None:
+    """Make a splat of a video: refine, then train or export.
+
+    It is `gsba refine`, then `gsba train` or, with --to, `gsba export --up auto`, with their
+    defaults and in one run's folder. The same call again resumes.
+    """
+    from gsba.export.trainers import format_of
+
+    if to is not None and iterations is not None:
+        raise GsbaError(f"--to {to} trains nothing here: leave out --iterations")
+    if to is not None:
+        format_of(to)  # fails before hours of work
+    training = splat_settings(iterations, face_size, backend)
+    out = out or run_folder(frames)
+    camera_name = [f'camera.name="{camera}"'] if camera is not None else []
+    settings = settings_of(config, [*camera_name, *(overrides or ())], None)
+    with loading():
+        from gsba import pipeline
+    result = pipeline.refine(frames, None, out, settings)
+    if to is None:
+        train_on(out, training)
+        typer.echo(f"walk around in it: gsba view {out}")
+    else:
+        _write_dataset(out, to, face_size)
+    conclude([result], allow_partial)
+
+
+def _write_dataset(run: Path, to: str, face_size: int | None) -> None:
+    """Write the run for a program, upright where that can be told."""
+    from gsba.config import PlacementSettings
+    from gsba.export import export
+    from gsba.export.trainers import format_of, how_to_start
+    from gsba.placement.placement import Placement, place
+    from gsba.store.finished import load_run
+    from gsba.store.folder import claim
+
+    reconstruction, frames = load_run(run)
+    try:
+        placement = place(reconstruction, frames, PlacementSettings(up="auto"))
+    except GsbaError as error:
+        logger.warning("the dataset is not turned upright: %s", error)
+        placement = Placement()
+    folder = run / to
+    lenses = lenses_of(run, reconstruction, frames, "auto", 1)
+    given = reconstruction, frames, folder, format_of(to), face_size, placement
+    export(*given, lenses=lenses, shutter=shutter_of(run))
+    claim(run.resolve(), folder.resolve())
+    typer.echo("\n".join([f"{to}: {folder}", *how_to_start(to, folder)]))

@@ -1,0 +1,50 @@
+"""`gsba splat`: a run and a dataset in one call."""
+
+import json
+from pathlib import Path
+
+import pytest
+from tiny_run import Case
+from typer.testing import CliRunner, Result
+
+from gsba.cli import app
+from gsba.config import RefineSettings
+from gsba.config_file import load_config
+from gsba.log import GsbaError
+from gsba.pipeline import RunResult
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_splat_writes_a_trainers_dataset(
+    upright: bool, case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`splat` refines, then exports; a world without a vertical goes out as it is."""
+    run, called = case.copy(tmp_path / "run"), []
+
+    def refine(frames: Path, trajectory: None, out: Path, settings: RefineSettings) -> RunResult:
+        called.append((frames, trajectory, out, settings))
+        return case.result
+
+    def no_vertical(*given: object) -> None:
+        raise GsbaError("the frames have no common up axis")
+
+    monkeypatch.setattr("gsba.pipeline.refine", refine)
+    if not upright:
+        monkeypatch.setattr("gsba.placement.placement.place", no_vertical)
+    options = ("--out", run, "--to", "brush", "--config", "fast", "--face-size", 64)
+    done = call("splat", tmp_path / "walk.mp4", *options)
+    assert done.exit_code == 0, done.output
+    assert called == [(tmp_path / "walk.mp4", None, run, load_config(Path("fast")))]
+    assert f"brush: brush {run / 'brush'}" in done.output
+    assert (run / "brush/sparse/0/images.bin").is_file()
+    place = json.loads((run / "brush/transform.json").read_text())
+    assert (place["up"] == "-y") == upright, place
+
+
+def test_splat_refuses_a_wrong_trainer_before_it_refines(tmp_path: Path) -> None:
+    done = call("splat", tmp_path / "walk.mp4", "--to", "brsh")
+    assert done.exit_code == 1 and "--to brsh is not known" in done.stderr
