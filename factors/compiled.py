@@ -10,8 +10,6 @@ Compiling takes half a minute in all, which the log announces.
 """
 
 import logging
-import math
-import time
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -20,8 +18,6 @@ from numba import njit
 from numba.core import event
 
 logger = logging.getLogger(__name__)
-
-_MIN_PAUSE_S = 10.0  # longest pause between compilations announced together
 
 
 def kernel_and_part(**options: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
@@ -39,17 +35,17 @@ def kernel_and_part(**options: Any) -> tuple[Callable[..., Any], Callable[..., A
 
 
 class _Announcer(event.Listener):
-    """Logs compilations, nearby ones once; loading a kernel from disk is none."""
+    """Logs the first compilation of a process; loading a kernel from disk is none."""
 
-    latest = -math.inf  # seconds
+    announced = False
 
     def on_start(self, event: Any) -> None:
-        before, self.latest = self.latest, time.monotonic()
-        if self.latest - before > _MIN_PAUSE_S:
+        if not self.announced:
             logger.info("compiling kernels, once per machine: this takes a while")
+        self.announced = True
 
     def on_end(self, event: Any) -> None:
-        self.latest = time.monotonic()
+        pass  # which the listener has to have
 
 
 @cache

@@ -1,12 +1,33 @@
-"""Settings of glibc's allocator: keep freed memory that is soon used again, return the rest."""
+"""Memory and processors of this machine, on Linux and macOS; settings of glibc's allocator."""
 
 import ctypes
+import os
+import resource
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3), from malloc.h
 _DEFAULT_THRESHOLDS = 32 << 20, 64 << 20  # bytes, glibc's own mapping and trimming thresholds
 _MIN_RETURNED_BYTES = 256 << 20  # fetching and clearing so much again takes a tenth of a second
+
+
+def total_memory_bytes() -> int:
+    """Memory of the machine."""
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def peak_memory_bytes() -> int:
+    """Most memory that this process has held."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak  # elsewhere it is in kB
+
+
+def usable_cpus() -> int:
+    """Processors that this process may use; all where the system has no affinity, as macOS."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @contextmanager

@@ -61,6 +61,8 @@ def _expected_failures() -> Iterator[None]:
     except Exception as error:
         if _Call.debug:
             raise
+        if isinstance(error, ModuleNotFoundError):
+            _fail(f"the package {error.name} is missing: `gsba doctor` says how to get it")
         _fail(_bug_message(error))
 
 

@@ -36,7 +36,9 @@ def localize(
         ),
     ] = False,
 ) -> None:
-    """Find the poses of new pictures in a finished run, which stays as it is.
+    """Find the poses of new pictures in a finished run.
+
+    The run stays as it is.
 
     The index of the run's places is kept beside it, in RUN-index.
     """

@@ -1,7 +1,9 @@
 """Examination of every group of packages, with conclusions and text."""
 
 import os
+import platform
 import shutil
+import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -27,6 +29,8 @@ _PURPOSES = {  # extra -> its purpose
 }
 _OWN = Requirement("gsba", "gsba.pipeline.refine", "", NEEDED)
 _WORDS = {"works": "ok", "partly": "partly", "absent": "absent", "broken": "BROKEN"}
+_NO_WHEEL = {("linux", "aarch64"): {"pycolmap", "open3d"}}  # as of 2026-11
+_ON_ARM = "there is no wheel for Linux on ARM (docs/install.md#linux-on-arm)"
 _SMALL_DISK_BYTES = 2 << 30
 _MAX_MESSAGE_LENGTH = 160  # characters of a package's message
 
@@ -100,8 +104,15 @@ def _group(name: str, wanted: Sequence[Requirement]) -> Group:
         notes, remedy = _conclusions(answers)
         return Group(name, "partly" if remedy else "works", packages, tuple(notes), remedy)
     if name != NEEDED and all(package.version is None for package in faulty):
-        return Group(name, "absent", packages, remedy=f"pip install 'gsba[{name}]'")
+        remedy = f"pip install 'gsba[{name}]'"
+        if {package.name for package in faulty} & _NO_WHEEL.get(_platform(), set()):
+            remedy = _remedy(faulty, wanted)
+        return Group(name, "absent", packages, remedy=remedy)
     return Group(name, "broken", packages, remedy=_remedy(faulty, wanted))
+
+
+def _platform() -> tuple[str, str]:
+    return sys.platform, platform.machine()
 
 
 def _remedy(faulty: Sequence[Package], wanted: Sequence[Requirement]) -> str:
@@ -112,6 +123,9 @@ def _remedy(faulty: Sequence[Package], wanted: Sequence[Requirement]) -> str:
     if libraries:
         return f"install the system packages that hold {', '.join(libraries)}"
     names = {package.name for package in faulty}
+    unbuilt = names & _NO_WHEEL.get(_platform(), set())
+    if unbuilt:
+        return f"build {', '.join(sorted(unbuilt))} from source: {_ON_ARM}"
     ranges = [f"'{one.name}{one.range}'" for one in wanted if one.name in names]
     if not ranges:  # all packages work, but gsba's own code does not
         no_place = any("cannot cache" in package.fault for package in faulty)

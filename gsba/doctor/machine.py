@@ -3,8 +3,11 @@
 import os
 import platform
 import shutil
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+
+from gsba.memory import total_memory_bytes, usable_cpus
 
 _CGROUP = Path("/sys/fs/cgroup")
 
@@ -31,7 +34,7 @@ def look() -> Machine:
         python=platform.python_version(),
         processor=_processor(),
         cores=os.cpu_count() or 1,
-        usable_cores=min(len(os.sched_getaffinity(0)), _quota()),
+        usable_cores=min(usable_cpus(), _quota()),
         memory_bytes=total,
         free_memory_bytes=free,
         free_disk_bytes=shutil.disk_usage(Path.cwd()).free,
@@ -39,6 +42,8 @@ def look() -> Machine:
 
 
 def _system() -> str:
+    if sys.platform == "darwin":
+        return f"macOS {platform.mac_ver()[0]}, {platform.machine()}"
     try:
         name = platform.freedesktop_os_release()["PRETTY_NAME"]
     except (OSError, KeyError):
@@ -56,7 +61,7 @@ def _processor() -> str:
 
 def _memory() -> tuple[int, int]:
     """Total and available memory, bytes."""
-    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    pages = total_memory_bytes()
     fields = dict(line.split(":")[:2] for line in _text(Path("/proc/meminfo")).splitlines())
     free = int(fields.get("MemAvailable", "0 kB").split()[0]) * 1024 or pages
     limit, used = (_text(_CGROUP / name).strip() for name in ("memory.max", "memory.current"))

@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import logging
 import math
-import os
 import platform
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -19,6 +18,7 @@ from pydantic import BaseModel
 from gsba.bundle.triangulation import points_under
 from gsba.disk import atomic_write
 from gsba.geometry import angular_errors, moved_to, quaternion_from_rotation
+from gsba.memory import total_memory_bytes, usable_cpus
 from gsba.report.maps import summarize_maps
 from gsba.store.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
@@ -248,12 +248,11 @@ def _frame_rows(
 
 
 def _machine() -> dict[str, Any]:
-    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return {
         "platform": platform.platform(),
         "processor": _processor(),
-        "cpus": len(os.sched_getaffinity(0)),
-        "memory_mb": round(pages / 2**20),
+        "cpus": usable_cpus(),
+        "memory_mb": round(total_memory_bytes() / 2**20),
         "python": platform.python_version(),
     }
 

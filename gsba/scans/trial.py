@@ -11,9 +11,11 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from gsba.log import GsbaError
+from gsba.memory import peak_memory_bytes
 
 _BASE_CPU_S, _BYTES_PER_CPU_S = 20.0, 1e6  # limit of processor time, by the file's size
 _BASE_MEMORY_BYTES, _MEMORY_PER_BYTE = 2 << 30, 100  # limit of memory besides that of libraries
@@ -61,8 +63,8 @@ def limited(path: Path, read: Callable[[Path], object]) -> None:
         path: file of the scan.
         read: function that is called with the path.
     """
-    size, mapped = path.stat().st_size, int(Path("/proc/self/statm").read_text().split()[0])
-    memory = mapped * os.sysconf("SC_PAGE_SIZE") + _BASE_MEMORY_BYTES + _MEMORY_PER_BYTE * size
+    size = path.stat().st_size
+    memory = _mapped_bytes() + _BASE_MEMORY_BYTES + _MEMORY_PER_BYTE * size
     spent = sum(os.times()[:2])
     _lower(resource.RLIMIT_AS, memory)
     _lower(resource.RLIMIT_CPU, int(spent + _BASE_CPU_S + size / _BYTES_PER_CPU_S))
@@ -80,7 +82,17 @@ def limited(path: Path, read: Callable[[Path], object]) -> None:
     os._exit(code)
 
 
+def _mapped_bytes() -> int:
+    """Address space of this process; the most memory it has held where /proc is not there."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+    except OSError:
+        return peak_memory_bytes()
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
 def _lower(kind: int, limit: int) -> None:
     soft, hard = resource.getrlimit(kind)
     known = [limit, *(x for x in (soft, hard) if x != resource.RLIM_INFINITY)]
-    resource.setrlimit(kind, (min(known), hard))
+    with suppress(OSError, ValueError):  # macOS refuses some: the file is read without this limit
+        resource.setrlimit(kind, (min(known), hard))

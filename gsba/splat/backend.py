@@ -1,13 +1,13 @@
 """The two renderers behind one interface: `cpu`, of this package, and `gsplat` on CUDA."""
 
 import logging
-import os
 from collections.abc import Iterable, Sequence
 from typing import Protocol
 
 import numpy as np
 
 from gsba.log import GsbaError
+from gsba.memory import total_memory_bytes
 from gsba.splat import adam
 from gsba.splat.camera import FaceCamera
 from gsba.splat.density import Pull
@@ -65,7 +65,7 @@ class CpuBackend:
 
     def __init__(self, num_threads: int | None = None) -> None:
         self.num_threads = num_threads
-        self.memory_bytes = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        self.memory_bytes = total_memory_bytes()
 
     def render(
         self,

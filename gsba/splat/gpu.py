@@ -5,7 +5,6 @@ Untested on a GPU: tests run the Python side of gsplat 1.5.3 on its own PyTorch 
 kernels (tests/splat/test_gsplat.py), not these kernels.
 """
 
-import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from gsba.log import GsbaError
+from gsba.memory import total_memory_bytes
 from gsba.splat import metrics
 from gsba.splat._project import DILATION
 from gsba.splat.adam import BETA1, BETA2, EPS, Moments, Rates
@@ -54,7 +54,7 @@ class GsplatBackend:
         self.memory_bytes = (
             torch.cuda.get_device_properties(device).total_memory
             if device == "cuda"
-            else os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+            else total_memory_bytes()
         )
         self._window = metrics.window().tolist()
 

@@ -11,7 +11,6 @@ import hashlib
 import json
 import logging
 import os
-import resource
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -23,8 +22,13 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 from pydantic import BaseModel
 
 from gsba.disk import FullDiskError, write_text
+<<<<<<< HEAD
 from gsba.log import GsbaError, brief, event
 from gsba.memory import give_back_freed_memory
+=======
+from gsba.log import GsbaError, brief
+from gsba.memory import give_back_freed_memory, peak_memory_bytes
+>>>>>>> 022ebfd (Run without what only Linux has; say what has no wheel on ARM; announce compilation once)
 from gsba.store.folder import (
     MARKER,
     STAGES,
@@ -442,7 +446,7 @@ class _Clocks:
         cpu_seconds = time.process_time() - self.cpu
         cpu_seconds += elsewhere.cpu_seconds - before.cpu_seconds
         took_part = [w for w, n in elsewhere.shards.items() if n > before.shards.get(w, 0)]
-        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0  # Linux: in kB
+        peak_mb = peak_memory_bytes() / 2**20
         if spent is not None:
             seconds += spent.seconds
             cpu_seconds += spent.cpu_seconds

@@ -48,3 +48,8 @@ def test_splat_writes_a_trainers_dataset(
 def test_splat_refuses_a_wrong_trainer_before_it_refines(tmp_path: Path) -> None:
     done = call("splat", tmp_path / "walk.mp4", "--to", "brsh")
     assert done.exit_code == 1 and "--to brsh is not known" in done.stderr
+
+
+def test_summaries_of_commands_fit_their_lines() -> None:
+    lines = call("--help").output.splitlines()
+    assert not [line for line in lines if line.endswith("...") and "Usage" not in line]
