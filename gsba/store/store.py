@@ -22,13 +22,8 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 from pydantic import BaseModel
 
 from gsba.disk import FullDiskError, write_text
-<<<<<<< HEAD
 from gsba.log import GsbaError, brief, event
-from gsba.memory import give_back_freed_memory
-=======
-from gsba.log import GsbaError, brief
 from gsba.memory import give_back_freed_memory, peak_memory_bytes
->>>>>>> 022ebfd (Run without what only Linux has; say what has no wheel on ARM; announce compilation once)
 from gsba.store.folder import (
     MARKER,
     STAGES,
