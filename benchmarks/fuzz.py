@@ -37,7 +37,8 @@ from pathlib import Path
 from typing import Any
 
 from common import write_table
-from fuzz_inputs import Spoiled, located
+from fuzz_damage import Spoiled
+from fuzz_inputs import located
 from fuzz_strangers import FAMILIES, prepare, spoil
 
 LIMIT_S = 30.0  # of a case; whole runs get more

@@ -12,7 +12,7 @@ import cv2
 import fuzz_inputs as usual
 import numpy as np
 import yaml
-from fuzz_inputs import (
+from fuzz_damage import (
     TREES,
     WORDS,
     Draft,
@@ -20,9 +20,12 @@ from fuzz_inputs import (
     change_bytes,
     change_member,
     change_tree,
-    small_settings,
+    copied,
     spoil_file,
 )
+from fuzz_inputs import small_settings
+from fuzz_prepare import NUM
+from fuzz_prepare import prepare as prepare_usual
 
 from gsba.camera.calibration import calibration_json
 from gsba.store.finished import load_run
@@ -67,7 +70,7 @@ def spoil(number: int, seed: int, family: str | None = None) -> Spoiled:
 
 def prepare(out: Path) -> None:
     """Make the inputs of all cases once."""
-    usual.prepare(out)
+    prepare_usual(out)
     if (out / "strangers").exists():
         return
     front = Fisheye(
@@ -92,7 +95,7 @@ def prepare(out: Path) -> None:
     cv2.imwrite(str(made / "a.tif"), np.full((32, 64, 3), 90, np.uint8))
     for lens in ("front", "back"):
         (made / "raw" / lens).mkdir(parents=True)
-        for number in range(usual.NUM):
+        for number in range(NUM):
             disc = cv2.circle(np.zeros((32, 32, 3), np.uint8), (16, 16), 15, (90, 90, 90), -1)
             cv2.imwrite(str(made / f"raw/{lens}/{number}.png"), disc)
     _make_scans(made, load_run(out / "run")[0].points_world)
@@ -125,7 +128,7 @@ def _make_scans(made: Path, points: np.ndarray) -> None:
 
 def _copy(draft: Draft, name: str) -> None:
     """Copy a prepared malicious file."""
-    draft.steps.append(lambda source, here: usual.copied(source / "strangers" / name, here / name))
+    draft.steps.append(lambda source, here: copied(source / "strangers" / name, here / name))
 
 
 def _unharmed(here: Path, _: Any = None) -> str | None:
@@ -359,11 +362,11 @@ def _numbers(draft: Draft) -> Spoiled:
             "--width",
             draft.pick([*large, "1", "-2", "33", "x"]),
         ],
-        ["train", usual._RUN, "--iterations", draft.pick([*large[2:], "0", "-1", "x"])],
-        ["train", usual._RUN, "--iterations", "1", "--face-size", draft.pick([*large, "0", "x"])],
+        ["train", usual.RUN, "--iterations", draft.pick([*large[2:], "0", "-1", "x"])],
+        ["train", usual.RUN, "--iterations", "1", "--face-size", draft.pick([*large, "0", "x"])],
         [
             "export",
-            usual._RUN,
+            usual.RUN,
             "--to",
             "tum",
             "--out",
