@@ -42,6 +42,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tags = _hung(truth[2::4])
     for world_T_rig, path in zip(truth, sorted((folder / "images").glob("*.jpg")), strict=True):
         image = cv2.imread(str(path))
+        assert image is not None
         cv2.imwrite(str(path), _with_tags(image, world_T_rig, tags), [cv2.IMWRITE_JPEG_QUALITY, 95])
     return folder
 
@@ -104,6 +105,7 @@ def test_a_barometer_finds_its_bias(walk: Path, tmp_path: Path) -> None:
     assert all(stage["resumed"] for stage in resumed.report["stages"])
 
 
+@pytest.mark.slow
 def test_wheels_set_the_scale(walk: Path, tmp_path: Path) -> None:
     import wheel_odometry
 
@@ -134,6 +136,7 @@ def test_the_general_loss_is_the_integral_of_its_weight() -> None:
             assert slope == pytest.approx(loss.weight(residual) * residual, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_floor_finds_its_plane(walk: Path, tmp_path: Path) -> None:
     import floor_plane
 

@@ -110,6 +110,7 @@ def test_what_the_trajectory_puts_into_a_place_that_looks_otherwise_is_apart() -
     assert found.reasons[0] == "" and "contradict its pose in the trajectory" in found.reasons[1]
 
 
+@pytest.mark.slow
 def test_a_join_that_asks_for_more_than_drift_is_not_believed_against_the_trajectory() -> None:
     context, whole, late = scene()
     far = torn(whole, late, 1.0, pose(np.eye(3), np.array([0.0, 40.0, 0.0])))

@@ -107,6 +107,7 @@ def test_a_walk_there_and_back_closes_its_loop(walk: RenderedWalk) -> None:
     assert np.isfinite(sigmas).all() and sigmas.max() < 0.2  # median distances
 
 
+@pytest.mark.slow
 def test_a_map_begun_in_the_dark_is_joined_where_it_meets_the_first(walk: RenderedWalk) -> None:
     order = [*range(33), *range(33, -1, -1)]
     there = walk.at(order)
@@ -118,6 +119,7 @@ def test_a_map_begun_in_the_dark_is_joined_where_it_meets_the_first(walk: Render
     assert _ate(found, truth) < 0.01
 
 
+@pytest.mark.slow
 def test_maps_that_share_a_poster_stay_apart(walk: RenderedWalk) -> None:
     elsewhere = [np.ascontiguousarray(frame[:, ::-1]) for frame in walk.frames]
     for other, frame in zip(elsewhere, walk.frames, strict=True):

@@ -43,6 +43,7 @@ def test_no_trajectory_will_do(case: Case, tmp_path: Path) -> None:
     case.assert_as_good(tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_two_poses_carry_the_rest(case: Case, tmp_path: Path) -> None:
     slam = read_trajectory(case.slam)
     _refine(case, tmp_path, Trajectory(slam.timestamps[:2], slam.world_T_rigs[:2]))

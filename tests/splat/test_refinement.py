@@ -102,6 +102,7 @@ def test_an_interrupted_refinement_goes_on_to_the_same_result(
     assert calls[5:] == [-1, 0, -1, 0]
 
 
+@pytest.mark.slow
 def test_a_run_with_all_families(case: Case, tmp_path: Path) -> None:
     out = case.copy(tmp_path / "run")
     settings = settings_for(("bearing", "photometric", "splat"))
