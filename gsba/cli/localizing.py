@@ -28,6 +28,13 @@ def localize(
     map_number: Annotated[
         int, typer.Option("--map", help="Number of the map; 1: the largest.", metavar="NUMBER")
     ] = 1,
+    fast: Annotated[
+        bool,
+        typer.Option(
+            "--fast",
+            help="Rest on keypoints alone: half the time, errors about three times as large.",
+        ),
+    ] = False,
     allow_partial: Annotated[
         bool,
         typer.Option(
@@ -48,7 +55,7 @@ def localize(
     out = out or images[0].with_name(f"{images[0].stem}-localized")
     if out.resolve() == run.resolve() or run.resolve() in out.resolve().parents:
         raise GsbaError(f"--out {out} is in the run's folder, which stays as it is: choose another")
-    localizer = Localizer(run, map_number)
+    localizer = Localizer(run, map_number, precise=not fast)
     pictures = find_pictures(images, run, localizer.map.frames.layout, out)
     found = localize_all(localizer, pictures)
     for frame in found:

@@ -15,6 +15,7 @@ from gsba.log import GsbaError
 _MAKE, _MODEL = 0x010F, 0x0110
 _EXIF_DIRECTORY, _GPS_DIRECTORY = 0x8769, 0x8825
 _TAKEN, _OFFSET, _SUBSECOND = 0x9003, 0x9011, 0x9291
+_FOCAL_35MM, _LENS = 0xA405, 0xA434
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)
 _GPS_TIME, _STATUS, _DOP, _GPS_DATE, _ERROR = 7, 9, 11, 29, 31
 _MAX_OFFSET_H = 14  # largest offset of a time zone from UTC, hours
@@ -41,6 +42,9 @@ class ExifTags:
     subsecond: bool  # True if `taken` has a fraction of a second
     gps: GpsTag | None  # None = no valid position
     camera: str = ""  # maker and model; "" = not given
+    focal_35mm: float = math.nan  # focal length in millimetres of a camera with 35 mm film and the
+    # same diagonal field of view; NaN = not given
+    lens: str = ""  # model of the lens; "" = not given
 
 
 def read_exif(path: Path) -> ExifTags:
@@ -66,8 +70,10 @@ def read_exif(path: Path) -> ExifTags:
         raise ValueError(f"{path}: damaged EXIF data") from None
     try:
         named = [text for text in (_text(exif, _MAKE), _text(exif, _MODEL)) if text]
-        return ExifTags(*_taken(shot), _gps_tag(gps), " ".join(named))
-    except (TypeError, IndexError, AttributeError):
+        focal = _number(shot, _FOCAL_35MM)
+        lens = _text(shot, _LENS)
+        return ExifTags(*_taken(shot), _gps_tag(gps), " ".join(named), focal, lens)
+    except (TypeError, IndexError, AttributeError, ZeroDivisionError):
         raise ValueError(f"{path}: damaged EXIF data") from None
 
 

@@ -19,6 +19,11 @@ def K(camera: int) -> int:
     return gtsam.symbol("k", camera)
 
 
+def isotropic(sigmas: np.ndarray) -> np.ndarray:
+    """Covariances (N, 2, 2) of standard deviations (N,) per axis."""
+    return sigmas[:, None, None] ** 2 * np.eye(2)
+
+
 def num_parameters(projection: Projection) -> int:
     """Number of a projection's parameters."""
     return sum(parameter.size for parameter in projection.parameters())
@@ -31,7 +36,8 @@ class Sightings:
     points_world: np.ndarray  # (N, 3) float64, map units
     covariances: np.ndarray  # (N, 3, 3) float64, of the points, map units^2
     measured: np.ndarray  # (N, 3) unit bearings, rig frame, of a panorama; (N, 2) pixels of a photo
-    sigmas: np.ndarray  # (N,) per axis, radians or pixels
+    spreads: np.ndarray  # (N, 2, 2) float64, covariances of what is measured: radians^2 on the
+    # bearing's tangent_basis, or pixels^2
     origins_rig: np.ndarray | None = None  # (N, 3) origins of rays, rig frame; None = the centre
     camera: int | None = None  # number of a photo's camera; None = a panorama
 
@@ -43,7 +49,7 @@ class Sightings:
             points_world=self.points_world[rows],
             covariances=self.covariances[rows],
             measured=self.measured[rows],
-            sigmas=self.sigmas[rows],
+            spreads=self.spreads[rows],
             origins_rig=None if origins is None else origins[rows],
         )
 
@@ -82,8 +88,7 @@ def residuals_of(
     turned = np.cross(by_vector, local[:, None])  # d(vector) = local x rotation - translation
     by_pose = np.concatenate([turned, -by_vector], axis=2)
     by_point = by_vector @ rotation.T
-    spread = by_point @ seen.covariances @ np.swapaxes(by_point, 1, 2)
-    spread[:, [0, 1], [0, 1]] += seen.sigmas[:, None] ** 2
+    spread = by_point @ seen.covariances @ np.swapaxes(by_point, 1, 2) + seen.spreads
     return Residuals(values, by_pose, by_camera, spread, behind)
 
 

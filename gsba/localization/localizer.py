@@ -7,13 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from factors.sphere_field import SphereField
+from factors.sphere_image import SphereImage
 from gsba.bundle.stitching import corrected
+from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import owner_faces
 from gsba.camera.sphere import dense_enough
 from gsba.features.detection import extract, gather
 from gsba.frames import cubemap
-from gsba.geometry import inverse
-from gsba.localization.known_points import Sightings
+from gsba.frames.panorama import load_grey
+from gsba.geometry import adjoint, inverse
+from gsba.localization.known_points import Sightings, isotropic
+from gsba.localization.patch_sightings import PatchAligner
 from gsba.localization.pictures import Picture, load_panorama
 from gsba.localization.place_index import PlaceIndex, open_index
 from gsba.localization.pose_fit import COARSE, FINE, PoseFit, fit
@@ -37,6 +41,8 @@ _WIDE_GATE_RAD, _NARROW_GATE_RAD = np.deg2rad(1.0), np.deg2rad(0.4)  # around pr
 _MIN_POINTS = 20  # inliers of a fit
 _MAX_POSITION_SIGMA = 0.05  # of a position, in median distances of points
 
+Grey = tuple[np.ndarray, np.ndarray | None]  # (h, 2h) uint8 panorama, and mask, True = use
+
 NO_PLACE = "no place of the map looks like it"
 TWO_PLACES = "two places of the map look like it"
 NOT_DETERMINED = "the points that it shows do not determine its pose"
@@ -48,8 +54,8 @@ class LocalizedFrame:
 
     name: str
     world_T_rig: np.ndarray  # (4, 4) float64, world of the run, map units; NaN = not localised
-    covariance: np.ndarray  # (6, 6) float64, tangent [rotation rad, translation], rig frame, given
-    # the map; NaN = not localised
+    covariance: np.ndarray  # (6, 6) float64, tangent [rotation rad, translation], rig frame; that
+    # of the nearest keyframe in the map is part of it; NaN = not localised
     num_points: int  # points of the map that it shows
     noise_rad: float  # standard deviation of its keypoints per axis; NaN = not localised
     nearest: str  # name of the nearest keyframe; "" = not localised
@@ -85,17 +91,21 @@ class Localizer:
         run: folder of a finished run, which is only read. The index of its places is kept beside
             it, in the folder RUN-index.
         map_number: number of the map to localise in, 1 = the largest.
+        precise: also align patches of the nearest keyframes to each picture, which takes longer
+            and is about three times as accurate.
 
     Raises:
         GsbaError: no finished run, or one of another version of gsba.
     """
 
-    def __init__(self, run: Path | str, map_number: int = 1) -> None:
+    def __init__(self, run: Path | str, map_number: int = 1, precise: bool = False) -> None:
         self.map = RunMap.open(Path(run), map_number)
         self.index: PlaceIndex = open_index(self.map)
         self._extractor = self.map.make_extractor()
         self._depth = self.map.median_depth()
         self._field = SphereField(np.array(self.map.result.correction))
+        self._precise = precise
+        self.aligner = PatchAligner(self.map)
 
     def localize(self, image: Path | str | np.ndarray, name: str = "") -> LocalizedFrame:
         """Pose of one panorama of the run's camera.
@@ -108,7 +118,8 @@ class Localizer:
             GsbaError: the image cannot be read, or is no panorama like those of the run.
         """
         if isinstance(image, np.ndarray):
-            return self._localize_features(name or "image", self._features_of(image))
+            features = self._features_of(image)
+            return self._localize_features(name or "image", features, lambda: self._grey(image))
         return self.localize(load_panorama(Path(image)), name or Path(image).stem)
 
     def localize_frame(self, frames: FrameSet, frame: int) -> LocalizedFrame:
@@ -120,7 +131,12 @@ class Localizer:
         """
         images, masks = cubemap.load(replace(frames, correction=()), frame, self.map.rig)
         features = extract(images, masks, self.map.rig, self._extractor)
-        return self._localize_features(frames.names[frame], features)
+        raw, width = replace(frames, correction=()), self.aligner.width
+
+        def grey() -> Grey:
+            return load_grey(raw, frame, width)
+
+        return self._localize_features(frames.names[frame], features, grey)
 
     def _features_of(self, erp: np.ndarray) -> Features:
         """Keypoints of a panorama (H, 2H, 3)."""
@@ -133,7 +149,18 @@ class Localizer:
             erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
         return extract(cubemap.cut(erp, self.map.rig), None, self.map.rig, self._extractor)
 
-    def _localize_features(self, name: str, features: Features) -> LocalizedFrame:
+    def _grey(self, erp: np.ndarray) -> Grey:
+        """Grey panorama of the aligner's width."""
+        import cv2
+
+        grey, width = cv2.cvtColor(erp, cv2.COLOR_RGB2GRAY), self.aligner.width
+        if grey.shape[1] != width:
+            grey = cv2.resize(grey, (width, width // 2), interpolation=cv2.INTER_AREA)
+        return grey, None
+
+    def _localize_features(
+        self, name: str, features: Features, load: Callable[[], Grey]
+    ) -> LocalizedFrame:
         query = self._query(features)
         start, reason = self._recognise(query)
         if start is None:
@@ -147,16 +174,65 @@ class Localizer:
             fitted = fit([seen], world_T_rig[None], scales)
             world_T_rig = fitted.world_T_rigs[0]
         assert fitted is not None and seen is not None
-        return self._judged(name, fitted, seen, candidates)
+        found = self._judged(name, fitted, seen, candidates)
+        if self._precise and found.found:
+            found = self._on_patches(found, load)
+        return self._with_map_error(found) if found.found else found
+
+    def _with_map_error(self, frame: LocalizedFrame) -> LocalizedFrame:
+        """The frame with the uncertainty of the map around it, which its nearest keyframe has."""
+        nearest, result = int(self.nearest_keyframes(frame.world_T_rig)[0]), self.map.result
+        uncertain = result.pose_covariances[nearest]
+        if not np.isfinite(uncertain).all():
+            return frame
+        rig_T_keyframe = inverse(frame.world_T_rig) @ result.world_T_rigs[nearest]
+        carried = adjoint(rig_T_keyframe[None])[0]
+        return replace(frame, covariance=frame.covariance + carried @ uncertain @ carried.T)
+
+    def _on_patches(self, frame: LocalizedFrame, load: Callable[[], Grey]) -> LocalizedFrame:
+        """The frame fitted to aligned patches; as it was if too few align."""
+        grey, mask = load()
+        image, lenses = SphereImage.of(grey, smooth=True), self._own_lenses()
+        places = self.nearest_keyframes(frame.world_T_rig)
+        expected = self.aligner.expected(frame.world_T_rig, places)
+        found = self.aligner.align(expected, frame.world_T_rig, image, mask, True, lenses)
+        if len(found.points) < _MIN_POINTS:
+            return frame
+        bearings, origins = self._field.corrected(found.bearings), None
+        if lenses:
+            bearings, origins = lenses.rays(bearings, np.zeros(len(bearings), np.int64))
+        points = self.map.result.points_world[found.points]
+        uncertain = self.map.point_covariances[found.points]
+        seen = Sightings(points, uncertain, bearings, found.covariances, origins)
+        fitted = fit([seen], frame.world_T_rig[None], FINE)
+        world_T_rig, inliers = fitted.world_T_rigs[0], fitted.inliers[0]
+        if not np.isfinite(fitted.covariances[0]).all() or inliers.sum() < _MIN_POINTS:
+            return frame
+        noise = float(fitted.noises[0]) * typical_sigma(found.covariances)
+        num = int(inliers.sum())
+        return replace(
+            frame,
+            world_T_rig=world_T_rig,
+            covariance=fitted.covariances[0],
+            num_points=num,
+            noise_rad=noise,
+            nearest=self.nearest_keyframe(world_T_rig),
+        )
+
+    def _own_lenses(self) -> Lenses:
+        """Lenses of a picture whose motion during the readout is not known."""
+        lenses = self.map.lenses
+        if not lenses or lenses.axes is not None:  # nothing says how the lenses lie in it
+            return ONE_CENTRE
+        return replace(lenses, readout_motion=None)
 
     def _query(self, features: Features) -> Query:
         """Keypoints ready to be matched, where they really point."""
         map_ = self.map
         seen: Keypoints = corrected(gather([features]), self._field, map_.rig)
         origins = None
-        if map_.lenses and map_.lenses.axes is None:  # else nothing says how the lenses lie in it
-            still = replace(map_.lenses, readout_motion=None)
-            seen = still.seen(seen)
+        if lenses := self._own_lenses():
+            seen = lenses.seen(seen)
             origins = seen.origins_rig
         ready = replace(
             features, bearings_rig=seen.bearings_rig, faces=owner_faces(seen.bearings_rig)
@@ -201,9 +277,7 @@ class Localizer:
     ) -> Candidates:
         """Points of the nearest keyframes that look like keypoints near their predicted
         bearing."""
-        poses = self.map.result.world_T_rigs
-        distances = np.linalg.norm(poses[:, :3, 3] - world_T_rig[:3, 3], axis=1)
-        places = np.argsort(distances, kind="stable")[:_NUM_NEAREST]
+        poses, places = self.map.result.world_T_rigs, self.nearest_keyframes(world_T_rig)
         gate, chosen = Gate.around_points(gate_rad), self.map.settings.matching
 
         def match(place: int) -> np.ndarray:
@@ -232,7 +306,7 @@ class Localizer:
             candidates.points_world,
             self.map.point_covariances[candidates.points],
             query.bearings[rows],
-            query.features.sigmas_rad[rows],
+            isotropic(query.features.sigmas_rad[rows]),
             None if origins is None else origins[rows],
         )
 
@@ -242,7 +316,7 @@ class Localizer:
         """The frame with its pose, if that is significant and determined."""
         inliers, covariance = fitted.inliers[0], fitted.covariances[0]
         world_T_rig, noise = fitted.world_T_rigs[0], float(fitted.noises[0])
-        sigma = noise * float(np.median(seen.sigmas))
+        sigma = noise * typical_sigma(seen.spreads)
         chance = min((3.5 * sigma / _NARROW_GATE_RAD) ** 2, 0.5)
         if not is_significant(candidates.bearings, inliers, chance):
             return LocalizedFrame.refused(name, NO_PLACE)
@@ -264,9 +338,18 @@ class Localizer:
 
     def nearest_keyframe(self, world_T_rig: np.ndarray) -> str:
         """Name of the keyframe nearest to a pose (4, 4)."""
+        return self.map.frames.names[int(self.nearest_keyframes(world_T_rig)[0])]
+
+    def nearest_keyframes(self, world_T_rig: np.ndarray) -> np.ndarray:
+        """The keyframes (N,) nearest to a pose (4, 4), the nearest first."""
         positions = self.map.result.world_T_rigs[:, :3, 3]
         distances = np.linalg.norm(positions - world_T_rig[:3, 3], axis=1)
-        return self.map.frames.names[int(np.argmin(distances))]
+        return np.argsort(distances, kind="stable")[:_NUM_NEAREST]
+
+
+def typical_sigma(covariances: np.ndarray) -> float:
+    """Median standard deviation per axis of covariances (N, 2, 2)."""
+    return float(np.median(np.linalg.det(covariances) ** 0.25))
 
 
 def localize_all(localizer: Localizer, pictures: Sequence[Picture]) -> list[LocalizedFrame]:

@@ -88,7 +88,7 @@ def _block(
 ) -> KnownPointBlock:
     """Block of pictures whose keypoints are `noises` (P,) times as noisy as they claim."""
     scaled = [
-        replace(seen, sigmas=noise * seen.sigmas)
+        replace(seen, spreads=noise**2 * seen.spreads)
         for seen, noise in zip(pictures, noises, strict=True)
     ]
     return KnownPointBlock(scaled, projections, RobustLoss(loss, scale))  # type: ignore[arg-type]

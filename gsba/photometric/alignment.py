@@ -24,6 +24,8 @@ _TILTED_STEP_PX = 1.4  # pixels to a step of patches tilted with their surfaces;
 # the host
 _MIN_SIGMA_PX = 0.03  # pixels, noise of the best patches: sampling, and a plane as the surface
 
+REJECTIONS = (*REASONS.values(), _TOO_UNCERTAIN)  # reasons why alignments are dropped
+
 _STRAIGHT = SphereField.none()
 
 
@@ -195,18 +197,18 @@ def _accepted(
     settings: PatchSettings,
 ) -> tuple[np.ndarray, _Observed, dict[str, int]]:
     """Accepted rows (N,) of the sightings, as observations, and counts of rejections by reason."""
-    parts, dropped = [], dict.fromkeys([*REASONS.values(), _TOO_UNCERTAIN], 0)
+    parts, dropped = [], dict.fromkeys(REJECTIONS, 0)
     for first in range(0, max(len(seeing), 1), _SIGHTINGS_AT_ONCE):
         some = slice(first, first + _SIGHTINGS_AT_ONCE)
         there = Sightings(*(array[some] for array in sightings))
-        kept, bearings, covariances = _accepted_rows(patches, there, pixel, settings, dropped)
+        kept, bearings, covariances = accepted_rows(patches, there, pixel, settings, dropped)
         parts.append((first + kept, bearings, covariances))
     kept, bearings, covariances = (np.concatenate(column) for column in zip(*parts, strict=True))
     found = _Observed(sightings.templates[kept], seeing[kept], bearings, covariances)
     return kept, found, dropped
 
 
-def _accepted_rows(
+def accepted_rows(
     patches: PatchSet,
     sightings: Sightings,
     pixel: float,

@@ -74,6 +74,23 @@ def align(
             array[chosen] = part
 
 
+def align_to(
+    image: SphereImage,
+    mask: np.ndarray | None,
+    patches: PatchSet,
+    sightings: Sightings,
+    settings: PatchSettings,
+) -> None:
+    """Align templates to one picture; the results are filled in.
+
+    Args:
+        image: the picture. mask: (H, 2H) bool, True = use; None = all.
+        patches, sightings, settings: as for `align`.
+    """
+    reach, every = _SEARCH_SHIFT_RATIO * settings.max_shift_px, np.arange(len(sightings.templates))
+    patches.align(image, mask, every, sightings, reach, _MAX_STEPS, _TOLERANCE_PX)
+
+
 def _empty_patches(num: int, settings: PatchSettings) -> PatchSet:
     """Empty storage for templates."""
     return PatchSet(
@@ -172,8 +189,7 @@ class _AlignJob(_FrameJob):
     def __call__(self, item: int) -> tuple[np.ndarray, ...]:
         rows = self.rows.of(item)
         own = Sightings(*(column[rows] for column in self.sightings))
-        reach, every = _SEARCH_SHIFT_RATIO * self.settings.max_shift_px, np.arange(len(rows))
-        self.patches.align(*self.image(item), every, own, reach, _MAX_STEPS, _TOLERANCE_PX)
+        align_to(*self.image(item), self.patches, own, self.settings)
         return own.warps, own.scores, own.variances, own.states
 
     def part(self, start: int, stop: int) -> "_AlignJob":

@@ -9,7 +9,7 @@ from factors import RobustLoss
 from gsba.bundle.prior_factors import X
 from gsba.camera.projections import PerspectiveProjection
 from gsba.geometry import pose
-from gsba.localization.known_points import K, KnownPointBlock, Sightings, residuals_of
+from gsba.localization.known_points import K, KnownPointBlock, Sightings, isotropic, residuals_of
 from gsba.localization.pose_fit import COARSE, FINE, fit
 
 CAMERA = PerspectiveProjection(800, 600, 500.0, (410.0, 295.0), (0.05, -0.01))
@@ -21,7 +21,7 @@ def test_derivatives_of_a_panoramas_residuals_agree_with_differences() -> None:
         seen.points_world,
         seen.covariances,
         seen.measured,
-        seen.sigmas,
+        seen.spreads,
         np.random.default_rng(2).normal(0, 0.02, (30, 3)),
     )
     found = residuals_of(seen, world_T_rig, None)
@@ -78,7 +78,7 @@ def test_a_panorama_is_fitted_despite_outliers_with_a_fair_covariance() -> None:
         wrong = rng.permutation(200)[:60]
         bearings = seen.measured.copy()
         bearings[wrong] = _units(rng, 60)
-        seen = Sightings(seen.points_world, seen.covariances, bearings, seen.sigmas)
+        seen = Sightings(seen.points_world, seen.covariances, bearings, seen.spreads)
         start = _moved(_moved(world_T_rig, 0.01, 1), 0.05, 3)
         start = fit([seen], start[None], COARSE).world_T_rigs
         found = fit([seen], start, FINE)
@@ -112,7 +112,7 @@ def test_uncertain_points_count_less() -> None:
     points, covariances = seen.points_world.copy(), seen.covariances.copy()
     points[:50] += rng.normal(0, 0.2, (50, 3))
     covariances[:50] = 0.04 * np.eye(3)
-    blurred = Sightings(points, covariances, seen.measured, seen.sigmas)
+    blurred = Sightings(points, covariances, seen.measured, seen.spreads)
     found = fit([blurred], world_T_rig[None], FINE)
     assert np.linalg.norm(found.world_T_rigs[0][:3, 3] - world_T_rig[:3, 3]) < 2e-3
 
@@ -124,7 +124,7 @@ def _panorama(rng: np.random.Generator, num: int, sigma: float) -> tuple[Sightin
     points = (bearings * distances) @ world_T_rig[:3, :3].T + world_T_rig[:3, 3]
     noisy = bearings + rng.normal(0, sigma, (num, 3))
     noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
-    return Sightings(points, np.zeros((num, 3, 3)), noisy, np.full(num, sigma)), world_T_rig
+    return Sightings(points, np.zeros((num, 3, 3)), noisy, isotropic(np.full(num, sigma))), world_T_rig
 
 
 def _photo(rng: np.random.Generator, num: int, sigma_px: float) -> tuple[Sightings, np.ndarray]:
@@ -134,8 +134,8 @@ def _photo(rng: np.random.Generator, num: int, sigma_px: float) -> tuple[Sightin
     local = CAMERA.unproject(pixels) * rng.uniform(1, 8, (num, 1))
     points = local @ world_T_rig[:3, :3].T + world_T_rig[:3, 3]
     noisy = pixels + rng.normal(0, sigma_px, (num, 2))
-    sigmas = np.full(num, sigma_px)
-    return Sightings(points, np.zeros((num, 3, 3)), noisy, sigmas, camera=0), world_T_rig
+    spreads = isotropic(np.full(num, sigma_px))
+    return Sightings(points, np.zeros((num, 3, 3)), noisy, spreads, camera=0), world_T_rig
 
 
 def _units(rng: np.random.Generator, num: int) -> np.ndarray:

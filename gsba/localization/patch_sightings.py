@@ -1,0 +1,123 @@
+"""Sub-pixel sightings of a map's points in a new picture: patches of keyframes aligned to it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factors import tangent_basis
+from factors.patches import PatchSet, expect
+from factors.sphere_field import SphereField
+from factors.sphere_image import SphereImage
+from gsba.camera.lens import Lenses
+from gsba.frames.panorama import Greys
+from gsba.localization.run_map import RunMap
+from gsba.photometric.alignment import REJECTIONS, accepted_rows
+from gsba.photometric.frame_jobs import align_to, cut
+from gsba.store.shards import Threads
+from gsba.types import FrameSet
+
+_LOG_RATIO_WEIGHT = 0.25  # of a squared log ratio of distances, relative to a squared angle
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """Where a new picture should show points of the map, and the frames that lend their patches."""
+
+    points: np.ndarray  # (N,) int64, numbers of points
+    hosts: np.ndarray  # (N,) int64, frame of the map with the most similar view of each
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedPoints:
+    """Points of the map where patches find them in a new picture."""
+
+    points: np.ndarray  # (N,) int64, numbers of points
+    bearings: np.ndarray  # (N, 3) unit, directions in the picture, as it shows them
+    covariances: np.ndarray  # (N, 2, 2) radians^2, on the bearings' tangent_basis
+
+
+class PatchAligner:
+    """Aligns patches of a map's keyframes to new pictures.
+
+    Args:
+        map_: the map; greys of the keyframes last used stay in memory.
+    """
+
+    def __init__(self, map_: RunMap) -> None:
+        self._map, settings = map_, map_.settings.patches
+        frames: FrameSet = map_.frames
+        self.greys = Greys(frames, settings.max_width)
+        self._field = SphereField(np.array(map_.result.correction))
+
+    @property
+    def width(self) -> int:
+        """Width of the panoramas that patches are aligned in, pixels."""
+        return self.greys.width
+
+    def expected(self, world_T_rig: np.ndarray, frames: np.ndarray) -> Expected:
+        """Points that frames (N,) of the map observe, each with the frame whose view is most like
+        that from a pose (4, 4)."""
+        result, settings = self._map.result, self._map.settings.patches
+        rows = np.flatnonzero(np.isin(result.observation_frames, frames))
+        points, hosts = result.observation_points[rows], result.observation_frames[rows]
+        positions = result.points_world[points]
+        own = positions - world_T_rig[:3, 3]
+        theirs = positions - result.world_T_rigs[hosts, :3, 3]
+        lengths = np.linalg.norm(own, axis=1), np.linalg.norm(theirs, axis=1)
+        cosines = np.sum(own * theirs, axis=1) / np.maximum(lengths[0] * lengths[1], 1e-300)
+        logs = np.log(np.maximum(lengths[0], 1e-300) / np.maximum(lengths[1], 1e-300))
+        likely = cosines > np.cos(np.deg2rad(settings.max_angle_deg))
+        likely &= np.abs(logs) < np.log(settings.max_ratio)
+        costs = 2 * (1 - cosines) + _LOG_RATIO_WEIGHT * logs**2
+        rows = np.flatnonzero(likely)
+        rows = rows[np.lexsort((costs[rows], points[rows]))]
+        _, first = np.unique(points[rows], return_index=True)
+        rows = rows[first]
+        return Expected(points[rows].astype(np.int64), hosts[rows].astype(np.int64))
+
+    def align(
+        self,
+        expected: Expected,
+        world_T_rig: np.ndarray,
+        image: SphereImage,
+        mask: np.ndarray | None,
+        panoramic: bool,
+        lenses: Lenses,
+    ) -> AlignedPoints:
+        """Align the patches of expected points to a picture.
+
+        Args:
+            expected: points and the frames that lend patches.
+            world_T_rig: (4, 4) predicted pose, within some pixels.
+            image: the picture on the sphere, (width / 2, width).
+            mask: (width / 2, width) bool, True = the picture shows it; None = all.
+            panoramic: True if stitching bends the picture like the run's.
+            lenses: of the picture; one centre by default.
+        """
+        map_, settings = self._map, self._map.settings.patches
+        points = map_.result.points_world[expected.points]
+        pixel, threads = 2 * np.pi / self.width, Threads(1)
+        world_T_hosts = map_.result.world_T_rigs[expected.hosts]
+        local = np.einsum("nji,nj->ni", world_T_hosts[:, :3, :3], points - world_T_hosts[:, :3, 3])
+        if map_.lenses:
+            local = map_.lenses.seeing(local, expected.hosts)
+        depths = np.linalg.norm(local, axis=1)
+        origins = self._field.observed(local / np.maximum(depths, 1e-300)[:, None])
+        spreads = pixel * np.swapaxes(tangent_basis(origins), 1, 2)
+        axes = world_T_hosts[:, :3, :3] @ spreads * depths[:, None, None]
+        seen = (points - world_T_rig[:3, 3]) @ world_T_rig[:3, :3]
+        if lenses:
+            seen = lenses.seeing(seen, np.zeros(len(seen), np.int64))
+        distances = np.maximum(np.linalg.norm(seen, axis=1), 1e-300)[:, None]
+        at = seen / distances
+        if panoramic:
+            at = self._field.observed(at)
+        across = world_T_rig[:3, :3].T @ axes / distances[:, :, None]
+        sightings = expect(np.arange(len(points)), at, across)
+        patches: PatchSet = cut(
+            "patches", self.greys, expected.hosts, origins, spreads, settings, threads
+        )
+        align_to(image, mask, patches, sightings, settings)
+        dropped = dict.fromkeys(REJECTIONS, 0)
+        kept, bearings, covariances = accepted_rows(patches, sightings, pixel, settings, dropped)
+        return AlignedPoints(expected.points[kept], bearings, covariances)
