@@ -60,6 +60,7 @@ class LocalizedFrame:
     noise_rad: float  # standard deviation of its keypoints per axis; NaN = not localised
     nearest: str  # name of the nearest keyframe; "" = not localised
     reason: str  # why it is not localised; "" = it is
+    camera: int | None = None  # number of a photo's camera; None = a panorama
 
     @property
     def found(self) -> bool:
@@ -101,8 +102,7 @@ class Localizer:
     def __init__(self, run: Path | str, map_number: int = 1, precise: bool = False) -> None:
         self.map = RunMap.open(Path(run), map_number)
         self.index: PlaceIndex = open_index(self.map)
-        self._extractor = self.map.make_extractor()
-        self._depth = self.map.median_depth()
+        self.extractor = self.map.make_extractor()
         self._field = SphereField(np.array(self.map.result.correction))
         self._precise = precise
         self.aligner = PatchAligner(self.map)
@@ -130,7 +130,7 @@ class Localizer:
             frame: its number.
         """
         images, masks = cubemap.load(replace(frames, correction=()), frame, self.map.rig)
-        features = extract(images, masks, self.map.rig, self._extractor)
+        features = extract(images, masks, self.map.rig, self.extractor)
         raw, width = replace(frames, correction=()), self.aligner.width
 
         def grey() -> Grey:
@@ -147,7 +147,7 @@ class Localizer:
         width = dense_enough(erp.shape[1], self.map.rig.focal)
         if width < erp.shape[1]:
             erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
-        return extract(cubemap.cut(erp, self.map.rig), None, self.map.rig, self._extractor)
+        return extract(cubemap.cut(erp, self.map.rig), None, self.map.rig, self.extractor)
 
     def _grey(self, erp: np.ndarray) -> Grey:
         """Grey panorama of the aligner's width."""
@@ -177,9 +177,9 @@ class Localizer:
         found = self._judged(name, fitted, seen, candidates)
         if self._precise and found.found:
             found = self._on_patches(found, load)
-        return self._with_map_error(found) if found.found else found
+        return self.with_map_error(found) if found.found else found
 
-    def _with_map_error(self, frame: LocalizedFrame) -> LocalizedFrame:
+    def with_map_error(self, frame: LocalizedFrame) -> LocalizedFrame:
         """The frame with the uncertainty of the map around it, which its nearest keyframe has."""
         nearest, result = int(self.nearest_keyframes(frame.world_T_rig)[0]), self.map.result
         uncertain = result.pose_covariances[nearest]

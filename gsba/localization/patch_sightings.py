@@ -9,12 +9,12 @@ from factors.patches import PatchSet, expect
 from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
 from gsba.camera.lens import Lenses
+from gsba.camera.projections import Projection
 from gsba.frames.panorama import Greys
 from gsba.localization.run_map import RunMap
 from gsba.photometric.alignment import REJECTIONS, accepted_rows
 from gsba.photometric.frame_jobs import align_to, cut
 from gsba.store.shards import Threads
-from gsba.types import FrameSet
 
 _LOG_RATIO_WEIGHT = 0.25  # of a squared log ratio of distances, relative to a squared angle
 
@@ -25,6 +25,18 @@ class Expected:
 
     points: np.ndarray  # (N,) int64, numbers of points
     hosts: np.ndarray  # (N,) int64, frame of the map with the most similar view of each
+
+    def shown_by(
+        self, projection: Projection, world_T_camera: np.ndarray, map_: RunMap
+    ) -> "Expected":
+        """Those of the points that lie in a photo taken from a pose (4, 4)."""
+        points = map_.result.points_world[self.points]
+        local = (points - world_T_camera[:3, 3]) @ world_T_camera[:3, :3]
+        ahead = local[:, 2] > 0
+        pixels = projection.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
+        size = np.array([projection.width, projection.height])
+        shown = ahead & (pixels > 0).all(axis=1) & (pixels < size).all(axis=1)
+        return Expected(self.points[shown], self.hosts[shown])
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +57,7 @@ class PatchAligner:
 
     def __init__(self, map_: RunMap) -> None:
         self._map, settings = map_, map_.settings.patches
-        frames: FrameSet = map_.frames
-        self.greys = Greys(frames, settings.max_width)
+        self.greys = Greys(map_.frames, settings.max_width)
         self._field = SphereField(np.array(map_.result.correction))
 
     @property

@@ -23,6 +23,14 @@ _SOLVER = SolverSettings(max_iterations=20, relative_tolerance=1e-5, absolute_to
 
 
 @dataclass(frozen=True, slots=True)
+class CameraPrior:
+    """What is known of a camera before pictures are looked at."""
+
+    step: np.ndarray  # (K,) step from the initial projection to the one expected
+    sigmas: np.ndarray  # (K,) standard deviations of its parameters
+
+
+@dataclass(frozen=True, slots=True)
 class PoseFit:
     """Poses of pictures, and cameras, fitted together."""
 
@@ -39,7 +47,7 @@ def fit(
     starts: np.ndarray,
     scales: Sequence[float],
     projections: Sequence[Projection] = (),
-    sigmas: Sequence[np.ndarray] = (),
+    priors: Sequence[CameraPrior] = (),
 ) -> PoseFit:
     """Minimise the robust residuals of known points over poses and cameras.
 
@@ -48,16 +56,15 @@ def fit(
         starts: (P, 4, 4) initial world_T_rigs.
         scales: of the loss, round by round.
         projections: (C) initial cameras.
-        sigmas: (C) of (K,), standard deviations of the priors on their parameters.
+        priors: (C) on their parameters.
     """
     values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
     for p, start in enumerate(starts):
         values.insert(X(p), gtsam.Pose3(start))
-    for c, (projection, spread) in enumerate(zip(projections, sigmas, strict=True)):
-        zero = np.zeros(num_parameters(projection))
-        values.insert(K(c), zero)
-        noise = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(spread))
-        graph.push_back(gtsam.PriorFactorVector(K(c), zero, noise))
+    for c, (projection, prior) in enumerate(zip(projections, priors, strict=True)):
+        values.insert(K(c), np.zeros(num_parameters(projection)))
+        noise = gtsam.noiseModel.Diagonal.Sigmas(prior.sigmas)
+        graph.push_back(gtsam.PriorFactorVector(K(c), prior.step, noise))
     noises = np.ones(len(pictures))
     for scale in scales:
         block = _block(pictures, noises, projections, scale)

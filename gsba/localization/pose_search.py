@@ -125,7 +125,11 @@ def _ransac(
 
 
 def is_significant(
-    bearings: np.ndarray, inliers: np.ndarray, chance: float, sample: int = 3
+    bearings: np.ndarray,
+    inliers: np.ndarray,
+    chance: float,
+    sample: int = 3,
+    per_side: int = _CELLS_PER_SIDE,
 ) -> bool:
     """True if chance does not explain a pose's inliers, counted in independent witnesses.
 
@@ -134,11 +138,12 @@ def is_significant(
         inliers: (m,) bool.
         chance: probability that a false candidate agrees with an unrelated pose.
         sample: candidates that determine a pose.
+        per_side: cells along a face's side, of 90 degrees: candidates within one are one witness.
     """
     if not inliers.any():
         return False
-    num = witnesses(bearings, _CELLS_PER_SIDE)
-    agreeing = witnesses(bearings[inliers], _CELLS_PER_SIDE)
+    num = witnesses(bearings, per_side)
+    agreeing = witnesses(bearings[inliers], per_side)
     per_witness = 1 - (1 - min(chance, 0.5)) ** (len(bearings) / num)
     needed = least_agreeing(num, per_witness, sample, _MAX_FALSE_ALARMS)
     return agreeing >= max(needed, _MIN_WITNESSES)

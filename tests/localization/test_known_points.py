@@ -10,7 +10,7 @@ from gsba.bundle.prior_factors import X
 from gsba.camera.projections import PerspectiveProjection
 from gsba.geometry import pose
 from gsba.localization.known_points import K, KnownPointBlock, Sightings, isotropic, residuals_of
-from gsba.localization.pose_fit import COARSE, FINE, fit
+from gsba.localization.pose_fit import COARSE, FINE, CameraPrior, fit
 
 CAMERA = PerspectiveProjection(800, 600, 500.0, (410.0, 295.0), (0.05, -0.01))
 
@@ -92,11 +92,11 @@ def test_photos_of_one_camera_share_its_focal_length() -> None:
     rng = np.random.default_rng(7)
     pairs = [_photo(rng, 150, 0.3) for _ in range(4)]
     plain = PerspectiveProjection(800, 600, 530.0, (400.0, 300.0), (0.0, 0.0))
-    sigmas = [np.array([0.3, 0.02, 0.02, 0.1, 0.05])]
+    priors = [CameraPrior(np.zeros(5), np.array([0.3, 0.02, 0.02, 0.1, 0.05]))]
     starts = np.array([_moved(world_T_rig, 0.01, 4) for _, world_T_rig in pairs])
     pictures = [seen for seen, _ in pairs]
-    starts = fit(pictures, starts, COARSE, [plain], sigmas).world_T_rigs
-    found = fit(pictures, starts, FINE, [plain], sigmas)
+    starts = fit(pictures, starts, COARSE, [plain], priors).world_T_rigs
+    found = fit(pictures, starts, FINE, [plain], priors)
     projection = found.projections[0]
     assert isinstance(projection, PerspectiveProjection)
     assert projection.focal == pytest.approx(CAMERA.focal, rel=1e-3)

@@ -1,0 +1,345 @@
+"""Localisation of perspective photos: pose, focal length, principal point and distortion."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factors import tangent_basis
+from factors.sphere_image import SphereImage
+from gsba.camera.lens import ONE_CENTRE
+from gsba.camera.projections import PerspectiveProjection
+from gsba.camera.rig import owner_faces
+from gsba.localization.known_points import Sightings
+from gsba.localization.localizer import (
+    NO_PLACE,
+    NOT_DETERMINED,
+    TWO_PLACES,
+    LocalizedFrame,
+    Localizer,
+    Query,
+    typical_sigma,
+)
+from gsba.localization.photos import Photo, as_panorama, photo_features, photo_rig
+from gsba.localization.pose_fit import COARSE, FINE, CameraPrior, PoseFit, fit
+from gsba.localization.pose_search import (
+    Candidates,
+    is_rivalled,
+    is_significant,
+    least_of_rival,
+    search_focal,
+)
+from gsba.log import GsbaError, track
+from gsba.matching.guided_search import searchable
+from gsba.types import Features
+
+_NUM_PLACES = 10  # keyframes with a face that looks most like a photo
+_FIELDS_RAD = tuple(np.deg2rad([70.0, 45.0, 105.0]))  # of the longer side, tried where the focal
+# length is not known
+_MAX_ERROR_RAD = np.deg2rad(0.6)  # of a first pose's inliers: it leaves out the distortion
+_GATES_RAD = tuple(np.deg2rad([2.5, 1.0, 0.5]))  # around predicted bearings, round by round
+_MIN_POINTS = 15  # inliers of a fit
+_MAX_POSITION_SIGMA = 0.05  # of a position, in median distances of points
+_SAMPLE = 4  # points that determine a pose and a focal length
+_FOCALS = (0.1, 20.0)  # least and largest focal length, in longer sides
+_STIFF = 0.1  # share of the priors' standard deviations but the focal length's, in a first fit
+_CELLS_PER_SIDE = 64  # along 90 degrees: keypoints within one are one witness of a guided fit
+_NUM_PATCH_ROUNDS = 2
+_GATE_SIGMAS = 3.5
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoCamera:
+    """A camera that photos share."""
+
+    projection: PerspectiveProjection
+    covariance: np.ndarray  # (5, 5) float64: log focal length, principal point in focal lengths,
+    # two radial terms
+    photos: tuple[str, ...]  # names
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizedPhotos:
+    """Photos in a run's map, and their cameras."""
+
+    frames: tuple[LocalizedFrame, ...]  # of all photos; the pose is world_T_camera: x right, y
+    # down, z forward
+    cameras: tuple[PhotoCamera, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Placed:
+    """A photo with a pose and a camera of its own."""
+
+    photo: Photo
+    image: np.ndarray  # (H, W, 3) uint8
+    world_T_camera: np.ndarray  # (4, 4)
+    projection: PerspectiveProjection
+    seen: Sightings  # points that it shows, camera 0
+    num_inliers: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Recognised:
+    """A photo with a first pose and focal length."""
+
+    world_T_camera: np.ndarray  # (4, 4)
+    projection: PerspectiveProjection  # without distortion
+    candidates: Candidates  # that agree with them
+    pixels: np.ndarray  # (K, 2) of all keypoints
+    features: Features  # all keypoints
+    cut_by: PerspectiveProjection  # by which the photo was cut into faces for them
+
+
+def localize_photos(localizer: Localizer, photos: Sequence[Photo]) -> LocalizedPhotos:
+    """Poses of photos, and the cameras that they share.
+
+    Each photo is first placed alone; then all poses and cameras are fitted together, to keypoints
+    and to patches aligned below a pixel.
+
+    Args:
+        localizer: of the run.
+        photos: in any order.
+    """
+    placed: list[_Placed] = []
+    refused: dict[str, LocalizedFrame] = {}
+    for photo in track(photos, "localising photos", len(photos)):
+        try:
+            found = _place(localizer, photo)
+        except GsbaError as error:
+            found = str(error)
+        if isinstance(found, str):
+            refused[photo.name] = LocalizedFrame.refused(photo.name, found)
+        else:
+            placed.append(found)
+    together = _fit_together(localizer, placed) if placed else ([], ())
+    frames = refused | {frame.name: frame for frame in together[0]}
+    return LocalizedPhotos(tuple(frames[photo.name] for photo in photos), tuple(together[1]))
+
+
+def _place(localizer: Localizer, photo: Photo) -> _Placed | str:
+    """A photo placed by its keypoints; or the reason why it is not."""
+    image, reason = photo.load(), NO_PLACE
+    known = photo.focal is not None
+    focals = [photo.focal] if photo.focal else [photo.focal_of_field(f) for f in _FIELDS_RAD]
+    best: _Recognised | None = None
+    for focal in focals:
+        projection = photo.projection(focal)
+        features = _features(localizer, image, projection)
+        found, why = _recognise(localizer, photo, features, projection, known)
+        if found is None:
+            reason = why or reason
+        elif best is None or len(found.candidates) > len(best.candidates):
+            best = found
+    if best is None:
+        return reason
+    start, prior = best.projection, photo.prior_sigmas()
+    expected = photo.projection(photo.focal or start.focal)
+    stiff = np.concatenate([prior[:1], _STIFF * prior[1:]])
+    seen = _sightings(localizer, best.candidates, best.pixels, best.features, best.cut_by)
+    belief = CameraPrior(_step(start, expected), stiff)
+    fitted = fit([seen], best.world_T_camera[None], COARSE, [start], [belief])
+    features, cut_by = best.features, best.cut_by
+    for n, gate in enumerate(_GATES_RAD):
+        pose, projection = fitted.world_T_rigs[0], _perspective(fitted.projections[0])
+        if not _plausible(projection):
+            return NO_PLACE
+        if n == len(_GATES_RAD) - 1:  # faces once more, now that the projection is known
+            features, cut_by = _features(localizer, image, projection), projection
+        pixels = cut_by.project(features.bearings_rig)
+        query = _query(localizer, features, projection.unproject(pixels))
+        candidates = localizer.candidates_around(query, pose, gate)
+        if len(candidates) < _MIN_POINTS:
+            return NO_PLACE
+        seen = _sightings(localizer, candidates, pixels, features, cut_by)
+        belief = CameraPrior(_step(projection, expected), prior)
+        fitted = fit([seen], pose[None], FINE, [projection], [belief])
+    pose, projection = fitted.world_T_rigs[0], _perspective(fitted.projections[0])
+    sigma = float(fitted.noises[0]) * typical_sigma(seen.spreads) / projection.focal
+    chance = min((_GATE_SIGMAS * sigma / _GATES_RAD[-1]) ** 2, 0.5)
+    if not is_significant(candidates.bearings, fitted.inliers[0], chance, _SAMPLE, _CELLS_PER_SIDE):
+        return NO_PLACE
+    inliers = int(fitted.inliers[0].sum())
+    return _Placed(photo, image, pose, projection, seen, inliers)
+
+
+def _plausible(projection: PerspectiveProjection) -> bool:
+    """True if a camera could have this focal length."""
+    share = projection.focal / max(projection.width, projection.height)
+    return _FOCALS[0] < share < _FOCALS[1]
+
+
+def _step(start: PerspectiveProjection, to: PerspectiveProjection) -> np.ndarray:
+    """Step (5,) of the parameters from one projection to another, see `RadialProjection`."""
+    moved = (np.array(to.principal) - np.array(start.principal)) / start.focal
+    bent = np.array(to.radial) - np.array(start.radial)
+    return np.concatenate([[np.log(to.focal / start.focal)], moved, bent])
+
+
+def _features(
+    localizer: Localizer, image: np.ndarray, projection: PerspectiveProjection
+) -> Features:
+    rig = photo_rig(projection, localizer.map.rig)
+    return photo_features(image, projection, rig, localizer.extractor)
+
+
+def _query(localizer: Localizer, features: Features, bearings: np.ndarray) -> Query:
+    """Keypoints of a photo, ready to be matched, in directions (K, 3)."""
+    ready = replace(features, bearings_rig=bearings, faces=owner_faces(bearings))
+    every = searchable(ready, localizer.map.axes)
+    return Query(features, bearings, None, every, every)
+
+
+def _recognise(
+    localizer: Localizer,
+    photo: Photo,
+    features: Features,
+    projection: PerspectiveProjection,
+    known: bool,
+) -> tuple[_Recognised | None, str]:
+    """A first pose and focal length by the places that look most like a photo; or the reason."""
+    import pycolmap
+
+    if len(features) < _MIN_POINTS:
+        return None, NO_PLACE
+    query = _query(localizer, features, features.bearings_rig)
+    places = localizer.index.nearest_faces(query.all.descriptors, _NUM_PLACES)
+    candidates = localizer.candidates_of(query, places, strongest=False)
+    pixels = projection.project(candidates.bearings)
+    params = (projection.focal, photo.width / 2, photo.height / 2)
+    camera = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=photo.width, height=photo.height, params=params
+    )
+    max_error, seed = _MAX_ERROR_RAD * projection.focal, localizer.map.settings.seed
+    found = search_focal(pixels, candidates.points_world, camera, known, max_error, seed)
+    chance = np.pi * max_error**2 / (photo.width * photo.height)
+    if found is None or not is_significant(candidates.bearings, found.inliers, chance, _SAMPLE):
+        return None, ""
+    if not _plausible(photo.projection(found.focal)):
+        return None, ""
+    left = candidates.taken(~found.inliers)
+    rest, least = pixels[~found.inliers], least_of_rival(found)
+    rival = search_focal(rest, left.points_world, camera, known, max_error, seed, least)
+    if is_rivalled(found, rival, candidates):
+        return None, TWO_PLACES
+    start, agreeing = photo.projection(found.focal), candidates.taken(found.inliers)
+    every = projection.project(features.bearings_rig)
+    return _Recognised(found.world_T_rig, start, agreeing, every, features, projection), ""
+
+
+def _sightings(
+    localizer: Localizer,
+    candidates: Candidates,
+    pixels: np.ndarray,
+    features: Features,
+    cut_by: PerspectiveProjection,
+) -> Sightings:
+    """Candidates as pixels (K, 2) of the photo, with the noise of their keypoints."""
+    rows = candidates.keypoints
+    by_bearing = cut_by.jacobians(features.bearings_rig[rows])[0]
+    spreads = by_bearing @ np.swapaxes(by_bearing, 1, 2)
+    spreads *= features.sigmas_rad[rows, None, None] ** 2
+    covariances = localizer.map.point_covariances[candidates.points]
+    return Sightings(candidates.points_world, covariances, pixels[rows], spreads, camera=0)
+
+
+def _fit_together(
+    localizer: Localizer, placed: Sequence[_Placed]
+) -> tuple[list[LocalizedFrame], list[PhotoCamera]]:
+    """Poses and shared cameras of placed photos, by keypoints, then by patches."""
+    names = list(dict.fromkeys(one.photo.camera for one in placed))
+    numbers = [names.index(one.photo.camera) for one in placed]
+    groups = [[one for one in placed if one.photo.camera == name] for name in names]
+    leaders = [max(group, key=lambda one: one.num_inliers) for group in groups]
+    starts = [leader.projection for leader in leaders]
+    expected = [
+        leader.photo.projection(leader.photo.focal or leader.projection.focal) for leader in leaders
+    ]
+    sigmas = [leader.photo.prior_sigmas() for leader in leaders]
+    pictures = [replace(one.seen, camera=c) for one, c in zip(placed, numbers, strict=True)]
+    poses = np.array([one.world_T_camera for one in placed])
+
+    def solve(seen: Sequence[Sightings]) -> PoseFit:
+        steps = [_step(*pair) for pair in zip(starts, expected, strict=True)]
+        beliefs = [CameraPrior(*pair) for pair in zip(steps, sigmas, strict=True)]
+        return fit(seen, poses, FINE, starts, beliefs)
+
+    fitted = solve(pictures)
+    for _ in range(_NUM_PATCH_ROUNDS):
+        poses, starts = fitted.world_T_rigs, [_perspective(one) for one in fitted.projections]
+        pictures = [
+            _on_patches(localizer, one, pose, starts[c], seen)
+            for one, pose, c, seen in zip(placed, poses, numbers, pictures, strict=True)
+        ]
+        fitted = solve(pictures)
+    frames = [
+        _judged(localizer, one.photo.name, fitted, p, seen, numbers[p])
+        for p, (one, seen) in enumerate(zip(placed, pictures, strict=True))
+    ]
+    cameras = [
+        PhotoCamera(
+            _perspective(fitted.projections[c]),
+            fitted.camera_covariances[c][:5, :5],
+            tuple(one.photo.name for one in group),
+        )
+        for c, group in enumerate(groups)
+    ]
+    return frames, cameras
+
+
+def _perspective(projection: object) -> PerspectiveProjection:
+    assert isinstance(projection, PerspectiveProjection)
+    return projection
+
+
+def _on_patches(
+    localizer: Localizer,
+    placed: _Placed,
+    world_T_camera: np.ndarray,
+    projection: PerspectiveProjection,
+    before: Sightings,
+) -> Sightings:
+    """Points that patches find in a photo; the sightings before if they are too few."""
+    aligner, map_ = localizer.aligner, localizer.map
+    grey, mask = as_panorama(placed.image, projection, aligner.width)
+    places = localizer.nearest_keyframes(world_T_camera)
+    expected = aligner.expected(world_T_camera, places).shown_by(projection, world_T_camera, map_)
+    image = SphereImage.of(grey, smooth=True)
+    found = aligner.align(expected, world_T_camera, image, mask, False, ONE_CENTRE)
+    if len(found.points) < _MIN_POINTS:
+        return before
+    pixels = projection.project(found.bearings)
+    axes = projection.jacobians(found.bearings)[0] @ np.swapaxes(
+        tangent_basis(found.bearings), 1, 2
+    )
+    spreads = axes @ found.covariances @ np.swapaxes(axes, 1, 2)
+    points = map_.result.points_world[found.points]
+    uncertain = map_.point_covariances[found.points]
+    return Sightings(points, uncertain, pixels, spreads, camera=before.camera)
+
+
+def _judged(
+    localizer: Localizer, name: str, fitted: PoseFit, number: int, seen: Sightings, camera: int
+) -> LocalizedFrame:
+    """A photo with its pose, if that is determined."""
+    pose, inliers = fitted.world_T_rigs[number], fitted.inliers[number]
+    covariance = fitted.covariances[number]
+    offsets = seen.points_world[inliers] - pose[:3, 3]
+    if inliers.sum() < _MIN_POINTS or not np.isfinite(covariance).all():
+        return LocalizedFrame.refused(name, NOT_DETERMINED)
+    depth = float(np.median(np.linalg.norm(offsets, axis=1)))
+    if np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) > _MAX_POSITION_SIGMA * depth:
+        return LocalizedFrame.refused(name, NOT_DETERMINED)
+    focal = _perspective(fitted.projections[camera]).focal
+    noise = float(fitted.noises[number]) * typical_sigma(seen.spreads) / focal
+    frame = LocalizedFrame(
+        name,
+        pose,
+        covariance,
+        int(inliers.sum()),
+        noise,
+        localizer.nearest_keyframe(pose),
+        "",
+        camera,
+    )
+    return localizer.with_map_error(frame)
