@@ -17,7 +17,7 @@ def localize(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
     images: Annotated[
         list[Path],
-        typer.Argument(help="Pictures of the run's camera: files, folders or videos."),
+        typer.Argument(help="Panoramas of the run's camera, or photos: files, folders, videos."),
     ],
     out: Annotated[
         Path | None,
@@ -58,11 +58,11 @@ def localize(
     localizer = Localizer(run, map_number, precise=not fast)
     pictures = find_pictures(images, run, localizer.map.frames.layout, out)
     found = localize_all(localizer, pictures)
-    for frame in found:
+    for frame in found.frames:
         if not frame.found:
             typer.echo(f"{frame.name}: not localised: {frame.reason}", err=True)
-    write_localized(out, run, found, [picture.time for picture in pictures])
-    num = sum(frame.found for frame in found)
-    typer.echo(f"{num} of {len(found)} pictures localised: {out}")
-    if num < _ENOUGH * len(found) and not allow_partial:
+    write_localized(out, run, found, pictures)
+    num = sum(frame.found for frame in found.frames)
+    typer.echo(f"{num} of {len(pictures)} pictures localised: {out}")
+    if num < _ENOUGH * len(pictures) and not allow_partial:
         raise typer.Exit(PARTIAL)

@@ -1,6 +1,6 @@
 """Localisation of new frames in a finished run: recognised places, known points, a pose fit."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from gsba.frames.panorama import load_grey
 from gsba.geometry import adjoint, inverse
 from gsba.localization.known_points import Sightings, isotropic
 from gsba.localization.patch_sightings import PatchAligner
-from gsba.localization.pictures import Picture, load_panorama
+from gsba.localization.pictures import load_panorama
 from gsba.localization.place_index import PlaceIndex, open_index
 from gsba.localization.pose_fit import COARSE, FINE, PoseFit, fit
 from gsba.localization.pose_search import (
@@ -30,7 +30,7 @@ from gsba.localization.pose_search import (
     search_pose,
 )
 from gsba.localization.run_map import RunMap
-from gsba.log import GsbaError, track
+from gsba.log import GsbaError
 from gsba.matching.guided_search import Gate, Searchable, match_pair, searchable
 from gsba.types import Features, FrameSet, Keypoints
 
@@ -273,11 +273,23 @@ class Localizer:
         return self._gathered(query, places, match)
 
     def candidates_around(
-        self, query: Query, world_T_rig: np.ndarray, gate_rad: float
+        self,
+        query: Query,
+        world_T_rig: np.ndarray,
+        gate_rad: float,
+        recognised: np.ndarray | None = None,
     ) -> Candidates:
-        """Points of the nearest keyframes that look like keypoints near their predicted
-        bearing."""
+        """Points of the nearest keyframes that look like keypoints near their predicted bearing.
+
+        Args:
+            query: the picture.
+            world_T_rig: (4, 4) predicted pose.
+            gate_rad: around the prediction.
+            recognised: (N,) keyframes whose points are searched, too; None = no others.
+        """
         poses, places = self.map.result.world_T_rigs, self.nearest_keyframes(world_T_rig)
+        if recognised is not None:
+            places = np.union1d(places, recognised)
         gate, chosen = Gate.around_points(gate_rad), self.map.settings.matching
 
         def match(place: int) -> np.ndarray:
@@ -350,18 +362,3 @@ class Localizer:
 def typical_sigma(covariances: np.ndarray) -> float:
     """Median standard deviation per axis of covariances (N, 2, 2)."""
     return float(np.median(np.linalg.det(covariances) ** 0.25))
-
-
-def localize_all(localizer: Localizer, pictures: Sequence[Picture]) -> list[LocalizedFrame]:
-    """Localise pictures one after the other; one that cannot be read is refused with the reason."""
-    found = []
-    for picture in track(pictures, "localising", len(pictures)):
-        try:
-            if picture.frames is not None:
-                found.append(localizer.localize_frame(picture.frames, picture.frame))
-            else:
-                assert picture.path is not None
-                found.append(localizer.localize(picture.path, picture.name))
-        except GsbaError as error:
-            found.append(LocalizedFrame.refused(picture.name, str(error)))
-    return found

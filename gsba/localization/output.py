@@ -10,6 +10,8 @@ import numpy as np
 from gsba.disk import atomic_write, write_json
 from gsba.geometry import quaternion_from_rotation
 from gsba.localization.localizer import LocalizedFrame
+from gsba.localization.photo_localizer import LocalizedPhotos, PhotoCamera
+from gsba.localization.pictures import Picture
 from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory
 from gsba.version import __version__
@@ -19,9 +21,12 @@ _UPPER = np.triu_indices(6)
 
 
 def write_localized(
-    folder: Path, run: Path, frames: Sequence[LocalizedFrame], times: Sequence[float]
+    folder: Path, run: Path, found: LocalizedPhotos, pictures: Sequence[Picture]
 ) -> None:
     """Write `trajectory.tum`, `poses.csv` and `localized.json`, each whole or not at all.
+
+    The trajectory holds panoramas; photos, whose poses are those of their cameras, are in the other
+    two.
 
     Covariances are of the tangent [rotation (radians), translation (map units)] in the picture's
     frame, given the map.
@@ -29,13 +34,14 @@ def write_localized(
     Args:
         folder: made if missing.
         run: folder of the run that they were localised in.
-        frames: all pictures, those that are not localised too.
-        times: of each, seconds.
+        found: all pictures, those that are not localised too.
+        pictures: of the same order.
 
     Raises:
         GsbaError: the disk cannot be written.
     """
-    rows = [n for n, frame in enumerate(frames) if frame.found]
+    frames, times = found.frames, [picture.time for picture in pictures]
+    rows = [n for n, frame in enumerate(frames) if frame.found and frame.camera is None]
     order = sorted(rows, key=lambda n: times[n])
     if len({times[n] for n in rows}) == len(rows):
         stamps = np.array([times[n] for n in order], np.float64)
@@ -48,13 +54,17 @@ def write_localized(
     content = {
         "gsba": __version__,
         "run": str(run.resolve()),
-        "pictures": [_as_json(frame, time) for frame, time in zip(frames, times, strict=True)],
+        "pictures": [
+            _as_json(frame, picture) for frame, picture in zip(frames, pictures, strict=True)
+        ],
+        "cameras": [_camera_json(camera) for camera in found.cameras],
     }
     write_json(folder / "localized.json", content)
 
 
 def _write_table(path: Path, frames: Sequence[LocalizedFrame], times: Sequence[float]) -> None:
-    header = ["picture", "timestamp", "status", "reason", "points", "noise_deg", "nearest_frame"]
+    header = ["picture", "timestamp", "status", "reason", "camera"]
+    header += ["points", "noise_deg", "nearest_frame"]
     header += ["tx", "ty", "tz", "qw", "qx", "qy", "qz"]
     header += [f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in zip(*_UPPER, strict=True)]
 
@@ -64,7 +74,8 @@ def _write_table(path: Path, frames: Sequence[LocalizedFrame], times: Sequence[f
             table.writerow(header)
             for frame, time in zip(frames, times, strict=True):
                 status = "localised" if frame.found else "refused"
-                row = [frame.name, repr(float(time)), status, frame.reason]
+                camera = "" if frame.camera is None else frame.camera
+                row = [frame.name, repr(float(time)), status, frame.reason, camera]
                 numbers = [""] * (len(header) - len(row))
                 if frame.found:
                     values = (*_position_and_rotation(frame), *frame.covariance[_UPPER])
@@ -81,8 +92,11 @@ def _position_and_rotation(frame: LocalizedFrame) -> tuple[float, ...]:
     return (*frame.world_T_rig[:3, 3].tolist(), *wxyz.tolist())
 
 
-def _as_json(frame: LocalizedFrame, time: float) -> dict[str, Any]:
-    content: dict[str, Any] = {"name": frame.name, "timestamp": time, "reason": frame.reason}
+def _as_json(frame: LocalizedFrame, picture: Picture) -> dict[str, Any]:
+    content: dict[str, Any] = {"name": frame.name, "timestamp": picture.time}
+    content |= {"reason": frame.reason, "camera": frame.camera}
+    if picture.path is not None:
+        content["file"] = str(picture.path.resolve())
     if frame.found:
         content |= {
             "world_T_picture": frame.world_T_rig.tolist(),
@@ -92,3 +106,22 @@ def _as_json(frame: LocalizedFrame, time: float) -> dict[str, Any]:
             "nearest_frame": frame.nearest,
         }
     return content
+
+
+def _camera_json(camera: PhotoCamera) -> dict[str, Any]:
+    """Camera of photos: r = focal (t + k1 t^3 + k2 t^5), t the tangent of the angle from the
+    axis."""
+    projection = camera.projection
+    sigmas = np.sqrt(np.maximum(np.diag(camera.covariance), 0)) * np.array(
+        [projection.focal] * 3 + [1.0, 1.0]
+    )
+    return {
+        "model": "perspective",
+        "width": projection.width,
+        "height": projection.height,
+        "focal": projection.focal,
+        "principal": list(projection.principal),
+        "radial": list(projection.radial),
+        "sigmas": sigmas.tolist(),
+        "photos": list(camera.photos),
+    }

@@ -42,6 +42,8 @@ _MIN_POINTS = 15  # inliers of a fit
 _MAX_POSITION_SIGMA = 0.05  # of a position, in median distances of points
 _SAMPLE = 4  # points that determine a pose and a focal length
 _FOCALS = (0.1, 20.0)  # least and largest focal length, in longer sides
+_ANNEALED = (32.0, *COARSE, *FINE)  # scales of the loss of the first guided fit: a focal length
+# that a wall leaves open is far off for what is beside the wall
 _STIFF = 0.1  # share of the priors' standard deviations but the focal length's, in a first fit
 _CELLS_PER_SIDE = 64  # along 90 degrees: keypoints within one are one witness of a guided fit
 _NUM_PATCH_ROUNDS = 2
@@ -85,7 +87,8 @@ class _Recognised:
 
     world_T_camera: np.ndarray  # (4, 4)
     projection: PerspectiveProjection  # without distortion
-    candidates: Candidates  # that agree with them
+    places: np.ndarray  # (N,) keyframes that look most like it
+    candidates: Candidates  # that agree with its pose
     pixels: np.ndarray  # (K, 2) of all keypoints
     features: Features  # all keypoints
     cut_by: PerspectiveProjection  # by which the photo was cut into faces for them
@@ -122,43 +125,51 @@ def _place(localizer: Localizer, photo: Photo) -> _Placed | str:
     image, reason = photo.load(), NO_PLACE
     known = photo.focal is not None
     focals = [photo.focal] if photo.focal else [photo.focal_of_field(f) for f in _FIELDS_RAD]
-    best: _Recognised | None = None
+    best: _Placed | None = None
     for focal in focals:
         projection = photo.projection(focal)
         features = _features(localizer, image, projection)
-        found, why = _recognise(localizer, photo, features, projection, known)
-        if found is None:
+        start, why = _recognise(localizer, photo, features, projection, known)
+        if start is None:
             reason = why or reason
-        elif best is None or len(found.candidates) > len(best.candidates):
+            continue
+        found = _refine(localizer, photo, image, start)
+        if found is not None and (best is None or found.num_inliers > best.num_inliers):
             best = found
-    if best is None:
-        return reason
-    start, prior = best.projection, photo.prior_sigmas()
+    return best or reason
+
+
+def _refine(
+    localizer: Localizer, photo: Photo, image: np.ndarray, first: _Recognised
+) -> _Placed | None:
+    """A recognised photo fitted to all points around it; None if they contradict its pose."""
+    start, prior = first.projection, photo.prior_sigmas()
     expected = photo.projection(photo.focal or start.focal)
     stiff = np.concatenate([prior[:1], _STIFF * prior[1:]])
-    seen = _sightings(localizer, best.candidates, best.pixels, best.features, best.cut_by)
+    seen = _sightings(localizer, first.candidates, first.pixels, first.features, first.cut_by)
     belief = CameraPrior(_step(start, expected), stiff)
-    fitted = fit([seen], best.world_T_camera[None], COARSE, [start], [belief])
-    features, cut_by = best.features, best.cut_by
+    fitted = fit([seen], first.world_T_camera[None], COARSE, [start], [belief])
+    features, cut_by = first.features, first.cut_by
     for n, gate in enumerate(_GATES_RAD):
         pose, projection = fitted.world_T_rigs[0], _perspective(fitted.projections[0])
         if not _plausible(projection):
-            return NO_PLACE
+            return None
         if n == len(_GATES_RAD) - 1:  # faces once more, now that the projection is known
             features, cut_by = _features(localizer, image, projection), projection
         pixels = cut_by.project(features.bearings_rig)
         query = _query(localizer, features, projection.unproject(pixels))
-        candidates = localizer.candidates_around(query, pose, gate)
+        candidates = localizer.candidates_around(query, pose, gate, first.places)
         if len(candidates) < _MIN_POINTS:
-            return NO_PLACE
+            return None
         seen = _sightings(localizer, candidates, pixels, features, cut_by)
         belief = CameraPrior(_step(projection, expected), prior)
-        fitted = fit([seen], pose[None], FINE, [projection], [belief])
+        scales = _ANNEALED if n == 0 else FINE
+        fitted = fit([seen], pose[None], scales, [projection], [belief])
     pose, projection = fitted.world_T_rigs[0], _perspective(fitted.projections[0])
     sigma = float(fitted.noises[0]) * typical_sigma(seen.spreads) / projection.focal
     chance = min((_GATE_SIGMAS * sigma / _GATES_RAD[-1]) ** 2, 0.5)
     if not is_significant(candidates.bearings, fitted.inliers[0], chance, _SAMPLE, _CELLS_PER_SIDE):
-        return NO_PLACE
+        return None
     inliers = int(fitted.inliers[0].sum())
     return _Placed(photo, image, pose, projection, seen, inliers)
 
@@ -224,7 +235,7 @@ def _recognise(
         return None, TWO_PLACES
     start, agreeing = photo.projection(found.focal), candidates.taken(found.inliers)
     every = projection.project(features.bearings_rig)
-    return _Recognised(found.world_T_rig, start, agreeing, every, features, projection), ""
+    return _Recognised(found.world_T_rig, start, places, agreeing, every, features, projection), ""
 
 
 def _sightings(

@@ -22,6 +22,9 @@ _UNKNOWN_FOCAL_SIGMA = 0.5  # relative
 _PRINCIPAL_SIGMA = 0.01  # in focal lengths
 _RADIAL_SIGMAS = (0.1, 0.05)
 _MAX_DENSITY = 2.0  # of faces cut from photos, in pixel densities of the run's faces
+_MIN_SLOPE = (
+    0.1  # of the radius by the angle, focal lengths: beyond it distortion folds the picture
+)
 _MARGIN_PX = 2.0  # of a photo's border that is not sampled
 
 
@@ -149,10 +152,19 @@ def _pixels_of(
     pixels = projection.project(np.where(ahead[..., None], bearings, [0.0, 0.0, 1.0]))
     size = np.array([projection.width, projection.height])
     inside = ahead & (pixels > _MARGIN_PX).all(axis=-1) & (pixels < size - _MARGIN_PX).all(axis=-1)
-    # Distortion can carry rays from outside of the field of view back into the picture.
-    corners = np.array([[0.0, 0], [size[0], 0], [0, size[1]], size])
-    inside &= bearings[..., 2] > projection.unproject(corners)[:, 2].min() - 0.05
+    inside &= bearings[..., 2] > np.cos(_field_rad(projection))
     return np.where(inside[..., None], pixels, 0.0), inside
+
+
+def _field_rad(projection: PerspectiveProjection) -> float:
+    """Angle from the axis up to which distortion carries rays outward, and into the picture."""
+    angles = np.linspace(0, _MAX_FIELD_RAD / 2, 500)
+    radii, slopes = projection.radii(angles)
+    size, middle = (projection.width, projection.height), np.array(projection.principal)
+    corners = np.array([[0.0, 0], [size[0], 0], [0, size[1]], size]) - middle
+    furthest = float(np.linalg.norm(corners, axis=1).max()) / projection.focal
+    shown = np.logical_and.accumulate((slopes > _MIN_SLOPE) & (radii <= furthest))
+    return float(angles[shown].max(initial=0.0)) + angles[1]
 
 
 def _as_dense_as(

@@ -1,4 +1,4 @@
-"""Pictures to localise: files, folders and videos, as panoramas of the run's camera."""
+"""Pictures to localise: files, folders and videos, as panoramas or as photos."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,6 +27,7 @@ class Picture:
     path: Path | None  # a 2:1 panorama or a photo; None = a frame of `frames`
     frames: FrameSet | None = None  # frames of several images each, in the layout of the run's
     frame: int = 0  # its number among them
+    photo: bool = False  # True = a perspective photo
 
 
 def load_panorama(path: Path) -> np.ndarray:
@@ -42,7 +43,7 @@ def load_panorama(path: Path) -> np.ndarray:
 
 
 def find_pictures(sources: Sequence[Path], run: Path, layout: str, work: Path) -> list[Picture]:
-    """The pictures of files, folders and videos, in this order.
+    """The pictures of files, folders and videos, in this order; those of one name are refused.
 
     Args:
         sources: pictures, folders of them, or 360-degree videos.
@@ -65,7 +66,7 @@ def find_pictures(sources: Sequence[Path], run: Path, layout: str, work: Path) -
         if source.is_dir() and not in_files:
             found += _frames_of_several_images(source, run)
         else:
-            found += _single_images(source)
+            found += _single_images(source, layout)
     return _with_own_names(found)
 
 
@@ -73,10 +74,15 @@ def _images(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_file() and is_image(path))
 
 
-def _single_images(source: Path) -> list[Picture]:
-    """Panoramas or photos, one file each."""
+def _single_images(source: Path, layout: str) -> list[Picture]:
+    """Panoramas or photos, one file each: 2:1 pictures are panoramas where the run's frames are."""
+
+    def picture(path: Path, time: float) -> Picture:
+        panoramic = layout == "erp" and _is_panorama(path)
+        return Picture(path.stem, time, path, photo=not panoramic)
+
     if source.is_file():
-        return [Picture(source.stem, 0.0, source)]
+        return [picture(source, 0.0)]
     paths = _images(source)
     if not paths:
         raise GsbaError(f"{source}: holds no JPEG, PNG, WebP or TIFF image")
@@ -85,7 +91,16 @@ def _single_images(source: Path) -> list[Picture]:
     tagged = [(path,) for path in paths] if all(map(_is_whole, paths)) else []
     times, _ = frame_times(names, given, None, True, tagged)
     order = np.argsort(times, kind="stable")
-    return [Picture(names[n], float(times[n]), paths[n]) for n in order]
+    return [picture(paths[n], float(times[n])) for n in order]
+
+
+def _is_panorama(path: Path) -> bool:
+    """True if an image is 2:1, or cannot be read: it is refused where its pixels are."""
+    try:
+        width, height = image_size(path)
+    except GsbaError:
+        return True
+    return width == 2 * height
 
 
 def _is_whole(path: Path) -> bool:
@@ -107,7 +122,7 @@ def _frames_of_several_images(folder: Path, run: Path) -> list[Picture]:
 
 
 def _with_own_names(pictures: list[Picture]) -> list[Picture]:
-    """Pictures of several sources; those of one name are refused."""
+    """The pictures, none of which has the name of another one."""
     seen: set[str] = set()
     for picture in pictures:
         if picture.name in seen:

@@ -124,7 +124,9 @@ def _panorama(rng: np.random.Generator, num: int, sigma: float) -> tuple[Sightin
     points = (bearings * distances) @ world_T_rig[:3, :3].T + world_T_rig[:3, 3]
     noisy = bearings + rng.normal(0, sigma, (num, 3))
     noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
-    return Sightings(points, np.zeros((num, 3, 3)), noisy, isotropic(np.full(num, sigma))), world_T_rig
+    return Sightings(
+        points, np.zeros((num, 3, 3)), noisy, isotropic(np.full(num, sigma))
+    ), world_T_rig
 
 
 def _photo(rng: np.random.Generator, num: int, sigma_px: float) -> tuple[Sightings, np.ndarray]:

@@ -1,0 +1,142 @@
+"""Rendered photos of a tiny walk, localised in its finished run; tags and pixels of photos."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from tiny_run import Case
+
+from gsba import Localizer
+from gsba.camera.projections import PerspectiveProjection
+from gsba.camera.rig import CubeRig
+from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.demo.gallery import build_gallery
+from gsba.demo.render import render_erp
+from gsba.geometry import rotation_angle
+from gsba.localization import localize_photos, read_photo
+from gsba.localization.photos import Photo, as_panorama, photo_features, photo_rig
+from gsba.similarity import pose_similarity
+from gsba.trajectory.files import read_trajectory
+
+CAMERA = PerspectiveProjection(640, 480, 430.0, (323.0, 238.0), (-0.03, 0.01))
+UPRIGHT = PerspectiveProjection(480, 640, 300.0, (241.0, 322.0), (0.02, 0.0))  # 94 degrees high
+_WIDTH = 2048  # pixels of the panoramas that photos are cut from
+
+
+@pytest.fixture(scope="module")
+def taken(case: Case, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """Folder of photos, and their true poses and cameras by name."""
+    folder, truth = tmp_path_factory.mktemp("photos"), {}
+    rng, scene = np.random.default_rng(1), build_gallery()
+    for n, (frame, yaw, camera) in enumerate(
+        [(2, 20, CAMERA), (4, 110, CAMERA), (6, 200, CAMERA), (3, 300, UPRIGHT)]
+    ):
+        pose = case.truth.world_T_rigs[frame].copy()
+        turn = Rotation.from_euler("yx", [yaw, -5], degrees=True)
+        pose[:3, :3] = pose[:3, :3] @ turn.as_matrix()
+        pose[:3, 3] += rng.normal(0, 0.08, 3)
+        image = _photographed(scene, pose, camera, rng)
+        path = folder / f"photo{n}.jpg"
+        tags = Image.Exif()
+        if camera is CAMERA:
+            tags[0x010F], tags[0x0110] = "Maker", "Model"
+            diagonal = 430.0 * np.hypot(36, 24) / np.hypot(640, 480)
+            tags.get_ifd(0x8769)[0xA405] = round(diagonal)
+        Image.fromarray(image).save(path, quality=95, exif=tags)
+        truth[path.stem] = pose, camera
+    return folder, truth
+
+
+def test_photos_are_found_with_their_cameras(case: Case, taken: tuple[Path, dict]) -> None:
+    folder, truth = taken
+    localizer = Localizer(case.out)
+    photos = [read_photo(path) for path in sorted(folder.glob("*.jpg"))]
+    assert [photo.focal is None for photo in photos] == [False, False, False, True]
+    found = localize_photos(localizer, photos)
+    assert all(frame.found for frame in found.frames), [frame.reason for frame in found.frames]
+    assert [frame.camera for frame in found.frames] == [0, 0, 0, 1]
+    assert [len(camera.photos) for camera in found.cameras] == [3, 1]
+    for frame in found.frames:
+        pose, camera = truth[frame.name]
+        assert frame.camera is not None
+        projection = found.cameras[frame.camera].projection
+        assert projection.focal == pytest.approx(camera.focal, rel=6e-3)
+        moved = _in_truth(case, frame.world_T_rig)
+        assert np.linalg.norm(moved[:3, 3] - pose[:3, 3]) < 0.02
+        assert np.degrees(rotation_angle(moved[:3, :3].T @ pose[:3, :3])) < 0.3
+
+
+def test_a_photo_of_something_else_is_refused(case: Case, tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (30, 40, 3)).astype(np.uint8)
+    path = tmp_path / "other.png"
+    cv2.imwrite(str(path), cv2.resize(noise, (640, 480), interpolation=cv2.INTER_CUBIC))
+    found = localize_photos(Localizer(case.out), [read_photo(path)])
+    assert found.frames[0].reason == "no place of the map looks like it"
+    assert found.cameras == ()
+
+
+def test_tags_give_the_focal_length_and_the_shared_camera(tmp_path: Path) -> None:
+    def photo(name: str, size: tuple[int, int], focal: int | None) -> Photo:
+        tags = Image.Exif()
+        tags[0x0110] = "Phone"
+        if focal is not None:
+            tags.get_ifd(0x8769)[0xA405] = focal
+        Image.new("RGB", size).save(tmp_path / name, exif=tags)
+        return read_photo(tmp_path / name)
+
+    one, two = photo("a.jpg", (600, 400), 36), photo("b.jpg", (600, 400), 36)
+    assert one.focal == pytest.approx(600.0)  # 36 mm on film 36 mm wide
+    assert one.camera == two.camera
+    assert photo("c.jpg", (600, 400), 24).camera != one.camera
+    none = photo("d.jpg", (600, 400), None)
+    assert none.focal is None
+    assert none.camera != photo("e.jpg", (600, 400), None).camera
+
+
+def test_keypoints_on_faces_lie_where_the_photo_shows_them() -> None:
+    rng = np.random.default_rng(2)
+    image = np.full((480, 640, 3), 30, np.uint8)
+    spots = rng.uniform([40, 40], [600, 440], (30, 2)).astype(int)
+    for u, v in spots:
+        cv2.circle(image, (int(u), int(v)), 6, (230, 230, 230), -1, cv2.LINE_AA)
+    from gsba.config import FeatureSettings
+    from gsba.features import SiftExtractor
+
+    rig = photo_rig(CAMERA, CubeRig(256, np.deg2rad(96.0)))
+    found = photo_features(image, CAMERA, rig, SiftExtractor(FeatureSettings()))
+    pixels = CAMERA.project(found.bearings_rig)
+    off = np.linalg.norm(pixels[:, None] - (spots + 0.5), axis=2).min(axis=0)
+    assert np.median(off) < 0.3
+
+
+def test_a_photo_as_panorama_shows_its_pixels_in_their_directions() -> None:
+    columns = np.tile(np.linspace(0, 255, 640), (480, 1)).astype(np.uint8)
+    grey, mask = as_panorama(np.repeat(columns[..., None], 3, axis=2), CAMERA, 1024)
+    rows, found = np.nonzero(mask)
+    bearings = bearings_from_erp(np.column_stack([found + 0.5, rows + 0.5]), 1024, 512)
+    expected = (CAMERA.project(bearings)[:, 0] - 0.5) * 255 / 639
+    assert np.abs(grey[mask] - expected).max() < 2
+    assert 0.03 < mask.mean() < 0.2
+
+
+def _photographed(
+    scene, world_T_camera: np.ndarray, camera: PerspectiveProjection, rng: np.random.Generator
+) -> np.ndarray:
+    """A photo (H, W, 3) uint8 RGB of the gallery."""
+    panorama = render_erp(scene, world_T_camera, _WIDTH, _WIDTH // 2)
+    grid = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    bearings = camera.unproject(np.stack(grid, axis=-1))
+    pixels = (erp_from_bearings(bearings, _WIDTH, _WIDTH // 2) + 3.5).astype(np.float32)
+    padded = cv2.copyMakeBorder(panorama, 4, 4, 4, 4, cv2.BORDER_WRAP)
+    u, v = (np.ascontiguousarray(part) for part in np.moveaxis(pixels, -1, 0))
+    image = cv2.remap(padded, u, v, cv2.INTER_CUBIC) + 2 * rng.standard_normal((*u.shape, 3))
+    return np.clip(image + 0.5, 0, 255).astype(np.uint8)
+
+
+def _in_truth(case: Case, pose: np.ndarray) -> np.ndarray:
+    """A pose in the world of the truth."""
+    mapped = read_trajectory(case.out / "trajectory.tum").world_T_rigs
+    return pose_similarity(mapped, case.truth.world_T_rigs).poses(pose[None])[0]
