@@ -150,6 +150,9 @@ class KnownPointBlock:
             pair += 1
         return PoseSystem(diagonal, mixed, gradient, {_FAMILY: cost})
 
+    def products(self) -> None:
+        """None: the Hessian is only written out."""
+
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Cost at tentative values."""
         return self.costs(values)[_FAMILY]
