@@ -14,6 +14,7 @@ from gsba.config import FORMATS_OF
 from gsba.export.folder import output_folder
 from gsba.export.images import write_pictures
 from gsba.export.motion import UNKNOWN, Shutter
+from gsba.export.photos import FITTING, Photos, add_photos
 from gsba.export.pictures import FrameWriter
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement
@@ -24,6 +25,8 @@ from gsba.types import FrameSet, PoseStatus, Reconstruction
 from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
+
+NO_PHOTOS = Photos()
 
 
 class ExportFormat(StrEnum):
@@ -51,6 +54,7 @@ class ExportOptions:
     map_number: int = 1  # 1 = the largest map
     fetched: bool = False  # with the frames that were added where the map was weak
     shutter: Shutter = UNKNOWN  # for trainers that model blur and rolling rows
+    photos: Photos = NO_PHOTOS  # localised photos, as cameras of their own
 
 
 def export(
@@ -67,6 +71,7 @@ def export(
     map_number: int = 1,
     fetched: bool = False,
     shutter: Shutter = UNKNOWN,
+    photos: Photos = NO_PHOTOS,
 ) -> None:
     """Write one map of a reconstruction in another program's format.
 
@@ -91,13 +96,14 @@ def export(
         map_number: number of the map, 1 = the largest.
         fetched: also write the frames that were added where the map was weak (see `FrameSet`).
         shutter: times of the exposure, which nerfstudio's format states.
+        photos: localised photos, as cameras of their own beside the faces.
 
     Raises:
         GsbaError: `out` is in use or not seen by a worker, the format does not fit the frames,
             there is no such map, or the disk cannot be written; nothing is left behind then.
     """
     options = ExportOptions(
-        face_size, placement, link, lenses, images, map_number, fetched, shutter
+        face_size, placement, link, lenses, images, map_number, fetched, shutter, photos
     )
     export_all(reconstruction, frames, {to: out}, options, workers)
 
@@ -124,7 +130,7 @@ def export_all(
     face_size, link, images = options.face_size, options.link, options.images
     map_number, lenses = options.map_number, options.lenses
     for to in outs:
-        _require_fitting(to, frames, images)
+        _require_fitting(to, frames, images, options.photos)
     whole = reconstruction
     reconstruction, frames = one_map(whole, frames, map_number, "the reconstruction")
     if lenses:
@@ -140,7 +146,7 @@ def export_all(
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)
     read = fingerprint(path for path in files if path and path.exists())  # some formats read none
     key = __version__, reconstruction, frames, read, face_size, z_up, link, seen_by, images
-    key = (*key, options.shutter)
+    key = (*key, options.shutter, options.photos)
     writers: list[FrameWriter] = []
     with ExitStack() as folders:
         for to, out in outs.items():
@@ -154,6 +160,8 @@ def export_all(
                 writers += _write_panoramas(*given, z_up, link, seen_by)
             else:
                 writers += _write(*given, face_size, z_up, link, seen_by, options.shutter)
+            if options.photos.photos:
+                add_photos(partial, to.value, options.photos, placement)
             placement.write(partial / "transform.json")
         write_pictures(frames, writers, workers)
     for to, out in outs.items():
@@ -221,12 +229,17 @@ def _write_panoramas(
             return [panoramas.write_with_poses(*given, lenses, link)]
 
 
-def _require_fitting(to: ExportFormat, frames: FrameSet, images: str) -> None:
+def _require_fitting(to: ExportFormat, frames: FrameSet, images: str, photos: Photos) -> None:
     """Refuse images that the format cannot hold, and panoramas of frames that are cube faces."""
     fitting = FORMATS_OF.get(images, (to.value,))
     if to.value not in fitting:
         choices = ", ".join(fitting)
         raise GsbaError(f"--images {images} goes with {choices}, not with {to.value}")
+    if photos.photos and (to.value not in FITTING or images in ("fisheye", "panorama")):
+        raise GsbaError(
+            f"photos go beside cube faces in {', '.join(FITTING)}, not in {to.value} with "
+            f"--images {images}"
+        )
     if images == "panorama" and not frames.panoramic:
         raise GsbaError("--images panorama needs panoramas, these frames are cube faces: use cube")
 
