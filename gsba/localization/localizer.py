@@ -10,7 +10,7 @@ from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
 from gsba.bundle.stitching import corrected
 from gsba.camera.lens import ONE_CENTRE, Lenses
-from gsba.camera.rig import owner_faces
+from gsba.camera.rig import CubeRig, owner_faces
 from gsba.camera.sphere import dense_enough
 from gsba.features.detection import extract, gather
 from gsba.frames import cubemap
@@ -37,6 +37,8 @@ from gsba.types import Features, FrameSet, Keypoints
 _NUM_PLACES = 5  # keyframes that look most like a frame
 _NUM_MORE_PLACES = 16  # where these do not suffice
 _NUM_NEAREST = 10  # keyframes whose points are searched along predicted bearings
+_MAX_FACE_PX = 288  # across the faces on which keypoints of panoramas are found: they serve to find
+# the place, and cost in proportion to the area
 _WIDE_GATE_RAD, _NARROW_GATE_RAD = np.deg2rad(1.0), np.deg2rad(0.4)  # around predicted bearings
 _MIN_POINTS = 20  # inliers of a fit
 _MAX_POSITION_SIGMA = 0.05  # of a position, in median distances of points
@@ -105,6 +107,9 @@ class Localizer:
         self.extractor = self.map.make_extractor()
         self._field = SphereField(np.array(self.map.result.correction))
         self._precise = precise
+        rig = self.map.rig
+        small = self.map.frames.panoramic and rig.size > _MAX_FACE_PX
+        self._rig = CubeRig(_MAX_FACE_PX, rig.hfov_rad) if small else rig
         self.aligner = PatchAligner(self.map)
 
     def localize(self, image: Path | str | np.ndarray, name: str = "") -> LocalizedFrame:
@@ -120,7 +125,9 @@ class Localizer:
         if isinstance(image, np.ndarray):
             features = self._features_of(image)
             return self._localize_features(name or "image", features, lambda: self._grey(image))
-        return self.localize(load_panorama(Path(image)), name or Path(image).stem)
+        width = round(2 * np.pi * self._rig.focal)
+        erp = load_panorama(Path(image), max(width, self._precise * self.aligner.width))
+        return self.localize(erp, name or Path(image).stem)
 
     def localize_frame(self, frames: FrameSet, frame: int) -> LocalizedFrame:
         """Pose of one frame of a scanned folder, with its mask.
@@ -129,8 +136,8 @@ class Localizer:
             frames: of the layout of the run's frames.
             frame: its number.
         """
-        images, masks = cubemap.load(replace(frames, correction=()), frame, self.map.rig)
-        features = extract(images, masks, self.map.rig, self.extractor)
+        images, masks = cubemap.load(replace(frames, correction=()), frame, self._rig)
+        features = extract(images, masks, self._rig, self.extractor)
         raw, width = replace(frames, correction=()), self.aligner.width
 
         def grey() -> Grey:
@@ -144,10 +151,10 @@ class Localizer:
 
         if erp.ndim != 3 or erp.shape[1] != 2 * erp.shape[0] or erp.shape[2] != 3:
             raise GsbaError(f"an image of shape {erp.shape} is no panorama: (H, 2H, 3) is needed")
-        width = dense_enough(erp.shape[1], self.map.rig.focal)
+        width = dense_enough(erp.shape[1], self._rig.focal)
         if width < erp.shape[1]:
             erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
-        return extract(cubemap.cut(erp, self.map.rig), None, self.map.rig, self.extractor)
+        return extract(cubemap.cut(erp, self._rig), None, self._rig, self.extractor)
 
     def _grey(self, erp: np.ndarray) -> Grey:
         """Grey panorama of the aligner's width."""
@@ -229,7 +236,7 @@ class Localizer:
     def _query(self, features: Features) -> Query:
         """Keypoints ready to be matched, where they really point."""
         map_ = self.map
-        seen: Keypoints = corrected(gather([features]), self._field, map_.rig)
+        seen: Keypoints = corrected(gather([features]), self._field, self._rig)
         origins = None
         if lenses := self._own_lenses():
             seen = lenses.seen(seen)

@@ -30,8 +30,12 @@ class Picture:
     photo: bool = False  # True = a perspective photo
 
 
-def load_panorama(path: Path) -> np.ndarray:
+def load_panorama(path: Path, at_least: int) -> np.ndarray:
     """A panorama (H, 2H, 3) uint8 RGB.
+
+    Args:
+        path: its file.
+        at_least: width that is enough: JPEGs are decoded at a part of theirs.
 
     Raises:
         GsbaError: the file cannot be read, or is no 2:1 image.
@@ -39,7 +43,7 @@ def load_panorama(path: Path) -> np.ndarray:
     width, height = image_size(path)
     if width != 2 * height:
         raise GsbaError(f"{path}: is {width}x{height}; a panorama is 2:1")
-    return decode(path, (width, height))
+    return decode(path, (width, height), at_least=at_least)
 
 
 def find_pictures(sources: Sequence[Path], run: Path, layout: str, work: Path) -> list[Picture]:
