@@ -106,6 +106,14 @@ Pairs = Annotated[
     ),
 ]
 
+Located = Annotated[
+    Path | None,
+    typer.Option(
+        help="Folder of gsba localize: also write its photos, as cameras of their own.",
+        metavar="DIR",
+    ),
+]
+
 
 @command
 def export(
@@ -132,20 +140,14 @@ def export(
         bool, typer.Option("--link", help="Make hard links to unchanged frames, not copies.")
     ] = False,
     map_number: MapNumber = 1,
-    photos: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of gsba localize: also write its photos, as cameras of their own.",
-            metavar="DIR",
-        ),
-    ] = None,
+    photos: Located = None,
     exposure_ms: Exposure = None,
     cluster: Cluster = None,
 ) -> None:
     """Write a finished run as a dataset for another program."""
     from gsba.config_file import validated
     from gsba.export import export as write
-    from gsba.export.photos import Photos, read_photos
+    from gsba.export.photos import read_photos
     from gsba.export.trainers import format_of, how_to_start
     from gsba.store.folder import claim
 
@@ -166,7 +168,7 @@ def export(
     placed = place(reconstruction, frames, settings, known_baseline, noise)
     placed, shutter = replace(placed, map_number=map_number), shutter_of(run, exposure_ms)
     given = reconstruction, frames, folder, to, face_size, placed, link, lenses
-    beside = Photos() if photos is None else read_photos(photos, run)
+    beside = read_photos(photos, run)
     with connected(cluster) as client, hired(client, folder, frames) as workers:
         write(*given, images=images, workers=workers, shutter=shutter, photos=beside)
     if folder.resolve().is_relative_to(run.resolve()):

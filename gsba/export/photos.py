@@ -56,17 +56,19 @@ class Photos:
     cameras: tuple[PhotoCamera, ...] = ()
 
 
-def read_photos(folder: Path, run: Path) -> Photos:
+def read_photos(folder: Path | None, run: Path) -> Photos:
     """The photos that `gsba localize` found in a run.
 
     Args:
-        folder: that `gsba localize` wrote.
+        folder: that `gsba localize` wrote; None = no photos.
         run: folder of the run.
 
     Raises:
         GsbaError: the folder holds no list of localised photos, or one of another run; a photo is
             gone.
     """
+    if folder is None:
+        return Photos()
     path = folder / LIST
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
