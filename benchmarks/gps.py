@@ -22,16 +22,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.common import write_table
-from gsba.bundle import gps_factors, prior_factors
 from gsba.bundle.adjustment import (
     AdjustmentContext,
     adjust,
     landmark_block,
     pose_covariances,
-    values_of,
 )
+from gsba.bundle.families import Families, Family
 from gsba.bundle.fixes import FrameFixes
+from gsba.bundle.gps_factors import AnchoredFixes, GpsFixes, linear_factors
 from gsba.bundle.optimizer import marginal_covariances
+from gsba.bundle.prior_factors import X, values_of
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import GpsSettings, RefineSettings
 from gsba.demo.degrade import Drift, degrade
@@ -135,14 +137,11 @@ def fixes_of(walk: Walk, rng: np.random.Generator, wild: float) -> FrameFixes:
 def problem_of(walk: Walk, world_T_rigs: np.ndarray, fixes: FrameFixes | None) -> AdjustmentContext:
     """Context of an adjustment from these poses: priors and fixes."""
     settings = RefineSettings()
-    given = walk.coarse_T_rigs, settings.priors.faint(), None, None, world_T_rigs[0]
-    problem = AdjustmentContext(prior_factors.build(*given), RIG, settings, 1)
-    if fixes is None:
-        return problem
-    anchors = gps_factors.anchor(world_T_rigs, fixes, GpsSettings())
-    assert anchors is not None
-    ungauged = prior_factors.build(*given, gauge=False)
-    return replace(problem, anchors=anchors, ungauged=ungauged)
+    faint, first = settings.priors.faint(), world_T_rigs[0]
+    members: list[Family] = [TrajectoryPrior(walk.coarse_T_rigs, faint, first=first)]
+    members += [] if fixes is None else [GpsFixes(fixes, GpsSettings())]
+    families = Families(tuple(members)).fitted(Solution.without_points(world_T_rigs))
+    return AdjustmentContext(families, RIG, settings, 1)
 
 
 def solve(
@@ -169,18 +168,19 @@ def far_end(walk: Walk, solved: Solution, fixes: FrameFixes) -> tuple[float, flo
 def claimed_of(walk: Walk, solved: Solution, fixes: FrameFixes) -> float:
     """Sigma of the last tenth of the frames by the covariances of the adjustment, metres."""
     problem = problem_of(walk, solved.world_T_rigs, fixes)
-    assert problem.anchors is not None and problem.ungauged is not None
+    gps = next(one for one in problem.families.members if isinstance(one, AnchoredFixes))
     block = landmark_block(solved.landmarks, walk.keypoints, solved.noise, problem)
-    keys = [prior_factors.X(f) for f in range(len(walk.times))]
-    values = values_of(solved.world_T_rigs)
-    graph = gtsam.NonlinearFactorGraph(problem.ungauged)
-    graph.push_back(
-        gps_factors.linear_factors(
-            problem.anchors, solved.world_T_rigs, values, free_similarity=False
-        )
-    )
+    keys = [X(f) for f in range(len(walk.times))]
+    snapshot = replace(problem.families.snapshot(solved), gauge_held=True)
+    graph, values = gtsam.NonlinearFactorGraph(), values_of(solved.world_T_rigs)
+    for family in problem.families.members:
+        if family is not gps:
+            graph.push_back(family.graph(snapshot))
+    linear, own = linear_factors(gps.anchors, solved.world_T_rigs, free_similarity=False)
+    graph.push_back(linear)
+    values.insert(own)
     found, _ = marginal_covariances(graph, [block], values, keys)
-    scale = problem.anchors.level_from_map[0].scale
+    scale = gps.anchors.level_from_map[0].scale
     variances = np.einsum("fii->f", found[-len(keys) // 10 :, 3:, 3:])
     return scale * float(np.sqrt(variances.mean()))
 

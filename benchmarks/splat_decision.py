@@ -23,8 +23,10 @@ from unittest import mock
 
 import numpy as np
 
-from gsba.bundle import adjustment, prior_factors
+from gsba.bundle import adjustment
+from gsba.bundle.families import Families
 from gsba.bundle.optimizer import optimize
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.rig import CubeRig
 from gsba.evaluate.trajectory import evaluate
 from gsba.splat import refinement
@@ -89,12 +91,12 @@ def poor_frames(case: Case, seed: int) -> Given:
         sqrt_infos=None,
     )
     rig = CubeRig(SETTINGS.cubemap.face_size, np.pi / 2)  # bearings ask no face
-    priors = prior_factors.build(case.result.coarse.world_T_rigs, SETTINGS.priors)
-    problem = adjustment.AdjustmentContext(priors, rig, SETTINGS, 2)
+    priors = TrajectoryPrior(case.result.coarse.world_T_rigs, SETTINGS.priors)
+    problem = adjustment.AdjustmentContext(Families((priors,)), rig, SETTINGS, 2)
     block = adjustment.landmark_block(landmarks, keypoints, 1.0, problem)
-    values = adjustment.values_of(solved.world_T_rigs)
-    block.polish(values)
-    values = optimize(priors, [block], values, SETTINGS.solver).values
+    terms = problem.terms(solved)
+    block.polish(terms.values)
+    values = optimize(terms.graph, [block], terms.values, SETTINGS.solver).values
     poses = adjustment.poses_of(values, len(solved.world_T_rigs))
     landmarks = replace(landmarks, points_world=block.points_world)
     start = replace(solved, world_T_rigs=poses, landmarks=landmarks, noise=1.0)

@@ -22,8 +22,10 @@ from factors import tangent_basis
 from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
 from gsba import refine
-from gsba.bundle import adjustment, prior_factors, stitching, triangulation
+from gsba.bundle import adjustment, stitching, triangulation
+from gsba.bundle.families import Families
 from gsba.bundle.shared_parameters import of_points
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.frames import cubemap, panorama
 from gsba.geometry import angular_errors
@@ -57,10 +59,10 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
     keypoints = load_stage(run, "keypoints", Keypoints)
     start, rig = load_stage(run, "refined1", Solution), cubemap.rig_for(frames, settings.cubemap)
     greys = panorama.Greys(frames, settings.patches.max_width)
-    priors = prior_factors.build(start.world_T_rigs, settings.priors)
+    priors = TrajectoryPrior(start.world_T_rigs, settings.priors)
     used, held = split(start.landmarks, settings.seed)
     none, threads, workers = SphereField.none(), 2, Threads(2)
-    problem = adjustment.AdjustmentContext(priors, rig, settings, threads)
+    problem = adjustment.AdjustmentContext(Families((priors,)), rig, settings, threads)
 
     bearing = adjustment.adjust(
         used.tracks, keypoints, start, problem, settings.rounds.refined[-1:]

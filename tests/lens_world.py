@@ -6,10 +6,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from synthetic import RIG, World, make_world, unit, with_noise
 
-from gsba.bundle import adjustment, prior_factors, triangulation
+from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.camera_adjustment import solve_with_camera
+from gsba.bundle.families import Families
 from gsba.bundle.readout import CameraEstimate
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import owner_faces
 from gsba.config import CameraSettings, RefineSettings
@@ -58,9 +60,9 @@ def times(num_frames: int) -> np.ndarray:
 
 
 def problem_of(world: World, camera: CameraSettings | None = None) -> AdjustmentContext:
-    priors = prior_factors.build(world.world_T_rigs, SETTINGS.priors)
+    priors = TrajectoryPrior(world.world_T_rigs, SETTINGS.priors)
     settings = SETTINGS.model_copy(update={"camera": camera or SETTINGS.camera})
-    return AdjustmentContext(priors, RIG, settings, 2)
+    return AdjustmentContext(Families((priors,)), RIG, settings, 2)
 
 
 def solved_under(

@@ -7,8 +7,9 @@ import gtsam
 import numpy as np
 from tiny_run import SETTINGS, Case
 
-from gsba.bundle import prior_factors
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.families import Families
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.frames import cubemap
 from gsba.splat import refinement
@@ -38,9 +39,11 @@ def spoiled(case: Case, degrees: float, distance: float, noise: float, seed: int
 
 
 def run(case: Case, given: Given, settings: RefineSettings, **options) -> SplatResult:
-    priors = prior_factors.build(case.result.coarse.world_T_rigs, settings.priors)
+    priors = TrajectoryPrior(case.result.coarse.world_T_rigs, settings.priors)
     rig = cubemap.rig_for(case.result.frames, settings.cubemap)
-    return refinement.refine(*given, AdjustmentContext(priors, rig, settings, 2), **options)
+    return refinement.refine(
+        *given, AdjustmentContext(Families((priors,)), rig, settings, 2), **options
+    )
 
 
 Harm = Callable[[np.ndarray, np.random.Generator], np.ndarray]  # of steps (F, 6), tangents

@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gsba.bundle.families import Family, MapSnapshot
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.geometry import inverse, pose
 from gsba.types import Features, Keypoints, Tracks
@@ -21,6 +23,18 @@ class World:
     keypoints: Keypoints  # bearings with noise
     tracks: Tracks  # which keypoint shows which point; some do not
     false: np.ndarray  # (O,) bool, observations of something else
+
+
+class GivenFactors(Family):
+    """A family of factors that do not depend on the map."""
+
+    name, digest = "given", "1"
+
+    def __init__(self, factors: gtsam.NonlinearFactorGraph) -> None:
+        self.factors = factors
+
+    def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
+        return self.factors
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol, Self, TypeVar
 
@@ -18,9 +18,9 @@ from factors import (
     RobustLoss,
     tangent_basis,
 )
-from gsba.bundle import gps_factors, prior_factors, triangulation
+from gsba.bundle import prior_factors, triangulation
 from gsba.bundle.families import Families, FamilyTerms
-from gsba.bundle.gps_factors import Anchors
+from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.optimizer import marginal_covariances, optimize
 from gsba.bundle.prior_factors import poses_of, values_of
 from gsba.camera.rig import RIG_R_FACE, CubeRig
@@ -44,76 +44,59 @@ DRAWS = 500  # errors of all poses, that tell how those of different ones belong
 _AT_ONCE = 1 << 18  # observations whose residuals are found together
 _REDUNDANT = 0.1  # least share of residual dimensions left over by the poses
 _FLAT = 1e-12  # of the information of a point, beside it: one that rays leave open has no inverse
-_GPS_DAMPING, _GPS_TOLERANCE = 1e-9, 1e-7  # of adjustments with GPS: drift is long and soft
+_DRIFT_DAMPING, _DRIFT_TOLERANCE = 1e-9, 1e-7  # first damping and relative tolerance of adjustments
+# with a family that limits drift
 _LEAST_LEFT = 1e-3  # share of a residual that a point leaves over, or it says nothing of noise
 
 
 @dataclass(frozen=True, slots=True)
 class Terms:
-    """Factors and blocks that an adjustment minimises, and its start."""
+    """Factors and blocks that an adjustment minimises, and its start values."""
 
     graph: gtsam.NonlinearFactorGraph
     blocks: tuple[Block, ...]
     values: gtsam.Values  # poses and families' own variables
-    own: FamilyTerms  # those of families among them
+    own: FamilyTerms  # the part of families
 
 
 @dataclass(frozen=True, slots=True)
 class AdjustmentContext:
-    """What all adjustments at one time of a run share."""
+    """Families, settings and faces that all adjustments at one time of a run share."""
 
-    priors: gtsam.NonlinearFactorGraph  # factors on the poses, gauge included
+    families: Families  # of residuals beside those of landmarks: trajectory prior, sensors, callers
     rig: CubeRig  # the faces, for the reprojection family
-    settings: RefineSettings  # families, loss, solver, rounds
+    settings: RefineSettings  # landmark families, loss, solver, rounds
     num_threads: int  # of the solver
-    turning: GyroConstraints | None = None  # of the frames; `priors` hold its factors on poses
-    anchors: Anchors | None = None  # GPS fixes in the world of the poses; None = there are none
-    ungauged: gtsam.NonlinearFactorGraph | None = None  # `priors` without the gauge, which anchors
-    # or families give; None = neither does
-    families: Families = field(
-        default_factory=Families
-    )  # of residuals that the caller or a package added
     maps: np.ndarray | None = None  # (F,) map of each frame, for the families; None = there is one
 
+    @property
+    def turning(self) -> GyroConstraints | None:
+        """The gyro's measurements of the frames; None where no gyro is used."""
+        gyros = (family for family in self.families.members if isinstance(family, GyroTurns))
+        return next((gyro.turning for gyro in gyros), None)
+
     def terms(self, solved: Solution) -> Terms:
-        """Priors, gauge, GPS and families of an adjustment that starts from a solution.
+        """Terms of all families for an adjustment that starts from a solution.
 
         Raises:
             GsbaError: a family whose factors are about variables without a value.
         """
-        own, graph = self.families.terms(solved, self.maps), self.graph
-        values = values_of(solved.world_T_rigs)
-        if self.families.members:
-            graph = gtsam.NonlinearFactorGraph(graph)
-            graph.push_back(own.graph)
-            values.insert(own.values)
-        return Terms(graph, own.blocks, values, own)
+        own, values = self.families.terms(solved, self.maps), values_of(solved.world_T_rigs)
+        values.insert(own.values)
+        return Terms(own.graph, own.blocks, values, own)
 
-    @property
-    def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Factors on the poses beside what images and families say: priors, gauge, GPS."""
-        if self.ungauged is None:
-            return self.priors
-        graph = gtsam.NonlinearFactorGraph(self.ungauged)
-        if self.anchors is not None:
-            graph.push_back(gps_factors.factors(self.anchors))
-        return graph
-
-    def held(
-        self, world_T_rigs: np.ndarray, values: gtsam.Values, maps: np.ndarray | None
-    ) -> gtsam.NonlinearFactorGraph:
-        """The same for covariances: the first pose and the extent of each map are held fixed.
+    def covariance_terms(self, solved: Solution, maps: np.ndarray | None) -> Terms:
+        """As `terms`, for covariances: the first pose and the extent of each map are held fixed.
 
         Args:
-            world_T_rigs: (F, 4, 4) poses.
-            values: of the poses; further variables that GPS asks for are added.
+            solved: poses, and own variables of families.
             maps: (F,) map of each frame; None = there is one.
         """
-        graph = gtsam.NonlinearFactorGraph(self.priors)
-        graph.push_back(prior_factors.fixed_scale(world_T_rigs, maps))
-        if self.anchors is not None:
-            graph.push_back(gps_factors.linear_factors(self.anchors, world_T_rigs, values))
-        return graph
+        own = self.families.covariance_terms(solved, self.maps)
+        graph, values = gtsam.NonlinearFactorGraph(own.graph), values_of(solved.world_T_rigs)
+        graph.push_back(prior_factors.fixed_scale(solved.world_T_rigs, maps))
+        values.insert(own.values)
+        return Terms(graph, own.blocks, values, own)
 
 
 class View(Protocol):
@@ -129,7 +112,7 @@ class View(Protocol):
         ...
 
     def terms(
-        self, solved: Solution, noise: float, problem: AdjustmentContext
+        self, solved: Solution, noise: float, context: AdjustmentContext
     ) -> "tuple[Terms, Callable[[gtsam.Values], Self]]":
         """Terms that an adjustment from a solution minimises, and the view at the values it finds.
 
@@ -154,18 +137,18 @@ class FixedRays:
         return FixedRays(keypoints)
 
     def terms(
-        self, solved: Solution, noise: float, problem: AdjustmentContext
+        self, solved: Solution, noise: float, context: AdjustmentContext
     ) -> tuple[Terms, Callable[[gtsam.Values], "FixedRays"]]:
         """Their block beside priors and families; rays stay."""
         block, terms = (
-            landmark_block(solved.landmarks, self.keypoints, noise, problem),
-            problem.terms(solved),
+            landmark_block(solved.landmarks, self.keypoints, noise, context),
+            context.terms(solved),
         )
         return replace(terms, blocks=(block, *terms.blocks)), lambda _: self
 
 
 def adjust_sighted(
-    sighted: Sighted, before: Solution, problem: AdjustmentContext, gates: Sequence[float]
+    sighted: Sighted, before: Solution, context: AdjustmentContext, gates: Sequence[float]
 ) -> tuple[Solution, Keypoints]:
     """As `adjust`, of aligned and former observations, the noise of either estimated on its own.
 
@@ -173,12 +156,12 @@ def adjust_sighted(
         The solution, and its keypoints with the noise that they turned out to have.
     """
     view = FixedRays(sighted.keypoints)
-    solved, seen = adjust_sighted_through(view, sighted, before, problem, gates)
+    solved, seen = adjust_sighted_through(view, sighted, before, context, gates)
     return solved, seen.keypoints
 
 
 def adjust_sighted_through(
-    view: V, sighted: Sighted, before: Solution, problem: AdjustmentContext, gates: Sequence[float]
+    view: V, sighted: Sighted, before: Solution, context: AdjustmentContext, gates: Sequence[float]
 ) -> tuple[Solution, V]:
     """As `adjust_sighted`, through a camera that may be solved for, too.
 
@@ -186,12 +169,12 @@ def adjust_sighted_through(
         view: of the observations.
         sighted: their tracks, and which of them are aligned.
     """
-    solved, rounds, settings = before, [], problem.settings
+    solved, rounds, settings = before, [], context.settings
     for number, gate in enumerate(gates, 1):
         there = rescale_noise(replace(sighted, keypoints=view.keypoints), solved, settings)
         view, start = view.with_noise_of(there.keypoints), replace(solved, noise=1.0)
         solver = _solver(settings, last=number == len(gates))
-        so_far = replace(problem, settings=settings.model_copy(update={"solver": solver}))
+        so_far = replace(context, settings=settings.model_copy(update={"solver": solver}))
         solved, view = adjust_through(view, sighted.tracks, start, so_far, (gate,))
         rounds += solved.rounds
     return replace(solved, rounds=tuple(rounds)), view
@@ -225,7 +208,7 @@ def adjust(
     tracks: Tracks,
     keypoints: Keypoints,
     start: Solution,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
     gates: Sequence[float],
     final: bool = True,
 ) -> Solution:
@@ -239,18 +222,18 @@ def adjust(
         tracks: candidate tracks; every round starts from all of them.
         keypoints: of all frames.
         start: poses to start from, and the noise known so far.
-        problem: priors, families, loss, solver.
+        context: priors, families, loss, solver.
         gates: of each round, in standard deviations of the noise.
         final: whether the last round is solved to the end; others lose observations anyway.
     """
-    return adjust_through(FixedRays(keypoints), tracks, start, problem, gates, final)[0]
+    return adjust_through(FixedRays(keypoints), tracks, start, context, gates, final)[0]
 
 
 def adjust_through(
     view: V,
     tracks: Tracks,
     start: Solution,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
     gates: Sequence[float],
     final: bool = True,
 ) -> tuple[Solution, V]:
@@ -259,19 +242,19 @@ def adjust_through(
     Returns:
         The solution and the view that belongs to it.
     """
-    solved, rounds, settings = replace(start, rounds=()), [], problem.settings
-    place = partial(_placed, tracks, problem=problem)
+    solved, rounds, settings = replace(start, rounds=()), [], context.settings
+    place = partial(_placed, tracks, context=context)
     last_gate = gates[-1] * start.noise
     support = len(place(view.keypoints, solved.world_T_rigs, last_gate).tracks)
     for number, gate in enumerate(gates, 1):
         landmarks = place(view.keypoints, solved.world_T_rigs, gate * solved.noise)
         spread = solved.noise * max(1.0, gate / settings.rounds.gate_scale)
         solver = _solver(settings, last=final and number == len(gates))
-        if problem.anchors is not None:
-            finer = {"lambda_initial": _GPS_DAMPING, "relative_tolerance": _GPS_TOLERANCE}
+        if context.families.limit_drift:
+            finer = {"lambda_initial": _DRIFT_DAMPING, "relative_tolerance": _DRIFT_TOLERANCE}
             solver = solver.model_copy(update=finer)
         here = replace(solved, landmarks=landmarks)
-        terms, after = view.terms(here, spread, problem)
+        terms, after = view.terms(here, spread, context)
         result = optimize(terms.graph, terms.blocks, terms.values, solver)
         poses, then = poses_of(result.values, len(solved.world_T_rigs)), after(result.values)
         new_support = len(place(then.keypoints, poses, last_gate).tracks)
@@ -298,11 +281,11 @@ def _placed(
     world_T_rigs: np.ndarray,
     gate: float,
     *,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
 ) -> Landmarks:
     """Points of tracks within a gate, in the keypoints' own standard deviations."""
-    settings = problem.settings.triangulate
-    return triangulation.place(tracks, keypoints, world_T_rigs, gate, settings, problem.num_threads)
+    settings = context.settings.triangulate
+    return triangulation.place(tracks, keypoints, world_T_rigs, gate, settings, context.num_threads)
 
 
 def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
@@ -314,16 +297,16 @@ def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
 
 
 def landmark_block(
-    landmarks: Landmarks, keypoints: Keypoints, noise: float, problem: AdjustmentContext
+    landmarks: Landmarks, keypoints: Keypoints, noise: float, context: AdjustmentContext
 ) -> LandmarkBlock:
     """The factor block of the chosen families; several share each observation's information.
 
     Args:
         landmarks, keypoints: what is observed, where.
         noise: of the observations, in units of the keypoints' own sigmas.
-        problem: faces, families, loss.
+        context: faces, families, loss.
     """
-    rig, settings = problem.rig, problem.settings
+    rig, settings = context.rig, context.settings
     tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
     share = noise * np.sqrt(len({"bearing", "reprojection"} & set(settings.factors)))
     terms, origins = [], keypoints.origins_of(rows)
@@ -349,24 +332,22 @@ def landmark_block(
         landmarks.points_world,
         terms,
         RobustLoss(settings.solver.loss, settings.solver.loss_sigmas),
-        problem.num_threads,
+        context.num_threads,
     )
 
 
 def pose_covariances(
     solved: Solution,
     keypoints: Keypoints,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
     components: np.ndarray | None = None,
 ) -> tuple[np.ndarray, JointErrors]:
     """Marginal covariances (F, 6, 6) with the first pose and the extent of each map held fixed."""
-    block = landmark_block(solved.landmarks, keypoints, solved.noise, problem)
+    block = landmark_block(solved.landmarks, keypoints, solved.noise, context)
     keys = [prior_factors.X(f) for f in range(len(solved.world_T_rigs))]
-    terms = problem.terms(solved)
-    held = problem.held(solved.world_T_rigs, terms.values, components)
-    held.push_back(terms.own.graph)
-    blocks, seed = [block, *terms.blocks], problem.settings.seed
-    return marginal_covariances(held, blocks, terms.values, keys, DRAWS, seed)
+    terms, seed = context.covariance_terms(solved, components), context.settings.seed
+    blocks = [block, *terms.blocks]
+    return marginal_covariances(terms.graph, blocks, terms.values, keys, DRAWS, seed)
 
 
 def _noise(

@@ -104,13 +104,12 @@ class CameraSystem:
         Args:
             components: (F,) map of each frame; None = there is one.
         """
-        unknowns, terms = self._unknowns(), self.problem.terms(self.solved)
+        unknowns, terms = self._unknowns(), self.problem.covariance_terms(self.solved, components)
         terms.values.insert(unknowns.values)
         block = unknowns.block(self.solved.landmarks, self.shown, self.solved.noise)
         block.polish(terms.values)
         num = len(self.solved.world_T_rigs)
-        graph = self.problem.held(self.solved.world_T_rigs, terms.values, components)
-        graph.push_back(terms.own.graph)
+        graph = gtsam.NonlinearFactorGraph(terms.graph)
         graph.push_back(unknowns.graph)
         beside = [key for key, _ in unknowns.variables.shared]
         found, joint = marginal_covariances(

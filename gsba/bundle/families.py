@@ -1,12 +1,14 @@
-"""Families of residuals beside those of images: one object adds all that a sensor or a plan knows.
+"""Families of residuals: one object adds everything that one source of knowledge contributes.
 
-A family has factors, and variables of its own if need be: a barometer has heights and a bias, tags
-have poses, wheels a scale. It is asked anew whenever the map changes, so that its factors always
-belong to the poses that they are solved with.
+The trajectory prior, the gyro and GPS are families, and so are those of callers and packages. A
+family has factors, and variables of its own if need be: a barometer has a bias, tags have poses. It
+builds its factors anew whenever the map changes, so that they always belong to the poses that they
+are solved with.
 """
 
+import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import gtsam
@@ -30,18 +32,24 @@ class MapSnapshot:
     # of their own until they are joined
     landmarks: Landmarks  # points so far; none before the first adjustment
     variables: gtsam.Values  # of all families, as the last adjustment left them; empty before it
+    gauge_held: bool = False  # another family holds the world and scale of the first frame's map:
+    # the trajectory prior does not hold the first pose then
 
 
 class Family(Protocol):
-    """Residuals of one kind, their variables, and what the report says of them.
+    """Residuals of one kind, their variables, and their part of the report.
 
     Subclass it; only `name`, `digest` and one of `graph` and `blocks` are needed. Keys of frames
-    are `gsba.X(frame)`; keys of own variables are `gtsam.symbol` with a capital letter.
+    are `gsba.X(frame)`; keys of own variables are `gtsam.symbol` with a capital letter. An instance
+    is never changed: `fitted` and `for_covariances` return another one.
     """
 
     name: str  # in settings, in the report and in messages
     digest: str  # of all that the family depends on: results are resumed while it stays the same
-    fixes_gauge: bool = False  # it knows the scale, or the world: the result stays where it says
+    fixes_gauge: bool = False  # its scale or world becomes that of the result
+    limits_drift: bool = False  # its residuals bend long paths softly: adjustments start with
+    # little damping and converge to a finer tolerance
+    reserved_letters: str = ""  # small letters of own keys, which only families of gsba have
 
     def variables(self, snapshot: MapSnapshot) -> gtsam.Values:
         """Own variables with the values to start from."""
@@ -54,6 +62,25 @@ class Family(Protocol):
     def blocks(self, snapshot: MapSnapshot) -> Sequence[Block]:
         """Many residuals held as arrays, see `factors.Block`."""
         return ()
+
+    def holds_gauge(self, snapshot: MapSnapshot) -> bool:
+        """Whether its factors determine world and scale of the first frame's map."""
+        return self.fixes_gauge
+
+    def fitted(self, snapshot: MapSnapshot) -> "Family | None":
+        """The family for one adjustment, asked for once at its start: all rounds minimise one cost.
+
+        Returns:
+            The family, for instance without outliers; None = it contributes nothing to this map.
+        """
+        return self
+
+    def for_covariances(self, snapshot: MapSnapshot) -> "Family":
+        """The family with the factors that covariances are computed from.
+
+        The first pose and the extent of each map are held fixed there, whatever `holds_gauge` says.
+        """
+        return self
 
     def report(self, snapshot: MapSnapshot) -> Mapping[str, Any]:
         """The family's part of report.json, under `families.NAME`: JSON values of the final map."""
@@ -76,7 +103,7 @@ class FamilyTerms:
 
 @dataclass(frozen=True, slots=True)
 class Families:
-    """The families of a run, and the frames that they are told of."""
+    """The families of a run, and the frames of their snapshots."""
 
     members: tuple[Family, ...] = ()
     names: tuple[str, ...] = ()  # (F) of the frames
@@ -85,20 +112,28 @@ class Families:
     def __post_init__(self) -> None:
         names = [family.name for family in self.members]
         for name in {name for name in names if names.count(name) > 1}:
-            raise GsbaError(f"family {name} is there twice: names are what reports tell apart by")
+            raise GsbaError(f"two families are named {name}: give each a name of its own")
+
+    def with_members(self, members: Iterable[Family]) -> "Families":
+        """Other families of the same frames."""
+        return replace(self, members=tuple(members))
 
     @property
     def fixing_gauge(self) -> "Families":
-        """Those that know scale or world."""
-        members = tuple(family for family in self.members if family.fixes_gauge)
-        return Families(members, self.names, self.timestamps)
+        """The families whose scale or world becomes that of the result."""
+        return self.with_members(family for family in self.members if family.fixes_gauge)
+
+    @property
+    def limit_drift(self) -> bool:
+        """Whether a family limits drift: see `Family.limits_drift`."""
+        return any(family.limits_drift for family in self.members)
 
     def digests(self) -> list[tuple[str, str]]:
         """Names and digests of the families, on which results rest."""
         return [(family.name, family.digest) for family in self.members]
 
     def snapshot(self, solved: Solution, maps: np.ndarray | None = None) -> MapSnapshot:
-        """A solution as families see it.
+        """The snapshot of a solution that families build their factors from.
 
         Args:
             solved: poses, points, and own variables so far.
@@ -109,35 +144,65 @@ class Families:
         given = self.names, self.timestamps, solved.world_T_rigs, of_frames
         return MapSnapshot(*given, solved.landmarks, variables)
 
+    def fitted(self, solved: Solution, maps: np.ndarray | None = None) -> "Families":
+        """The families for one adjustment that starts from a solution: see `Family.fitted`."""
+        snapshot = self.snapshot(solved, maps)
+        fitted = (family.fitted(snapshot) for family in self.members)
+        return self.with_members(family for family in fitted if family is not None)
+
     def terms(self, solved: Solution, maps: np.ndarray | None = None) -> FamilyTerms:
         """Factors, blocks and variables of all families, for an adjustment from a solution.
+
+        Args:
+            solved: poses, points, and own variables so far.
+            maps: (F,) map of each frame; None = there is one.
 
         Raises:
             GsbaError: a factor on a variable that has no value, or a variable that two families
                 have, or whose key is not a family's.
         """
-        graph, blocks, values = gtsam.NonlinearFactorGraph(), list[Block](), gtsam.Values()
-        if not self.members:
-            return FamilyTerms(graph, (), values)
-        snapshot, frames = self.snapshot(solved, maps), len(solved.world_T_rigs)
-        poses = {X(f) for f in range(frames)}
-        for family in self.members:
-            own = family.variables(snapshot)
-            _check_keys(family, own, values)
-            known = poses | set(own.keys())
-            factors, arrays = family.graph(snapshot), tuple(family.blocks(snapshot))
-            for n in range(factors.size()):
-                _check_known(family, f"factor {n}", factors.at(n).keys(), known)
-            for block in arrays:
-                _check_known(family, "a block", block.keys, known)
-            values.insert(own)
-            graph.push_back(factors)
-            blocks += arrays
-        start = values_of(solved.world_T_rigs)
+        snapshot = self.snapshot(solved, maps)
+        held = any(family.holds_gauge(snapshot) for family in self.members)
+        return _terms_of(self.members, replace(snapshot, gauge_held=held))
+
+    def covariance_terms(self, solved: Solution, maps: np.ndarray | None = None) -> FamilyTerms:
+        """As `terms`, for covariances: the trajectory prior holds the first pose."""
+        snapshot = self.snapshot(solved, maps)
+        return _terms_of([family.for_covariances(snapshot) for family in self.members], snapshot)
+
+
+def _terms_of(families: Sequence[Family], snapshot: MapSnapshot) -> FamilyTerms:
+    """Factors, blocks and variables of families; see `Families.terms`."""
+    graph, blocks, values = gtsam.NonlinearFactorGraph(), list[Block](), gtsam.Values()
+    poses = {X(f) for f in range(len(snapshot.world_T_rigs))}
+    for family in families:
+        own = family.variables(snapshot)
+        _check_keys(family, own, values)
+        known = poses | set(own.keys())
+        factors, arrays = family.graph(snapshot), tuple(family.blocks(snapshot))
+        for n in range(factors.size()):
+            _check_known(family, f"factor {n}", factors.at(n).keys(), known)
+        for block in arrays:
+            _check_known(family, "a block", block.keys, known)
+        values.insert(own)
+        graph.push_back(factors)
+        blocks += arrays
+    if blocks:
+        start = values_of(snapshot.world_T_rigs)
         start.insert(values)
         for block in blocks:
             block.refresh(start)
-        return FamilyTerms(graph, tuple(blocks), values)
+    return FamilyTerms(graph, tuple(blocks), values)
+
+
+def digest_of(*parts: object) -> str:
+    """Digest of arrays and of the text of other values, for a family that depends on them."""
+    found = hashlib.sha256()
+    for part in parts:
+        is_array = isinstance(part, np.ndarray)
+        found.update(f"{part.dtype}{part.shape}".encode() if is_array else repr(part).encode())
+        found.update(np.ascontiguousarray(part).tobytes() if is_array else b"")
+    return found.hexdigest()[:16]
 
 
 def numbered(maps: np.ndarray | None, num_frames: int) -> np.ndarray:
@@ -149,7 +214,8 @@ def _check_keys(family: Family, own: gtsam.Values, others: gtsam.Values) -> None
     """GsbaError where a key of a family's variables is not its own."""
     for key in own.keys():  # noqa: SIM118
         shown = gtsam.DefaultKeyFormatter(key)
-        if not chr(gtsam.symbolChr(key)).isupper():
+        letter = chr(gtsam.symbolChr(key))
+        if not (letter.isupper() or letter in family.reserved_letters):
             raise GsbaError(
                 f"family {family.name}: variable {shown}: make its key by gtsam.symbol with a "
                 "capital letter, others are gsba's own"

@@ -1,4 +1,4 @@
-"""GPS factors: fixes of frames, carried into the map, hold its poses against drift.
+"""The family of GPS fixes: fixes of frames, carried into the map, hold its poses against drift.
 
 The similarity between the map and level metres is no variable of the adjustment. It is found from
 the poses at the start of each, and defines the coordinates: as the fixes then determine place,
@@ -14,14 +14,16 @@ errors as variables; and as they are of the gauge that holds the first pose, the
 all by factors that are linear.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
 
+from gsba.bundle.families import Family, MapSnapshot, digest_of
 from gsba.bundle.fixes import WHITE_SHARE, FrameFixes
-from gsba.bundle.prior_factors import X
+from gsba.bundle.prior_factors import X, values_of
 from gsba.config import GpsSettings
 from gsba.similarity import NoSimilarityError, Sim3, robust_similarity, similarity
 
@@ -127,6 +129,95 @@ def _level_from_map(positions: np.ndarray, fixes: FrameFixes) -> tuple[Sim3, np.
     return fit, used, wide
 
 
+@dataclass(frozen=True, slots=True)
+class GpsFixes(Family):
+    """Fixes of frames; each adjustment carries them into its map anew."""
+
+    name = "gps"
+    limits_drift = True
+
+    fixes: FrameFixes
+    settings: GpsSettings  # scale of the loss
+
+    @property
+    def digest(self) -> str:
+        """Digest of the fixes and of the scale of the loss."""
+        return digest_of(self.fixes.digest(), self.settings.loss_sigmas)
+
+    def fitted(self, snapshot: MapSnapshot) -> "AnchoredFixes | None":
+        """The fixes in the world of these poses; None where they are not correlated with them."""
+        anchors = anchor(snapshot.world_T_rigs, self.fixes, self.settings, snapshot.maps)
+        return None if anchors is None else AnchoredFixes(anchors, self.digest)
+
+    def report(self, snapshot: MapSnapshot) -> Mapping[str, Any]:
+        """Used and false fixes, and their residuals in metres."""
+        fixes, poses = self.fixes, snapshot.world_T_rigs
+        anchors = anchor(poses, fixes, self.settings, snapshot.maps)
+        content: dict[str, Any] = {"fixes": len(fixes), "taken": anchors is not None}
+        if anchors is None:
+            return content | {"used": 0}
+        used = np.flatnonzero(anchors.used)
+        off = np.empty((len(used), 3))
+        for number, fit in anchors.level_from_map.items():
+            inside = anchors.maps == number
+            carried = fit.points(poses[anchors.frames[inside], :3, 3])
+            off[inside] = carried - fixes.positions[used[inside]]
+        lengths = np.linalg.norm(off, axis=1)
+        return content | {
+            "used": len(used),
+            "false_fixes": [snapshot.names[f] for f in fixes.frames[~anchors.used]],
+            "residual_m": {"median": np.median(lengths), "most": lengths.max()},
+            "rms_m_east_north_up": np.sqrt(np.mean(off**2, axis=0)),
+            "sigma_m_east_north_up": np.median(fixes.sigmas, axis=0),
+            "metres_per_unit": {str(n): fit.scale for n, fit in anchors.level_from_map.items()},
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class AnchoredFixes(Family):
+    """Fixes in the world of a map, for one adjustment."""
+
+    name = "gps"
+    limits_drift = True
+
+    anchors: Anchors
+    digest: str
+
+    def holds_gauge(self, snapshot: MapSnapshot) -> bool:
+        """Whether the map of the first frame has fixes."""
+        return self.anchors.holds(0, snapshot.maps)
+
+    def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
+        """A factor for each fix."""
+        return factors(self.anchors)
+
+    def for_covariances(self, snapshot: MapSnapshot) -> "LastingErrors":
+        """The fixes with their lasting errors as variables."""
+        return LastingErrors(self.anchors, self.digest)
+
+
+@dataclass(frozen=True, slots=True)
+class LastingErrors(Family):
+    """Linear factors of fixes whose lasting errors are variables: see `linear_factors`."""
+
+    name = "gps"
+    reserved_letters = "es"
+
+    anchors: Anchors
+    digest: str
+
+    def variables(self, snapshot: MapSnapshot) -> gtsam.Values:
+        """Lasting errors of fixes, and similarities of maps."""
+        return self._linear(snapshot)[1]
+
+    def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
+        """Linear factors, weighted by the loss at these poses."""
+        return self._linear(snapshot)[0]
+
+    def _linear(self, snapshot: MapSnapshot) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        return linear_factors(self.anchors, snapshot.world_T_rigs)
+
+
 def factors(anchors: Anchors) -> gtsam.NonlinearFactorGraph:
     """GTSAM's GPS factors under a Cauchy loss, one for each fix."""
     graph = gtsam.NonlinearFactorGraph()
@@ -141,28 +232,29 @@ def factors(anchors: Anchors) -> gtsam.NonlinearFactorGraph:
 def linear_factors(
     anchors: Anchors,
     world_T_rigs: np.ndarray,
-    values: gtsam.Values,
     *,
     free_similarity: bool = True,
-) -> gtsam.NonlinearFactorGraph:
-    """What fixes say of poses, for covariances: their lasting errors are variables, too.
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Factors of fixes for covariances: lasting errors are variables, too.
 
     Args:
         anchors: fixes in the world of the poses.
         world_T_rigs: (F, 4, 4) where factors are linearized.
-        values: of the poses; the further variables are added.
         free_similarity: whether the map's similarity is a variable, as it must be where the first
             pose is held.
 
     Returns:
-        Linear factors, weighted as the loss weighs them there.
+        Linear factors, weighted as the loss weighs them there, and the variables beside the poses.
     """
     graph, weights = gtsam.NonlinearFactorGraph(), anchors.weights(world_T_rigs)
+    own = gtsam.Values()
     for a in range(len(anchors.frames)):
-        values.insert(E(a), np.zeros(3))
+        own.insert(E(a), np.zeros(3))
+    for number in anchors.level_from_map if free_similarity else ():
+        own.insert(S(number), np.zeros(7))
+    values = values_of(world_T_rigs)
+    values.insert(own)
     for number, fit in anchors.level_from_map.items():
-        if free_similarity:
-            values.insert(S(number), np.zeros(7))
         chosen = np.flatnonzero(anchors.maps == number)
         fixes, middle = anchors.fixes.taken(chosen), anchors.positions[chosen].mean(axis=0)
         memories = np.concatenate([[0.0], fixes.correlations()])
@@ -183,7 +275,7 @@ def linear_factors(
                 by_similarity = np.column_stack([arm, *np.cross(np.eye(3), arm), np.eye(3)])
                 terms[S(number)] = -whitened @ by_similarity
             graph.add(_linear(terms, -whitened @ off, values))
-    return graph
+    return graph, own
 
 
 def _linear(

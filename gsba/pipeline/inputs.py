@@ -9,7 +9,7 @@ import numpy as np
 from gsba import odometry, video
 from gsba.bundle.families import Family
 from gsba.bundle.fixes import FrameFixes
-from gsba.bundle.gps_factors import MIN_FIXES
+from gsba.bundle.gps_factors import MIN_FIXES, GpsFixes
 from gsba.camera.calibration import read_calibration
 from gsba.config import RefineSettings, VideoSettings, installed_families
 from gsba.frames.image_circles import ImageCircle
@@ -174,12 +174,13 @@ def _duration_s(path: Path) -> float | None:
 
 
 def families_of(frames: FrameSet, settings: RefineSettings) -> list[Family]:
-    """Families that packages provide, as settings.factors name them.
+    """GPS fixes and families that packages provide, as settings.factors name them.
 
     Raises:
-        GsbaError: a package whose family cannot be made.
+        GsbaError: a package whose family cannot be made, or positions that cannot be used.
     """
-    made = list[Family]()
+    fixes = positions_of(frames, settings)
+    made: list[Family] = [] if fixes is None else [GpsFixes(fixes, settings.gps)]
     for named in settings.package_families():
         name, _, argument = named.partition(":")
         try:

@@ -4,7 +4,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsba.bundle.gps_factors import anchor
+from gsba.bundle.gps_factors import GpsFixes
+from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.reconstruction import world_scale
 from gsba.camera.calibration import calibration_json
 from gsba.camera.fisheye import Pair
@@ -21,7 +22,7 @@ from gsba.pipeline.state import State
 from gsba.placement.placement import Placement, metres_per_unit, place
 from gsba.report import findings
 from gsba.report.camera_findings import of_camera, of_lenses
-from gsba.report.gps_findings import of_gps
+from gsba.report.gps_findings import notes_on_gps
 from gsba.report.html import residual_sphere, write_html
 from gsba.report.imu_findings import of_gyro
 from gsba.report.maps import MapSummary, is_partial, summarize_maps
@@ -148,18 +149,22 @@ def _report(state: State, result: Reconstruction) -> dict[str, Any]:
     run, rounds = state.run, state.run.journal.rounds
     solver = [{"stage": name, "rounds": some} for name, some in rounds.items()]
     stages = StageLog(tuple(run.store.records.values()), run.journal.counts, solver)
-    gauge, found = _gauge(run, state.prior), _findings(state, result)
+    gauge, of_families = _gauge(run, state.prior), _of_families(state)
+    found = _findings(state, result, of_families.pop(GpsFixes.name, None))
     coarse = state.prior.coarse
     report = build_report(run.settings, run.frames, coarse, result, stages, gauge, found)
-    report["families"] = _of_families(state)
+    report["families"] = of_families
     report["residual_sphere"] = plain(residual_sphere(result), digits=4)
     return report
 
 
-def _findings(state: State, result: Reconstruction) -> Findings:
-    """Sections of the report on trajectory, camera and sensors, and notes on all that is odd."""
-    run, prior, map_, poses = state.run, state.prior, state.map, state.solution.world_T_rigs
-    frames, evidence = run.frames, run.evidence
+def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) -> Findings:
+    """Sections of the report on trajectory, camera and sensors, and notes on all that is odd.
+
+    Args:
+        gps: report of the GPS fixes; None = there are none.
+    """
+    run, prior, map_, frames = state.run, state.prior, state.map, state.run.frames
     trajectory, notes = findings.of_trajectory(
         prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.absent
     )
@@ -181,13 +186,10 @@ def _findings(state: State, result: Reconstruction) -> Findings:
         notes += more
     gyro = None
     if prior.gyro is not None:
-        gyro, more = of_gyro(prior.gyro, prior.turning, map_.readout, poses)
+        gyro, more = of_gyro(prior.gyro, _gyro_steps_used(state), map_.readout)
         notes += more
-    gps = None
-    if evidence.fixes is not None:
-        anchors = anchor(poses, evidence.fixes, run.settings.gps, prior.parts)
-        gps, more = of_gps(evidence.fixes, anchors, poses, frames)
-        notes += more
+    if gps is not None:
+        notes += notes_on_gps(gps, len(frames))
     most = run.settings.weak_frames.max_scale_sigma
     notes += findings.of_frames(frames, prior.coarse, result, map_.frame_weights, most)
     stitching = map_.stitching and findings.of_field(map_.stitching)
@@ -198,8 +200,17 @@ def _findings(state: State, result: Reconstruction) -> Findings:
     return replace(found, recordings=recordings, reasons=_reasons(prior))
 
 
+def _gyro_steps_used(state: State) -> float | None:
+    """Share of steps whose rotation agrees with the gyro; None = no gyro was used."""
+    snapshot = state.run.families.snapshot(state.solution, state.prior.parts)
+    for family in state.prior.families(state.run.settings.priors):
+        if isinstance(family, GyroTurns):
+            return family.report(snapshot)["steps_used"]
+    return None
+
+
 def _of_families(state: State) -> dict[str, Any]:
-    """The report of each family of the caller and of packages, by its name."""
+    """The report of each family of GPS, of packages and of the caller, by its name."""
     families = state.run.families
     snapshot = families.snapshot(state.solution, state.prior.parts)
     return {family.name: plain(family.report(snapshot)) for family in families.members}

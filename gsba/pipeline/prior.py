@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 
-from gsba.bundle import prior_factors
+from gsba.bundle.families import Family
 from gsba.bundle.gauge import Gauge
+from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.map_strength import MapStrength
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import PriorSettings
 from gsba.imu.alignment import Alignment
 from gsba.loop_closure.merged_map import Registered, side_by_side
@@ -64,15 +65,14 @@ class Prior:
         """The trajectory, chained past its false steps, as a solution without points."""
         return Solution.without_points(self.trust.world_T_rigs)
 
-    def graph(
-        self, settings: PriorSettings, first: np.ndarray | None = None, *, gauge: bool = True
-    ) -> gtsam.NonlinearFactorGraph:
-        """Priors of the trajectory, as far as it is believed, and the gauge.
+    def families(
+        self, settings: PriorSettings, first: np.ndarray | None = None
+    ) -> tuple[Family, ...]:
+        """The trajectory prior, as far as images confirm it, and the gyro's family if it has one.
 
         Args:
-            settings: noise of the trajectory, unless images told it.
-            first: (4, 4) where to fix the first pose; None = where the start has it.
-            gauge: whether to fix it.
+            settings: noise of the trajectory, unless images showed it.
+            first: (4, 4) where the first pose is held; None = where the start has it.
         """
         trust, strength = self.trust, self.strength
         whole = trust.false_steps.all()  # then the start is all there is
@@ -81,13 +81,11 @@ class Prior:
         if strength is not None:
             false, noise = false | strength.held_steps, strength.noise
         first = trust.world_T_rigs[0] if first is None else first
-        graph = prior_factors.build(
-            believed, settings, false, trust.false_frames, first, noise, gauge
-        )
-        if self.turning is not None:
-            extent = float(np.linalg.norm(np.ptp(believed[:, :3, 3], axis=0)))
-            graph.push_back(prior_factors.turns(self.turning, extent, settings.loss_sigmas))
-        return graph
+        prior = TrajectoryPrior(believed, settings, false, trust.false_frames, first, noise)
+        if self.turning is None:
+            return (prior,)
+        extent = float(np.linalg.norm(np.ptp(believed[:, :3, 3], axis=0)))
+        return prior, GyroTurns(self.turning, extent, settings.loss_sigmas)
 
     def moved(self, gauge: Gauge) -> "Prior":
         """The trajectory carried to another world, part by part as numbered in `parts`."""

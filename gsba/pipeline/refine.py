@@ -125,13 +125,12 @@ class Start:
     @classmethod
     def of(cls, frames: FrameSet, evidence: Evidence, settings: RefineSettings) -> "Start":
         """With the GPS fixes and the families of packages that settings ask for."""
-        fixes = inputs.positions_of(frames, settings)
+        made = inputs.families_of(frames, settings)
         if evidence.recordings:
             coarse = each_recording.joined_poses([one.coarse for one in evidence.recordings])
         else:
             coarse = inputs.coarse_poses(frames, evidence.trajectories, settings)
-        families = (*evidence.families, *inputs.families_of(frames, settings))
-        return cls(frames, coarse, replace(evidence, fixes=fixes, families=families))
+        return cls(frames, coarse, replace(evidence, families=(*made, *evidence.families)))
 
 
 def refine_from(
@@ -203,7 +202,9 @@ def _without_distractors(
     store: RunStore, settings: RefineSettings, start: Start, journal: Journal
 ) -> FrameSet:
     """Frames without what a first solution, plainer than the last, does not explain."""
-    frames, evidence = start.frames, replace(start.evidence, imu=None, fixes=None)
+    # Drift over the whole path does not show in what frames near one another do not explain.
+    near = tuple(family for family in start.evidence.families if not family.limits_drift)
+    frames, evidence = start.frames, replace(start.evidence, imu=None, families=near)
     direct.check(frames, settings)  # before the first solution, not after
     with store.named("first"):
         run = Run.begin(store, frames, start.coarse, settings.plainer(), evidence)
@@ -225,7 +226,6 @@ def _solve_raw(run: Run) -> State:
     evidence = run.evidence
     known = [run.settings.model_dump(exclude={"export", "placement"}), run.families.digests()]
     known += [] if evidence.imu is None else [evidence.imu.digest]
-    known += [] if evidence.fixes is None else [evidence.fixes.digest()]
     counts, frames = dict(run.journal.counts), run.frames
     n, best = 0, None  # the pass before: what it rests on, steps without matches, its result
     while True:

@@ -9,7 +9,8 @@ import numpy as np
 
 from gsba import learned
 from gsba.bundle.families import Families, Family
-from gsba.bundle.fixes import FrameFixes
+from gsba.bundle.gyro_turns import GyroTurns
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.rig import CubeRig
 from gsba.config import RefineSettings
 from gsba.frames import cubemap
@@ -63,8 +64,7 @@ class Evidence:
 
     trajectories: tuple[Trajectory, ...] = ()  # files, in pieces that each have their own world
     imu: Readings | None = None  # of a gyro that rode along; None = there are none
-    fixes: FrameFixes | None = None  # of frames by GPS, for its factors; None = there are none
-    families: tuple[Family, ...] = ()  # residuals of the caller, or of packages
+    families: tuple[Family, ...] = ()  # of GPS, of packages and of the caller
     recordings: tuple[RecordingEvidence, ...] = ()  # of several recordings, in order of their
     # frames, which then have their trajectories and gyros from here; () = there is one recording
 
@@ -103,7 +103,8 @@ class Run:
         """Start a run, or take it up, on these frames and poses.
 
         Raises:
-            GsbaError: frames that a chosen family cannot use, or weights that are not there.
+            GsbaError: frames that a chosen family cannot use, a family with a name of gsba's own,
+                or weights that are not there.
         """
         direct.check(frames, settings)
         if settings.camera.model == "two_lens" and not frames.panoramic:
@@ -112,6 +113,9 @@ class Run:
         sensors = [evidence.imu, *(one.imu for one in evidence.recordings)]
         if any(imu is not None for imu in sensors) and not frames.timed:
             raise GsbaError("--imu: nothing says when frames are from: pass --timestamps or --fps")
+        for family in evidence.families:
+            if family.name in (TrajectoryPrior.name, GyroTurns.name):
+                raise GsbaError(f"family {family.name}: gsba has one of this name; rename yours")
         chain = Chain(store)
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
         start = coarse.world_T_rigs.tolist(), settings.read
@@ -200,7 +204,4 @@ class Run:
         settings = self.settings
         relevant = [settings.triangulate, settings.rounds, settings.priors, settings.solver]
         families = [f for f in settings.factors if f not in ("photometric", "splat")]
-        known = []
-        if self.evidence.fixes is not None:
-            known = [settings.gps.loss_sigmas, self.evidence.fixes.digest()]
-        return [*relevant, families, self.families.digests(), *known]
+        return [*relevant, families, self.families.digests()]

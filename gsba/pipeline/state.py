@@ -4,8 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsba.bundle import gps_factors, triangulation
+from gsba.bundle import triangulation
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.families import Families
 from gsba.bundle.readout import CameraEstimate
 from gsba.camera.lens import Lenses
 from gsba.config import PriorSettings
@@ -105,40 +106,27 @@ class State:
         return triangulation.place(tracks, keypoints, poses, gate, settings, threads)
 
     def adjustment_context(self) -> AdjustmentContext:
-        """Priors, GPS fixes, families and settings of an adjustment of this map."""
-        run, prior, poses = self.run, self.prior, self.solution.world_T_rigs
-        noise = run.settings.priors
-        anchors, first, ungauged = None, None, None
-        freed = bool(run.families.fixing_gauge.members)
-        fixes = run.evidence.fixes
-        if fixes is not None:
-            first = poses[0]
-            anchors = gps_factors.anchor(poses, fixes, run.settings.gps, prior.parts)
-            freed |= anchors is not None and anchors.holds(0, prior.parts)
-        if freed or anchors is not None:
-            ungauged = prior.graph(noise, poses[0], gauge=not freed)
-        return replace(
-            self.context_of_images(noise, first),
-            anchors=anchors,
-            ungauged=ungauged,
-            families=run.families,
-        )
+        """Families and settings of an adjustment of this map."""
+        run, prior = self.run, self.prior
+        first = self.solution.world_T_rigs[0] if run.families.members else None
+        own = prior.families(run.settings.priors, first)
+        families = run.families.with_members((*own, *run.families.members))
+        return self._context(families.fitted(self.solution, prior.parts))
 
-    def context_of_images(
-        self, noise: PriorSettings, first: np.ndarray | None = None
-    ) -> AdjustmentContext:
-        """The context of an adjustment without GPS fixes and families.
+    def context_of_images(self, noise: PriorSettings) -> AdjustmentContext:
+        """The context of an adjustment by images, trajectory and gyro alone.
 
         Args:
             noise: of the trajectory's steps and poses.
-            first: (4, 4) where to fix the first pose; None = where the start has it.
         """
-        run, prior = self.run, self.prior
+        return self._context(self.run.families.with_members(self.prior.families(noise)))
+
+    def _context(self, families: Families) -> AdjustmentContext:
+        run = self.run
         return AdjustmentContext(
-            priors=prior.graph(noise, first),
+            families=families,
             rig=run.rig,
             settings=run.settings if run.frames.timed else run.settings.untimed(),
             num_threads=run.num_threads,
-            turning=prior.turning,
-            maps=prior.parts,
+            maps=self.prior.parts,
         )

@@ -7,32 +7,27 @@ import numpy as np
 
 from gsba.bundle.readout import CameraEstimate
 from gsba.imu.alignment import Alignment
-from gsba.types import GyroConstraints
 
 logger = logging.getLogger(__name__)
-
-_MAX_RESIDUAL_SIGMAS = 3.0  # of a gyro step; beyond it, the robust loss suppresses the step
 
 
 def of_gyro(
     found: Alignment,
-    turning: GyroConstraints | None,
+    steps_used: float | None,
     readout: CameraEstimate | None,
-    world_T_rigs: np.ndarray,
 ) -> tuple[dict[str, Any], list[str]]:
     """Clock, bias and axes of a gyro, and the share of its steps that agree with the poses.
 
     Args:
         found: alignment of the gyro with the frames.
-        turning: its constraints on the frames; None = it was not used.
+        steps_used: share of its steps that agree with the poses; None = it was not used.
         readout: estimated readout of the frames; None = a global shutter.
-        world_T_rigs: (F, 4, 4) refined poses.
 
     Returns:
         Content of report.json and notes.
     """
     content: dict[str, Any] = {
-        "taken": turning is not None,
+        "taken": steps_used is not None,
         "reason": found.reason,
         "offset_s": found.clock.offset,
         "offset_sigma_s": found.offset_sigma,
@@ -44,18 +39,17 @@ def of_gyro(
         "noise_of_a_step_deg": np.rad2deg(found.noise),
         "turns_explained": found.explained,
     }
-    if turning is None:
+    if steps_used is None:
         note = f"the gyro was not used: {found.reason}"
         logger.warning(note)
         return content, [note]
-    steps = _steps_used(turning, world_T_rigs)
     during = (
         None if readout is None or readout.lenses.readout_motion is None else bool(readout.by_gyro)
     )
-    content |= {"steps_used": steps, "during_readout": during}
+    content |= {"steps_used": steps_used, "during_readout": during}
     bias = ", ".join(f"{value:.3g}" for value in np.rad2deg(found.sensor.bias))
     notes = [
-        f"the gyro agrees with {100 * steps:.0f} % of the steps between frames (sigma "
+        f"the gyro agrees with {100 * steps_used:.0f} % of the steps between frames (sigma "
         f"{np.rad2deg(found.noise):.2g} degrees); its clock is {found.clock.offset:.4f} s ahead "
         f"(sigma {found.offset_sigma:.1g}), its bias is {bias} degrees per second, and the sigma "
         f"of its axes is {np.rad2deg(found.axes_sigma):.2g} degrees"
@@ -64,14 +58,3 @@ def of_gyro(
         source = "the gyro" if during else "images, which contradict the gyro"
         notes.append(f"rotations during the readout come from {source}")
     return content, notes
-
-
-def _steps_used(turning: GyroConstraints, world_T_rigs: np.ndarray) -> float:
-    """Share of all steps whose refined rotation agrees with the gyro."""
-    from scipy.spatial.transform import Rotation
-
-    rotations = world_T_rigs[:, :3, :3]
-    found = Rotation.from_matrix(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
-    off = (found.inv() * Rotation.from_rotvec(turning.steps)).as_rotvec()
-    near = np.linalg.norm(off, axis=1) < _MAX_RESIDUAL_SIGMAS * np.sqrt(3) * turning.step_sigmas
-    return float(np.mean(near & np.isfinite(turning.step_sigmas)))

@@ -9,9 +9,11 @@ import pytest
 from scipy.stats import chi2
 from synthetic import RIG, World, drifted, make_world
 
-from gsba.bundle import adjustment, prior_factors, triangulation
+from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.families import Families
 from gsba.bundle.optimizer import OptimizeResult
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle
 from gsba.similarity import pose_similarity
@@ -38,17 +40,17 @@ def _world(seed: int = 0) -> tuple[World, np.ndarray]:
 def _run(
     world: World, coarse: np.ndarray, settings: RefineSettings, gates: tuple[float, ...] = GATES
 ) -> Solution:
-    priors = prior_factors.build(coarse, settings.priors)
+    priors = TrajectoryPrior(coarse, settings.priors)
     start = Solution.without_points(coarse)
-    problem = AdjustmentContext(priors, RIG, settings, 1)
+    problem = AdjustmentContext(Families((priors,)), RIG, settings, 1)
     return adjustment.adjust(world.tracks, world.keypoints, start, problem, gates)
 
 
 def _covariances(
     solved: Solution, world: World, coarse: np.ndarray, settings: RefineSettings
 ) -> np.ndarray:
-    priors = prior_factors.build(coarse, settings.priors)
-    problem = AdjustmentContext(priors, RIG, settings, 1)
+    priors = TrajectoryPrior(coarse, settings.priors)
+    problem = AdjustmentContext(Families((priors,)), RIG, settings, 1)
     return adjustment.pose_covariances(solved, world.keypoints, problem)[0]
 
 

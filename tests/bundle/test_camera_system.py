@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 from lens_world import motion, problem_of, seen_through, solved_with, times
-from synthetic import loop_walk
+from synthetic import GivenFactors, loop_walk
 
 from factors import PoseSystem
 from factors.quadratic_block import QuadraticBlock
@@ -15,6 +15,7 @@ from gsba import Family, MapSnapshot, X
 from gsba.bundle import adjustment
 from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.families import Families
+from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.readout import CameraEstimate
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
@@ -36,7 +37,10 @@ def _settled(
 ):
     world, shown = seen_through(camera, seed)
     solved = Solution.without_points(world.world_T_rigs)
-    problem = replace(problem_of(world, said), turning=turning)
+    problem = problem_of(world, said)
+    if turning is not None:  # its rates alone: steps are not measured
+        own = (*problem.families.members, GyroTurns(turning, 1.0, 2.0))
+        problem = replace(problem, families=Families(own))
     solved, known = solved_with(world, shown, known, solved, problem)
     return world, known, (solved, shown, known, times(24), problem)
 
@@ -127,7 +131,8 @@ def test_frames_own_motion_does_not_shrink_a_map_of_no_known_scale() -> None:
     gauge, tight = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
     gauge.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(world.world_T_rigs[0]), tight))
     problem, start = problem_of(world), Solution.without_points(world.world_T_rigs)
-    given = CameraEstimate(LENSES, READOUT_S), start, replace(problem, priors=gauge)
+    problem = replace(problem, families=Families((GivenFactors(gauge),)))
+    given = CameraEstimate(LENSES, READOUT_S), start, problem
     solved, found = solved_with(world, shown, *given)
     scale = pose_similarity(solved.world_T_rigs, world.world_T_rigs).scale
     assert scale == pytest.approx(1, abs=0.01)

@@ -10,11 +10,12 @@ from synthetic import RIG, World, drifted, make_world
 from factors import Block
 from factors.block import PoseSystem
 from gsba import Family, MapSnapshot, X
-from gsba.bundle import adjustment, gauge, prior_factors
+from gsba.bundle import adjustment, gauge
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.families import Families
 from gsba.bundle.family_variables import kept, restored
 from gsba.bundle.optimizer import optimize
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings, SolverSettings
 from gsba.log import GsbaError
 from gsba.similarity import Sim3
@@ -137,9 +138,9 @@ class Ranges(Family):
 def _adjusted(world: World, *members: Family) -> tuple[Solution, AdjustmentContext]:
     """The synthetic world from a drifting start, with families."""
     coarse = drifted(world.world_T_rigs, np.random.default_rng(0))
-    families = Families(members, tuple(map(str, range(len(coarse)))), np.arange(float(len(coarse))))
-    priors = prior_factors.build(coarse, SETTINGS.priors)
-    problem = AdjustmentContext(priors, RIG, SETTINGS, 1, families=families)
+    every = TrajectoryPrior(coarse, SETTINGS.priors), *members
+    families = Families(every, tuple(map(str, range(len(coarse)))), np.arange(float(len(coarse))))
+    problem = AdjustmentContext(families, RIG, SETTINGS, 1)
     start = Solution.without_points(coarse)
     gates = (200.0, 60.0, 20.0, 8.0, 8.0)
     return adjustment.adjust(world.tracks, world.keypoints, start, problem, gates), problem
@@ -250,7 +251,7 @@ def test_what_cannot_be_solved_is_refused(world: World) -> None:
     start, measured = Solution.without_points(world.world_T_rigs), _measured(world)
     with pytest.raises(GsbaError, match=r"variable b0: .* capital letter"):
         Families((Sideways(measured, key=gtsam.symbol("b", 0)),)).terms(start)
-    with pytest.raises(GsbaError, match="sideways is there twice"):
+    with pytest.raises(GsbaError, match="two families are named sideways"):
         Families((Sideways(measured), Sideways(measured)))
     with pytest.raises(GsbaError, match="B0 belongs to another family"):
         Families((Sideways(measured), SidewaysInOneBlock(measured))).terms(start)

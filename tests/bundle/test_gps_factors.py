@@ -9,9 +9,12 @@ from lasting_errors import fixes_at, lasting_errors
 from scipy.spatial.transform import Rotation
 from synthetic import RIG, World, drifted, make_world
 
-from gsba.bundle import adjustment, gps_factors, prior_factors
+from gsba.bundle import adjustment, gps_factors
 from gsba.bundle.adjustment import AdjustmentContext, values_of
+from gsba.bundle.families import Families, Family
 from gsba.bundle.fixes import FrameFixes
+from gsba.bundle.gps_factors import GpsFixes
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import GpsSettings, RefineSettings
 from gsba.geometry import furthest, inverse
 from gsba.similarity import Sim3, pose_similarity
@@ -32,14 +35,10 @@ def _fixes(world: World, seed: int, noise: float = 1.0) -> FrameFixes:
 def _problem(coarse: np.ndarray, poses: np.ndarray, fixes: FrameFixes | None) -> AdjustmentContext:
     """As `gsba.pipeline.state.State.adjustment_context` has it."""
     settings = RefineSettings()
-    given = coarse, settings.priors, None, None, poses[0]
-    problem = AdjustmentContext(prior_factors.build(*given), RIG, settings, 1)
-    if fixes is None:
-        return problem
-    anchors = gps_factors.anchor(poses, fixes, GpsSettings())
-    if anchors is None:
-        return problem
-    return replace(problem, anchors=anchors, ungauged=prior_factors.build(*given, gauge=False))
+    members: list[Family] = [TrajectoryPrior(coarse, settings.priors, first=poses[0])]
+    members += [] if fixes is None else [GpsFixes(fixes, GpsSettings())]
+    families = Families(tuple(members)).fitted(Solution.without_points(poses))
+    return AdjustmentContext(families, RIG, settings, 1)
 
 
 def _solve(world: World, coarse: np.ndarray, fixes: FrameFixes | None) -> Solution:
@@ -141,8 +140,9 @@ def test_linear_factors_leave_the_gauge_free() -> None:
     poses, fixes = world.world_T_rigs, _fixes(world, 2)
     anchors = gps_factors.anchor(poses, fixes, GpsSettings())
     assert anchors is not None
-    values = values_of(poses)
-    graph = gps_factors.linear_factors(anchors, poses, values).linearize(values)
+    factors, values = gps_factors.linear_factors(anchors, poses)
+    values.insert(values_of(poses))
+    graph = factors.linearize(values)
     matrix = graph.hessian(gtsam.Ordering.ColamdGaussianFactorGraph(graph))[0]
     eigenvalues = np.linalg.eigvalsh(matrix)
     # Rotations of the frames, 3 * 24, say nothing, and neither do the 7 unknowns of the gauge.

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from synthetic import drifted, loop_walk, unit
 
-from gsba.bundle import map_strength, prior_factors
+from gsba.bundle import map_strength
+from gsba.bundle.families import Families
 from gsba.bundle.map_strength import MapStrength
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle, step_covariances
-from gsba.types import JointErrors, StepNoise
+from gsba.types import JointErrors, Solution, StepNoise
 
 NUM = 24
 POSES = loop_walk(NUM)
@@ -150,11 +152,12 @@ def test_priors_of_steps_in_a_row_count_as_one_that_drifts() -> None:
     """The length of k steps is known as badly as one is: their drift has one sign."""
     noise, kept = StepNoise(0.01, 0.02, 0.03), np.zeros(NUM - 1, bool)
     kept[[3, 4, 5, 9]] = True
-    built = prior_factors.build(POSES, PRIORS, ~kept, np.ones(NUM, bool), noise=noise)
+    prior = TrajectoryPrior(POSES, PRIORS, ~kept, np.ones(NUM, bool), noise=noise)
+    built = prior.graph(Families().snapshot(Solution.without_points(POSES)))
     steps = [built.at(i) for i in range(built.size()) if len(built.at(i).keys()) == 2]
     assert len(steps) == 4
     for factor, (f, times) in zip(steps, {3: 3, 4: 3, 5: 3, 9: 1}.items(), strict=True):
-        covariance = factor.noiseModel().noise().covariance() / times
+        covariance = factor.noiseModel().noise().covariance() / times  # type: ignore
         ahead = POSES[f + 1, :3, :3].T @ (POSES[f + 1, :3, 3] - POSES[f, :3, 3])
         length, along = max(LENGTHS[f], np.median(LENGTHS)), ahead / np.linalg.norm(ahead)
         assert along @ covariance[3:, 3:] @ along == pytest.approx((length * noise.length) ** 2)

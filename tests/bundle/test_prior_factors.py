@@ -7,12 +7,20 @@ from scipy.spatial.transform import Rotation
 from synthetic import loop_walk
 
 from gsba.bundle import prior_factors
+from gsba.bundle.families import Families
+from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.prior_factors import X
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import PriorSettings
 from gsba.geometry import inverse, pose, rotation_angle
-from gsba.types import GyroConstraints
+from gsba.types import GyroConstraints, Solution
 
 SETTINGS = PriorSettings()
+
+
+def _factors(coarse: np.ndarray) -> gtsam.NonlinearFactorGraph:
+    snapshot = Families().snapshot(Solution.without_points(coarse))
+    return TrajectoryPrior(coarse, SETTINGS).graph(snapshot)
 
 
 def _values(world_T_rigs: np.ndarray) -> gtsam.Values:
@@ -41,7 +49,7 @@ def _shaken(world_T_rigs: np.ndarray, seed: int = 0) -> np.ndarray:
 
 def test_alone_the_priors_give_the_trajectory_back() -> None:
     coarse = loop_walk(12)
-    factors = prior_factors.build(coarse, SETTINGS)
+    factors = _factors(coarse)
     assert factors.error(_values(coarse)) == pytest.approx(0, abs=1e-12)
     np.testing.assert_allclose(_solve(factors, _shaken(coarse)), coarse, atol=1e-4)
 
@@ -49,7 +57,7 @@ def test_alone_the_priors_give_the_trajectory_back() -> None:
 def test_the_first_pose_is_fixed() -> None:
     """However hard another factor pulls at it."""
     coarse = loop_walk(6)
-    factors = prior_factors.build(coarse, SETTINGS)
+    factors = _factors(coarse)
     pulled = gtsam.Pose3(coarse[0]).compose(gtsam.Pose3.Expmap(np.full(6, 0.3)))
     factors.add(gtsam.PriorFactorPose3(X(0), pulled, gtsam.noiseModel.Isotropic.Sigma(6, 1e-2)))
     solved = _solve(factors, coarse)
@@ -58,7 +66,7 @@ def test_the_first_pose_is_fixed() -> None:
 
 def test_every_pose_is_constrained() -> None:
     coarse = loop_walk(8)
-    marginals = gtsam.Marginals(prior_factors.build(coarse, SETTINGS), _values(coarse))
+    marginals = gtsam.Marginals(_factors(coarse), _values(coarse))
     for f in range(8):
         eigenvalues = np.linalg.eigvalsh(marginals.marginalCovariance(X(f)))
         assert eigenvalues.min() > 0 and np.isfinite(eigenvalues).all()
@@ -66,7 +74,7 @@ def test_every_pose_is_constrained() -> None:
 
 def _with_truth(coarse: np.ndarray, true: np.ndarray, gap: int) -> np.ndarray:
     """Solve the priors with images replaced by exact steps of the truth, none across `gap`."""
-    factors = prior_factors.build(coarse, SETTINGS)
+    factors = _factors(coarse)
     tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)
     steps = inverse(true[:-1]) @ true[1:]
     for f, step in enumerate(steps):
@@ -97,7 +105,7 @@ def test_a_standing_camera_gives_no_nan(still: str) -> None:
         coarse[:] = coarse[0]
     else:
         coarse[3:8] = coarse[3]
-    factors = prior_factors.build(coarse, SETTINGS)
+    factors = _factors(coarse)
     error = factors.error(_values(_shaken(coarse)))
     assert np.isfinite(error) and error > 0
     np.testing.assert_allclose(_solve(factors, _shaken(coarse)), coarse, atol=1e-4)
@@ -107,7 +115,7 @@ def test_a_standing_camera_gives_no_nan(still: str) -> None:
 
 def test_images_may_move_a_camera_that_slam_thought_still() -> None:
     coarse = np.stack([np.eye(4)] * 5)
-    factors = prior_factors.build(coarse, SETTINGS)
+    factors = _factors(coarse)
     moved = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 0.1]))
     tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)
     for f in range(4):
@@ -127,7 +135,7 @@ def test_step_noise_scales_with_the_map() -> None:
         bigger[:, :3, 3] *= scale
         bigger_off[:, :3, 3] *= scale
         bigger_off[0] = bigger[0]  # the gauge is not at issue
-        errors.append(prior_factors.build(bigger, SETTINGS).error(_values(bigger_off)))
+        errors.append(_factors(bigger).error(_values(bigger_off)))
     assert errors[1] == pytest.approx(errors[0], rel=1e-9)
 
 
@@ -150,8 +158,8 @@ def test_turns_of_a_gyro_hold_rotations_and_nothing_else() -> None:
         rotations.append(rotations[-1] * Rotation.from_rotvec(step))
     sigmas = np.array([1e-3, np.inf, 2e-3])
     turning = GyroConstraints(steps, sigmas, np.full((4, 3), np.nan), 0.0)
-    graph = prior_factors.turns(turning, 5.0, 2.0)
-    values = gtsam.Values()
+    values, start = gtsam.Values(), Solution.without_points(np.tile(np.eye(4), (4, 1, 1)))
+    graph = GyroTurns(turning, 5.0, 2.0).graph(Families().snapshot(start))
     for f, rotation in enumerate(rotations):
         values.insert(X(f), gtsam.Pose3(pose(rotation.as_matrix(), rng.normal(size=3))))
     assert graph.size() == 2 and graph.error(values) < 1e-8

@@ -8,11 +8,13 @@ import pytest
 from synthetic import RIG, World, make_world
 
 from factors.sphere_field import SphereField, num_harmonics
-from gsba.bundle import adjustment, prior_factors, stitching
+from gsba.bundle import adjustment, stitching
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.families import Families
 from gsba.bundle.optimizer import optimize
 from gsba.bundle.shared_parameters import PARTS, SharedModel, model_of, parts_of
 from gsba.bundle.stitching import Stitching, corrected, with_noise_of
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.sphere import bearings_from_erp
 from gsba.camera.straighten import straightened
 from gsba.config import RefineSettings
@@ -46,9 +48,9 @@ def _found(bent: bool) -> tuple[World, Solution, Keypoints, Stitching]:
     sighted = Sighted(
         keypoints, np.ones(len(keypoints.faces), bool), world.tracks, Counts(0, 0, "observations")
     )
-    priors = prior_factors.build(world.world_T_rigs, SETTINGS.priors)
+    priors = TrajectoryPrior(world.world_T_rigs, SETTINGS.priors)
     start = Solution.without_points(world.world_T_rigs)
-    problem = AdjustmentContext(priors, RIG, SETTINGS, 1)
+    problem = AdjustmentContext(Families((priors,)), RIG, SETTINGS, 1)
     solved, calibrated = adjustment.adjust_sighted(sighted, start, problem, (30.0, 6.0))
     found = stitching.estimate(sighted, calibrated, solved, SphereField.none(), problem)
     return world, solved, keypoints, found
@@ -112,8 +114,8 @@ def test_too_little_is_left_alone() -> None:
     )
     small = replace(before, landmarks=landmarks)
     sighted = Sighted(keypoints, np.ones(len(keypoints.faces), bool), some, Counts(0, 0, "o"))
-    priors = prior_factors.build(world.world_T_rigs, SETTINGS.priors)
-    problem = AdjustmentContext(priors, RIG, SETTINGS, 1)
+    priors = TrajectoryPrior(world.world_T_rigs, SETTINGS.priors)
+    problem = AdjustmentContext(Families((priors,)), RIG, SETTINGS, 1)
     found = stitching.estimate(sighted, keypoints, small, SphereField.none(), problem)
     assert not found.field and found.adjustment is small
 
@@ -125,14 +127,15 @@ def test_model_predicts_the_cost() -> None:
         update={"loss": "none", "relative_tolerance": 1e-9}
     )  # fmt: skip
     settings = SETTINGS.model_copy(update={"solver": plain})
-    priors = prior_factors.build(world.world_T_rigs, settings.priors)
-    problem = AdjustmentContext(priors, RIG, settings, 1)
+    priors = TrajectoryPrior(world.world_T_rigs, settings.priors)
+    problem = AdjustmentContext(Families((priors,)), RIG, settings, 1)
     landmarks = Landmarks(world.points_world, world.tracks, Counts(0, 0, "tracks"))
 
     def solved(field: SphereField) -> tuple[Solution, float]:
         there = corrected(keypoints, field, RIG)
         block = adjustment.landmark_block(landmarks, there, 1.0, problem)
-        result = optimize(priors, [block], adjustment.values_of(world.world_T_rigs), plain)
+        terms = problem.terms(Solution.without_points(world.world_T_rigs))
+        result = optimize(terms.graph, [block], terms.values, plain)
         poses = adjustment.poses_of(result.values, len(world.world_T_rigs))
         return Solution(poses, landmarks, 1.0, ()), block.error(result.values)
 
@@ -160,6 +163,7 @@ def test_noise_carries_over() -> None:
     louder = replace(shaped, sigmas_rad=2 * shaped.sigmas_rad, sqrt_infos=roots / 2)
     back = with_noise_of(shaped, corrected(louder, _true_field(), RIG))
     np.testing.assert_allclose(back.sigmas_rad, louder.sigmas_rad)
+    assert back.sqrt_infos is not None and louder.sqrt_infos is not None
     np.testing.assert_allclose(back.sqrt_infos, louder.sqrt_infos)
 
 

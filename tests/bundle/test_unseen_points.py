@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 from functools import cache
 
-import gtsam
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,6 +11,7 @@ from synthetic import RIG, World, make_world
 
 from gsba.bundle import shared_parameters, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.families import Families
 from gsba.bundle.reconstruction import assemble
 from gsba.camera.lens import Lenses
 from gsba.config import PatchSettings, RefineSettings
@@ -20,7 +20,7 @@ from gsba.types import CoarsePoses, Counts, Landmarks, PoseSource, Solution, Tra
 
 NUM_FRAMES, NUM_POINTS = 12, 60
 SETTINGS = RefineSettings()
-PROBLEM = AdjustmentContext(gtsam.NonlinearFactorGraph(), RIG, SETTINGS, 1)
+PROBLEM = AdjustmentContext(Families(), RIG, SETTINGS, 1)
 
 
 @cache

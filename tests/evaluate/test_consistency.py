@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from synthetic import RIG, make_world
+from synthetic import RIG, GivenFactors, make_world
 
 from gsba.bundle import adjustment, prior_factors
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.families import Families
 from gsba.config import RefineSettings
 from gsba.evaluate.consistency import (
     EXPECTED,
@@ -43,10 +44,10 @@ def _solved(seed: int) -> tuple[Reconstruction, Trajectory]:
     priors = gtsam.NonlinearFactorGraph(held)
     priors.push_back(prior_factors.fixed_scale(true))
     start = Solution.without_points(true)
-    problem = AdjustmentContext(priors, RIG, settings, 1)
+    problem = AdjustmentContext(Families((GivenFactors(priors),)), RIG, settings, 1)
     solved = adjustment.adjust(world.tracks, world.keypoints, start, problem, (8.0,))
     solved = replace(solved, noise=1.0)
-    problem = replace(problem, priors=held)
+    problem = replace(problem, families=Families((GivenFactors(held),)))
     covariances, joint = adjustment.pose_covariances(solved, world.keypoints, problem)
     return _result(solved.world_T_rigs, covariances, joint), Trajectory(TIMES, true)
 

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from synthetic import bearings_of
 
-from gsba.bundle import adjustment, prior_factors
+from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.families import Families
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.rig import CubeRig
 from gsba.config import PatchSettings, RefineSettings
 from gsba.frames.panorama import Greys
@@ -160,7 +162,7 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
     frames, world_T_rigs = walk
     landmarks, keypoints = _start(world_T_rigs)
     settings = RefineSettings(patches=SETTINGS)
-    priors = prior_factors.build(world_T_rigs, settings.priors)
+    priors = TrajectoryPrior(world_T_rigs, settings.priors)
 
     def rotation_errors(solved: Solution) -> np.ndarray:
         true = inverse(world_T_rigs[:-1]) @ world_T_rigs[1:]
@@ -171,7 +173,7 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
         Solution.without_points(world_T_rigs),
         landmarks=landmarks,
     )
-    problem, gates = AdjustmentContext(priors, RIG, settings, 2), (6.0, 3.0)
+    problem, gates = AdjustmentContext(Families((priors,)), RIG, settings, 2), (6.0, 3.0)
     before = adjustment.adjust(landmarks.tracks, keypoints, start, problem, gates)
     greys, workers = Greys(frames, 4096), Threads(2)
     sighted = alignment.align(before, Observations(keypoints), greys, RIG, SETTINGS, workers)
@@ -194,7 +196,8 @@ def test_a_frame_without_texture_keeps_what_it_had(walk, tmp_path: Path, grey: i
     seen = np.bincount(sighted.tracks.frames, minlength=NUM)
     assert seen.min() > 100
     assert not sighted.aligned[slice(*sighted.keypoints.starts[2:4])].any()
-    assert np.isfinite(sighted.keypoints.sqrt_infos).all()
+    infos = sighted.keypoints.sqrt_infos
+    assert infos is not None and np.isfinite(infos).all()
 
 
 def test_all_masked_leaves_the_former_observations(walk, tmp_path: Path) -> None:
@@ -221,7 +224,8 @@ def test_points_at_a_centre_and_behind_walls_do_no_harm(walk) -> None:
     observed, workers = Observations(keypoints), Threads(2)
     sighted = alignment.align(solved, observed, greys, RIG, SETTINGS, workers)
     assert np.isfinite(sighted.keypoints.bearings_rig).all()
-    assert np.isfinite(sighted.keypoints.sqrt_infos).all()
+    infos = sighted.keypoints.sqrt_infos
+    assert infos is not None and np.isfinite(infos).all()
 
 
 def test_confirmed_points_are_looked_for_elsewhere(walk) -> None:
@@ -331,6 +335,7 @@ def test_patches_come_to_lie_on_their_surfaces(tmp_path: Path) -> None:
         wanted = points[nearest] - world_T_rigs[there, :3, 3]
         wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
         errors.append(np.median(np.linalg.norm(where - wanted, axis=1)[good]) / PIXEL)
+        assert found.normals_rig is not None
         lies = found.normals_rig[own][good]
         known = lies.any(axis=1)
         cosines = np.einsum("oi,oi->o", lies[known], walls[good][known])

@@ -13,6 +13,8 @@ from tiny_run import SETTINGS, Case, computed_stages
 from factors.patch_windows import PatchTable, patch_spans, pixel_grid, planes_from
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.families import Families
+from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import erp_from_bearings
 from gsba.config import PhotometricSettings, RefineSettings
@@ -138,7 +140,6 @@ def test_the_report_tells_of_patches(joint) -> None:
 
 
 def _start(case: Case, settings: RefineSettings):
-    from gsba.bundle import prior_factors
     from gsba.frames import cubemap
     from gsba.store.store import load_stage
     from gsba.types import Keypoints, Solution
@@ -146,7 +147,7 @@ def _start(case: Case, settings: RefineSettings):
     frames = load_stage(case.out, "frames", FrameSet)
     solved = load_stage(case.out, "refined1", Solution)
     keypoints = load_stage(case.out, "keypoints", Keypoints)
-    priors = prior_factors.build(case.result.coarse.world_T_rigs, settings.priors)
+    priors = TrajectoryPrior(case.result.coarse.world_T_rigs, settings.priors)
     return frames, keypoints, solved, priors, cubemap.rig_for(frames, settings.cubemap)
 
 
@@ -155,7 +156,9 @@ def test_nothing_to_see_changes_nothing(case: Case) -> None:
         update={"photometric": PhotometricSettings(min_gradient=1e3, depth_levels=0)}
     )
     frames, keypoints, solved, priors, rig = _start(case, settings)
-    result = direct.refine(frames, keypoints, solved, AdjustmentContext(priors, rig, settings, 1))
+    result = direct.refine(
+        frames, keypoints, solved, AdjustmentContext(Families((priors,)), rig, settings, 1)
+    )
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
     assert all(counts.kept == 0 for counts in result.counts)
 
@@ -194,7 +197,9 @@ def test_a_solve_against_the_map_is_undone(case: Case) -> None:
         update={"photometric": PhotometricSettings(max_growth=1e-3, depth_levels=0, spacing_deg=20)}
     )
     frames, keypoints, solved, priors, rig = _start(case, settings)
-    result = direct.refine(frames, keypoints, solved, AdjustmentContext(priors, rig, settings, 1))
+    result = direct.refine(
+        frames, keypoints, solved, AdjustmentContext(Families((priors,)), rig, settings, 1)
+    )
     assert not result.adjustment.rounds[-1].accepted
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
 
@@ -218,7 +223,9 @@ def test_a_small_panorama_has_fewer_levels(case: Case) -> None:
         update={"photometric": PhotometricSettings(levels=(9,), spacing_deg=20, size=5)}
     )
     frames, keypoints, solved, priors, rig = _start(case, settings)
-    result = direct.refine(frames, keypoints, solved, AdjustmentContext(priors, rig, settings, 1))
+    result = direct.refine(
+        frames, keypoints, solved, AdjustmentContext(Families((priors,)), rig, settings, 1)
+    )
     assert np.isfinite(result.adjustment.world_T_rigs).all() and len(result.counts) == 2
 
 

@@ -1,0 +1,112 @@
+"""The trajectory prior: a family of relative priors, weak absolute ones, and a held first pose."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from gsba.bundle.families import Family, MapSnapshot, digest_of
+from gsba.bundle.prior_factors import X
+from gsba.config import PriorSettings
+from gsba.geometry import inverse
+from gsba.types import StepNoise
+
+_WEAKER = 10.0  # times the noise of absolute priors, where another family holds the gauge
+_FIRST_SIGMA = 1e-6  # of the held first pose: radians, and part of the extent
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryPrior(Family):
+    """The poses of a trajectory as priors, as far as images confirm them.
+
+    Where another family holds the gauge, the first pose is as free as the map is large, and
+    absolute priors are weaker.
+    """
+
+    name = "trajectory"
+
+    world_T_rigs: np.ndarray  # (F, 4, 4) float64, in the frame and scale that the result keeps
+    settings: PriorSettings  # noise of steps and poses, loss
+    false_steps: np.ndarray | None = None  # (F - 1,) bool, steps without a prior; None = all have
+    # one
+    false_frames: np.ndarray | None = None  # (F,) bool, frames without an absolute prior; None =
+    # all have one
+    first: np.ndarray | None = None  # (4, 4) where the first pose is held; None = where the
+    # trajectory has it
+    noise: StepNoise | None = None  # of steps with a prior, as others showed it; None = as in the
+    # settings
+
+    @property
+    def digest(self) -> str:
+        """Digest of the trajectory and of its noise."""
+        flags = self.false_steps, self.false_frames, self.first
+        return digest_of(self.world_T_rigs, *flags, repr(self.settings), repr(self.noise))
+
+    def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
+        """Priors of steps, of frames, and of the first pose."""
+        world_T_rigs, held = self.world_T_rigs, not snapshot.gauge_held
+        lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
+        typical = float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
+        extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), typical)
+        graph = gtsam.NonlinearFactorGraph()
+        self._add_steps(graph, np.maximum(lengths, typical))
+        self._add_frames(graph, extent, 1.0 if held else _WEAKER)
+        sigma = _FIRST_SIGMA if held else 1.0
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma] * 3 + [sigma * extent] * 3))
+        fixed = gtsam.Pose3(world_T_rigs[0] if self.first is None else self.first)
+        graph.add(gtsam.PriorFactorPose3(X(0), fixed, noise))
+        return graph
+
+    def _add_steps(self, graph: gtsam.NonlinearFactorGraph, lengths: np.ndarray) -> None:
+        """Add relative priors of steps whose lengths (F - 1,) scale the noise."""
+        settings, noise = self.settings, self.noise
+        steps = inverse(self.world_T_rigs[:-1]) @ self.world_T_rigs[1:]
+        kept = np.ones(len(steps), bool) if self.false_steps is None else ~self.false_steps
+        in_a_row = _in_a_row(kept)
+        for f in np.flatnonzero(kept).tolist():
+            length = float(lengths[f])
+            if noise is None:
+                rotation, translation = np.deg2rad(settings.rotation_deg), settings.translation
+                model = self._robust(rotation, translation * length)
+            else:
+                covariance = in_a_row[f] * _step_covariance(steps[f], length, noise)
+                gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
+                model = gtsam.noiseModel.Robust.Create(self._loss(), gaussian)
+            graph.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), gtsam.Pose3(steps[f]), model))
+
+    def _add_frames(self, graph: gtsam.NonlinearFactorGraph, extent: float, weaker: float) -> None:
+        """Add absolute priors of frames, `weaker` times as noisy as in the settings."""
+        model = self._robust(
+            weaker * np.deg2rad(self.settings.absolute_rotation_deg),
+            weaker * self.settings.absolute_position * extent,
+        )
+        for f, world_T_rig in enumerate(self.world_T_rigs):
+            if self.false_frames is None or not self.false_frames[f]:
+                graph.add(gtsam.PriorFactorPose3(X(f), gtsam.Pose3(world_T_rig), model))
+
+    def _robust(self, rotation: float, translation: float) -> gtsam.noiseModel.Base:
+        """Noise of a pose, radians and map units, under the loss."""
+        sigmas = np.array([rotation] * 3 + [translation] * 3)
+        gaussian = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        return gtsam.noiseModel.Robust.Create(self._loss(), gaussian)
+
+    def _loss(self) -> gtsam.noiseModel.mEstimator.Base:
+        return gtsam.noiseModel.mEstimator.Cauchy.Create(self.settings.loss_sigmas)
+
+
+def _in_a_row(kept: np.ndarray) -> np.ndarray:
+    """For each step (N,), the number of kept ones in its gapless run: these drift alike."""
+    runs = np.cumsum(np.diff(kept.astype(int), prepend=0) != 0)
+    return np.bincount(runs, minlength=1)[runs] if len(kept) else runs
+
+
+def _step_covariance(f_T_next: np.ndarray, length: float, noise: StepNoise) -> np.ndarray:
+    """Covariance (6, 6) of a step perturbed on the right; `length` in map units."""
+    ahead = f_T_next[:3, :3].T @ f_T_next[:3, 3]
+    along = np.outer(ahead, ahead) / max(float(ahead @ ahead), 1e-300)
+    covariance = np.diag([noise.rotation**2] * 6)
+    across = noise.direction**2 * (np.eye(3) - along)
+    covariance[3:, 3:] = length**2 * (noise.length**2 * along + across)
+    if not ahead.any():
+        covariance[3:, 3:] = (length * noise.length) ** 2 * np.eye(3)
+    return covariance
