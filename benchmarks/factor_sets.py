@@ -1,9 +1,13 @@
-"""Accuracy by sets of observations: bearings of features alone, and with aligned patches.
+"""Accuracy by sets of observations: bearings, aligned patches, and families by their names.
 
 `bearing` has the features that `aligned` starts from; `tuned bearing` has the finer ones of
 `--config bearing`, the best configuration without patches.
 
     python benchmarks/factor_sets.py --data DATA --sequences aisle_loop,demo_rectangle --out WORK
+
+`--families photometric,barometer:{walk}/heights.csv` adds rows of `aligned` with each of these
+families beside it, gsba's own or a package's, as `gsba refine --factors` names them; {walk} stands
+for the folder of the sequence.
 
 Every sequence is refined from several coarse trajectories, one for each seed, with every set.
 Sequences are folders of `--data` with `images/`, `groundtruth.tum` and, for induced errors,
@@ -112,17 +116,37 @@ def disturbed(images: Path, how: str, folder: Path, seed: int = 0) -> Path:
     return folder
 
 
+def with_family(settings: RefineSettings, family: str, walk: Path) -> RefineSettings:
+    """Settings with one more family, named as in settings.factors.
+
+    Raises:
+        ValueError: the family is not installed.
+    """
+    factors = (*settings.factors, family.replace("{walk}", str(walk)))
+    return RefineSettings.model_validate(settings.model_dump() | {"factors": factors})
+
+
 def run_case(
-    name: str, walk: Path, images: Path, how: str, start: Path, out: Path, settings: RefineSettings
+    name: str,
+    walk: Path,
+    images: Path,
+    how: str,
+    start: Path,
+    out: Path,
+    settings: RefineSettings,
+    families: Sequence[str] = (),
 ) -> Iterable[Row]:
     """Refine with each set; `aligned` reuses the stages of `bearing`."""
     truth = read_trajectory(walk / "groundtruth.tum")
     plain = settings.patches.model_copy(update={"rounds": 0})
     sets = {
         "tuned bearing": (load_config(TUNED), out.with_name(f"{out.name}-tuned")),
-        "bearing": (settings.model_copy(update={"align": plain}), out),
+        "bearing": (settings.model_copy(update={"patches": plain}), out),
         "aligned": (settings, out),
     }
+    for family in families:
+        folder = out.with_name(f"{out.name}-{family.partition(':')[0]}")
+        sets[family] = with_family(settings, family, walk), folder
     for factors, (chosen, run) in sets.items():
         export = chosen.export.model_copy(update={"formats": ()})
         result = refine(images, start, run, chosen.model_copy(update={"export": export}))
@@ -177,6 +201,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("data"))
     parser.add_argument("--sequences", default="aisle_loop,gallery_forward,demo_rectangle")
     parser.add_argument("--starts", default="0,1,2", help="seeds, or files of the sequence")
+    parser.add_argument("--families", default="", help="beside aligned: NAME or NAME:ARGUMENT, ...")
     parser.add_argument("--disturb", default="none", help=f"of {','.join(DISTURBANCES)}")
     parser.add_argument("--config", type=Path)
     parser.add_argument("--out", type=Path, default=Path("factor_sets"))
@@ -184,6 +209,7 @@ def main() -> None:
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
     settings, rows = load_config(options.config), []
+    families = [name for name in options.families.split(",") if name]
     for name in options.sequences.split(","):
         try:
             walk = find_walk(name, options.data, options.out)
@@ -200,7 +226,7 @@ def main() -> None:
                     path.parent.mkdir(parents=True, exist_ok=True)
                     write_tum(path, degrade(truth, int(start)))
                 out = options.out / name / how / f"run_{path.stem}"
-                for row in run_case(name, walk, images, how, path, out, settings):
+                for row in run_case(name, walk, images, how, path, out, settings, families):
                     rows.append(row)
                     print(row, flush=True)
                     if options.json is not None:
