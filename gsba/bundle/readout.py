@@ -26,6 +26,7 @@ _UNTURNED = np.deg2rad(0.005)  # the same where a stabiliser took it out of ever
 _OWN_MOVE = 0.3  # the same of a translation about what velocities say, part of a typical one
 _ROW_SCALE_SIGMA = 0.03  # relative; a stitched picture does not tell the distortion and the field
 # of view of its lenses, on which it hangs how many rows lie between two directions
+_MIN_PAUSE_INTERVALS = 50.0  # median intervals between frames; a longer one is a pause
 _AXES = np.eye(3)[:2]
 
 
@@ -138,11 +139,16 @@ def velocities(
     """Mean velocity (F, 6) around each frame, [rotation rad/s, translation per s], rig frame.
 
     Between frames a walk turns to and fro: rotations say nothing of those during a readout, which
-    are 0 where no gyro knows them.
+    are 0 where no gyro knows them. Nothing is known of motion across a pause, such as that from
+    one recording to the next.
     """
-    before = np.maximum(np.arange(len(timestamps)) - 1, 0)
-    after = np.minimum(np.arange(len(timestamps)) + 1, len(timestamps) - 1)
-    span = (timestamps[after] - timestamps[before])[:, None]
+    num = len(timestamps)
+    before, after = np.arange(num) - 1, np.arange(num) + 1
+    intervals = np.diff(timestamps)
+    pauses = np.flatnonzero(intervals > _MIN_PAUSE_INTERVALS * np.median(intervals))
+    first, last = np.append(pauses + 1, 0), np.append(pauses, num - 1)
+    before[first], after[last] = first, last
+    span = np.maximum(timestamps[after] - timestamps[before], intervals.min())[:, None]
     moved = world_T_rigs[after, :3, 3] - world_T_rigs[before, :3, 3]
     local = np.einsum("fji,fj->fi", world_T_rigs[:, :3, :3], moved)
     rates = np.zeros_like(local) if turning is None else np.nan_to_num(turning.rates)

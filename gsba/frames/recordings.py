@@ -1,5 +1,6 @@
 """Frames of several recordings as one set: named by recording, one recording after the other."""
 
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,6 +10,8 @@ import numpy as np
 
 from gsba.log import GsbaError
 from gsba.types import NO_FILE_NAME, FrameSet
+
+_log = logging.getLogger(__name__)
 
 _GAP_INTERVALS = 100.0  # least time between two recordings, in the longest median interval
 _GAP_MULTIPLE_S = 100.0  # recordings begin at multiples of this many seconds
@@ -32,6 +35,7 @@ def combine(recordings: Mapping[str, FrameSet]) -> FrameSet:
     for (name, one), (other_name, other) in combinations(recordings.items(), 2):
         _refuse_same(name, one, other_name, other)
         _refuse_other_camera(name, one, other_name, other)
+        _log_common_times(name, one, other_name, other)
     parts = list(recordings.values())
     gap = _GAP_INTERVALS * max(float(np.median(np.diff(part.timestamps))) for part in parts)
     times, shifts, end = list[np.ndarray](), list[float](), -gap
@@ -64,6 +68,17 @@ def _check_names(names: list[str]) -> None:
     for name in names:
         if NO_FILE_NAME.search(name):
             raise GsbaError(f"recording {name!r:.60}: the name cannot be that of a folder")
+
+
+def _log_common_times(name: str, one: FrameSet, other_name: str, other: FrameSet) -> None:
+    """Log that the times of two recordings overlap, which says nothing of one another."""
+    first, second = one.timestamps, other.timestamps
+    if one.timed and other.timed and first[0] <= second[-1] and second[0] <= first[-1]:
+        _log.info(
+            "times of recordings '%s' and '%s' overlap: each has a clock of its own",
+            name,
+            other_name,
+        )
 
 
 def _refuse_same(name: str, one: FrameSet, other_name: str, other: FrameSet) -> None:

@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_limits
 from gsba import video
 from gsba.bundle.families import Family
 from gsba.config import RefineSettings
+from gsba.config_file import validated
 from gsba.frames.recordings import combine
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
@@ -150,7 +151,7 @@ def _with_camera(settings: RefineSettings, given: Sequence[_Given]) -> RefineSet
             )
     if named:
         camera = settings.camera.model_dump() | {"name": named[0][1]}
-        settings = RefineSettings.model_validate(settings.model_dump() | {"camera": camera})
+        settings = validated(settings.model_dump() | {"camera": camera})
     for one in given:
         settings = inputs.with_baseline(settings, _path(one.recording.calibration))
     return settings

@@ -52,6 +52,14 @@ def test_how_far_frames_own_motion_is_spread_is_found() -> None:
     np.testing.assert_allclose(found.own_sigmas, np.sqrt(np.mean(own**2, axis=0)), rtol=0.4)
 
 
+def test_velocities_do_not_span_the_pause_between_recordings() -> None:
+    poses, moments = loop_walk(24), times(24)
+    first = readout.velocities(poses[:10], moments[:10])
+    second = readout.velocities(poses[10:], moments[10:])
+    apart = np.concatenate([moments[:10], moments[10:] + 100.0])
+    np.testing.assert_allclose(readout.velocities(poses, apart), np.concatenate([first, second]))
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_frames_of_one_instant_have_none(seed: int) -> None:
     found, _ = _found(LENSES, seed)

@@ -1,0 +1,65 @@
+"""Frames of several recordings as one set: names, times and what cannot be combined."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsba.frames.recordings import combine, own_timestamps
+from gsba.log import GsbaError
+from gsba.types import FrameSet
+
+NUM = 4
+
+
+def _frames(folder: Path, start: float, interval: float = 0.5) -> FrameSet:
+    folder.mkdir()
+    names = tuple(f"{n:03d}" for n in range(NUM))
+    for name in names:
+        (folder / f"{name}.jpg").write_text(f"{folder.name} {name}")
+    paths = tuple((folder / f"{name}.jpg",) for name in names)
+    times = start + interval * np.arange(NUM)
+    return FrameSet(names, paths, times, "erp", (), 512, 256, (None,) * NUM)
+
+
+def test_recordings_follow_one_another_whatever_their_clocks(tmp_path: Path) -> None:
+    first, second = _frames(tmp_path / "a", 1.7e9), _frames(tmp_path / "b", 1.7e9 - 0.25, 2.0)
+    frames = combine({"a": first, "b": second})
+    assert frames.names[:1] == ("a/000",) and frames.names[NUM] == "b/000"
+    assert {name: rows.tolist() for name, rows in frames.recordings.items()} == {
+        "a": [0, 1, 2, 3],
+        "b": [4, 5, 6, 7],
+    }
+    steps = np.diff(frames.timestamps)
+    assert (steps > 0).all() and steps[NUM - 1] >= 100 * 2.0
+    np.testing.assert_allclose(
+        own_timestamps(frames),
+        np.concatenate([first.timestamps, second.timestamps]),
+        rtol=0,
+        atol=1e-6,
+    )
+    some = frames.taken(np.array([1, 5, 6]))
+    assert list(some.recordings) == ["a", "b"]
+    np.testing.assert_allclose(own_timestamps(some), own_timestamps(frames)[[1, 5, 6]])
+
+
+def test_what_cannot_be_combined_is_refused(tmp_path: Path) -> None:
+    first, second = _frames(tmp_path / "a", 0.0), _frames(tmp_path / "b", 0.0)
+    with pytest.raises(GsbaError, match="another layout"):
+        combine({"a": first, "b": replace(second, layout="eac", tracks=(4, 2))})
+    with pytest.raises(GsbaError, match="'a' and 'c' are the same"):
+        combine({"a": first, "b": second, "c": first})
+    with pytest.raises(GsbaError, match="cannot be that of a folder"):
+        combine({"a/b": first, "c": second})
+    for name in second.names:  # a copy under another name
+        (tmp_path / "b" / f"{name}.jpg").write_text(f"a {name}")
+    with pytest.raises(GsbaError, match="hold the same pictures"):
+        combine({"a": first, "b": second})
+
+
+@pytest.mark.parametrize("name", ["a/b/c", "../a", "a/..", "/a"])
+def test_names_lead_out_of_no_folder(name: str, tmp_path: Path) -> None:
+    frames = combine({"a": _frames(tmp_path / "a", 0.0), "b": _frames(tmp_path / "b", 0.0)})
+    with pytest.raises(ValueError, match="cannot be the name of a frame"):
+        replace(frames, names=(name, *frames.names[1:]))
