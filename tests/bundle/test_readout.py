@@ -12,7 +12,7 @@ from gsba.bundle.readout import CameraEstimate
 from gsba.camera.lens import Lenses
 from gsba.types import Fisheye, Solution
 
-FISHEYE = Fisheye(960, 960, 300.0, (480.0, 480.0), (0.0,) * 4, (0.0,) * 3)
+FISHEYE = Fisheye(960, 960, 300.0, (480.0, 480.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 LENSES, READOUT_S = Lenses(np.array([0.0, 0.0, 0.05]), band_rad=np.deg2rad(4)), 0.03
 SWEEPS = np.array([[-1.0, 0, 0], [0, 1.0, 0]])
@@ -35,6 +35,7 @@ def _found(camera: Lenses, seed: int) -> tuple[CameraEstimate, float]:
 def test_duration_way_and_each_frames_motion_are_found(seed: int) -> None:
     found, noise = _found(replace(LENSES, row_directions=SWEEPS, readout_motion=TWISTS), seed)
     assert not found.reason and (found.gains > 0).all()
+    assert found.lenses.row_directions is not None
     np.testing.assert_allclose(found.lenses.row_directions, SWEEPS)
     assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
     assert found.lenses.readout_motion is not None
