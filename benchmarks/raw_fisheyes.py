@@ -70,7 +70,10 @@ def linked(walk: Path, folder: Path) -> Path:
         for path in sorted((home / name).iterdir()):
             (folder / name / path.name).symlink_to(path.resolve())
     times = [home / "timestamps.csv", walk / "images" / "timestamps.csv"]
-    shutil.copyfile(next(path for path in times if path.exists()), folder / "timestamps.csv")
+    found = next((path for path in times if path.exists()), None)
+    if found is None:
+        raise SystemExit(f"{walk} has no timestamps.csv: put one beside its images")
+    shutil.copyfile(found, folder / "timestamps.csv")
     return folder
 
 
