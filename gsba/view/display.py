@@ -165,7 +165,8 @@ class View:
         gui.add_markdown(
             f"## {scene.name}\n{len(scene.frames)} frames, {num} points, {self._where()}"
         )
-        with gui.add_folder("Frame"):
+        panel = gui.add_panel()  # on phones it begins folded, so that the scene has room
+        with panel.add_tab("Frame"):
             slider = gui.add_slider("Number", 0, len(scene.frames) - 1, 1, 0)
             slider.on_update(lambda _: self.show(int(slider.value)))
             self.controls["Number"] = slider
@@ -181,7 +182,7 @@ class View:
             masks = gui.add_checkbox("Masks", False, visible=_has_masks(scene))
             masks.on_update(lambda _: self.show(self.frame))
             self.controls["Masks"] = masks
-        with gui.add_folder("Run"):
+        with panel.add_tab("Run"):
             self._add_switch("Refined trajectory", "/refined")
             self._add_switch("Coarse trajectory", "/coarse")
             self._add_switch("Rigs", "/rigs")
@@ -192,6 +193,8 @@ class View:
             size.on_update(lambda _: self._resize_points(size.value))
             for splat in scene.splats:
                 self._add_switch(f"Splat {splat.name}", f"/splat/{splat.name}")
+        gui.main_panel.dock_right()
+        panel.dock_below(gui.main_panel)
 
     def _add_switch(self, label: str, name: str) -> None:
         """Add a checkbox that shows and hides a node, if the node exists."""

@@ -345,7 +345,7 @@ function job(id) {
       drawn = key;
       drawPlan(canvas, map);
       caption.textContent = map.stage === "odometry" ? `${map.path.length} keyframes of the odometry`
-        : map.path.length ? `${map.path.length} frames, after “${map.stage}”` : "Nothing yet.";
+        : map.path.length ? `${map.path.length} frames, after: ${titleOf(progress, map.stage)}` : "Nothing yet.";
     }
     if (found.status !== shownStatus) {
       shownStatus = found.status;
@@ -354,6 +354,11 @@ function job(id) {
     }
     return true;
   });
+}
+
+function titleOf(progress, name) {
+  const stage = progress.stages.find((one) => one.name === name);
+  return stage ? stage.title : name;
 }
 
 function fillHead(head, job) {
@@ -394,7 +399,7 @@ function fillStages(list, progress) {
 
 function fillNotes(notes, job) {
   const parts = [];
-  if (job.camera && job.camera.length) {
+  if (job.camera && job.camera.length && !["done", "partial"].includes(job.status)) {
     parts.push(card("The camera so far", make("ul", {}, ...job.camera.map((line) => make("li", {}, line)))));
   }
   if (job.progress.warnings.length) {

@@ -14,7 +14,11 @@ function drawPlan(canvas, map) {
     ? `The path from above: ${path.length} poses, ${points.length} points shown`
     : "The path from above: nothing yet");
   if (!path.length) return;
-  const style = getComputedStyle(canvas), color = (name) => style.getPropertyValue(name);
+  const color = (name) => { // resolved for the light or the dark page
+    canvas.style.color = `var(${name})`;
+    return getComputedStyle(canvas).color;
+  };
+  const faint = color("--faint");
   const box = [Infinity, Infinity, -Infinity, -Infinity];
   const grow = ([x, y]) => {
     box[0] = Math.min(box[0], x); box[1] = Math.min(box[1], y);
@@ -38,7 +42,7 @@ function drawPlan(canvas, map) {
   context.globalAlpha = 0.65;
   points.forEach((point, k) => {
     const own = map.colors && map.colors[k];
-    context.fillStyle = own ? `rgb(${own[0]} ${own[1]} ${own[2]})` : color("--faint");
+    context.fillStyle = own ? `rgb(${own[0]} ${own[1]} ${own[2]})` : faint;
     const [x, y] = at(point);
     context.fillRect(x - 1, y - 1, 2, 2);
   });

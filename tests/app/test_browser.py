@@ -1,0 +1,215 @@
+"""A person's way through the page in a real browser, from a video to a dataset.
+
+With GSBA_PICTURES=FOLDER the pictures of docs/app.md are written to that folder.
+"""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsba.demo.film import make_film
+
+pytest.importorskip("starlette")
+pytest.importorskip("uvicorn")
+pytest.importorskip("av")
+sync_api = pytest.importorskip("playwright.sync_api")
+
+pytestmark = pytest.mark.slow
+
+BROWSER = next((p for name in ("chromium", "chromium-browser") if (p := shutil.which(name))), None)
+GSBA = (sys.executable, "-c", "from gsba.cli import main; main()")
+DESK, PHONE = {"width": 1100, "height": 800}, {"width": 390, "height": 844}
+RUN_MS = 540_000  # a run on a busy machine
+
+
+@dataclass
+class Server:
+    """`gsba app` as its own process, which can be killed and started again."""
+
+    root: Path
+    state: Path
+    port: int = 0
+    process: subprocess.Popen[str] = field(init=False)
+    address: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.start()
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(
+            [*GSBA, "app", ".", "--port", str(self.port), "--state", str(self.state)],
+            cwd=self.root,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        assert self.process.stdout is not None
+        found = re.search(r"http://127\.0\.0\.1:(\d+)/\S+", self.process.stdout.readline())
+        assert found is not None
+        self.address, self.port = found[0], int(found[1])
+
+    def kill(self) -> None:
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    if BROWSER is None:
+        pytest.skip("no chromium here: apt-get install chromium")
+    with sync_api.sync_playwright() as playwright:
+        shown = playwright.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+        yield shown
+        shown.close()
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    root = tmp_path_factory.mktemp("page") / "footage"
+    make_film(root, num_frames=60, width=512)
+    started = Server(root, root.parent / "state")
+    yield started
+    started.kill()
+
+
+def opened(browser: Any, address: str, size: dict[str, int]) -> Any:
+    """A page; errors of its console fail the test that looks at `page.faults`."""
+    page = browser.new_page(viewport=size)
+    page.faults = []
+    page.on("pageerror", lambda error: page.faults.append(str(error)))
+    page.on("requestfailed", lambda request: page.faults.append(f"{request.url} failed"))
+    page.goto(address)
+    return page
+
+
+def picture(page: Any, name: str) -> None:
+    if folder := os.environ.get("GSBA_PICTURES"):
+        page.screenshot(path=f"{folder}/{name}.jpg", type="jpeg", quality=80)
+
+
+def chosen(page: Any, out: str) -> None:
+    """Choose the video on the page of new runs, and name the run."""
+    page.get_by_role("button", name="walk.mp4 video").click()
+    page.get_by_text("stitched panoramas, 512x256").wait_for(timeout=60_000)
+    page.locator("#field-out").fill(out)
+    page.locator("#command", has_text=f"--out {out}").wait_for()
+
+
+def status(page: Any, text: str) -> None:
+    page.locator(f".badge.{text}").first.wait_for(timeout=RUN_MS)
+
+
+def fits(page: Any) -> bool:
+    return page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+
+
+def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
+    page = opened(browser, server.address, DESK)
+    chosen(page, "first")
+    page.get_by_text("Fast", exact=True).click()
+    page.locator("#command", has_text="--config fast").wait_for()
+    picture(page, "app-new")
+    line = page.locator("#command").text_content()
+    page.get_by_role("button", name="Start").click()
+    status(page, "running")
+    page.get_by_text("From above").wait_for()
+    drawn = page.locator("canvas[aria-label*=' poses']")  # the path grows while the run goes on
+    drawn.wait_for(timeout=RUN_MS)
+    status(page, "running")
+    # A second page shows the same job; on a phone nothing is cut off.
+    phone = opened(browser, f"{server.address}#jobs", PHONE)
+    status(phone, "running")
+    phone.get_by_role("link", name="refine first").click()
+    phone.get_by_role("heading", name="Stages").wait_for()
+    assert fits(phone)
+    page.locator(".stages li").nth(20).wait_for(timeout=RUN_MS)
+    picture(page, "app-watch")
+    # The server is killed: the run goes on, both pages say so and find the next server.
+    server.kill()
+    page.locator("#offline").wait_for()
+    phone.locator("#offline").wait_for()
+    server.start()
+    page.locator("#offline").wait_for(state="hidden", timeout=30_000)
+    phone.locator("#offline").wait_for(state="hidden", timeout=30_000)
+    status(page, "done")
+    page.get_by_text("frames refined").first.wait_for()
+    phone.get_by_text("frames refined").first.wait_for()
+    picture(phone, "app-phone")
+    assert fits(page) and fits(phone)
+    with page.context.expect_page() as report:
+        page.get_by_role("link", name="Report").click()
+    report.value.wait_for_load_state()
+    assert report.value.locator("svg, canvas").count() > 0  # its script runs in the sandbox
+    page.get_by_role("button", name="nerfstudio", exact=True).click()
+    page.get_by_role("heading", name="export first").wait_for()
+    status(page, "done")
+    assert (server.root / "first/nerfstudio/transforms.json").is_file()
+    # The line that was shown gives the same bytes in a terminal.
+    assert line is not None and line.startswith("gsba refine walk.mp4 ")
+    words = [word.replace("first", "second") for word in line.split()[1:]]
+    subprocess.run([*GSBA, *words], cwd=server.root, check=True, capture_output=True)
+    ours, other = (server.root / name / "trajectory.tum" for name in ("first", "second"))
+    assert ours.read_bytes() == other.read_bytes()
+    page.goto(f"{server.address}#compare")
+    for name in ("first", "second"):
+        page.get_by_role("button", name=f"{name} run").click()
+        page.get_by_role("button", name="Take this folder").click()
+        page.get_by_role("columnheader", name=name).wait_for()
+    picture(page, "app-compare")
+    assert fits(page)
+
+
+def test_a_run_is_stopped_and_goes_on_and_the_next_one_waits(browser: Any, server: Server) -> None:
+    page = opened(browser, server.address, PHONE)
+    chosen(page, "third")
+    page.get_by_role("button", name="Start").click()
+    status(page, "running")
+    page.goto(f"{server.address}#new")
+    chosen(page, "fourth")
+    page.get_by_role("button", name="Start").click()
+    status(page, "waiting")
+    page.goto(f"{server.address}#jobs")
+    first = page.locator(".jobs li", has_text="refine third")
+    next_one = page.locator(".jobs li", has_text="refine fourth")
+    next_one.get_by_role("button", name="Take out").click()
+    next_one.locator(".badge.stopped").wait_for()
+    first.get_by_role("button", name="Stop").click()
+    first.locator(".badge.stopped").wait_for(timeout=RUN_MS)
+    assert fits(page)
+    first.get_by_role("button", name="Go on").click()
+    first.locator(".badge.done").wait_for(timeout=RUN_MS)
+    assert (server.root / "third/report.html").is_file()
+    next_one.get_by_role("button", name="Forget").click()
+    next_one.wait_for(state="detached")
+    assert page.faults == []
+
+
+def test_what_cannot_be_refined_is_said_in_one_line(browser: Any, server: Server) -> None:
+    (server.root / "broken.mp4").write_bytes(b"no video")
+    page = opened(browser, server.address, PHONE)
+    page.get_by_role("button", name="broken.mp4 video").click()
+    alert = page.get_by_role("alert").filter(has_text="broken.mp4")
+    alert.wait_for(timeout=60_000)
+    assert page.locator("#command").count() == 0
+    other = opened(browser, server.address.replace(server.address.split("/")[3], "guess"), PHONE)
+    assert "Forbidden" in (other.text_content("body") or "")
+
+
+def test_a_page_in_the_dark_has_contrast(browser: Any, server: Server) -> None:
+    page = browser.new_page(viewport=DESK, color_scheme="dark")
+    page.goto(server.address)
+    page.get_by_role("heading", name="New run").wait_for()
+    back, text = page.evaluate(
+        "[getComputedStyle(document.body).backgroundColor, getComputedStyle(document.body).color]"
+    )
+    shades = [sum(map(int, re.findall(r"\d+", color)[:3])) / 3 for color in (back, text)]
+    assert shades[0] < 60 and shades[1] > 200
