@@ -57,7 +57,8 @@ class Progress:
         if kind == "stage":
             self.stage, self.work = dict(entry), None
         elif kind == "done":
-            self.stages.append(dict(entry))
+            if entry.get("name") not in self.names():  # runs take up their own stages again
+                self.stages.append(dict(entry))
             self.stage = self.work = None
         elif kind == "progress":
             self.work = dict(entry)
